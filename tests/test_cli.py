@@ -221,7 +221,7 @@ def test_export_writes_one_deck_with_the_changes_in_it(command: Command) -> None
     assert "* fingerspice_mobile.lib - " in Path("sub/y.cir").read_text()
 
 
-@pytest.mark.parametrize("name", ["run", "ac", "compare", "export", "figures", "explore", "sets"])
+@pytest.mark.parametrize("name", ["run", "ac", "compare", "export", "figures", "explore", "sets", "check"])
 @pytest.mark.parametrize("flag", ["--help", "-h"])
 def test_help_of_every_command_shows_an_example(command: Command, name: str, flag: str) -> None:
     result = command(name, flag)

@@ -71,6 +71,7 @@ def answer(result: Result, command: str) -> Any:
         (["sets"], 0),
         (["sets", "MOIST"], 0),
         (["sets", "moits"], 2),
+        (["check", "none.zarr"], 2),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import struct
 import zipfile
@@ -110,6 +111,153 @@ def test_what_is_no_whole_recording_is_refused(
     monkeypatch.chdir(tmp_path)
     Path("a.wav").write_bytes(data)
     assert said in refusal(lambda: fs.Samples.from_wav("a.wav", 1.0))
+
+
+def chunk(name: bytes, data: bytes, order: str = "<", size: int | None = None, pad: bool = True) -> bytes:
+    """A chunk of a WAV file, also with another size than its own."""
+    length = struct.pack(f"{order}I", len(data) if size is None else size)
+    return name + length + data + (b"\0" if pad and len(data) % 2 else b"")
+
+
+def pieced(
+    kind: str, count: int = 12, channels: int = 1, *, head: bytes = b"RIFF", size: int | None = None,
+    long: int | None = None, whole: int | None = None, before: bytes = b"", after: bytes = b"",
+    extensible: bool = False, pace: int | None = None,
+) -> bytes:  # fmt: skip
+    """A WAV file of random samples, such as of ``i3``, whose header may lie.
+
+    `size` and `long` are the sizes of its samples in their chunk and in RF64's header, `whole` that of the file, and
+    `pace` the bytes a second.
+    """
+    order, width = ">" if head == b"RIFX" else "<", int(kind[1])
+    random = np.random.default_rng(width)
+    data = (
+        random.normal(size=count * channels).astype(f"{order}{kind}").tobytes()
+        if kind[0] == "f"
+        else random.bytes(count * channels * width)
+    )
+    tag, block = 3 if kind[0] == "f" else 1, channels * width
+    form = struct.pack(
+        f"{order}HHIIHH", 0xFFFE if extensible else tag, channels, 8000, 8000 * block if pace is None else pace, block,
+        8 * width,
+    )  # fmt: skip
+    if extensible:
+        middle = struct.pack(f"{order}HH", 0, 16)
+        form += struct.pack(f"{order}HHII", 22, 8 * width, 0, tag) + middle + bytes.fromhex("800000aa00389b71")
+    body = before + chunk(b"fmt ", form, order) + chunk(b"data", data, order, size) + after
+    if head == b"RF64":
+        body = (
+            chunk(b"ds64", struct.pack("<QQQI", len(body) + 40, len(data) if long is None else long, count, 0)) + body
+        )
+    return head + struct.pack(f"{order}I", len(body) + 4 if whole is None else whole) + b"WAVE" + body
+
+
+def read_both_ways(path: Path, channel: int | None = None) -> tuple[object, object]:
+    """What a file gives read at once and read piece by piece: its values and rate, or the refusal."""
+
+    def one(at_once: bool) -> object:
+        try:
+            wave = fs.Samples.from_wav(path, 150.0, channel, at_once=at_once)
+            return wave.values.tobytes(), wave.rate
+        except fs.InputError as error:
+            return str(error)
+
+    return one(True), one(False)
+
+
+KINDS = ["u1", "i2", "i3", "i4", "i5", "i8", "f4", "f8"]
+
+
+@pytest.mark.parametrize("extensible", [False, True])
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("head", [b"RIFF", b"RIFX", b"RF64"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_whole_files_are_read_as_scipy_reads_them(
+    kind: str, head: bytes, channels: int, extensible: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.wav"
+    size = 0xFFFFFFFF if head == b"RF64" else None
+    path.write_bytes(pieced(kind, 13, channels, head=head, size=size, extensible=extensible))
+    rate, data = wavfile.read(path)
+    full = 2.0 ** (8 * data.dtype.itemsize - 1)
+    expected = data.reshape(13, channels)[:, channels - 1].astype(float)
+    if kind[0] != "f":
+        expected = (expected - 128.0 * (kind == "u1")) / full
+    for found in read_both_ways(path, channels - 1):
+        assert found == ((150.0 * expected).tobytes(), float(rate))
+
+
+def test_a_malformed_file_gives_the_same_values_or_the_same_refusal_at_once_and_in_pieces(tmp_path: Path) -> None:
+    path, told = tmp_path / "a.wav", {"values": 0, "refused": 0}
+    sizes = [None, 0, 5, 60, 0xFFFFFFFF]
+    odd, second = chunk(b"LIST", b"INFOx"), chunk(b"data", bytes(24))
+    around = [
+        (b"", b""), (odd, b""), (b"", odd), (b"", second), (second, b""), (b"", b"TAG of a player"),
+        (chunk(b"LIST", b"INFOx", pad=False), b""), (chunk(b"fmt ", bytes(16)), b""), (b"", chunk(b"fmt ", bytes(16))),
+        (b"", chunk(b"LIST", b"", size=2**31)), (chunk(b"ds64", struct.pack("<QQQI", 99, 8, 4, 0)), b""),
+    ]  # fmt: skip
+    files = [
+        pieced(kind, channels=channels, head=head, size=size, long=long, whole=whole, before=before, after=after)
+        for kind, channels in (("i2", 2), ("f4", 1))
+        for head in (b"RIFF", b"RIFX", b"RF64")
+        for size, whole in itertools.product(sizes, (None, 20))
+        for long in ((None, 2**64 - 1) if head == b"RF64" else (None,))
+        for before, after in around
+    ]
+    sound = pieced("i3", extensible=True, before=odd)
+    files += [sound[:length] for length in range(1, len(sound))]
+    files += [sound[:at] + bytes([value]) + sound[at + 1 :] for at in range(80) for value in (0, 255)]
+    for data in files:
+        path.write_bytes(data)
+        whole_file, in_pieces = read_both_ways(path, 0)
+        assert whole_file == in_pieces, data
+        told["refused" if isinstance(whole_file, str) else "values"] += 1
+    assert min(told.values()) > 100
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (pieced("i2", after=chunk(b"data", bytes(24))), "holds two 'data' chunks; allowed: one"),
+        (pieced("i2", size=60, whole=36 + 24), "is cut short: it ends before the samples that its header promises"),
+        (pieced("i2", size=23), "cut short or broken: 23 bytes are no whole number of samples of 2"),
+        (pieced("i2", pace=999), "is broken: its header says that 1 channels of 16 bits take 2 bytes, at 8000 Hz 999"),
+        (pieced("i2", head=b"RF64", size=0xFFFFFFFF, long=2**40), "is cut short"),
+        (pieced("i2", head=b"RF64", size=24, long=20), "is broken: its header gives 24 and 20 bytes of samples"),
+        (wav(bytes(8), 16, extensible=True).replace(GUID, bytes(14)), "holds samples as 0xfffe; allowed: PCM or float"),
+    ],
+    ids=range(7),
+)
+def test_a_header_that_contradicts_the_file_is_refused(data: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / "a.wav").write_bytes(data)
+    for found in read_both_ways(tmp_path / "a.wav"):
+        assert isinstance(found, str)
+        assert said in found
+
+
+@pytest.mark.parametrize("size", [0xFFFFFFFF, 0x7FFFF000])
+@pytest.mark.parametrize("kind", ["i2", "i3", "f8"])
+def test_a_stream_whose_header_does_not_know_its_end_is_read_to_the_end_of_the_file(
+    kind: str, size: int, tmp_path: Path
+) -> None:
+    sound, live = tmp_path / "sound.wav", tmp_path / "live.wav"
+    sound.write_bytes(pieced(kind))
+    live.write_bytes(pieced(kind, size=size, whole=0xFFFFFFFF))
+    assert read_both_ways(live) == read_both_ways(sound)
+    assert not isinstance(read_both_ways(live)[0], str)
+    # The recorder was killed within a sample.
+    live.write_bytes(live.read_bytes()[:-1])
+    assert "cut short or broken" in str(read_both_ways(live)[0])
+
+
+def test_a_gain_beyond_the_range_is_refused_by_the_samples_that_it_makes_too_large(tmp_path: Path) -> None:
+    path = tmp_path / "a.wav"
+    for at_once in (True, False):
+        path.write_bytes(wav(packed(np.full(9, 2**14), 16), 16))
+        said = refusal(lambda at_once=at_once: fs.Samples.from_wav(path, 3e12, at_once=at_once))
+        assert said == f"'{path}': a sample is 1.5e+12 V; allowed: a size up to 1e+12"
+        path.write_bytes(wav(bytes(18), 16))
+        assert fs.Samples.from_wav(path, 3e12, at_once=at_once).peak(0.0, 1.0) == 0.0
 
 
 def test_channels_that_are_not_there_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -250,6 +398,64 @@ def test_a_channel_and_a_gain_are_numbers(tmp_path: Path) -> None:
         assert said == f"'{path}' has no channel 'left'; allowed: channel=0 to 1"
         said = refusal(lambda once=at_once: fs.Samples.from_wav(path, "150", 0, at_once=once))
         assert said == "gain is '150'; allowed: a finite number of V at full scale"
+
+
+MICRO = "t (\xb5s),drive (V)\n0,0\n1000,10\n2000,20\n3000,0\n".encode("latin-1")
+
+
+@pytest.mark.parametrize(
+    ("data", "columns"),
+    [
+        (b"; captured, dt = 1m\n* 4 points\n0 0\n1m 10 ; peak soon\n2m 20\n3m 0\n", ()),
+        (b"time\tV(n001)\n0.0e+000\t0.0e+000\n1.0e-003\t1.0e+001\n2.0e-003\t2.0e+001\n3.0e-003\t0.0e+000\n", ()),
+        (b"time\tV(a,b)\tI(R1)\n0\t0\t5\n1m\t10\t5\n2m\t20\t5\n3m\t0\t5\n", ("time", "V(a,b)")),
+        (b"time\tV(a)\nStep Information: R=1k  (Run: 1/1)\n0\t0\n1e-3\t10\n2e-3\t20\n3e-3\t0\n", ()),
+        (MICRO, ()),
+        (b"n,time_s,u,i,on\n1,0,0,nan,no\n1,1e-3,10,inf,\n1,2e-3,20,1,yes\n1,3e-3,0,2k7,1\n", ("time_s", "u")),
+    ],
+    ids=["comments", "LTspice", "LTspice's choice", "one step", "Latin-1", "cells nobody asked for"],
+)
+def test_tables_of_other_programs_are_read(data: bytes, columns: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_bytes(data)
+    assert fs.PWL.from_table(tmp_path / "a.txt", *columns) == fs.PWL((0.0, 1e-3, 2e-3, 3e-3), (0.0, 10.0, 20.0, 0.0))
+
+
+@pytest.mark.parametrize("column", ["i", "on"])
+def test_a_cell_that_is_asked_for_is_refused_with_its_line(column: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,u,i,on\n0,0,1,1\n1,1,nan,\n")
+    said = {"i": "line 3: column 'i' is nan; allowed: finite numbers", "on": "line 3: the cell in column 3 is empty"}
+    assert said[column] in refusal(lambda: fs.PWL.from_table(tmp_path / "a.csv", "t", column))
+
+
+def test_several_runs_of_a_step_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text(
+        "time\tV(n001)\nStep Information: R=1k  (Run: 1/2)\n0\t0\n1e-3\t10\n"
+        "Step Information: R=2k  (Run: 2/2)\n0\t0\n1e-3\t5\n"
+    )
+    assert "line 5: the table holds 2 runs of .step, here 'Step Information: R=2k  (Run: 2/2)'; allowed: one run" in (
+        refusal(lambda: fs.PWL.from_table(tmp_path / "a.txt"))
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["0 0 1m 10 2m 20 3m 0", "0, 0, 1m, 10, 2m, 20, 3m, 0\n", "0\n0\n1m\n10\n2m\n20\n3m\n0\n"]
+)
+def test_a_file_of_a_pwl_alternates_times_and_values(text: str, folder: Path) -> None:
+    points = fs.PWL((0.0, 1e-3, 2e-3, 3e-3), (0.0, 10.0, 20.0, 0.0))
+    Path("decks/line.txt").write_text(text)
+    same(source("PWL FILE=line.txt"), points)
+    assert fs.PWL.from_table("decks/line.txt", pairs=True) == points
+    # A column alone may as well be samples.
+    for given in ({}, {"value": 0}) if "\n1m" in text else ():
+        said = refusal(lambda given=given: fs.PWL.from_table("decks/line.txt", **given))
+        assert "one column and no rate" in said
+        assert "PWL FILE= takes alternating times and values" in said
+    Path("decks/line.txt").write_text(text.replace("10", "", 1).replace("\n\n", "\n").replace(" , ", " "))
+    assert "'decks/line.txt' holds 7 numbers; allowed: pairs of time and value" in refusal(
+        lambda: source("PWL FILE=line.txt")
+    )
+    Path("decks/line.txt").write_text(text.replace("2m", "0.5m"))
+    assert "the time 0.0005 s follows 0.001 s" in refusal(lambda: source("PWL FILE=line.txt"))
 
 
 BAD_TABLES: list[tuple[str, dict[str, object], str]] = [
@@ -556,8 +762,9 @@ def test_results_tell_recordings_apart_by_their_names(command: Command) -> None:
     assert command(*words, "WAV(a.wav 150)").code == 0
     assert "--overwrite" in command(*words, "WAV(b.wav 150)").err
     assert command(*words, "TABLE(a.csv)", "--name", "table").code == 0
-    with pytest.warns(fs.FingerspiceWarning, match="a source that was a function or samples is not kept"):
-        assert fs.load("out/table.nc").circuit.overrides == {"Vdrive": "TABLE(a.csv)"}
+    loaded = fs.load("out/table.nc").circuit
+    assert loaded.overrides == {"Vdrive": "TABLE(a.csv)"}
+    assert loaded["Vdrive"].waveform == fs.PWL.from_table("a.csv")
 
 
 def test_a_recording_longer_than_the_run_is_told(command: Command) -> None:

@@ -380,6 +380,68 @@ def test_a_damaged_store_is_refused(scene: Path, command: Command, monkeypatch: 
     assert piece.exists()
 
 
+def flipped(file: Path, place: int, bit: int) -> None:
+    """Change one bit of a file."""
+    content = bytearray(file.read_bytes())
+    content[place] ^= 1 << bit
+    file.write_bytes(content)
+
+
+def test_a_flipped_bit_of_a_store_is_found(scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    import zarr
+
+    monkeypatch.chdir(scene)
+    few = ("run", "long.cir", "--stream", "--stop", "0.3", "--rtol", "1e-4", "--chunk", "0.1")
+    assert command(*few).code == 0
+    store, rng = Path("out/long.zarr"), random.Random(3)
+    sound = tree(store)
+    assert command("check", str(store)).out == f"{store}: 12 chunks of 3 arrays are as they were written\n"
+    assert json.loads(command("check", str(store), "--json").out)["chunks"] == {"f_el": 4, "time": 4, "u_gap": 4}
+    for name in ("f_el", "u_gap", "time"):
+        for chunk in range(4):
+            file = store / name / "c" / str(chunk)
+            flipped(file, rng.randrange(file.stat().st_size), rng.randrange(8))
+            said = f"{store} is damaged: {file} has changed since it was written; allowed: "
+            for words in (few, ("check", str(store))):
+                result = command(*words)
+                assert result.code == 2
+                assert said in result.lines[-1]
+            with pytest.raises(ValueError, match="checksum"):
+                zarr.open_group(store, mode="r")[name][:]
+            file.write_bytes(sound[str(file.relative_to(store))])
+    # The state from which the run goes on is not in a chunk.
+    head = store / "zarr.json"
+    head.write_text(head.read_text().replace('"chunks_done": 4', '"chunks_done": 3'))
+    assert "is no whole store of a run" in command(*few).lines[-1]
+    assert f"is damaged: {head} has changed" in command("check", str(store)).lines[-1]
+    (store / "f_el/c/2").unlink()
+    assert command("check", str(store)).code == 2
+    assert command("check", "out").lines == [
+        "fingerspice: out is no whole store; allowed: one that --stream or --store wrote"
+    ]
+
+
+def test_a_store_of_an_earlier_version_says_that_it_has_no_checksums(
+    scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(scene)
+    few = ("run", "long.cir", "--stream", "--stop", "0.3", "--rtol", "1e-4", "--chunk", "0.1")
+    assert command(*few).code == 0
+    for file in Path("out/long.zarr").rglob("zarr.json"):
+        about = json.loads(file.read_text())
+        about["codecs"] = [one for one in about.get("codecs", ()) if one["name"] != "crc32c"]
+        about["attributes"].get("run", {}).pop("kind of checksum", None)
+        about["attributes"].pop("checksum", None)
+        file.write_text(json.dumps(about))
+    for file in Path("out/long.zarr").glob("*/c/*"):
+        file.write_bytes(file.read_bytes()[:-4])
+    assert (
+        "out/long.zarr has no checksums, as an earlier version wrote it" in command("check", "out/long.zarr").lines[-1]
+    )
+    said = "out/long.zarr holds a run of another kind of checksum (None, and this one crc32c); allowed: --name NAME"
+    assert said in command(*few).lines[-1]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

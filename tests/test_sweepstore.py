@@ -385,6 +385,29 @@ def test_a_chunk_that_is_cut_short_or_not_marked_is_run_again(
     assert tree(path) == whole
 
 
+def test_a_chunk_of_which_a_bit_has_changed_is_run_again(
+    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, command: Command
+) -> None:
+    path, rng = tmp_path / "s.zarr", np.random.default_rng(5)
+    for name, content in whole.items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        if content is not None:
+            (path / name).write_bytes(content)
+    assert "chunks of 6 arrays are as they were written" in command("check", str(path)).out
+    for name in ("f_el_mean_periodic/c/0/3", "error/c/1/7", "status/c/2/9", "Xgap.d/c/5", "Xskin.d/c/63"):
+        content = bytearray((path / name).read_bytes())
+        content[rng.integers(len(content))] ^= 1 << rng.integers(8)
+        (path / name).write_bytes(content)
+        said = command("check", str(path))
+        assert said.code == 2
+        assert f"{path} is damaged: {path / name} has changed since it was written" in said.lines[-1]
+        found = fs.sweep(circuit, PARAMETERS, store=path, **HOW)
+        assert found.attrs["chunks"] - found.attrs["chunks_found"] == 1
+        assert tree(path) == whole
+    (path / "error/c/1/7").unlink()
+    assert f"{path / 'error'} has 191 of 192 chunks" in command("check", str(path)).lines[-1]
+
+
 @pytest.mark.parametrize(
     ("parameters", "how", "said"),
     [

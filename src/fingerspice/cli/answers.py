@@ -57,6 +57,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "figures": (),
     "explore": ("url",),
     "sets": ("parameter_sets",),
+    "check": ("chunks",),
 }
 #: Figures of a signal; a figure that a signal lacks is null.
 FIGURES = ("min", "max", "peak", "mean", "rms", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")

@@ -35,6 +35,7 @@ from fingerspice.cli.arguments import (
     Stop,
     Streamed,
 )  # fmt: skip
+from fingerspice.cli.check import check
 from fingerspice.cli.explore import explore
 from fingerspice.cli.figures import figures
 from fingerspice.cli.limits import limits
@@ -349,6 +350,7 @@ def export(
 app.command()(figures)
 app.command()(explore)
 app.command()(sets)
+app.command()(check)
 
 
 @app.callback(invoke_without_command=True)

@@ -18,28 +18,12 @@ from fingerspice.base.errors import InputError
 from fingerspice.base.files import UNFINISHED, settle_on_disk, write_aside, write_durably
 from fingerspice.results.datafiles import Variable, variables
 from fingerspice.results.solution import Solution
+from fingerspice.results.stores import CHECKSUM, SIGNATURE, fault, signature, zarr_library
 
 #: Attributes of the group: identity of the run, number of finished chunks, state to continue from, and results so far.
 RUN, DONE, MARK, SO_FAR = "run", "chunks_done", "goes_on", "so_far"
 # Number of bytes of the store that are copied at once.
 _PIECE = 1 << 25
-
-
-def zarr_library() -> Any:
-    """The library that writes Zarr.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
-    """
-    try:
-        import zarr
-    except ImportError:
-        raise InputError(
-            "--stream writes Zarr, and the package zarr is not installed; allowed: pip install 'fingerspice[stream]'"
-        ) from None
-    return zarr
 
 
 class Store:
@@ -57,7 +41,8 @@ class Store:
 
     def __init__(self, path: Path, run: dict[str, Any], total: int, count: int) -> None:
         self.zarr = zarr_library()
-        self.path, self.run, self.total, self.count = path, json.loads(json.dumps(run)), total, count
+        self.run = json.loads(json.dumps({**run, "kind of checksum": CHECKSUM}))
+        self.path, self.total, self.count = path, total, count
         self.done = 0
         self.mark: dict[str, Any] = {}
         self.so_far: dict[str, Any] = {}
@@ -92,8 +77,9 @@ class Store:
                 raise InputError(f"{self.path} holds a run of {other} {key.replace('_', ' ')}{said}; {ways}")
         self.done, self.mark, self.so_far = attributes[DONE], attributes[MARK], attributes[SO_FAR]
         for file, size in self._files(attributes):
-            if not file.is_file() or file.stat().st_size != size:
-                raise InputError(f"{self.path} is damaged: {file} is missing or cut short; allowed: --overwrite")
+            what = fault(file, size)
+            if what is not None:
+                raise InputError(f"{self.path} is damaged: {file} {what}; allowed: --overwrite")
         self._tidy(attributes)
 
     def _tidy(self, attributes: dict[str, Any]) -> None:
@@ -105,16 +91,17 @@ class Store:
                 file.unlink()
 
     def _attributes(self) -> dict[str, Any] | None:
-        """Attributes of the group; None if it is not a store of this program."""
+        """Attributes of the group; None if it is not a store of this program, or they have changed."""
         try:
             found = json.loads((self.path / "zarr.json").read_text())["attributes"]
             whole = all(isinstance(found[key], dict) for key in (RUN, MARK, SO_FAR, "arrays"))
-            return found if whole and isinstance(found[DONE], int) and found[DONE] >= 0 else None
+            sound = found.get(SIGNATURE, "") in ("", signature(found))
+            return found if whole and sound and isinstance(found[DONE], int) and found[DONE] >= 0 else None
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
     def _files(self, attributes: dict[str, Any]) -> list[tuple[Path, int]]:
-        """Files of the finished chunks, and their sizes, bytes."""
+        """Files of the finished chunks, and their sizes without checksum, bytes."""
         return [
             (self._file(name, k, columns), 8 * self.count * max(columns, 1))
             for name, columns in attributes["arrays"].items()
@@ -167,7 +154,8 @@ class Store:
                 names = {d: coords[d][1].tolist() for d in dimensions if d != "time"}
                 group.create_array(
                     name, shape=(self.total, *values.shape[1:]), chunks=(self.count, *values.shape[1:]), dtype="<f8",
-                    compressors=None, fill_value=np.nan, dimension_names=dimensions, attributes={**said, **names},
+                    compressors=[self.zarr.codecs.Crc32cCodec()], fill_value=np.nan, dimension_names=dimensions,
+                    attributes={**said, **names},
                 )  # fmt: skip
             aside.rename(self.path)
             settle_on_disk(self.path.parent)
@@ -182,6 +170,7 @@ class Store:
         file = self.path / "zarr.json"
         about = json.loads(file.read_text())
         about["attributes"] |= {DONE: done, MARK: mark, SO_FAR: self.so_far}
+        about["attributes"][SIGNATURE] = signature(about["attributes"])
         write_durably(file, json.dumps(about, indent=1).encode())
 
     def to_netcdf(self, path: Path) -> Path:

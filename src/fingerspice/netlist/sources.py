@@ -152,7 +152,7 @@ def _pwl(call: Call, context: Context) -> Waveform:
     if "file" in call.params:
         if call.args:
             raise InputError("PWL has points and file= too; allowed: one of them", call.where)
-        points = PWL.from_table(context.files.find(*_path(call, call.params["file"])))
+        points = PWL.from_table(context.files.find(*_path(call, call.params["file"])), pairs=True)
         given, levels = points.times, points.values
     else:
         numbers = [_number(arg, "PWL value") for arg in call.args]

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import BoolArray
 from fingerspice.base.files import write_aside, write_pieces
 from fingerspice.results.signals import SIGNALS
+from fingerspice.results.stored_circuit import stored_circuit
+from fingerspice.results.summary import Figures
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -105,7 +107,15 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             for key, text in solution.provenance().items():
                 file.attrs[key] = text
             group = file.create_group(GROUP)
-            group.attrs["run"] = json.dumps(_run(solution))
+            circuit, arrays = stored_circuit(solution.circuit, solution.t_stop, solution.rtol)
+            between = solution._figures.between() if isinstance(solution._figures, Figures) else None
+            more = {"circuit": circuit, "arrays": len(arrays), "between": between and between[0]}
+            group.attrs["run"] = json.dumps({**_run(solution), **more}, default=float)
+            tables = {f"circuit{k}": array for k, array in enumerate(arrays)}
+            for name, table in (tables | ({} if between is None else {"between": between[1]})).items():
+                dimensions = tuple(f"{name}_{axis}" for axis in range(table.ndim))
+                group.dimensions.update(zip(dimensions, table.shape, strict=True))
+                group.create_variable(name, dimensions, dtype=float, data=table)
             if not keep.all():
                 # Only `load` uses the left-hand rows of jumps; they form one table, because each variable takes time.
                 group.dimensions["jump"] = int(np.count_nonzero(~keep))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import json
-import math
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,37 +14,23 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.netlist.netlist import parse_netlist
 from fingerspice.physics.contact import Contact
 from fingerspice.results.datafiles import FORMAT, GROUP
 from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, State, Status
 from fingerspice.results.plan import Plan
 from fingerspice.results.solution import Solution
-from fingerspice.results.stored_record import StoredRecord
-from fingerspice.waveforms import combinations, periodic, ramps, repeated, transients
-from fingerspice.waveforms import waveform as waveforms
-from fingerspice.waveforms.waveform import Fundamental, Waveform
-
-# Waveform classes that `_literal` accepts in the stored text of a changed source.
-_WAVEFORMS = {
-    kind.__name__: kind
-    for kind in (
-        waveforms.DC, waveforms.Sine, transients.Chirp, transients.Exp, ramps.PWL, periodic.Pulse, periodic.Square,
-        periodic.Triangle, periodic.Sawtooth, combinations.Sum, combinations.Product, combinations.AM,
-        repeated.Burst, repeated.Repeat,
-    )
-}  # fmt: skip
-# Deepest nesting of expressions in that text, so that a malicious file cannot exhaust the stack.
-_DEEPEST = 20
-_NOT_KEPT = "a source that was a function or samples is not kept in a file"
+from fingerspice.results.stored_circuit import made_again
+from fingerspice.results.stored_record import StoredRecord, StoredRun
+from fingerspice.waveforms.waveform import Fundamental
 
 
 def load(path: str | Path) -> Solution:
     """Read a run back from a file of `Solution.to_netcdf` or of ``fingerspice run``.
 
-    Signals with both rows of each jump, figures, error, status and warnings are those of the run. The circuit is built
-    again from the deck's text and the changes; where that is not possible (a source that was a function or samples, a
-    deck that includes or plays files), it has no elements, and a warning is issued. No run can start from a loaded one.
+    Signals with both rows of each jump, figures, error, status and warnings are those of the run, and so are the lines
+    of its spectra. The circuit is made again from the elements in the file, with the samples of recordings, and with a
+    function as the Chebyshev series by which the run represented it. Where these are more than 8 million numbers, it
+    has no elements, and a warning is issued. No run can start from a loaded one.
 
     Parameters
     ----------
@@ -106,7 +91,7 @@ def _solution(file: Any) -> Solution:
         area_mode=str(run["area_mode"]),
         method=str(run["method"]),
         plan=Plan(**{**plan, "reasons": tuple(plan["reasons"]), "rates": tuple(plan["rates"])}),
-        circuit=_circuit(file, run["overrides"])._with(sets=_sets(file)),
+        circuit=_circuit(file, run),
         state=_state(run["state"], str(run["charge_law"])),
         fundamental=None if run["fundamental"] is None else Fundamental(**run["fundamental"]),
         period=run["period"],
@@ -114,6 +99,7 @@ def _solution(file: Any) -> Solution:
         warnings=tuple(map(str, run["warnings"])),
         first=float(run["first"]),
         t_stop=float(run["t_stop"]),
+        continuous=_between(file, run, record),
         stored=dict(run["summary"]),
     )
 
@@ -141,6 +127,13 @@ def _record(file: Any, run: dict[str, Any]) -> StoredRecord:
     t = whole("time")
     if t is None or np.any(np.diff(t) < 0.0):
         raise ValueError("its times do not ascend")
+    return _of_columns(t, whole, names, run)
+
+
+def _of_columns(
+    t: FloatArray, whole: Callable[[str], FloatArray | None], names: dict[str, tuple[str, ...]], run: dict[str, Any]
+) -> StoredRecord:
+    """A record at times (s) of the signals that `whole` gives by name."""
     u_layer, nodes, u_source, margin = (whole(name) for name in ("u_layer", "v", "u_source", "fold_margin"))
     if u_layer is None or nodes is None or u_source is None or margin is None:
         raise ValueError("a voltage is missing")
@@ -155,6 +148,23 @@ def _record(file: Any, run: dict[str, Any]) -> StoredRecord:
     )  # fmt: skip
 
 
+def _between(file: Any, run: dict[str, Any], record: StoredRecord) -> StoredRun | None:
+    """The last period between the outputs; None where the file has none."""
+    group = file.groups[GROUP]
+    if "between" not in group.variables:
+        return None
+    table, signals = np.asarray(group.variables["between"][...], float), [str(name) for name in run["between"]]
+    kept = {"layer": record.layers, "node": tuple(record.node_voltages)}
+
+    def whole(name: str) -> FloatArray | None:
+        own = [1 + i for i, signal in enumerate(signals) if signal == name or signal.startswith(f"{name}:")]
+        if name in ("u_layer", "v"):
+            return table[:, own]
+        return None if not own else table[:, own[0]].copy() if len(own) == 1 else table[:, own]
+
+    return StoredRun(float(run["t_stop"]) - float(run["period"]), _of_columns(table[:, 0].copy(), whole, kept, run))
+
+
 def _text(value: Any) -> str:
     return value.decode() if isinstance(value, bytes) else str(value)
 
@@ -167,60 +177,22 @@ def _state(kept: dict[str, Any], law: str) -> State:
     return State(float(kept["t"]), y, before, sign, law)
 
 
-def _circuit(file: Any, overrides: dict[str, str]) -> Circuit:
-    title, text = _text(file.attrs["title"]), _text(file.attrs["deck"])
+def _circuit(file: Any, run: dict[str, Any]) -> Circuit:
+    kept = run.get("circuit", "an earlier version wrote it")
+    group = file.groups[GROUP]
     try:
-        circuit = parse_netlist(text)
-        return circuit.replace({path: _value(value) for path, value in overrides.items()}) if overrides else circuit
-    except (InputError, ValueError, TypeError) as error:
+        if isinstance(kept, str):
+            raise ValueError(kept)
+        names = [f"circuit{k}" for k in range(int(run["arrays"]))]
+        made = made_again(kept, [np.asarray(group.variables[name][...], float) for name in names])
+        return made._with(text=_text(file.attrs["deck"]))
+    except (InputError, ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError) as error:
         warnings.warn(
             f"the circuit of this run cannot be made again from its file ({error}); its elements are left out",
             FingerspiceWarning,
             stacklevel=4,
         )
-        return Circuit(title, (), text=text, overrides=dict(overrides))
-
-
-def _sets(file: Any) -> dict[str, dict[str, float | Waveform]]:
-    """The named sets of parameters that were applied; files of earlier versions name none."""
-    found = json.loads(_text(file.attrs["sets"])) if "sets" in file.attrs else {}
-    return {str(name): {path: _value(text) for path, text in values.items()} for name, values in found.items()}
-
-
-def _value(text: str) -> float | Waveform:
-    """The value that `Circuit.replace` was given, from its text.
-
-    Raises
-    ------
-    ValueError
-        For anything but a number or a waveform made of numbers.
-    """
-    try:
-        return float(text)
-    except ValueError:
-        pass
-    try:
-        found = _literal(ast.parse(text, mode="eval").body)
-    except SyntaxError:
-        found = None
-    if not isinstance(found, Waveform):
-        raise ValueError(_NOT_KEPT)
-    return found
-
-
-def _literal(node: ast.expr, depth: int = 0) -> Any:
-    """The value of a number, a tuple or a waveform made of these; anything else is refused."""
-    if depth < _DEEPEST:
-        if isinstance(node, ast.Constant) and (node.value is None or isinstance(node.value, (int, float))):
-            return node.value
-        if isinstance(node, ast.Name) and node.id in ("inf", "nan"):
-            return math.inf if node.id == "inf" else math.nan
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-            return -_literal(node.operand, depth + 1)
-        if isinstance(node, ast.Tuple):
-            return tuple(_literal(x, depth + 1) for x in node.elts)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in _WAVEFORMS:
-            given = {str(k.arg): _literal(k.value, depth + 1) for k in node.keywords}
-            kind: Any = _WAVEFORMS[node.func.id]
-            return kind(*(_literal(x, depth + 1) for x in node.args), **given)
-    raise ValueError(_NOT_KEPT)
+        sets = json.loads(_text(file.attrs["sets"])) if "sets" in file.attrs else {}
+        return Circuit(
+            _text(file.attrs["title"]), (), text=_text(file.attrs["deck"]), overrides=dict(run["overrides"]), sets=sets
+        )

@@ -147,6 +147,16 @@ class Stretch:
         low, high = exact[:, 0].tolist()
         return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
 
+    def at_nodes(self, reads: Sequence[Read], tol: float) -> list[FloatArray]:
+        """Times (s) and these signals at the nodes of panels on which each misses its polynomial by `tol` of its peak.
+
+        All have the shape (p, NODES).
+        """
+        for read in reads:
+            self.panels = self._cut(read, *self.run.at_points(read, self.panels), tol)[1]
+        found = [self.run.at_points(read, self.panels) for read in reads]
+        return [x[:, :NODES] for x in (found[0][0], *(x for _, x in found))]
+
     def _cut(self, read: Read, t: FloatArray, x: FloatArray, tol: float) -> tuple[Weighed, Panels]:
         """A signal, and panels on which its interpolation error is at most `tol` times its peak."""
         smooth = tol * float(np.abs(x).max(initial=0.0))

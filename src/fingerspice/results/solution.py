@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from fingerspice.results.sensitivity import Sensitivity
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import Recorded
+    from fingerspice.results.stored_record import StoredRun
     from fingerspice.waveforms.waveform import Fundamental
 
 
@@ -65,8 +66,8 @@ class Solution(Sealed, Doors, Figured):
         TSTART and the end of the run, s.
     start : str
         How the run started, as in `simulate`; ``"given"`` where it went on from another one.
-    continuous : Recorded or ClosedForm or None
-        The run between its outputs; None where only its outputs are known.
+    continuous : Recorded or ClosedForm or StoredRun or None
+        The run between its outputs, or the last period of one from a file; None where only its outputs are known.
     fundamental, period : Fundamental or None, float or None
         Fundamental and period (s) of the source; None where it has none.
     fold_margin_min : float
@@ -98,7 +99,7 @@ class Solution(Sealed, Doors, Figured):
     first: float = 0.0
     t_stop: float = 0.0
     start: str = "deck"
-    continuous: Recorded | ClosedForm | None = None
+    continuous: Recorded | ClosedForm | StoredRun | None = None
     stored: Mapping[str, Any] | None = None
     sensitivities: Mapping[str, Sensitivity] = field(default_factory=dict)
 
@@ -324,6 +325,9 @@ class Solution(Sealed, Doors, Figured):
 
     def to_netcdf(self, path: str | Path, *, jumps: str = "right") -> Path:
         """Write `to_xarray` as a NetCDF file, without the cost of loading xarray; `fs.load` reads it back.
+
+        The file also has the circuit, with up to 8 million samples of its sources (64 MB), and the last period between
+        the outputs, up to 2 million numbers (16 MB), beyond which a loaded run's lines are those of its outputs.
 
         Raises
         ------

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.measures import Stretch, Weighed, weigh_outputs
 from fingerspice.results.record import sealed
 from fingerspice.results.signals import AnyRecord, Signals
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 
 Value = float | FloatArray | None
 
+#: Most numbers of the last period between the outputs that a file keeps (16 MB).
+MOST_BETWEEN = 2_000_000
+# The signals in it, and how far they may be from their polynomials, relative to their peaks.
+_BETWEEN, _MISSED = ("u_source", "u_layer", "v", "u_gap", "area", "f_el", "fold_margin"), 1e-10
 # Signals whose summary has a ripple instead of an rms.
 _RIPPLE = ("area", "f_el", "f_t", "friction")
 
@@ -167,6 +172,22 @@ class Figures:
             return self.last.weigh(name), False
         coarse = self.last.stretch
         return _Steps(Stretch(coarse.run, *coarse.span, coarse.rtol, longest)).weigh(name), True
+
+    def between(self) -> tuple[list[str], FloatArray] | None:
+        """Names of the voltages, areas and forces, and a table of the last period: times (s), then these signals.
+
+        Its rows are the nodes of panels on which all are polynomials. None where the run is not known between its
+        outputs, or the table is larger than `MOST_BETWEEN`.
+        """
+        if not isinstance(self.last, _Steps):
+            return None
+        coarse = self.last.stretch
+        names = [name for key in _BETWEEN for name in self.signals.names(key)]
+        if coarse.panels.step.size * NODES * len(names) > MOST_BETWEEN:
+            return None
+        columns = Stretch(coarse.run, *coarse.span, coarse.rtol).at_nodes([partial(_read, x) for x in names], _MISSED)
+        table = np.column_stack([x.ravel() for x in columns])
+        return (names, table) if table.size <= MOST_BETWEEN else None
 
     @cached_property
     def shown(self) -> tuple[str, ...]:

@@ -99,7 +99,7 @@ def _from_table(path: Path) -> dict[str, FloatArray]:
         measured = [own for own in MEASURED if own in map(str.lower, table.names)]
         of = measured[0] if key == SIGMA and len(measured) == 1 else key.removesuffix(f"_{SIGMA}")
         factor = unit_factor(unit, known[of], f"'{path}': the unit of column {name!r}") if of in known else 1.0
-        out[key] = factor * table.data[:, i]
+        out[key] = factor * table.numbers(i)
     return out
 
 

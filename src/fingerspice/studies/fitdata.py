@@ -194,7 +194,7 @@ def _from_table(circuit: Circuit, path: Path, by: str | None) -> tuple[dict[str,
     measured = next((name.removesuffix("_mean") for name in table.names if name.removesuffix("_mean") in MEASURED), "")
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
         if by is not None and name.lower() == by.lower():
-            groups = Groups(by, words, table.data[:, i].astype(int))
+            groups = Groups(by, words, table.numbers(i).astype(int))
             continue
         signal = name.removesuffix("_mean")
         key = {"time": TIME}.get(name.lower(), name.lower())
@@ -209,7 +209,7 @@ def _from_table(circuit: Circuit, path: Path, by: str | None) -> tuple[dict[str,
             base = MEASURED[signal]
         else:
             base = circuit.parameters[_path(circuit, name)].unit
-        found[key] = table.data[:, i] * unit_factor(unit, base, f"'{path}': the unit of column {name!r}")
+        found[key] = table.numbers(i) * unit_factor(unit, base, f"'{path}': the unit of column {name!r}")
     return found, groups
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import UNFINISHED, settle_on_disk
+from fingerspice.results.stores import CHECKSUM, checksum, fault, zarr_library
 from fingerspice.studies.batchtask import STATUS_NAMES
 
 if TYPE_CHECKING:
@@ -86,11 +87,8 @@ class SweepStore:
         return tuple(slice(i * own, min((i + 1) * own, size)) for i, own, size in ranges)
 
     def is_done(self, index: int) -> bool:
-        """Whether a chunk has been written as a whole."""
-        try:
-            return all(file.stat().st_size == size for file, size in self._files(index).values())
-        except OSError:
-            return False
+        """Whether a chunk has been written as a whole, and has not changed since."""
+        return all(fault(file, size) is None for file, size in self._files(index).values())
 
     def write(self, index: int, values: Mapping[str, NDArray[Any]]) -> None:
         """Write a chunk, and mark it as done; `values` has every array in the shape of the chunk's part.
@@ -117,7 +115,7 @@ class SweepStore:
         """
         temporary = self.path / STATUS / f"{UNFINISHED}{os.urandom(6).hex()}"
         with temporary.open("wb") as stream:
-            stream.write(content)
+            stream.write(content + checksum(content))
             stream.flush()
             os.fsync(stream.fileno())
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -129,7 +127,7 @@ class SweepStore:
                 raise
 
     def _files(self, index: int) -> dict[str, tuple[Path, int]]:
-        """File and size of every array's part in a chunk; the draws belong to the first place of the grid."""
+        """File and size (without checksum) of each array's part in a chunk; the first place of a grid has the draws."""
         place = self.place(index)
         found = {}
         for name, one in self.arrays.items():
@@ -173,7 +171,7 @@ class SweepStore:
         InputError
             If there is something else, or a store of another sweep; nothing is changed then.
         """
-        own = json.loads(json.dumps(run, default=float))
+        own = json.loads(json.dumps({**run, "kind of checksum": CHECKSUM}, default=float))
         if not os.path.lexists(self.path):
             try:
                 self._create({**about, RUN: json.dumps(own)}, grid)
@@ -198,6 +196,7 @@ class SweepStore:
     def _create(self, attributes: dict[str, Any], grid: Mapping[str, tuple[FloatArray, dict[str, Any]]]) -> None:
         """Create the store with its arrays, still without values, under a temporary name, then rename it."""
         zarr = zarr_library()
+        sums = [zarr.codecs.Crc32cCodec()]
         self.path.parent.mkdir(parents=True, exist_ok=True)
         aside = self.path.with_name(f"{UNFINISHED}{os.urandom(6).hex()}")
         try:
@@ -205,17 +204,17 @@ class SweepStore:
             for name, one in self.arrays.items():
                 dims, more = (*self.dims, *one.further), tuple(one.further.values())
                 group.create_array(
-                    name, shape=(*self.sizes, *more), chunks=(*self.block, *more), dtype=one.kind, compressors=None,
+                    name, shape=(*self.sizes, *more), chunks=(*self.block, *more), dtype=one.kind, compressors=sums,
                     fill_value=MISSING if name == STATUS else math.nan, dimension_names=dims, attributes=one.attributes,
                 )  # fmt: skip
             for name, unit in self.drawn.items():
                 group.create_array(
-                    name, shape=self.sizes[-1:], chunks=self.block[-1:], dtype="<f8", compressors=None,
+                    name, shape=self.sizes[-1:], chunks=self.block[-1:], dtype="<f8", compressors=sums,
                     fill_value=math.nan, dimension_names=("scene",), attributes={"units": unit},
                 )  # fmt: skip
             for name, (values, attributes) in grid.items():
                 group.create_array(
-                    name, data=values, chunks=values.shape, compressors=None, dimension_names=(name,),
+                    name, data=values, chunks=values.shape, compressors=sums, dimension_names=(name,),
                     attributes=attributes,
                 )  # fmt: skip
             try:
@@ -247,21 +246,3 @@ class SweepStore:
         named = {str(name): one.attrs[NAMES] for name, one in found.coords.items() if NAMES in one.attrs}
         found = found.assign_coords(named)
         return found[list(self.arrays)]
-
-
-def zarr_library() -> Any:
-    """The library that writes Zarr.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
-    """
-    try:
-        import zarr
-    except ImportError:
-        raise InputError(
-            "a store is written as Zarr, and the package zarr is not installed; allowed: pip install "
-            "'fingerspice[stream]'"
-        ) from None
-    return zarr

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import itertools
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,18 +15,25 @@ from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number
 
 _UNIT = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
+# Names that simulators give to a voltage between nodes or the current of an element: V(n001), I(R1), Ix(u1:in).
+_PROBE = re.compile(r"[vi]\w?\((.*)\)", re.IGNORECASE)
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 _VOLTS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6, "μV": 1e-6, "kV": 1e3}
 _AMPERES = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6, "μA": 1e-6, "nA": 1e-9}
 _NEWTONS = {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "µN": 1e-6, "μN": 1e-6, "kN": 1e3}
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
+# Lines of comments; a comment behind numbers that blanks separate, where without a blank a semicolon separates cells.
+_COMMENTED = ("#", ";", "*")
+_COMMENT = re.compile(r"^(\s*[^\s;]+\s[^;]*\s);.*")
+# Begins the line above each run in LTspice's export of a .step.
+_STEPPED = "Step Information:"
 # Largest number of column names shown in a message.
 _SHOWN = 8
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of finite numbers, with their names and units.
+    """Columns of numbers, with their names and units; only those that are used need be numbers, and finite.
 
     Attributes
     ----------
@@ -35,11 +41,13 @@ class Columns:
     names : tuple of str
         Without units; empty where the file has no header.
     data : ndarray, shape (n_row, n_column)
-        Numbers as written in the file, before any conversion of units.
+        Numbers as written in the file, before any conversion of units; NaN for a cell that is no number.
     units : tuple of str
         Unit of every column, an empty text for a column without a unit; an empty tuple if the file has no header.
     lines : ndarray of int, shape (n_row,), or None
         Number of each row's line in the file, from 1; None for a file without lines.
+    faults : dict of int to str
+        Message about the first cell that is no number, by column.
     """
 
     file: Path
@@ -48,12 +56,24 @@ class Columns:
     units: tuple[str, ...] = ()
     lines: NDArray[np.int64] | None = field(default=None, repr=False)
 
-    def __post_init__(self) -> None:
-        bad = np.argwhere(~np.isfinite(self.data))
+    faults: dict[int, str] = field(default_factory=dict, repr=False)
+
+    def numbers(self, column: int) -> FloatArray:
+        """The numbers of a column, shape (n_row,).
+
+        Raises
+        ------
+        InputError
+            If one of them is no number, or not finite; the message names the line.
+        """
+        if column in self.faults:
+            raise InputError(self.faults[column])
+        found = self.data[:, column]
+        bad = np.flatnonzero(~np.isfinite(found))
         if bad.size:
-            row, column = bad[0].tolist()
             name = repr(self.names[column]) if self.names else str(column)
-            raise InputError(f"{self.place(row)}: column {name} is {self.data[row, column]}; allowed: finite numbers")
+            raise InputError(f"{self.place(int(bad[0]))}: column {name} is {found[bad[0]]}; allowed: finite numbers")
+        return found
 
     def place(self, row: int) -> str:
         """File and line (or row) of a row counted from 0, as text for messages."""
@@ -108,7 +128,19 @@ class Columns:
             allowed = ", ".join(name for name in known if name.isascii())
             problem = f"'{self.file}': the unit of column {self.names[column]!r} is {unit!r}"
             raise InputError(f"{problem}; allowed: {allowed}")
-        return np.asarray(self.data[:, column] * (factors[unit.lower()] if unit else 1.0))
+        return np.asarray(self.numbers(column) * (factors[unit.lower()] if unit else 1.0))
+
+    def paired(self) -> Columns:
+        """Two columns from one row or column of alternating times and values; other tables as they are."""
+        rows, columns = self.data.shape
+        if self.names or (rows > 1 and columns > 1):
+            return self
+        if self.data.size % 2:
+            raise InputError(f"'{self.file}' holds {self.data.size} numbers; allowed: pairs of time and value")
+        for column in range(columns):
+            self.numbers(column)
+        lines = None if self.lines is None else np.resize(self.lines[::2], self.data.size // 2)
+        return Columns(self.file, (), self.data.reshape(-1, 2), (), lines)
 
 
 def read_text_columns(path: Path) -> Columns:
@@ -117,7 +149,7 @@ def read_text_columns(path: Path) -> Columns:
     Raises
     ------
     InputError
-        If the rows are not finite numbers, the same count in each row; the message names the line.
+        If there are no rows of numbers, or not the same count of cells in each; the message names the line.
     """
     return _parsed(path, _lines(path))
 
@@ -139,7 +171,7 @@ def read_labelled_columns(path: Path, label: str) -> tuple[Columns, tuple[str, .
     lines, words, place = _lines(path), dict[str, int](), -1
     separator: str | None = None
     for number, line in enumerate(lines):
-        if not line.strip() or line.lstrip().startswith("#"):
+        if not line.strip() or line.lstrip().startswith(_COMMENTED):
             continue
         if place < 0:
             separator = "\t" if "\t" in line else "," if "," in line else None
@@ -160,12 +192,22 @@ def _lines(path: Path) -> list[str]:
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     if b"\0" in data and not wide:
         raise InputError(f"'{path}' is no text; allowed: a table as text, or an NPZ file")
-    return data.decode("utf-16" if wide else "utf-8-sig", "replace").splitlines()
+    try:
+        return data.decode("utf-16" if wide else "utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        # Windows' Latin-1, in which spreadsheets and LTspice write the micro sign.
+        return data.decode("cp1252", "replace").splitlines()
 
 
 def _parsed(path: Path, lines: list[str]) -> Columns:
+    lines = [_COMMENT.sub(r"\1", line) if ";" in line else line for line in lines]
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    rows = [(number, line) for number, line in numbered if not line.lstrip().startswith("#")]
+    steps = [one for one in numbered if one[1].startswith(_STEPPED)]
+    if len(steps) > 1:
+        said = f"'{path}', line {steps[1][0]}: the table holds {len(steps)} runs of .step, here {steps[1][1].strip()!r}"
+        raise InputError(f"{said}; allowed: one run: export one step, or keep the rows of one")
+    numbered = [one for one in numbered if one not in steps]
+    rows = [(number, line) for number, line in numbered if not line.lstrip().startswith(_COMMENTED)]
     first = next((i for i, (_, line) in enumerate(rows) if _begins_with_number(line)), None)
     if first is None:
         raise InputError(f"'{path}' holds no rows of numbers")
@@ -176,11 +218,10 @@ def _parsed(path: Path, lines: list[str]) -> Columns:
     count = len(_cells(line, separator))
     names = _header(path, numbered, begin, separator, count)
     rows = rows[first:]
-    table = _numbers(path, rows, separator, count)
+    table, faults = _numbers(path, rows, separator, count)
     units = tuple(_unit(name)[1] for name in names)
-    return Columns(
-        path, tuple(_unit(name)[0] for name in names), table, units, np.array([number for number, _ in rows])
-    )  # fmt: skip
+    places = np.array([number for number, _ in rows])
+    return Columns(path, tuple(_unit(name)[0] for name in names), table, units, places, faults)
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
@@ -195,7 +236,10 @@ def _begins_with_number(line: str) -> bool:
 
 
 def _unit(header: str) -> tuple[str, str]:
-    """Name and unit of a column from ``name (unit)`` or ``name [unit]``."""
+    """Name and unit of a column from ``name (unit)`` or ``name [unit]``; ``V(n001)`` is a name."""
+    probe = _PROBE.fullmatch(header)
+    if probe and probe[1] not in _VOLTS | _AMPERES:
+        return header, ""
     match = _UNIT.fullmatch(header)
     return (match[1], match[2]) if match else (header, "")
 
@@ -229,42 +273,49 @@ def _header(
     number, line = before[-1]
     text = line.strip()
     names = tuple(_cells(text.lstrip("#"), separator))
-    if len(names) == count:
+    if len(names) == count and text[0] not in ";*":
         return names
-    if text.startswith("#"):
+    if text.startswith(_COMMENTED):
         return ()
     hint = ", or are its commas decimal commas" if separator == "," and count == 2 * len(names) else ""
     raise InputError(f"'{path}', line {number}: the header names {len(names)} columns, and the rows have {count}: is "
                      f"a name missing{hint}?")  # fmt: skip
 
 
-def _numbers(path: Path, rows: list[tuple[int, str]], separator: str | None, count: int) -> FloatArray:
-    """The numbers, shape (n_row, count); a bad cell is refused with its line."""
+def _numbers(
+    path: Path, rows: list[tuple[int, str]], separator: str | None, count: int
+) -> tuple[FloatArray, dict[int, str]]:
+    """The numbers, shape (n_row, count), and the message about the first cell of each column that is none."""
+    faults: dict[int, str] = {}
     try:
         table = np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None)
     except ValueError:
         # NumPy reads neither SPICE's scale suffixes nor quoted cells, and its message does not help the user: read the
         # rows one by one.
-        return np.array([_row(path, number, line, separator, count) for number, line in rows])
-    return np.asarray(table, float)
+        table = np.array([_row(path, number, line, separator, count, faults) for number, line in rows])
+    return np.asarray(table, float), faults
 
 
-def _row(path: Path, number: int, line: str, separator: str | None, count: int) -> list[float]:
+def _row(
+    path: Path, number: int, line: str, separator: str | None, count: int, faults: dict[int, str]
+) -> list[float]:  # fmt: skip
     _refuse_semicolons(path, number, line)
     cells = _cells(line, separator)
     if len(cells) != count:
         raise InputError(f"'{path}', line {number} has {len(cells)} cells; allowed: {count}, as in the first row")
-    return [_number(path, number, column, cell) for column, cell in zip(itertools.count(), cells, strict=False)]
+    found = []
+    for column, cell in enumerate(cells):
+        try:
+            found.append(_number(cell))
+        except ValueError as error:
+            reason = str(error) if cell else f"the cell in column {column} is empty; allowed: numbers"
+            faults.setdefault(column, f"'{path}', line {number}: {reason}")
+            found.append(np.nan)
+    return found
 
 
-def _number(path: Path, number: int, column: int, cell: str) -> float:
+def _number(cell: str) -> float:
     try:
-        # NaN and inf pass here; `Columns` refuses them with their line and column.
         return float(cell)
     except ValueError:
-        pass
-    try:
         return parse_number(cell)
-    except ValueError as error:
-        reason = str(error) if cell else f"the cell in column {column} is empty; allowed: numbers"
-        raise InputError(f"'{path}', line {number}: {reason}") from None

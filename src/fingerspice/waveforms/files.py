@@ -1,13 +1,8 @@
-"""Recordings from files: WAV, tables as text (CSV and the like), and tables as NPZ.
-
-WAV files are read by `scipy.io.wavfile`: it is a dependency already, and reads integers of 8 to 64 bits, floats,
-extensible headers and RF64. Its errors and warnings about broken files become clear messages here.
-"""
+"""Recordings from files: WAV, tables as text (CSV and the like), and tables as NPZ."""
 
 from __future__ import annotations
 
 import struct
-import warnings
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,14 +18,19 @@ from fingerspice.waveforms.columns import Columns, read_text_columns
 MAX_BYTES, MAX_TEXT_BYTES = 2**30, 2**26
 #: Largest number of samples: an hour at 48 kHz has 1.7e8, which take 1.4 GB.
 MAX_SAMPLES = 200_000_000
-#: Largest size of a WAV file that is read piece by piece, and of one chunk of its header, bytes.
-LARGEST_STREAMED, MAX_HEADER = 2**40, 2**16
+#: Largest size of a WAV file that is read piece by piece, bytes.
+LARGEST_STREAMED = 2**40
 # Largest deviation, in samples, of a file's times from those that its rate gives: the written times are rounded.
 _JITTER = 0.1
 _RATE_NAMES = ("rate", "fs", "sample_rate")
 _TIME_NAMES = ("t", "time")
-# Exceptions that scipy 1.17 raised on 20,000 randomly broken headers, and others that it may raise.
-_BROKEN = (ValueError, struct.error, ArithmeticError, NameError, TypeError, LookupError, MemoryError, OSError)
+# Sizes of samples that stand for an unknown one, in headers that were written before a live stream ended: the samples
+# go on to the end of the file. SoX writes the second one.
+_UNKNOWN_SIZES = (0xFFFFFFFF, 0x7FFFF000)
+# Most chunks of a file that are looked at, so that a crafted one takes no minutes.
+_MOST_CHUNKS = 10_000
+# Names of number formats that are not read.
+_FORMATS = {2: "ADPCM", 6: "ALAW", 7: "MULAW", 17: "DVI_ADPCM", 85: "MPEGLAYER3"}
 # First bytes of other file formats, to name the format in the message.
 _OTHERS = {
     b"ID3": "MP3",
@@ -64,40 +64,10 @@ class Recording:
 
 
 def read_wav(path: str | Path, channel: int | None = None) -> Recording:
-    """One channel of a WAV file, as fractions of full scale.
-
-    An integer is divided by half the range of its type (from 8-bit integers their middle, 128, is subtracted first), so
-    that full scale is -1 to just below 1. A float is taken as it is.
-
-    Parameters
-    ----------
-    path : str or Path
-        A file of at most `MAX_BYTES`.
-    channel : int, optional
-        Counted from 0; needed where there are several.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, too large, not a WAV file, broken, cut short or empty, or if the channel is missing or
-        wrong.
-    """
-    path = checked_file(path, MAX_BYTES)
-    rate, data = _wav_data(path)
-    if data.size == 0:
-        raise InputError(f"'{path}' holds no samples")
-    if not rate > 0:
-        raise InputError(f"'{path}' is broken: its header gives a rate of {rate} Hz")
-    data = data.reshape(data.shape[0], -1)
-    channels = data.shape[1]
-    if channel is None and channels > 1:
-        raise InputError(f"'{path}' has {channels} channels and none is chosen; allowed: channel=0 to {channels - 1}")
-    number = 0 if channel is None else channel
-    if isinstance(number, bool | str) or number != int(number) or not 0 <= number < channels:
-        allowed = "channel=0, its only one" if channels == 1 else f"channel=0 to {channels - 1}"
-        raise InputError(f"'{path}' has no channel {number!r}; allowed: {allowed}")
-    check_count(str(path), data.shape[0])
-    return Recording(_shares(data[:, int(number)]), float(rate))
+    """One channel of a WAV file of at most `MAX_BYTES`, all samples at once; see `wav_layout`."""
+    layout = wav_layout(path, channel, MAX_BYTES)
+    check_count(str(layout.path), layout.count)
+    return Recording(layout.read(0, layout.count), float(layout.rate))
 
 
 def _shares(data: np.ndarray) -> FloatArray:
@@ -121,7 +91,7 @@ class WavLayout:
     rate, channels, channel, count : int
         Sample rate (Hz), number of channels, index of the channel that is read, and number of samples per channel.
     kind : str
-        NumPy's name of the number format, such as ``<i2``; ``<i3`` and ``>i3``, of three bytes, are not known to NumPy.
+        Number format as NumPy writes it, such as ``<i2``; NumPy itself does not know those of 3, 5, 6 or 7 bytes.
     offset : int
         Position of the first sample, bytes.
     """
@@ -152,100 +122,117 @@ class WavLayout:
             raise InputError(f"'{self.path}' cannot be read: {error.strerror}") from None
         if len(raw) < (last - first) * block:
             raise InputError(f"'{self.path}' has become shorter while it was read")
-        if width != 3:
+        if width in (1, 2, 4, 8):
             return _shares(np.frombuffer(raw, self.kind).reshape(-1, self.channels)[:, self.channel])
-        # As in `scipy.io.wavfile`, a sample of three bytes fills the upper bytes of a 32-bit integer.
-        wide = np.zeros((last - first, 4), np.uint8)
-        low = 1 if self.kind[0] == "<" else 0
-        wide[:, low : low + 3] = np.frombuffer(raw, np.uint8).reshape(-1, self.channels, 3)[:, self.channel]
-        return _shares(wide.view(self.kind[0] + "i4")[:, 0])
+        # The sample fills the upper bytes of an integer that NumPy knows.
+        full = 4 if width == 3 else 8
+        wide = np.zeros((last - first, full), np.uint8)
+        low = full - width if self.kind[0] == "<" else 0
+        wide[:, low : low + width] = np.frombuffer(raw, np.uint8).reshape(-1, self.channels, width)[:, self.channel]
+        return _shares(wide.view(f"{self.kind[0]}i{full}")[:, 0])
 
 
-def wav_layout(path: str | Path, channel: int | None) -> WavLayout | None:
-    """Position of a channel's samples; None where only `read_wav` can tell: for a strange header or a wrong channel.
+def wav_layout(path: str | Path, channel: int | None = None, most: int = LARGEST_STREAMED) -> WavLayout:
+    """Position of the samples of one channel of a WAV file, which are read as fractions of full scale.
+
+    An integer is divided by half the range of its type (from 8-bit integers their middle, 128, is subtracted first), so
+    that full scale is -1 to just below 1. A float is taken as it is. The samples of a stream whose header was written
+    before its end was known go on to the end of the file.
+
+    Parameters
+    ----------
+    path : str or Path
+    channel : int, optional
+        Counted from 0; needed where there are several.
+    most : int
+        Largest size of the file, bytes.
 
     Raises
     ------
     InputError
-        If the path is not an ordinary file, or the file is empty or larger than `LARGEST_STREAMED`.
+        If the file is missing, too large, not a WAV file, broken, cut short or empty, if its header contradicts itself,
+        or if the channel is missing or wrong.
     """
-    path = checked_file(path, LARGEST_STREAMED)
+    path = checked_file(path, most)
     with path.open("rb") as file:
-        found = _wav_header(file)
-        if found is None:
-            return None
-        order, form, length = found
-        offset, size = file.tell(), file.seek(0, 2)
-    tag, channels, rate, _, block, bits = struct.unpack(order + "HHIIHH", form[:16])
-    if tag == 0xFFFE and len(form) >= 26:
-        (tag,) = struct.unpack(order + "H", form[24:26])
+        order, form, offset, length = _wav_chunks(path, file)
+    tag, channels, rate, pace, block, bits = struct.unpack(order + "HHIIHH", form[:16])
+    if tag == 0xFFFE and form[28:40] == struct.pack(order + "HH", 0, 16) + bytes.fromhex("800000aa00389b71"):
+        (tag,) = struct.unpack(order + "I", form[24:28])
+    if tag not in (1, 3):
+        raise InputError(f"'{path}' holds samples as {_FORMATS.get(tag, hex(tag))}; allowed: PCM or float (convert it)")
     width = block // max(channels, 1)
-    known = {1: (1, 2, 3, 4, 8), 3: (4, 8)}.get(tag, ())
-    whole = width in known and block == channels * width and (bits + 7) // 8 == width and length % block == 0
-    number = 0 if channel is None and channels == 1 else channel
-    if not whole or offset + length > size or length < 2 * block or rate == 0:
-        return None
-    if number is None or isinstance(number, bool | str) or number != int(number) or not 0 <= number < channels:
-        return None
+    whole = bits == 8 * width and width in (4, 8) if tag == 3 else 0 < bits <= 8 * width and (bits > 8 or width == 1)
+    # Of floats, some programs write no number of bytes a second.
+    if not whole or width > 8 or block != channels * width or (tag == 1 and pace != rate * block):
+        problem = f"{channels} channels of {bits} bits take {block} bytes, at {rate} Hz {pace} bytes a second"
+        raise InputError(f"'{path}' is broken: its header says that {problem}")
+    if rate == 0:
+        raise InputError(f"'{path}' is broken: its header gives a rate of 0 Hz")
+    if length == 0:
+        raise InputError(f"'{path}' holds no samples")
+    if length % block:
+        raise InputError(f"'{path}' is cut short or broken: {length} bytes are no whole number of samples of {block}")
+    if channel is None and channels > 1:
+        raise InputError(f"'{path}' has {channels} channels and none is chosen; allowed: channel=0 to {channels - 1}")
+    number = 0 if channel is None else channel
+    if isinstance(number, bool | str) or number != int(number) or not 0 <= number < channels:
+        allowed = "channel=0, its only one" if channels == 1 else f"channel=0 to {channels - 1}"
+        raise InputError(f"'{path}' has no channel {number!r}; allowed: {allowed}")
     kind = f"{order}{'f' if tag == 3 else 'u' if width == 1 else 'i'}{width}"
     return WavLayout(path, rate, channels, int(number), length // block, kind, offset)
 
 
-def _wav_header(file: BinaryIO) -> tuple[str, bytes, int] | None:
-    """Byte order, format chunk, and length of the samples (bytes); the file is then positioned at the first sample."""
+def _wav_chunks(path: Path, file: BinaryIO) -> tuple[str, bytes, int, int]:
+    """Byte order, format chunk, and position and length of the samples, bytes."""
     start = file.read(12)
     order = {b"RIFF": "<", b"RIFX": ">", b"RF64": "<"}.get(start[:4])
-    form, long = b"", 0
-    while order is not None and start[8:12] == b"WAVE":
-        entry = file.read(8)
-        if len(entry) < 8:
-            break
-        (length,) = struct.unpack(order + "I", entry[4:])
-        if entry[:4] == b"data":
-            return (order, form, long or length) if len(form) >= 16 else None
-        if entry[:4] in (b"fmt ", b"ds64") and length < MAX_HEADER:
-            body = file.read(length)
-            form = body if entry[:4] == b"fmt " else form
-            long = struct.unpack("<Q", body[8:16])[0] if entry[:4] == b"ds64" and len(body) >= 16 else long
-        else:
-            file.seek(length, 1)
-        file.seek(length & 1, 1)
-    return None
-
-
-def _wav_data(path: Path) -> tuple[int, np.ndarray]:
-    """Rate (Hz) and samples as they are stored, shape (n,) or (n, n_channel)."""
-    from scipy.io import wavfile
-
-    with path.open("rb") as file:
-        start = file.read(12)
-    if start[:4] not in (b"RIFF", b"RIFX", b"RF64") or (len(start) == 12 and start[8:] != b"WAVE"):
+    if order is None or (len(start) == 12 and start[8:] != b"WAVE"):
         kind = next((f", it begins as {name} does" for magic, name in _OTHERS.items() if start.startswith(magic)), "")
         raise InputError(f"'{path}' is no WAV file{kind}; allowed: WAV (convert it), or a table by TABLE")
-    try:
-        with warnings.catch_warnings(record=True) as noticed:
-            warnings.simplefilter("always")
-            rate, data = wavfile.read(path)
-    except _BROKEN as error:
-        if "Unknown wave file format" in str(error):
-            what = str(error).partition(": ")[2].partition(".")[0]
-            raise InputError(f"'{path}' holds samples as {what}; allowed: PCM or float (convert it)") from None
-        raise InputError(f"'{path}' is broken or cut short: it cannot be read as WAV to its end") from None
-    if any("EOF" in str(note.message) for note in noticed):
+    size, at, long = file.seek(0, 2), 12, None
+    # Behind the end that the header gives there may be anything, such as tags of players.
+    end = struct.unpack(order + "I", start[4:8])[0] + 8 if len(start) == 12 else 0
+    found: dict[bytes, tuple[bytes, int, int]] = {}
+    for _ in range(_MOST_CHUNKS):
+        if at + 8 > size or (at >= end and b"data" in found):
+            break
+        file.seek(at)
+        entry = file.read(8)
+        name, (length,) = entry[:4], struct.unpack(order + "I", entry[4:])
+        body, at = file.read(min(length, 40)), at + 8
+        if name in found and name in (b"fmt ", b"data"):
+            raise InputError(f"'{path}' holds two {name.decode().strip()!r} chunks; allowed: one")
+        if name == b"ds64" and start[:4] == b"RF64" and len(body) >= 16:
+            end, long = (x + y for x, y in zip(struct.unpack("<QQ", body[:16]), (8, 0), strict=True))
+        elif name == b"data" and long is not None:
+            if length not in (0xFFFFFFFF, long):
+                raise InputError(f"'{path}' is broken: its header gives {length} and {long} bytes of samples")
+            length = long
+        elif name == b"data" and start[:4] != b"RF64" and length in _UNKNOWN_SIZES and at + length > size:
+            length = size - at
+        found[name] = body, at, length
+        at += length + (length & 1)
+    form, samples = found.get(b"fmt ", (b"", 0, 0)), found.get(b"data")
+    if samples is None or len(form[0]) < 16 or form[1] > samples[1]:
+        raise InputError(f"'{path}' is broken or cut short: it cannot be read as WAV to its end")
+    if samples[1] + samples[2] > size:
         raise InputError(f"'{path}' is cut short: it ends before the samples that its header promises")
-    return rate, data
+    return order, form[0], samples[1], samples[2]
 
 
 def read_table(
-    path: str | Path, time: str | int | None = None, value: str | int | None = None, rate: float | None = None
-) -> Recording:
+    path: str | Path, time: str | int | None = None, value: str | int | None = None, rate: float | None = None, *,
+    pairs: bool = False,
+) -> Recording:  # fmt: skip
     """Columns of a table: a text file with one row per line, or an NPZ file of NumPy.
 
     Numbers in a text have decimal points and may have SPICE's scales (``1m``); commas, tabs or blanks separate them.
-    Lines that begin with ``#`` are comments. The line before the first numbers may name the columns, with units in
-    brackets: ``time (ms), drive [kV]``; the units s and V are assumed where none is given. Of two columns the one named
-    ``t`` or ``time`` is the times, or else the first one, with a header or without. An NPZ file holds one array
-    per column, and may hold a number named ``rate`` instead of times.
+    Lines that begin with ``#``, ``;`` or ``*`` are comments, and so is what follows a blank and ``;`` behind numbers.
+    The line before the first numbers may name the columns, with units in brackets: ``time (ms), drive [kV]``; the units
+    s and V are assumed where none is given. Of two columns the one named ``t`` or ``time`` is the times, or else the
+    first one, with a header or without. An NPZ file holds one array per column, and may hold a number named ``rate``
+    instead of times.
 
     Parameters
     ----------
@@ -255,13 +242,15 @@ def read_table(
         Names of the columns, or their numbers counted from 0; may be left out where only one choice is possible.
     rate : float, optional
         Samples per second, for a table without a column of times.
+    pairs : bool
+        Whether one row or column holds alternating times and values, as in a file of SPICE's PWL.
 
     Raises
     ------
     InputError
-        If the file is missing, too large, empty or broken; has semicolons, decimal commas, cells that are not finite
-        numbers, rows of different length or decreasing times; has no such column; or if its times and rate contradict
-        each other. The message names the line.
+        If the file is missing, too large, empty or broken; has semicolons, decimal commas, rows of different length or
+        several runs; has no such column; if cells of the columns asked for are not finite numbers, or times decrease;
+        or if its times and rate contradict each other. The message names the line.
     """
     path = checked_file(path, MAX_BYTES)
     with path.open("rb") as file:
@@ -269,6 +258,7 @@ def read_table(
     if not packed:
         checked_file(path, MAX_TEXT_BYTES)
     found, own_rate = _npz_columns(path) if packed else (read_text_columns(path), None)
+    found = found.paired() if pairs else found
     check_count(str(path), found.data.shape[0])
     if rate is not None and time is not None:
         raise InputError(f"'{path}': a rate and a column of times are given; allowed: one of them")
@@ -277,7 +267,8 @@ def read_table(
     rate = own_rate if rate is None else positive_number(f"'{path}': the rate", rate, "Hz")
     columns = found.data.shape[1]
     if rate is None and columns == 1:
-        raise InputError(f"'{path}' has one column and no rate; allowed: a column of times too, or rate= in Hz")
+        raise InputError(f"'{path}' has one column and no rate; allowed: a column of times too, or rate= in Hz; "
+                         "PWL FILE= takes alternating times and values")  # fmt: skip
     # A column that is named as times is one even beside a rate, which it may contradict.
     named = columns > 1 and any(name.lower() in _TIME_NAMES for name in found.names)
     if rate is not None and not (named or (columns == 2 and value is None)):

@@ -24,7 +24,7 @@ from fingerspice.waveforms.waveform import Waveform, blank_terms, require
 
 # A waveform with at most this many knots is not divided into windows, however close together its knots are.
 FEW_KNOTS = 1000
-# Most points that the text of a PWL shows; from a text with its points a stored run makes the source again.
+# Most points that the text of a PWL shows.
 MOST_SHOWN = 10_000
 
 
@@ -251,7 +251,9 @@ class PWL(Ramps):
         return f"PWL({len(self.times)} points, {span}, sha256 {digest}, repeat={self.repeat!r})"
 
     @classmethod
-    def from_table(cls, path: str | Path, time: str | int | None = None, value: str | int | None = None) -> PWL:
+    def from_table(
+        cls, path: str | Path, time: str | int | None = None, value: str | int | None = None, *, pairs: bool = False
+    ) -> PWL:
         """The points of a table with a column of times (see `waveforms.files.read_table`).
 
         Parameters
@@ -259,13 +261,15 @@ class PWL(Ramps):
         path : str or Path
         time, value : str or int, optional
             Names of the columns, or their numbers counted from 0; needed if there are more than two.
+        pairs : bool
+            Whether one row or column without a header holds alternating times and values, as ``PWL FILE=`` takes it.
 
         Raises
         ------
         InputError
             If the file cannot be read (the message names the line), or has a rate and no times.
         """
-        table = read_table(path, time, value)
+        table = read_table(path, time, value, pairs=pairs)
         require(table.times is not None, f"'{path}'", "a table with a rate", "one with times; fs.Samples.from_table")
         return cls(table.times, table.values)  # type: ignore[arg-type]
 

@@ -14,7 +14,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, read_only, real_number, real_numbers
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import check_range, take_numbers
+from fingerspice.waveforms.bounds import RANGES, check_range, take_numbers
 from fingerspice.waveforms.files import WavLayout, read_table, read_wav, wav_layout
 from fingerspice.waveforms.ramps import FEW_KNOTS, Ramps
 from fingerspice.waveforms.upsampling import upsample
@@ -89,7 +89,7 @@ class Samples(Ramps):
     def from_wav(
         cls, path: str | Path, gain: float, channel: int | None = None, *, at_once: bool = True
     ) -> Samples:  # fmt: skip
-        """One channel of a WAV file of integers (8 to 32 bits) or floats, at any rate.
+        """One channel of a WAV file of integers (8 to 64 bits) or floats, at any rate.
 
         Parameters
         ----------
@@ -111,15 +111,15 @@ class Samples(Ramps):
         """
         gain = real_number("gain", gain, "a finite number of V at full scale")
         require(math.isfinite(gain), "gain", gain, "a finite number of V at full scale")
-        layout = None if at_once else wav_layout(path, channel)
-        recording = read_wav(path, channel) if layout is None else None
-        try:
-            if layout is not None:
-                return _WavFile(layout, gain)
-            assert recording is not None
-            return cls(gain * recording.values, recording.rate)  # type: ignore[arg-type]
-        except InputError as error:
-            raise InputError(f"'{path}': {error}") from None
+        # Samples of a float file that are no numbers, or become too large, are refused below without NumPy's warning.
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = read_wav(path, channel) if at_once else wav_layout(path, channel)
+            try:
+                if isinstance(found, WavLayout):
+                    return _WavFile(found, gain)
+                return cls(gain * found.values, found.rate)  # type: ignore[arg-type]
+            except InputError as error:
+                raise InputError(f"'{path}': {error}") from None
 
     @classmethod
     def from_table(cls, path: str | Path, rate: float | None = None, value: str | int | None = None) -> Samples:
@@ -261,9 +261,10 @@ class _WavFile(Samples):
 
     def __init__(self, layout: WavLayout, gain: float) -> None:
         self.__dict__.update(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
-        check_range("a sample", [gain], "V")
-        # Only floats need the check: integers are finite, and within full scale.
-        for first in range(0, self.count if layout.kind[1] == "f" else 0, AT_ONCE):
+        require(self.count >= 2, "samples", f"shape ({self.count},)", "one row of two or more")
+        # Integers are finite, and within full scale.
+        sure = layout.kind[1] != "f" and abs(gain) <= RANGES["V"][0]
+        for first in range(0, 0 if sure else self.count, AT_ONCE):
             _check_samples(self.between(first, min(first + AT_ONCE, self.count)), first)
 
     def __repr__(self) -> str:
