@@ -36,10 +36,8 @@ class Bar:
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-            columns = [TextColumn("{task.description}"), BarColumn()]
-            columns += (
-                [TimeElapsedColumn()] if self._endless else [TextColumn("{task.percentage:3.0f} %{task.fields[note]}")]
-            )
+            share = TimeElapsedColumn() if self._endless else TextColumn("{task.percentage:3.0f} %")
+            columns = [TextColumn("{task.description}"), BarColumn(), share, TextColumn("{task.fields[note]}")]
             self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
             self._bar.add_task(self._what, total=None if self._endless else 1.0, note="")
             self._bar.start()

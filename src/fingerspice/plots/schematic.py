@@ -42,6 +42,9 @@ class Schematic(Picture):
         self._write_svg(content, {})
         return content.getvalue()
 
+    def _content(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        return {"image/svg+xml": self._repr_svg_()}, {}
+
     def _write_svg(self, target: Path | io.StringIO, about: Mapping[str, str]) -> None:
         from matplotlib import rc_context
 
