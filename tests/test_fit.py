@@ -474,7 +474,8 @@ def test_a_skin_held_at_one_frequency_is_told_and_biases_the_fit(
             fs.batch(circuit, {path: at}, periodic=True)
         with pytest.warns(fs.FingerspiceWarning, match="Xskin takes its data at f = .*the source's fundamental is"):
             fs.sweep(circuit, {path: at}, periodic=True)
-    result = command("sweep", "pad.cir", "--vary", "Vdrive.frequency=30,500", "--periodic", "--json", "--no-plot")
+    Path("sweep.toml").write_text('deck = "pad.cir"\nperiodic = true\n[parameters]\n"source.frequency" = [30, 500]\n')
+    result = command("sweep", "sweep.toml", "--json", "--no-plot")
     assert any(text.startswith("Xskin takes its data at f =") for text in json.loads(result.out)["warnings"])
 
 

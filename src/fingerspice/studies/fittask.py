@@ -40,8 +40,8 @@ _STEP = 1e-4
 _SLOPES = 1e-6
 # What a scene that cannot be run counts as, over the scale of the data.
 REFUSED = 1e6
-# Error of the least squares' last step, relative; and the largest number of evaluations.
-CLOSE, _MOST = 1e-8, 40
+# Error of the least squares' last step, relative; and the largest number of evaluations, and of refused ones.
+CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
 #: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
 FARTHEST = 1e3
 
@@ -244,12 +244,20 @@ def followed(task: Problem, begin: FloatArray, close: float = CLOSE) -> Fitted:
     from scipy.optimize import least_squares
 
     known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+    refusals = 0
 
     def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        nonlocal refusals
         key = x.tobytes()
         if key not in known:
+            last = next(iter(known.values()), None)
             known.clear()
-            known[key] = task.residuals(unit * np.exp(x))
+            # At the edge of what can be run, all further steps are refused without a run, so that the search ends.
+            if last is None or refusals < _MOST_REFUSALS:
+                known[key] = task.residuals(unit * np.exp(x))
+            else:
+                known[key] = np.full_like(last[0], REFUSED), np.zeros_like(last[1])
+            refusals += bool(np.all(known[key][0] == REFUSED))
         return known[key]
 
     # The first step is at most as long as the place it starts from: by a factor of e, not by that of the unit.
@@ -262,5 +270,6 @@ def followed(task: Problem, begin: FloatArray, close: float = CLOSE) -> Fitted:
     found = least_squares(
         lambda x: at(x)[0], x0, lambda x: at(x)[1], bounds=box, xtol=close, ftol=close**1.5, gtol=1e-12, max_nfev=_MOST
     )
-    (residual, by), values = at(found.x), unit * np.exp(found.x)
-    return Fitted(values, residual, by, float(residual @ residual), int(found.nfev), bool(found.status > 0))
+    values, closed = unit * np.exp(found.x), found.status > 0 and refusals < _MOST_REFUSALS
+    residual, by = at(found.x) if refusals < _MOST_REFUSALS else task.residuals(values)
+    return Fitted(values, residual, by, float(residual @ residual), int(found.nfev), bool(closed))
