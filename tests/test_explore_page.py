@@ -189,7 +189,7 @@ def test_pinned_traces_stay_with_the_difference(page: Page) -> None:
     lines = page.page.locator("#plots .panel").first.locator(".u-series:not(:first-child) .u-marker")
     shape = "(marker) => { const s = getComputedStyle(marker); return [s.borderTopStyle, s.height]; }"
     # A sample of each line: a square of dashes would look like one of lines.
-    assert [marker.evaluate(shape) for marker in lines.all()] == [["solid", "0px"]] * 2 + [["dashed", "0px"]] * 2
+    assert [marker.evaluate(shape) for marker in lines.all()] == [["solid", "2px"]] * 2 + [["dashed", "2px"]] * 2
     a, b = (fs.simulate(SINE.replace({"Xgap.d": d}), rtol=1e-6).f_el_mean for d in (3.5e-6, 4e-6))
     assert page.shown("electroadhesive force")[-1] == f"{100 * (b / a - 1):.2f} %"
 

@@ -474,7 +474,9 @@ def test_a_skin_held_at_one_frequency_is_told_and_biases_the_fit(
             fs.batch(circuit, {path: at}, periodic=True)
         with pytest.warns(fs.FingerspiceWarning, match="Xskin takes its data at f = .*the source's fundamental is"):
             fs.sweep(circuit, {path: at}, periodic=True)
-    Path("sweep.toml").write_text('deck = "pad.cir"\nperiodic = true\n[parameters]\n"source.frequency" = [30, 500]\n')
+    Path("sweep.toml").write_text(
+        'deck = "pad.cir"\nperiodic = true\n[parameters]\n"source.frequency" = { values = [30, 500] }\n'
+    )
     result = command("sweep", "sweep.toml", "--json", "--no-plot")
     assert any(text.startswith("Xskin takes its data at f =") for text in json.loads(result.out)["warnings"])
 
@@ -500,7 +502,7 @@ def test_a_stored_sweep_tells_once_of_a_skin_held_at_one_frequency(circuit: fs.C
     ("column", "factor", "said"),
     [
         ("f_el_mean", 1e3, "largest f_el_mean is .*newton, not millinewton; was .*m"),
-        ("Vdrive.amplitude", 1e-3, r"largest Vdrive\.amplitude is 200 mV, .*volt, not kilovolt; was 200 or"),
+        ("Vdrive.amplitude", 1e-3, r"largest Vdrive\.amplitude is 200 mV, .*volt, not kilovolt; was 200 meant"),
         ("source.frequency", 1e-9, "Vdrive frequency is 500 nHz, outside"),
     ],
 )

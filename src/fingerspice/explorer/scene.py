@@ -46,8 +46,8 @@ def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     dict
         ``ok``, ``status`` and ``message``; ``sliders``, ``sets``, ``waveform`` (text), ``warnings`` and ``unknown``; of
         a run ``t`` and ``traces`` (arrays in SI units), ``figures``, ``error``, ``plan``, ``harmonics``, ``stacks``,
-        ``period``, ``t_stop`` and ``failed_at``. A request that is refused, or a run that fails, says why in ``message``; neither
-        raises an exception.
+        ``period``, ``t_stop`` and ``failed_at``. A request that is refused, or a run that fails, says why in
+        ``message``; neither raises an exception.
     """
     first, rest = begun(given, own)
     return first | rest()
