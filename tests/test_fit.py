@@ -515,6 +515,16 @@ def test_data_in_another_unit_are_told_and_end_in_a_bounded_number_of_evaluation
     assert 1e-3 <= found.estimates["Xgap.d"].value / 3.5e-6 <= 1e3
 
 
+def test_the_axes_of_a_fits_picture_have_names_and_units(circuit: fs.Circuit, data: dict[str, np.ndarray]) -> None:
+    finger = circuit.replace(dict(TRUE))
+    top, bottom = fs.fit(finger, data, ["Xgap.d"], starts=1, rtol=1e-4, skin="follow").plot().axes
+    assert (top.get_ylabel(), bottom.get_xlabel()) == ("mean electroadhesive force [N]", "frequency of Vdrive [Hz]")
+    assert top.get_legend_handles_labels()[1] == ["amplitude of Vdrive = 100 V", "amplitude of Vdrive = 200 V"]
+    loads = {"Xgap.fn": [0.3, 0.5], "f_t_mean": [0.1, 0.17]}
+    _, bottom = fs.fit(finger, loads, ["Xgap.d"], starts=1, rtol=1e-4).plot().axes
+    assert bottom.get_xlabel() == "load of Xgap [N]"
+
+
 def test_a_start_outside_its_bounds_moves_into_them(circuit: fs.Circuit, data: dict[str, np.ndarray]) -> None:
     finger = circuit.replace({path: TRUE[path] for path in ("Xgap.r", "Xgap.alpha")})
     said = r"Xgap\.d is 3\.5e-06, outside its bounds 2e-06 to 3\.3e-06: it starts at 3\.3e-06"
