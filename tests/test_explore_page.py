@@ -9,6 +9,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import fingerspice as fs
@@ -133,8 +134,12 @@ def test_a_fold_shows_its_sentence_and_keeps_the_last_good_traces(page: Page) ->
     page.typed("Xgap.d", "30n")
     assert "no solution" in page.status()
     assert "source voltage, before" in page.page.inner_text("#plots")
+    # So are the panels that belong to them.
+    grey = """(parts) => parts.map((part) => getComputedStyle(document.querySelector(part)).filter)"""
+    assert page.page.evaluate(grey, [".three", "#figures"]) == ["grayscale(1)"] * 2
     page.typed("Xgap.d", "4u")
     assert "before" not in page.page.inner_text("#plots")
+    assert page.page.evaluate(grey, [".three", "#figures"]) == ["none"] * 2
     assert page.status().startswith("Table 1")
 
 
@@ -181,8 +186,41 @@ def test_pinned_traces_stay_with_the_difference(page: Page) -> None:
     page.page.click("#pin")
     page.typed("Xgap.d", "4u")
     assert "gap voltage, pinned" in page.page.inner_text("#plots")
+    lines = page.page.locator("#plots .panel").first.locator(".u-series:not(:first-child) .u-marker")
+    shape = "(marker) => { const s = getComputedStyle(marker); return [s.borderTopStyle, s.height]; }"
+    # A sample of each line: a square of dashes would look like one of lines.
+    assert [marker.evaluate(shape) for marker in lines.all()] == [["solid", "2px"]] * 2 + [["dashed", "2px"]] * 2
     a, b = (fs.simulate(SINE.replace({"Xgap.d": d}), rtol=1e-6).f_el_mean for d in (3.5e-6, 4e-6))
     assert page.shown("electroadhesive force")[-1] == f"{100 * (b / a - 1):.2f} %"
+
+
+def test_the_waveforms_text_follows_the_scene(page: Page) -> None:
+    source = page.page.locator("#source")
+    assert source.get_attribute("placeholder") == "SIN(0 200 100)"
+    page.typed("Vdrive.amplitude", "150")
+    assert source.get_attribute("placeholder") == "SIN(0 150 100)"
+    source.fill("SQUARE(120 50)")
+    page.after(lambda: source.press("Enter"))
+    assert page.page.input_value("#kind") == "SQUARE"
+    # The field has the focus still, and is not being typed in.
+    page.after(lambda: page.page.evaluate("document.querySelector('#reset').click()"))
+    assert (page.page.input_value("#source"), page.page.input_value("#kind")) == ("", "")
+    assert source.get_attribute("placeholder") == "SIN(0 200 100)"
+    source.type("SQ")
+    page.after(lambda: page.page.evaluate("document.querySelector('#area').dispatchEvent(new Event('change'))"))
+    assert page.page.input_value("#source") == "SQ"
+
+
+def test_the_mean_force_says_of_which_sine_it_is(page: Page) -> None:
+    page.page.wait_for_selector("#means canvas")
+    assert page.page.inner_text("#means h2") == "mean force of a sine of 200 V against its frequency"
+    page.after(lambda: page.page.select_option("#kind", "SQUARE"))
+    said = "mean force of a sine of 254.6 V, the source's fundamental, against its frequency"
+    page.page.wait_for_function("(said) => document.querySelector('#means h2')?.textContent === said", arg=said)
+    assert 4.0 / np.pi * 200.0 == pytest.approx(254.6, abs=0.05)
+    # Another scene has nothing of the one before.
+    page.after(lambda: page.page.select_option("#scene", "chirp"))
+    assert "254.6 V" not in page.page.inner_text("#means")
 
 
 def test_sets_are_applied_from_the_menu_with_their_caveats_and_the_link_has_their_values(

@@ -132,6 +132,48 @@ def test_what_is_weak_or_too_fast_is_not_felt() -> None:
     assert "no part of the friction" in fast.verdict()
 
 
+@pytest.mark.parametrize("frequency", [200.0, 240.0, 499.0])
+@pytest.mark.parametrize("amplitude", [1.0, 150.0])
+def test_friction_beyond_the_table_is_felt_not_felt_or_not_known(frequency: float, amplitude: float) -> None:
+    run = fs.simulate(table1(f"SIN(0 {amplitude} {frequency})", f=frequency), start="periodic", t_stop=0.01, rtol=1e-5)
+    table = android_threshold()
+    # What may be felt is felt if the threshold stays where its table ends.
+    longer = Threshold("longer", [*table.frequency, 1e3], [*table.level, table.level[-1]], table.reference)
+    possible, found = feel(run, threshold=longer), feel(run)
+    assert possible.felt is (amplitude == 150.0)
+    assert found.felt is (None if possible.felt and frequency > 200.0 else possible.felt)
+    if frequency > 200.0:
+        assert found.unjudged is not None
+        assert found.unjudged.level == pytest.approx(possible.highest, abs=1e-9)
+        assert f"at {2 * frequency:g} Hz, outside the threshold's frequencies" in found.verdict()
+        assert found.change_felt is found.felt
+
+
+def test_friction_below_the_table_is_compared_by_its_displacement() -> None:
+    run = fs.simulate(table1("SIN(0 200 20)", f=20), start="periodic", t_stop=0.05, rtol=1e-5)
+    found = feel(run, threshold=Threshold("from 50 Hz", (50.0, 1000.0), (20.0, 20.0)))
+    line = int(found.force.argmax())
+    # 10 m/s^2 at 50 Hz.
+    level = 20.0 * math.log10(found.displacement[line] * (2.0 * math.pi * 50.0) ** 2 / 10.0)
+    assert found.unjudged is not None
+    assert (found.unjudged.frequency, found.unjudged.level) == pytest.approx((40.0, level))
+    assert (found.felt, level < 0.0) == (False, True)
+    assert "too weak to be felt" in found.verdict()
+
+
+@pytest.mark.parametrize(("amplitude", "felt"), [(200.0, None), (0.1, False)])
+def test_a_run_too_short_to_resolve_its_friction_has_no_verdict(amplitude: float, felt: bool | None) -> None:
+    chirp = fs.Chirp(amplitude, 40.0, 60.0, 0.05)
+    run = fs.simulate(table1(), sources=chirp, t_stop=0.05, t_eval=np.arange(0.0, 0.05, 1e-4), rtol=1e-5)
+    found = feel(run)
+    assert found.felt is felt
+    assert found.unjudged is not None
+    assert found.unjudged.slower
+    # The friction varies at 80 to 120 Hz, below all bands: its rms about the mean is that of the outputs.
+    assert found.unjudged.force == pytest.approx(math.sqrt(2.0) * float(np.std(run.f_t)), rel=0.2)
+    assert "which only a longer run resolves" in found.verdict()
+
+
 @pytest.mark.parametrize("frequency", [15.0, 30.0, 60.0, 180.0])
 def test_below_60_hz_squares_are_felt_at_lower_voltages_than_sines_by_their_fast_lines(frequency: float) -> None:
     # Measured by Vardar, Güçlü and Basdogan (2016 and 2017, doi:10.1109/TOH.2017.2704603): at 60 Hz and above squares

@@ -477,3 +477,116 @@ def test_a_report_has_the_layout_of_lmfit(circuit: fs.Circuit) -> None:
     share = f"({100 * one.error / one.value:.2f}%)"
     assert f"    Xgap.d:  {one.value:.8g} +/- {one.error:.8g} {share} (init = 3.5e-06)" in lines
     assert lines[-1] == f"    C(Xgap.d, Xgap.r) = {found.correlation[0, 1]:+.4f}"
+
+
+def test_a_skin_held_at_one_frequency_is_told_and_biases_the_fit(
+    circuit: fs.Circuit, data: dict[str, np.ndarray], command: Command
+) -> None:
+    said = r"Xskin takes its data at f = 100 Hz, the source's fundamental is 30 to 500 Hz; with skin 'follow'"
+    finger = circuit.replace({path: TRUE[path] for path in ("Xgap.r", "Xgap.alpha")})
+    with pytest.warns(fs.FingerspiceWarning, match=said):
+        held = fs.fit(finger, data, ["Xgap.d"], starts=1)
+    followed = fs.fit(finger, data, ["Xgap.d"], starts=1, skin="follow")
+    assert followed.estimates["Xgap.d"].value == pytest.approx(TRUE["Xgap.d"], rel=1e-5)
+    assert abs(held.estimates["Xgap.d"].value / TRUE["Xgap.d"] - 1.0) > 0.01
+    for path, at in (("Vdrive.frequency", [30.0, 500.0]), ("Xskin.f", [100.0, 200.0])):
+        with pytest.warns(fs.FingerspiceWarning, match="Xskin takes its data at f = .*the source's fundamental is"):
+            fs.batch(circuit, {path: at}, periodic=True)
+        with pytest.warns(fs.FingerspiceWarning, match="Xskin takes its data at f = .*the source's fundamental is"):
+            fs.sweep(circuit, {path: at}, periodic=True)
+    Path("sweep.toml").write_text(
+        'deck = "pad.cir"\nperiodic = true\n[parameters]\n"source.frequency" = { values = [30, 500] }\n'
+    )
+    result = command("sweep", "sweep.toml", "--json", "--no-plot")
+    assert any(text.startswith("Xskin takes its data at f =") for text in json.loads(result.out)["warnings"])
+
+
+def test_a_skin_that_suits_every_source_is_not_told(
+    circuit: fs.Circuit, tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    both = {"Vdrive.frequency": [30.0, 500.0], "Xskin.f": [30.0, 500.0]}
+    fs.batch(circuit, both, periodic=True)
+    fs.batch(circuit, {"Vdrive.frequency": [30.0, 500.0]}, periodic=True, skin="follow")
+    fs.batch(circuit, {"Vdrive.amplitude": [30.0, 500.0]}, periodic=True)
+    fs.sweep(circuit, {"Vdrive.frequency,Xskin.f": [0.3, 5.0]}, periodic=True, store=tmp_path / "sweep.zarr")
+    assert not [one for one in recwarn if "takes its data" in str(one.message)]
+
+
+def test_a_stored_sweep_tells_once_of_a_skin_held_at_one_frequency(circuit: fs.Circuit, tmp_path: Path) -> None:
+    with pytest.warns(fs.FingerspiceWarning, match="the source's fundamental is 100 to 400 Hz") as told:
+        fs.sweep(circuit, {"Vdrive.frequency": [100.0, 200.0, 400.0]}, periodic=True, store=tmp_path / "sweep.zarr")
+    assert len([one for one in told if "takes its data" in str(one.message)]) == 1
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "said"),
+    [
+        ("f_el_mean", 1e3, "largest f_el_mean is .*newton, not millinewton; was .*m"),
+        ("Vdrive.amplitude", 1e-3, r"largest Vdrive\.amplitude is 200 mV, .*volt, not kilovolt; was 200 meant"),
+        ("source.frequency", 1e-9, "Vdrive frequency is 500 nHz, outside"),
+    ],
+)
+def test_data_in_another_unit_are_told_and_end_in_a_bounded_number_of_evaluations(
+    circuit: fs.Circuit, data: dict[str, np.ndarray], column: str, factor: float, said: str
+) -> None:
+    with pytest.warns(fs.FingerspiceWarning, match=said):
+        found = fs.fit(circuit, {**data, column: factor * data[column]}, ["Xgap.d"], starts=1, rtol=1e-4, skin="follow")
+    assert found.evaluations <= 40
+    assert 1e-3 <= found.estimates["Xgap.d"].value / 3.5e-6 <= 1e3
+
+
+def test_the_axes_of_a_fits_picture_have_names_and_units(circuit: fs.Circuit, data: dict[str, np.ndarray]) -> None:
+    finger = circuit.replace(dict(TRUE))
+    top, bottom = fs.fit(finger, data, ["Xgap.d"], starts=1, rtol=1e-4, skin="follow").plot().axes
+    assert (top.get_ylabel(), bottom.get_xlabel()) == ("mean electroadhesive force [N]", "frequency of Vdrive [Hz]")
+    assert top.get_legend_handles_labels()[1] == ["amplitude of Vdrive = 100 V", "amplitude of Vdrive = 200 V"]
+    loads = {"Xgap.fn": [0.3, 0.5], "f_t_mean": [0.1, 0.17]}
+    _, bottom = fs.fit(finger, loads, ["Xgap.d"], starts=1, rtol=1e-4).plot().axes
+    assert bottom.get_xlabel() == "load of Xgap [N]"
+
+
+def test_a_start_outside_its_bounds_moves_into_them(circuit: fs.Circuit, data: dict[str, np.ndarray]) -> None:
+    finger = circuit.replace({path: TRUE[path] for path in ("Xgap.r", "Xgap.alpha")})
+    said = r"Xgap\.d is 3\.5e-06, outside its bounds 2e-06 to 3\.3e-06: it starts at 3\.3e-06"
+    with pytest.warns(fs.FingerspiceWarning, match=said):
+        found = fs.fit(finger, data, ["Xgap.d"], bounds={"Xgap.d": (2e-6, 3.3e-6)}, starts=1, skin="follow")
+    assert found.estimates["Xgap.d"].value == pytest.approx(TRUE["Xgap.d"], rel=1e-5)
+    assert found.estimates["Xgap.d"].initial == 3.3e-6
+    for pair in ((3e-6, 3e-6), (4e-6, 3e-6), (-1.0, 1.0), (np.nan, 1.0), (1.0,)):
+        with pytest.raises(InputError, match="allowed: two values with 0 <= low < high"):
+            fs.fit(finger, data, ["Xgap.d"], bounds={"Xgap.d": pair})  # type: ignore[dict-item]
+
+
+def test_sigma_in_percent_is_a_share_of_every_value(
+    circuit: fs.Circuit, data: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    columns = [data["Vdrive.amplitude"], data["source.frequency"], 1e3 * data["f_el_mean"]]
+    rows = [",".join(f"{x:.9g}" for x in row) for row in zip(*columns, strict=True)]
+    head = "Vdrive.amplitude (V),frequency (Hz),f_el_mean (mN)"
+    (tmp_path / "a.csv").write_text("\n".join([f"sigma (%),{head}", *(f"3,{row}" for row in rows)]))
+    found = fs.fit(circuit, tmp_path / "a.csv", ["Xgap.d"], starts=1, rtol=1e-4, skin="follow")
+    np.testing.assert_allclose(found.data.sigma, 0.03 * data["f_el_mean"], rtol=1e-6)
+    # Of a friction coefficient in %, sigma in % is of the same unit.
+    (tmp_path / "b.csv").write_text("Vdrive.amplitude (V),friction_mean (%),sigma (%)\n100,31,0.5\n200,36,0.5\n")
+    found = fs.fit(circuit, tmp_path / "b.csv", ["Xgap.d"], starts=1, rtol=1e-4)
+    np.testing.assert_allclose(found.data.sigma, 0.005)
+
+
+def test_what_is_named_twice_is_refused(circuit: fs.Circuit, tmp_path: Path) -> None:
+    good = {"f_el_mean": [1e-2, 2e-2]}
+    with pytest.raises(InputError, match=r"Xgap\.d is named twice; allowed: once"):
+        fs.fit(circuit, good, ["Xgap.d", "xgap.D"])
+    with pytest.raises(InputError, match=r"two columns of Vdrive\.amplitude; allowed: one"):
+        fs.fit(circuit, {**good, "Vdrive.amplitude": 1.0, "source.amplitude": 2.0}, ["Xgap.d"])
+    with pytest.raises(InputError, match="alpha is named twice"):
+        fs.fit_contact(circuit, {"fn": [0.1, 0.2], "area": [1e-5, 2e-5]}, ["alpha", "Xgap.alpha"])
+    (tmp_path / "a.csv").write_text("f_el_mean (N),Xgap.fn (N),Xgap.fn (N)\n0.01,0.5,0.6\n0.02,0.5,0.6\n")
+    with pytest.raises(InputError, match=r"two columns 'Xgap\.fn'; allowed: one"):
+        fs.fit(circuit, tmp_path / "a.csv", ["Xgap.d"])
+
+
+def test_a_column_of_one_value_is_no_column_for_all(circuit: fs.Circuit) -> None:
+    with pytest.raises(
+        InputError, match=r"'Vdrive.amplitude' has the shape \(1,\), others have 2 rows; allowed: as ma"
+    ):
+        fs.fit(circuit, {"f_el_mean": [1e-2, 2e-2], "Vdrive.amplitude": [100.0]}, ["Xgap.d"])

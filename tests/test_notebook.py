@@ -26,6 +26,10 @@ CELLS = (
     "import urllib.request\nurllib.request.urlopen(explorer.url).headers['Content-Security-Policy']",
     "fs.simulate(circuit, charge_law='mobile', rtol=1e-5, t_stop=0.03, area='frozen').explore()",
     "fs.explore(browser=False)._repr_html_() is None",
+    "solution.plot();",
+    "for signal in ('f_el', 'u_gap'):\n    solution.plot(signal)",
+    "pictures = [solution.spectrum().plot() for _ in range(2)]\npictures[0].show()\npictures[1]",
+    "kept = pictures[0].savefig('spectrum.png')",
     "explorers = [circuit.explore() for _ in range(9)]\n[one._thread.is_alive() for one in explorers]",
 )
 
@@ -62,6 +66,14 @@ def test_a_picture_is_shown_once(outputs: list[list[Any]], number: int) -> None:
     assert len(shown(outputs[number])["image/png"]) > 10_000
 
 
+@pytest.mark.parametrize(("number", "count"), [(15, 1), (16, 2), (17, 2), (18, 0)])
+def test_pictures_in_a_loop_or_before_a_semicolon_are_shown_once_each(
+    outputs: list[list[Any]], number: int, count: int
+) -> None:
+    pictures = [shown([output])["image/png"] for output in outputs[number]]
+    assert [len(picture) > 10_000 for picture in pictures] == [True] * count
+
+
 @pytest.mark.parametrize(
     ("number", "said"),
     [
@@ -91,4 +103,4 @@ def test_the_explorer_is_shown_as_a_frame_which_this_computers_pages_may_hold(ou
 
 def test_a_notebook_keeps_a_bounded_number_of_explorers(outputs: list[list[Any]]) -> None:
     assert shown(outputs[14])["text/plain"] == "True"
-    assert shown(outputs[15])["text/plain"] == str([False] + 8 * [True])
+    assert shown(outputs[-1])["text/plain"] == str([False] + 8 * [True])

@@ -129,6 +129,15 @@ def test_a_run_that_stopped_at_once_still_makes_a_picture(sine: fs.Solution, row
     assert drawing.save(figure, tmp_path / "x.png").stat().st_size > 0
 
 
+@pytest.mark.parametrize("amplitude", [0.01, 0.5, 10.0, 50.0, 200.0])
+def test_a_friction_line_is_within_its_frame(amplitude: float) -> None:
+    figure = traces.plot_solution(simulate(table1(f"SIN(0 {amplitude} 100)"), t_stop=0.02, rtol=1e-4), "f_t")
+    (ax,) = figure.axes
+    bottom, top = ax.get_ylim()
+    assert bottom == 0.0
+    assert float(np.max(ax.lines[0].get_ydata())) < 0.97 * top
+
+
 def test_a_fixed_area_is_drawn_flat_not_as_its_rounding() -> None:
     figure = traces.plot_solution(simulate(table1(), area="frozen", t_stop=0.01))
     low, high = figure.axes[2].get_ylim()
@@ -363,8 +372,10 @@ def test_an_envelope_is_smooth_where_oscillations_are_longer_than_most_and_falls
 
     chirp = run(fs.Chirp(150.0, 20.0, 2000.0, 0.3), 0.3, 2e-5)
     t, upper = curve(traces.plot_solution(chirp, "u_source").axes[0], "source")
-    # After the first ten oscillations or so every part of it reaches the amplitude.
-    assert upper[t > 45.0].min() > 0.97 * 150.0
+    # Every part of it reaches the amplitude on both sides, the first ones, too.
+    assert upper.min() > 0.97 * 150.0
+    lower = traces.plot_solution(chirp, "u_source").axes[0].lines[0].get_ydata()
+    assert np.max(lower) < -0.97 * 150.0
     burst = fs.Repeat(fs.Burst(fs.Sine(200.0, 5000.0), 2e-3), 10e-3)
     bursts = run(burst, 0.05, 5e-6)
     t, upper = curve(traces.plot_solution(bursts, "u_source").axes[0], "source")

@@ -61,10 +61,9 @@ class Bar:
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
             # All of an endless bar's text has room in 80 columns.
-            columns = [TextColumn("{task.description}"), BarColumn(10 if self._endless else 40)]
-            columns += (
-                [TimeElapsedColumn()] if self._endless else [TextColumn("{task.percentage:3.0f} %{task.fields[note]}")]
-            )
+            share = TimeElapsedColumn() if self._endless else TextColumn("{task.percentage:3.0f} %")
+            bar = BarColumn(10 if self._endless else 40)
+            columns = [TextColumn("{task.description}"), bar, share, TextColumn("{task.fields[note]}")]
             self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
             self._bar.add_task(self._what, total=None if self._endless else 1.0, note="")
             self._bar.start()

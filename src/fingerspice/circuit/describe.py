@@ -16,10 +16,35 @@ from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DC, Waveform
 
+#: What the parameters are, in few words: by device and name, and those of waveforms by name.
+MEANINGS = {
+    "LAYER": {"d": "thickness", "eps_r": "permittivity", "r": "leak resistance", "e_max": "dielectric strength"},
+    "SLAB": {"d": "thickness", "eps_r": "permittivity", "rho": "resistivity", "e_max": "dielectric strength"},
+    "SKIN": {"d": "thickness", "f": "data taken at"},
+    "SKIN_DISPERSIVE": {"d": "thickness"},
+    "GAP": {
+        "d": "gap height", "eps_r": "permittivity", "r": "leak resistance", "fn": "load", "mu": "friction coeff.",
+        "alpha": "area at 1 N", "m_exp": "load exp.", "beta": "area at 1 mm", "n_exp": "indent exp.",
+        "c2": "friction loss", "a_fix": "fixed area", "tau": "area lag",
+    },
+    "R": {"value": "resistance"},
+    "C": {"value": "capacitance"},
+}  # fmt: skip
+MEANINGS_OF_WAVEFORMS = {
+    "modulation": "envelope", "phase_deg": "phase", "f0": "first frequency", "f1": "last frequency", "v1": "low level",
+    "v2": "high level", "td1": "rise begins", "tau1": "rise constant", "td2": "fall begins", "tau2": "fall constant",
+}  # fmt: skip
 #: Largest number of changes, or of sources, that one line names; the number of the others is added.
 _MOST = 8
 #: Largest number of elements that a circuit's page lists.
 MOST_ELEMENTS = 25
+
+
+def meaning_of(circuit: Circuit, path: str) -> str:
+    """A parameter in words, as in ``load of Xgap``."""
+    name, _, parameter = path.rpartition(".")
+    known = MEANINGS.get(circuit[name].device, MEANINGS_OF_WAVEFORMS)
+    return f"{known.get(parameter, parameter)} of {name}"
 
 
 def waveform_text(waveform: Waveform, unit: str = "V") -> str:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.spectrum import energy_outside, skin_error, surely_wide
+from fingerspice.circuit.topology import driving_sources
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.waveform import Waveform
@@ -16,6 +20,8 @@ from fingerspice.waveforms.waveform import Waveform
 # Half-width of a band around a frequency, relative to the frequency, in which the skin's data change by 3 %; and the
 # fraction of the source's energy that may lie outside the band.
 _BAND, _OUTSIDE = 0.05, 0.01
+# Largest relative difference of frequencies that are the same; and the words by which a warning about a SKIN begins.
+_SAME, _TAKES = 1e-9, "takes its data at f ="
 # Text about the mean force if its error cannot be computed, and the smallest relative error that is given as a number.
 _UNKNOWN, _LITTLE = "may be 5 to 10 % off", 0.005
 # Directives that only ngspice needs, so that no warning is given about them.
@@ -98,6 +104,39 @@ def time_slip(first: float, last: float, stop: float) -> str:
     return f"; a run to {last:g} s contains it" if stop < last < math.inf else ""
 
 
+def scenes_warnings(circuit: Circuit, t_stop: float | None, scenes: Mapping[str, FloatArray]) -> Iterator[str]:
+    """Warnings about a SKIN whose single frequency does not suit the sources of several scenes.
+
+    Parameters
+    ----------
+    circuit : Circuit
+    t_stop : float or None
+        As in `circuit_warnings`.
+    scenes : mapping of str to ndarray, shape (n,)
+        Path to the values that a parameter has in the scenes.
+    """
+    own = [f"{skin.name}.f" for skin in circuit.by_device("SKIN")]
+    on = driving_sources(circuit) if own else []
+    clocks = [f"{e.name}.{name}" for e in on for name in ("frequency", "carrier")]
+    if not any(path in scenes for path in (*own, *clocks)):
+        yield from (text for text in circuit_warnings(circuit, t_stop) if _TAKES in text)
+    elif len(on) == 1 and on[0].waveform is not None and on[0].waveform.fundamental is not None:
+        fixed = np.array(on[0].waveform.fundamental.frequency)
+        at = next((scenes[path] for path in clocks if path in scenes), fixed)
+        for path in own:
+            f = scenes.get(path, np.array(circuit.parameters[path].value))
+            if np.any(np.abs(f / at - 1.0) > _SAME):
+                yield (
+                    f"{path.removesuffix('.f')} {_TAKES} {_span(f)}, the source's fundamental is {_span(at)}; with "
+                    "skin 'follow' they are taken at the fundamental"
+                )
+
+
+def _span(f: FloatArray) -> str:
+    low, high = float(f.min()), float(f.max())
+    return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+
+
 def _is_near(wave: Waveform, stop: float, f: float) -> bool:
     """Whether nearly all of a source's energy is close to a frequency (Hz), as for a carrier with a slow envelope."""
     if surely_wide(wave, stop, f):
@@ -121,13 +160,13 @@ def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
         if fundamental is None:
             if not (known and circuit.remember(("near", f, stop), partial(_is_near, wave, stop, f))):
                 yield (
-                    f"{skin.name} takes its data at f = {f:g} Hz, and the source has no fundamental: the mean force "
+                    f"{skin.name} {_TAKES} {f:g} Hz, and the source has no fundamental: the mean force "
                     f"{_how_far(circuit, wave, stop) if known else _UNKNOWN}; SKIN_DISPERSIVE "
                     f"d={1e6 * skin.values['d']:g}u is right for any source"
                 )
-        elif abs(f / fundamental.frequency - 1.0) > 1e-9:
+        elif abs(f / fundamental.frequency - 1.0) > _SAME:
             yield (
-                f"{skin.name} takes its data at f = {f:g} Hz, the source's fundamental is "
+                f"{skin.name} {_TAKES} {f:g} Hz, the source's fundamental is "
                 f"{fundamental.frequency:g} Hz; {skin.name}.f={fundamental.frequency:g} would match"
             )
 

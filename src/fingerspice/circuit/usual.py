@@ -76,6 +76,15 @@ SOURCES = {
     "Hz": Usual(10e-3, 10e6, "a finger feels up to 1 kHz, carriers have up to some 100 kHz"),
 }
 
+#: Usual ranges of the largest of several measured values, by the signal: a finger's, pressed on with up to some N.
+MEASURED = {
+    "f_el": Usual(1e-6, 10.0, "a finger is pulled with up to 1 N", "newton, not millinewton"),
+    "f_t": Usual(1e-3, 50.0, "a finger rubs with 0.01 to 10 N", "newton, not millinewton"),
+    "area": Usual(0.1e-6, 2e-3, "a fingertip has 20 to 400 mm^2", "m^2, not mm^2"),
+}
+#: Usual range of the largest amplitude (V) under which forces, friction and areas are measured.
+MEASURING = Usual(1.0, 10e3, "forces are measured at 10 V to some kV", "volt, not kilovolt")
+
 #: Largest plausible results, N, Pa and m^2. A finger bears 100 N. Air, and most solids, break down far below an
 #: electric pressure of 10 MPa (1.5 GV/m). No finger has a contact of 10 cm^2.
 LARGEST_FORCE = 100.0

@@ -151,5 +151,5 @@ class _Pace:
         took, made = time.perf_counter() - self.begun, t - self.first
         if took > 1.0 and made > 0.0 and sys.stderr.isatty():
             left = time.strftime("%H:%M:%S", time.gmtime((self.stop - t) * took / made))
-            note = f", {made / took:,.3g} times real time, {left} left"
+            note = f"{made / took:,.3g} times real time, {left} left"
             self.bar.show((t - self.start) / (self.stop - self.start), note)

@@ -14,8 +14,9 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.explorer.changed import marked, sentences
-from fingerspice.explorer.request import Request, circuits_of, points_of, request_of, times_of
+from fingerspice.explorer.request import Request, circuits_of, points_of, request_of, times_of, waveform_of
 from fingerspice.explorer.sliders import sliders
+from fingerspice.explorer.waveforms import text_of
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
@@ -43,10 +44,10 @@ def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``ok``, ``status`` and ``message``; ``sliders``, ``sets``, ``warnings`` and ``unknown``; of a run ``t`` and
-        ``traces`` (arrays in SI units), ``figures``, ``error``, ``plan``, ``harmonics``, ``stacks``, ``period``,
-        ``t_stop`` and ``failed_at``. A request that is refused, or a run that fails, says why in ``message``; neither
-        raises an exception.
+        ``ok``, ``status`` and ``message``; ``sliders``, ``sets``, ``waveform`` (text), ``warnings`` and ``unknown``; of
+        a run ``t`` and ``traces`` (arrays in SI units), ``figures``, ``error``, ``plan``, ``harmonics``, ``stacks``,
+        ``period``, ``t_stop`` and ``failed_at``. A request that is refused, or a run that fails, says why in
+        ``message``; neither raises an exception.
     """
     first, rest = begun(given, own)
     return first | rest()
@@ -68,6 +69,7 @@ def begun(given: dict[str, Any], own: Circuit | None = None) -> tuple[dict[str, 
                 "title": circuit.title, "sliders": sliders(base, circuit), "sets": sentences(circuit, request),
                 "unknown": [*request.unknown, *lost, *without],
             }  # fmt: skip
+            answer["waveform"] = text_of(waveform_of(circuit))
             run, more = _run(circuit, request)
             answer |= run
         except InputError as error:

@@ -21,6 +21,7 @@ from fingerspice.explorer.waveforms import gain_of, read_source
 from fingerspice.results.outcome import SolveError
 from fingerspice.studies.export import export_netlist
 from fingerspice.studies.largesignal import large_signal
+from fingerspice.waveforms.waveform import Sine
 
 #: Characters of an exported deck beyond which the page does not take it.
 _LONGEST_EXPORT = 20_000_000
@@ -157,7 +158,8 @@ def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
             gaps = circuit.by_device("GAP")
             if not gaps:
                 raise InputError("the circuit has no GAP, and so no force")
-            if waveform_of(circuit).fundamental is None:
+            wave = waveform_of(circuit)
+            if wave.fundamental is None:
                 raise InputError("the source has no one amplitude that sines could have; allowed: a periodic source")
             (found,) = large_signal(
                 circuit, np.asarray(frequencies, float), charge_law=request.charge_law, finger=gaps[0].name,
@@ -165,7 +167,10 @@ def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
             )  # fmt: skip
     except (InputError, SolveError) as error:
         return {"ok": False, "message": str(error)}
+    amplitude = format_si(float(np.max(found.amplitude)), "V")
+    if not (isinstance(wave, Sine) and wave.offset == 0.0):
+        amplitude += ", the source's fundamental,"
     return {
         "ok": True, "message": "", "frequency": found.frequency, "force": found.f_el_mean, "gap": gaps[0].name,
-        "amplitude": format_si(float(np.max(found.amplitude)), "V"),
+        "amplitude": amplitude,
     }  # fmt: skip

@@ -7,6 +7,7 @@ from typing import Any
 
 from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.describe import MEANINGS, MEANINGS_OF_WAVEFORMS
 from fingerspice.circuit.devices import ParameterSpec
 from fingerspice.circuit.topology import driving_sources
 
@@ -19,24 +20,6 @@ _FIRST_OF_SOURCES = (
     *("amplitude", "frequency", "level", "v1", "v2", "carrier", "modulation", "depth", "f0", "f1", "duration"),
     *("duty", "pulse_period", "period", "td1", "tau1", "td2", "tau2"),
 )
-#: What the parameters are, in few words: by device and name, and those of waveforms by name.
-_MEANINGS = {
-    "LAYER": {"d": "thickness", "eps_r": "permittivity", "r": "leak resistance", "e_max": "dielectric strength"},
-    "SLAB": {"d": "thickness", "eps_r": "permittivity", "rho": "resistivity", "e_max": "dielectric strength"},
-    "SKIN": {"d": "thickness", "f": "data taken at"},
-    "SKIN_DISPERSIVE": {"d": "thickness"},
-    "GAP": {
-        "d": "gap height", "eps_r": "permittivity", "r": "leak resistance", "fn": "load", "mu": "friction coeff.",
-        "alpha": "area at 1 N", "m_exp": "load exp.", "beta": "area at 1 mm", "n_exp": "indent exp.",
-        "c2": "friction loss", "a_fix": "fixed area", "tau": "area lag",
-    },
-    "R": {"value": "resistance"},
-    "C": {"value": "capacitance"},
-}  # fmt: skip
-_OF_WAVEFORMS = {
-    "modulation": "envelope", "phase_deg": "phase", "f0": "first frequency", "f1": "last frequency", "v1": "low level",
-    "v2": "high level", "td1": "rise begins", "tau1": "rise constant", "td2": "fall begins", "tau2": "fall constant",
-}  # fmt: skip
 _WHAT = {
     "LAYER": "layer", "SLAB": "layer", "SKIN": "skin", "SKIN_DISPERSIVE": "skin, dispersive", "GAP": "gap and contact",
     "R": "resistor", "C": "capacitor", "V": "voltage source", "I": "current source",
@@ -76,7 +59,7 @@ def _group(base: Element, e: Element, drives: bool) -> dict[str, Any]:
     for spec in e.spec.parameters:
         value, own = e.values[spec.name], base.values.get(spec.name, e.values[spec.name])
         first = spec.name in _FIRST.get(e.device, ())
-        meaning = _MEANINGS.get(e.device, {}).get(spec.name, "")
+        meaning = MEANINGS.get(e.device, {}).get(spec.name, "")
         found.append(_slider(f"{e.name}.{spec.name}", spec.unit, value, first, _of_parameter(spec, own), meaning))
     if e.waveform is not None:
         same = type(base.waveform) is type(e.waveform)
@@ -87,7 +70,7 @@ def _group(base: Element, e: Element, drives: bool) -> dict[str, Any]:
             own = getattr(base.waveform, name) if same else now
             limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
             first = name in _FIRST_OF_SOURCES
-            meaning = _OF_WAVEFORMS.get(name, "")
+            meaning = MEANINGS_OF_WAVEFORMS.get(name, "")
             found.append(_slider(f"{e.name}.{name}", _unit(e, unit, drives), now, first, limits, meaning))
     return {"element": e.name, "device": e.device, "what": _WHAT.get(e.device, e.device), "sliders": found}
 

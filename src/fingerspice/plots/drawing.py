@@ -183,8 +183,9 @@ def peak_of(values: FloatArray) -> float:
 
 
 def from_zero(ax: Axes) -> None:
-    """Let the scale begin at 0, so that ripple is shown in proportion to the value."""
-    top = ax.get_ylim()[1]
+    """Let the scale begin at 0, so that ripple is shown in proportion to the value, and end above the highest one."""
+    highest = float(ax.dataLim.ymax)
+    top = max(ax.get_ylim()[1], 1.05 * highest if np.isfinite(highest) else 0.0)
     ax.set_ylim(0.0, top if top > 0.0 else 1.0)
 
 

@@ -190,11 +190,13 @@ def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray)
     # A span contains an oscillation, and so a maximum and a minimum, also where oscillations are longer than most, as
     # at the beginning of a chirp. A pause between bursts is no oscillation: what is beside it is much shorter.
     beside = np.pad(lengths, 1, mode="edge")
-    oscillation = 2.0 * np.minimum(np.minimum(beside[:-2], beside[2:]), lengths)
+    oscillation = 2.0 * np.median([beside[:-2], lengths, beside[2:]], axis=0)
     here = np.clip(np.searchsorted(turns, middle) - 1, 0, lengths.size - 1)
-    half = 0.5 * np.maximum(edges[1] - edges[0], oscillation[here])
-    first = np.searchsorted(t, np.maximum(middle - half, start))
-    after = np.minimum(np.searchsorted(t, np.minimum(middle + half, stop)), t.size - 1)
+    whole = np.maximum(edges[1] - edges[0], oscillation[here])
+    # At the ends of the window a span is one-sided, and as long as any other.
+    begin = np.maximum(np.minimum(middle - 0.5 * whole, stop - whole), start)
+    first = np.searchsorted(t, begin)
+    after = np.minimum(np.searchsorted(t, np.minimum(begin + whole, stop)), t.size - 1)
     kept = after > first
     return middle[kept], np.column_stack([first, after])[kept].ravel()
 

@@ -28,8 +28,9 @@ MOST_ELEMENTS = 200
 _LETTERS, _LONGEST, _LINES = 34, 40, 7
 #: Inches: height of a line of text, from a symbol to its label, around everything, and around a label in its row.
 _LINE, _BESIDE, _MARGIN, _ROOM = 0.135, 0.08, 0.15, 0.1
-#: Size of a schematic beside a run's picture, over its own, and its resolution there, dots per inch of its own size.
-_SMALL, _SMALL_DPI = 0.7, 200
+#: Largest size of a schematic beside a run's picture, over its own, and its resolution there, dots per inch of its own
+#: size; and how low that picture may become beside it, over its own height.
+_LARGE, _SMALL_DPI, _LEAST = 1.3, 200, 0.8
 _TINTS = {"LAYER": drawing.SKY, "SLAB": drawing.SKY, "SKIN": drawing.ORANGE, "SKIN_DISPERSIVE": drawing.ORANGE}
 
 
@@ -40,6 +41,9 @@ class Schematic(Picture):
         content = io.StringIO()
         self._write_svg(content, {})
         return content.getvalue()
+
+    def _content(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        return {"image/svg+xml": self._repr_svg_()}, {}
 
     def _write_svg(self, target: Path | io.StringIO, about: Mapping[str, str]) -> None:
         from matplotlib import rc_context
@@ -102,14 +106,16 @@ def put_beside(picture: Figure, circuit: Circuit) -> Figure:
     content.seek(0)
     width, height = picture.get_size_inches()
     wide, high = schematic.get_size_inches()
-    shrunk = min(_SMALL, height / high)
+    height = min(height, max(_LEAST * height, _LARGE * high))
+    shrunk = min(_LARGE, height / high)
     total = width + shrunk * wide
     picture.set_size_inches(total, height)
     engine: Any = picture.get_layout_engine()
     engine.set(rect=(0.0, 0.0, width / total, 1.0))
     # Axes without a grid take no part in the layout.
     ax = picture.add_axes(
-        (width / total, 1.0 - shrunk * high / height, shrunk * wide / total, shrunk * high / height), label="schematic"
+        (width / total, 0.5 - 0.5 * shrunk * high / height, shrunk * wide / total, shrunk * high / height),
+        label="schematic",
     )
     ax.set_axis_off()
     ax.imshow(image.imread(content), aspect="auto", interpolation="antialiased")

@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.base.arrays import FloatArray, positive_number, real_numbers, whole_number
 from fingerspice.base.card import require_card
-from fingerspice.base.errors import InputError
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.results.signals import SIGNALS
 from fingerspice.solve.simulation import rtol_given
@@ -119,6 +120,9 @@ def batch(
             if f"{element.name}.f" in scenes:
                 raise InputError(f"skin='follow' and {element.name}.f are both given; allowed: one of them")
             changed[f"{element.name}.f"] = frequency
+    else:
+        for text in scenes_warnings(circuit, task.t_stop, scenes):
+            warnings.warn(text, FingerspiceWarning, stacklevel=2)
     paths = gradient_paths(circuit, gradients)
     wanted = gradient_request(task, paths, scenes, skin) if paths else None
     with ThreadPoolExecutor(threads or _processors()) as pool:

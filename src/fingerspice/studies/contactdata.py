@@ -93,14 +93,19 @@ def _from_table(path: Path) -> dict[str, FloatArray]:
     if not table.names:
         raise InputError(f"'{path}' has no header; allowed: names with units, such as fn (N), area (mm^2)")
     known = MEASURED | CONDITIONS
-    out = {}
+    out: dict[str, FloatArray] = {}
+    of_share: dict[str, str] = {}
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
         key = name.lower()
         measured = [own for own in MEASURED if own in map(str.lower, table.names)]
         of = measured[0] if key == SIGMA and len(measured) == 1 else key.removesuffix(f"_{SIGMA}")
-        factor = unit_factor(unit, known[of], f"'{path}': the unit of column {name!r}") if of in known else 1.0
+        base = "" if of != key and unit == "%" else known.get(of)
+        factor = unit_factor(unit, base, f"'{path}': the unit of column {name!r}") if base is not None else 1.0
+        if key in out:
+            raise InputError(f"'{path}' has two columns {name!r}; allowed: one")
         out[key] = factor * table.numbers(i)
-    return out
+        of_share |= {key: of} if of != key and unit == "%" else {}
+    return out | {key: out[key] * np.abs(out[of]) for key, of in of_share.items() if of in out}
 
 
 def _relations(columns: Mapping[str, FloatArray], fn: float, place: str) -> list[Relation]:

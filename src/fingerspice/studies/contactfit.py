@@ -16,7 +16,7 @@ from fingerspice.circuit.devices import DEVICES
 from fingerspice.studies.contactdata import Given, Relation, relations_of
 from fingerspice.studies.contactresult import ContactFit, contact_result
 from fingerspice.studies.contacttask import ContactTask, solved
-from fingerspice.studies.fit import bounds_of, profiled
+from fingerspice.studies.fit import bounds_of, profiled, refuse_twice
 from fingerspice.studies.fitprofile import profile_of
 from fingerspice.studies.fittask import REFUSED
 from fingerspice.waveforms.waveform import require
@@ -89,8 +89,7 @@ def fit_contact(
     count = sum(relation.values.size for relation in relations)
     if count < len(paths):
         raise InputError(f"{count} data cannot tell {len(paths)} parameters; allowed: at least as many data")
-    initial = [start.parameters[path].value for path in paths]
-    box = bounds_of(paths, initial, {_named(gap, path): pair for path, pair in (bounds or {}).items()})
+    start, box = bounds_of(start, paths, {_named(gap, path): pair for path, pair in (bounds or {}).items()})
     wanted = profiles if isinstance(profiles, bool) else [_named(gap, path) for path in profiles]
     asked = profiled(paths, wanted)
     task, best, freedom = solved(ContactTask(start, gap, relations, paths, box, (_SHARE,) * len(relations)))
@@ -153,6 +152,7 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
     bare = [name.rpartition(".")[2].lower() for name in given]
     for name in bare:
         require(name in PARAMETERS, "parameters", repr(name), ", ".join(PARAMETERS))
+    refuse_twice(bare)
     return tuple(name for name in PARAMETERS if name in bare)
 
 

@@ -125,7 +125,7 @@ class ContactFit(Shown):
             x, label, others = _abscissa(one)
             kinds = np.unique(others)
             curves = [
-                Curve(f"{_OTHER[label]} = {kind:g}" if kinds.size > 1 else one.name, *(
+                Curve(f"{_OTHER[label][0]} = {kind:g} {_OTHER[label][1]}" if kinds.size > 1 else one.name, *(
                     part[others == kind] for part in (x, one.values, fitted, sigma)
                 ))
                 for kind in kinds
@@ -172,7 +172,8 @@ class ContactFit(Shown):
 
 
 # The condition that tells curves apart, by the one along the axis.
-_OTHER = {"normal load [N]": "u_gap [V]", "gap voltage [V]": "load [N]", "indentation [mm]": "load [N]"}
+_LOAD = "normal load", "N"
+_OTHER = {"normal load [N]": ("gap voltage", "V"), "gap voltage [V]": _LOAD, "indentation [mm]": _LOAD}
 
 
 def _abscissa(one: Relation) -> tuple[FloatArray, str, FloatArray]:

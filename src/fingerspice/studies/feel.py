@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from fingerspice.base.units import format_si
 from fingerspice.results.record import Sealed, sealed
 from fingerspice.studies.perception import (
     DIFFERENCE_DB,
+    FASTEST_FELT,
     FINGERPAD,
     WEBER_FRICTION,
     SkinMechanics,
@@ -36,6 +37,30 @@ _EDGE, _FEWEST = 2.0 ** (1.0 / 6.0), 2
 _NOTHING = 1e-9
 #: Largest number of rows in a report.
 _SHOWN = 10
+
+
+class Unjudged(NamedTuple):
+    """Friction that the threshold cannot judge: outside its frequencies, or slower than the lowest band.
+
+    Attributes
+    ----------
+    level : float
+        Highest level above the threshold that it may have, dB (`Threshold.beyond`).
+    force, frequency : float
+        Amplitude (N) and frequency (Hz); of what is slower than the lowest band, that band's lower edge.
+    slower : bool
+    """
+
+    level: float
+    force: float
+    frequency: float
+    slower: bool
+
+    def __str__(self) -> str:
+        part = f"{format_si(self.force, 'N')} {'below' if self.slower else 'at'} {format_si(self.frequency, 'Hz')}"
+        why = "which only a longer run resolves" if self.slower else "outside the threshold's frequencies"
+        too = "fast" if self.frequency > FASTEST_FELT and not self.slower else "weak"
+        return f"{part}, {why}, {'may be felt' if self.level >= 0.0 else f'is too {too} to be felt'}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -60,6 +85,8 @@ class Feel(Sealed, Shown):
     change : float
         Peak-to-peak change of the friction relative to its highest value, for a sine with the rms of the lines or bands
         within the threshold's frequencies.
+    unjudged : Unjudged or None
+        The friction that the threshold cannot judge and that may have the highest level.
     mechanics : SkinMechanics
     threshold : Threshold
     """
@@ -72,6 +99,7 @@ class Feel(Sealed, Shown):
     acceleration: FloatArray
     level: FloatArray
     change: float
+    unjudged: Unjudged | None
     mechanics: SkinMechanics
     threshold: Threshold
 
@@ -90,14 +118,18 @@ class Feel(Sealed, Shown):
         return None if self.strongest is None else float(self.level[self.strongest])
 
     @property
-    def felt(self) -> bool:
-        """Whether some line or band reaches the threshold."""
-        return self.highest is not None and self.highest >= 0.0
+    def felt(self) -> bool | None:
+        """Whether some line or band reaches the threshold; None if none does, but what it cannot judge may be felt."""
+        return self._or_unknown(self.highest is not None and self.highest >= 0.0)
 
     @property
-    def change_felt(self) -> bool:
-        """Whether the friction's change reaches Weber's fraction of 0.11 (`perception.WEBER_FRICTION`)."""
-        return self.change >= WEBER_FRICTION
+    def change_felt(self) -> bool | None:
+        """Whether the change reaches Weber's fraction of 0.11 (`perception.WEBER_FRICTION`); None as for `felt`."""
+        return self._or_unknown(self.change >= WEBER_FRICTION)
+
+    def _or_unknown(self, felt: bool) -> bool | None:
+        """`felt`, or None where it is False and what cannot be judged may be felt."""
+        return None if not felt and self.unjudged is not None and self.unjudged.level >= 0.0 else felt
 
     @property
     def steps(self) -> float | None:
@@ -116,6 +148,7 @@ class Feel(Sealed, Shown):
             "kind": self.kind,
             "strongest": None if place is None else float(self.frequency[place]),
             "level_db": self.highest,
+            "unjudged": None if self.unjudged is None else self.unjudged._asdict(),
             "difference_steps": self.steps,
             "friction_change": self.change,
             "friction_change_felt": self.change_felt,
@@ -152,19 +185,22 @@ class Feel(Sealed, Shown):
         return Page(blocks)
 
     def verdict(self) -> str:
-        """A sentence: whether it is felt, at which frequency most, and the level above the threshold."""
+        """A sentence: whether it is felt, at which frequency most, the level, and friction that cannot be judged."""
         finger = f"finger {self.signal.partition(':')[2]}: " if ":" in self.signal else ""
         place = self.strongest
         low, high = self.threshold.frequency[[0, -1]]
         if place is None:
-            return f"{finger}not felt: no part of the friction lies between {low:g} and {high:g} Hz"
-        level, at = self.level[place], format_si(float(self.frequency[place]), "Hz")
-        where = f"at {at}" if self.kind == "lines" else f"in the third octave around {at}"
-        if self.steps is None:
-            return f"{finger}not felt: strongest {where}, {-level:.1f} dB below the threshold"
-        return (
-            f"{finger}felt: strongest {where}, {level:.1f} dB above the threshold ({self.steps:.0f} noticeable steps)"
-        )
+            said = f"no part of the friction lies between {low:g} and {high:g} Hz"
+        else:
+            at = format_si(float(self.frequency[place]), "Hz")
+            where = f"at {at}" if self.kind == "lines" else f"in the third octave around {at}"
+            steps = "" if self.steps is None else f" ({self.steps:.0f} noticeable steps)"
+            side = "above" if steps else "below"
+            said = f"strongest {where}, {abs(self.level[place]):.1f} dB {side} the threshold{steps}"
+        if self.unjudged is not None and (self.unjudged.level >= 0.0 or not self.felt):
+            said += f"; {self.unjudged}"
+        verdict = {True: "felt", False: "not felt", None: "not known whether felt"}[self.felt]
+        return f"{finger}{verdict}: {said}"
 
     def plot(self, others: Sequence[Feel] = ()) -> Figure:
         """Draw the acceleration, also that of other fingers, and the threshold against frequency.
@@ -213,20 +249,32 @@ def feel(
     if not solution.gaps:
         raise InputError("the circuit has no GAP, so there is no friction to feel; allowed: a circuit with a GAP")
     spectrum = solution.spectrum(signal)
-    if spectrum.amplitude is not None and spectrum.frequency[-1] < table.frequency[-1]:
+    end = math.inf if spectrum.amplitude is None else float(spectrum.frequency[-1])
+    if end < max(table.frequency[-1], 0.1 * FASTEST_FELT):
         # A long period has so many lines that the spectrum ends below the threshold's highest frequency, and they are
         # too close to be felt separately: use the spectral density.
         spectrum = solution.spectrum(signal, method="welch")
+    elif end < FASTEST_FELT:
+        spectrum = solution.spectrum(signal, highest=FASTEST_FELT)
     kind = "bands" if spectrum.amplitude is None else "lines"
-    f, force = _bands(spectrum) if spectrum.amplitude is None else (spectrum.frequency, spectrum.amplitude)
+    f, force, slower = _bands(spectrum) if spectrum.amplitude is None else (spectrum.frequency, spectrum.amplitude, 0.0)
+    edge = float(f[0]) / _EDGE
     size = np.abs(mechanics.acceleration(f)) * force
     kept = size > _NOTHING * size.max(initial=0.0)
     f, force, size = f[kept], force[kept], size[kept]
     with np.errstate(divide="ignore"):
         level = 20.0 * np.log10(size / table.acceleration(f))
+        most = 20.0 * np.log10(size / table.beyond(f))
+    rows = zip(most, force, f, strict=True)
+    unjudged = [Unjudged(float(x), float(n), float(at), slower=False) for x, n, at in rows if not np.isnan(x)]
+    if slower > 0.0:
+        # It may have any frequency below the lowest band.
+        below = np.geomspace(1e-3 * edge, edge, 200)
+        least = np.fmin(table.acceleration(below), table.beyond(below)) / np.abs(mechanics.acceleration(below))
+        unjudged.append(Unjudged(20.0 * math.log10(slower / least.min()), slower, edge, slower=True))
     return Feel(
         spectrum.signal, kind, f, force, np.abs(mechanics.displacement(f)) * force, size, level,
-        _change(spectrum.mean, force[np.isfinite(level)]), mechanics, table,
+        _change(spectrum.mean, force[np.isfinite(level)]), max(unjudged, default=None), mechanics, table,
     )  # fmt: skip
 
 
@@ -236,8 +284,11 @@ def _change(mean: float, force: FloatArray) -> float:
     return 2.0 * amplitude / (mean + amplitude) if amplitude > 0.0 else 0.0
 
 
-def _bands(spectrum: Spectrum) -> tuple[FloatArray, FloatArray]:
-    """Middles (Hz) of the third-octave bands that the density resolves, and amplitudes of sines with the bands' rms."""
+def _bands(spectrum: Spectrum) -> tuple[FloatArray, FloatArray, float]:
+    """Middles (Hz) of the third-octave bands that the density resolves, and amplitudes of sines with the bands' rms.
+
+    The last value is the amplitude for all that is slower than the lowest band.
+    """
     assert spectrum.density is not None
     width = spectrum.resolution
     # A bin belongs to the band that contains its middle; the lowest band is at least _FEWEST bins wide.
@@ -246,4 +297,4 @@ def _bands(spectrum: Spectrum) -> tuple[FloatArray, FloatArray]:
     middle = 1e3 * 2.0 ** (np.arange(lowest, max(highest, lowest) + 1) / 3.0)
     edges = np.append(middle / _EDGE, middle[-1] * _EDGE)
     sums = np.append(0.0, np.cumsum(spectrum.density * width))[np.searchsorted(spectrum.frequency, edges)]
-    return middle, np.sqrt(2.0 * np.diff(sums))
+    return middle, np.sqrt(2.0 * np.diff(sums)), math.sqrt(2.0 * sums[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, whole_number
-from fingerspice.base.errors import InputError
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.batch import batch
@@ -21,7 +23,7 @@ from fingerspice.studies.fitdata import IMPEDANCE, Data, data_of
 from fingerspice.studies.fitgroups import Unknown, group_column, unknowns_of
 from fingerspice.studies.fitprofile import limit_of, profile_of
 from fingerspice.studies.fitresult import Fit, Fitted, fit_result
-from fingerspice.studies.fittask import REFUSED, Task, followed
+from fingerspice.studies.fittask import FARTHEST, REFUSED, Task, evaluations_shown, followed
 from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
@@ -65,7 +67,7 @@ def fit(
     parameters : sequence of str
         Paths of the parameters to fit.
     bounds : mapping of str to tuple of float, optional
-        Smallest and largest value by path.
+        Smallest and largest value by path; a thousandth and a thousand times the start by default.
     groups : mapping of str to sequence of str, optional
         The column that tells which measurements belong together, and the parameters of which every such group has its
         own: ``{"finger": ["Xgap.d"]}``. The others are the same for all.
@@ -96,8 +98,21 @@ def fit(
     table, unknowns = _request(circuit, data, parameters, groups)
     task = _task(circuit, table, unknowns, bounds, average, skin, charge_law, rtol)
     starts = whole_number("starts", starts, 1)
-    names = tuple(one.name for one in task.unknowns)
-    wanted = profiled(names, profiles)
+    wanted = profiled(tuple(one.name for one in task.unknowns), profiles)
+    said = [*table.unusual(circuit), *(scenes_warnings(circuit, None, table.conditions) if skin == "own" else ())]
+    for text in filter(None, said):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    with evaluations_shown() as watch:
+        return _fitted(replace(task, watch=watch), starts, wanted)
+
+
+def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
+    """The fit, with the profiles `wanted`."""
+    table, names = free.data, tuple(one.name for one in free.unknowns)
+    # Where no bounds are given, nothing is looked for far from the start: there are no likely values, and slow runs.
+    (low, high), near, far = free.bounds.T, free.initial / FARTHEST, free.initial * FARTHEST
+    walls = np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
+    task = replace(free, bounds=walls)
     ends = [followed(task, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
     if not best.objective < 0.5 * REFUSED**2:
@@ -105,25 +120,19 @@ def fit(
             "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
             "circuit that runs under the conditions of the data"
         )
-    spare = task.target.size - len(unknowns)
+    spare = task.target.size - len(names)
     chosen = table.sigma is None and table.t is None and table.signal != IMPEDANCE and spare >= _CHOOSING
     if chosen:
         task, ends = _with_likelier_noise(task, ends, best)
         best = min(ends, key=lambda end: end.objective)
+    objectives = [end.objective for end in ends]
     found = fit_result(
-        task.circuit,
-        task.data,
-        task.unknowns,
-        task.bounds,
-        best,
-        [end.objective for end in ends],
-        task.scale,
-        spare - chosen,
-    )
-    limit = limit_of(best.objective, found.freedom, given=task.data.sigma is not None)
+        task.circuit, table, task.unknowns, task.bounds, best, objectives, task.scale, spare - chosen
+    )  # fmt: skip
+    limit = limit_of(best.objective, found.freedom, given=table.sigma is not None)
+    free = replace(task, bounds=free.bounds)
     return replace(
-        found,
-        profiles={name: profile_of(task, names, best, name, _error(found, name), limit) for name in wanted},
+        found, profiles={name: profile_of(free, names, best, name, _error(found, name), limit) for name in wanted}
     )
 
 
@@ -174,6 +183,7 @@ def _request(
         if path.lower() not in known:
             circuit.varied({path: 1.0})
     paths = tuple(known[path.lower()] for path in parameters)
+    refuse_twice(paths)
     by = group_column(circuit, groups)
     table = data_of(circuit, data, by)
     both = sorted(set(paths) & set(table.conditions))
@@ -190,6 +200,12 @@ def _request(
     return table, unknowns
 
 
+def refuse_twice(paths: Sequence[str]) -> None:
+    """Refuse a parameter that is named twice."""
+    for path in paths:
+        require(paths.count(path) == 1, path, "named twice", "once")
+
+
 def _task(
     circuit: Circuit, table: Data, unknowns: tuple[Unknown, ...], bounds: Mapping[str, tuple[float, float]] | None,
     average: str, skin: str, charge_law: str | None, rtol: float,
@@ -200,7 +216,7 @@ def _task(
     target, scale = _target(table)
     exact = is_stack(circuit) and build_stack(circuit).contact is not None and table.signal != IMPEDANCE
     every = tuple(one.path for one in unknowns)
-    box = bounds_of(every, [circuit.parameters[path].value for path in every], bounds or {})
+    circuit, box = bounds_of(circuit, every, bounds or {})
     return Task(circuit, table, unknowns, box, average, skin, rtol_given(rtol), charge_law, target, scale, exact)
 
 
@@ -217,22 +233,31 @@ def _target(table: Data) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([table.values, table.phase]), np.concatenate([scale, np.degrees(scale / sizes)])
 
 
-def bounds_of(paths: tuple[str, ...], initial: list[float], given: Mapping[str, tuple[float, float]]) -> FloatArray:
-    """Smallest and largest values of the parameters, shape (n_parameter, 2); 0 and infinity where none are given."""
+def bounds_of(
+    circuit: Circuit, paths: tuple[str, ...], given: Mapping[str, tuple[float, float]]
+) -> tuple[Circuit, FloatArray]:
+    """The circuit to start from, and smallest and largest values, shape (n_parameter, 2): 0 and infinity by default.
+
+    A start outside its bounds moves to the nearer one, with a warning.
+    """
     lower = {path.lower(): tuple(pair) for path, pair in given.items()}
     unknown = [path for path in given if path.lower() not in {p.lower() for p in paths}]
     if unknown:
         raise InputError(f"bounds names {unknown[0]}, which is not fitted; allowed: {', '.join(paths)}")
     out = np.tile([0.0, math.inf], (len(paths), 1))
-    for i, (path, value) in enumerate(zip(paths, initial, strict=True)):
+    for i, path in enumerate(paths):
         if path.lower() in lower:
             pair = lower[path.lower()]
-            if len(pair) != 2 or not 0.0 <= pair[0] <= value <= pair[1] or pair[0] == pair[1]:
-                raise InputError(
-                    f"bounds of {path} are {pair}, and it starts at {value:g}; allowed: low <= start <= high"
-                )
+            if len(pair) != 2 or not 0.0 <= pair[0] < pair[1]:
+                raise InputError(f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
             out[i] = pair
-    return out
+            value = circuit.parameters[path].value
+            moved = min(max(value, pair[0]), pair[1])
+            if moved != value:
+                said = f"{path} is {value:g}, outside its bounds {pair[0]:g} to {pair[1]:g}: it starts at {moved:g}"
+                warnings.warn(said, FingerspiceWarning, stacklevel=4)
+                circuit = circuit.varied({path: moved})
+    return circuit, out
 
 
 def _starts(task: Task, count: int) -> list[FloatArray]:
@@ -252,9 +277,13 @@ def _starts(task: Task, count: int) -> list[FloatArray]:
         own = [k for k, one in enumerate(task.unknowns) if one.path == path]
         table[path] = (tried[:, own] @ task.members[own]).ravel()
     periodic = task.average == "periodic"
-    found = batch(
-        task.circuit, table, outputs=(f"{task.data.signal}_mean",), rtol=_ROUGH, periodic=periodic, skin=task.skin
-    )[f"{task.data.signal}_mean"].to_numpy().reshape(n, rows)  # fmt: skip
+    with warnings.catch_warnings():
+        # What there is to say of the data has been said.
+        warnings.simplefilter("ignore", FingerspiceWarning)
+        tests = batch(
+            task.circuit, table, outputs=(task.data.name,), rtol=_ROUGH, periodic=periodic, skin=task.skin
+        )  # fmt: skip
+    found = tests[task.data.name].to_numpy().reshape(n, rows)
     off = (((found - task.data.values) / task.scale) ** 2).sum(axis=1)
     order = np.argsort(np.where(np.isfinite(off), off, math.inf), kind="stable")
     return [initial, *(tried[i] for i in order[:_FOLLOWED].tolist() if i > 0)]

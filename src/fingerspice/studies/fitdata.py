@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +14,11 @@ from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
+from fingerspice.circuit.usual import MEASURED as USUAL
+from fingerspice.circuit.usual import MEASURING
+from fingerspice.circuit.values import unusual_of_changed
 from fingerspice.studies.fitgroups import Groups, labels_of
-from fingerspice.waveforms.columns import read_labelled_columns, read_text_columns
+from fingerspice.waveforms.columns import Columns, read_labelled_columns, read_text_columns
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file
 
 #: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
@@ -62,6 +65,17 @@ class Data:
         """Name of the measured column."""
         return self.signal if self.t is not None or self.signal == IMPEDANCE else f"{self.signal}_mean"
 
+    def unusual(self, circuit: Circuit) -> Iterator[str]:
+        """Warnings about largest values, measured or of conditions, that are probably in another unit."""
+        if self.signal in USUAL:
+            largest = float(np.abs(self.values).max())
+            yield USUAL[self.signal].warning(f"the data's largest {self.name}", largest, MEASURED[self.signal]) or ""
+        for path, x in self.conditions.items():
+            largest = float(x[np.abs(x).argmax()])
+            yield from unusual_of_changed(circuit, circuit.varied({path: largest}))[1]
+            if self.signal in MEANS and path.endswith(".amplitude"):
+                yield MEASURING.warning(f"the data's largest {path}", largest, "V") or ""
+
     @property
     def varying(self) -> dict[str, FloatArray]:
         """The conditions that are not the same in all measurements."""
@@ -102,7 +116,12 @@ def data_of(circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, by: s
         raise InputError(f"{place}: the smallest sigma is {sigma.min():g}; allowed: more than 0")
     if t is not None and (measured[0].endswith("_mean") or np.any(np.diff(t) <= 0.0)):
         raise InputError(f"{place} have the column t; allowed: rising times, with a signal that is no mean")
-    conditions = {_path(circuit, name): x for name, x in columns.items()}
+    conditions: dict[str, FloatArray] = {}
+    for name, x in columns.items():
+        path = _path(circuit, name)
+        if path in conditions:
+            raise InputError(f"{place} have two columns of {path}; allowed: one")
+        conditions[path] = x
     if t is not None and any(np.ptp(x) > 0.0 for x in conditions.values()):
         raise InputError(f"{place} have times and changing conditions; allowed: one run over time, or means")
     if t is not None and groups is not None:
@@ -160,14 +179,17 @@ def number_columns(given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
     """
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
-    found = {name: np.atleast_1d(real_numbers(f"data column {name!r}", x, "numbers")) for name, x in given.items()}
+    found = {name: real_numbers(f"data column {name!r}", x, "numbers") for name, x in given.items()}
     size = max((x.size for x in found.values()), default=0)
     for name, x in found.items():
-        if x.ndim != 1 or x.size not in (1, size):
-            raise InputError(f"data column {name!r} has the shape {x.shape}, others have {size} rows; allowed: as many")
+        if x.shape not in ((), (size,)):
+            raise InputError(
+                f"data column {name!r} has the shape {x.shape}, others have {size} rows; allowed: as many, or one "
+                "number for all"
+            )
         bad = np.flatnonzero(~np.isfinite(x))
         if bad.size:
-            raise InputError(f"data column {name!r} is {x[bad[0]]} in row {bad[0]}; allowed: finite numbers")
+            raise InputError(f"data column {name!r} is {x.flat[bad[0]]} in row {bad[0]}; allowed: finite numbers")
     return {name: np.broadcast_to(x, size).copy() for name, x in found.items()}
 
 
@@ -191,7 +213,7 @@ def _from_table(circuit: Circuit, path: Path, by: str | None) -> tuple[dict[str,
         )
     found: dict[str, FloatArray] = {}
     groups: Groups | None = None
-    measured = next((name.removesuffix("_mean") for name in table.names if name.removesuffix("_mean") in MEASURED), "")
+    measured = next((name for name in table.names if name.removesuffix("_mean") in MEASURED), "")
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
         if by is not None and name.lower() == by.lower():
             groups = Groups(by, words, table.numbers(i).astype(int))
@@ -202,15 +224,25 @@ def _from_table(circuit: Circuit, path: Path, by: str | None) -> tuple[dict[str,
         if key == TIME:
             base = "s"
         elif key == SIGMA:
-            base = MEASURED.get(measured, "")
+            base = "" if unit == "%" else MEASURED.get(measured.removesuffix("_mean"), "")
         elif key == PHASE:
             base = "deg"
         elif signal in MEASURED:
             base = MEASURED[signal]
         else:
             base = circuit.parameters[_path(circuit, name)].unit
+        if key in found:
+            raise InputError(f"'{path}' has two columns {name!r}; allowed: one")
         found[key] = table.numbers(i) * unit_factor(unit, base, f"'{path}': the unit of column {name!r}")
+    if SIGMA in found and shares(table, measured, SIGMA):
+        found[SIGMA] = found[SIGMA] * np.abs(found[measured])
     return found, groups
+
+
+def shares(table: Columns, values: str, sigma: str) -> bool:
+    """Whether the column `sigma` of a table has shares of `values`: it is in %, and they are not."""
+    units = {name.lower(): unit for name, unit in zip(table.names, table.units, strict=True)}
+    return units[sigma.lower()] == "%" and units.get(values.lower(), "%") != "%"
 
 
 def unit_factor(unit: str, base: str, what: str) -> float:

@@ -11,10 +11,8 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.studies.fitestimates import Profile
 from fingerspice.studies.fitresult import Fitted
-from fingerspice.studies.fittask import Problem, followed
+from fingerspice.studies.fittask import FARTHEST, Problem, followed
 
-# A profile is followed to this factor of the value, and no further.
-_FARTHEST = 1e3
 # Growth of the distance from the value, in its logarithm; and the error of an interval's end over that distance.
 _GROWTH, _CLOSE = 1.6, 0.01
 # Error of the other parameters on the way.
@@ -89,7 +87,7 @@ def _end(
     here = math.log(best.values[place])
     with np.errstate(divide="ignore"):
         wall = float(np.log(box[0 if sign < 0.0 else 1]))
-    farthest = min(math.log(_FARTHEST), abs(wall - here))
+    farthest = min(math.log(FARTHEST), abs(wall - here))
     look = _held(task, best, place, known)
     near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
     while look(here + sign * far) <= limit:

@@ -15,6 +15,8 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.files import write_aside
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.describe import meaning_of
+from fingerspice.results.signals import SIGNALS
 from fingerspice.studies.fitdata import MEASURED, Data
 from fingerspice.studies.fitestimates import (
     Estimate,
@@ -128,15 +130,21 @@ class Fit(Shown):
         """Data and fit, with the residuals below."""
         from fingerspice.plots.fits import Curve, plot_fit
 
-        data, signal = self.data, self.data.name
+        data, circuit = self.data, self.circuit
+        signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal
+        signal = f"mean {signal}" if data.name.endswith("_mean") else signal
         varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
         groups, names = np.zeros(data.values.size, int), ["measured and fitted"]
         if data.t is not None:
             x, label = data.t, "time [s]"
         elif varying:
             (path, x), others = varying[0], varying[1:]
-            label = self._labelled(path)
-            keys = [(self._labelled(path), [f"{y:g}" for y in values]) for path, values in others]
+            unit = circuit.parameters[path].unit
+            label = meaning_of(circuit, path) + (f" [{unit}]" if unit else "")
+            keys = [
+                (meaning_of(circuit, path), [f"{y:g} {circuit.parameters[path].unit}".rstrip() for y in values])
+                for path, values in others
+            ]
             if data.groups is not None:
                 keys.insert(0, (data.groups.column, [data.groups.labels[i] for i in data.groups.of]))
             if keys:
@@ -151,10 +159,6 @@ class Fit(Shown):
             for own in [groups == group]
         ]
         return plot_fit(curves, label, signal, MEASURED[data.signal])
-
-    def _labelled(self, path: str) -> str:
-        unit = self.circuit.parameters[path].unit
-        return f"{path} [{unit}]" if unit else path
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as plain numbers and texts; `parameters` has a row for each."""

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import time
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
@@ -10,6 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base.announcing import Bar
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
@@ -35,8 +40,10 @@ _STEP = 1e-4
 _SLOPES = 1e-6
 # What a scene that cannot be run counts as, over the scale of the data.
 REFUSED = 1e6
-# Error of the least squares' last step, relative.
-CLOSE = 1e-8
+# Error of the least squares' last step, relative; and the largest number of evaluations, and of refused ones.
+CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
+#: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
+FARTHEST = 1e3
 
 
 class Problem(Protocol):
@@ -71,6 +78,8 @@ class Task:
         impedance is given, the phases (deg) after them.
     exact : bool
         Whether derivatives are those of a series stack, and not differences.
+    watch : callable
+        Called before every evaluation.
     """
 
     circuit: Circuit
@@ -84,6 +93,7 @@ class Task:
     target: FloatArray
     scale: FloatArray
     exact: bool
+    watch: Callable[[], None] = lambda: None
 
     @property
     def initial(self) -> FloatArray:
@@ -192,6 +202,7 @@ class Task:
 
     def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals over their scale, and their derivatives; large ones where a scene cannot be run."""
+        self.watch()
         try:
             with warnings.catch_warnings():
                 # Of values that no user has written.
@@ -212,24 +223,53 @@ def _end(circuit: Circuit) -> float:
     return circuit.tran.stop
 
 
+@contextmanager
+def evaluations_shown() -> Iterator[Callable[[], None]]:
+    """A progress bar of a fit, which appears after one second; the function counts the evaluations."""
+    bar, begun, count = Bar("fitting", endless=True), time.perf_counter(), itertools.count(1)
+
+    def watch() -> None:
+        number = next(count)
+        if time.perf_counter() - begun > 1.0:
+            bar.show(note=f"evaluation {number}")
+
+    try:
+        yield watch
+    finally:
+        bar.stop()
+
+
 def followed(task: Problem, begin: FloatArray, close: float = CLOSE) -> Fitted:
     """Where least squares lead from a start; `close` is the relative error of the last step."""
     from scipy.optimize import least_squares
 
     known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+    refusals = 0
 
     def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        nonlocal refusals
         key = x.tobytes()
         if key not in known:
+            last = next(iter(known.values()), None)
             known.clear()
-            known[key] = task.residuals(np.exp(x))
+            # At the edge of what can be run, all further steps are refused without a run, so that the search ends.
+            if last is None or refusals < _MOST_REFUSALS:
+                known[key] = task.residuals(unit * np.exp(x))
+            else:
+                known[key] = np.full_like(last[0], REFUSED), np.zeros_like(last[1])
+            refusals += bool(np.all(known[key][0] == REFUSED))
         return known[key]
 
+    # The first step is at most as long as the place it starts from: by a factor of e, not by that of the unit.
+    begin = np.clip(begin, *task.bounds.T)
+    x0 = np.full(begin.size, begin.size**-0.5)
+    unit = begin / np.exp(x0)
     with np.errstate(divide="ignore"):
-        box = np.log(task.bounds).T
-    x0 = np.clip(np.log(begin), *box)
+        box = np.log(task.bounds / unit[:, None]).T
+    x0 = np.clip(x0, *box)
     found = least_squares(
-        lambda x: at(x)[0], x0, lambda x: at(x)[1], bounds=box, xtol=close, ftol=close**1.5, gtol=1e-12, max_nfev=100
+        lambda x: at(x)[0], x0, lambda x: at(x)[1], bounds=box, xtol=close, ftol=close**1.5, gtol=1e-12, max_nfev=_MOST
     )
-    residual, by = at(found.x)
-    return Fitted(np.exp(found.x), residual, by, float(residual @ residual), int(found.nfev), bool(found.status > 0))
+    values, closed = unit * np.exp(found.x), found.status > 0 and refusals < _MOST_REFUSALS
+    residual, by = at(found.x) if refusals < _MOST_REFUSALS else task.residuals(values)
+    return Fitted(values, residual, by, float(residual @ residual), int(found.nfev), bool(closed))

@@ -32,6 +32,11 @@ Source: D. Gueorguiev et al., "The tactile perception of transient changes in fr
 Interface 14, 20170641 (2017), doi:10.1098/rsif.2017.0641: in all conditions. Caveat: the experiment reduced friction
 for a short time by ultrasonic lubrication of a passive finger, while electroadhesion increases friction.
 """
+FASTEST_FELT = 1000.0
+"""Highest frequency that may be felt, Hz: nothing faster is, whatever its amplitude.
+
+Assumed: receptors of the skin are commonly said to respond up to about 1 kHz, without a threshold at that frequency.
+"""
 
 
 @dataclass(frozen=True)
@@ -131,6 +136,17 @@ class Threshold(Sealed):
         """Amplitude that is just felt at frequencies (Hz), m/s^2, same shape; NaN beyond the table."""
         level = np.interp(frequency, self.frequency, self.level, left=np.nan, right=np.nan)
         return np.asarray(self.reference * 10.0 ** (level / 20.0))
+
+    def beyond(self, frequency: FloatArray) -> FloatArray:
+        """Amplitude that may be felt beyond the table's frequencies (Hz), m/s^2, same shape; NaN within the table.
+
+        Below the table it has the displacement of the first point, and above it the acceleration of the last one, as
+        a threshold in these terms hardly falls there. Above `FASTEST_FELT` it is infinite.
+        """
+        f, (low, high) = np.asarray(frequency, float), self.frequency[[0, -1]]
+        first, last = self.acceleration(self.frequency[[0, -1]])
+        above = np.where(f > high, np.where(f <= FASTEST_FELT, last, np.inf), np.nan)
+        return np.where(f < low, first * (f / low) ** 2 if low > 0.0 else np.nan, above)
 
 
 @cache

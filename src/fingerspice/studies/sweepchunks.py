@@ -24,7 +24,7 @@ import numpy as np
 from fingerspice import __version__
 from fingerspice.base.announcing import Bar
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.errors import InputError
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.heap import keep_freed_memory
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies import sweepplan
@@ -182,13 +182,14 @@ class _Pace:
         if took > 1.0 and sys.stderr.isatty():
             seconds = (self.total - self.done) * took / (self.done - self.first)
             left = f"{seconds // 3600:02.0f}:{seconds % 3600 // 60:02.0f}:{seconds % 60:02.0f}"
-            self.bar.show(self.done / self.total, f", {self.scenes / took:,.3g} scenes/s, {left} left")
+            self.bar.show(self.done / self.total, f"{self.scenes / took:,.3g} scenes/s, {left} left")
 
 
 def _here(work: Work, missing: Sequence[int]) -> Iterator[Done]:
     """Chunks by this process."""
     # A batch changes the filters for a while, and two of them at once for good.
     with warnings.catch_warnings(), ThreadPoolExecutor(AT_ONCE) as pool:
+        warnings.simplefilter("ignore", FingerspiceWarning)
         yield from pool.map(partial(run_chunk, work, computing=Lock()), missing)
 
 

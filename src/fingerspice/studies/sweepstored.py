@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import warnings
 from collections.abc import Mapping
 from inspect import signature
 from pathlib import Path
@@ -12,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fingerspice.base.arrays import whole_number
-from fingerspice.base.errors import InputError
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.studies.batch import batch, checked_scenes
 from fingerspice.studies.batchtask import LOCKSTEP, REFUSED
 from fingerspice.studies.sweepchunks import Work, programs, run_chunks, scheduled
@@ -72,7 +74,14 @@ def _work(circuit: Circuit, plan: Plan, options: Mapping[str, Any], path: Path) 
     """The sweep as chunks, and the attributes of its store; its first scene is run to see what outputs there are."""
     _check_values(circuit, plan)
     middle = plan.quantiles(np.full((1, len(plan.drawn)), 0.5))
-    first = batch(circuit, plan.spread({name: values[:1] for name, values in plan.grid.items()}, middle), **options)
+    if options.get("skin", "own") == "own":
+        ends = plan.spread({name: values[[0, -1]] for name, values in plan.grid.items()}, middle)
+        for text in scenes_warnings(circuit, options.get("t_stop"), checked_scenes(circuit, ends)):
+            warnings.warn(text, FingerspiceWarning, stacklevel=4)
+    with warnings.catch_warnings():
+        # Of one scene.
+        warnings.simplefilter("ignore", FingerspiceWarning)
+        first = batch(circuit, plan.spread({name: values[:1] for name, values in plan.grid.items()}, middle), **options)
     if "u_gap" in first:
         raise InputError("outputs are u_gap, and a store has figures, which are one number for each scene")
     if int(first.status[0]) >= REFUSED and len(circuit.by_device("GAP")) > 1:

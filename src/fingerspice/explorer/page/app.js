@@ -1,6 +1,6 @@
 // The explorer: a state, a request in flight, and what its answer shows.
 
-import { Sliders, Waveforms } from "./controls.js";
+import { Sliders, Waveforms, write } from "./controls.js";
 import { Sets } from "./sets.js";
 import { read } from "./recording.js";
 import { Harmonics, Means, Traces } from "./plots.js";
@@ -121,6 +121,7 @@ function show(answer) {
   else if (usable) traces.show(answer, null, pinned);
   else traces.clear();
   if (!answer.ok && !good) clear();
+  document.body.classList.toggle("before", !answer.ok && Boolean(good));
   const values = (of) => JSON.stringify([of.set, of.options.source]);
   const changed = values(state) !== values(reset(state, examples));
   say(answer.ok ? `${answer.title}${changed ? " (changed)" : ""}: ${answer.error.text}` : answer.message, !answer.ok);
@@ -158,7 +159,10 @@ function showFigures(answer) {
       `Charge law ${answer.charge_law}, area ${answer.area}, method ${answer.method}.`,
       `Run of ${quantity(answer.t_stop, "s")}${answer.period ? `, period ${quantity(answer.period, "s")}` : ""}.`,
     ].join("\n");
-  } else if (answer.message) say(answer.message, true);
+  } else if (answer.message) {
+    say(answer.message, true);
+    document.body.classList.add("before");
+  }
   document.body.dataset.figures = Number(document.body.dataset.figures || 0) + 1;
 }
 
@@ -263,12 +267,12 @@ function controls() {
     if (![...select.options].some((o) => o.value === value)) select.append(new Option(value, value));
     select.value = value;
   }
-  if (document.activeElement !== $("periods")) $("periods").value = option("periods");
-  waveforms.update(option("source"));
+  write($("periods"), option("periods"));
+  waveforms.update(option("source"), now.waveform);
   $("scene").value = state.deck === null ? state.scene : "";
   const example = examples.find((e) => e.name === state.scene);
   $("note").textContent = state.deck === null && example ? example.note : "";
-  if (document.activeElement !== $("netlist")) $("netlist").value = request(state, examples).deck;
+  write($("netlist"), request(state, examples).deck);
 }
 
 function keepAddress() {
@@ -314,16 +318,20 @@ async function apply(entry) {
 function open(hash) {
   [state, unknownInLink] = fromHash(hash, examples);
   written = "";
-  good = null;
-  shown += 1;
-  refresh();
+  another();
 }
 
 function choose(next) {
   state = next;
   unknownInLink = [];
+  another();
+}
+
+/** Ask for another scene. */
+function another() {
   good = null;
   shown += 1;
+  means.clear();
   refresh();
 }
 

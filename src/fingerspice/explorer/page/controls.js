@@ -27,6 +27,12 @@ function make(tag, properties = {}, parent = null) {
   return element;
 }
 
+/** Write a text into a field, but not over what is being typed: then only a text that has changed is written. */
+export function write(field, text) {
+  if (document.activeElement !== field || field.dataset.text !== text) field.value = text;
+  field.dataset.text = text;
+}
+
 /** One slider; `changed(text)` is called with the new value as text, `wrong(sentence)` where a typed one is no number. */
 export function slider(s, name, changed, wrong) {
   const row = make("div", { className: "slider" });
@@ -44,7 +50,7 @@ export function slider(s, name, changed, wrong) {
   make("span", { className: "unit", textContent: UNITS[s.unit] || s.unit }, row);
   const show = (value) => {
     if (document.activeElement !== range) range.value = place(value, s);
-    if (document.activeElement !== field) field.value = spice(value, s.unit, 6);
+    write(field, spice(value, s.unit, 6));
     range.setAttribute("aria-valuetext", `${spice(value, s.unit)} ${s.unit}`);
     field.classList.remove("invalid");
   };
@@ -62,6 +68,7 @@ export function slider(s, name, changed, wrong) {
       return;
     }
     range.value = place(value, s);
+    field.dataset.text = spice(value, s.unit, 6);
     changed(field.value.trim());
   });
   show(s.value === null ? Infinity : s.value);
@@ -129,7 +136,10 @@ export class Waveforms {
     for (const w of menu) make("option", { value: w.kind, textContent: w.title }, this.kind);
     make("option", { value: "?", textContent: "as the text says" }, this.kind);
     this.kind.addEventListener("change", () => this.choose(this.kind.value));
-    this.field.addEventListener("change", () => this.changed(this.field.value.trim()));
+    this.field.addEventListener("change", () => {
+      this.field.dataset.text = this.field.value.trim();
+      this.changed(this.field.dataset.text);
+    });
   }
 
   choose(kind) {
@@ -151,8 +161,10 @@ export class Waveforms {
     return { one, values, before: text.slice(0, text.indexOf("(")) };
   }
 
-  update(text) {
-    if (document.activeElement !== this.field) this.field.value = text;
+  /** Show the source's text, and while there is none that of the deck's own waveform. */
+  update(text, own) {
+    write(this.field, text);
+    this.field.placeholder = own || "the deck's own";
     const found = this.read(text);
     this.kind.value = found ? found.one.kind : text ? "?" : "";
     if (!found) {
