@@ -506,3 +506,23 @@ def test_requests_that_cannot_be_run_are_refused(request_: dict[str, object], me
     with pytest.raises(fs.InputError) as caught:
         fs.simulate(floating("SIN(0 200 5k)"), **request_)  # type: ignore[arg-type]
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(("seed", "law"), [(9, "mobile"), (20, "local"), (20, "mobile"), (21, "local")])
+def test_a_gap_voltage_that_turns_back_right_after_its_zero_keeps_its_branch(seed: int, law: str) -> None:
+    # Clusters of ten points 0.1 to 0.5 us apart, with rests of 1 us to 2 ms between them.
+    rng = np.random.default_rng(seed)
+    gaps = rng.uniform(0.1e-6, 0.5e-6, (110, 10))
+    gaps[:, 0] = 10 ** rng.uniform(-6.0, -2.7, 110)
+    t = np.concatenate([[0.0], np.cumsum(gaps.ravel())[:-1]])
+    source = fs.PWL(tuple(t), tuple(100.0 + 10.0 * rng.standard_normal(t.size)))
+    last = float(t[-1])
+    at = np.unique(np.concatenate([t, t[:-1] + 3e-8, *(t[9:-1:10] + x for x in np.geomspace(1e-8, 1e-6, 8))]))
+    deck = Path(__file__).parents[1] / "circuits" / "ungrounded_user.cir"
+    circuit = fs.read_netlist(deck).replace({"Vdrive": source})
+    run, implicit = (
+        fs.simulate(circuit, t_stop=last, t_eval=at[at <= last], charge_law=law, charge=False, method=method, rtol=1e-8)
+        for method in ("auto", "radau")
+    )
+    assert run.method == "exponential"
+    assert np.abs(run.u_gap - implicit.u_gap).max() <= run.error.u_gap + implicit.error.u_gap

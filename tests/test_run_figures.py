@@ -112,3 +112,20 @@ def test_where_the_recorded_steps_fill_their_arrays_changes_nothing(name: str, m
         assert run.stats["steps"] == plain.stats["steps"]
         np.testing.assert_array_equal(run.u_gap, plain.u_gap)
         np.testing.assert_allclose(run.f_el_mean, plain.f_el_mean, rtol=1e-13)
+
+
+@pytest.mark.parametrize("method", ["radau", "scipy:DOP853"])
+@pytest.mark.parametrize("t_eval", [[0.02], [0.003, 0.0071, 0.02], None], ids=["one", "three", "deck"])
+def test_figures_of_every_method_are_integrals_of_the_run(method: str, t_eval: list[float] | None) -> None:
+    # Of the area held the last period is the closed form, of the coupled one the independent reference.
+    held = fs.simulate(
+        table1().replace({"Vdrive": fs.Sine(U, F)}), area=AREA, start="periodic", t_stop=0.02, t_eval=t_eval,
+        method=method, rtol=1e-6,
+    )  # fmt: skip
+    amplitude = U * abs(ref.phasor_gains(F, AREA, ref.table1_layers(F))[ref.GAP])
+    assert held.f_el_mean == pytest.approx(STRESS * AREA * amplitude**2 / 2.0, rel=3e-6)
+    assert held.u_gap_peak == pytest.approx(amplitude, rel=2e-6)
+    exact = ref.transient(ref.sine_segments(U, F, 0.02), [0.0, 0.02], freq=F)
+    run = fs.simulate(table1(), t_stop=0.02, t_eval=t_eval, method=method, rtol=1e-6)
+    assert run.summary()["figures_from"] == "steps"
+    assert run.f_el_mean == pytest.approx(exact.mean_force(0.0, 0.02), rel=3e-6)
