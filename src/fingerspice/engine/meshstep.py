@@ -174,18 +174,23 @@ def complete_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
     step[T_NEW], step[THETA], place[CROSSED] = t + h, 1.0, -1
     if step[T_NEW] >= stop or stop - step[T_NEW] <= 1e-12 * h:
         step[T_NEW], step[THETA] = stop, min(1.0, (stop - t) / h)
-    u = work.areas[netform.U]
-    a, theta, t_new = first_zero(c.form.cell, u, c.sign, pace.tol, t, h, step[THETA], step[T_NEW], work.room[0])
-    if a >= 0 and t_new <= t:
-        if place[FLIPS] <= c.sign.size:
-            branch = branch_of(c, s)
-            c.sign[a], branch[a, 0], branch[a, 1] = -c.sign[a], t, math.inf
-            place[FLIPS] += 1
+    u, turned_enough = work.areas[netform.U], place[FLIPS] > c.sign.size
+    place[CROSSED], step[THETA], step[T_NEW] = first_zero(
+        c.form.cell, u, c.sign, pace.tol, t, h, step[THETA], step[T_NEW], turned_enough, work.room[0]
+    )  # fmt: skip
+    a = place[CROSSED]
+    if a >= 0 and step[T_NEW] <= t:
+        branch = branch_of(c, s)
+        c.sign[a], branch[a, 0], branch[a, 1] = -c.sign[a], t, math.inf
+        place[FLIPS] += 1
+        return AGAIN
+    if turned_enough:
+        off = 0.0
+        for b in range(c.sign.size):
+            if c.form.cell[b] >= 0:
+                off = max(off, farthest_off(u[b], c.sign[b], step[THETA]))
+        if off > pace.tol and may_shorten(s, t):
             return AGAIN
-        if farthest_off(u[a], c.sign[a]) > pace.tol and may_shorten(s, t):
-            return AGAIN
-    elif a >= 0:
-        place[CROSSED], step[THETA], step[T_NEW] = a, theta, t_new
     if c.form.mobile and place[WHOLE] == 0:
         step[GROWN] = _magnified_whole(c, s)
         _take_coupling(c, s)
@@ -197,7 +202,7 @@ def complete_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
     _write(c, pace, s, t)
     _account(c, s)
     _move(c, s)
-    if place[CROSSED] >= 0:
+    if a >= 0:
         _cross(c, s, a)
     control[T] = step[T_NEW]
     s.counters[ACCEPTED] += 1

@@ -180,14 +180,17 @@ def turn_at_start(cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t
 @jit
 def first_zero(
     cell: IntArray, u: FloatArray, sign: FloatArray, tol: float, t: float, h: float, theta: float, t_new: float,
-    series: FloatArray,
+    later: bool, series: FloatArray,
 ) -> tuple[int, float, float]:  # fmt: skip
-    """The area whose gap voltage is the first to leave its branch before t_new, or -1; the fraction and the time."""
+    """The area whose gap voltage is the first to leave its branch before t_new, or -1; the fraction and the time.
+
+    With `later` zeros at the start of the step are passed over.
+    """
     which = -1
     for a in range(cell.size):
         if cell[a] >= 0:
             crossing = leaves(u[a], sign[a], tol, series)
-            if crossing <= theta and t + crossing * h <= t_new:
+            if crossing <= theta and t + crossing * h <= t_new and not (later and t + crossing * h <= t):
                 which, theta, t_new = a, crossing, t + crossing * h
     return which, theta, t_new
 

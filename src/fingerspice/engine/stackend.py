@@ -80,7 +80,7 @@ def complete_stack(c: Stack, pace: Pace, s: LoopState) -> int:
         if since + crossing * h <= since:
             if place[FLIPS] < 2:
                 return flip(s)
-            if farthest_off(c.work.r[U], control[SIGN]) > pace.tol and may_shorten(s, since):
+            if farthest_off(c.work.r[U], control[SIGN], step[THETA]) > pace.tol and may_shorten(s, since):
                 return AGAIN
         elif since + crossing * h <= reached and crossing <= step[THETA]:
             step[THETA], reached, place[CROSSED] = crossing, since + crossing * h, 0

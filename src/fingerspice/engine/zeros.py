@@ -132,11 +132,11 @@ def leaves(u: FloatArray, sign: float, tol: float, series: FloatArray) -> float:
 
 
 @jit_rows
-def farthest_off(u: FloatArray, sign: float) -> float:
-    """How far the gap voltage is off its branch at the nodes at most, V; negative where it is on it."""
-    off: float = -sign * u[0]
-    for j in range(1, NODES):
-        off = max(off, -sign * u[j])
+def farthest_off(u: FloatArray, sign: float, theta: float) -> float:
+    """How far the gap voltage is off its branch at the nodes up to fraction `theta` of the step at most, V."""
+    off: float = 0.0
+    for j in range(NODES):
+        off = max(off, -sign * u[j] if POINTS[j] <= theta else 0.0)
     return off
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import codecs
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from encodings import cp1252
 from pathlib import Path, PurePath
@@ -60,7 +60,9 @@ def read_text(path: Path, shown: str, where: Where | None = None, root: Path | N
 
 def is_stream(path: Path) -> bool:
     """Whether a deck's path means standard input (``-``), a device, or a pipe such as bash's ``<(...)``."""
-    return str(path) == "-" or path.is_relative_to("/dev") or path.is_fifo()
+    with suppress(OSError):
+        return str(path) == "-" or path.is_relative_to("/dev") or path.is_fifo()
+    return False
 
 
 def read_stream(path: Path) -> str:

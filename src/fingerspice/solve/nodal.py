@@ -193,7 +193,7 @@ def solve_coupled(
     The stated error is the difference from a second run of lower order with a larger tolerance. `reason` says why this
     method took over from another; a run that takes long is announced with it, and with its expected time.
     """
-    progress = _announced(progress, reason or "implicit steps")
+    progress = _announced(progress, f"{reason}: " if reason else "")
     longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
     fine, coarse = (radau_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
     at, side, probed = _with_probes(problem, t_out, left)
@@ -254,14 +254,16 @@ def solve_coupled(
 
 def _announced(progress: Progress | None, reason: str) -> Progress:
     """Progress of implicit steps, which tells once how long they are expected to take."""
-    begun, told = time.perf_counter(), False
+    first, told = (0.0, 0.0), False
 
     def update(done: float) -> None:
-        nonlocal told
-        taken = time.perf_counter() - begun
-        if not told and taken > TELL_AFTER and done > 0.0:
+        nonlocal first, told
+        # From the first call on, because the compiler may have worked before it.
+        first = first if first[0] else (time.perf_counter(), done)
+        taken, more = time.perf_counter() - first[0], done - first[1]
+        if not told and taken > TELL_AFTER and more > 0.0:
             # A run consists of the coarser one, which comes first, and the finer one.
-            tell(f"{reason}: implicit steps since {taken:.0f} s, about {2.0 * taken / done:.2g} s in all")
+            tell(f"{reason}implicit steps take about {2.0 * taken / more:.2g} s in all")
             told = True
         if progress is not None:
             progress(done)
