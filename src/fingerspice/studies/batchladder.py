@@ -12,7 +12,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.lockcard import Lengths, march_on_card
 from fingerspice.engine.lockmarch import march, new_stepping, put_traces, trace_changes
 from fingerspice.engine.locksamples import N_PORTION, march_samples
-from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, OMEGA, REST, STRESS, new_block
+from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
 from fingerspice.engine.lockstep import ALL_MOMENTS, START_TIMES, marks_of
 from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, peak_of, table_of
 from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
@@ -48,8 +48,9 @@ _MOST_GAIN = 24.0
 # Under sines and below this rtol, where the kinks are most of the error, no scene is accepted before the steps have
 # been doubled once, with a smaller such factor.
 _DOUBTFUL, _GAIN_IN_DOUBT = 5e-7, 12.0
-# Longest first step after a jump of the source, in time constants of the fastest cell.
-_LONGEST_STEP = 1.0
+# Longest first step after a jump of the source, in time constants of the fastest cell; and the source's voltage at the
+# start that counts as 0 V, over the sum of its tones.
+_LONGEST_STEP, _FROM_ZERO = 1.0, 1e-12
 # Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
 # `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
 _PIECES = ((5e-5, 8), (5e-7, 12), (0.0, 24))
@@ -111,12 +112,12 @@ def climb(
     """
     table = table_of(form, scenes)
     mu = friction_of(form, scenes)
-    touching, pieces, decays = mesh_of(form, table, most=1 if task.traced else MOST_PIECES)
+    mesh = mesh_of(task, form, table, most=1 if task.traced else MOST_PIECES)
     # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
     order = np.argsort(_leakage_rates(form, table).min(axis=0)) if halves > 4 else np.arange(mu.size)
-    every = _Scenes(table, mu, decays, members)
-    for count in np.unique(pieces[touching]).tolist():
-        pending = order[(touching & (pieces == count))[order]]
+    every = _Scenes(table, mu, mesh, members)
+    for count in np.unique(mesh.pieces[mesh.touching]).tolist():
+        pending = order[(mesh.touching & (mesh.pieces == count))[order]]
         for covered in COVERED:
             pending = _climb_one(task, form, every, (halves, count), covered, pending, found)
 
@@ -127,16 +128,31 @@ def friction_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatAr
     return np.broadcast_to(mu, next(iter(scenes.values())).shape)
 
 
-def mesh_of(form: LockstepForm, table: FloatArray, most: int) -> tuple[BoolArray, NDArray[np.int64], FloatArray]:
-    """Whether there is contact, pieces of a half period (0: no jumps), and half a period in the fastest time constants.
+class Mesh(NamedTuple):
+    """What scenes need of their steps, each of shape (n,).
 
-    Parameters
+    Attributes
     ----------
-    form : LockstepForm
-    table : ndarray, shape (n_row, n)
-    most : int
-        Largest number of pieces. Each is twice as long as the one before, so that gap voltages at equal distances need
-        a single one.
+    touching : ndarray of bool
+        Whether there is contact.
+    pieces : ndarray of int
+        Pieces of a half period; 0 for a source that is no square.
+    decays : ndarray
+        Half a period in time constants of the fastest cell.
+    least : ndarray
+        Least number of steps a period (sample), so that the first step after a jump of the source is short enough.
+    """
+
+    touching: BoolArray
+    pieces: NDArray[np.int64]
+    decays: FloatArray
+    least: FloatArray
+
+
+def mesh_of(task: Task, form: LockstepForm, table: FloatArray, most: int) -> Mesh:
+    """What the scenes of a table (n_row, n) need of their steps, with at most so many pieces of a half period.
+
+    Each piece is twice as long as the one before, so that gap voltages at equal distances need a single one.
     """
     others = CELL_ROWS * form.cells
     touching = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
@@ -145,7 +161,16 @@ def mesh_of(form: LockstepForm, table: FloatArray, most: int) -> tuple[BoolArray
     decays = np.max(_leakage_rates(form, table), axis=0) * np.pi
     if form.jumping:
         pieces = np.ceil(np.log2(1.0 + _PIECE_START * decays)).clip(1, most).astype(int)
-    return touching, pieces, decays
+        first = pieces / (2.0**pieces - 1.0)
+    elif task.periodic:
+        first = 0.0
+    elif form.recording is not None:
+        first = 0.5 * (form.recording.between(0, 1)[0] != 0.0)
+    else:
+        sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
+        from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
+        first = np.where(from_zero, 0.0, START_TIMES[1])
+    return Mesh(touching, pieces, decays, 2.0 * first * decays / _LONGEST_STEP)
 
 
 def _leakage_rates(form: LockstepForm, table: FloatArray) -> FloatArray:
@@ -165,19 +190,12 @@ def first_level(rtol: float, form: LockstepForm, pieces: int) -> tuple[int, int]
     return steps, degree
 
 
-def short_enough(decays: FloatArray, pieces: int, steps: int) -> BoolArray:
-    """Whether the first step after a jump, if there is one, is short enough; `decays` as `mesh_of` gives them."""
-    # That step, in half periods, times the number of steps a period.
-    shortest = 2.0 * pieces / (2.0**pieces - 1.0) if pieces > 0 else 0.0
-    return np.asarray(decays * shortest <= _LONGEST_STEP * steps)
-
-
 class _Scenes(NamedTuple):
-    """Table of scenes, friction coefficient, half a period in time constants of the fastest cell, places of answers."""
+    """Table of scenes, friction coefficient, what they need of their steps, places of answers."""
 
     table: FloatArray
     mu: FloatArray
-    decays: FloatArray
+    mesh: Mesh
     members: NDArray[np.int64]
 
 
@@ -208,9 +226,9 @@ def _climb_one(
             break
         level = Level(task, form, mesh, steps, degree, covered, ALL_MOMENTS if needed[-1] else 1, traced)
         now = level.run(table, pending, curves, before)
-        error = level.error(now, needed, scenes.decays[pending])
+        error = level.error(now, needed, scenes.mesh.decays[pending])
         error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
-        good = (error <= ENOUGH * task.rtol) & short_enough(scenes.decays[pending], pieces, steps)
+        good = (error <= ENOUGH * task.rtol) & (scenes.mesh.least[pending] <= steps)
         good &= before is not None or not doubtful
         at = pending[good]
         places = scenes.members[at]
