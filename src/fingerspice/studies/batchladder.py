@@ -44,12 +44,14 @@ _STATED_TRACED = 0.8
 # Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
 # 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
 _STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
+# What decays after a start away from 0 V is met by steps of several lengths, whose errors may cancel with half the steps.
+_STATED_STARTED = 2.0
 _MOST_GAIN = 24.0
 # Under sines and below this rtol, where the kinks are most of the error, no scene is accepted before the steps have
 # been doubled once, with a smaller such factor.
 _DOUBTFUL, _GAIN_IN_DOUBT = 5e-7, 12.0
-# Longest first step after a jump of the source, in time constants of the fastest cell; and the source's voltage at the
-# start that counts as 0 V, over the sum of its tones.
+# Longest first step after a jump of a square, and longest step at all of a run whose source is not 0 V at its start, in
+# time constants of the fastest cell; and the voltage at the start that counts as 0 V, over the sum of the tones.
 _LONGEST_STEP, _FROM_ZERO = 1.0, 1e-12
 # Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
 # `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
@@ -140,7 +142,7 @@ class Mesh(NamedTuple):
     decays : ndarray
         Half a period in time constants of the fastest cell.
     least : ndarray
-        Least number of steps a period (sample), so that the first step after a jump of the source is short enough.
+        Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0.
     """
 
     touching: BoolArray
@@ -169,7 +171,7 @@ def mesh_of(task: Task, form: LockstepForm, table: FloatArray, most: int) -> Mes
     else:
         sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
         from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
-        first = np.where(from_zero, 0.0, START_TIMES[1])
+        first = np.where(from_zero, 0.0, 1.0)
     return Mesh(touching, pieces, decays, 2.0 * first * decays / _LONGEST_STEP)
 
 
@@ -226,9 +228,10 @@ def _climb_one(
             break
         level = Level(task, form, mesh, steps, degree, covered, ALL_MOMENTS if needed[-1] else 1, traced)
         now = level.run(table, pending, curves, before)
-        error = level.error(now, needed, scenes.mesh.decays[pending])
+        error = level.error(now, needed, scenes.mesh.decays[pending], scenes.mesh.least[pending])
         error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
-        good = (error <= ENOUGH * task.rtol) & (scenes.mesh.least[pending] <= steps)
+        resolved = scenes.mesh.least[pending] <= steps
+        good = (error <= ENOUGH * task.rtol) & resolved
         good &= before is not None or not doubtful
         at = pending[good]
         places = scenes.members[at]
@@ -243,7 +246,7 @@ def _climb_one(
         found.error[places], found.status[places], found.done[places] = error[good] / ENOUGH, LOCKSTEP, True
         # More steps are no help where the area's polynomial of the highest degree is what limits the error.
         # A scene whose estimate grows from twice the steps, too: the explicit steps may be unstable around that area.
-        beyond = np.isinf(now.fine[-1]) | ~good & (error > last)
+        beyond = np.isinf(now.fine[-1]) | ~good & resolved & (error > last)
         outside.append(pending[beyond])
         left = ~good & ~beyond & ((degree < HIGHEST_DEGREE) | (before is None) | (now.fine[-1] <= ENOUGH * task.rtol))
         before = Run(now.fine[:, left], now.fine[:, left], now.trace[left], now.trace[left])
@@ -317,8 +320,8 @@ class Level(NamedTuple):
         none = np.empty((pending.size, 0))
         return Run(out[0] if before is None else before.fine, out[1], none, none)
 
-    def error(self, run: Run, needed: list[int], decays: FloatArray) -> FloatArray:
-        """Largest estimated relative error of the outputs, for each scene; `decays` as `mesh_of` gives them."""
+    def error(self, run: Run, needed: list[int], decays: FloatArray, fewest: FloatArray) -> FloatArray:
+        """Largest estimated relative error of the outputs, for each scene; see `Mesh` for `decays`, and `least`."""
         peak, closing, tail = run.fine[-3:]
         changes = [np.zeros(peak.size)]
         for row in needed:
@@ -341,6 +344,7 @@ class Level(NamedTuple):
         change = np.max(changes, axis=0) + run.coarse[-1]
         least = _STATED_TRACED if self.traced else next(s for least, s in _STATED if self.task.rtol >= least)
         share = np.where(2.0 * decays > _STIFF * self.steps, max(least, _STATED_STIFF), least)
+        share = np.where(fewest > 0.0, _STATED_STARTED, share)
         if self.form.jumping:
             share = np.full(peak.size, _STATED_JUMPING)
         if self.form.recording is not None:
