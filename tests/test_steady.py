@@ -158,10 +158,9 @@ def test_a_modulated_carrier_with_a_memory_of_hundreds_of_periods_is_the_referen
         return 100.0 * (1.0 + np.sin(200.0 * np.pi * t)) * np.sin(2e3 * np.pi * t)
 
     def slope(t: np.ndarray) -> np.ndarray:
-        envelope = 1.0 + np.sin(200.0 * np.pi * t)
-        return 100.0 * np.pi * (
-            200.0 * np.cos(200.0 * np.pi * t) * np.sin(2e3 * np.pi * t) + 2e3 * envelope * np.cos(2e3 * np.pi * t)
-        )
+        grows = 2e4 * np.pi * np.cos(200.0 * np.pi * t)
+        carries = 2e5 * np.pi * (1.0 + np.sin(200.0 * np.pi * t))
+        return grows * np.sin(2e3 * np.pi * t) + carries * np.cos(2e3 * np.pi * t)
 
     plain = ref.table1_layers(100.0)
     layers = (ref.Layer(plain[0].c, r_total=2e9), ref.Layer(plain[1].c, r_total=1e11), plain[2])
@@ -175,8 +174,8 @@ def test_a_modulated_carrier_with_a_memory_of_hundreds_of_periods_is_the_referen
 
 @pytest.mark.parametrize("coat", [2e5, 2e9, 1e11])
 @pytest.mark.parametrize("gap", [1e11, 1e13])
-@pytest.mark.parametrize("source", [fs.AM(200.0, 5000.0, 20.0), fs.Sum((fs.Sine(200.0, 100.0), fs.Sine(100.0, 5000.0)))])
-def test_two_tones_and_hardly_any_leaks_are_within_the_error_stated(source: fs.Waveform, gap: float, coat: float) -> None:
+@pytest.mark.parametrize("source", [fs.AM(200.0, 5000.0, 20.0), fs.Sum((fs.Sine(200.0, 100.0), fs.Sine(100.0, 5e3)))])
+def test_two_tones_and_hardly_any_leaks_meet_what_is_asked(source: fs.Waveform, gap: float, coat: float) -> None:
     circuit = table1(coat={"r": coat}, gap={"r": gap}).replace({"Vdrive": source})
     runs = [fs.steady_state(circuit, rtol=rtol, points=40, charge=False).solution for rtol in (1e-10, 1e-8)]
     off = np.abs(runs[0].u_gap - runs[1].u_gap).max()

@@ -26,7 +26,6 @@ from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, LONGEST_STEP, SAFETY
 from fingerspice.solve.track import prepare_system
 from fingerspice.waveforms.sampling import SourceTable, source_table
 
-
 # In the search for a periodic state, the longest step allowed after each that was not good enough, over the last.
 _SHORTER = 0.8
 

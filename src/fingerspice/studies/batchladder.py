@@ -44,7 +44,7 @@ _STATED_TRACED = 0.8
 # Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
 # 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
 _STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
-# What decays after a start away from 0 V is met by steps of several lengths, whose errors may cancel with half the steps.
+# What decays after a start away from 0 V meets steps of several lengths, whose errors may cancel with half the steps.
 _STATED_STARTED = 2.0
 _MOST_GAIN = 24.0
 # Under sines and below this rtol, where the kinks are most of the error, no scene is accepted before the steps have
