@@ -37,8 +37,8 @@ CLOSING, SETTLED, ROUNDING = 0.02, 0.05, 1e-11
 # the factor _MOST_GAIN.
 _STATED, _STATED_JUMPING = ((5e-6, 0.25), (5e-7, 0.5), (0.0, 0.8)), 0.5
 # Where a step is longer than this many of the fastest time constants, the start of a run from rest is not resolved, and
-# the change is no larger than the error.
-_STIFF, _STATED_STIFF = 2.0, 0.8
+# the change is no larger than the error; it is smaller where that start is most of the error.
+_STIFF, _STATED_STIFF = 2.0, ((5e-6, 0.8), (0.0, 2.5))
 # A gap voltage shows the kinks at its zeros more than means do.
 _STATED_TRACED = 0.8
 # Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
@@ -342,8 +342,9 @@ class Level(NamedTuple):
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
         change = np.max(changes, axis=0) + run.coarse[-1]
-        least = _STATED_TRACED if self.traced else next(s for least, s in _STATED if self.task.rtol >= least)
-        share = np.where(2.0 * decays > _STIFF * self.steps, max(least, _STATED_STIFF), least)
+        least, stiff = (next(s for rtol, s in shares if self.task.rtol >= rtol) for shares in (_STATED, _STATED_STIFF))
+        least = _STATED_TRACED if self.traced else least
+        share = np.where(2.0 * decays > _STIFF * self.steps, max(least, stiff), least)
         share = np.where(fewest > 0.0, _STATED_STARTED, share)
         if self.form.jumping:
             share = np.full(peak.size, _STATED_JUMPING)
