@@ -87,6 +87,13 @@ def test_what_a_start_away_from_0_v_excites_is_in_the_error(phase: float, period
     assert np.count_nonzero(found.status == 0) >= 12
 
 
+def test_a_leaking_gap_that_leads_a_sine_from_0_v_has_its_error_met() -> None:
+    changes = {"Xgap.r": 26850.0, "Xcoat.r": 420900.0, "Xgap.fn": 0.1793, "Xgap.d": 3.59e-6, "Vdrive.amplitude": 184.5}
+    found = fs.batch(table1(), changes, periods=0.5, rtol=1e-6)
+    run = fs.simulate(table1().varied(changes), t_stop=0.005, rtol=1e-11, charge=False)
+    assert found.f_el_mean[0] == pytest.approx(run.f_el_mean, rel=1e-6)
+
+
 @pytest.mark.parametrize("jumping", [False, True], ids=["sine", "square"])
 def test_the_mean_force_is_that_of_the_independent_reference(jumping: bool) -> None:
     volts, f = np.array([80.0, 200.0, 290.0]), 400.0

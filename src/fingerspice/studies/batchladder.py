@@ -51,8 +51,9 @@ _MOST_GAIN = 24.0
 # been doubled once, with a smaller such factor.
 _DOUBTFUL, _GAIN_IN_DOUBT = 5e-7, 12.0
 # Longest first step after a jump of a square, and longest step at all of a run whose source is not 0 V at its start, in
-# time constants of the fastest cell; and the voltage at the start that counts as 0 V, over the sum of the tones.
-_LONGEST_STEP, _FROM_ZERO = 1.0, 1e-12
+# time constants of the fastest cell; and the voltage at the start that counts as 0 V, over all tones. Also from
+# there a leaking gap's voltage jumps, as it leads the source: below this rtol the first step is as short as a square's.
+_LONGEST_STEP, _FROM_ZERO, _LEADING = 1.0, 1e-12, 5e-6
 # Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
 # `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
 _PIECES = ((5e-5, 8), (5e-7, 12), (0.0, 24))
@@ -171,7 +172,7 @@ def mesh_of(task: Task, form: LockstepForm, table: FloatArray, most: int) -> Mes
     else:
         sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
         from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
-        first = np.where(from_zero, 0.0, 1.0)
+        first = np.where(from_zero, START_TIMES[1] if task.rtol < _LEADING else 0.0, 1.0)
     return Mesh(touching, pieces, decays, 2.0 * first * decays / _LONGEST_STEP)
 
 
@@ -345,7 +346,8 @@ class Level(NamedTuple):
         least, stiff = (next(s for rtol, s in shares if self.task.rtol >= rtol) for shares in (_STATED, _STATED_STIFF))
         least = _STATED_TRACED if self.traced else least
         share = np.where(2.0 * decays > _STIFF * self.steps, max(least, stiff), least)
-        share = np.where(fewest > 0.0, _STATED_STARTED, share)
+        # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
+        share = np.where(fewest > decays, _STATED_STARTED, share)
         if self.form.jumping:
             share = np.full(peak.size, _STATED_JUMPING)
         if self.form.recording is not None:
