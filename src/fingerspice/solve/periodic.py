@@ -28,6 +28,8 @@ from fingerspice.waveforms.sampling import SourceTable, source_table
 
 # In the search for a periodic state, the longest step allowed after each that was not good enough, over the last.
 _SHORTER = 0.8
+# Above this rtol the bound of what slow modes hold can be met, and alone is stated.
+_BOUNDED = 1e-9
 
 
 @dataclass(frozen=True)
@@ -213,7 +215,9 @@ def _judged(
     # Add round-off, and `left`, the last step of Newton's method, as an estimate of the error that remains after it.
     floor = memory * 4e-16 * (peak_u + u_scale)
     steepest = 2.0 * peak_f / (peak_u or 1.0)
-    moved = np.inf if coarser is None else SAFETY * float(np.abs(gap * (w - coarser.w)).sum())
+    moved = np.inf
+    if coarser is not None and rtol <= _BOUNDED:
+        moved = SAFETY * float(np.abs(gap * (w - coarser.w)).sum())
     own = np.array([SAFETY * error_u + floor + left, SAFETY * error_f + steepest * (floor + left)])
     held = np.minimum((memory - 1.0) * SAFETY * np.array([error_u, error_f]), np.array([1.0, steepest]) * moved)
     asked = rtol * np.array([peak_u, peak_f])
