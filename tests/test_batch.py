@@ -70,6 +70,30 @@ def test_a_wide_population_meets_what_was_asked_and_states_its_error(circuit: Ci
         assert found.attrs["n_ordinary"] == np.count_nonzero(found.status == 1) == 0
 
 
+@pytest.mark.parametrize(("periods", "rtol"), [(0.5, 1e-4), (5, 1e-4), (0.5, 1e-6), (1, 1e-6)])
+@pytest.mark.parametrize("phase", [21.0, 90.0, 250.0])
+def test_what_a_start_away_from_0_v_excites_is_in_the_error(phase: float, periods: float, rtol: float) -> None:
+    rng = np.random.default_rng(5)
+    circuit = table1().replace({"Vdrive.phase_deg": phase})
+    parameters = {
+        "Xgap.r": 10.0 ** rng.uniform(4.0, 8.0, 30), "Xcoat.r": 10.0 ** rng.uniform(3.0, 7.0, 30),
+        "Xgap.fn": rng.uniform(0.1, 2.0, 30), "Vdrive.frequency": np.full(30, 100.0),
+    }  # fmt: skip
+    expected = singly(circuit, parameters, OUTPUTS[2:], periods)
+    found = fs.batch(circuit, parameters, outputs=OUTPUTS[2:], periods=periods, rtol=rtol)
+    off = np.max(np.abs(np.array([found[name].values for name in OUTPUTS[2:]]) / expected - 1.0), axis=0)
+    assert off.max() <= rtol
+    assert np.mean(off <= found.error.values + 0.01 * rtol) >= 0.95
+    assert np.count_nonzero(found.status == 0) >= 12
+
+
+def test_a_leaking_gap_that_leads_a_sine_from_0_v_has_its_error_met() -> None:
+    changes = {"Xgap.r": 26850.0, "Xcoat.r": 420900.0, "Xgap.fn": 0.1793, "Xgap.d": 3.59e-6, "Vdrive.amplitude": 184.5}
+    found = fs.batch(table1(), changes, periods=0.5, rtol=1e-6)
+    run = fs.simulate(table1().varied(changes), t_stop=0.005, rtol=1e-11, charge=False)
+    assert found.f_el_mean[0] == pytest.approx(run.f_el_mean, rel=1e-6)
+
+
 @pytest.mark.parametrize("jumping", [False, True], ids=["sine", "square"])
 def test_the_mean_force_is_that_of_the_independent_reference(jumping: bool) -> None:
     volts, f = np.array([80.0, 200.0, 290.0]), 400.0

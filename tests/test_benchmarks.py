@@ -225,6 +225,13 @@ def test_the_batch_benchmark_runs_and_meets_its_errors(monkeypatch, capsys):
     assert all(row["largest_error"] <= row["rtol"] for row in checked)
 
 
+def test_the_benchmark_of_batch_errors_runs_and_meets_them(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    rows = importlib.import_module("batch_errors").main(["--quick"])["rows"]
+    assert [row["periods"] for row in rows] == [0.5, 1, 5]
+    assert all(row["off_over_asked"] <= 1.0 for row in rows)
+
+
 def test_the_benchmark_of_sweeps_finds_the_same_bytes_after_a_kill(monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(FOLDER))
     results = importlib.import_module("sweeps").main(["--quick"])

@@ -106,6 +106,31 @@ def test_repeated_periods_are_followed_one_by_one(table_1: fs.Circuit) -> None:
     assert abs(one.f_el_mean - other.f_el_mean) <= 1e-7 * abs(other.f_el_mean)
 
 
+def uneven(points: int, stop: float) -> fs.PWL:
+    """A PWL on no even grid."""
+    t = np.sort(np.random.default_rng(4).uniform(0.0, stop, points))
+    return fs.PWL(np.append(0.0, t), np.append(0.0, 150.0 * np.sin(2.0 * np.pi * 150.0 * t)))
+
+
+def test_points_at_uneven_times_have_them(table_1: fs.Circuit) -> None:
+    circuit = table_1.replace({"Vdrive": uneven(1100, T_STOP)})
+    how: dict[str, Any] = {"t_stop": T_STOP, "t_eval": np.linspace(0.0, T_STOP, 20)[1:], "charge": False}
+    assert fs.simulate(circuit, rtol=1e-6, **how).method == "relaxation"
+    paths = ("Xgap.d", "Xcoat.r")
+    run = fs.simulate(circuit, rtol=1e-8, sensitivities=paths, **how)
+    for path in paths:
+        # One difference of second order: its truncation is about 1e-7 of a signal.
+        value = circuit.parameters[path].value
+        low, high = (
+            fs.simulate(circuit.replace({path: by * value}), rtol=1e-11, method="exponential", **how)
+            for by in (1.0 - STEP, 1.0 + STEP)
+        )
+        for name in ("u_gap", "f_el", "f_el_mean"):
+            found = value * getattr(run.sensitivities[path], name)
+            expected = (getattr(high, name) - getattr(low, name)) / (2.0 * STEP)
+            assert np.abs(found - expected).max() <= 1e-6 * np.abs(getattr(run, name.removesuffix("_mean"))).max()
+
+
 def test_without_leaks_a_gap_divides_the_voltage() -> None:
     # u_gap = U / (1 + d1 / (eps1 d)): the capacitances of a series stack, whatever the area.
     deck = """divider

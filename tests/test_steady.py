@@ -153,6 +153,36 @@ def test_the_error_stated_holds_though_a_disturbance_would_outlast_many_periods(
     assert true <= 1e-9 * np.abs(want.u_gap).max()
 
 
+def test_a_modulated_carrier_with_a_memory_of_hundreds_of_periods_is_the_reference_s() -> None:
+    def source(t: np.ndarray) -> np.ndarray:
+        return 100.0 * (1.0 + np.sin(200.0 * np.pi * t)) * np.sin(2e3 * np.pi * t)
+
+    def slope(t: np.ndarray) -> np.ndarray:
+        grows = 2e4 * np.pi * np.cos(200.0 * np.pi * t)
+        carries = 2e5 * np.pi * (1.0 + np.sin(200.0 * np.pi * t))
+        return grows * np.sin(2e3 * np.pi * t) + carries * np.cos(2e3 * np.pi * t)
+
+    plain = ref.table1_layers(100.0)
+    layers = (ref.Layer(plain[0].c, r_total=2e9), ref.Layer(plain[1].c, r_total=1e11), plain[2])
+    circuit = table1(coat={"r": 2e9}, gap={"r": 1e11}).replace({"Vdrive": fs.AM(200.0, 1000.0, 100.0)})
+    state = fs.steady_state(circuit, rtol=1e-10, points=40, charge=False)
+    assert state.memory > 100.0
+    want = ref.periodic_state([(0.0, 0.01, source, slope)], layers=layers, t_out=np.linspace(0.0, 0.01, 41)[:-1])
+    true = np.abs(state.solution.u_gap[:-1] - want.u_gap).max()
+    assert true <= min(state.solution.error.u_gap, 1e-10 * np.abs(want.u_gap).max())
+
+
+@pytest.mark.parametrize("coat", [2e5, 2e9, 1e11])
+@pytest.mark.parametrize("gap", [1e11, 1e13])
+@pytest.mark.parametrize("source", [fs.AM(200.0, 5000.0, 20.0), fs.Sum((fs.Sine(200.0, 100.0), fs.Sine(100.0, 5e3)))])
+def test_two_tones_and_hardly_any_leaks_meet_what_is_asked(source: fs.Waveform, gap: float, coat: float) -> None:
+    circuit = table1(coat={"r": coat}, gap={"r": gap}).replace({"Vdrive": source})
+    runs = [fs.steady_state(circuit, rtol=rtol, points=40, charge=False).solution for rtol in (1e-10, 1e-8)]
+    off = np.abs(runs[0].u_gap - runs[1].u_gap).max()
+    assert runs[0].error.u_gap <= 1e-10 * runs[0].u_gap_peak
+    assert off <= runs[0].error.u_gap + runs[1].error.u_gap
+
+
 LITTLE = [(25e6, 1.7e3), (2e5, 1e3), (5e6, 1e4)]
 
 

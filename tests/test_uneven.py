@@ -74,6 +74,15 @@ def test_the_error_is_covered_and_not_overstated_on_random_points() -> None:
     assert within >= 18
 
 
+@pytest.mark.parametrize("seed", range(4, 17, 2))
+def test_fast_leaks_beside_long_intervals_have_their_errors_met(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    intervals = np.where(rng.uniform(size=1200) < 0.2, 1e-9, 5e-5 * rng.uniform(0.2, 1.0, 1200))
+    t = np.append(0.0, np.cumsum(intervals))
+    wave = fs.PWL(t, 150.0 * np.sin(2.0 * np.pi * rng.uniform(50.0, 1000.0) * t))
+    compared(circuit_of("SKIN").replace({"Xcoat.r": 300.0 * 1.15**seed}), wave, t[::3], 1e-6)
+
+
 def test_outputs_between_the_points_and_pauses_between_bursts() -> None:
     circuit, (t, v) = circuit_of("SKIN"), points(7)
     compared(circuit, fs.PWL(t, v), np.linspace(0.0, 1.1 * t[-1], 2345), 1e-6)

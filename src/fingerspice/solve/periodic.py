@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,11 @@ from fingerspice.solve.stackstate import StackState, from_stack, model_of
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, LONGEST_STEP, SAFETY
 from fingerspice.solve.track import prepare_system
 from fingerspice.waveforms.sampling import SourceTable, source_table
+
+# In the search for a periodic state, the longest step allowed after each that was not good enough, over the last.
+_SHORTER = 0.8
+# Above this rtol the bound of what slow modes hold can be met, and alone is stated.
+_BOUNDED = 1e-9
 
 
 @dataclass(frozen=True)
@@ -142,29 +148,32 @@ def _close(problem: Problem, table: SourceTable, before: float, half: bool, rtol
     prepared = prepare_system(scene, rtol)
     # The first tolerance assumes the gap's capacitive share of the source's voltage; its peak is known only later.
     tol = LOCAL_SHARE * rtol * scale * model.k_gap
-    known = False
+    last: _Closing | None = None
+    best: _Closing | None = None
     while True:
         system = prepared.system
-        if not known:
+        if last is None:
             w = np.zeros(n)
         pace = Pace(max(tol, FINEST * scale), longest, True, False)
         code, defect = shooting.close_period(
             Stack(
                 system, prepared.tables, prepared.work, prepared.integral, table.edges, table.terms, table.series
-            ), pace, before, turned, scale, known, w, slope, counts, figures,
+            ), pace, before, turned, scale, last is not None, w, slope, counts, figures,
         )  # fmt: skip
         if code == OUT_OF_RANGE:
             prepared = prepare_system(scene, rtol, 1.5 * system.u_top)
-            known = False
+            last = best = None
             continue
-        if code != shooting.CLOSED:
+        # Where chance in the steps, times the memory, is more than `tol`, Newton's last step says how much it is.
+        if code != shooting.CLOSED and (last is None or code != shooting.NOT_CLOSED):
             break
-        errors, excess = _errors(figures, model.k_gap * scale, rtol)
-        if excess <= 1.0 or pace.tol <= FINEST * scale:
+        last = _judged(w.copy(), figures.copy(), float(defect), last, system.gap[0], model.k_gap * scale, rtol)
+        best = last if best is None or last.excess < best.excess else best
+        if last.excess <= 1.0 or pace.tol <= FINEST * scale:
             break
-        tol = pace.tol * min(0.3, 0.5 / excess)
-        known = True
-    if code != shooting.CLOSED:
+        # As a period without memory asks for; all steps are shorter, also those that `tol` does not limit.
+        tol, longest = pace.tol * min(0.3, 0.5 / last.plain), _SHORTER * longest
+    if best is None:
         status = Status.FOLD if model.mobile else Status.STEP_UNDERFLOW
         cause = ""
         if code == shooting.NOT_CLOSED:
@@ -174,20 +183,43 @@ def _close(problem: Problem, table: SourceTable, before: float, half: bool, rtol
     # The defect of two half periods is at most twice that of one: the map does not enlarge the first half's defect.
     parts = 2 if half else 1
     map_slope = slope @ slope if half else slope
-    found = Found(parts * float(defect), map_slope, float(figures[6]), errors, int(counts[1]) / parts)
-    return system.live[0] @ w, found
+    memory = float(best.figures[6])
+    return system.live[0] @ best.w, Found(parts * best.defect, map_slope, memory, best.errors, int(counts[1]) / parts)
 
 
-def _errors(figures: FloatArray, u_scale: float, rtol: float) -> tuple[FloatArray, float]:
-    """Errors of the periodic state (1, 2), V and N, and the largest ratio of an error to the error asked for.
+class _Closing(NamedTuple):
+    """A periodic state: its modes (V), the figures of its period (`shooting.N_FIGURES`) and its defect (V).
 
-    The ratio counts as 0 where the error asked for, a peak times `rtol`, underflows to 0.
+    Then its errors (1, 2), V and N; the largest ratio of an error to the error asked for; and that ratio if no error
+    were kept from earlier periods. A ratio counts as 0 where the error asked for, a peak times `rtol`, underflows to 0.
+    """
+
+    w: FloatArray
+    figures: FloatArray
+    defect: float
+    errors: FloatArray
+    excess: float
+    plain: float
+
+
+def _judged(
+    w: FloatArray, figures: FloatArray, defect: float, coarser: _Closing | None, gap: FloatArray, u_scale: float,
+    rtol: float,
+) -> _Closing:  # fmt: skip
+    """A periodic state with its errors, by those of its steps and by that found with longer steps.
+
+    Slow modes may hold the errors of all periods within their memory, if these are alike; or they are off by what they
+    have moved from the state found with longer steps. `gap` is the gap voltage by modes.
     """
     peak_u, peak_f, error_u, error_f, left, _, memory = map(float, figures)
     # Add round-off, and `left`, the last step of Newton's method, as an estimate of the error that remains after it.
-    floor = 4e-16 * (peak_u + u_scale)
+    floor = memory * 4e-16 * (peak_u + u_scale)
     steepest = 2.0 * peak_f / (peak_u or 1.0)
-    u_error = memory * (SAFETY * error_u + floor) + left
-    f_error = memory * (SAFETY * error_f + steepest * floor) + steepest * left
-    pairs = ((u_error, rtol * peak_u), (f_error, rtol * peak_f))
-    return np.array([[u_error, f_error]]), max(error / asked if asked > 0.0 else 0.0 for error, asked in pairs)
+    moved = np.inf
+    if coarser is not None and rtol <= _BOUNDED:
+        moved = SAFETY * float(np.abs(gap * (w - coarser.w)).sum())
+    own = np.array([SAFETY * error_u + floor + left, SAFETY * error_f + steepest * (floor + left)])
+    held = np.minimum((memory - 1.0) * SAFETY * np.array([error_u, error_f]), np.array([1.0, steepest]) * moved)
+    asked = rtol * np.array([peak_u, peak_f])
+    excess, plain = (float(np.divide(x, asked, where=asked > 0.0, out=np.zeros(2)).max()) for x in (own + held, own))
+    return _Closing(w, figures, defect, (own + held)[None], excess, plain)

@@ -27,11 +27,11 @@ from fingerspice.results.sensitivity import Sensitivity, Tangents, sensitivity_o
 from fingerspice.results.solution import Solution
 from fingerspice.results.steps import Recorded, Stretches, basis
 from fingerspice.solve.initial import initial_state
+from fingerspice.solve.pieces import driving
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene, scene_of
 from fingerspice.solve.stackstate import model_of, to_stack
 from fingerspice.solve.track import prepare_system
-from fingerspice.waveforms.recorded import as_samples
 
 # Error of every sweep relative to what is asked of the run, and the smallest that is more than rounding.
 _SHARE, _FINEST = 1e-2, 1e-13
@@ -97,8 +97,8 @@ def check_request(problem: Problem, paths: Sequence[str], method: str, start: st
             f"sensitivities are asked for, and {what}; allowed: a series stack with area='coupled', one of the other "
             "starts, and the methods 'auto' and 'exponential'"
         )
-    # A recording is otherwise followed sample by sample, without steps that are kept.
-    return "exponential" if as_samples(problem.waveform) is not None else method
+    # A recording, or a PWL with many points, is otherwise followed point by point, without steps that are kept.
+    return method if driving(problem) is None else "exponential"
 
 
 def _layers(one: _Varied, stack: Stack, scene: Scene) -> tuple[FloatArray, FloatArray]:

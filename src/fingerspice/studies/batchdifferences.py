@@ -29,7 +29,6 @@ from fingerspice.studies.batchladder import (
     first_level,
     friction_of,
     mesh_of,
-    short_enough,
 )
 from fingerspice.studies.batchscenes import LockstepForm, curves_of, table_of
 from fingerspice.studies.batchtask import LOCKSTEP, ONE_BY_ONE, Task
@@ -136,7 +135,8 @@ def climb_gradients(
     halves : int
         Length of the runs in half periods.
     """
-    touching, pieces, decays = mesh_of(form, table_of(form, scenes), most=MOST_PIECES)
+    mesh = mesh_of(task, form, table_of(form, scenes), most=MOST_PIECES)
+    touching, pieces = mesh.touching, mesh.pieces
     found = Slopes.empty(wanted, touching.size)
     for path in wanted.paths:
         value = scenes[path.lower()]
@@ -145,7 +145,7 @@ def climb_gradients(
         chosen = np.flatnonzero(touching & (pieces == count))
         for covered in COVERED:
             some = {path: array[chosen] for path, array in scenes.items()}
-            which = chosen, decays[chosen]
+            which = chosen, mesh.least[chosen]
             chosen = _climb_one(task, wanted, form, some, (halves, count), covered, which, found)
     return found
 
@@ -156,7 +156,7 @@ def _climb_one(
 ) -> NDArray[np.int64]:  # fmt: skip
     """Differentiate `scenes`, at `which` places of `found`; the rest is as in `batchladder`."""
     steps, degree = first_level(task.rtol, form, mesh[1])
-    (place, decays), pairs = which, 2 * len(wanted.paths)
+    (place, needed), pairs = which, 2 * len(wanted.paths)
     # What ends the search for a periodic state moves a difference by 1 / STEP of itself.
     closer = replace(task, rtol=task.rtol * STEP)
     before: Run | None = None
@@ -174,7 +174,7 @@ def _climb_one(
         own, coarse = (_changes(wanted, one[0], rows, friction_of(form, moved)) for one in (run.fine, run.coarse))
         share = _STATED_JUMPING if form.jumping else _STATED
         error = np.maximum(_error(own, coarse, run, degree, share), least)
-        good = (error <= ENOUGH * LIMIT * task.rtol) & short_enough(decays[pending], mesh[1], steps)
+        good = (error <= ENOUGH * LIMIT * task.rtol) & (needed[pending] <= steps)
         at = place[pending[good]]
         for k, path in enumerate(wanted.paths):
             for j, name in enumerate(wanted.outputs):

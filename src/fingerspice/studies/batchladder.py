@@ -12,7 +12,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.lockcard import Lengths, march_on_card
 from fingerspice.engine.lockmarch import march, new_stepping, put_traces, trace_changes
 from fingerspice.engine.locksamples import N_PORTION, march_samples
-from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, OMEGA, REST, STRESS, new_block
+from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
 from fingerspice.engine.lockstep import ALL_MOMENTS, START_TIMES, marks_of
 from fingerspice.studies.batchscenes import Curves, LockstepForm, curves_of, peak_of, table_of
 from fingerspice.studies.batchtask import LOCKSTEP, Answers, Task
@@ -37,19 +37,23 @@ CLOSING, SETTLED, ROUNDING = 0.02, 0.05, 1e-11
 # the factor _MOST_GAIN.
 _STATED, _STATED_JUMPING = ((5e-6, 0.25), (5e-7, 0.5), (0.0, 0.8)), 0.5
 # Where a step is longer than this many of the fastest time constants, the start of a run from rest is not resolved, and
-# the change is no larger than the error.
-_STIFF, _STATED_STIFF = 2.0, 0.8
+# the change is no larger than the error; it is smaller where that start is most of the error.
+_STIFF, _STATED_STIFF = 2.0, ((5e-6, 0.8), (0.0, 2.5))
 # A gap voltage shows the kinks at its zeros more than means do.
 _STATED_TRACED = 0.8
 # Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
 # 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
 _STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
+# What decays after a start away from 0 V meets steps of several lengths, whose errors may cancel with half the steps.
+_STATED_STARTED = 2.0
 _MOST_GAIN = 24.0
 # Under sines and below this rtol, where the kinks are most of the error, no scene is accepted before the steps have
 # been doubled once, with a smaller such factor.
 _DOUBTFUL, _GAIN_IN_DOUBT = 5e-7, 12.0
-# Longest first step after a jump of the source, in time constants of the fastest cell.
-_LONGEST_STEP = 1.0
+# Longest first step after a jump of a square, and longest step at all of a run whose source is not 0 V at its start, in
+# time constants of the fastest cell; and the voltage at the start that counts as 0 V, over all tones. Also from
+# there a leaking gap's voltage jumps, as it leads the source: below this rtol the first step is as short as a square's.
+_LONGEST_STEP, _FROM_ZERO, _LEADING = 1.0, 1e-12, 5e-6
 # Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
 # `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
 _PIECES = ((5e-5, 8), (5e-7, 12), (0.0, 24))
@@ -111,12 +115,12 @@ def climb(
     """
     table = table_of(form, scenes)
     mu = friction_of(form, scenes)
-    touching, pieces, decays = mesh_of(form, table, most=1 if task.traced else MOST_PIECES)
+    mesh = mesh_of(task, form, table, most=1 if task.traced else MOST_PIECES)
     # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
     order = np.argsort(_leakage_rates(form, table).min(axis=0)) if halves > 4 else np.arange(mu.size)
-    every = _Scenes(table, mu, decays, members)
-    for count in np.unique(pieces[touching]).tolist():
-        pending = order[(touching & (pieces == count))[order]]
+    every = _Scenes(table, mu, mesh, members)
+    for count in np.unique(mesh.pieces[mesh.touching]).tolist():
+        pending = order[(mesh.touching & (mesh.pieces == count))[order]]
         for covered in COVERED:
             pending = _climb_one(task, form, every, (halves, count), covered, pending, found)
 
@@ -127,16 +131,31 @@ def friction_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatAr
     return np.broadcast_to(mu, next(iter(scenes.values())).shape)
 
 
-def mesh_of(form: LockstepForm, table: FloatArray, most: int) -> tuple[BoolArray, NDArray[np.int64], FloatArray]:
-    """Whether there is contact, pieces of a half period (0: no jumps), and half a period in the fastest time constants.
+class Mesh(NamedTuple):
+    """What scenes need of their steps, each of shape (n,).
 
-    Parameters
+    Attributes
     ----------
-    form : LockstepForm
-    table : ndarray, shape (n_row, n)
-    most : int
-        Largest number of pieces. Each is twice as long as the one before, so that gap voltages at equal distances need
-        a single one.
+    touching : ndarray of bool
+        Whether there is contact.
+    pieces : ndarray of int
+        Pieces of a half period; 0 for a source that is no square.
+    decays : ndarray
+        Half a period in time constants of the fastest cell.
+    least : ndarray
+        Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0.
+    """
+
+    touching: BoolArray
+    pieces: NDArray[np.int64]
+    decays: FloatArray
+    least: FloatArray
+
+
+def mesh_of(task: Task, form: LockstepForm, table: FloatArray, most: int) -> Mesh:
+    """What the scenes of a table (n_row, n) need of their steps, with at most so many pieces of a half period.
+
+    Each piece is twice as long as the one before, so that gap voltages at equal distances need a single one.
     """
     others = CELL_ROWS * form.cells
     touching = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
@@ -145,7 +164,16 @@ def mesh_of(form: LockstepForm, table: FloatArray, most: int) -> tuple[BoolArray
     decays = np.max(_leakage_rates(form, table), axis=0) * np.pi
     if form.jumping:
         pieces = np.ceil(np.log2(1.0 + _PIECE_START * decays)).clip(1, most).astype(int)
-    return touching, pieces, decays
+        first = pieces / (2.0**pieces - 1.0)
+    elif task.periodic:
+        first = 0.0
+    elif form.recording is not None:
+        first = 0.5 * (form.recording.between(0, 1)[0] != 0.0)
+    else:
+        sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
+        from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
+        first = np.where(from_zero, START_TIMES[1] if task.rtol < _LEADING else 0.0, 1.0)
+    return Mesh(touching, pieces, decays, 2.0 * first * decays / _LONGEST_STEP)
 
 
 def _leakage_rates(form: LockstepForm, table: FloatArray) -> FloatArray:
@@ -165,19 +193,12 @@ def first_level(rtol: float, form: LockstepForm, pieces: int) -> tuple[int, int]
     return steps, degree
 
 
-def short_enough(decays: FloatArray, pieces: int, steps: int) -> BoolArray:
-    """Whether the first step after a jump, if there is one, is short enough; `decays` as `mesh_of` gives them."""
-    # That step, in half periods, times the number of steps a period.
-    shortest = 2.0 * pieces / (2.0**pieces - 1.0) if pieces > 0 else 0.0
-    return np.asarray(decays * shortest <= _LONGEST_STEP * steps)
-
-
 class _Scenes(NamedTuple):
-    """Table of scenes, friction coefficient, half a period in time constants of the fastest cell, places of answers."""
+    """Table of scenes, friction coefficient, what they need of their steps, places of answers."""
 
     table: FloatArray
     mu: FloatArray
-    decays: FloatArray
+    mesh: Mesh
     members: NDArray[np.int64]
 
 
@@ -208,9 +229,10 @@ def _climb_one(
             break
         level = Level(task, form, mesh, steps, degree, covered, ALL_MOMENTS if needed[-1] else 1, traced)
         now = level.run(table, pending, curves, before)
-        error = level.error(now, needed, scenes.decays[pending])
+        error = level.error(now, needed, scenes.mesh.decays[pending], scenes.mesh.least[pending])
         error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
-        good = (error <= ENOUGH * task.rtol) & short_enough(scenes.decays[pending], pieces, steps)
+        resolved = scenes.mesh.least[pending] <= steps
+        good = (error <= ENOUGH * task.rtol) & resolved
         good &= before is not None or not doubtful
         at = pending[good]
         places = scenes.members[at]
@@ -225,7 +247,7 @@ def _climb_one(
         found.error[places], found.status[places], found.done[places] = error[good] / ENOUGH, LOCKSTEP, True
         # More steps are no help where the area's polynomial of the highest degree is what limits the error.
         # A scene whose estimate grows from twice the steps, too: the explicit steps may be unstable around that area.
-        beyond = np.isinf(now.fine[-1]) | ~good & (error > last)
+        beyond = np.isinf(now.fine[-1]) | ~good & resolved & (error > last)
         outside.append(pending[beyond])
         left = ~good & ~beyond & ((degree < HIGHEST_DEGREE) | (before is None) | (now.fine[-1] <= ENOUGH * task.rtol))
         before = Run(now.fine[:, left], now.fine[:, left], now.trace[left], now.trace[left])
@@ -299,8 +321,8 @@ class Level(NamedTuple):
         none = np.empty((pending.size, 0))
         return Run(out[0] if before is None else before.fine, out[1], none, none)
 
-    def error(self, run: Run, needed: list[int], decays: FloatArray) -> FloatArray:
-        """Largest estimated relative error of the outputs, for each scene; `decays` as `mesh_of` gives them."""
+    def error(self, run: Run, needed: list[int], decays: FloatArray, fewest: FloatArray) -> FloatArray:
+        """Largest estimated relative error of the outputs, for each scene; see `Mesh` for `decays`, and `least`."""
         peak, closing, tail = run.fine[-3:]
         changes = [np.zeros(peak.size)]
         for row in needed:
@@ -321,8 +343,11 @@ class Level(NamedTuple):
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
         change = np.max(changes, axis=0) + run.coarse[-1]
-        least = _STATED_TRACED if self.traced else next(s for least, s in _STATED if self.task.rtol >= least)
-        share = np.where(2.0 * decays > _STIFF * self.steps, max(least, _STATED_STIFF), least)
+        least, stiff = (next(s for rtol, s in shares if self.task.rtol >= rtol) for shares in (_STATED, _STATED_STIFF))
+        least = _STATED_TRACED if self.traced else least
+        share = np.where(2.0 * decays > _STIFF * self.steps, max(least, stiff), least)
+        # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
+        share = np.where(fewest > decays, _STATED_STARTED, share)
         if self.form.jumping:
             share = np.full(peak.size, _STATED_JUMPING)
         if self.form.recording is not None:
