@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
+from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.segment import Segment, source
 from fingerspice.solve.sources import LOOKS
 from fingerspice.waveforms.sampling import SourceTable, on_grid, source_table
@@ -429,3 +431,17 @@ def test_a_function_of_single_numbers_is_not_called_more_often_for_short_events(
     for function in (one, many):
         fs.simulate(circuit, sources=function, t_stop=0.05, rtol=1e-4)
     assert 15_000 < seen[1] - seen[0] < 25_000
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.floats(0.0, 0.05), st.floats(-5.5, -2.0), st.sampled_from([1e-4, 1e-8]))
+def test_a_function_that_rises_out_of_next_to_nothing_costs_no_more(middle: float, width: float, rtol: float) -> None:
+    calls: list[int] = []
+
+    def bump(t: FloatArray) -> FloatArray:
+        calls.append(np.size(t))
+        return 100.0 * np.exp(-(((t - middle) / 10.0**width) ** 2))
+
+    run = fs.simulate(table1(), sources=fs.Function(bump, breaks=(middle,)), t_stop=0.05, rtol=rtol, charge=False)
+    assert run.success
+    assert sum(calls) < 400_000

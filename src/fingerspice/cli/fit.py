@@ -47,13 +47,14 @@ def fit(
     with Answering("fit", as_json, charge_law=charge_law) as answer:
         from fingerspice.studies.fit import fit as find
 
+        grouped = _groups(groups)
         circuit = read_circuit(deck, changes, None)
         answer.update(**answers.of_circuit(circuit, charge_law))
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         file, image = results.file("_fit.csv"), None if no_plot else results.file("_fit.png")
         paths = [path.strip() for path in free.split(",")]
         found = find(
-            circuit, table, paths, groups=_groups(groups), average=average, skin=skin, charge_law=charge_law,
+            circuit, table, paths, groups=grouped, average=average, skin=skin, charge_law=charge_law,
             profiles=profile,
         )  # fmt: skip
         _give(answer, results, found, file, image)

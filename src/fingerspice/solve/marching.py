@@ -42,7 +42,8 @@ def solve(
     """
     tables = Tables(problem, LOCAL_SHARE * rtol, t_out=t_out)
     is_stack = problem.scene.stack is not None
-    u_scale = scale_of(problem, tables) if is_stack else problem.largest or GUESS
+    met = tables.peak() if is_stack or problem.scene.is_sampled else 0.0
+    u_scale = scale_of(problem, met) if is_stack else max(problem.largest, met) or GUESS
     tol, top, nfev, attempts, tries_out = LOCAL_SHARE * rtol, 0.0, 0, 0, True
     # The voltages of sources that cancel are rounding errors of those of their parts.
     finest = FINEST * max(1.0, problem.scene.u_size / u_scale)

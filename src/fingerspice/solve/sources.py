@@ -52,8 +52,10 @@ class Tables:
         self.rough = 0.0
         self.unseen: tuple[float, float, int] | None = None
         self.not_finite: float | None = None
-        # Largest value (V or A) of each source in the windows so far.
-        self.scales = [0.0] * len(problem.waveforms)
+        # Largest value (V or A) of each source in the windows so far, and among a few of its samples: a function that
+        # rises out of next to nothing would be followed there beyond its own digits.
+        peaks = [wave.kept.get("peak", (None, 0.0))[1] for wave in problem.waveforms]
+        self.scales = [peak if np.isfinite(peak) else 0.0 for peak in peaks]
         self.kept: dict[Any, list[SourceTable]] | None = {} if problem.scene.is_sampled else None
         if self.kept is None and len(self.edges) <= 1 + KEPT_WINDOWS:
             self.kept = problem.waveform.kept.setdefault("tables", {})
@@ -89,10 +91,12 @@ class Tables:
         return table
 
     def peak(self) -> float:
-        """Largest source voltage (V) of the run."""
-        if self.kept is None:
-            return self.problem.waveform.peak(self.problem.t_start, self.problem.t_stop)
-        return max(table.scale for tables in self for table in tables)
+        """Largest source voltage (V) of the run; of users' functions also between the samples that a scene knows."""
+        problem, n_voltage = self.problem, self.problem.network.n_voltage
+        if not problem.scene.is_sampled:
+            return problem.scene.u_peak or problem.waveform.peak(problem.t_start, problem.t_stop)
+        met = (table.scale for tables in self for table in tables[:n_voltage])
+        return max(met, default=0.0) or problem.scene.u_peak
 
 
 def shortest_event(problem: Problem) -> float:

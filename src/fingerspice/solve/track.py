@@ -32,7 +32,7 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run, kept_with
 from fingerspice.solve.scenes import Scene
 from fingerspice.solve.settling import Settling
-from fingerspice.solve.sources import Tables, segment_index
+from fingerspice.solve.sources import segment_index
 from fingerspice.solve.stackstate import (
     StackState,
     as_marched,
@@ -340,8 +340,8 @@ def _segment(sources: Sources, t: float, side: Literal["left", "right"]) -> tupl
     return Segment(start, float(sources.edges[i + 1]) - start, sources.terms[i], sources.series[i]), t - start
 
 
-def scale_of(problem: Problem, tables: Tables) -> float:
-    """Largest gap voltage to expect, V."""
-    peak, start = problem.scene.u_peak or tables.peak(), problem.inner
+def scale_of(problem: Problem, peak: float) -> float:
+    """Largest gap voltage to expect under a source with this peak, V."""
+    start = problem.inner
     share = peak * model_of(problem.scene).k_gap if np.isfinite(peak) else 0.0
     return max(share, float(np.abs(start.y[:-1]).max(initial=0.0))) or 1.0

@@ -95,9 +95,9 @@ def fit(
         If a column, unit or path is unknown, there are fewer data than parameters, or no start can be run.
     """
     require_circuit(circuit)
+    starts, rtol = whole_number("starts", starts, 1), rtol_given(rtol)
     table, unknowns = _request(circuit, data, parameters, groups)
     task = _task(circuit, table, unknowns, bounds, average, skin, charge_law, rtol)
-    starts = whole_number("starts", starts, 1)
     wanted = profiled(tuple(one.name for one in task.unknowns), profiles)
     said = [*table.unusual(circuit), *(scenes_warnings(circuit, None, table.conditions) if skin == "own" else ())]
     for text in filter(None, said):
@@ -217,7 +217,7 @@ def _task(
     exact = is_stack(circuit) and build_stack(circuit).contact is not None and table.signal != IMPEDANCE
     every = tuple(one.path for one in unknowns)
     circuit, box = bounds_of(circuit, every, bounds or {})
-    return Task(circuit, table, unknowns, box, average, skin, rtol_given(rtol), charge_law, target, scale, exact)
+    return Task(circuit, table, unknowns, box, average, skin, rtol, charge_law, target, scale, exact)
 
 
 def _target(table: Data) -> tuple[FloatArray, FloatArray]:
