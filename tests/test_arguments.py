@@ -172,7 +172,7 @@ ROWS: dict[str, Any] = {
             fs.Samples([0.0, 1.0], 1.0), fs.PWL([0.0, 1.0], [0.0, 1.0]), fs.Function(np.sin),
         )
     },
-    "t_eval": lambda x: fs.simulate(table1(), t_stop=2.0, t_eval=x, area="frozen", sources=fs.DC(0.0)).t,
+    "t_eval": lambda x: fs.simulate(table1(), t_stop=2.0, t_eval=x, area="frozen", sources=fs.DC(1.0)).t,
     "a batch": lambda x: fs.batch(table1(), {"Vdrive.amplitude": x}, rtol=1e-2, periods=1.0).f_el_mean.to_numpy(),
     "a sweep": lambda x: fs.sweep(table1(), {"Vdrive.offset": x}, rtol=1e-2, periods=1.0).f_el_mean.to_numpy(),
     "a force": lambda x: fs.inverse_drive(table1(), force=x, rate=1e3, limit=1.0).drive.values,

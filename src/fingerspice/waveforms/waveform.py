@@ -158,8 +158,10 @@ class Waveform:
         size = np.abs(self.value(t))
         quick = self.shortest_time()
         if quick < (t1 - t0) / 64.0:
-            # A carrier is sampled too coarsely: look at whole cycles of it about the largest values.
-            about = t[np.argsort(size)[-8:], None] + quick * np.linspace(-0.5, 0.5, 65)
+            # A carrier is sampled too coarsely: its amplitude follows from values a quarter of a cycle apart. Look at
+            # whole cycles where that is largest.
+            amplitude = np.hypot(size, self.value(np.minimum(t + 0.25 * quick, t1)))
+            about = t[np.argsort(amplitude)[-8:], None] + quick * np.linspace(-0.5, 0.5, 65)
             size = np.append(size, np.abs(self.value(np.clip(about, t0, t1))))
         breakpoints = self.breakpoints(t0, t1)
         values = [size, *(np.abs(self.value(breakpoints, side)) for side in ("right", "left") if breakpoints.size)]
