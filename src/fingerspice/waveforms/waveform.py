@@ -150,7 +150,7 @@ class Waveform:
         return Fundamental(frequency, abs(p), math.atan2(p.imag, p.real))
 
     def peak(self, t0: float, t1: float) -> float:
-        """Largest ``|U|`` (V) over [t0, t1]; exact at breakpoints, within a few parts in a thousand elsewhere."""
+        """Largest ``|U|`` (V) over [t0, t1]; exact at breakpoints, within a percent elsewhere."""
         if self.period is not None:
             # All periods after `settled` are equal, so that the first of them gives the peak of all.
             t1 = min(t1, max(t0, self.settled) + self.period)
