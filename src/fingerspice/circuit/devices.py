@@ -26,28 +26,17 @@ Cells = Callable[[Mapping[str, float], float | None], FloatArray]
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """One parameter of a device, in the unit of the netlist.
-
-    Attributes
-    ----------
-    name, unit : str
-    default : float or None
-        None for a parameter that the netlist must give.
-    usual : Usual or None
-        Range outside which a warning is given.
-    may_be_zero, may_be_infinite : bool
-        Whether 0, or infinity, is allowed besides positive numbers.
-    least, most : float
-        Range of all other numbers: wide enough for any device, and so narrow that products and quotients do not
-        overflow.
-    """
+    """One parameter of a device, in the unit of the netlist."""
 
     name: str
     unit: str
-    default: float | None = None
-    usual: Usual | None = None
+    default: float | None = None  # None for a parameter that the netlist must give
+    usual: Usual | None = None  # Range outside which a warning is given
+    # may_be_zero, may_be_infinite: Whether 0, or infinity, is allowed besides positive numbers
     may_be_zero: bool = False
     may_be_infinite: bool = False
+    # least, most: Range of all other numbers: wide enough for any device, and so narrow that products and quotients do
+    # not overflow
     least: float = 1e-30
     most: float = 1e30
 

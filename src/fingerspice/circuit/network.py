@@ -50,62 +50,36 @@ class Network:
     """A connected network of capacitors, resistors, sources and layers. SI throughout.
 
     n live states, one for each capacitor of the tree; n_s sources, voltage sources first.
-
-    Attributes
-    ----------
-    sources : tuple of Element
-    n_voltage : int
-        Number of voltage sources among them.
-    cells : tuple of Cell
-    layers : tuple of Element
-        Elements whose capacitance scales with an area, in deck order.
-    live : tuple of int
-        Index of the cell whose voltage is the live state, for each live state.
-    areas : tuple of Area
-    contacts : tuple of Contact or None
-        Contact of each area; None for an area without GAP.
-    gaps : tuple of int or None
-        Index of the cell of each area's GAP.
-    p, q : ndarray, shape (n_cell, n) and (n_cell, n_s)
-        u = p x + q s.
-    k, b : ndarray, shape (n, n) and (n, n_s)
-        Currents of the resistors and the current sources into the cuts of the live capacitors, S.
-    through : ndarray, shape (n_s, n_cell)
-    delivered : ndarray, shape (n_s, n + n_s)
-        The current that each source delivers (a V out of its p node, an I out of its n node) is
-        through @ i + delivered @ (x, s), with the currents i of the cells.
-    resistor_factor, resistor_factor_s : ndarray, shape (n_r, n) and (n_r, n_s)
-        Factors f and f_s with k = f^T f and, in the columns of the voltage sources, b = f^T f_s; f_s is zero in the
-        columns of the current sources.
-    node_names : tuple of str
-    nodes : ndarray, shape (n_node, n + n_s + n_inner)
-        Node voltages from x, s and the inner sources.
-    stack : Stack or None
-        The series stack if this is its network (see `loop`): modes and phasors are then computed from the stack, to
-        full relative precision.
-    kept : dict
-        Cache of results that do not depend on the sources, shared by networks that differ in their sources only.
     """
 
     sources: tuple[Element, ...]
-    n_voltage: int
+    n_voltage: int  # Number of voltage sources among them
     cells: tuple[Cell, ...]
-    layers: tuple[Element, ...]
-    live: tuple[int, ...]
+    layers: tuple[Element, ...]  # Elements whose capacitance scales with an area, in deck order
+    live: tuple[int, ...]  # Index of the cell whose voltage is the live state, for each live state
     areas: tuple[Area, ...]
-    contacts: tuple[Contact | None, ...]
-    gaps: tuple[int | None, ...]
+    contacts: tuple[Contact | None, ...]  # Contact of each area; None for an area without GAP
+    gaps: tuple[int | None, ...]  # Index of the cell of each area's GAP
+    # p, q (n_cell, n): u = p x + q s
     p: FloatArray
     q: FloatArray
+    # k, b (n, n): Currents of the resistors and the current sources into the cuts of the live capacitors, S
     k: FloatArray
     b: FloatArray
-    through: FloatArray
+    through: FloatArray  # (n_s, n_cell)
+    # (n_s, n + n_s): The current that each source delivers (a V out of its p node, an I out of its n node) is through @
+    # i + delivered @ (x, s), with the currents i of the cells
     delivered: FloatArray
+    # resistor_factor, resistor_factor_s (n_r, n): Factors f and f_s with k = f^T f and, in the columns of the voltage
+    # sources, b = f^T f_s; f_s is zero in the columns of the current sources
     resistor_factor: FloatArray
     resistor_factor_s: FloatArray
     node_names: tuple[str, ...]
-    nodes: FloatArray
+    nodes: FloatArray  # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources
+    # The series stack if this is its network (see `loop`): modes and phasors are then computed from the stack, to full
+    # relative precision
     stack: Stack | None = None
+    # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
     kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -278,26 +252,15 @@ def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
 
 @dataclass(frozen=True)
 class Modes:
-    """Modes v of a network with fixed areas: x = shape v - follow s, with v_k' = -rates_k v_k + gains_k s.
+    """Modes v of a network with fixed areas: x = shape v - follow s, with v_k' = -rates_k v_k + gains_k s."""
 
-    Attributes
-    ----------
-    rates : ndarray, shape (n,)
-        1/s; zero for a charge that no conductance drains.
-    gains : ndarray, shape (n, n_s)
-    shape, inverse : ndarray, shape (n, n)
-        v = inverse (x + follow s).
-    follow : ndarray, shape (n, n_s)
-        A jump ds of the sources changes x by -follow ds, and v not at all.
-    take : ndarray, shape (n, n_cell)
-        Currents j (A) through the cells in addition to their linear ones contribute -take j to v'.
-    """
-
-    rates: FloatArray
-    gains: FloatArray
+    rates: FloatArray  # (n,): 1/s; zero for a charge that no conductance drains
+    gains: FloatArray  # (n, n_s)
+    # shape, inverse (n, n): v = inverse (x + follow s)
     shape: FloatArray
     inverse: FloatArray
-    follow: FloatArray
+    follow: FloatArray  # (n, n_s): A jump ds of the sources changes x by -follow ds, and v not at all
+    # (n, n_cell): Currents j (A) through the cells in addition to their linear ones contribute -take j to v'
     take: FloatArray
 
 

@@ -60,22 +60,15 @@ class Resistors(NamedTuple):
     """What resistors do in a network, with the voltages of the tree's resistors eliminated.
 
     The tree's other voltages are e = (s, x), those of its sources and its capacitors.
-
-    Attributes
-    ----------
-    from_e, from_i : ndarray, shape (n_r, n_e) and (n_r, n_i)
-        Voltages of the tree's resistors by e, and by the currents of the current sources.
-    into_e, into_i : ndarray, shape (n_e, n_e) and (n_e, n_i)
-        Currents into the cuts of the tree's sources and capacitors, by both.
-    factor : ndarray, shape (n_resistor, n_e)
-        Square roots of the power in each resistor, by e: into_e = factor' factor.
     """
 
+    # from_e, from_i (n_r, n_e): Voltages of the tree's resistors by e, and by the currents of the current sources
     from_e: FloatArray
     from_i: FloatArray
+    # into_e, into_i (n_e, n_e): Currents into the cuts of the tree's sources and capacitors, by both
     into_e: FloatArray
     into_i: FloatArray
-    factor: FloatArray
+    factor: FloatArray  # (n_resistor, n_e): Square roots of the power in each resistor, by e: into_e = factor' factor
 
 
 def eliminate(over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_e: int) -> Resistors:

@@ -22,25 +22,13 @@ from fingerspice.waveforms.waveform import Fundamental
 
 @dataclass(frozen=True)
 class LinearScene:
-    """The data of a circuit that the phasors of one of its contacts depend on.
-
-    Attributes
-    ----------
-    network : Network
-    contact : Contact
-    gap : int
-        Index of the GAP among the layers.
-    finger : int
-        Index of the GAP's area.
-    note : str
-        Text that names the GAP if there are several; empty for one GAP.
-    """
+    """The data of a circuit that the phasors of one of its contacts depend on."""
 
     network: Network
     contact: Contact
-    gap: int
-    finger: int
-    note: str
+    gap: int  # Index of the GAP among the layers
+    finger: int  # Index of the GAP's area
+    note: str  # Text that names the GAP if there are several; empty for one GAP
 
     @property
     def fixed(self) -> bool:

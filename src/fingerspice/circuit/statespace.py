@@ -35,40 +35,20 @@ class Stack:
     """Layers in one series loop with an ideal source, sharing one area. SI throughout.
 
     A layer is one cell, which is a capacitor parallel to a resistor, or, for a dispersive material, several in series.
-
-    Attributes
-    ----------
-    layers : tuple of Element
-        In loop order, from the source's positive side.
-    cells : tuple of int
-        Number of cells of each layer; the arrays below list the cells of a layer one after the other.
-    sign : ndarray, shape (n_cell,)
-        +1 for a layer whose p node comes first along the loop, -1 for a layer whose n node does.
-    c : ndarray, shape (n_cell,)
-        Capacitance per area, F/m^2.
-    g_total : ndarray, shape (n_cell,)
-        Leakage conductance independent of the area, S.
-    g_area : ndarray, shape (n_cell,)
-        Leakage conductance per area, S/m^2.
-    gap : int or None
-        Index of the gap among the cells.
-    contact : Contact or None
-    area_given : float or None
-        Area fixed by the deck, m^2.
-    hops : tuple of Hop
-        The elements of the loop in order, from ground to ground.
     """
 
-    layers: tuple[Element, ...]
+    layers: tuple[Element, ...]  # In loop order, from the source's positive side
+    # Number of cells of each layer; the arrays below list the cells of a layer one after the other
     cells: tuple[int, ...]
+    # (n_cell,): +1 for a layer whose p node comes first along the loop, -1 for a layer whose n node does
     sign: FloatArray
-    c: FloatArray
-    g_total: FloatArray
-    g_area: FloatArray
-    gap: int | None
+    c: FloatArray  # (n_cell,): Capacitance per area, F/m^2
+    g_total: FloatArray  # (n_cell,): Leakage conductance independent of the area, S
+    g_area: FloatArray  # (n_cell,): Leakage conductance per area, S/m^2
+    gap: int | None  # Index of the gap among the cells
     contact: Contact | None
-    area_given: float | None
-    hops: tuple[Hop, ...]
+    area_given: float | None  # Area fixed by the deck, m^2
+    hops: tuple[Hop, ...]  # The elements of the loop in order, from ground to ground
 
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:

@@ -30,24 +30,12 @@ class Hop:
 
 @dataclass(frozen=True)
 class Area:
-    """A contact area of a circuit, with the GAP or the value that determines it.
+    """A contact area of a circuit, with the GAP or the value that determines it."""
 
-    Attributes
-    ----------
-    node : str
-        Canonical name of the area node.
-    gap : Element or None
-        The GAP that drives it.
-    given : float or None
-        m^2, from a DC source on the node or the gap's a_fix.
-    source : Element or None
-        The DC source that gives the area, or None.
-    """
-
-    node: str
-    gap: Element | None
-    given: float | None
-    source: Element | None = None
+    node: str  # Canonical name of the area node
+    gap: Element | None  # The GAP that drives it
+    given: float | None  # m^2, from a DC source on the node or the gap's a_fix
+    source: Element | None = None  # The DC source that gives the area, or None
 
 
 @dataclass(frozen=True)

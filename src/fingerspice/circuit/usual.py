@@ -16,22 +16,14 @@ _MILLIONS = {"mm^2": (6, -6), "mm^2/N^m": (6, -6), "mm^4/N^2": (12, -12)}
 
 @dataclass(frozen=True)
 class Usual:
-    """Usual range of a quantity, both ends included.
+    """Usual range of a quantity, both ends included."""
 
-    Attributes
-    ----------
-    least, most : float
-        Smallest and largest usual size of the quantity, in its unit. 0 and inf mean "none" and cause no warning.
-    source : str
-        Origin of the range, as words to stand in brackets.
-    slip : str
-        The unit, and the other unit for which it is often taken, such as ``newton, not millinewton``.
-    """
-
+    # least, most: Smallest and largest usual size of the quantity, in its unit. 0 and inf mean "none" and cause no
+    # warning.
     least: float
     most: float
-    source: str
-    slip: str = ""
+    source: str  # Origin of the range, as words to stand in brackets
+    slip: str = ""  # The unit, and the other unit for which it is often taken, such as ``newton, not millinewton``
 
     def warning(self, what: str, value: float, unit: str) -> str | None:
         """The warning about a value outside the range; None for a value inside.

@@ -43,29 +43,18 @@ _NEWTON = 2
 
 
 class Room(NamedTuple):
-    """Arrays of a sweep.
+    """Arrays of a sweep."""
 
-    Attributes
-    ----------
-    reached : ndarray, shape (n,)
-        The adjoint state; after the sweep that at the start of the run.
-    weight, fixed : ndarray, shape (n, 8)
-        Weights of a step, and those of the usual one.
-    state, forcing, density : ndarray, shape (3, n), (3, n) and (3,)
-        At the end, middle and start of a step.
-    place : ndarray, shape (3, 4 + n_tap)
-        q, dq, u, U and X there.
-    cuts, found : ndarray
-        Fractions at which a step is cut, and moments.
-    """
-
-    reached: FloatArray
+    reached: FloatArray  # (n,): The adjoint state; after the sweep that at the start of the run
+    # weight, fixed (n, 8): Weights of a step, and those of the usual one
     weight: FloatArray
     fixed: FloatArray
+    # state, forcing, density (3, n): At the end, middle and start of a step
     state: FloatArray
     forcing: FloatArray
     density: FloatArray
-    place: FloatArray
+    place: FloatArray  # (3, 4 + n_tap): q, dq, u, U and X there
+    # cuts, found: Fractions at which a step is cut, and moments
     cuts: FloatArray
     found: FloatArray
 

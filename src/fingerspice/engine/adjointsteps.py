@@ -20,61 +20,36 @@ MOST_PARTS = 40
 
 
 class Course(NamedTuple):
-    """A run at the start, middle and end of n steps: node 2 j begins step j.
+    """A run at the start, middle and end of n steps: node 2 j begins step j."""
 
-    Attributes
-    ----------
-    h : ndarray, shape (n,)
-        Lengths of the steps, s.
-    u, s : ndarray, shape (2 n + 1,)
-        Gap voltage and source along the loop, V.
-    held : ndarray, shape (2 n + 1,)
-        Under `mobile` (u - k_gap U) A (V m^2), which is smooth where u is 0 and its slope jumps; else no entry.
-    x : ndarray, shape (n_tap, 2 n + 1)
-        X_t, V.
-    q, dq : ndarray, shape (2 n + 1,)
-        1/A (1/m^2) and its derivative by the gap voltage.
-    sample : ndarray of int, shape (n,)
-        Number of the sample before each step.
-    share, width : ndarray, shape (n,)
-        Where each step starts between this sample and the next one, and its length, in distances of samples.
-    """
-
-    h: FloatArray
+    h: FloatArray  # (n,): Lengths of the steps, s
+    # u, s (2 n + 1,): Gap voltage and source along the loop, V
     u: FloatArray
     s: FloatArray
+    # (2 n + 1,): Under `mobile` (u - k_gap U) A (V m^2), which is smooth where u is 0 and its slope jumps; else no
+    # entry
     held: FloatArray
-    x: FloatArray
+    x: FloatArray  # (n_tap, 2 n + 1): X_t, V
+    # q, dq (2 n + 1,): 1/A (1/m^2) and its derivative by the gap voltage
     q: FloatArray
     dq: FloatArray
-    sample: IntArray
+    sample: IntArray  # (n,): Number of the sample before each step
+    # share, width (n,): Where each step starts between this sample and the next one, and its length, in distances of
+    # samples
     share: FloatArray
     width: FloatArray
 
 
 class Wanted(NamedTuple):
-    """The scalar J: the mean of an integrand from a time on, and values at single times.
+    """The scalar J: the mean of an integrand from a time on, and values at single times."""
 
-    Attributes
-    ----------
-    by_force, by_area : float
-        Weights of force (1/N) and area (1/m^2) in the integrand, over the length of its interval (s).
-    since : tuple of int and float
-        Step, and fraction of it, at which this interval begins.
-    step : ndarray of int, shape (m,)
-        Step of each value, ascending.
-    at : ndarray, shape (m,)
-        Fraction of the step, ascending in each step.
-    weight : ndarray, shape (m,)
-        Derivative of J by the gap voltage there, 1/V.
-    """
-
+    # by_force, by_area: Weights of force (1/N) and area (1/m^2) in the integrand, over the length of its interval (s)
     by_force: float
     by_area: float
-    since: tuple[int, float]
-    step: IntArray
-    at: FloatArray
-    weight: FloatArray
+    since: tuple[int, float]  # Step, and fraction of it, at which this interval begins
+    step: IntArray  # (m,): Step of each value, ascending
+    at: FloatArray  # (m,): Fraction of the step, ascending in each step
+    weight: FloatArray  # (m,): Derivative of J by the gap voltage there, 1/V
 
 
 @jit_within

@@ -14,28 +14,19 @@ from fingerspice.engine.model import Model
 
 
 class Charges(NamedTuple):
-    """Rows of a block for the charge.
+    """Rows of a block for the charge."""
 
-    Attributes
-    ----------
-    q : ndarray, shape (4, n)
-        1/A at the ends of the steps and at `PLACES`, 1/m^2.
-    steps : ndarray, shape (10, n)
-        Rate of the charge at 0, 1/4, 1/2, 3/4 and 1 of each step (A), the charge gained in the step, the error of this
-        gain, and, in steps of several samples, the triangles of the rate at `PLACES` times the step length (C).
-    z, rest, current, error : ndarray, shape (n,)
-        Charge (C), that without c r G(u), and current (A) at the starts of the steps, and error of the slowest layer's
-        voltage (V).
-    h, t : ndarray, shape (n,)
-        Lengths of the steps, and their limits, s; the limits are needed for outputs within steps only.
-    """
-
-    q: FloatArray
+    q: FloatArray  # (4, n): 1/A at the ends of the steps and at `PLACES`, 1/m^2
+    # (10, n): Rate of the charge at 0, 1/4, 1/2, 3/4 and 1 of each step (A), the charge gained in the step, the error
+    # of this gain, and, in steps of several samples, the triangles of the rate at `PLACES` times the step length (C)
     steps: FloatArray
+    # z, rest, current, error (n,): Charge (C), that without c r G(u), and current (A) at the starts of the steps, and
+    # error of the slowest layer's voltage (V)
     z: FloatArray
     rest: FloatArray
     current: FloatArray
     error: FloatArray
+    # h, t (n,): Lengths of the steps, and their limits, s; the limits are needed for outputs within steps only
     h: FloatArray
     t: FloatArray
 

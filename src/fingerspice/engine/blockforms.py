@@ -48,38 +48,23 @@ class Coarse(NamedTuple):
 
     Within a step the source is the straight line between its ends and three triangles, whose tops are at `PLACES`; the
     triangles are a quarter of the step wide to either side. A further index is the place within a step.
-
-    Attributes
-    ----------
-    bump : ndarray, shape (r, ONE, m, 3)
-        Contribution of the triangles to a mode at the end of a step.
-    bump_within : ndarray, shape (r, ONE, 3, P, 3)
-        The same to the projections at `PLACES`.
-    decay : ndarray, shape (r, ONE, 3, m)
-        From the start of a step to `PLACES`.
-    source, bump_to, drive, defect : ndarray, shape (r, ONE, 3, m, 2), (..., m, 3), (..., m, T, 3) and (..., m, T, 2)
-        As `Form.source`, `bump`, `Form.drive` and `Form.defect`, up to `PLACES`.
-    share : ndarray, shape (r, ONE, 3, m, 2)
-        As `Form.share`.
-    hat : ndarray, shape (r, ONE, m, T, 3)
-        Contribution of triangles of the drives to a mode at the end of a step, less that to the parabolas.
-    hat_to : ndarray, shape (r, ONE, 3, m, T, 3)
-        The same up to `PLACES`.
-    slope : ndarray, shape (4 k + 1,)
-        Derivative of 1/A by |u|, a polynomial as `Form.area`.
     """
 
-    bump: FloatArray
-    bump_within: FloatArray
-    decay: FloatArray
+    bump: FloatArray  # (r, ONE, m, 3): Contribution of the triangles to a mode at the end of a step
+    bump_within: FloatArray  # (r, ONE, 3, P, 3): The same to the projections at `PLACES`
+    decay: FloatArray  # (r, ONE, 3, m): From the start of a step to `PLACES`
+    # source, bump_to, drive, defect (r, ONE, 3, m, 2): As `Form.source`, `bump`, `Form.drive` and `Form.defect`, up to
+    # `PLACES`
     source: FloatArray
     bump_to: FloatArray
     drive: FloatArray
     defect: FloatArray
-    share: FloatArray
+    share: FloatArray  # (r, ONE, 3, m, 2): As `Form.share`
+    # (r, ONE, m, T, 3): Contribution of triangles of the drives to a mode at the end of a step, less that to the
+    # parabolas
     hat: FloatArray
-    hat_to: FloatArray
-    slope: FloatArray
+    hat_to: FloatArray  # (r, ONE, 3, m, T, 3): The same up to `PLACES`
+    slope: FloatArray  # (4 k + 1,): Derivative of 1/A by |u|, a polynomial as `Form.area`
 
 
 class Form(NamedTuple):
@@ -88,129 +73,70 @@ class Form(NamedTuple):
     r references, `LEVELS` step lengths, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step:
     the gap voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by
     (see `engine.blockcharge`).
-
-    Attributes
-    ----------
-    mobile : bool
-        Charge law. Then the last drive is (1/q - 1/q0) U.
-    q0 : ndarray, shape (r,)
-    decay : ndarray, shape (r, LEVELS, m)
-        Over a step.
-    source : ndarray, shape (r, LEVELS, m, 2)
-        Contribution of the source's values at both ends to a mode.
-    drive : ndarray, shape (r, LEVELS, m, T, 3)
-        Contribution of the drives at 0, 1/2 and 1 to a mode.
-    feed : ndarray, shape (r, m, T)
-    taps, tap_s : ndarray, shape (r, P, m) and (P,)
-        Projections of modes and source.
-    within, within_s, within_g : ndarray, shape (r, LEVELS, 3, P, m), (r, LEVELS, 3, P, 2) and (r, LEVELS, 3, P, T, 3)
-        The same at `PLACES`, from the modes at the start of a step, the source at both ends, and the drives.
-    share : ndarray, shape (r, LEVELS, m, 2)
-        The weights of 1/2 and 1 in the integral of a parabola over a step, in units of its length.
-    defect : ndarray, shape (r, LEVELS, m, T, 2)
-        Contribution of the interpolation errors at the quarters to the error of a mode.
-    area : ndarray, shape (4 k + 1,)
-        1/A as a polynomial in `scale` |u| + `shift`.
-    kappa : float
-        1/m^2; 0 in a stack.
-    bend : ndarray, shape (4 l + 1,)
-        N (V m^2) for positive xi, as `area`; no entry in a stack. In a network N is the last drive, which has no tap.
-    bent : ndarray, shape (T - 1,)
-        Share of N in each tap; no entry in a stack.
-    fast : int
-        The mode that decays within a small part of a step and has the largest share in kappa; -1 if there is none.
-    faded : ndarray, shape (r, LEVELS)
-        Its rate times the step length; 0 where that is too small.
-    pulse, pulse_within : ndarray, shape (r, LEVELS, m) and (r, LEVELS, 3, P)
-        What a part exp(-rate t) of N adds to the modes and to the projections, in place of the parabola through it.
-    coarse : Coarse
-    longest : int
-        The longest step length that is used: 0 in stacks under `local`, else `ONE`.
     """
 
-    mobile: bool
-    q0: FloatArray
+    mobile: bool  # Charge law. Then the last drive is (1/q - 1/q0) U.
+    q0: FloatArray  # (r,)
     rates: FloatArray
     gain: FloatArray
-    decay: FloatArray
-    source: FloatArray
-    drive: FloatArray
-    feed: FloatArray
+    decay: FloatArray  # (r, LEVELS, m): Over a step
+    source: FloatArray  # (r, LEVELS, m, 2): Contribution of the source's values at both ends to a mode
+    drive: FloatArray  # (r, LEVELS, m, T, 3): Contribution of the drives at 0, 1/2 and 1 to a mode
+    feed: FloatArray  # (r, m, T)
+    # taps, tap_s (r, P, m): Projections of modes and source
     taps: FloatArray
     tap_s: FloatArray
+    # within, within_s, within_g (r, LEVELS, 3, P, m): The same at `PLACES`, from the modes at the start of a step, the
+    # source at both ends, and the drives
     within: FloatArray
     within_s: FloatArray
     within_g: FloatArray
+    # (r, LEVELS, m, 2): The weights of 1/2 and 1 in the integral of a parabola over a step, in units of its length
     share: FloatArray
+    # (r, LEVELS, m, T, 2): Contribution of the interpolation errors at the quarters to the error of a mode
     defect: FloatArray
-    area: FloatArray
+    area: FloatArray  # (4 k + 1,): 1/A as a polynomial in `scale` |u| + `shift`
     scale: float
     shift: float
     k_gap: float
     area0: float
-    kappa: float
+    kappa: float  # 1/m^2; 0 in a stack
+    # (4 l + 1,): N (V m^2) for positive xi, as `area`; no entry in a stack. In a network N is the last drive, which has
+    # no tap.
     bend: FloatArray
-    bent: FloatArray
+    bent: FloatArray  # (T - 1,): Share of N in each tap; no entry in a stack
+    # The mode that decays within a small part of a step and has the largest share in kappa; -1 if there is none
     fast: int
-    faded: FloatArray
+    faded: FloatArray  # (r, LEVELS): Its rate times the step length; 0 where that is too small
+    # pulse, pulse_within (r, LEVELS, m): What a part exp(-rate t) of N adds to the modes and to the projections, in
+    # place of the parabola through it
     pulse: FloatArray
     pulse_within: FloatArray
     coarse: Coarse
-    longest: int
+    longest: int  # The longest step length that is used: 0 in stacks under `local`, else `ONE`
 
 
 class Shown(NamedTuple):
-    """Constants of the outputs.
+    """Constants of the outputs."""
 
-    Attributes
-    ----------
-    columns : ndarray, shape (r, C, m)
-        Recorded voltages over k U.
-    k : ndarray, shape (C,)
-    node : ndarray, shape (r, n_node, m)
-        Voltages of the nodes, as `columns`.
-    node_bend : ndarray, shape (n_node,)
-        Share of N in them; no entry in a stack.
-    slow : ndarray, shape (r, m)
-        The slowest layer's share of each mode (see `Model.slow`).
-    live, project : ndarray, shape (r, m, m)
-        From modes to live voltages and back.
-    stress : float
-        Force per area and squared gap voltage, Pa/V^2.
-    kink : ndarray, shape (T,)
-        Derivative by |u_gap| at 0 V of the factor of each drive. N counts as a factor times xi.
-    area_kink : float
-        dA/d|u| at 0 V, m^2/V.
-    moved : ndarray
-        c r G(|u|) under `local`, a polynomial as `Form.area`, C.
-    charge : bool
-        Whether the charge follows from that, as in a stack.
-    bend : ndarray, shape (C,)
-        Share of N in each column; no entry in a stack.
-    flows : int
-        Number of the last columns that are charges of a network, whose rates are outputs, too.
-    capacitance : float
-        Sum of all capacitances of the network, F, where there are such columns.
-    moves : ndarray, shape (2,)
-        Largest error of a node's voltage (V), and of such a charge (C), that the area causes, per volt of the gap
-        voltage's error.
-    """
-
-    columns: FloatArray
-    k: FloatArray
-    node: FloatArray
-    node_bend: FloatArray
-    slow: FloatArray
+    columns: FloatArray  # (r, C, m): Recorded voltages over k U
+    k: FloatArray  # (C,)
+    node: FloatArray  # (r, n_node, m): Voltages of the nodes, as `columns`
+    node_bend: FloatArray  # (n_node,): Share of N in them; no entry in a stack
+    slow: FloatArray  # (r, m): The slowest layer's share of each mode (see `Model.slow`)
+    # live, project (r, m, m): From modes to live voltages and back
     live: FloatArray
     project: FloatArray
-    stress: float
-    kink: FloatArray
-    area_kink: float
-    moved: FloatArray
-    charge: bool
-    bend: FloatArray
-    flows: int
-    capacitance: float
+    stress: float  # Force per area and squared gap voltage, Pa/V^2
+    kink: FloatArray  # (T,): Derivative by |u_gap| at 0 V of the factor of each drive. N counts as a factor times xi.
+    area_kink: float  # dA/d|u| at 0 V, m^2/V
+    moved: FloatArray  # c r G(|u|) under `local`, a polynomial as `Form.area`, C
+    charge: bool  # Whether the charge follows from that, as in a stack
+    bend: FloatArray  # (C,): Share of N in each column; no entry in a stack
+    flows: int  # Number of the last columns that are charges of a network, whose rates are outputs, too
+    capacitance: float  # Sum of all capacitances of the network, F, where there are such columns
+    # (2,): Largest error of a node's voltage (V), and of such a charge (C), that the area causes, per volt of the gap
+    # voltage's error
     moves: FloatArray
 
 

@@ -49,32 +49,23 @@ ROUNDING = 1e-14
 
 
 class Passage(NamedTuple):
-    """An integration by implicit steps in progress.
+    """An integration by implicit steps in progress."""
 
-    Attributes
-    ----------
-    y, s_before : ndarray
-        State, and the sources' values just before the time reached; updated.
-    control, counters, peaks : ndarray
-        Bookkeeping, updated; peaks (n_area,) in V.
-    charge : bool
-        Whether the output rows contain the sources' currents.
-    t_out, left, rows : ndarray
-        Output times (s, ascending), whether the left-hand limit is meant, and the rows to fill: the state, then the
-        currents.
-    tried : ndarray, shape (n, 4)
-        Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one, number from 1.
-    """
-
+    # y, s_before: State, and the sources' values just before the time reached; updated
     y: FloatArray
     s_before: FloatArray
+    # control, counters, peaks: Bookkeeping, updated; peaks (n_area,) in V
     control: FloatArray
     counters: IntArray
     peaks: FloatArray
-    charge: bool
+    charge: bool  # Whether the output rows contain the sources' currents
+    # t_out, left, rows: Output times (s, ascending), whether the left-hand limit is meant, and the rows to fill: the
+    # state, then the currents
     t_out: FloatArray
     left: NDArray[np.bool_]
     rows: FloatArray
+    # (n, 4): Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one, number
+    # from 1
     tried: FloatArray
 
 

@@ -40,51 +40,34 @@ _KEPT, _MOST_NUMBERS = 16, 65_536
 
 
 class Coupling(NamedTuple):
-    """Maps to and from eta, chi and rho of the module; n_f cells in their areas' bases, n modes, n_s sources.
+    """Maps to and from eta, chi and rho of the module; n_f cells in their areas' bases, n modes, n_s sources."""
 
-    Attributes
-    ----------
-    answer : ndarray, shape (n_f,)
-        L, 1/m^2.
-    root : ndarray, shape (n_f, n_f)
-        C^1/2 V: currents of the cells from rho.
-    from_modes, from_rates, from_stiff, held : ndarray, shape (n_f, n)
-        eta from the modes, from their forcing, and from the rates of the stiff ones; chi from the modes.
-    from_sources, from_slopes : ndarray, shape (n_f, n_s)
-        eta from the sources and from their slopes; `from_slopes` also maps the sources to chi.
-    feed : ndarray, shape (n, n_f)
-        Rates of the modes from rho.
-    gap, leak : ndarray, shape (n_f,)
-        The voltage u that the area follows has the rate sum of gap (eta - L chi A') / (1 + e L), less leak u.
-    cross : ndarray, shape (n_f, n_f)
-        eta from rho of other areas.
-    numbers : ndarray, shape (size,)
-        Memory of all arrays above, which are views of it.
-    key : ndarray of int, shape (2,)
-        Number of this coupling as the caller counts them, and number of stiff modes (the fastest ones); -1: not filled.
-    kept, keys : ndarray, shape (room, size) and (room, 2)
-        Cache: `numbers` and `key` of couplings filled in before; a new one overwrites the oldest.
-    used : ndarray of int, shape (1,)
-        How many couplings have been put into the cache.
-    """
-
-    answer: FloatArray
-    root: FloatArray
+    answer: FloatArray  # (n_f,): L, 1/m^2
+    root: FloatArray  # (n_f, n_f): C^1/2 V: currents of the cells from rho
+    # from_modes, from_rates, from_stiff, held (n_f, n): eta from the modes, from their forcing, and from the rates of
+    # the stiff ones; chi from the modes
     from_modes: FloatArray
     from_rates: FloatArray
     from_stiff: FloatArray
     held: FloatArray
+    # from_sources, from_slopes (n_f, n_s): eta from the sources and from their slopes; `from_slopes` also maps the
+    # sources to chi
     from_sources: FloatArray
     from_slopes: FloatArray
-    feed: FloatArray
+    feed: FloatArray  # (n, n_f): Rates of the modes from rho
+    # gap, leak (n_f,): The voltage u that the area follows has the rate sum of gap (eta - L chi A') / (1 + e L), less
+    # leak u
     gap: FloatArray
     leak: FloatArray
-    cross: FloatArray
-    numbers: FloatArray
+    cross: FloatArray  # (n_f, n_f): eta from rho of other areas
+    numbers: FloatArray  # (size,): Memory of all arrays above, which are views of it
+    # (2,): Number of this coupling as the caller counts them, and number of stiff modes (the fastest ones); -1: not
+    # filled
     key: IntArray
+    # kept, keys (room, size): Cache: `numbers` and `key` of couplings filled in before; a new one overwrites the oldest
     kept: FloatArray
     keys: IntArray
-    used: IntArray
+    used: IntArray  # (1,): How many couplings have been put into the cache
 
 
 def new_coupling(n: int, cells: int, sources: int) -> Coupling:

@@ -145,25 +145,19 @@ def _add_rates(
 
 
 class Moving(NamedTuple):
-    """Rows of a step that the currents under `mobile` depend on, and those that receive them.
+    """Rows of a step that the currents under `mobile` depend on, and those that receive them."""
 
-    Attributes
-    ----------
-    u, more, slope, rate : ndarray, shape (n_area, ROWS)
-        Gap voltage, A - A0, dA/du, and the part of A' that does not come from the gap voltage.
-    chi, eta, rho : ndarray, shape (n_f, ROWS)
-        See the module.
-    known, share : ndarray, shape (n_area, ROWS) and (n_f, ROWS)
-        Scratch.
-    """
-
+    # u, more, slope, rate (n_area, ROWS): Gap voltage, A - A0, dA/du, and the part of A' that does not come from the
+    # gap voltage
     u: FloatArray
     more: FloatArray
     slope: FloatArray
     rate: FloatArray
+    # chi, eta, rho (n_f, ROWS): See the module
     chi: FloatArray
     eta: FloatArray
     rho: FloatArray
+    # known, share (n_area, ROWS): Scratch
     known: FloatArray
     share: FloatArray
 

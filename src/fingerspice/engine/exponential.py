@@ -19,21 +19,13 @@ N_SLOTS, FEWEST_SLOTS, MOST_ENTRIES = 192, 8, 8_192
 
 
 class Tables(NamedTuple):
-    """Exponentials and their integrals, by step length and reference area, computed when first needed.
+    """Exponentials and their integrals, by step length and reference area, computed when first needed."""
 
-    Attributes
-    ----------
-    h : ndarray, shape (n_slots,)
-        Step length of each slot, s.
-    level, used : ndarray of int
-        Reference area of each slot (-1: empty), and [slots in use, slot used last].
-    decay, phi, miss : ndarray, shape (n_slots, n, ...)
-        The tables of `fill_table`, with `phi` and `miss` multiplied by h.
-    """
-
-    h: FloatArray
+    h: FloatArray  # (n_slots,): Step length of each slot, s
+    # level, used: Reference area of each slot (-1: empty), and [slots in use, slot used last]
     level: IntArray
     used: IntArray
+    # decay, phi, miss (n_slots, n, ...): The tables of `fill_table`, with `phi` and `miss` multiplied by h
     decay: FloatArray
     phi: FloatArray
     miss: FloatArray

@@ -36,39 +36,24 @@ How = tuple[int, int, int, bool, float, float]
 
 
 class Stepping(NamedTuple):
-    """Arrays for the steps of a block of scenes; all are overwritten.
+    """Arrays for the steps of a block of scenes; all are overwritten."""
 
-    Attributes
-    ----------
-    still, moving : ndarray
-        Weights, as `lockstep.run` takes them.
-    s : ndarray, shape (n_state * lanes,)
-        State.
-    last : ndarray, shape (n_moment * lanes,)
-        Sums over the last period.
-    before : ndarray, shape (n_mode * lanes,)
-        Modes at the start of the last period.
-    back : ndarray, shape (n_mode * lanes,)
-        In the search for the periodic state, the derivative of the start by what a period leaves open, with the area
-        held. In a run from rest, an upper bound of the modes' time constants, in periods.
-    closing : ndarray, shape (lanes,)
-        What the periodic state is off, relative to the peak gap voltage; or half of what the mean force is off because
-        the last period stands for those after it, relative to that force, and infinite while it does not.
-    length : ndarray, shape (lanes,)
-        Length of the shortest step, s; in a run from rest, then the number of half periods after which it has settled.
-    moments : ndarray, shape (11, lanes)
-        Scratch of `lockweights.weigh`.
-    """
-
+    # still, moving: Weights, as `lockstep.run` takes them
     still: FloatArray
     moving: NDArray[np.float64]
-    s: FloatArray
-    last: FloatArray
-    before: FloatArray
+    s: FloatArray  # (n_state * lanes,): State
+    last: FloatArray  # (n_moment * lanes,): Sums over the last period
+    before: FloatArray  # (n_mode * lanes,): Modes at the start of the last period
+    # (n_mode * lanes,): In the search for the periodic state, the derivative of the start by what a period leaves open,
+    # with the area held. In a run from rest, an upper bound of the modes' time constants, in periods.
     back: FloatArray
+    # (lanes,): What the periodic state is off, relative to the peak gap voltage; or half of what the mean force is off
+    # because the last period stands for those after it, relative to that force, and infinite while it does not
     closing: FloatArray
+    # (lanes,): Length of the shortest step, s; in a run from rest, then the number of half periods after which it has
+    # settled
     length: FloatArray
-    moments: FloatArray
+    moments: FloatArray  # (11, lanes): Scratch of `lockweights.weigh`
 
 
 def stepping_shapes(pieces: int, marks: Marks) -> tuple[tuple[int, ...], ...]:

@@ -191,28 +191,16 @@ def put_result(
 
 
 class Block(NamedTuple):
-    """What `fill_block` finds of a block's scenes, and its scratch.
+    """What `fill_block` finds of a block's scenes, and its scratch."""
 
-    Attributes
-    ----------
-    c : ndarray, shape (n_constants * lanes,)
-        Constants, as `engine.lockstep` takes them.
-    start : ndarray, shape (n_mode * lanes,)
-        Modes at the start, V.
-    rates, drive : ndarray, shape (n_mode, lanes)
-        Rates (1/s), and drive of a source of constant pieces.
-    t : ndarray, shape (n_row * lanes,)
-        The scenes' columns of the table.
-    top, tail : ndarray, shape (lanes,)
-        Largest gap voltage that the area's polynomial covers (V), and the relative size of its last coefficient;
-        infinite where the universal curve does not reach so far.
-    """
-
-    c: FloatArray
-    start: FloatArray
+    c: FloatArray  # (n_constants * lanes,): Constants, as `engine.lockstep` takes them
+    start: FloatArray  # (n_mode * lanes,): Modes at the start, V
+    # rates, drive (n_mode, lanes): Rates (1/s), and drive of a source of constant pieces
     rates: FloatArray
     drive: FloatArray
-    t: FloatArray
+    t: FloatArray  # (n_row * lanes,): The scenes' columns of the table
+    # top, tail (lanes,): Largest gap voltage that the area's polynomial covers (V), and the relative size of its last
+    # coefficient; infinite where the universal curve does not reach so far
     top: FloatArray
     tail: FloatArray
     scratch: Scratch

@@ -58,36 +58,23 @@ N_PLACE = 22
 
 
 class LoopState(NamedTuple):
-    """An integration in progress; the loop updates all arrays.
+    """An integration in progress; the loop updates all arrays."""
 
-    Attributes
-    ----------
-    y : ndarray
-        State voltages (V), areas with a time constant, and charges (C).
-    error : ndarray
-        Estimated error of the modes, signed; of a stack, then the number of the reference area that they belong to.
-    control, counters : ndarray
-        Bookkeeping, see `engine.readout`.
-    step, place : ndarray, shape (N_STEP,) and (N_PLACE,)
-        The step at hand; its entries are named above.
-    outputs : Outputs
-    kept : Kept
-        Takes the first steps, for repeated periods, until it is full; `counters` tells how many steps there were.
-    steps : Steps
-        Takes all steps, for figures of the run.
-    tried : ndarray, shape (TRIED, 4)
-        Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one, number from 1.
-    """
-
-    y: FloatArray
+    y: FloatArray  # State voltages (V), areas with a time constant, and charges (C)
+    # Estimated error of the modes, signed; of a stack, then the number of the reference area that they belong to
     error: FloatArray
+    # control, counters: Bookkeeping, see `engine.readout`
     control: FloatArray
     counters: IntArray
+    # step, place (N_STEP,): The step at hand; its entries are named above
     step: FloatArray
     place: IntArray
     outputs: Outputs
+    # Takes the first steps, for repeated periods, until it is full; `counters` tells how many steps there were
     kept: Kept
-    steps: Steps
+    steps: Steps  # Takes all steps, for figures of the run
+    # (TRIED, 4): Ring buffer of the last steps tried: start and length (s), ratio of the error to the allowed one,
+    # number from 1
     tried: FloatArray
 
 

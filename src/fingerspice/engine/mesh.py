@@ -67,35 +67,22 @@ class Mesh(NamedTuple):
 
     Within a jump of the sources the independent variable is the fraction of the jump, and time stands still: the same
     network, in which nothing leaks.
-
-    Attributes
-    ----------
-    form, references, tables, work
-        The network in modal form around a reference, whose number is in `work.at`; all references; tables of
-        exponentials, and scratch arrays.
-    integral : ndarray
-        `lobatto.integral_table()`.
-    sources : Sources
-    u_scale : float
-        Largest voltage, V; the error of an area with a time constant is measured as a fraction of it.
-    sign, s_before : ndarray
-        Branch of each area (0: to be chosen), and the sources' values just before the time reached.
-    branch : ndarray, shape (n_area, 2)
-        Time at which each area's branch began, and length of the branch before, s.
-    peaks, collected : ndarray
-        As described in `netassess` and `netcharge.charge_error`.
     """
 
+    # form, references, tables, work: The network in modal form around a reference, whose number is in `work.at`; all
+    # references; tables of exponentials, and scratch arrays
     form: Form
     references: References
     tables: Tables
     work: Work
-    integral: FloatArray
+    integral: FloatArray  # `lobatto.integral_table()`
     sources: Sources
-    u_scale: float
+    u_scale: float  # Largest voltage, V; the error of an area with a time constant is measured as a fraction of it
+    # sign, s_before: Branch of each area (0: to be chosen), and the sources' values just before the time reached
     sign: FloatArray
     s_before: FloatArray
-    branch: FloatArray
+    branch: FloatArray  # (n_area, 2): Time at which each area's branch began, and length of the branch before, s
+    # peaks, collected: As described in `netassess` and `netcharge.charge_error`
     peaks: FloatArray
     collected: FloatArray
 

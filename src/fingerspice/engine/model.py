@@ -24,49 +24,26 @@ from fingerspice.physics.contact import inverse_area
 
 
 class Model(NamedTuple):
-    """A reduced stack with its area curve, as numbers.
+    """A reduced stack with its area curve, as numbers."""
 
-    Attributes
-    ----------
-    mobile : bool
-        Charge law.
-    coupled : bool
-        Whether the area follows the gap voltage; then steps end on the zeros of this voltage.
-    k : ndarray, shape (n + 1,)
-        Share of a jump of U that each layer takes. The state is x = layer voltage - k U (`local`) of the first n
-        layers; that of the last layer is minus their sum.
-    rate, rate0 : ndarray, shape (n + 1,)
-        Leak rate of each layer: the part that does not depend on the area (1/s), and the factor of 1/A in the rest
-        (m^2/s).
-    k_gap : float
-        Share of a jump of U that the gap takes.
-    gap : ndarray, shape (n,)
-        x_gap = gap @ x.
-    s : float
-        Sum of 1/c_x over the layers, m^2/F.
-    slow : ndarray, shape (n + 4,)
-        The layer that leaks slowest, through which the current suffers least from cancellation: its row of E, share k,
-        capacitance c (F/m^2), and the two parts of its leak per area, constant (S/m^2) and factor of 1/A (S).
-    area0 : float
-        Reference area of the mobile state, m^2.
-    tau : float
-        Shortest time constant of the frozen stack, s (inf without leakage).
-    curve : ndarray
-        See `fingerspice.physics.contact.inverse_area`.
-    """
-
-    mobile: bool
-    coupled: bool
+    mobile: bool  # Charge law
+    coupled: bool  # Whether the area follows the gap voltage; then steps end on the zeros of this voltage
+    # (n + 1,): Share of a jump of U that each layer takes. The state is x = layer voltage - k U (`local`) of the first
+    # n layers; that of the last layer is minus their sum.
     k: FloatArray
+    # rate, rate0 (n + 1,): Leak rate of each layer: the part that does not depend on the area (1/s), and the factor of
+    # 1/A in the rest (m^2/s)
     rate: FloatArray
     rate0: FloatArray
-    k_gap: float
-    gap: FloatArray
-    s: float
+    k_gap: float  # Share of a jump of U that the gap takes
+    gap: FloatArray  # (n,): x_gap = gap @ x
+    s: float  # Sum of 1/c_x over the layers, m^2/F
+    # (n + 4,): The layer that leaks slowest, through which the current suffers least from cancellation: its row of E,
+    # share k, capacitance c (F/m^2), and the two parts of its leak per area, constant (S/m^2) and factor of 1/A (S)
     slow: FloatArray
-    area0: float
-    tau: float
-    curve: FloatArray
+    area0: float  # Reference area of the mobile state, m^2
+    tau: float  # Shortest time constant of the frozen stack, s (inf without leakage)
+    curve: FloatArray  # See `fingerspice.physics.contact.inverse_area`
 
 
 # Gauss-Legendre rule for the charge of a jump under the local law: A is analytic on either side of 0 V. The last

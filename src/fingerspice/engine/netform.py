@@ -131,26 +131,16 @@ class Leaks(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """A jump of the sources in progress, and what is put aside for its duration.
+    """A jump of the sources in progress, and what is put aside for its duration."""
 
-    Attributes
-    ----------
-    before, after : ndarray, shape (n_s,)
-        Values of the sources before and after it, V or A.
-    control, sign : ndarray
-        Bookkeeping and branches of the areas before the jump.
-    branch : ndarray, shape (n_area, 2)
-        As `Mesh.branch`, by the fraction of the jump.
-    leaks : Leaks
-        Zeros.
-    """
-
+    # before, after (n_s,): Values of the sources before and after it, V or A
     before: FloatArray
     after: FloatArray
+    # control, sign: Bookkeeping and branches of the areas before the jump
     control: FloatArray
     sign: FloatArray
-    branch: FloatArray
-    leaks: Leaks
+    branch: FloatArray  # (n_area, 2): As `Mesh.branch`, by the fraction of the jump
+    leaks: Leaks  # Zeros
 
 
 class Work(NamedTuple):

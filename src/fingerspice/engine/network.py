@@ -26,62 +26,37 @@ from fingerspice.physics.contact import inverse_area
 
 
 class Net(NamedTuple):
-    """A reduced network with its area curves, as numbers; see `fingerspice.circuit.network.Network`.
+    """A reduced network with its area curves, as numbers; see `fingerspice.circuit.network.Network`."""
 
-    Attributes
-    ----------
-    mobile : bool
-        Charge law.
-    p, q : ndarray, shape (n_cell, n) and (n_cell, n_s)
-    c, g_total, g_area : ndarray, shape (n_cell,)
-    place : ndarray of int, shape (n_cell,)
-        The area of each cell, -1 for none.
-    k, b : ndarray, shape (n, n) and (n, n_s)
-    through, delivered : ndarray, shape (n_s, n_cell) and (n_s, n + n_s)
-    gap : ndarray of int, shape (n_area,)
-        The cell whose voltage the area follows, -1 where it is fixed.
-    area0 : ndarray, shape (n_area,)
-        The fixed area, or the one at 0 V, m^2.
-    tau : ndarray, shape (n_area,)
-        Time constant of the area, s; 0 where it follows at once.
-    slow : ndarray of int, shape (n_area,)
-        Place of the area among those in the state; -1 if it follows at once or is fixed.
-    curves : ndarray, shape (n_area, l)
-        See `fingerspice.physics.contact.inverse_area`; series padded with zeros.
-    """
-
-    mobile: bool
+    mobile: bool  # Charge law
+    # p, q (n_cell, n)
     p: FloatArray
     q: FloatArray
+    # c, g_total, g_area (n_cell,)
     c: FloatArray
     g_total: FloatArray
     g_area: FloatArray
-    place: IntArray
+    place: IntArray  # (n_cell,): The area of each cell, -1 for none
+    # k, b (n, n)
     k: FloatArray
     b: FloatArray
+    # through, delivered (n_s, n_cell)
     through: FloatArray
     delivered: FloatArray
-    gap: IntArray
-    area0: FloatArray
-    tau: FloatArray
-    slow: IntArray
-    curves: FloatArray
+    gap: IntArray  # (n_area,): The cell whose voltage the area follows, -1 where it is fixed
+    area0: FloatArray  # (n_area,): The fixed area, or the one at 0 V, m^2
+    tau: FloatArray  # (n_area,): Time constant of the area, s; 0 where it follows at once
+    slow: IntArray  # (n_area,): Place of the area among those in the state; -1 if it follows at once or is fixed
+    curves: FloatArray  # (n_area, l): See `fingerspice.physics.contact.inverse_area`; series padded with zeros
 
 
 class Sources(NamedTuple):
-    """All sources on one window of time: their tables of `Segment`s, one after the other.
+    """All sources on one window of time: their tables of `Segment`s, one after the other."""
 
-    Attributes
-    ----------
-    first : ndarray of int, shape (n_s + 1,)
-        First edge of each source; its first segment has that number less the number of sources before.
-    edges : ndarray, shape (sum of m + 1,)
-        s.
-    terms, series : ndarray, shape (sum of m, k, 6) and (sum of m, l)
-    """
-
+    # (n_s + 1,): First edge of each source; its first segment has that number less the number of sources before
     first: IntArray
-    edges: FloatArray
+    edges: FloatArray  # (sum of m + 1,): s
+    # terms, series (sum of m, k, 6)
     terms: FloatArray
     series: FloatArray
 

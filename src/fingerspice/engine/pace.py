@@ -40,24 +40,12 @@ _MOST_FRESH, _TRIED_FRESH = 2.0, 1.1
 
 
 class Pace(NamedTuple):
-    """How steps are chosen.
+    """How steps are chosen."""
 
-    Attributes
-    ----------
-    tol : float
-        Error of the gap voltage allowed in a step, V.
-    h_max : float
-        Longest step, s.
-    controlled : bool
-        Whether the error governs the step; else every step is `h_max` (for measuring orders).
-    charge : bool
-        Whether charge and current are wanted.
-    """
-
-    tol: float
-    h_max: float
-    controlled: bool
-    charge: bool
+    tol: float  # Error of the gap voltage allowed in a step, V
+    h_max: float  # Longest step, s
+    controlled: bool  # Whether the error governs the step; else every step is `h_max` (for measuring orders)
+    charge: bool  # Whether charge and current are wanted
 
 
 @jit

@@ -21,28 +21,18 @@ FARTHEST = 2.0
 
 
 class Scheme(NamedTuple):
-    """Radau IIA as numbers (see `fingerspice.numerics.radau_tableau.Tableau`), with its matrix diagonalised.
+    """Radau IIA as numbers (see `fingerspice.numerics.radau_tableau.Tableau`), with its matrix diagonalised."""
 
-    Attributes
-    ----------
-    a, c, e, dense : ndarray
-        The tableau's; `e` (s,) gives the highest Legendre coefficient of the increment.
-    eigenvalues : ndarray of complex, shape (m,)
-        Of `a`: one of each conjugate pair, and the real one.
-    to, back : ndarray of complex, shape (m, s) and (s, m)
-        a = Re(back diag(eigenvalues) to).
-    h_max : float
-        s.
-    """
-
+    # a, c, e, dense: The tableau's; `e` (s,) gives the highest Legendre coefficient of the increment
     a: FloatArray
     c: FloatArray
     e: FloatArray
     dense: FloatArray
-    eigenvalues: ComplexArray
+    eigenvalues: ComplexArray  # (m,): Of `a`: one of each conjugate pair, and the real one
+    # to, back (m, s): a = Re(back diag(eigenvalues) to)
     to: ComplexArray
     back: ComplexArray
-    h_max: float
+    h_max: float  # s
 
 
 class Work(NamedTuple):

@@ -55,18 +55,12 @@ _STRIDE = 32
 
 
 class Steps(NamedTuple):
-    """Takes every step, so that figures of the run do not depend on its outputs.
+    """Takes every step, so that figures of the run do not depend on its outputs."""
 
-    Attributes
-    ----------
-    times : ndarray, shape (capacity, 4)
-        Start and length (s), the end reached (s), and which fraction of the length that is: a step may be shorter than
-        the rounding of the time. No capacity: nothing is recorded.
-    values : ndarray, shape (capacity, n_column, NODES)
-        Recorded voltages, or the state of a network, at the nodes of the whole length.
-    """
-
+    # (capacity, 4): Start and length (s), the end reached (s), and which fraction of the length that is: a step may be
+    # shorter than the rounding of the time. No capacity: nothing is recorded.
     times: FloatArray
+    # (capacity, n_column, NODES): Recorded voltages, or the state of a network, at the nodes of the whole length
     values: FloatArray
 
 
@@ -98,19 +92,12 @@ def note(tried: FloatArray, number: int, t: float, h: float, error: float) -> No
 
 
 class Outputs(NamedTuple):
-    """Where a run's outputs go.
+    """Where a run's outputs go."""
 
-    Attributes
-    ----------
-    t, left : ndarray, shape (n_out,)
-        Output times (s, ascending), and whether the left-hand limit is meant.
-    columns : ndarray, shape (n_column, n_out)
-        To be filled.
-    """
-
+    # t, left (n_out,): Output times (s, ascending), and whether the left-hand limit is meant
     t: FloatArray
     left: NDArray[np.bool_]
-    columns: FloatArray
+    columns: FloatArray  # (n_column, n_out): To be filled
 
 
 @jit_rows

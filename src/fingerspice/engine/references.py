@@ -17,20 +17,11 @@ LEVEL_RATIO, FARTHEST = 1.28, 1.2
 
 
 class References(NamedTuple):
-    """The forms of a network around several reference areas.
+    """The forms of a network around several reference areas."""
 
-    Attributes
-    ----------
-    levels : ndarray of int, shape (room, n_area)
-        Areas of each reference over those at 0 V, as powers of LEVEL_RATIO.
-    numbers : ndarray, shape (room, size)
-        See `Form`.
-    used, wanted : ndarray of int, shape (1,) and (n_area,)
-        Number of references; the levels that were looked for last.
-    """
-
-    levels: IntArray
-    numbers: FloatArray
+    levels: IntArray  # (room, n_area): Areas of each reference over those at 0 V, as powers of LEVEL_RATIO
+    numbers: FloatArray  # (room, size): See `Form`
+    # used, wanted (1,): Number of references; the levels that were looked for last
     used: IntArray
     wanted: IntArray
 

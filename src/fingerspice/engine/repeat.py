@@ -29,19 +29,12 @@ AT_ONCE = 1_000_000
 
 
 class Kept(NamedTuple):
-    """Steps kept for repetition.
+    """Steps kept for repetition."""
 
-    Attributes
-    ----------
-    times : ndarray, shape (n_step, 4)
-        Start, length and reached end of each step, s; and whether it ends at a zero of the gap voltage, an edge of the
-        source, or anywhere (AT_ZERO, AT_EDGE, 0).
-    series : ndarray, shape (n_step, n_column, ROWS)
-        Chebyshev coefficients of the output columns over the whole length.
-    """
-
+    # (n_step, 4): Start, length and reached end of each step, s; and whether it ends at a zero of the gap voltage, an
+    # edge of the source, or anywhere (AT_ZERO, AT_EDGE, 0)
     times: FloatArray
-    series: FloatArray
+    series: FloatArray  # (n_step, n_column, ROWS): Chebyshev coefficients of the output columns over the whole length
 
 
 def new_kept(steps: int, columns: int) -> Kept:
@@ -158,33 +151,16 @@ def _make_powers(series: FloatArray, by: FloatArray, made: NDArray[np.bool_]) ->
 
 
 class PeriodMap(NamedTuple):
-    """Affine map from the start of a period to its steps and its end, made at a period from live voltages `x`.
+    """Affine map from the start of a period to its steps and its end, made at a period from live voltages `x`."""
 
-    Attributes
-    ----------
-    marks : ndarray, shape (n_step + 1,)
-        Where the steps begin and end in the first period, if that starts from `x` without charge, s.
-    marks_by : ndarray, shape (n_step + 1, n)
-        Its derivative by the live voltages at the start, s/V.
-    series : ndarray, shape (n_step, n_column, ROWS)
-        Chebyshev coefficients of that period's outputs, each over its step.
-    by : ndarray, shape (n, n_step, n_column, ROWS)
-        Their derivative.
-    slope : ndarray, shape (n + 1, n)
-        That of live voltages and charge at the end.
-    x : ndarray, shape (n,)
-        V.
-    end : ndarray, shape (n + 1,)
-        Live voltages (V) and charge (C) where the period from `x` ends.
-    """
-
+    # (n_step + 1,): Where the steps begin and end in the first period, if that starts from `x` without charge, s
     marks: FloatArray
-    marks_by: FloatArray
-    series: FloatArray
-    by: FloatArray
-    slope: FloatArray
-    x: FloatArray
-    end: FloatArray
+    marks_by: FloatArray  # (n_step + 1, n): Its derivative by the live voltages at the start, s/V
+    series: FloatArray  # (n_step, n_column, ROWS): Chebyshev coefficients of that period's outputs, each over its step
+    by: FloatArray  # (n, n_step, n_column, ROWS): Their derivative
+    slope: FloatArray  # (n + 1, n): That of live voltages and charge at the end
+    x: FloatArray  # (n,): V
+    end: FloatArray  # (n + 1,): Live voltages (V) and charge (C) where the period from `x` ends
 
 
 def approach(
@@ -225,23 +201,12 @@ def approach(
 
 
 class _Formed(NamedTuple):
-    """The period that was formed last; it serves until the start has changed too much.
+    """The period that was formed last; it serves until the start has changed too much."""
 
-    Attributes
-    ----------
-    at : ndarray, shape (n,)
-        Difference of its start from `x`, V.
-    stops : ndarray, shape (n_step + 1,)
-        Its marks, s.
-    series : ndarray, shape (n_step, n_column, ROWS)
-    stale : ndarray of bool, shape (1,)
-        Whether `stops` and `series` still belong to an earlier start than `at`.
-    """
-
-    at: FloatArray
-    stops: FloatArray
-    series: FloatArray
-    stale: NDArray[np.bool_]
+    at: FloatArray  # (n,): Difference of its start from `x`, V
+    stops: FloatArray  # (n_step + 1,): Its marks, s
+    series: FloatArray  # (n_step, n_column, ROWS)
+    stale: NDArray[np.bool_]  # (1,): Whether `stops` and `series` still belong to an earlier start than `at`
 
 
 @jit

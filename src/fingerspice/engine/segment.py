@@ -11,22 +11,14 @@ from fingerspice.numerics import chebyshev
 
 
 class Segment(NamedTuple):
-    """The source between two breakpoints.
+    """The source between two breakpoints."""
 
-    Attributes
-    ----------
-    start, length : float
-        Seconds.
-    terms : ndarray, shape (k, 6)
-        c, n, a, omega, phi, beta of c tau^n exp(a tau) cos(phi + omega tau + beta tau^2 / 2), tau from the start.
-    series : ndarray, shape (l,)
-        Chebyshev coefficients over the segment, or empty.
-    """
-
+    # start, length: Seconds
     start: float
     length: float
+    # (k, 6): c, n, a, omega, phi, beta of c tau^n exp(a tau) cos(phi + omega tau + beta tau^2 / 2), tau from the start
     terms: FloatArray
-    series: FloatArray
+    series: FloatArray  # (l,): Chebyshev coefficients over the segment, or empty
 
 
 @jit

@@ -38,21 +38,11 @@ N_VALUES = 23
 
 
 class Looks(NamedTuple):
-    """When a run looks for its periodic state, and what it has found.
+    """When a run looks for its periodic state, and what it has found."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (N_VALUES,)
-        The entries are named above.
-    before : ndarray, shape (n,)
-        State at the last look, V.
-    scale : ndarray, shape (n,)
-        Converts the first n entries of the integration's state to volts.
-    """
-
-    values: FloatArray
-    before: FloatArray
-    scale: FloatArray
+    values: FloatArray  # (N_VALUES,): The entries are named above
+    before: FloatArray  # (n,): State at the last look, V
+    scale: FloatArray  # (n,): Converts the first n entries of the integration's state to volts
 
 
 def no_looks() -> Looks:

@@ -80,23 +80,15 @@ _NEAR_FOLD = 0.01
 
 
 class Stack(NamedTuple):
-    """A stack and its source, as the loop takes it.
+    """A stack and its source, as the loop takes it."""
 
-    Attributes
-    ----------
-    system, tables, work
-        The modal system, its tables of exponentials, and scratch arrays.
-    integral : ndarray
-        `lobatto.integral_table()`.
-    edges : ndarray, shape (m + 1,)
-        Edges of the source's segments, s; `terms` (m, k, 6) and `series` (m, l) hold the source on each (see
-        `Segment`).
-    """
-
+    # system, tables, work: The modal system, its tables of exponentials, and scratch arrays
     system: System
     tables: Tables
     work: Work
-    integral: FloatArray
+    integral: FloatArray  # `lobatto.integral_table()`
+    # (m + 1,): Edges of the source's segments, s; `terms` (m, k, 6) and `series` (m, l) hold the source on each (see
+    # `Segment`)
     edges: FloatArray
     terms: FloatArray
     series: FloatArray

@@ -41,61 +41,36 @@ _AREA_SHARE, _AREA_ROUNDING = 1e-3, 2e-14
 
 
 class System(NamedTuple):
-    """See the module; arrays have one row per reference area.
-
-    Attributes
-    ----------
-    model : Model
-    q0 : ndarray, shape (n_level,)
-        Reference values of 1/A, 1/m^2, ascending.
-    rates, gain, push, gap, slow : ndarray, shape (n_level, n)
-        `slow` holds the slowest layer's share of each mode (see `Model.slow`).
-    tap : ndarray, shape (n_level, n_tap, n)
-    tap_k : ndarray, shape (n_tap,)
-        Zero under `mobile`.
-    feed : ndarray, shape (n_level, n, n_tap)
-    live, project : ndarray, shape (n_level, n, n)
-        x = live @ w for the live voltages, w = project @ x.
-    shown : ndarray, shape (n_level, n_column, n)
-        Recorded voltages over k_shown U, as `live` gives the live ones.
-    k_shown : ndarray, shape (n_column,)
-    node : ndarray, shape (n_level, n_node, n)
-        Voltages of the nodes in the same way, over k_node U.
-    k_node : ndarray, shape (n_node,)
-    powers, slopes : ndarray, shape (DEGREE + 1,) or longer
-        1/A as a polynomial in (u - lo) * scale - 1, and its derivative; longer ones hold coefficients of Chebyshev
-        series
-    lo, scale : float
-        Lowest gap voltage (V) of the branch's continuation, and 1/V; scale is 0 where Eq. 4 is solved at every
-        evaluation instead.
-    u_top : float
-        Largest gap voltage (V) that the model's curve covers.
-    stress : float
-        Force per area and squared gap voltage, Pa/V^2.
-    """
+    """See the module; arrays have one row per reference area."""
 
     model: Model
-    q0: FloatArray
+    q0: FloatArray  # (n_level,): Reference values of 1/A, 1/m^2, ascending
+    # rates, gain, push, gap, slow (n_level, n): `slow` holds the slowest layer's share of each mode (see `Model.slow`)
     rates: FloatArray
     gain: FloatArray
     push: FloatArray
     gap: FloatArray
     slow: FloatArray
-    tap: FloatArray
-    tap_k: FloatArray
-    feed: FloatArray
+    tap: FloatArray  # (n_level, n_tap, n)
+    tap_k: FloatArray  # (n_tap,): Zero under `mobile`
+    feed: FloatArray  # (n_level, n, n_tap)
+    # live, project (n_level, n, n): x = live @ w for the live voltages, w = project @ x
     live: FloatArray
     project: FloatArray
-    shown: FloatArray
-    k_shown: FloatArray
-    node: FloatArray
-    k_node: FloatArray
+    shown: FloatArray  # (n_level, n_column, n): Recorded voltages over k_shown U, as `live` gives the live ones
+    k_shown: FloatArray  # (n_column,)
+    node: FloatArray  # (n_level, n_node, n): Voltages of the nodes in the same way, over k_node U
+    k_node: FloatArray  # (n_node,)
+    # powers, slopes (DEGREE + 1,): 1/A as a polynomial in (u - lo) * scale - 1, and its derivative; longer ones hold
+    # coefficients of Chebyshev series
     powers: FloatArray
     slopes: FloatArray
+    # lo, scale: Lowest gap voltage (V) of the branch's continuation, and 1/V; scale is 0 where Eq. 4 is solved at every
+    # evaluation instead.
     lo: float
     scale: float
-    u_top: float
-    stress: float
+    u_top: float  # Largest gap voltage (V) that the model's curve covers
+    stress: float  # Force per area and squared gap voltage, Pa/V^2
 
 
 def build_system(

@@ -32,41 +32,23 @@ _MOST_SWEEPS, _SLOW = 80, 0.15
 
 
 class Changes(NamedTuple):
-    """Derivatives of a stack's constants by the parameters; the cells are in the order of `Model.k`.
+    """Derivatives of a stack's constants by the parameters; the cells are in the order of `Model.k`."""
 
-    Attributes
-    ----------
-    layers : ndarray, shape (n_parameter, 3, n + 1)
-        Of `Model.k`, `Model.rate` and `Model.rate0`.
-    k_gap : ndarray, shape (n_parameter,)
-    contact : ndarray, shape (n_parameter, N_PACKED)
-        Of `Contact.packed`.
-    """
-
-    layers: FloatArray
-    k_gap: FloatArray
-    contact: FloatArray
+    layers: FloatArray  # (n_parameter, 3, n + 1): Of `Model.k`, `Model.rate` and `Model.rate0`
+    k_gap: FloatArray  # (n_parameter,)
+    contact: FloatArray  # (n_parameter, N_PACKED): Of `Contact.packed`
 
 
 class Course(NamedTuple):
-    """The steps of a run at the `ROWS` of each, gap and source voltage along the loop.
+    """The steps of a run at the `ROWS` of each, gap and source voltage along the loop."""
 
-    Attributes
-    ----------
-    h : ndarray, shape (n_step,)
-        Length of each different step, s.
-    order : ndarray of int, shape (n,)
-        Which step comes when; a period that stands for others occurs several times.
-    u, s : ndarray, shape (n_step, ROWS)
-        Gap voltage and source, V.
-    moved : ndarray, shape (n_parameter, n, ROWS)
-        Change of the source by each parameter, V per unit; of length 0 along the second axis where none moves it.
-    """
-
-    h: FloatArray
-    order: IntArray
+    h: FloatArray  # (n_step,): Length of each different step, s
+    order: IntArray  # (n,): Which step comes when; a period that stands for others occurs several times
+    # u, s (n_step, ROWS): Gap voltage and source, V
     u: FloatArray
     s: FloatArray
+    # (n_parameter, n, ROWS): Change of the source by each parameter, V per unit; of length 0 along the second axis
+    # where none moves it
     moved: FloatArray
 
 

@@ -33,33 +33,17 @@ _QUARTERS = np.array([
 
 
 class Steps(NamedTuple):
-    """Weights of the steps of a block for m modes, at the places `PLACES` and at the end of a step.
+    """Weights of the steps of a block for m modes, at the places `PLACES` and at the end of a step."""
 
-    Attributes
-    ----------
-    decay : ndarray, shape (m, 4, n)
-        Over the part of a step up to the place.
-    parabola : ndarray, shape (m, 4, 3, n)
-        Contribution of a forcing at 0, 1/2 and 1, s.
-    quarter : ndarray, shape (m, 2, n)
-        Contribution of the errors at the quarters to the end, s.
-    forced, forced_within : ndarray, shape (m, n)
-        Forcing of the modes at the ends and in the middle of the steps.
-    w : ndarray, shape (m, n)
-        Modes at a place.
-    moments : ndarray, shape (5, n)
-    low : ndarray, shape (n,)
-        Scratch.
-    """
-
-    decay: FloatArray
-    parabola: FloatArray
-    quarter: FloatArray
+    decay: FloatArray  # (m, 4, n): Over the part of a step up to the place
+    parabola: FloatArray  # (m, 4, 3, n): Contribution of a forcing at 0, 1/2 and 1, s
+    quarter: FloatArray  # (m, 2, n): Contribution of the errors at the quarters to the end, s
+    # forced, forced_within (m, n): Forcing of the modes at the ends and in the middle of the steps
     forced: FloatArray
     forced_within: FloatArray
-    w: FloatArray
-    moments: FloatArray
-    low: FloatArray
+    w: FloatArray  # (m, n): Modes at a place
+    moments: FloatArray  # (5, n)
+    low: FloatArray  # (n,): Scratch
 
 
 def new_steps(modes: int) -> Steps:

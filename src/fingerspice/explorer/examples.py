@@ -43,24 +43,14 @@ Cbody   far   0           150p
 
 @dataclass(frozen=True)
 class Example:
-    """One scene of the page's menu: a deck, and what the page asks for with it.
+    """One scene of the page's menu: a deck, and what the page asks for with it."""
 
-    Attributes
-    ----------
-    name : str
-        Short name, which stands in the page's address.
-    title, note : str
-        What the menu and the page say about it.
-    deck : str
-    asked : dict
-        Further keys of the request, as in `scene.scene`.
-    """
-
-    name: str
+    name: str  # Short name, which stands in the page's address
+    # title, note: What the menu and the page say about it
     title: str
     note: str
     deck: str
-    asked: dict[str, object] = field(default_factory=dict)
+    asked: dict[str, object] = field(default_factory=dict)  # Further keys of the request, as in `scene.scene`
 
 
 def _made(gap: str, **changes: str) -> str:

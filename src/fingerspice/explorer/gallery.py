@@ -23,25 +23,14 @@ SIGNALS = ("u_source", "u_gap", "f_t")
 
 @dataclass(frozen=True)
 class Entry:
-    """One picture.
+    """One picture."""
 
-    Attributes
-    ----------
-    name : str
-        Of its file, without the suffix.
-    title, about : str
-        What it shows, in a line, and the comment of the deck or the note of the scene.
-    origin : Path
-        File that it is drawn from.
-    run : callable
-        Runs it.
-    """
-
-    name: str
+    name: str  # Of its file, without the suffix
+    # title, about: What it shows, in a line, and the comment of the deck or the note of the scene
     title: str
     about: str
-    origin: Path
-    run: Callable[[], Solution]
+    origin: Path  # File that it is drawn from
+    run: Callable[[], Solution]  # Runs it
 
 
 def decks(folder: Path) -> Iterator[Entry]:

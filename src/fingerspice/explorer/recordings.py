@@ -22,24 +22,12 @@ _KEYS = "an object with the keys name, values, and rate or times"
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A file's numbers.
+    """A file's numbers."""
 
-    Attributes
-    ----------
-    name : str
-        Of the file, for the script that "Copy as Python" gives.
-    values : ndarray
-        From -1 to 1 for full scale of a recording; as in the file for a table.
-    rate : float or None
-        Samples per second.
-    times : ndarray or None
-        Times of a table, s.
-    """
-
-    name: str
-    values: FloatArray
-    rate: float | None = None
-    times: FloatArray | None = None
+    name: str  # Of the file, for the script that "Copy as Python" gives
+    values: FloatArray  # From -1 to 1 for full scale of a recording; as in the file for a table
+    rate: float | None = None  # Samples per second
+    times: FloatArray | None = None  # Times of a table, s
 
     @property
     def duration(self) -> float:

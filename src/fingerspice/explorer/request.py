@@ -40,50 +40,26 @@ _AREAS = ("coupled", "mean", "frozen")
 
 @dataclass(frozen=True)
 class Request:
-    """What the page asks for.
+    """What the page asks for."""
 
-    Attributes
-    ----------
-    deck : str
-        Text of the netlist.
-    overrides : mapping of str to float
-        Path to value, in the netlist's unit.
-    source : str
-        Text of another source, ``SQUARE(200 100)`` or ``NAME=SQUARE(200 100)``; empty for the deck's own.
-    charge_law : str or None
-        None for the deck's own.
-    area : str or float
-        As in `simulate`.
-    skin : str
-        ``own``: the data of SKIN are taken at its f; ``follow``: at the source's fundamental; ``dispersive``: at all
-        frequencies.
-    rtol : float
-        Largest error of gap voltage and force, relative to their peaks.
-    periods : float
-        Length of the run in periods of the source; a source without a period runs to the deck's TSTOP.
-    last : float or None
-        How many of the last periods are shown; None for all of the run.
-    recording : Recording or None
-        The file dropped on the page, for the source ``RECORDING(gain)``.
-    sets : str
-        Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME`` with commas; they
-        change nothing, and the page shows their caveats.
-    unknown : tuple of str
-        Names that mean nothing here, each in a sentence.
-    """
-
-    deck: str
-    overrides: Mapping[str, float] = field(default_factory=dict)
+    deck: str  # Text of the netlist
+    overrides: Mapping[str, float] = field(default_factory=dict)  # Path to value, in the netlist's unit
+    # Text of another source, ``SQUARE(200 100)`` or ``NAME=SQUARE(200 100)``; empty for the deck's own
     source: str = ""
-    charge_law: str | None = None
-    area: str | float = "coupled"
+    charge_law: str | None = None  # None for the deck's own
+    area: str | float = "coupled"  # As in `simulate`
+    # ``own``: the data of SKIN are taken at its f; ``follow``: at the source's fundamental; ``dispersive``: at all
+    # frequencies
     skin: str = "own"
-    rtol: float = 1e-6
+    rtol: float = 1e-6  # Largest error of gap voltage and force, relative to their peaks
+    # Length of the run in periods of the source; a source without a period runs to the deck's TSTOP
     periods: float = 5.0
-    last: float | None = None
-    recording: Recording | None = None
+    last: float | None = None  # How many of the last periods are shown; None for all of the run
+    recording: Recording | None = None  # The file dropped on the page, for the source ``RECORDING(gain)``
+    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME`` with commas; they change
+    # nothing, and the page shows their caveats
     sets: str = ""
-    unknown: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()  # Names that mean nothing here, each in a sentence
 
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Request) if f.name != "unknown")

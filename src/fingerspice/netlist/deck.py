@@ -42,47 +42,24 @@ _DEVICE_TITLE = re.compile(rf"x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices()
 
 @dataclass(frozen=True, slots=True)
 class Deck:
-    """A netlist, read and flattened.
+    """A netlist, read and flattened."""
 
-    Attributes
-    ----------
-    title : str
-        The first line in printable characters (see `errors.printable`); `text` has the line as written.
-    statements : tuple of Statement
-        Elements in the order of the file, subcircuit calls expanded.
-    tran, ac : Directive or None
-        The analyses; each may be given once.
-    ic, options : tuple of Directive
-        Start values, as in `Flattener.starts`, and options, in the order of the file.
-    includes : tuple of str
-        Names, without folder, of the included libraries of native devices, whose files are not read.
-    files : tuple of Path
-        The other included files, which were read.
-    unused : tuple of str
-        Names of the directives that are accepted and have no effect here.
-    warnings : tuple of str
-        Warnings about text that is legal but probably not meant, each with its place.
-    params : dict
-        Values of the deck's own `.param` definitions by lower-case name.
-    text : str
-        The netlist as read.
-    path : Path or None
-        Path of the file; None for a text.
-    """
-
-    title: str
-    statements: tuple[Statement, ...]
+    title: str  # The first line in printable characters (see `errors.printable`); `text` has the line as written
+    statements: tuple[Statement, ...]  # Elements in the order of the file, subcircuit calls expanded
+    # tran, ac: The analyses; each may be given once
     tran: Directive | None
     ac: Directive | None
+    # ic, options: Start values, as in `Flattener.starts`, and options, in the order of the file
     ic: tuple[Directive, ...]
     options: tuple[Directive, ...]
+    # Names, without folder, of the included libraries of native devices, whose files are not read
     includes: tuple[str, ...]
-    files: tuple[Path, ...]
-    unused: tuple[str, ...]
-    warnings: tuple[str, ...]
-    params: dict[str, float]
-    text: str
-    path: Path | None
+    files: tuple[Path, ...]  # The other included files, which were read
+    unused: tuple[str, ...]  # Names of the directives that are accepted and have no effect here
+    warnings: tuple[str, ...]  # Warnings about text that is legal but probably not meant, each with its place
+    params: dict[str, float]  # Values of the deck's own `.param` definitions by lower-case name
+    text: str  # The netlist as read
+    path: Path | None  # Path of the file; None for a text
 
 
 def read_deck(path: str | Path) -> Deck:

@@ -50,29 +50,16 @@ Place: TypeAlias = Where | Callable[[int], Where]
 
 @dataclass(frozen=True, slots=True)
 class Expression:
-    """A checked expression.
-
-    Attributes
-    ----------
-    text : str
-    names : tuple of str
-        The names in the expression, constants included, in lower case, each once.
-    positions : mapping of str to int
-        Position of the first use of each name.
-    mega, mega_position : str, int
-        The first number written with a capital M, or an empty text, and its position.
-    tree : ast.expr
-    value : float or None
-        Value of an expression that is a single number; None for all others.
-    """
+    """A checked expression."""
 
     text: str
-    names: tuple[str, ...]
-    positions: Mapping[str, int]
+    names: tuple[str, ...]  # The names in the expression, constants included, in lower case, each once
+    positions: Mapping[str, int]  # Position of the first use of each name
+    # mega, mega_position: The first number written with a capital M, or an empty text, and its position
     mega: str
     mega_position: int
     tree: ast.expr
-    value: float | None
+    value: float | None  # Value of an expression that is a single number; None for all others
 
     def evaluate(self, names: Mapping[str, float], where: Place) -> float:
         """Value of the expression, given the values of names (lower case); `where` is its place, for messages."""

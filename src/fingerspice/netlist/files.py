@@ -104,21 +104,12 @@ def _decoded(data: bytes, shown: str, where: Where | None) -> str:
 
 @dataclass
 class SourceFiles:
-    """Finds the recordings and tables of sources: a deck's in its folder or below, a user's own anywhere.
+    """Finds the recordings and tables of sources: a deck's in its folder or below, a user's own anywhere."""
 
-    Attributes
-    ----------
-    folder : Path or None
-        Folder of the deck; None for a deck given as text.
-    anywhere : bool
-        Whether any file may be read, relative to the working directory: for sources given by the user, not by a deck.
-    size : int
-        Total size of the files named so far, bytes; a file counts each time that it is named.
-    """
-
-    folder: Path | None = None
+    folder: Path | None = None  # Folder of the deck; None for a deck given as text
+    # Whether any file may be read, relative to the working directory: for sources given by the user, not by a deck
     anywhere: bool = False
-    size: int = 0
+    size: int = 0  # Total size of the files named so far, bytes; a file counts each time that it is named
 
     def find(self, name: str, where: Where) -> Path:
         """Path of a file named at the place `where`.

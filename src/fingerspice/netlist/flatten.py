@@ -44,67 +44,31 @@ _ELSEWHERE = {
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """One element of the flat circuit.
+    """One element of the flat circuit."""
 
-    Attributes
-    ----------
-    name : str
-        Name as written, with the names of the enclosing calls in front: ``Xfinger.Xgap``.
-    letter : str
-        R, C, V, I, or X for a native device.
-    nodes : tuple of str
-        Nodes in lower case, ground as ``0``; a node inside a subcircuit has the names of the enclosing calls in front.
-    node_names : tuple of str
-        The same nodes as written.
-    device : str or None
-        A native device's name in upper case.
-    body : tuple of Number, Token or Call
-        The words after the nodes; empty for an X.
-    params : dict
-        Values of `key=value` pairs by key in lower case.
-    param_where : dict
-        Places of the keys.
-    where : Where
-        Place of the name.
-    """
-
-    name: str
-    letter: str
+    name: str  # Name as written, with the names of the enclosing calls in front: ``Xfinger.Xgap``
+    letter: str  # R, C, V, I, or X for a native device
+    # Nodes in lower case, ground as ``0``; a node inside a subcircuit has the names of the enclosing calls in front
     nodes: tuple[str, ...]
-    node_names: tuple[str, ...]
-    device: str | None
-    body: tuple[Number | Token | Call, ...]
-    params: dict[str, Value]
-    param_where: dict[str, Where]
-    where: Where
+    node_names: tuple[str, ...]  # The same nodes as written
+    device: str | None  # A native device's name in upper case
+    body: tuple[Number | Token | Call, ...]  # The words after the nodes; empty for an X
+    params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
+    param_where: dict[str, Where]  # Places of the keys
+    where: Where  # Place of the name
 
 
 @dataclass(frozen=True, slots=True)
 class Directive:
-    """A line such as `.tran 10u 50m uic`.
+    """A line such as `.tran 10u 50m uic`."""
 
-    Attributes
-    ----------
-    name : str
-        Name in lower case, with its dot.
-    args : tuple of Number, Token or Call
-        Words of the line, numbers evaluated.
-    params : dict
-        Values of `key=value` pairs by key in lower case; `.ic v(area)=1` has the key ``v(area)``.
-    param_where : dict
-        Places of the keys.
-    where : Where
-        Place of the dot.
-    text : str
-        The line as written, continuations joined.
-    """
-
-    name: str
-    args: tuple[Number | Token | Call, ...]
+    name: str  # Name in lower case, with its dot
+    args: tuple[Number | Token | Call, ...]  # Words of the line, numbers evaluated
+    # Values of `key=value` pairs by key in lower case; `.ic v(area)=1` has the key ``v(area)``
     params: dict[str, Value]
-    param_where: dict[str, Where]
-    where: Where
-    text: str
+    param_where: dict[str, Where]  # Places of the keys
+    where: Where  # Place of the dot
+    text: str  # The line as written, continuations joined
 
 
 @dataclass(slots=True)

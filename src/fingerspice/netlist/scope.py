@@ -33,23 +33,12 @@ class Token:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number, or an expression's value.
+    """A number, or an expression's value."""
 
-    Attributes
-    ----------
-    value : float
-        The value in SI units.
-    text : str
-        As written, braces included.
-    where : Where
-        The place of its first character.
-    mega : Token, optional
-        The number with a capital M from which the value was computed: M is milli, and perhaps meant as mega.
-    """
-
-    value: float
-    text: str
-    where: Where
+    value: float  # The value in SI units
+    text: str  # As written, braces included
+    where: Where  # The place of its first character
+    # The number with a capital M from which the value was computed: M is milli, and perhaps meant as mega
     mega: Token | None = None
 
 

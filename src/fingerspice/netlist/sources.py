@@ -42,22 +42,13 @@ _PLAIN: dict[str, tuple[Callable[..., Waveform], tuple[str, ...], int]] = {
 
 @dataclass(frozen=True)
 class Context:
-    """Data that the text of a source may refer to.
+    """Data that the text of a source may refer to."""
 
-    Attributes
-    ----------
-    step, stop : float or None
-        TSTEP and TSTOP of the deck (s), on which SPICE's defaults depend; None without a .tran line.
-    files : SourceFiles
-        Finds recordings and tables.
-    in_deck : bool
-        Whether the text stands in a deck, which a SPICE may read, too.
-    """
-
+    # step, stop: TSTEP and TSTOP of the deck (s), on which SPICE's defaults depend; None without a .tran line
     step: float | None = None
     stop: float | None = None
-    files: SourceFiles = field(default_factory=SourceFiles)
-    in_deck: bool = True
+    files: SourceFiles = field(default_factory=SourceFiles)  # Finds recordings and tables
+    in_deck: bool = True  # Whether the text stands in a deck, which a SPICE may read, too
 
 
 @dataclass(frozen=True)
@@ -270,19 +261,11 @@ _REFUSED = {  # in decks, which a SPICE may read, too; --source takes an AM
 
 @dataclass(frozen=True)
 class Source:
-    """Waveform and small signal of a V or I element, from the words after its nodes.
-
-    Attributes
-    ----------
-    waveform : Waveform
-    ac : SmallSignal or None
-    notes : tuple of str
-        Warnings about words that ngspice reads differently.
-    """
+    """Waveform and small signal of a V or I element, from the words after its nodes."""
 
     waveform: Waveform
     ac: SmallSignal | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # Warnings about words that ngspice reads differently
 
 
 def read_source(name: str, body: Sequence[Word], context: Context, where: Where) -> Source:

@@ -16,25 +16,14 @@ from fingerspice.base.arrays import FloatArray
 
 
 class Tableau(NamedTuple):
-    """A collocation method of s stages: order 2 s - 1 at the end of a step, stiffly accurate, L-stable.
+    """A collocation method of s stages: order 2 s - 1 at the end of a step, stiffly accurate, L-stable."""
 
-    Attributes
-    ----------
-    a : ndarray, shape (s, s)
-        Stage weights; the last row gives the end of the step.
-    c : ndarray, shape (s,)
-        Stage times in units of the step, the last one 1.
-    e : ndarray, shape (s,)
-        Error weights: the highest Legendre coefficient of the increment, the part that a polynomial of one degree less
-        could not follow.
-    dense : ndarray, shape (s, s)
-        x(t + theta h) = x + h sum_i sum_j K_i dense[i, j] theta^(j + 1), of order s.
-    """
-
-    a: FloatArray
-    c: FloatArray
+    a: FloatArray  # (s, s): Stage weights; the last row gives the end of the step
+    c: FloatArray  # (s,): Stage times in units of the step, the last one 1
+    # (s,): Error weights: the highest Legendre coefficient of the increment, the part that a polynomial of one degree
+    # less could not follow
     e: FloatArray
-    dense: FloatArray
+    dense: FloatArray  # (s, s): x(t + theta h) = x + h sum_i sum_j K_i dense[i, j] theta^(j + 1), of order s
 
 
 def radau(stages: int) -> Tableau:

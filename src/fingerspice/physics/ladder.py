@@ -23,24 +23,12 @@ from fingerspice.physics.materials import EPS0
 
 @dataclass(frozen=True)
 class Ladder:
-    """A material as a passive ladder.
+    """A material as a passive ladder."""
 
-    Attributes
-    ----------
-    conductivity : float
-        g0, at zero frequency, S/m; above 0.
-    eps_inf : float
-        Relative permittivity far above the poles; above 0.
-    poles : tuple of float
-        p_j, rad/s, ascending.
-    weights : tuple of float
-        k_j, S/m; above 0.
-    """
-
-    conductivity: float
-    eps_inf: float
-    poles: tuple[float, ...]
-    weights: tuple[float, ...]
+    conductivity: float  # g0, at zero frequency, S/m; above 0
+    eps_inf: float  # Relative permittivity far above the poles; above 0
+    poles: tuple[float, ...]  # p_j, rad/s, ascending
+    weights: tuple[float, ...]  # k_j, S/m; above 0
 
     def admittivity(self, frequency: ArrayLike) -> ComplexArray:
         """y(2 pi i f), S/m, at frequencies in Hz."""

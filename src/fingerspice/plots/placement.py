@@ -19,23 +19,14 @@ Extent = tuple[int, int]
 
 @dataclass(frozen=True)
 class Place:
-    """Where one element stands.
-
-    Attributes
-    ----------
-    element : Element
-    column : int
-    top, bottom : int
-        Rows of its upper and its lower node.
-    upright : bool
-        Whether its first node is the upper one.
-    """
+    """Where one element stands."""
 
     element: Element
     column: int
+    # top, bottom: Rows of its upper and its lower node
     top: int
     bottom: int
-    upright: bool
+    upright: bool  # Whether its first node is the upper one
 
     @property
     def gap(self) -> int:

@@ -29,20 +29,13 @@ _WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 *
 
 
 class Panels(NamedTuple):
-    """Parts of a run on each of which every signal is smooth.
+    """Parts of a run on each of which every signal is smooth."""
 
-    Attributes
-    ----------
-    step : ndarray of int, shape (p,)
-    low, high : ndarray, shape (p,)
-        The part of that step that the panel covers, as fractions of its length.
-    duration : ndarray, shape (p,)
-        Duration, s; longer than the panel itself if the panel represents several equal periods.
-    """
-
-    step: IntArray
+    step: IntArray  # (p,)
+    # low, high (p,): The part of that step that the panel covers, as fractions of its length
     low: FloatArray
     high: FloatArray
+    # (p,): Duration, s; longer than the panel itself if the panel represents several equal periods
     duration: FloatArray
 
     def take(self, which: IntArray) -> Panels:
@@ -76,14 +69,9 @@ class Run(Protocol):
 
 @dataclass(frozen=True)
 class Weighed:
-    """Values of a signal with quadrature weights.
+    """Values of a signal with quadrature weights."""
 
-    Attributes
-    ----------
-    t, weight, x : ndarray, shape (n,)
-        Times (s), weights whose sum is 1, and the signal in its unit.
-    """
-
+    # t, weight, x (n,): Times (s), weights whose sum is 1, and the signal in its unit
     t: FloatArray
     weight: FloatArray
     x: FloatArray

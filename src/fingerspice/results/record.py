@@ -49,25 +49,14 @@ class Record(Sealed):
     """Outputs of a run as they were computed, and the signals that follow from them.
 
     Signals of gaps and of sources have the shape (n_t,) where there is one of them, else (n_t, n).
-
-    Attributes
-    ----------
-    network : Network
-    net : Net
-    t : ndarray, shape (n_t,)
-        s; at a jump two entries share a time.
-    left : ndarray of bool, shape (n_t,)
-        Whether an output is the left-hand value at a jump.
-    rows : ndarray, shape (n_t, size)
-        The state as in `engine.network`; with `has_charge` the sources' currents follow in the last columns, and
-        without it the columns of the charges may be missing.
-    has_charge : bool
     """
 
     network: Network
     net: Net
-    t: FloatArray
-    left: BoolArray
+    t: FloatArray  # (n_t,): s; at a jump two entries share a time
+    left: BoolArray  # (n_t,): Whether an output is the left-hand value at a jump
+    # (n_t, size): The state as in `engine.network`; with `has_charge` the sources' currents follow in the last columns,
+    # and without it the columns of the charges may be missing
     rows: FloatArray
     has_charge: bool
 

@@ -27,29 +27,18 @@ _MOST_PASSED, _LONGEST = 200_000, 0.5
 
 @dataclass(frozen=True)
 class ClosedForm:
-    """A run in closed form, or by a method that computes it anew for any times.
+    """A run in closed form, or by a method that computes it anew for any times."""
 
-    Attributes
-    ----------
-    look : callable
-        Function of times (s, ascending), and of whether the left-hand limit is wanted at each, that returns a record.
-    waveform : Waveform
-        Waveform with the breakpoints of all sources.
-    t_start, first, stop : float
-        Start of the run, and the interval for figures, s.
-    error : float
-        Error of the records of `look`, relative to the peaks; the panels' polynomials need not be more accurate.
-    rounding : float
-        Round-off of a voltage, V, below which the polynomials need not be accurate.
-    """
-
+    # Function of times (s, ascending), and of whether the left-hand limit is wanted at each, that returns a record
     look: Callable[[FloatArray, BoolArray], Record]
-    waveform: Waveform
+    waveform: Waveform  # Waveform with the breakpoints of all sources
+    # t_start, first, stop: Start of the run, and the interval for figures, s
     t_start: float
     first: float
     stop: float
+    # Error of the records of `look`, relative to the peaks; the panels' polynomials need not be more accurate
     error: float = 0.0
-    rounding: float = 0.0
+    rounding: float = 0.0  # Round-off of a voltage, V, below which the polynomials need not be accurate
 
     def run(self, readers: Mapping[str, Read], since: float, until: float) -> Stretches | None:
         """Panels between two times (s), on each of which a polynomial represents every voltage; None if too many.

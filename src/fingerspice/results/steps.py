@@ -32,23 +32,15 @@ _FROM_SERIES = chebyshev.chebvander(2.0 * _NODES - 1.0, NODES - 1).T
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive steps, and the periods that they represent.
+    """Consecutive steps, and the periods that they represent."""
 
-    Attributes
-    ----------
-    times : ndarray, shape (k, 4)
-        Start and length of each step and the end reached, s, and the part of the length that was reached.
-    values : ndarray, shape (k, n_column, NODES)
-        Values at the nodes of the whole step, which may extend beyond the end reached.
-    count : int
-        Number of equal periods.
-    shift, period : float
-        The first of these periods is `shift` (s) after the steps' own times, each further one `period` (s) later.
-    """
-
+    # (k, 4): Start and length of each step and the end reached, s, and the part of the length that was reached
     times: FloatArray
+    # (k, n_column, NODES): Values at the nodes of the whole step, which may extend beyond the end reached
     values: FloatArray
-    count: int = 1
+    count: int = 1  # Number of equal periods
+    # shift, period: The first of these periods is `shift` (s) after the steps' own times, each further one `period` (s)
+    # later
     shift: float = 0.0
     period: float = 0.0
 

@@ -60,18 +60,10 @@ class StoredRecord(Sealed):
 
 @dataclass(frozen=True, eq=False)
 class StoredRun:
-    """The last period of a run between its outputs, by polynomials on panels; see `measures.Run`.
+    """The last period of a run between its outputs, by polynomials on panels; see `measures.Run`."""
 
-    Attributes
-    ----------
-    since : float
-        Start of the period, s.
-    nodes : StoredRecord
-        Signals at the nodes of each panel, one panel after another.
-    """
-
-    since: float
-    nodes: StoredRecord
+    since: float  # Start of the period, s
+    nodes: StoredRecord  # Signals at the nodes of each panel, one panel after another
 
     def run(self, readers: Mapping[str, Read], since: float, until: float) -> StoredRun | None:
         """This period itself; None for any other part of the run."""

@@ -61,26 +61,15 @@ class SetValue:
 
 @dataclass(frozen=True)
 class Reference:
-    """A work to cite; `doi` is empty where none is known.
+    """A work to cite; `doi` is empty where none is known."""
 
-    Attributes
-    ----------
-    key, kind, title : str
-        The kind is BibTeX's.
-    authors : tuple of str
-        ``Family, Given``; an institution is in braces.
-    year : int or None
-    where : mapping of str to str
-        Journal or book title, volume, number, pages, as BibTeX names them.
-    doi, url : str
-    """
-
+    # key, kind, title: The kind is BibTeX's
     key: str
     kind: str
     title: str
-    authors: tuple[str, ...]
+    authors: tuple[str, ...]  # ``Family, Given``; an institution is in braces
     year: int | None
-    where: Mapping[str, str]
+    where: Mapping[str, str]  # Journal or book title, volume, number, pages, as BibTeX names them
     doi: str
     url: str
 

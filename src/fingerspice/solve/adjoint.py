@@ -44,17 +44,10 @@ _SHARE = 1e-2
 
 @dataclass(frozen=True)
 class _Grid:
-    """Steps of equal length between the samples of a recording, from the start of a run to its end.
+    """Steps of equal length between the samples of a recording, from the start of a run to its end."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (2 n + 1,)
-        Start, middle and end of the n steps, s.
-    sample, share, width : ndarray, shape (n,)
-        See `engine.adjoint.Course`.
-    """
-
-    t: FloatArray
+    t: FloatArray  # (2 n + 1,): Start, middle and end of the n steps, s
+    # sample, share, width (n,): See `engine.adjoint.Course`
     sample: IntArray
     share: FloatArray
     width: FloatArray

@@ -45,20 +45,12 @@ class _LostError(Exception):
 
 @dataclass(frozen=True)
 class _Period:
-    """A period that has been integrated.
+    """A period that has been integrated."""
 
-    Attributes
-    ----------
-    track : Track
-        The integration at the end of the period; its charge is the charge delivered within the period.
-    marks : ndarray, shape (n_step + 1,)
-        Limits of the steps, s.
-    fixed : ndarray of float, shape (n_step + 1,)
-        AT_ZERO or AT_EDGE for a limit at a zero of the gap voltage or at an edge of the source, 0 for any other.
-    """
-
-    track: Track
-    marks: FloatArray
+    track: Track  # The integration at the end of the period; its charge is the charge delivered within the period
+    marks: FloatArray  # (n_step + 1,): Limits of the steps, s
+    # (n_step + 1,): AT_ZERO or AT_EDGE for a limit at a zero of the gap voltage or at an edge of the source, 0 for any
+    # other
     fixed: FloatArray
 
     @property

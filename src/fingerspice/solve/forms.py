@@ -187,25 +187,13 @@ def _pulse(z: FloatArray, faded: FloatArray, at: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class Follower(ABC):
-    """A scene prepared for recordings, for all tolerances of one decade.
-
-    Attributes
-    ----------
-    shown : blockforms.Shown
-    share : float
-        Largest gap voltage to expect for a peak of the source of 1, V/V or V/A.
-    u_top : float
-        Largest gap voltage that the polynomials cover, V.
-    q_rest : float
-        1/A at 0 V, 1/m^2.
-    missed, missed_u : float
-        Error of the polynomials: of 1/A, relative, and of the gap voltage in addition, V.
-    """
+    """A scene prepared for recordings, for all tolerances of one decade."""
 
     shown: blockforms.Shown
-    share: float
-    u_top: float
-    q_rest: float
+    share: float  # Largest gap voltage to expect for a peak of the source of 1, V/V or V/A
+    u_top: float  # Largest gap voltage that the polynomials cover, V
+    q_rest: float  # 1/A at 0 V, 1/m^2
+    # missed, missed_u: Error of the polynomials: of 1/A, relative, and of the gap voltage in addition, V
     missed: float
     missed_u: float
 
@@ -237,20 +225,11 @@ class Follower(ABC):
 
 @dataclass(frozen=True)
 class Followed(Follower):
-    """A stack prepared for recordings.
-
-    Attributes
-    ----------
-    system : System
-    area : ndarray
-        Polynomial of 1/A, see `Form.area`.
-    at_rest : float
-        Variable of that polynomial at 0 V.
-    """
+    """A stack prepared for recordings."""
 
     system: System
-    area: FloatArray
-    at_rest: float
+    area: FloatArray  # Polynomial of 1/A, see `Form.area`
+    at_rest: float  # Variable of that polynomial at 0 V
 
     def _charge_with(self, u_gap: float) -> float:
         """Part of the charge (C) that is a function of the gap voltage (V)."""

@@ -66,24 +66,15 @@ def is_followed(scene: Scene, circuit: Circuit) -> bool:
 
 @dataclass(frozen=True)
 class Finger(Follower):
-    """A network prepared for recordings.
-
-    Attributes
-    ----------
-    reduced : Reduced
-    modal : Modal
-    area, bend : ndarray
-        1/A and N, see `Form`; `scale` is that of their variable.
-    missed_bend : float
-        Error of N, V m^2.
-    """
+    """A network prepared for recordings."""
 
     reduced: Reduced
     modal: Modal
+    # area, bend: 1/A and N, see `Form`; `scale` is that of their variable
     area: FloatArray
     bend: FloatArray
     scale: float
-    missed_bend: float
+    missed_bend: float  # Error of N, V m^2
 
     def form(self, spacing: float) -> Form:
         one, reduced = self.modal, self.reduced

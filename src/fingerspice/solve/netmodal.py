@@ -30,49 +30,29 @@ from fingerspice.solve.scenes import Scene
 
 @dataclass(frozen=True)
 class Modal:
-    """Modes w of a network and, behind them, the charges of its sources where these are wanted.
+    """Modes w of a network and, behind them, the charges of its sources where these are wanted."""
 
-    Attributes
-    ----------
-    rates, gain : ndarray, shape (m,)
-        w' = -rates w + gain s + drives g, for the one source that is not 0.
-    drives : ndarray, shape (m, T)
-        By (q - q0) times each tap, and last by N.
-    taps, tap_s : ndarray, shape (1 + T, m) and (1 + T,)
-        xi, the voltages of the cells with a fixed leak, and xi again for N.
-    columns, bends, k : ndarray, shape (C, m), (C,) and (C,)
-        State voltages and charges from w, N and the source.
-    nodes : ndarray, shape (n_node, m)
-        Voltages of the nodes from w.
-    """
-
+    # rates, gain (m,): w' = -rates w + gain s + drives g, for the one source that is not 0
     rates: FloatArray
     gain: FloatArray
-    drives: FloatArray
+    drives: FloatArray  # (m, T): By (q - q0) times each tap, and last by N
+    # taps, tap_s (1 + T, m): xi, the voltages of the cells with a fixed leak, and xi again for N
     taps: FloatArray
     tap_s: FloatArray
+    # columns, bends, k (C, m): State voltages and charges from w, N and the source
     columns: FloatArray
     bends: FloatArray
     k: FloatArray
-    nodes: FloatArray
+    nodes: FloatArray  # (n_node, m): Voltages of the nodes from w
 
 
 @dataclass(frozen=True)
 class Reduced:
-    """A network with one moving area, at a reference area.
-
-    Attributes
-    ----------
-    scene : Scene
-    source : int
-        Number of the source that is not 0.
-    area0 : ndarray
-        Every area, m^2; `q0` is the inverse of the one that moves.
-    """
+    """A network with one moving area, at a reference area."""
 
     scene: Scene
-    source: int
-    area0: FloatArray
+    source: int  # Number of the source that is not 0
+    area0: FloatArray  # Every area, m^2; `q0` is the inverse of the one that moves
 
     @cached_property
     def moving(self) -> int:

@@ -34,32 +34,19 @@ _BOUNDED = 1e-9
 
 @dataclass(frozen=True)
 class Closed:
-    """A problem that starts from its periodic state, with the error of that state.
+    """A problem that starts from its periodic state, with the error of that state."""
 
-    Attributes
-    ----------
-    problem : Problem
-        It starts with the first whole period after the source has become periodic, not before its original start.
-    defect : float
-        Largest change of a live voltage over a further period, V.
-    map_slope : ndarray, shape (n, n)
-        Jacobian matrix of the period map, to about 1e-5; its variables are the modes and the areas with a time
-        constant.
-    memory : float
-        Error of the periodic state relative to the error of one period: a slow mode accumulates the errors of the
-        periods within its memory.
-    error : ErrorEstimate
-        Error of the state, as its effect on the gap voltage and the force of the period.
-    periods : float
-        Number of periods integrated.
-    """
-
+    # It starts with the first whole period after the source has become periodic, not before its original start
     problem: Problem
-    defect: float
+    defect: float  # Largest change of a live voltage over a further period, V
+    # (n, n): Jacobian matrix of the period map, to about 1e-5; its variables are the modes and the areas with a time
+    # constant
     map_slope: FloatArray
+    # Error of the periodic state relative to the error of one period: a slow mode accumulates the errors of the periods
+    # within its memory
     memory: float
-    error: ErrorEstimate
-    periods: float
+    error: ErrorEstimate  # Error of the state, as its effect on the gap voltage and the force of the period
+    periods: float  # Number of periods integrated
 
 
 def close_period(problem: Problem, rtol: float) -> Closed:

@@ -26,26 +26,19 @@ LONGEST, SLOW_ENOUGH = 4.0, 4.0
 
 @dataclass(frozen=True)
 class Piece:
-    """A part of a run with evenly spaced samples, or with the points of a PWL.
+    """A part of a run with evenly spaced samples, or with the points of a PWL."""
 
-    Attributes
-    ----------
-    start, spacing : float
-        Time of the first sample and distance of the samples, s.
-    first, last : int
-        Numbers of the first and the last sample; both 0 for a single step between two times that are no samples.
-    times : ndarray, shape (n,), or None
-        Of the points of a PWL at uneven times, s; None for samples. `spacing` is then the mean distance in the run.
-    led : bool
-        Whether the ordinary engine integrates it: where a run of a network starts, the source may jump, after which
-        fast modes decay that no step of a sample resolves.
-    """
-
+    # start, spacing: Time of the first sample and distance of the samples, s
     start: float
     spacing: float
+    # first, last: Numbers of the first and the last sample; both 0 for a single step between two times that are no
+    # samples
     first: int = 0
     last: int = 0
+    # Whether the ordinary engine integrates it: where a run of a network starts, the source may jump, after which fast
+    # modes decay that no step of a sample resolves
     led: bool = False
+    # (n,): Of the points of a PWL at uneven times, s; None for samples. `spacing` is then the mean distance in the run.
     times: FloatArray | None = None
 
     @property

@@ -29,36 +29,21 @@ KEPT_BREAKPOINTS = 8192
 
 @dataclass(frozen=True)
 class Problem:
-    """All data that an integrator needs.
-
-    Attributes
-    ----------
-    circuit : Circuit
-    scene : Scene
-    t_start, t_stop, first, step : float
-        Start and end of the run, first output and spacing of the outputs, s.
-    initial : State
-    charge : bool
-        Whether charge and current are wanted.
-    start : str
-        How the run starts, as in `simulate`; ``"given"`` for the end of another run.
-    by_deck : bool
-        Whether the run ends at the deck's own TSTOP.
-    begun : ndarray, shape (n_gap, 2), or None
-        Error of a periodic start, as its effect on every gap's voltage and force, V and N. The start was computed with
-        half of the error asked for; the other half is left to the run.
-    """
+    """All data that an integrator needs."""
 
     circuit: Circuit
     scene: Scene
+    # t_start, t_stop, first, step: Start and end of the run, first output and spacing of the outputs, s
     t_start: float
     t_stop: float
     first: float
     step: float
     initial: State
-    charge: bool = True
-    start: str = "deck"
-    by_deck: bool = False
+    charge: bool = True  # Whether charge and current are wanted
+    start: str = "deck"  # How the run starts, as in `simulate`; ``"given"`` for the end of another run
+    by_deck: bool = False  # Whether the run ends at the deck's own TSTOP
+    # (n_gap, 2): Error of a periodic start, as its effect on every gap's voltage and force, V and N. The start was
+    # computed with half of the error asked for; the other half is left to the run.
     begun: FloatArray | None = None
 
     @property

@@ -31,26 +31,15 @@ MOST_KEPT = 16
 
 @dataclass
 class Known:
-    """The references of a scene that one thread has needed so far, and the step tables for them.
-
-    Attributes
-    ----------
-    arrays : References
-    tables : Tables
-    magnified : ndarray, shape (n_area + 1,)
-        Round-off of each gap's voltage, and last of the nodes' voltages, relative to the rounding of the largest
-        voltage; the maximum over all references.
-    shapes : list of tuple
-        Shapes of the arrays in `REFERRED`.
-    fixed : dict
-        The fields of a `Form` that are the same for all references.
-    """
+    """The references of a scene that one thread has needed so far, and the step tables for them."""
 
     arrays: References
     tables: Tables
+    # (n_area + 1,): Round-off of each gap's voltage, and last of the nodes' voltages, relative to the rounding of the
+    # largest voltage; the maximum over all references
     magnified: FloatArray
-    shapes: list[tuple[int, ...]]
-    fixed: dict[str, Any]
+    shapes: list[tuple[int, ...]]  # Shapes of the arrays in `REFERRED`
+    fixed: dict[str, Any]  # The fields of a `Form` that are the same for all references
 
     @property
     def count(self) -> int:

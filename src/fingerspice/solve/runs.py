@@ -44,64 +44,33 @@ def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: C
 
 @dataclass
 class Run:
-    """Result of one run, with its statistics and stated errors.
+    """Result of one run, with its statistics and stated errors."""
 
-    Attributes
-    ----------
-    t, left, rows : ndarray
-        As in `Record`, up to the time reached.
-    status : Status
-    nfev : int
-        Evaluations of the right-hand side.
-    stats : dict
-    state : State
-        State at the time reached.
-    gaps : ndarray, shape (n_measured, 4)
-        Peaks of voltage (V) and force (N), and the stated errors of both, for each cell in `Scene.measured`.
-    charge_error : float or None
-        Stated error of the charge, C.
-    node_error : float or None
-        Stated error of the nodes' voltages, V.
-    t_failed : float or None
-        Time at which the run failed, s.
-    unseen, rough
-        See `Tables`.
-    margin : float
-        Smallest distance to the fold in the run.
-    detail : str
-        Message of a method about its failure.
-    note : str
-        Why an implicit method took over; empty where none did.
-    tried : ndarray, shape (n, 4)
-        The last steps tried, as rows of `results.outcome.last_tried`.
-    here : ndarray, shape (width,), or None
-        The row at the time that a failed run reached.
-    continuous : Recorded or ClosedForm or None
-        The run between its outputs, where that is known.
-    by_layer : bool
-        Whether the rows refer to the network of `Scene.shown`.
-    """
-
+    # t, left, rows: As in `Record`, up to the time reached
     t: FloatArray
     left: BoolArray
     rows: FloatArray
     status: Status
-    nfev: int
+    nfev: int  # Evaluations of the right-hand side
     stats: dict[str, int]
-    state: State
+    state: State  # State at the time reached
+    # (n_measured, 4): Peaks of voltage (V) and force (N), and the stated errors of both, for each cell in
+    # `Scene.measured`
     gaps: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
-    charge_error: float | None = None
-    node_error: float | None = None
-    t_failed: float | None = None
+    charge_error: float | None = None  # Stated error of the charge, C
+    node_error: float | None = None  # Stated error of the nodes' voltages, V
+    t_failed: float | None = None  # Time at which the run failed, s
+    # unseen, rough: See `Tables`
     unseen: tuple[float, float, int] | None = None
     rough: float = 0.0
-    margin: float = 1.0
-    detail: str = ""
-    note: str = ""
+    margin: float = 1.0  # Smallest distance to the fold in the run
+    detail: str = ""  # Message of a method about its failure
+    note: str = ""  # Why an implicit method took over; empty where none did
+    # (n, 4): The last steps tried, as rows of `results.outcome.last_tried`
     tried: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
-    here: FloatArray | None = None
-    continuous: Recorded | ClosedForm | None = None
-    by_layer: bool = False
+    here: FloatArray | None = None  # (width,): The row at the time that a failed run reached
+    continuous: Recorded | ClosedForm | None = None  # The run between its outputs, where that is known
+    by_layer: bool = False  # Whether the rows refer to the network of `Scene.shown`
 
     @property
     def error(self) -> ErrorEstimate:
@@ -218,15 +187,9 @@ class Integration(ABC):
 
 
 class NetworkIntegration(Integration):
-    """An integration whose steps use the same state as the outputs.
+    """An integration whose steps use the same state as the outputs."""
 
-    Attributes
-    ----------
-    rows : ndarray, shape (n_out, width)
-        Rows of the outputs, as in `Record`.
-    """
-
-    rows: FloatArray
+    rows: FloatArray  # (n_out, width): Rows of the outputs, as in `Record`
 
     @abstractmethod
     def jump(self, after: FloatArray) -> bool:

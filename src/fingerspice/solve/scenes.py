@@ -40,54 +40,27 @@ DRIVEN_BY_CURRENT = 300.0
 
 @dataclass(frozen=True)
 class Freezing:
-    """The single frequency at which a dispersive skin's data are taken, and the error of doing so.
+    """The single frequency at which a dispersive skin's data are taken, and the error of doing so."""
 
-    Attributes
-    ----------
-    frequency : float
-        Hz.
-    error : float
-        Error of the gap voltage, relative to its peak.
-    """
-
-    frequency: float
-    error: float
+    frequency: float  # Hz
+    error: float  # Error of the gap voltage, relative to its peak
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A circuit under one charge law and area mode, as arrays; the circuit caches it from run to run.
+    """A circuit under one charge law and area mode, as arrays; the circuit caches it from run to run."""
 
-    Attributes
-    ----------
-    network : Network
-        The circuit's network; for a series stack that of its loop.
-    charge_law, area_mode : str
-    fixed : tuple of float or None
-        Each area if it is fixed, m^2; None if it follows its gap.
-    u_peak : float
-        Sum of the largest |U| of the voltage sources, V; 0 where it is not known.
-    u_size : float
-        The larger one of `u_peak` and the sum of the peaks of all parts that may cancel in the sources, V.
-    u_top : float
-        Largest gap voltage that the areas' curves cover, V.
-    model : Model or None
-        Model of a series stack, whose modes follow from a secular equation.
-    skin : Freezing or None
-        Frequency at which a dispersive skin's data are taken, if one is accurate enough for the error asked for.
-    prepared : dict
-        Cache of the tables and systems that integrators have made for this scene.
-    """
-
-    network: Network
+    network: Network  # The circuit's network; for a series stack that of its loop
     charge_law: str
     area_mode: str
-    fixed: tuple[float | None, ...]
-    u_peak: float
-    u_size: float
-    u_top: float
-    model: Model | None = None
+    fixed: tuple[float | None, ...]  # Each area if it is fixed, m^2; None if it follows its gap
+    u_peak: float  # Sum of the largest |U| of the voltage sources, V; 0 where it is not known
+    u_size: float  # The larger one of `u_peak` and the sum of the peaks of all parts that may cancel in the sources, V
+    u_top: float  # Largest gap voltage that the areas' curves cover, V
+    model: Model | None = None  # Model of a series stack, whose modes follow from a secular equation
+    # Frequency at which a dispersive skin's data are taken, if one is accurate enough for the error asked for
     skin: Freezing | None = None
+    # Cache of the tables and systems that integrators have made for this scene
     prepared: dict[Any, Any] = field(default_factory=dict)
 
     @property

@@ -128,17 +128,11 @@ def _changes(varied: Sequence[_Varied], scene: Scene) -> Changes:
 
 @dataclass(frozen=True)
 class _Steps:
-    """The steps of a run in the order of time, those of repeated periods as often as they occur.
-
-    Attributes
-    ----------
-    order : ndarray of int, shape (n,)
-    begin, end : ndarray, shape (n,)
-        s.
-    """
+    """The steps of a run in the order of time, those of repeated periods as often as they occur."""
 
     stretches: Stretches
-    order: IntArray
+    order: IntArray  # (n,)
+    # begin, end (n,): s
     begin: FloatArray
     end: FloatArray
 

@@ -20,27 +20,13 @@ from fingerspice.solve.scenes import Scene
 
 @dataclass(frozen=True)
 class StackState:
-    """A state in the engine's form.
+    """A state in the engine's form."""
 
-    Attributes
-    ----------
-    t : float
-        s.
-    y : ndarray, shape (n + 1,)
-        State x (V), and z (C) last.
-    u_before : float
-        Voltage around the loop just before `t`, V.
-    u_gap : float
-        Gap voltage along the loop, V.
-    offset : float
-        Value of A U / S at the start of the run, subtracted so that the charge counts from there, C.
-    """
-
-    t: float
-    y: FloatArray
-    u_before: float
-    u_gap: float
-    offset: float
+    t: float  # s
+    y: FloatArray  # (n + 1,): State x (V), and z (C) last
+    u_before: float  # Voltage around the loop just before `t`, V
+    u_gap: float  # Gap voltage along the loop, V
+    offset: float  # Value of A U / S at the start of the run, subtracted so that the charge counts from there, C
 
 
 def model_of(scene: Scene) -> Model:

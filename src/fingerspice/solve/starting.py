@@ -189,21 +189,11 @@ def at_own_area(u: float, area: float, curve: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Settled:
-    """Consistent start voltages, and the charges that have flowed to make them so.
+    """Consistent start voltages, and the charges that have flowed to make them so."""
 
-    Attributes
-    ----------
-    x : ndarray, shape (n,)
-        Live voltages, V.
-    slow : ndarray, shape (n_slow,)
-        Areas with a time constant, relative to their values at 0 V.
-    charge : ndarray, shape (n_s,)
-        Charge that each source delivered, C.
-    """
-
-    x: FloatArray
-    slow: FloatArray
-    charge: FloatArray
+    x: FloatArray  # (n,): Live voltages, V
+    slow: FloatArray  # (n_slow,): Areas with a time constant, relative to their values at 0 V
+    charge: FloatArray  # (n_s,): Charge that each source delivered, C
 
 
 def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> Settled:

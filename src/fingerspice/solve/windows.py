@@ -32,26 +32,16 @@ Mark = dict[str, Any]
 
 @dataclass(frozen=True)
 class Outputs:
-    """Output times, evenly spaced.
+    """Output times, evenly spaced."""
 
-    Attributes
-    ----------
-    start, over : float
-        Time of output number 0, s, and spacing, s; if `rated`, `over` is the rate of a recording, Hz.
-    rated : bool
-        Whether the outputs are at the samples of a recording.
-    low, total : int
-        Number of the first output, and how many outputs there are.
-    stop : float
-        End of the run, s.
-    """
-
+    # start, over: Time of output number 0, s, and spacing, s; if `rated`, `over` is the rate of a recording, Hz
     start: float
     over: float
-    rated: bool
+    rated: bool  # Whether the outputs are at the samples of a recording
+    # low, total: Number of the first output, and how many outputs there are
     low: int
     total: int
-    stop: float
+    stop: float  # End of the run, s
 
     def times(self, i: int, j: int) -> FloatArray:
         """Times of outputs i to j - 1, s, rounded as ``start + arange / rate`` or ``start + step * arange`` are."""

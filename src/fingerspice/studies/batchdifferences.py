@@ -50,27 +50,15 @@ _MOST_GAIN = 8.0
 
 @dataclass(frozen=True)
 class Gradients:
-    """The checked request.
+    """The checked request."""
 
-    Attributes
-    ----------
-    paths : tuple of str
-        The parameters, in the circuit's own spelling.
-    outputs : tuple of str
-        Outputs that have derivatives.
-    together : mapping of str to tuple of str
-        Each parameter with those that grow in proportion to it: the frequency of a source with that of a skin.
-    longer : str or None
-        The parameter with which the length of a run changes: the frequency, where the length is given in periods.
-    clock : str or None
-        The frequency of the only source, if it is one of the parameters.
-    """
-
-    paths: tuple[str, ...]
-    outputs: tuple[str, ...]
+    paths: tuple[str, ...]  # The parameters, in the circuit's own spelling
+    outputs: tuple[str, ...]  # Outputs that have derivatives
+    # Each parameter with those that grow in proportion to it: the frequency of a source with that of a skin
     together: Mapping[str, tuple[str, ...]]
+    # The parameter with which the length of a run changes: the frequency, where the length is given in periods
     longer: str | None
-    clock: str | None
+    clock: str | None  # The frequency of the only source, if it is one of the parameters
 
     def values(self, circuit: Circuit, scenes: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Values of the parameters in all scenes, shape (n,) each."""
@@ -82,24 +70,14 @@ class Gradients:
 
 @dataclass
 class Slopes:
-    """Derivatives of the outputs of some scenes.
+    """Derivatives of the outputs of some scenes."""
 
-    Attributes
-    ----------
-    values : dict of str to ndarray, shape (n, n_parameter)
-        Derivatives of every output, per unit of the parameter; NaN for a scene without a result.
-    error : ndarray, shape (n,)
-        Stated error for a change of a parameter by all of itself, relative to the output; the largest of all.
-    status : ndarray, shape (n,)
-        As in `Answers`.
-    done : ndarray, shape (n,)
-    messages : dict of int to str
-    """
-
+    # (n, n_parameter): Derivatives of every output, per unit of the parameter; NaN for a scene without a result
     values: dict[str, FloatArray]
+    # (n,): Stated error for a change of a parameter by all of itself, relative to the output; the largest of all
     error: FloatArray
-    status: NDArray[np.int8]
-    done: BoolArray
+    status: NDArray[np.int8]  # (n,): As in `Answers`
+    done: BoolArray  # (n,)
     messages: dict[int, str]
 
     @classmethod

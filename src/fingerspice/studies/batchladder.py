@@ -132,23 +132,12 @@ def friction_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatAr
 
 
 class Mesh(NamedTuple):
-    """What scenes need of their steps, each of shape (n,).
+    """What scenes need of their steps, each of shape (n,)."""
 
-    Attributes
-    ----------
-    touching : ndarray of bool
-        Whether there is contact.
-    pieces : ndarray of int
-        Pieces of a half period; 0 for a source that is no square.
-    decays : ndarray
-        Half a period in time constants of the fastest cell.
-    least : ndarray
-        Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0.
-    """
-
-    touching: BoolArray
-    pieces: NDArray[np.int64]
-    decays: FloatArray
+    touching: BoolArray  # Whether there is contact
+    pieces: NDArray[np.int64]  # Pieces of a half period; 0 for a source that is no square
+    decays: FloatArray  # Half a period in time constants of the fastest cell
+    # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
     least: FloatArray
 
 

@@ -40,34 +40,18 @@ _CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
 
 @dataclass(frozen=True)
 class LockstepForm:
-    """Properties that all scenes in lockstep have in common.
+    """Properties that all scenes in lockstep have in common."""
 
-    Attributes
-    ----------
-    layers : tuple of Element
-        Layers in the order of the loop.
-    gap : int
-        Index of the gap among them.
-    sources : tuple of (Element, float)
-        The sources that are on; each with the sign of the gap along the loop times the sign of the source.
-    multiples : tuple of int
-        Frequency of every tone of the sources' sum, in that of the sum.
-    frequency : float or None
-        That of the sum, Hz; None for one source of one tone, whose frequency may vary. For a recording half of its
-        sample rate, so that a sample's length is half a period.
-    jumping : bool
-        Whether the source is a square.
-    recording : Samples or None
-        The samples of the only source, if it is a recording.
-    """
-
-    layers: tuple[Element, ...]
-    gap: int
+    layers: tuple[Element, ...]  # Layers in the order of the loop
+    gap: int  # Index of the gap among them
+    # The sources that are on; each with the sign of the gap along the loop times the sign of the source
     sources: tuple[tuple[Element, float], ...]
-    multiples: tuple[int, ...]
+    multiples: tuple[int, ...]  # Frequency of every tone of the sources' sum, in that of the sum
+    # That of the sum, Hz; None for one source of one tone, whose frequency may vary. For a recording half of its sample
+    # rate, so that a sample's length is half a period.
     frequency: float | None
-    jumping: bool
-    recording: Samples | None = None
+    jumping: bool  # Whether the source is a square
+    recording: Samples | None = None  # The samples of the only source, if it is a recording
 
     @property
     def layer(self) -> Element:

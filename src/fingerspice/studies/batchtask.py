@@ -72,27 +72,14 @@ def jobs_of(
 
 @dataclass
 class Answers:
-    """Outputs of some scenes, their stated errors, and their status.
+    """Outputs of some scenes, their stated errors, and their status."""
 
-    Attributes
-    ----------
-    values : dict of str to ndarray, shape (n,) or (n, n_t)
-        Outputs; NaN for a scene without a result, but for gap voltages, which are filled last (`fill`).
-    error : ndarray, shape (n,)
-        Stated relative error.
-    status : ndarray, shape (n,)
-        Index into `STATUS_NAMES`.
-    done : ndarray, shape (n,)
-        Whether results have been entered.
-    messages : dict of int to str
-        Messages of the scenes without a result.
-    """
-
+    # (n,): Outputs; NaN for a scene without a result, but for gap voltages, which are filled last (`fill`)
     values: dict[str, FloatArray]
-    error: FloatArray
-    status: NDArray[np.int8]
-    done: BoolArray
-    messages: dict[int, str]
+    error: FloatArray  # (n,): Stated relative error
+    status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`
+    done: BoolArray  # (n,): Whether results have been entered
+    messages: dict[int, str]  # Messages of the scenes without a result
 
     @classmethod
     def empty(cls, task: Task, n: int, width: int) -> Answers:

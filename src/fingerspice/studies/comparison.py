@@ -28,23 +28,12 @@ class Figures:
     """Gap voltage at the fundamental, mean force and mean area from one method.
 
     Each is a number, or an array (n_gap,) if the circuit has several GAPs.
-
-    Attributes
-    ----------
-    amplitude : float or ndarray
-        V.
-    phase_deg : float or ndarray
-        Lead over the source's fundamental, degrees.
-    f_el_mean : float or ndarray
-        N.
-    area_mean : float or ndarray
-        m^2.
     """
 
-    amplitude: float | NDArray[np.float64]
-    phase_deg: float | NDArray[np.float64]
-    f_el_mean: float | NDArray[np.float64]
-    area_mean: float | NDArray[np.float64]
+    amplitude: float | NDArray[np.float64]  # V
+    phase_deg: float | NDArray[np.float64]  # Lead over the source's fundamental, degrees
+    f_el_mean: float | NDArray[np.float64]  # N
+    area_mean: float | NDArray[np.float64]  # m^2
 
     def of_gap(self, i: int) -> dict[str, float]:
         """The figures of one GAP by their names."""

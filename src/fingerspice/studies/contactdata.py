@@ -30,22 +30,12 @@ _ALLOWED = ", ".join([*MEASURED, *CONDITIONS, "sigma"])
 
 @dataclass(frozen=True)
 class Relation:
-    """Measured values of one kind with their conditions, in SI units.
+    """Measured values of one kind with their conditions, in SI units."""
 
-    Attributes
-    ----------
-    kind : str
-        A key of `NAMES`.
-    values : ndarray, shape (n,)
-    sigma : ndarray, shape (n,), or None
-        Standard deviation of every value; None where it is not known.
-    fn, u_gap, indentation : ndarray, shape (n,)
-        Normal load, gap voltage and indentation; the last is 0 where it has no meaning.
-    """
-
-    kind: str
-    values: FloatArray
-    sigma: FloatArray | None
+    kind: str  # A key of `NAMES`
+    values: FloatArray  # (n,)
+    sigma: FloatArray | None  # (n,): Standard deviation of every value; None where it is not known
+    # fn, u_gap, indentation (n,): Normal load, gap voltage and indentation; the last is 0 where it has no meaning
     fn: FloatArray
     u_gap: FloatArray
     indentation: FloatArray

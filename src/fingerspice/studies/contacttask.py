@@ -30,26 +30,14 @@ FEWEST = 0.5
 
 @dataclass(frozen=True)
 class ContactTask:
-    """What is fitted.
+    """What is fitted."""
 
-    Attributes
-    ----------
-    circuit : Circuit
-        With the values to start from.
-    gap : str
-        Name of the GAP.
-    relations : tuple of Relation
-    paths : tuple of str
-    bounds : ndarray, shape (n_parameter, 2)
-    shares : tuple of float
-        Standard deviation of the logarithms of each relation's values, where the relation has no sigma.
-    """
-
-    circuit: Circuit
-    gap: str
+    circuit: Circuit  # With the values to start from
+    gap: str  # Name of the GAP
     relations: tuple[Relation, ...]
     paths: tuple[str, ...]
-    bounds: FloatArray
+    bounds: FloatArray  # (n_parameter, 2)
+    # Standard deviation of the logarithms of each relation's values, where the relation has no sigma
     shares: tuple[float, ...]
 
     @property
@@ -114,21 +102,11 @@ def _predicted(contact: Contact, relation: Relation) -> FloatArray:
 
 
 class Pool(NamedTuple):
-    """Relations whose values have one standard deviation, as they come from the same instrument.
+    """Relations whose values have one standard deviation, as they come from the same instrument."""
 
-    Attributes
-    ----------
-    members : tuple of int
-        Numbers of the relations.
-    at : ndarray of int
-        Places of their values among the residuals.
-    estimated : bool
-        Whether the standard deviation follows from the residuals, and is not given.
-    """
-
-    members: tuple[int, ...]
-    at: NDArray[np.int64]
-    estimated: bool
+    members: tuple[int, ...]  # Numbers of the relations
+    at: NDArray[np.int64]  # Places of their values among the residuals
+    estimated: bool  # Whether the standard deviation follows from the residuals, and is not given
 
 
 def pools_of(relations: Sequence[Relation]) -> list[Pool]:

@@ -40,18 +40,10 @@ _SHOWN = 10
 
 
 class Unjudged(NamedTuple):
-    """Friction that the threshold cannot judge: outside its frequencies, or slower than the lowest band.
+    """Friction that the threshold cannot judge: outside its frequencies, or slower than the lowest band."""
 
-    Attributes
-    ----------
-    level : float
-        Highest level above the threshold that it may have, dB (`Threshold.beyond`).
-    force, frequency : float
-        Amplitude (N) and frequency (Hz); of what is slower than the lowest band, that band's lower edge.
-    slower : bool
-    """
-
-    level: float
+    level: float  # Highest level above the threshold that it may have, dB (`Threshold.beyond`)
+    # force, frequency: Amplitude (N) and frequency (Hz); of what is slower than the lowest band, that band's lower edge
     force: float
     frequency: float
     slower: bool

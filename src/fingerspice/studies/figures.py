@@ -43,29 +43,16 @@ FREQUENCIES = (100.0, 5000.0)
 
 @dataclass(frozen=True)
 class Variation:
-    """One panel of Fig. 3: a parameter, its values, and the circuit parameters that it changes.
+    """One panel of Fig. 3: a parameter, its values, and the circuit parameters that it changes."""
 
-    Attributes
-    ----------
-    title, symbol, unit : str
-        Texts of the picture; the symbol is in TeX.
-    name : str
-        Name in the data file.
-    paths : tuple of str
-        Paths of the circuit parameters that are proportional to the varied parameter.
-    base : float
-        Value in Table 1, in `unit`.
-    values : tuple of float
-        Value for each curve, in `unit`.
-    """
-
+    # title, symbol, unit: Texts of the picture; the symbol is in TeX
     title: str
     symbol: str
     unit: str
-    name: str
-    paths: tuple[str, ...]
-    base: float
-    values: tuple[float, ...]
+    name: str  # Name in the data file
+    paths: tuple[str, ...]  # Paths of the circuit parameters that are proportional to the varied parameter
+    base: float  # Value in Table 1, in `unit`
+    values: tuple[float, ...]  # Value for each curve, in `unit`
 
     def apply(self, circuit: Circuit, value: float) -> Circuit:
         """The circuit with this parameter at `value`, in `unit`."""

@@ -32,33 +32,16 @@ IMPEDANCE, PHASE = "impedance", "impedance_phase"
 
 @dataclass(frozen=True)
 class Data:
-    """Measured values with their conditions.
+    """Measured values with their conditions."""
 
-    Attributes
-    ----------
-    signal : str
-        A key of `MEASURED`.
-    values : ndarray, shape (n,)
-        Measured values in SI units: means, or, with `t`, values over time.
-    sigma : ndarray, shape (n,), or None
-        Standard deviation of every value; None where it is not known.
-    conditions : dict of str to ndarray, shape (n,)
-        Path to the values that a parameter had in the measurements, in the unit of the netlist.
-    t : ndarray, shape (n,), or None
-        Times, s.
-    phase : ndarray, shape (n,), or None
-        Phase of an impedance, deg.
-    groups : Groups or None
-        Which measurements belong together, such as those of one finger.
-    """
-
-    signal: str
-    values: FloatArray
-    sigma: FloatArray | None
+    signal: str  # A key of `MEASURED`
+    values: FloatArray  # (n,): Measured values in SI units: means, or, with `t`, values over time
+    sigma: FloatArray | None  # (n,): Standard deviation of every value; None where it is not known
+    # (n,): Path to the values that a parameter had in the measurements, in the unit of the netlist
     conditions: dict[str, FloatArray]
-    t: FloatArray | None = None
-    phase: FloatArray | None = None
-    groups: Groups | None = None
+    t: FloatArray | None = None  # (n,): Times, s
+    phase: FloatArray | None = None  # (n,): Phase of an impedance, deg
+    groups: Groups | None = None  # Which measurements belong together, such as those of one finger
 
     @property
     def name(self) -> str:

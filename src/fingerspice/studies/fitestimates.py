@@ -27,24 +27,14 @@ _UNLIKELY = 1e-3
 
 @dataclass(frozen=True)
 class Estimate:
-    """One fitted parameter, in the unit of the netlist.
-
-    Attributes
-    ----------
-    path, unit : str
-    value, initial : float
-    error : float
-        Standard error.
-    low, high : float
-        95 % interval, symmetric in the logarithm.
-    at_bound : bool
-    """
+    """One fitted parameter, in the unit of the netlist."""
 
     path: str
     unit: str
     value: float
     initial: float
-    error: float
+    error: float  # Standard error
+    # low, high: 95 % interval, symmetric in the logarithm
     low: float
     high: float
     at_bound: bool

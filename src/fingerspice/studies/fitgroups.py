@@ -15,36 +15,19 @@ from fingerspice.circuit.circuit import Circuit
 
 @dataclass(frozen=True)
 class Groups:
-    """The group of every measurement.
+    """The group of every measurement."""
 
-    Attributes
-    ----------
-    column : str
-        Name of the column that tells it.
-    labels : tuple of str
-        Every group's name, in the order of the data.
-    of : ndarray of int, shape (n,)
-        Number of each measurement's group.
-    """
-
-    column: str
-    labels: tuple[str, ...]
-    of: NDArray[np.int64]
+    column: str  # Name of the column that tells it
+    labels: tuple[str, ...]  # Every group's name, in the order of the data
+    of: NDArray[np.int64]  # (n,): Number of each measurement's group
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """What is fitted: a parameter in all measurements, or in those of one group.
-
-    Attributes
-    ----------
-    path : str
-    label : str or None
-        Name of the group.
-    """
+    """What is fitted: a parameter in all measurements, or in those of one group."""
 
     path: str
-    label: str | None = None
+    label: str | None = None  # Name of the group
 
     @property
     def name(self) -> str:

@@ -59,41 +59,22 @@ class Problem(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """What is fitted.
+    """What is fitted."""
 
-    Attributes
-    ----------
-    circuit : Circuit
-        With the values to start from.
-    data : Data
-    unknowns : tuple of Unknown
-    bounds : ndarray, shape (n_parameter, 2)
-        Smallest and largest values.
-    average : str
-    skin : str
-    rtol : float
-    charge_law : str or None
-    target, scale : ndarray, shape (n,) or (2 n,)
-        What is to be predicted, and that by which residuals are divided: the data's values, and, where the phase of an
-        impedance is given, the phases (deg) after them.
-    exact : bool
-        Whether derivatives are those of a series stack, and not differences.
-    watch : callable
-        Called before every evaluation.
-    """
-
-    circuit: Circuit
+    circuit: Circuit  # With the values to start from
     data: Data
     unknowns: tuple[Unknown, ...]
-    bounds: FloatArray
+    bounds: FloatArray  # (n_parameter, 2): Smallest and largest values
     average: str
     skin: str
     rtol: float
     charge_law: str | None
+    # target, scale (n,): What is to be predicted, and that by which residuals are divided: the data's values, and,
+    # where the phase of an impedance is given, the phases (deg) after them
     target: FloatArray
     scale: FloatArray
-    exact: bool
-    watch: Callable[[], None] = lambda: None
+    exact: bool  # Whether derivatives are those of a series stack, and not differences
+    watch: Callable[[], None] = lambda: None  # Called before every evaluation
 
     @property
     def initial(self) -> FloatArray:

@@ -51,23 +51,13 @@ class Inverter(Protocol):
 
 @dataclass(frozen=True)
 class Finger:
-    """The one finger of a circuit.
-
-    Attributes
-    ----------
-    gap, source : Element
-    contact : Contact
-    area : float or None
-        Area fixed by the deck, m^2, or None.
-    direct : bool
-        Whether the circuit is a series stack, so that the gap voltage jumps with the source.
-    """
+    """The one finger of a circuit."""
 
     gap: Element
     source: Element
     contact: Contact
-    area: float | None
-    direct: bool
+    area: float | None  # Area fixed by the deck, m^2, or None
+    direct: bool  # Whether the circuit is a series stack, so that the gap voltage jumps with the source
 
 
 def the_finger(circuit: Circuit) -> Finger:

@@ -46,27 +46,15 @@ class Variable:
 
 @dataclass(frozen=True)
 class SweepStore:
-    """Where the chunks of a sweep are.
-
-    Attributes
-    ----------
-    path : Path
-    dims, sizes : tuple
-        Dimensions of the sweep, and how many scenes each has.
-    block : tuple of int
-        Scenes of a chunk along each dimension.
-    arrays : dict of str to Variable
-        Outputs, ``error`` and ``status``.
-    drawn : dict of str to str
-        Parameters along ``scene``, with their units.
-    """
+    """Where the chunks of a sweep are."""
 
     path: Path
+    # dims, sizes: Dimensions of the sweep, and how many scenes each has
     dims: tuple[str, ...]
     sizes: tuple[int, ...]
-    block: tuple[int, ...]
-    arrays: dict[str, Variable]
-    drawn: dict[str, str]
+    block: tuple[int, ...]  # Scenes of a chunk along each dimension
+    arrays: dict[str, Variable]  # Outputs, ``error`` and ``status``
+    drawn: dict[str, str]  # Parameters along ``scene``, with their units
 
     @property
     def chunks(self) -> int:

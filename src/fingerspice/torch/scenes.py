@@ -30,27 +30,13 @@ MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean")
 
 @dataclass(frozen=True)
 class Scenes:
-    """Runs of a circuit with other values of its parameters.
-
-    Attributes
-    ----------
-    circuit : Circuit
-    outputs : tuple of str
-        Names out of `SIGNALS` and `MEANS`.
-    t : ndarray, shape (n_t,)
-        Times of the signals, s; empty where there are only means.
-    t_stop : float or None
-        End of every run, s; None where only the periodic state is asked for.
-    periodic : bool
-        Whether the periodic state is asked for, and not the run.
-    rtol : float
-    """
+    """Runs of a circuit with other values of its parameters."""
 
     circuit: Circuit
-    outputs: tuple[str, ...]
-    t: FloatArray
-    t_stop: float | None
-    periodic: bool
+    outputs: tuple[str, ...]  # Names out of `SIGNALS` and `MEANS`
+    t: FloatArray  # (n_t,): Times of the signals, s; empty where there are only means
+    t_stop: float | None  # End of every run, s; None where only the periodic state is asked for
+    periodic: bool  # Whether the periodic state is asked for, and not the run
     rtol: float
 
     @property

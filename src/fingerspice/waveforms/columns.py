@@ -33,29 +33,19 @@ _SHOWN = 8
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of numbers, with their names and units; only those that are used need be numbers, and finite.
-
-    Attributes
-    ----------
-    file : Path
-    names : tuple of str
-        Without units; empty where the file has no header.
-    data : ndarray, shape (n_row, n_column)
-        Numbers as written in the file, before any conversion of units; NaN for a cell that is no number.
-    units : tuple of str
-        Unit of every column, an empty text for a column without a unit; an empty tuple if the file has no header.
-    lines : ndarray of int, shape (n_row,), or None
-        Number of each row's line in the file, from 1; None for a file without lines.
-    faults : dict of int to str
-        Message about the first cell that is no number, by column.
-    """
+    """Columns of numbers, with their names and units; only those that are used need be numbers, and finite."""
 
     file: Path
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # Without units; empty where the file has no header
+    # (n_row, n_column): Numbers as written in the file, before any conversion of units; NaN for a cell that is no
+    # number
     data: FloatArray
+    # Unit of every column, an empty text for a column without a unit; an empty tuple if the file has no header
     units: tuple[str, ...] = ()
+    # (n_row,): Number of each row's line in the file, from 1; None for a file without lines
     lines: NDArray[np.int64] | None = field(default=None, repr=False)
 
+    # Message about the first cell that is no number, by column
     faults: dict[int, str] = field(default_factory=dict, repr=False)
 
     def numbers(self, column: int) -> FloatArray:

@@ -46,21 +46,11 @@ _OTHERS = {
 
 @dataclass(frozen=True)
 class Recording:
-    """Values against time, either at a rate or at times.
+    """Values against time, either at a rate or at times."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (n,)
-        V, or A; for a WAV file fractions of full scale.
-    rate : float or None
-        Samples per second.
-    times : ndarray, shape (n,), or None
-        s, not decreasing.
-    """
-
-    values: FloatArray
-    rate: float | None = None
-    times: FloatArray | None = None
+    values: FloatArray  # (n,): V, or A; for a WAV file fractions of full scale
+    rate: float | None = None  # Samples per second
+    times: FloatArray | None = None  # (n,): s, not decreasing
 
 
 def read_wav(path: str | Path, channel: int | None = None) -> Recording:
@@ -83,26 +73,18 @@ def _shares(data: np.ndarray) -> FloatArray:
 
 @dataclass(frozen=True)
 class WavLayout:
-    """Position and number format of the samples in a WAV file, so that some of them can be read.
-
-    Attributes
-    ----------
-    path : Path
-    rate, channels, channel, count : int
-        Sample rate (Hz), number of channels, index of the channel that is read, and number of samples per channel.
-    kind : str
-        Number format as NumPy writes it, such as ``<i2``; NumPy itself does not know those of 3, 5, 6 or 7 bytes.
-    offset : int
-        Position of the first sample, bytes.
-    """
+    """Position and number format of the samples in a WAV file, so that some of them can be read."""
 
     path: Path
+    # rate, channels, channel, count: Sample rate (Hz), number of channels, index of the channel that is read, and
+    # number of samples per channel
     rate: int
     channels: int
     channel: int
     count: int
+    # Number format as NumPy writes it, such as ``<i2``; NumPy itself does not know those of 3, 5, 6 or 7 bytes
     kind: str
-    offset: int
+    offset: int  # Position of the first sample, bytes
 
     def read(self, first: int, last: int) -> FloatArray:
         """Samples number `first` to `last` - 1 as fractions of full scale.

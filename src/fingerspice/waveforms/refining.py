@@ -39,25 +39,15 @@ _DEEP, _MOST_DEEP, _MOST_DEEP_EACH = 12, 10_000, 100
 
 
 class _Interval(NamedTuple):
-    """An interval (s) that waits for its series.
-
-    Attributes
-    ----------
-    lo, hi : float
-    depth : int
-        Number of halvings that led to it.
-    misfit, largest : float
-        Misfit (V) before the last halving, and the largest misfit before any of the halvings.
-    idle : int
-        Number of halvings in a row that did not reduce the misfit.
-    """
+    """An interval (s) that waits for its series."""
 
     lo: float
     hi: float
-    depth: int = 0
+    depth: int = 0  # Number of halvings that led to it
+    # misfit, largest: Misfit (V) before the last halving, and the largest misfit before any of the halvings
     misfit: float = math.inf
     largest: float = 0.0
-    idle: int = 0
+    idle: int = 0  # Number of halvings in a row that did not reduce the misfit
 
     def halves(self, misfit: float = math.inf, largest: float | None = None, idle: int = 0) -> list[_Interval]:
         """Both halves, the later one first, because they are put on a stack."""
@@ -73,51 +63,27 @@ class _Interval(NamedTuple):
 
 @dataclass
 class Refiner:
-    """Covers intervals with Chebyshev series by bisection.
-
-    Attributes
-    ----------
-    waveform : Waveform
-    tol : float
-        Allowed error of a series, relative to `scale`.
-    step : float
-        Output step, s.
-    shortest : float
-        Length (s) of the shortest event of the waveform that its samples have to meet.
-    scale, steepest : float
-        Largest |U| (V) and |dU/dt| (V/s) seen.
-    edges : list of float
-        Ends of the series' intervals, s.
-    series : list of ndarray, shape (POINTS,)
-        Chebyshev coefficients on each interval.
-    jumps : list of (float, float)
-        Times (s) at which neighbouring series differ, and the difference (V).
-    located, narrow : list of float
-        Times (s) of the jumps found by bisection, and of intervals much shorter than the output step.
-    short : list of (float, float)
-        Start (s) of each short interval, and the change (V) over it.
-    not_finite : float or None
-        Time (s) of the first NaN or inf.
-    rough : float
-        Largest misfit (V) taken for round-off of the function's values.
-    allowed, deep : int
-        Largest allowed and present number of intervals that were halved more than `_DEEP` times.
-    """
+    """Covers intervals with Chebyshev series by bisection."""
 
     waveform: Waveform
-    tol: float
-    step: float
-    shortest: float = math.inf
+    tol: float  # Allowed error of a series, relative to `scale`
+    step: float  # Output step, s
+    shortest: float = math.inf  # Length (s) of the shortest event of the waveform that its samples have to meet
+    # scale, steepest: Largest |U| (V) and |dU/dt| (V/s) seen
     scale: float = 0.0
     steepest: float = 0.0
-    edges: list[float] = field(default_factory=list)
-    series: list[FloatArray] = field(default_factory=list)
+    edges: list[float] = field(default_factory=list)  # Ends of the series' intervals, s
+    series: list[FloatArray] = field(default_factory=list)  # (POINTS,): Chebyshev coefficients on each interval
+    # Times (s) at which neighbouring series differ, and the difference (V)
     jumps: list[tuple[float, float]] = field(default_factory=list)
+    # located, narrow: Times (s) of the jumps found by bisection, and of intervals much shorter than the output step
     located: list[float] = field(default_factory=list)
     narrow: list[float] = field(default_factory=list)
+    # Start (s) of each short interval, and the change (V) over it
     short: list[tuple[float, float]] = field(default_factory=list)
-    not_finite: float | None = None
-    rough: float = 0.0
+    not_finite: float | None = None  # Time (s) of the first NaN or inf
+    rough: float = 0.0  # Largest misfit (V) taken for round-off of the function's values
+    # allowed, deep: Largest allowed and present number of intervals that were halved more than `_DEEP` times
     allowed: int = _MOST_DEEP
     deep: int = 0
 

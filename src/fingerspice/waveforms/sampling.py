@@ -119,28 +119,15 @@ class Function(Waveform):
 
 @dataclass(frozen=True)
 class SourceTable:
-    """A waveform on a window of time, in the form that compiled code reads.
+    """A waveform on a window of time, in the form that compiled code reads."""
 
-    Attributes
-    ----------
-    edges : ndarray, shape (m + 1,)
-        Segment edges, s.
-    terms : ndarray, shape (m, k, 6)
-    series : ndarray, shape (m, l)
-        Chebyshev coefficients of each segment's series, which is added to its terms; l = 0 without series.
-    scale : float
-        Largest |U| (V) at the points where the series were fitted and checked; 0 without series.
-    not_finite : float or None
-        Time (s) of the first NaN or inf; the table then ends just before it.
-    rough : float
-        Largest misfit (V) that finer series do not reduce, because it is round-off of the function's own values.
-    """
-
-    edges: FloatArray
-    terms: FloatArray
+    edges: FloatArray  # (m + 1,): Segment edges, s
+    terms: FloatArray  # (m, k, 6)
+    # (m, l): Chebyshev coefficients of each segment's series, which is added to its terms; l = 0 without series
     series: FloatArray
-    scale: float = 0.0
-    not_finite: float | None = None
+    scale: float = 0.0  # Largest |U| (V) at the points where the series were fitted and checked; 0 without series
+    not_finite: float | None = None  # Time (s) of the first NaN or inf; the table then ends just before it
+    # Largest misfit (V) that finer series do not reduce, because it is round-off of the function's own values
     rough: float = 0.0
 
     def values(self, t: FloatArray) -> FloatArray:
