@@ -51,7 +51,7 @@ OPTIONS = [
     (["--method", "scipy:RK4"], "unknown method 'scipy:RK4'; allowed: scipy:RK23"),
     (["--set", "Vdrive.amplitude=1e99"], "Sine amplitude is 1e+99 V; allowed: a size up to 1e+12"),
     (["--source", "SIN(0 1e-320 100)"], "the source's peak is 9.99989e-321 V; allowed: 0, or 1e-300 V or more"),
-    (["--source", "PULSE(0 1 0 1e-300 1e-300 1e-300 1e-299)"], "pulse rise is 1e-300 s; allowed: 0, or a size from"),
+    (["--source", "PULSE(0 1 0 1e-300 1e-300 1e-300 1e-299)"], "Pulse rise is 1e-300 s; allowed: 0, or a size from"),
     (["--source", "SIN(0 200 1e300)"], "Sine frequency is 1e+300 Hz; allowed: 0, or a size from 1e-30 to 1e+30"),
     (["--stop", "soon"], "--stop 'soon': 'soon' is not a number"),
     (["--stop", "1u"], "--stop 1e-06 s is before the second output; allowed: TSTART + TSTEP = 5e-05 s or more"),

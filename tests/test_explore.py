@@ -28,13 +28,13 @@ from hypothesis import strategies as st
 import fingerspice as fs
 from commands import Command
 from fingerspice.base.arrays import FloatArray
+from fingerspice.circuit.describe import MEANINGS
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.examples import EXAMPLES
 from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS
 from fingerspice.explorer.scene import scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
 from fingerspice.explorer.sharing import as_deck, as_python, means
-from fingerspice.explorer.sliders import _MEANINGS
 from fingerspice.explorer.waveforms import WAVEFORMS
 
 ROOT = Path(__file__).parents[1]
@@ -206,8 +206,8 @@ def test_sliders_show_every_parameter_within_its_range() -> None:
 
 
 def test_every_slider_of_an_element_says_what_it_moves() -> None:
-    assert set(_MEANINGS) == {name for name, spec in DEVICES.items() if spec.parameters}
-    for name, meanings in _MEANINGS.items():
+    assert set(MEANINGS) == {name for name, spec in DEVICES.items() if spec.parameters}
+    for name, meanings in MEANINGS.items():
         assert set(meanings) == {p.name for p in DEVICES[name].parameters}, name
     groups = scene({"deck": BY_NAME["ungrounded"].deck})["sliders"]
     meanings = {s["path"]: s["meaning"] for group in groups for s in group["sliders"]}

@@ -18,6 +18,7 @@ from test_hard_cases import T, check, every_law, run
 # Nothing, almost nothing, and for ever ------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:the sources are 0 all the time", "ignore:the source is a function")
 @every_law
 @pytest.mark.parametrize("source", [fs.DC(0.0), fs.Sine(0.0, 5000.0), fs.Square(0.0, 100.0), lambda t: 0.0 * t])
 def test_zero_volt_for_ever_is_exactly_nothing_at_once(source: Any, law: str) -> None:

@@ -20,7 +20,7 @@ from fingerspice.numerics.lobatto import (
     fill_table,
     integral_table,
 )
-from fingerspice.solve.runs import ROUNDING
+from fingerspice.solve.problem import ROUNDING
 
 DIGITS = 60
 # From no decay in a step to one that is over within a rounding of its start, past every change of branch.

@@ -61,7 +61,8 @@ def read_text(path: Path, shown: str, where: Where | None = None, root: Path | N
 def is_stream(path: Path) -> bool:
     """Whether a deck's path means standard input (``-``), a device, or a pipe such as bash's ``<(...)``."""
     with suppress(OSError):
-        return str(path) == "-" or path.is_relative_to("/dev") or path.is_fifo()
+        named = str(path) in ("-", "/dev/stdin") or path.is_relative_to("/dev/fd")
+        return named or path.is_fifo() or path.is_char_device()
     return False
 
 

@@ -355,7 +355,8 @@ def _stepped(
             folded = run_to_fold(problem, t_out, left)
             if folded is not None:
                 return folded, "exponential"
-        reason = f"exponential steps gave up at t = {run.state.t:.4g} s, because {run.status.cause}"
+        cause = "a fold is near" if run.status is Status.FOLD else run.status.cause
+        reason = f"exponential steps gave up at t = {run.state.t:.4g} s, because {cause}"
     # The implicit method is the last resort: its step length does not depend on fast modes.
     run = solve_coupled(problem, rtol, t_out, left, progress, reason)
     if is_stack and run.status is Status.FOLD:
