@@ -49,7 +49,6 @@ def test_the_fold_is_that_of_a_run_which_starts_as_the_deck_s_does(start: str) -
 
 
 @pytest.mark.filterwarnings("ignore:the fold of the mobile charge law is near")
-@pytest.mark.filterwarnings("ignore:exponential steps gave up .* because a fold is near")
 def test_an_operating_point_past_the_fold_has_met_it_and_a_given_start_there_is_refused() -> None:
     # Across 10 nm the first of the voltages tried stands past the fold before it has begun.
     circuit = table1("SIN(0 200 100 0 0 90)", tran="10u 4m").replace({"Xgap.d": 1e-8})
