@@ -432,15 +432,17 @@ def test_a_function_of_single_numbers_is_not_called_more_often_for_short_events(
     assert 15_000 < seen[1] - seen[0] < 25_000
 
 
-@settings(deadline=None, max_examples=10)
-@given(st.floats(0.0, 0.05), st.floats(-5.5, -2.0), st.sampled_from([1e-4, 1e-8]))
+@pytest.mark.parametrize("middle", [0.005, 0.01234567, 0.0333])
+@pytest.mark.parametrize("width", [1e-3, 1e-5])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
 def test_a_function_that_rises_out_of_next_to_nothing_costs_no_more(middle: float, width: float, rtol: float) -> None:
     calls: list[int] = []
 
     def bump(t: FloatArray) -> FloatArray:
         calls.append(np.size(t))
-        return 100.0 * np.exp(-(((t - middle) / 10.0**width) ** 2))
+        return 100.0 * np.exp(-(((t - middle) / width) ** 2))
 
     run = fs.simulate(table1(), sources=fs.Function(bump, breaks=(middle,)), t_stop=0.05, rtol=rtol, charge=False)
-    assert run.success
-    assert sum(calls) < 400_000
+    assert sum(calls) < 200_000
+    # Capacitors alone share it as 0.9, resistors alone as 0.5.
+    assert 50.0 < run.u_gap_peak < 92.0
