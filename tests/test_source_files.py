@@ -583,7 +583,7 @@ def test_an_upsampled_recording_is_held_at_its_ends() -> None:
     assert wave.values.size == 49 * 8 + 1
     assert wave.start == 0.2
     for factor in (1, 65, 2.5):
-        assert "allowed: a whole number from 2 to 64" in refusal(lambda f=factor: wave.upsampled(f))  # type: ignore[misc]
+        assert "allowed: 2 to 64, a whole number" in refusal(lambda f=factor: wave.upsampled(f))  # type: ignore[misc]
 
 
 # In decks -----------------------------------------------------------------------------------------------------
