@@ -229,7 +229,7 @@ def test_curves_have_more_points_where_the_source_oscillates_often_and_too_few_a
     carrier = scene({"deck": SINE, "source": "AM(200 100k 50)", "periods": 1, "rtol": 1e-3, "skin": "dispersive"})
     assert carrier["t"].size == MOST_POINTS
     (said,) = [w for w in carrier["warnings"] if "points" in w]
-    assert said.startswith("the curves have 12,000 points for 5,002 oscillations of the source, too few")
+    assert said.startswith("the curves have 12,000 points for 2,001 oscillations of the source, too few")
     assert not any("points" in w for one in (few, many, most) for w in one["warnings"])
 
 

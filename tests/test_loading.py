@@ -97,10 +97,11 @@ def test_a_file_holds_any_source(name: str, tmp_path: Path) -> None:
     same_spectra(run, again)
     assert str(again) == str(run)
     assert pickle.loads(pickle.dumps(again)).circuit["Vdrive"].waveform(0.01) == held(0.01)
-    rerun = fs.simulate(again.circuit, t_stop=0.04, rtol=1e-6)
-    assert run.u_gap is not None
-    assert rerun.u_gap is not None
-    assert np.abs(rerun.u_gap - run.u_gap).max() <= 2e-6 * np.abs(run.u_gap).max()
+    # At an edge of a function there are two outputs or one, as its sides are known or not: compare in between.
+    one, other = (fs.simulate(c, t_stop=0.04, t_eval=times, rtol=1e-6).u_gap for c in (run.circuit, again.circuit))
+    assert one is not None
+    assert other is not None
+    assert np.abs(one - other).max() <= 2e-6 * np.abs(one).max()
 
 
 def same_spectra(run: fs.Solution, again: fs.Solution) -> None:
@@ -130,7 +131,7 @@ def test_a_loaded_run_has_the_lines_of_the_run(name: str, tmp_path: Path) -> Non
 def test_a_file_holds_what_a_deck_includes_and_plays(tmp_path: Path) -> None:
     data = np.round(2.0**15 * np.sin(np.arange(800.0)) * 0.5).astype("<i2")
     wavfile.write(tmp_path / "a.wav", 8000, data)
-    (tmp_path / "gap.inc").write_text("Xgap area gap GAP d=4u\n")
+    (tmp_path / "gap.inc").write_text("Xgap top skin area GAP d=4u\n")
     (tmp_path / "table.txt").write_text("0 0 1m 100 2m 0")
     for source in ("WAVEFILE(a.wav 150)", "PWL FILE=table.txt"):
         deck = table1_deck(source, tran="50u 20m uic").splitlines()
