@@ -138,10 +138,10 @@ class Stretch:
     def at_nodes(self, reads: Sequence[Read], tol: float) -> list[FloatArray]:
         """Times (s) and these signals at the nodes of panels on which each misses its polynomial by `tol` of its peak.
 
-        All have the shape (p, NODES). There are at most some hundred times as many panels as before: on an edge of 1 ns
+        All have the shape (p, NODES). There are at most some ten times as many panels as before: on an edge of 1 ns
         the rounding of the time alone makes a source rough, which is therefore looked at last.
         """
-        most = 64 * self.panels.step.size
+        most = 8 * self.panels.step.size
         for read in reversed(reads):
             left = most - self.panels.step.size
             self.panels = self._cut(read, *self.run.at_points(read, self.panels), tol, left)[1]
