@@ -138,25 +138,24 @@ class Stretch:
     def at_nodes(self, reads: Sequence[Read], tol: float) -> list[FloatArray]:
         """Times (s) and these signals at the nodes of panels on which each misses its polynomial by `tol` of its peak.
 
-        All have the shape (p, NODES). There are at most some ten times as many panels as before: on an edge of 1 ns
-        the rounding of the time alone makes a source rough, which is therefore looked at last.
+        All have the shape (p, NODES). Panels on which the rounding of the time alone is as much, as on an edge of 1 ns,
+        are not cut.
         """
-        most = 8 * self.panels.step.size
-        for read in reversed(reads):
-            left = most - self.panels.step.size
-            self.panels = self._cut(read, *self.run.at_points(read, self.panels), tol, left)[1]
+        shortest = np.finfo(float).eps * abs(self.span[1]) / tol
+        for read in reads:
+            self.panels = self._cut(read, *self.run.at_points(read, self.panels), tol, shortest)[1]
         found = [self.run.at_points(read, self.panels) for read in reads]
         return [x[:, :NODES] for x in (found[0][0], *(x for _, x in found))]
 
     def _cut(
-        self, read: Read, t: FloatArray, x: FloatArray, tol: float, most: int | None = None
+        self, read: Read, t: FloatArray, x: FloatArray, tol: float, shortest: float = 0.0
     ) -> tuple[Weighed, Panels]:
-        """A signal, and panels on which its interpolation error is at most `tol` times its peak."""
+        """A signal, and panels on which its interpolation error is at most `tol` of its peak, or as short as told."""
         smooth = tol * float(np.abs(x).max(initial=0.0))
         panels, parts = self.panels, []
-        most = _MOST_CUT + 4 * panels.step.size if most is None else most
+        most = _MOST_CUT + 4 * panels.step.size
         for left in range(_MOST_ROUNDS, 0, -1):
-            wrong = _missed(x) > smooth
+            wrong = (_missed(x) > smooth) & (panels.duration > shortest)
             if most <= 0 or left == 1:
                 # Panels that are still not smooth hold round-off, or a jump that round-off has shifted across an end.
                 wrong[:] = False

@@ -28,6 +28,8 @@ from fingerspice.waveforms.waveform import DOUBLE, Waveform, blank_terms, requir
 _PERIODS_PER_SEGMENT = 64.0
 # Number of times compared between two looks whether one has missed.
 _AT_ONCE = 1024
+# Units in the last place of the time by which a function is looked at beside a break, for its limits there.
+_ASIDE = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +67,12 @@ class Function(Waveform):
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = real_numbers("t", t, "times in s")
-        if side == "left":
+        if self.breaks:
             windows = [t.ravel()[window] for window in in_windows(t.ravel(), self.breakpoint_rate())]
             edges = np.concatenate([self.breakpoints(x.min(), x.max()) for x in windows if x.size] or [np.empty(0)])
-            t = np.where(np.isin(t, edges), np.nextafter(t, -1), t)
+            # At a break itself the rounding of its own arithmetic may put a function on either side.
+            aside = (_ASIDE if side == "right" else -_ASIDE) * np.spacing(np.abs(t))
+            t = np.where(np.isin(t, edges), t + aside, t)
         if t.ndim == 0:
             return np.asarray(self._scalar(np.float64(t)))
         try:
