@@ -175,13 +175,14 @@ def test_tstart_is_where_figures_begin():
 
 
 @pytest.mark.parametrize("method", ["scipy:DOP853", "radau"])
-def test_a_run_of_another_method_says_that_its_figures_are_those_of_its_outputs(method):
-    solution = table1_run(fs.Sine(200.0, 100.0), 100.0, 2, method=method, outputs=801, rtol=1e-6)
-    figures = solution.summary()
-    assert figures["figures_from"] == "outputs"
-    assert figures["f_el_max"] == solution.f_el.max()
+def test_figures_of_a_run_of_another_method_do_not_depend_on_its_outputs(method):
     expected = ref.transient(ref.sine_segments(200.0, 100.0, 0.02), [0.0], freq=100.0)
-    assert figures["f_el_mean"] == pytest.approx(expected.mean_force(0.0, 0.02), rel=1e-5)
+    for outputs in (11, 801):
+        solution = table1_run(fs.Sine(200.0, 100.0), 100.0, 2, method=method, outputs=outputs, rtol=1e-6)
+        figures = solution.summary()
+        assert figures["figures_from"] == "steps"
+        assert figures["f_el_max"] >= solution.f_el.max()
+        assert figures["f_el_mean"] == pytest.approx(expected.mean_force(0.0, 0.02), rel=1e-5)
 
 
 def test_weights_of_outputs_integrate_cubics_between_jumps_and_lines_where_points_are_few():

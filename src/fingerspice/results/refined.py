@@ -71,10 +71,12 @@ class ClosedForm:
             if begin.size + sum(x.size for x, _ in done) > MOST_PANELS:
                 return None
         begin, end = (np.sort(np.concatenate(x)) for x in zip(*done, strict=True))
-        marks = np.append(begin, end[-1])
-        marks = np.unique(np.concatenate([marks, *self._zeros(readers, begin, end)]))
-        begin, end = marks[:-1], marks[1:]
-        _, order, record = self._at_points(begin, end)
+        shape, order, record = self._at_points(begin, end)
+        zeros = list(self._zeros(readers, begin, end, record, order, shape))
+        if zeros:
+            marks = np.unique(np.concatenate([begin, end[-1:], *zeros]))
+            begin, end = marks[:-1], marks[1:]
+            _, order, record = self._at_points(begin, end)
         columns = np.empty((order.size, record.rows.shape[1]))
         columns[order] = record.rows
         values = columns.reshape(begin.size, POINTS.size, -1)[:, :NODES].transpose(0, 2, 1)
@@ -105,9 +107,16 @@ class ClosedForm:
             wrong |= missed > max(max(_MISSED, self.error) * peaks[name], self.rounding)
         return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
 
-    def _zeros(self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray) -> Iterator[FloatArray]:
-        """Zeros of gap voltages (s), where the area has a kink."""
-        shape, order, record = self._at_points(begin, end)
+    def _zeros(
+        self,
+        readers: Mapping[str, Read],
+        begin: FloatArray,
+        end: FloatArray,
+        record: Record,
+        order: IntArray,
+        shape: tuple[int, int],
+    ) -> Iterator[FloatArray]:
+        """Zeros of gap voltages (s) within panels, where the area has a kink."""
         for name, read in readers.items():
             if name.partition(":")[0] != "u_gap":
                 continue
