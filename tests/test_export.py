@@ -84,6 +84,7 @@ def test_every_source_runs_in_ngspice_as_exported(source: str, law: str) -> None
     assert deviation(table1(source, tran="10u 30m uic"), law) <= 5e-5
 
 
+@pytest.mark.filterwarnings("ignore:Vdrive. the recording ends")
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("start", [0.0, -1.1e-3, 2.3e-3])
 def test_a_recording_is_exported_as_its_own_points(start: float, law: str) -> None:

@@ -247,6 +247,7 @@ def test_files_say_what_it_takes_to_repeat_the_run(tmp_path: Path) -> None:
     assert dict(again["Xgap"].values) == dict(circuit["Xgap"].values)
 
 
+@pytest.mark.filterwarnings("ignore:Vdrive. the recording ends")
 def test_a_deck_of_more_than_64_kib_is_kept_whole(tmp_path: Path) -> None:
     # HDF5 has a limit of 64 KiB for an attribute written the compact way.
     points = " ".join(f"{i}u {100.0 * np.sin(i / 300.0):.9f}" for i in range(6000))
