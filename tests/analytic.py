@@ -825,7 +825,7 @@ def mobile_gap_voltage(
 # ----------------------------------------------------------------------------------------------------------
 
 
-class _NoStep(Exception):
+class _NoStep(RuntimeError):
     """The collocation equations were not solved; try a shorter step."""
 
 

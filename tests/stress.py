@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import contextlib
 import dataclasses
 import json
 import math
@@ -233,7 +234,9 @@ def quantities(
     # Errors are relative to the peaks of the run, which its outputs may miss.
     extremes = {"u_gap_max": float(np.abs(expected.u_gap).max()), "force_max": float(expected.force.max())}
     if from_steps:
-        extremes = expected.extremes(0.0, float(solution.t[-1]))
+        # Where the reference comes too near to a fold between its outputs, theirs have to do.
+        with contextlib.suppress(RuntimeError):
+            extremes = expected.extremes(0.0, float(solution.t[-1]))
     u, strongest = np.append(np.abs(expected.u_gap), extremes["u_gap_max"]), extremes["force_max"]
     rounded = REFERENCE * scene.amplitude
     may = RTOL * float(u.max()) + rounded

@@ -177,7 +177,9 @@ def test_an_area_given_in_mm2_in_python_is_warned_about() -> None:
 
 def test_shipped_decks_are_usual() -> None:
     for deck in sorted((Path(__file__).parents[1] / "circuits").glob("*.cir")):
-        assert said_by(lambda d=deck: fs.simulate(fs.read_netlist(d), t_stop=2e-4)) == []  # type: ignore[misc]
+        said = said_by(lambda d=deck: fs.simulate(fs.read_netlist(d), t_stop=2e-4))  # type: ignore[misc]
+        # Some begin with a rest, which is all of so short a run.
+        assert [text for text in said if "covers nothing of the run" not in text] == []
 
 
 def test_a_sweep_of_this_package_is_not_warned_about_value_by_value(command: Command) -> None:

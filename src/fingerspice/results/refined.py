@@ -20,6 +20,8 @@ from fingerspice.waveforms.waveform import Waveform
 _MISSED = 1e-11
 #: Largest number of panels, beyond which figures are computed from the outputs; and of halvings of one panel.
 MOST_PANELS, _MOST_ROUNDS = 20_000, 60
+# Length of a panel that is a straight line at all events, in units of the last place of the time.
+_ROUNDINGS = 32.0
 #: Largest number of the source's segments that an evaluation may pass; length of the first panels relative to the
 #: source's shortest time.
 _MOST_PASSED, _LONGEST = 200_000, 0.5
@@ -80,6 +82,10 @@ class ClosedForm:
         columns = np.empty((order.size, record.rows.shape[1]))
         columns[order] = record.rows
         values = columns.reshape(begin.size, POINTS.size, -1)[:, :NODES].transpose(0, 2, 1)
+        # Within some roundings of the time nodes are not apart, and a polynomial through them may be anything.
+        short = np.flatnonzero(end - begin <= _ROUNDINGS * np.spacing(np.abs(end)))
+        first, last = values[short, :, :1], values[short, :, -1:]
+        values[short] = first + POINTS[:NODES] * (last - first)
         times = np.column_stack([begin, end - begin, end, np.ones(begin.size)])
         return Stretches([Block(times, values)], partial(bare_record, record.network, record.net))
 
