@@ -17,8 +17,14 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "fingerspice"
 FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 400
-# Lines of all files together: as many as there are, rounded up. This number is only ever lowered.
-ALL_LINES = 53_830
+# Lines of all files together and of each package: as many as there are, rounded up. They are only ever lowered; what
+# moves from one package to another takes its lines along.
+ALL_LINES = 53_810
+PACKAGE_LINES = {
+    "base": 1_160, "circuit": 3_020, "cli": 2_460, "engine": 13_170, "explorer": 1_920, "netlist": 3_260,
+    "numerics": 1_400, "physics": 560, "plots": 1_730, "results": 3_430, "sets": 510, "solve": 7_980, "studies": 9_390,
+    "torch": 580, "waveforms": 3_120,
+}  # fmt: skip
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.
 MAX_BODY, MAX_PARAMETERS = 60, 8
@@ -274,8 +280,12 @@ def functions(path: Path) -> Iterator[tuple[str, bool, int, int]]:
 
 
 def test_the_whole_grows_no_more() -> None:
-    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in FILES)
-    assert lines <= ALL_LINES, f"{lines} lines in all; allowed: {ALL_LINES}, as something else becomes shorter"
+    lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
+    every = sum(lines.values())
+    assert every <= ALL_LINES, f"{every} lines in all; allowed: {ALL_LINES}, as something else becomes shorter"
+    for package, allowed in PACKAGE_LINES.items():
+        own = sum(n for path, n in lines.items() if path.relative_to(PACKAGE).parts[0] == package)
+        assert 0 < own <= allowed, f"{package} has {own} lines; allowed: {allowed}"
 
 
 @each_file
