@@ -200,6 +200,9 @@ CHECKED_FIRST = [
     ("ac --sweep dec", "--sweep 'dec'"),
     ("ac --amplitude 5", "--amplitude goes with --area coupled"),
     ("compare --rtol 7", "rtol is 7.0; allowed"),
+    ("ac --area coupled --amplitude -5", "amplitude is [-5.0] V; allowed: positive"),
+    ("limits --points 1", "points is 1; allowed: 3 to 1000"),
+    ("limits --span 0.5", "span is 0.5; allowed: more than 1"),
     ("limits --capability --carrier -5", "--carrier is -5; allowed: > 0"),
     ("design --limit -3", "--limit is -3; allowed: > 0"),
 ]
@@ -208,7 +211,7 @@ CHECKED_FIRST = [
 @pytest.mark.parametrize(("words", "said"), CHECKED_FIRST)
 def test_arguments_are_checked_before_files(command: Command, words: str, said: str) -> None:
     Path("out").mkdir()
-    for end in (".nc", "_ac.csv", "_compare.png", "_capability.csv", "_drive.wav"):
+    for end in (".nc", "_ac.csv", "_compare.png", "_limits.csv", "_capability.csv", "_drive.wav"):
         Path(f"out/pad{end}").write_text("of someone else")
     Path("wanted.csv").write_text("time (ms),friction (mN)\n" + "".join(f"{i},{170 + i % 7}\n" for i in range(9)))
     name, *options = words.split()

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from fingerspice.base.arrays import positive_row
 from fingerspice.base.errors import InputError
 from fingerspice.cli import answers, options
 from fingerspice.cli import design as designs
@@ -220,6 +221,8 @@ def ac(
         frequencies = sweep_frequencies(options.sweep(sweep, circuit))
         if area == "coupled" and skin != "swept":
             raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
+        if amplitude and area == "coupled":
+            positive_row("amplitude", amplitude, "V")
         if area != "coupled":
             if amplitude:
                 raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")

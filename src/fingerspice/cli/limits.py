@@ -38,7 +38,7 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.studies.limits import fold_limits, plot_limits
+    from fingerspice.studies.limits import fold_limits, grid_of, plot_limits
     from fingerspice.studies.reports import limits_csv, limits_text
 
     law = None if capability else "mobile"
@@ -54,6 +54,7 @@ def limits(
             return
         if limit is not None or carrier is not None:
             raise InputError("--limit and --carrier belong to --capability")
+        grid_of(points, span)
         answer.update(**answers.of_circuit(circuit, "mobile"))
         results = Results(deck, circuit, out, name, overwrite, "mobile")
         table = results.file("_limits.csv")

@@ -73,12 +73,12 @@ class ClosedForm:
             if begin.size + sum(x.size for x, _ in done) > MOST_PANELS:
                 return None
         begin, end = (np.sort(np.concatenate(x)) for x in zip(*done, strict=True))
-        shape, order, record = self._at_points(begin, end)
-        zeros = list(self._zeros(readers, begin, end, record, order, shape))
-        if zeros:
+        found = self._at_points(begin, end)
+        if zeros := list(self._zeros(readers, begin, end, *found)):
             marks = np.unique(np.concatenate([begin, end[-1:], *zeros]))
             begin, end = marks[:-1], marks[1:]
-            _, order, record = self._at_points(begin, end)
+            found = self._at_points(begin, end)
+        _, order, record = found
         columns = np.empty((order.size, record.rows.shape[1]))
         columns[order] = record.rows
         values = columns.reshape(begin.size, POINTS.size, -1)[:, :NODES].transpose(0, 2, 1)
@@ -114,14 +114,9 @@ class ClosedForm:
         return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
 
     def _zeros(
-        self,
-        readers: Mapping[str, Read],
-        begin: FloatArray,
-        end: FloatArray,
+        self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray, shape: tuple[int, int], order: IntArray,
         record: Record,
-        order: IntArray,
-        shape: tuple[int, int],
-    ) -> Iterator[FloatArray]:
+    ) -> Iterator[FloatArray]:  # fmt: skip
         """Zeros of gap voltages (s) within panels, where the area has a kink."""
         for name, read in readers.items():
             if name.partition(":")[0] != "u_gap":
