@@ -327,7 +327,8 @@ def judge(scene: Scene) -> Verdict:
     if tried > MOST_STEPS:
         raise WrongError(f"{tried} steps")
     with np.errstate(all="ignore"):
-        signal.setitimer(signal.ITIMER_PROF, LONGEST)
+        # The reference may take its time, on slow processors too.
+        signal.setitimer(signal.ITIMER_PROF, 6.0 * LONGEST)
         try:
             expected = scene.expected(solution.t)
         except ref.NoStepError as error:
