@@ -1,4 +1,4 @@
-"""Digests of sixty runs with their stated errors, for comparison before and after a change of the engine.
+"""Digests of 74 runs with their stated errors, for comparison before and after a change of the engine.
 
 A digest has gap voltages, forces and the first source's charge at 40 times. Two agree where they differ by no more than
 both errors that are stated.
