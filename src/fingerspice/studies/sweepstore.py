@@ -35,6 +35,14 @@ NAMES = "names"
 RUN = "sweep"
 
 
+def identity(path: Path) -> dict[str, Any]:
+    """What the store that is at a path holds about its sweep; refuses what is no store of a sweep."""
+    try:
+        return dict(json.loads(json.loads((path / "zarr.json").read_text())["attributes"][RUN]))
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path} is there already and is no store of a sweep; allowed: another path") from None
+
+
 @dataclass(frozen=True)
 class Variable:
     """An array of the store: its dimensions beyond those of the sweep, their sizes, its type and its attributes."""
@@ -165,15 +173,8 @@ class SweepStore:
                 self._create({**about, RUN: json.dumps(own)}, grid)
             except OSError as error:
                 raise InputError(f"cannot write {self.path}: {error.strerror or error}") from None
-        try:
-            attributes = json.loads((self.path / "zarr.json").read_text())["attributes"]
-            held = json.loads(attributes[RUN])
-            differ = [key for key in {**own, **held} if held.get(key) != own.get(key)]
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            raise InputError(
-                f"{self.path} is there already and is no store of a sweep; allowed: another path"
-            ) from None
-        if differ:
+        held = identity(self.path)
+        if differ := [key for key in {**own, **held} if held.get(key) != own.get(key)]:
             key, told = differ[0], [str(one.get(differ[0])) for one in (held, own)]
             said = "" if max(map(len, told)) > 40 else f" ({told[0]}, and this one {told[1]})"
             raise InputError(

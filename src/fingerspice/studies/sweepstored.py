@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import warnings
 from collections.abc import Mapping
 from inspect import signature
@@ -20,7 +21,7 @@ from fingerspice.studies.batch import batch, checked_scenes
 from fingerspice.studies.batchtask import LOCKSTEP, REFUSED
 from fingerspice.studies.sweepchunks import Work, programs, run_chunks, scheduled
 from fingerspice.studies.sweepplan import Plan
-from fingerspice.studies.sweepstore import MISSING, NAMES, STATUS, SweepStore, Variable
+from fingerspice.studies.sweepstore import MISSING, NAMES, STATUS, SweepStore, Variable, identity
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
@@ -46,6 +47,8 @@ def stored(
         does not answer.
     """
     _check(workers, scheduler, shard)
+    if os.path.lexists(path):
+        identity(path)
     work, about = _work(circuit, plan, options, path)
     if workers is not None or scheduler is not None:
         work = Work(work.circuit, plan, work.draws, {"threads": 1, **options}, work.store, work.programs)
