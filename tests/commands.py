@@ -25,8 +25,8 @@ class Result:
 
     @property
     def lines(self) -> list[str]:
-        """Lines on stderr."""
-        return self.err.splitlines()
+        """Lines on stderr, without those about compilation, which depend on the tests before."""
+        return [line for line in self.err.splitlines() if ": note: compiling" not in line]
 
 
 Command = Callable[..., Result]

@@ -205,6 +205,15 @@ def test_a_source_that_misses_the_run_is_told_with_the_likely_slip(name: str) ->
     assert said in told[0]
 
 
+def test_a_batch_says_that_the_recording_misses_their_run() -> None:
+    values = {"Xgap.d": [3e-6, 4e-6]}
+    with pytest.warns(fs.FingerspiceWarning, match="Vdrive changes from 0.002 s to 0.004 s only, and covers nothing"):
+        found = fs.batch(table1().replace({"Vdrive": fs.Samples(NOISE, 1e6, start=2e-3)}), values, t_stop=1e-3)
+    # It stays at its first value.
+    held = fs.batch(table1().replace({"Vdrive": fs.DC(float(NOISE[0]))}), values, t_stop=1e-3)
+    assert np.allclose(found.f_el_mean, held.f_el_mean, rtol=1e-6, atol=0.0)
+
+
 @pytest.mark.parametrize("source", [
     fs.Burst(fs.Sine(100.0, 5e3), 2e-4, delay=1e-4), fs.PWL((0.0, 1e-6, 2e-6), (0.0, 50.0, 0.0)),
     fs.Samples(NOISE[:101], 1e6, start=5e-4), fs.Pulse(0.0, 100.0, delay=-1.0), fs.DC(5.0),

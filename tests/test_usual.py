@@ -167,6 +167,11 @@ def test_a_large_signal_out_of_this_world_is_warned_about() -> None:
     assert sum("force reaches" in text or "area reaches" in text for text in said) == 2
 
 
+def test_a_batch_of_gaps_in_the_wrong_unit_is_warned_about_once() -> None:
+    said = said_by(lambda: fs.batch(table1(), {"Xgap.d": [2.0, 3.0, 4.0]}, rtol=1e-3, t_stop=1e-2))
+    assert sum("Xgap d is" in text and "the usual range" in text for text in said) == 2
+
+
 def test_an_area_given_in_mm2_in_python_is_warned_about() -> None:
     said = said_by(lambda: fs.simulate(table1(tran="50u 10m uic"), area=35.0))
     assert "the contact area reaches 35 m^2, over 0.001 m^2 (10 cm^2, more than a finger has)" in " ".join(said)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.spectrum import energy_outside, skin_error, surely_wide
 from fingerspice.circuit.topology import driving_sources
+from fingerspice.circuit.values import unusual_of_changed
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.waveform import Waveform
@@ -104,8 +107,10 @@ def time_slip(first: float, last: float, stop: float) -> str:
     return f"; a run to {last:g} s contains it" if stop < last < math.inf else ""
 
 
-def scenes_warnings(circuit: Circuit, t_stop: float | None, scenes: Mapping[str, FloatArray]) -> Iterator[str]:
-    """Warnings about a SKIN whose single frequency does not suit the sources of several scenes.
+def scenes_warnings(
+    circuit: Circuit, t_stop: float | None, scenes: Mapping[str, FloatArray], skin: str = "own"
+) -> Iterator[str]:
+    """Warnings about several scenes: unusual values, sources that miss the run, a SKIN whose single frequency is wrong.
 
     Parameters
     ----------
@@ -114,12 +119,22 @@ def scenes_warnings(circuit: Circuit, t_stop: float | None, scenes: Mapping[str,
         As in `circuit_warnings`.
     scenes : mapping of str to ndarray, shape (n,)
         Path to the values that a parameter has in the scenes.
+    skin : str
+        As in `batch`.
     """
-    own = [f"{skin.name}.f" for skin in circuit.by_device("SKIN")]
+    for path, values in scenes.items():
+        for end in sorted({values.min(), values.max()}):
+            # A scene that cannot be run says so itself.
+            with suppress(InputError):
+                yield from unusual_of_changed(circuit, circuit.varied({path: float(end)}))[1]
+    stop = t_stop or (circuit.tran.stop if circuit.tran is not None else math.nan)
+    if not any(path.startswith(f"{e.name}.") for e in driving(circuit) for path in scenes):
+        yield from course_warnings(circuit, 0.0, stop, t_stop is None)
+    own = [f"{e.name}.f" for e in circuit.by_device("SKIN") if skin == "own"]
     on = driving_sources(circuit) if own else []
     clocks = [f"{e.name}.{name}" for e in on for name in ("frequency", "carrier")]
     if not any(path in scenes for path in (*own, *clocks)):
-        yield from (text for text in circuit_warnings(circuit, t_stop) if _TAKES in text)
+        yield from (text for text in circuit_warnings(circuit, t_stop) if _TAKES in text and skin == "own")
     elif len(on) == 1 and on[0].waveform is not None and on[0].waveform.fundamental is not None:
         fixed = np.array(on[0].waveform.fundamental.frequency)
         at = next((scenes[path] for path in clocks if path in scenes), fixed)

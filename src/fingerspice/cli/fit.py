@@ -98,10 +98,10 @@ def fit_contact(
 
         circuit = read_circuit(deck, changes, None)
         answer.update(**answers.of_circuit(circuit, None))
-        results = Results(deck, circuit, out, name, overwrite, None)
-        file, image = results.file("_contact.csv"), None if no_plot else results.file("_contact.png")
         names = None if free is None else [one.strip() for one in free.split(",")]
         found = find(circuit, list(tables), names, finger=finger, profiles=profile)
+        results = Results(deck, circuit, out, name, overwrite, None)
+        file, image = results.file("_contact.csv"), None if no_plot else results.file("_contact.png")
         _give(answer, results, found, file, image)
 
 

@@ -120,9 +120,8 @@ def batch(
             if f"{element.name}.f" in scenes:
                 raise InputError(f"skin='follow' and {element.name}.f are both given; allowed: one of them")
             changed[f"{element.name}.f"] = frequency
-    else:
-        for text in scenes_warnings(circuit, task.t_stop, scenes):
-            warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    for text in scenes_warnings(circuit, task.t_stop, scenes, skin):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     paths = gradient_paths(circuit, gradients)
     wanted = gradient_request(task, paths, scenes, skin) if paths else None
     with ThreadPoolExecutor(threads or _processors()) as pool:

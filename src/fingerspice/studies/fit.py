@@ -99,7 +99,7 @@ def fit(
     table, unknowns = _request(circuit, data, parameters, groups)
     task = _task(circuit, table, unknowns, bounds, average, skin, charge_law, rtol)
     wanted = profiled(tuple(one.name for one in task.unknowns), profiles)
-    said = [*table.unusual(circuit), *(scenes_warnings(circuit, None, table.conditions) if skin == "own" else ())]
+    said = [*table.unusual(), *scenes_warnings(circuit, None, table.conditions, skin)]
     for text in filter(None, said):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     with evaluations_shown() as watch:

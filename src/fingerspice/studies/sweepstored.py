@@ -77,10 +77,10 @@ def _work(circuit: Circuit, plan: Plan, options: Mapping[str, Any], path: Path) 
     """The sweep as chunks, and the attributes of its store; its first scene is run to see what outputs there are."""
     _check_values(circuit, plan)
     middle = plan.quantiles(np.full((1, len(plan.drawn)), 0.5))
-    if options.get("skin", "own") == "own":
-        ends = plan.spread({name: values[[0, -1]] for name, values in plan.grid.items()}, middle)
-        for text in scenes_warnings(circuit, options.get("t_stop"), checked_scenes(circuit, ends)):
-            warnings.warn(text, FingerspiceWarning, stacklevel=4)
+    ends = plan.spread({name: values[[0, -1]] for name, values in plan.grid.items()}, middle)
+    skin = options.get("skin", "own")
+    for text in scenes_warnings(circuit, options.get("t_stop"), checked_scenes(circuit, ends), skin):
+        warnings.warn(text, FingerspiceWarning, stacklevel=4)
     with warnings.catch_warnings():
         # Of one scene.
         warnings.simplefilter("ignore", FingerspiceWarning)
