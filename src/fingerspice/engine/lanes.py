@@ -1,0 +1,343 @@
+"""Spans of samples in lanes (`engine.lanestep`), weights of their steps, and what is read from states at samples."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.engine.lanestep import BASIS, INNER, NODES, PER_MODE, SOURCES, polynomial_rows, step
+
+# Samples that are read and written at once.
+TILE = 16
+# Largest rate times length for which moments follow from the highest one, and that from its series.
+_EARLY = 1.0
+
+
+@jit_rows
+def _series(n: int, share: float, h: FloatArray, m: FloatArray) -> None:
+    for i in range(n):
+        m[i] = 1.0 - share * h[i] * m[i]
+
+
+@jit_rows
+def _below(n: int, rate: float, j: int, h: FloatArray, m: FloatArray, lower: FloatArray) -> None:
+    over = 1.0 / j
+    for i in range(n):
+        lower[i] = (1.0 - rate * h[i] * m[i]) * over
+
+
+@jit_rows
+def _decays(n: int, rate: float, h: FloatArray, out: FloatArray) -> None:
+    """exp(-rate h), by its series at a 64th of the exponent; 0 from an exponent of 40 on."""
+    for i in range(n):
+        out[i] = 1.0
+    for j in range(16, 0, -1):
+        share = rate / (64.0 * j)
+        for i in range(n):
+            out[i] = 1.0 - min(share * h[i], 0.625 / j) * out[i]
+    for _ in range(6):
+        for i in range(n):
+            out[i] *= out[i]
+
+
+@jit_rows
+def _late(n: int, j: int, rate: float, h: FloatArray, lower: FloatArray, m: FloatArray) -> None:
+    for i in range(n):
+        y = rate * h[i]
+        m[i] = (1.0 - j * lower[i]) / y if y > _EARLY else m[i]
+
+
+@jit
+def _moments(top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
+    """Integrals of exp(-y (1 - x)) x^j over [0, 1] for y = rate h (n,), into the rows j = 0 to `top` of m."""
+    n, longest = h.size, rate * h.max()
+    terms, term = 1, 1.0
+    while term > 1e-17 and terms < 24:
+        term *= min(longest, _EARLY) / (top + 1 + terms)
+        terms += 1
+    highest = m[top]
+    highest[:] = 1.0
+    for j in range(terms, 0, -1):
+        _series(n, rate / (top + 1 + j), h, highest)
+    highest *= 1.0 / (top + 1)
+    for j in range(top, 0, -1):
+        _below(n, rate, j, h, m[j], m[j - 1])
+    if longest > _EARLY:
+        decay = m[NODES]
+        _decays(n, rate, h, decay)
+        _late(n, 1, rate, h, decay, m[0])
+        for j in range(1, top + 1):
+            _late(n, j, rate, h, m[j - 1], m[j])
+
+
+@jit_rows
+def _until(
+    n: int, rate: float, gain: float, at: float, h: FloatArray, m0: FloatArray, m1: FloatArray, decay: FloatArray,
+    first: FloatArray, last: FloatArray, held: FloatArray,
+) -> None:  # fmt: skip
+    """Weights up to the place `at`: decay, both ends of the source, and a drive that is held."""
+    for i in range(n):
+        length = at * h[i]
+        decay[i] = 1.0 - rate * length * m0[i]
+        first[i] = gain * length * (m0[i] - at * m1[i])
+        last[i] = gain * length * at * m1[i]
+        held[i] = length * m0[i]
+
+
+@jit_rows
+def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = h[i] * (c[0] * m[0, i] + c[1] * m[1, i] + c[2] * m[2, i] + c[3] * m[3, i])
+
+
+@jit
+def weigh(rates: FloatArray, gain: FloatArray, h: FloatArray, weights: FloatArray) -> None:
+    """Weights of steps of the lengths h (n,), into the rows (n,) of `weights`: `PER_MODE` for each mode, then h."""
+    n, m = h.size, np.empty((NODES + 1, h.size))
+    for k in range(rates.size):
+        own = weights[k * PER_MODE :]
+        for node in range(NODES - 1):
+            at, rows = INNER[node] if node < NODES - 2 else 1.0, own[4 * node :]
+            _moments(1 if node < NODES - 2 else NODES - 1, rates[k] * at, h, m)
+            _until(n, rates[k], gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2], rows[3])
+        for j in range(NODES):
+            _drive(n, BASIS[j], h, m, own[4 * (NODES - 1) + j])
+    weights[rates.size * PER_MODE] = h
+
+
+@jit
+def begin(marks: Any, c: Any, still: FloatArray, starts: FloatArray, source: FloatArray, state: FloatArray) -> None:
+    """Put the lanes at the modes `starts` (m, lanes) under a source (lanes,).
+
+    `still` are the weights of a step of length 0.
+    """
+    lanes, m = len(marks.lanes), len(marks.modes)
+    state[:] = 0.0
+    for i in range(lanes):
+        state[2 * lanes + i] = source[i]
+        for k in range(m):
+            state[(SOURCES + k) * lanes + i] = starts[k, i]
+    step(marks, c, still.reshape(-1), state, source, 0.0, 1.0)
+
+
+@jit
+def span(
+    marks: Any, c: Any, weights: FloatArray, h: FloatArray, x: FloatArray, first: IntArray, count: int, parts: int,
+    tol: float, state: FloatArray, kept: FloatArray, left: FloatArray,
+) -> bool:  # fmt: skip
+    """Advance the lanes by `count` samples, each in `parts` steps, and keep the modes at the samples.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (rows, 1) or (rows, lanes)
+        Of one step; where every lane has its own, they are computed here.
+    h : ndarray, shape (n,)
+        Distance (s) from each sample to the next, where lanes have their own.
+    x, first : ndarray, shape (n + 1,) and (lanes,)
+        The source (V), and the sample of each lane's start.
+    tol : float
+        Change (V) of the gap voltage against what is kept already, at which the lanes may stop; negative for none.
+    state : ndarray
+        Of the lanes, see `begin`.
+    kept : ndarray, shape (m, lanes, count + 1)
+    left : ndarray, shape (m,)
+        Largest changes of the active modes where the lanes stop; left alone if they do not.
+
+    Returns
+    -------
+    bool
+        Whether the lanes stopped.
+    """
+    lanes, m, active = len(marks.lanes), len(marks.modes), len(marks.active)
+    after, found = np.empty(TILE * lanes), np.empty(TILE * m * lanes)
+    length, flat = np.empty(lanes), weights.reshape(-1)
+    done = 0
+    while done < count:
+        size = min(TILE, count - done)
+        for i in range(lanes):
+            for k in range(size):
+                after[k * lanes + i] = x[first[i] + done + 1 + k]
+        for k in range(size):
+            if len(marks.own) > 0:
+                for i in range(lanes):
+                    length[i] = h[first[i] + done + k] / parts
+                weigh(c.rates, c.gain, length, weights)
+            for p in range(parts):
+                step(marks, c, flat, state, after[k * lanes :], p / parts, (p + 1) / parts)
+            for i in range(m * lanes):
+                found[k * m * lanes + i] = state[SOURCES * lanes + i]
+        off = 0.0
+        for i in range(lanes):
+            change = 0.0
+            for k in range(active):
+                change += abs(c.shape[k] * (state[(SOURCES + k) * lanes + i] - kept[k, i, done + size]))
+            off = max(off, change) if change == change else math.inf
+        stops = off <= tol
+        if stops:
+            for k in range(active):
+                left[k] = 0.0
+                for i in range(lanes):
+                    left[k] = max(left[k], abs(state[(SOURCES + k) * lanes + i] - kept[k, i, done + size]))
+            for k in range(active, m):
+                for i in range(lanes):
+                    shift = state[(SOURCES + k) * lanes + i] - kept[k, i, done + size]
+                    for j in range(done + size + 1, count + 1):
+                        kept[k, i, j] += shift
+        for row in range(m):
+            for i in range(lanes):
+                for k in range(size):
+                    kept[row, i, done + 1 + k] = found[(k * m + row) * lanes + i]
+        done += size
+        if stops:
+            return True
+    return False
+
+
+@jit
+def along(weights: FloatArray, x: FloatArray, first: IntArray, count: int, z: FloatArray) -> None:
+    """Advance modes z (m, lanes) by `count` samples with the area at its reference and steps of one length."""
+    lanes, now, after = first.size, np.empty(first.size), np.empty(first.size)
+    for i in range(lanes):
+        now[i] = x[first[i]]
+    for t in range(count):
+        for i in range(lanes):
+            after[i] = x[first[i] + t + 1]
+        for k in range(z.shape[0]):
+            p = k * PER_MODE + 4 * (NODES - 2)
+            decay, before, last = weights[p, 0], weights[p + 1, 0], weights[p + 2, 0]
+            for i in range(lanes):
+                z[k, i] = decay * z[k, i] + before * now[i] + last * after[i]
+        for i in range(lanes):
+            now[i] = after[i]
+
+
+@jit_rows
+def project(n: int, k: float, x: FloatArray, columns: FloatArray, z: FloatArray, out: FloatArray) -> None:
+    """k x + columns z in n places: x, out (n,), columns (m,), z (m or more, n)."""
+    for i in range(n):
+        out[i] = k * x[i]
+    for row in range(columns.size):
+        share = columns[row]
+        for i in range(n):
+            out[i] += share * z[row, i]
+
+
+@jit_rows
+def largest(n: int, x: FloatArray) -> float:
+    """Largest |x|; inf if any is NaN."""
+    most, total = 0.0, 0.0
+    for i in range(n):
+        value = abs(x[i])
+        most = value if value > most else most
+        total += value
+    return most if total == total else math.inf
+
+
+@jit
+def show(
+    k: float, columns: FloatArray, x: FloatArray, first: IntArray, count: int, n: int, kept: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """k x + columns z at the samples 0 to n - 1, of which each lane has `count` from `first` on, into `out` (n,).
+
+    The last lane reads one more, where the number of samples asks for it.
+    """
+    for i in range(first.size):
+        size = n - first[i] if i + 1 == first.size else min(count, n - first[i])
+        if size > 0:
+            project(size, k, x[first[i] :], columns, kept[:, i], out[first[i] :])
+
+
+@jit
+def bends(c: Any, n: int, u: FloatArray, out: FloatArray) -> None:
+    """N (V m^2) at gap voltages u (n,)."""
+    x = np.empty(n)
+    for i in range(n):
+        x[i] = abs(u[i]) * c.scale + c.shift
+    polynomial_rows(n, c.bend, x, out)
+    for i in range(n):
+        out[i] = out[i] if u[i] >= 0.0 else -out[i]
+
+
+@jit
+def flow(
+    c: Any, k: float, columns: FloatArray, share: float, x: FloatArray, slope: FloatArray, first: IntArray, count: int,
+    n: int, kept: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Rate of k x + columns z + share N at the samples, as `show`; `slope` (n,) is the source's, V/s."""
+    m, drives, x_now, q = c.rates.size, c.tap_s.size, np.empty(count), np.empty(count)
+    # Shares of source and drives in the rates of the quantity and of the gap voltage.
+    by_s, by_s_u, by_g, by_g_u = 0.0, 0.0, np.zeros(drives), np.zeros(drives)
+    for j in range(m):
+        by_s += columns[j] * c.gain[j]
+        by_s_u += c.shape[j] * c.gain[j]
+        for t in range(drives):
+            by_g[t] += columns[j] * c.feed[j, t]
+            by_g_u[t] += c.shape[j] * c.feed[j, t]
+    for lane in range(first.size):
+        size, at = min(count, n - first[lane]), first[lane]
+        if size <= 0:
+            break
+        z, rate = kept[:, lane], out[at:]
+        project(size, c.k, x[at:], c.shape, z, x_now)
+        for i in range(size):
+            x_now[i] = abs(x_now[i]) * c.scale + c.shift
+        polynomial_rows(size, c.area, x_now, q)
+        for i in range(size):
+            s = x[at + i]
+            total, rise = by_s * s + k * slope[at + i], by_s_u * s + c.k * slope[at + i]
+            for j in range(m):
+                total -= columns[j] * c.rates[j] * z[j, i]
+                rise -= c.shape[j] * c.rates[j] * z[j, i]
+            for t in range(drives):
+                g = c.tap_s[t] * s
+                for j in range(m):
+                    g += c.taps[t, j] * z[j, i]
+                total += by_g[t] * g * q[i]
+                rise += by_g_u[t] * g * q[i]
+            # N' = A - 1/q0 by the gap voltage.
+            rate[i] = total - share * q[i] / (c.q0 * (c.q0 + q[i])) * rise
+
+
+@jit
+def busiest(x: FloatArray, first: IntArray, count: int, width: int, n: int, place: IntArray) -> None:
+    """Where each lane's source moves most between two samples: the first sample of one of its windows of `width`.
+
+    Windows end before sample n; -1 where no window does.
+    """
+    for i in range(first.size):
+        most, place[i] = -1.0, -1
+        for at in range(first[i], min(first[i] + count, n) - width + 1, width):
+            moves = 0.0
+            for j in range(at, at + width):
+                moves = max(moves, abs(x[j + 1] - x[j]))
+            if moves > most:
+                most, place[i] = moves, at - first[i]
+
+
+@jit
+def within(
+    marks: Any, c: Any, still: FloatArray, starts: FloatArray, x: FloatArray,
+    to: FloatArray, h: FloatArray, parts: int, state: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Modes (m, n) after steps of lengths h (n,) from `starts` (m, n), in `parts`; the source goes from x to `to`."""
+    lanes, m = len(marks.lanes), len(marks.modes)
+    weights = np.empty((m * PER_MODE + 1, lanes))
+    modes, before, after, length = np.empty((m, lanes)), np.empty(lanes), np.empty(lanes), np.empty(lanes)
+    for first in range(0, h.size, lanes):
+        for i in range(lanes):
+            j = min(first + i, h.size - 1)
+            before[i], after[i], length[i] = x[j], to[j], h[j] / parts
+            for k in range(m):
+                modes[k, i] = starts[k, j]
+        begin(marks, c, still, modes, before, state)
+        weigh(c.rates, c.gain, length, weights)
+        for p in range(parts):
+            step(marks, c, weights.reshape(-1), state, after, p / parts, (p + 1) / parts)
+        for i in range(min(lanes, h.size - first)):
+            for k in range(m):
+                out[k, first + i] = state[(SOURCES + k) * lanes + i]

@@ -1,0 +1,219 @@
+"""Stacks under `local` prepared for steps in lanes (`engine.lanestep`): modes, drives, the charge, and outputs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import cast
+
+import numpy as np
+from numpy.polynomial import chebyshev as series_of
+from numpy.polynomial.polynomial import polyder, polyval
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.circuit.statespace import Stack
+from fingerspice.engine.blockforms import MOST_DEGREE
+from fingerspice.engine.lanes import bends, weigh
+from fingerspice.engine.lanestep import PER_MODE, Lanes, Marks, places
+from fingerspice.engine.system import System
+from fingerspice.numerics import chebyshev
+from fingerspice.physics.contact import N_PACKED
+from fingerspice.results.outcome import State
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.scenes import BEYOND_PEAK
+from fingerspice.solve.stackstate import StackState, from_stack
+from fingerspice.solve.track import system_of
+
+# Number of lanes, whose rows fill the processor's vectors, and in which a recording goes as so many pieces.
+LANES = 32
+# Truncation error allowed for the polynomial of 1/A, relative to the error asked for.
+AREA_SHARE = 0.003
+# Matrix from values at Chebyshev nodes to the Chebyshev coefficients of the antiderivative of their interpolant.
+_POINTS = 40
+_NODES = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
+_INTEGRAL = series_of.chebint(np.linalg.inv(series_of.chebvander(_NODES, _POINTS - 1)))
+# Ratio of reference areas, so large that there is one.
+_ONE_REFERENCE = 1e12
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Quantities k s + columns z + bends N."""
+
+    columns: FloatArray  # (C, m)
+    k: FloatArray  # (C,)
+    bends: FloatArray  # (C,)
+
+
+@dataclass(frozen=True)
+class LaneForm:
+    """A stack prepared for recordings, for all tolerances of one decade."""
+
+    system: System
+    lanes: Lanes
+    active: int  # Number of modes that are not passive: the charge is one more, where it is wanted
+    rows: Shown  # What is recorded: voltages, and the charge
+    nodes: Shown
+    missed: float  # Relative error of the polynomial of 1/A
+
+    @property
+    def charge(self) -> bool:
+        """Whether the charge is wanted."""
+        return self.lanes.rates.size > self.active
+
+    def marks(self, own: bool) -> Marks:
+        """The lengths that the compiled code knows; `own` weights are those of each lane."""
+        return _marks(self.lanes.rates.size, self.active, self.lanes.tap_s.size, own)
+
+    def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
+        """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
+        rows = self.lanes.rates.size * PER_MODE + 1
+        return np.zeros(places(self.marks(own))[-1] * LANES), np.zeros((rows, LANES if own else 1))
+
+    def weights(self, h: FloatArray) -> FloatArray:
+        """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
+        out = np.empty((self.lanes.rates.size * PER_MODE + 1, h.size))
+        weigh(self.lanes.rates, self.lanes.gain, h, out)
+        return out
+
+    def inverse_area(self, u: FloatArray) -> FloatArray:
+        """1/A at gap voltages (V), 1/m^2."""
+        c = self.lanes
+        return np.asarray(c.q0 + polyval(np.abs(u) * c.scale + c.shift, c.area))
+
+    def bend(self, u: FloatArray) -> FloatArray:
+        """N at gap voltages (V), V m^2."""
+        flat, out = np.ravel(u), np.empty(np.size(u))
+        bends(self.lanes, flat.size, flat, out)
+        return out.reshape(np.shape(u))
+
+    def force(self, u: FloatArray) -> FloatArray:
+        """Force (N) at gap voltages (V)."""
+        return np.asarray(self.system.stress * u * u / self.inverse_area(u))
+
+    def gap(self, z: FloatArray, source: float) -> float:
+        """The gap voltage (V) at modes z (m,)."""
+        return float(self.lanes.shape @ z + self.lanes.k * source)
+
+    def _rest(self, z: FloatArray, u_gap: float, source: float) -> float:
+        """The charge (C) but for its mode."""
+        charge = self.rows.columns[-1, : self.active] @ z[: self.active] + self.rows.k[-1] * source
+        return float(charge + self.rows.bends[-1] * self.bend(np.array([u_gap]))[0])
+
+    def start(self, problem: Problem) -> FloatArray:
+        """The modes (m,) at the start of a run."""
+        start = problem.inner
+        z = self.system.project[0] @ start.y[:-1]
+        if not self.charge:
+            return np.asarray(z)
+        return np.append(z, start.y[-1] - self._rest(z, start.u_gap, start.u_before))
+
+    def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
+        """The state at modes z (m,) and `t` (s), where the source has the value `u_last` (V)."""
+        start, u_gap = problem.inner, self.gap(z, u_last)
+        charge = z[-1] + self._rest(z, u_gap, u_last) if self.charge else start.y[-1]
+        y = np.append(self.system.live[0] @ z[: self.active], charge)
+        return from_stack(problem.scene, StackState(t, y, u_last, u_gap, start.offset))
+
+
+@lru_cache(maxsize=64)
+def _marks(modes: int, active: int, drives: int, own: bool) -> Marks:
+    return Marks(*((0,) * size for size in (modes, active, drives, LANES, int(own))))
+
+
+def rounded_peak(peak: float) -> float:
+    """A peak (V) rounded up to one of four values an octave, so that recordings of about the same peak share forms."""
+    return 2.0 ** (math.ceil(4.0 * math.log2(peak)) / 4.0) if peak > 0.0 else 0.0
+
+
+def prepared(problem: Problem, rtol: float) -> LaneForm | None:
+    """The stack prepared for recordings with about its peak; None where no polynomial represents 1/A well enough."""
+    scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
+    peak = rounded_peak(scene.u_peak)
+    system = system_of(scene, decade, BEYOND_PEAK * peak, _ONE_REFERENCE, peak)
+    found = area_powers(system, AREA_SHARE * rtol)
+    assert scene.stack is not None
+    if found is None or scene.stack.gap is None or scene.stack.g_area[scene.stack.gap] > 0.0:
+        return None
+    area, missed = found
+    model, shift, q0 = system.model, -system.lo * system.scale - 1.0, float(system.q0[0])
+    area[0] -= q0
+    kink = float(polyval(shift, polyder(area))) * system.scale
+    rates, gain, feed, taps, shape = system.rates[0], system.gain[0], system.feed[0], system.tap[0], system.gap[0]
+    n, nodes = rates.size, system.node[0]
+    columns, k, bent = system.shown[0], system.k_shown, np.zeros(system.k_shown.size)
+    if problem.charge:
+        column, stored, gain_of, feed_of, moved = _charge(system, scene.stack)
+        rates, gain, feed = np.append(rates, 0.0), np.append(gain, gain_of), np.vstack([feed, feed_of])
+        columns = np.vstack([_wider(columns), np.append(column, 1.0)])
+        k, bent, nodes = np.append(k, stored), np.append(bent, moved), _wider(nodes)
+        taps, shape = _wider(taps), np.append(shape, 0.0)
+    rates, gain, shape, taps, tap_s, feed = map(
+        np.ascontiguousarray, (rates, gain, shape, taps, system.tap_k, feed)
+    )  # fmt: skip
+    lanes = Lanes(
+        rates, gain, shape, float(model.k_gap), taps, tap_s, feed, area, _bend(system, area), float(system.scale),
+        float(shift), q0, kink,
+    )  # fmt: skip
+    return LaneForm(
+        system, lanes, n, Shown(columns, k, bent), Shown(nodes, system.k_node, np.zeros(len(nodes))), missed
+    )
+
+
+def _wider(rows: FloatArray) -> FloatArray:
+    """Rows (n, m) with a column of zeros behind them."""
+    return np.hstack([rows, np.zeros((len(rows), 1))])
+
+
+def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:
+    """The charge as columns z + k s + y + moved N with y' = gain s + feed g.
+
+    Through the slowest layer, i = A0 (c v' + g v) + G v + j, where v = share s + own z is its voltage and j the current
+    by the change of the area (`solve.netmodal`): c_gap N' + A0 (q - q0) (G v - G_gap u).
+    """
+    model, area0 = system.model, 1.0 / float(system.q0[0])
+    rates, own = system.rates[0], system.slow[0]
+    share, c, g_area, g_total = cast("list[float]", model.slow[rates.size :].tolist())
+    leak = (g_area * area0 + g_total) * own
+    over = np.divide(leak, rates, out=np.zeros_like(leak), where=rates > 0.0)
+    order = np.array(stack.state_order)
+    leaking = order[stack.g_total[order] > 0.0]
+    slow = int(np.argmin(stack.leak_rates(model.area0)))
+    turned = (leaking == slow).astype(float) - (leaking == stack.gap)
+    gain = (g_area * area0 + g_total) * share + float(over @ system.gain[0])
+    feed = over @ system.feed[0] + area0 * stack.g_total[leaking] * turned
+    return area0 * c * own - over, area0 * c * share, gain, feed, float(stack.c[stack.gap])
+
+
+def _bend(system: System, area: FloatArray) -> FloatArray:
+    """N as a polynomial in the variable of `area`, which is 1/A - q0."""
+    q0 = float(system.q0[0])
+    q = polyval(_NODES, area)
+    series = _INTEGRAL @ (-q / (q0 * (q0 + q))) / system.scale
+    kept = series[: np.flatnonzero(np.abs(series) > 1e-16 * np.abs(series).max())[-1] + 1]
+    # A number of terms that the compiled evaluation takes.
+    kept = np.append(kept, np.zeros(-(kept.size - 1) % 4))
+    powers = np.empty(kept.size)
+    chebyshev.to_powers(kept, powers)
+    powers[0] -= polyval(-system.lo * system.scale - 1.0, powers)
+    return powers
+
+
+def area_powers(system: System, tol: float) -> tuple[FloatArray, float] | None:
+    """Coefficients of 1/A as a polynomial in the variable of `System`, and its relative error, at most `tol`.
+
+    The degree is a multiple of 4, for the compiled evaluation; None if no degree up to MOST_DEGREE is enough.
+    """
+    series = np.asarray(system.model.curve[2 + N_PACKED :])
+    if not system.scale > 0.0 or series.size < 2:
+        return None
+    for degree in range(4, min(MOST_DEGREE, series.size + 2) + 1, 4):
+        missed = float(np.abs(series[degree + 1 :]).sum() / np.abs(series[0]))
+        if missed <= tol:
+            kept = np.zeros(degree + 1)
+            kept[: min(series.size, degree + 1)] = series[: degree + 1]
+            out = np.empty(degree + 1)
+            chebyshev.to_powers(kept, out)
+            return out, missed
+    return None

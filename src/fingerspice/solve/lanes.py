@@ -1,0 +1,376 @@
+"""Recordings of stacks under `local`: a block of samples as pieces in lanes, with stated errors.
+
+All pieces of a block are followed at once (`engine.lanes`). Their starts are first those of the stack with its area
+held; after each sweep they are corrected by what the modes decay by in a piece, until the gap voltage no longer
+changes. Then a window of each piece, where the source moves most, is followed by steps half as long. The difference is
+the error of the window; a piece adds as much more as it is longer, and hands it on to the pieces after it, as the modes
+decay: once as if all errors were alike, and once as if they came by chance.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
+from fingerspice.engine.lanes import along, begin, busiest, flow, largest, show, span, within
+from fingerspice.engine.lanestep import NODES
+from fingerspice.results.outcome import State
+from fingerspice.solve.following import Following, Outcome
+from fingerspice.solve.laneform import LANES, LaneForm
+from fingerspice.solve.pieces import Piece
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import excess_of
+from fingerspice.solve.track import as_recorded
+
+# Steps of a sample, by level.
+PARTS = (1, 2, 4, 8, 16, 32, 64)
+# Stated over seen errors.
+SAFETY = 2.0
+# Changes of starts that may be left, over the error asked for.
+OF_STARTS = 0.05
+# A window over its piece, and the fewest samples in one.
+WINDOW, FEWEST = 1.0 / 16.0, 32
+# Excess below which the next block has steps twice as long, and what half the length divides an error by at least.
+COARSER, FINER = 1.0 / 60.0, 5.0
+# Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
+LUCK = 2.0
+# The rate that stands for 0, 1/s.
+_STILL = 1e-9
+_ONE_ROW = np.zeros(1, np.int64)
+
+
+class Block:
+    """A row of samples, at once in `LANES` pieces.
+
+    Parameters
+    ----------
+    form : LaneForm
+    x : ndarray, shape (n + 1,)
+        The source at the samples, V.
+    h : ndarray, shape (n,) or (1,)
+        Distances of the samples, or their common distance, s.
+    starts_run : bool
+        Whether the run starts here, perhaps with a jump: the first piece is then checked at its start.
+    """
+
+    def __init__(self, form: LaneForm, x: FloatArray, h: FloatArray, starts_run: bool) -> None:
+        self.form, self.n, self.own = form, x.size - 1, h.size > 1
+        self.count = -(-self.n // LANES)
+        beyond = self.count * LANES - self.n
+        # The source stays at its last value behind the end.
+        self.x = np.concatenate([x, np.full(beyond, x[-1])]) if beyond else x
+        self.h = np.concatenate([h, np.zeros(beyond)]) if self.own and beyond else h
+        self.first = self.count * np.arange(LANES)
+        self.starts_run, self.marks, self.active = starts_run, form.marks(self.own), form.active
+        self.rates = np.maximum(form.lanes.rates, _STILL)
+        self.room, self.scratch = form.room(self.own)
+        self.still = form.weights(np.zeros(LANES if self.own else 1))
+        self.kept = np.zeros((self.rates.size, LANES, self.count + 1))
+        self.left = np.zeros(self.rates.size)
+
+    @cached_property
+    def lengths(self) -> FloatArray:
+        """Durations of the pieces, s."""
+        if not self.own:
+            return np.full(LANES, self.count * self.h[0])
+        return np.asarray(self.h.reshape(LANES, self.count).sum(axis=1))
+
+    @cached_property
+    def handed(self) -> FloatArray:
+        """What is left at the start of each piece of the modes at the start of the block and the ends of the pieces.
+
+        Shape (m, LANES, 1 + LANES).
+        """
+        ends = np.concatenate([[0.0], np.cumsum(self.lengths)])
+        since = ends[:LANES, None] - ends[None, :]
+        left = np.exp(-self.rates[:, None, None] * np.maximum(since, 0.0))
+        return np.asarray(np.where(np.tri(LANES, 1 + LANES, dtype=bool), left, 0.0))
+
+    def _weights(self, parts: int) -> FloatArray:
+        return self.scratch if self.own else self.form.weights(self.h / parts)
+
+    def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
+        return bool(span(
+            self.marks, self.form.lanes, self._weights(parts), self.h, self.x, first, count, parts, tol, self.room,
+            kept, self.left,
+        ))  # fmt: skip
+
+    def _begin(self, starts: FloatArray, first: IntArray) -> None:
+        begin(self.marks, self.form.lanes, self.still, np.ascontiguousarray(starts), self.x[first], self.room)
+
+    def solve(self, start: FloatArray, parts: int, tol: float) -> bool:
+        """Follow all pieces from `start` (m,), until the gap voltage is known to `tol` (V); False where it is not.
+
+        The states at the samples go into `kept`.
+        """
+        form, active, self.sweeps = self.form, self.active, 0
+        self.__dict__.pop("voltages", None)
+        own = np.zeros_like(self.kept[:, :, 0])
+        # A guess, for which uneven points may count as even ones.
+        along(form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
+        starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[:, None], own], axis=1))
+        starts[active:] = 0.0
+        for sweep in range(LANES + 1):
+            self._begin(starts, self.first)
+            self.kept[:, :, 0] = starts
+            stops = self._span(self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
+            self.sweeps += 1
+            if stops:
+                break
+            off = self.kept[:active, :, -1] - np.roll(starts[:active], -1, axis=1)
+            off[:, -1] = 0.0
+            change = np.einsum("kij,kj->ki", self.handed[:active, :, 1:], off)
+            self.left[:active] = np.abs(change).max(axis=1)
+            most = float(np.abs(form.lanes.shape) @ self.left)
+            if not most < math.inf:
+                return False
+            if most <= tol:
+                break
+            starts[:active] += change
+        else:
+            return False
+        # Passive modes have begun at 0 in every piece.
+        ends = np.cumsum(self.kept[active:, :, -1], axis=1)
+        self.kept[active:] += (start[active:, None] + np.pad(ends, ((0, 0), (1, 0)))[:, :-1])[:, :, None]
+        return True
+
+    @cached_property
+    def voltages(self) -> FloatArray:
+        """Gap voltages (V) at the samples, shape (n + 1,), after `solve`."""
+        c, out = self.form.lanes, np.empty(self.n + 1)
+        show(c.k, c.shape, self.x, self.first, self.count, self.n + 1, self.kept, out)
+        return out
+
+    def end(self) -> FloatArray:
+        """The state (m,) at the last sample."""
+        lane = (self.n - 1) // self.count
+        return np.array(self.kept[:, lane, self.n - lane * self.count])
+
+    def check(self, parts: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Follow a window of every piece by twice as many steps.
+
+        Returns
+        -------
+        off : ndarray, shape (m, LANES, width + 1)
+            Differences of the states, 0 in pieces that are not checked.
+        u : ndarray, shape (LANES, width + 1)
+            Gap voltages, V.
+        share : ndarray, shape (m, LANES)
+            What a piece adds over what its window does, if all errors are alike.
+        share_of_products : ndarray, shape (m, m, LANES)
+            The same of products of two errors, if they come by chance.
+        """
+        width, place = min(self.count, max(FEWEST, round(self.count * WINDOW))), np.empty(LANES, np.int64)
+        busiest(self.x, self.first, self.count, width, self.n, place)
+        if self.starts_run:
+            place[0] = 0
+        seen, at = place >= 0, np.maximum(place, 0)
+        index = at[:, None] + np.arange(width + 1)
+        coarse = self.kept[:, np.arange(LANES)[:, None], index]
+        fine = np.zeros_like(coarse)
+        fine[:, :, 0] = coarse[:, :, 0]
+        self._begin(fine[:, :, 0], self.first + at)
+        self._span(self.first + at, width, 2 * parts, -1.0, fine)
+        off = np.where(seen[:, None], fine - coarse, 0.0)
+        u = self.voltages[np.minimum(self.first[:, None] + index, self.n)]
+        took = np.full(LANES, width * self.h[0])
+        if self.own:
+            took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
+        y, window = self.rates[:, None] * self.lengths, self.rates[:, None] * np.maximum(took, 1e-30)
+        share, of_products = (
+            np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
+        )
+        return off, u, share, of_products
+
+    def hand_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
+        """Errors at the start of each piece, and at the end of the block, shape (*kinds, LANES + 1).
+
+        Pieces add `added` (*kinds, LANES), and `before` (*kinds,) is there at the start. Of one error for each mode, or
+        of the products of two.
+        """
+        handed, lane = self.handed, (self.n - 1) // self.count
+        left = np.exp(-self.rates * self.lengths[lane])
+        if before.ndim == 2:
+            handed, left = handed[:, None] * handed, left[:, None] * left
+        at_starts = np.einsum("...ij,...j->...i", handed, np.concatenate([before[..., None], added], axis=-1))
+        return np.append(at_starts, (left * at_starts[..., lane] + added[..., lane])[..., None], axis=-1)
+
+    def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
+        """Source (V; n,) and modes (m, n) `since` (s) after samples of these numbers, whose steps are `length` (s)."""
+        lane = number // self.count
+        z = np.ascontiguousarray(self.kept[:, lane, number - lane * self.count])
+        x = self.x[number]
+        if not since.any():
+            return x, z
+        to, out, form = x + (self.x[number + 1] - x) * (since / length), np.empty_like(z), self.form
+        still, (room, _) = form.weights(np.zeros(LANES)), form.room(True)
+        within(form.marks(True), form.lanes, still, z, x, to, since, parts, room, out)
+        return to, out
+
+
+class LaneMarch(Following):
+    """A recording of a stack in progress, block by block."""
+
+    def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
+        gain = float(form.system.model.k_gap)
+        super().__init__(problem, rtol, share, gain, form.rows.k.size + int(form.charge))
+        self.form, self.z, m = form, form.start(problem), form.lanes.rates.size
+        self.u_last = problem.inner.u_before
+        self.level, self.outputs, self.steps, self.refused, self.evaluated = 0, 0, 0, 0, 0
+        # Errors of the modes so far, as if they were alike, and products of two, as if they came by chance.
+        self.alike, self.chance = np.zeros(m), np.zeros((m, m))
+        # Largest gap voltage (V), and errors seen of gap voltage (V), force (N), nodes (V) and charge (C).
+        self.peak, self.errors = 0.0, np.zeros(4)
+
+    def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
+        self.heard(values)
+        h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
+        block = Block(self.form, values, h, self.steps == 0)
+        while True:
+            parts, excess = PARTS[self.level], math.inf
+            solved = block.solve(self.z, parts, OF_STARTS * self.rtol * self.scale)
+            self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
+            if solved:
+                peak = float(largest(block.n + 1, block.voltages))
+                if not peak <= self.form.system.u_top:
+                    return Outcome.LOST
+                excess, errors, handed = self._judge(block, parts, max(peak, self.peak))
+            if excess <= 1.0:
+                break
+            self.refused += parts * block.n
+            if self.level + 1 == len(PARTS):
+                return Outcome.NOT_MET
+            finer = math.ceil(math.log(excess) / math.log(FINER)) if excess < math.inf else 1
+            self.level = min(self.level + max(1, finer), len(PARTS) - 1)
+        self.peak, self.errors = max(peak, self.peak), np.maximum(errors, self.errors)
+        self.alike, self.chance = handed
+        self.steps += parts * block.n
+        self._write(piece, block, parts, t_out, out)
+        self.z, self.t, self.u_last = block.end(), piece.stop, float(values[-1])
+        if excess < COARSER and self.level > 0:
+            self.level -= 1
+        return Outcome.MET
+
+    def _judge(self, block: Block, parts: int, peak: float) -> tuple[float, FloatArray, tuple[FloatArray, FloatArray]]:
+        """Excess of the stated over the allowed error, the errors seen so far, and those that the block hands on."""
+        form, active = self.form, block.active
+        off, u, share, of_products = block.check(parts)
+        own = off[:, :, -1]
+        products = own[:, None] * own
+        alike, chance = block.hand_on(own * share, self.alike), block.hand_on(products * of_products, self.chance)
+        # At the end of a piece, with what it adds beyond its window.
+        alike_there = alike[:, :LANES] + own * (share - 1.0)
+        chance_there = chance[..., :LANES] + products * (of_products - 1.0)
+
+        def added(columns: FloatArray) -> float:
+            """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
+            lucky = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there), 0.0))
+            more = np.maximum(lucky, np.abs(columns @ alike_there) - LUCK * lucky)
+            return float(more.max() + np.abs(columns[:active]) @ block.left[:active])
+
+        c, errors = form.lanes, np.zeros(4)
+        du = np.einsum("k,kij->ij", c.shape, off)
+        over, dn = added(c.shape), form.bend(u + du) - form.bend(u)
+        force = form.force(np.array([peak, 1.001 * peak]))
+        steep = float(force[1] - force[0]) / (1e-3 * peak) if peak > 0.0 else 0.0
+        errors[0] = np.abs(du).max() + over
+        errors[1] = np.abs(form.force(u + du) - form.force(u)).max() + steep * over
+        # N changes most at the largest voltage, where the area is farthest from the reference, or at rest.
+        bent = float(np.abs(1.0 / form.inverse_area(np.array([0.0, peak])) - 1.0 / c.q0).max()) * over
+        rows = [(2, columns, 0.0) for columns in form.nodes.columns]
+        for i, columns, bend in rows + ([(3, form.rows.columns[-1], form.rows.bends[-1])] if form.charge else []):
+            seen = float(np.abs(np.einsum("k,kij->ij", columns, off) + bend * dn).max())
+            errors[i] = max(errors[i], seen + added(columns) + abs(bend) * bent)
+        excess = self._excess(np.maximum(errors, self.errors), peak)
+        if self.share < 1.0:
+            alone = np.abs(du).max() + np.abs(c.shape @ (own * (share - 1.0))).max()
+            excess = max(excess, SAFETY * alone / (self.share * self.rtol * max(peak, self.least)))
+        return excess, errors, (alike[:, LANES], chance[..., LANES])
+
+    def _excess(self, errors: FloatArray, peak: float) -> float:
+        gaps, _, _ = self._stated(errors, peak)
+        least = self.least, float(self.form.force(np.array(self.least)))
+        gaps[0, :2] = np.maximum(gaps[0, :2], least)
+        return excess_of(gaps, self.problem.rounding) / self.rtol
+
+    def _write(self, piece: Piece, block: Block, parts: int, t_out: FloatArray, out: FloatArray) -> None:
+        """Write the outputs before the end of a block."""
+        first, n = self.outputs, block.n
+        slack = 8e-16 * (abs(piece.start) + n * piece.spacing)
+        last = first + int(np.searchsorted(t_out[first:], piece.stop - slack))
+        if last == first:
+            return
+        t, self.outputs, rows = t_out[first:last], last, out[:, first:last]
+        times = piece.times
+        samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
+        if t.size == n and np.abs(t - samples).max() <= slack:
+            self._show(block.x, np.diff(block.x[: n + 1]) / block.h[:n], block.first, block.kept, rows)
+            return
+        number = np.clip(np.searchsorted(samples, t + slack, side="right") - 1, 0, n - 1)
+        length = np.broadcast_to(block.h[:n], n)[number]
+        since = t - samples[number]
+        since[np.abs(since) <= slack] = 0.0
+        x, z = block.at(number, np.clip(since, 0.0, length), length, parts)
+        self._show(x, (block.x[number + 1] - block.x[number]) / length, _ONE_ROW, z[:, None], rows)
+
+    def _show(self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, out: FloatArray) -> None:
+        """Write outputs into the columns of `out`: from the source (V), its slope (V/s), and modes as in `Block`."""
+        form, c, n = self.form, self.form.lanes, out.shape[1]
+        count, shown = n if first.size == 1 else int(first[1]), form.rows
+        if form.charge:
+            u = np.empty(n)
+            show(c.k, c.shape, x, first, count, n, kept, u)
+            bend = form.bend(u)
+        for i, k in enumerate(shown.k.tolist()):
+            show(k, shown.columns[i], x, first, count, n, kept, out[i])
+        if form.charge:
+            out[-2] += shown.bends[-1] * bend
+            flow(c, shown.k[-1], shown.columns[-1], shown.bends[-1], x, slope, first, count, n, kept, out[-1])
+
+    def finish(self, t_out: FloatArray, out: FloatArray) -> None:
+        count = t_out.size - self.outputs
+        if count:
+            here, slope = np.full(count, self.u_last), np.full(count, self.slope_after)
+            z = np.repeat(self.z[:, None, None], count, axis=2)
+            self._show(here, slope, _ONE_ROW, z, out[:, self.outputs :])
+        self.outputs = t_out.size
+
+    def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
+        return as_recorded(self.problem, self.form.system.model, out[:, : t.size].T, np.empty(0))
+
+    def state(self) -> State:
+        return self.form.state(self.problem, self.z, self.t, self.u_last)
+
+    def stated(self) -> tuple[FloatArray, float, float | None]:
+        return self._stated(self.errors, self.peak)
+
+    def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
+        form, u_peak = self.form, self.problem.scene.u_peak
+        missed, force = form.missed, float(form.force(np.array(peak)))
+        floor = 4e-16 * (peak + form.lanes.k * max(u_peak, self.loudest)) + missed * peak
+        u_error = SAFETY * float(errors[0]) + floor
+        f_error = SAFETY * float(errors[1]) + (2.0 * floor / (peak or 1.0) + missed) * force
+        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + missed * peak
+        charge_error = None
+        if form.charge:
+            stored = float(form.system.model.slow[-3]) * form.system.model.area0
+            charge_error = SAFETY * float(errors[3]) + stored * missed * peak
+            charge_error += 4e-16 * stored * (u_peak + peak) * (1.0 + self.steps)
+        return np.array([[peak, force, u_error, f_error]]), node_error, charge_error
+
+    @property
+    def stats(self) -> tuple[int, int, int]:
+        return self.steps, self.refused, self.evaluated
+
+    def mark(self) -> dict[str, Any]:
+        names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak")
+        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors")}
+        return {name: getattr(self, name) for name in names} | arrays
+
+    def stand(self, mark: dict[str, Any]) -> None:
+        for name, value in mark.items():
+            setattr(self, name, np.array(value) if isinstance(value, list) else value)
