@@ -1,4 +1,6 @@
-"""Runs under a recorded source, sample by sample, in pieces of fixed length; see `engine.recording`.
+"""Runs under a recorded source, sample by sample, in pieces of fixed length.
+
+Stacks under `local` go in lanes (`solve.lanes`), others block by block (`engine.recording`).
 
 The error of each piece is judged at its end, independently of later pieces. Its outputs are therefore the same however
 long the run is, and whether all outputs are held in one array or streamed in chunks.
@@ -7,35 +9,33 @@ long the run is, and whether all outputs are held in one array or streamed in ch
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterable
 from dataclasses import replace
-from enum import Enum
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
-from fingerspice.engine import blockforms, recording, uneven
+from fingerspice.engine import blockforms, recording
 from fingerspice.engine.blockforms import BLOCK, Form
 from fingerspice.engine.blockpoints import write_end
-from fingerspice.engine.unevenweights import new_steps
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
-from fingerspice.solve.forms import Follower, followed, rounded_peak
+from fingerspice.solve.following import ATTEMPTS, Following, Outcome
+from fingerspice.solve.forms import Follower, followed
+from fingerspice.solve.laneform import LaneForm, prepared, rounded_peak
+from fingerspice.solve.lanes import LaneMarch
 from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.netforms import finger
-from fingerspice.solve.pieces import Piece, driving, pieces_of, spacing_of
+from fingerspice.solve.pieces import Piece, pieces_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, closed_form, excess_of, kept_with
-from fingerspice.waveforms.ramps import PWL
 
-# Error allowed in a block, relative to the error asked for; ratio of stated to estimated error; attempts at a piece.
-SHARE, SAFETY, ATTEMPTS = 0.28, 1.75, 4
+# Error allowed in a block, relative to the error asked for; ratio of stated to estimated error.
+SHARE, SAFETY = 0.28, 1.75
 # Share of the error asked for that another attempt at a piece is to have.
 ENOUGH = 0.85
-# The error of a piece is related to the peaks up to its end, or to this share of the largest gap voltage that the
-# source may cause: noise before the first loud sound need not be exact relative to itself.
-LEAST_PEAK = 1e-3
 # Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
 # and add up, a later piece cannot make up for errors of the earlier ones.
 BEGINNINGS = (1.0, 0.03)
@@ -46,40 +46,20 @@ LED_SHARE = 0.03
 MOST_FORMS = 16
 
 
-class Outcome(Enum):
-    """Outcome of a piece: its error is met, or not met, or this method cannot integrate it (LOST)."""
-
-    MET, NOT_MET, LOST = range(3)
-
-
-class March:
-    """A run in progress, piece by piece.
+class March(Following):
+    """A recording of a network, or of a stack under `mobile`, in progress.
 
     Attributes
     ----------
-    t : float
-        Time reached, s.
-    share : float
-        Factor of the error allowed in a block, reduced each time that a piece is rejected.
-    loudest : float
-        Largest |U| of the source so far, V.
     led : list of float
         Stated errors of the piece that the ordinary engine has integrated: gap voltage (V), force (N), nodes (V) and
         charge (C).
     """
 
     def __init__(self, problem: Problem, one: Follower, rtol: float, share: float = 1.0) -> None:
-        self.problem, self.one, self.rtol, self.share = problem, one, rtol, share
-        self.t, self.loudest, self.u_last, self.spacing = problem.t_start, 0.0, 0.0, 0.0
-        self.led = [0.0] * 4
-        self.width = one.width
-        wave = driving(problem)
-        assert wave is not None
-        self.wave, self.usual = wave, spacing_of(wave)
+        super().__init__(problem, rtol, share, one.share, one.width)
+        self.one, self.spacing, self.led = one, 0.0, [0.0] * 4
         self.course = one.course(problem, self._form(self.usual))
-        self.steps = new_steps(self.course.w.size) if isinstance(wave, PWL) else None
-        held = float(np.abs(problem.initial.y).max(initial=0.0))
-        self.least = max(held, LEAST_PEAK * problem.scene.u_peak * one.share)
 
     def _form(self, spacing: float) -> Form:
         kept, *key = _kept(self.problem, self.rtol)
@@ -97,17 +77,13 @@ class March:
             self.course.checks[:] = blockforms.new_checks(one.shown)
             if not recording.jump(self.course, float(values[0])):
                 return Outcome.LOST
-        self.loudest = max(self.loudest, float(values.max()), -float(values.min()))
-        scale = max(self.loudest * one.share, self.least)
-        before = self.mark()
+        self.heard(values)
+        before = [x.copy() for x in self._parts()]
         for _ in range(ATTEMPTS):
-            tol = self.share * SHARE * self.rtol * scale
-            if self.steps is not None and piece.times is not None:
-                code = uneven.march(self.course, self.steps, piece.times, values, tol, t_out, out)
-            else:
-                code = recording.march(
-                    self.course, values, 0, values.size - 1, piece.start, piece.spacing, tol, t_out, out
-                )  # fmt: skip
+            tol = self.share * SHARE * self.rtol * self.scale
+            code = recording.march(
+                self.course, values, 0, values.size - 1, piece.start, piece.spacing, tol, t_out, out
+            )  # fmt: skip
             if code != recording.DONE or control[blockforms.PEAK_U] > one.u_top:
                 return Outcome.LOST
             gaps, _, _ = self.stated()
@@ -117,7 +93,7 @@ class March:
                 self.t, self.u_last = piece.stop, float(values[-1])
                 return Outcome.MET
             refused = self.course.counters[blockforms.REFUSED]
-            self.recall(before)
+            self._recall(before)
             self.course.counters[blockforms.REFUSED] = refused
             self.share *= ENOUGH / excess
         return Outcome.NOT_MET
@@ -149,46 +125,39 @@ class March:
         c = self.course
         return c.w, c.error, c.control, c.counters, c.checks
 
-    def mark(self) -> list[FloatArray | IntArray]:
-        """A copy of the state of the integration, which `recall` restores."""
-        return [x.copy() for x in self._parts()]
-
-    def recall(self, mark: list[FloatArray | IntArray]) -> None:
-        for x, kept in zip(self._parts(), mark, strict=True):
+    def _recall(self, parts: Iterable[FloatArray | IntArray]) -> None:
+        for x, kept in zip(self._parts(), parts, strict=True):
             x[:] = kept
 
-    def stand(self, numbers: dict[str, Any], arrays: list[list[float]]) -> None:
-        """Restore the state of another march through the same run, from its attributes and its `mark`."""
-        for name, value in numbers.items():
-            setattr(self, name, value)
-        self.recall([np.array(x) for x in arrays])
+    def mark(self) -> dict[str, Any]:
+        names = ("t", "share", "loudest", "u_last", "spacing", "led")
+        return {name: getattr(self, name) for name in names} | {"parts": [x.tolist() for x in self._parts()]}
+
+    def stand(self, mark: dict[str, Any]) -> None:
+        self._recall([np.array(x) for x in mark["parts"]])
+        for name in mark.keys() - {"parts"}:
+            setattr(self, name, mark[name])
         self.course = self.course._replace(form=self._form(self.spacing or self.usual))
 
     @property
-    def outputs(self) -> int:
-        """Number of outputs written since `begin_outputs`."""
+    def outputs(self) -> int:  # type: ignore[override]
         return int(self.course.counters[blockforms.OUTPUT])
 
-    def begin_outputs(self) -> None:
-        """Start counting outputs from 0, for a new array of outputs."""
-        self.course.counters[blockforms.OUTPUT] = 0
+    @outputs.setter
+    def outputs(self, count: int) -> None:
+        self.course.counters[blockforms.OUTPUT] = count
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
-        """Write the outputs at the end of the run."""
-        stop, after = self.problem.t_stop, 1e-3 * self.usual
-        here, later = self.wave.value([stop, stop + after]).tolist()
-        write_end(self.course, self.u_last, (later - here) / after, read_only(t_out), out)
+        here, slope = self.at_end()
+        write_end(self.course, self.u_last, slope, read_only(t_out), out)
 
     def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
-        """Outputs at times `t` (s) as rows of a record."""
         return self.one.rows(self.problem, t, left, out)
 
     def state(self) -> State:
-        """The state reached."""
         return self.one.state(self.problem, self.course, self.t, self.u_last)
 
     def stated(self) -> tuple[FloatArray, float, float | None]:
-        """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C), so far."""
         control, u_peak = self.course.control, self.problem.scene.u_peak
         peak_u, peak_f = float(control[blockforms.PEAK_U]), float(control[blockforms.PEAK_F])
         # Round-off adds to the errors estimated in the blocks.
@@ -206,27 +175,31 @@ class March:
             charge_error += self.one.charge_error(self.problem, self.course, peak_u)
         return np.array([[peak_u, peak_f, u_error, f_error]]), node_error, charge_error
 
-    def run(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Run:
-        """The run so far, with the given outputs."""
-        counters = self.course.counters
-        stats = {"steps": int(counters[blockforms.STEPS]), "rejected": int(counters[blockforms.REFUSED]), "zeros": 0}
-        evaluated = 2 * BLOCK * int(counters[blockforms.SWEEPS])
-        run = Run(t, left, rows, Status.SUCCESS, evaluated, stats, self.state())
-        run.gaps, run.node_error, run.charge_error = self.stated()
-        run.margin, run.by_layer = float(self.course.control[blockforms.MARGIN]), self.problem.scene.stack is not None
-        return run
+    @property
+    def stats(self) -> tuple[int, int, int]:
+        steps, refused, sweeps = self.course.counters[blockforms.STEPS :].tolist()
+        return steps, refused, 2 * BLOCK * sweeps
+
+    @property
+    def margin(self) -> float:
+        return float(self.course.control[blockforms.MARGIN])
 
 
 def _decade(rtol: float) -> float:
     return float(10.0 ** np.floor(np.log10(rtol)))
 
 
-def ready(problem: Problem, rtol: float) -> Follower | None:
-    """The scene prepared for this method, cached by decade; None where it does not apply (see `forms`, `netforms`)."""
+def ready(problem: Problem, rtol: float) -> LaneForm | Follower | None:
+    """The scene prepared for this method, cached by decade; None where it does not apply."""
     kept, *key = _kept(problem, rtol)
-    make = followed if problem.scene.stack is not None else finger
-    one: Follower | None = kept_with(kept, ("followed", *key), MOST_FORMS, partial(make, problem, _decade(rtol)))
+    make = finger if problem.scene.stack is None else followed if problem.scene.net.mobile else prepared
+    one: LaneForm | Follower | None = kept_with(kept, ("followed", *key), MOST_FORMS, partial(make, problem, _decade(rtol)))
     return one
+
+
+def march_of(problem: Problem, one: LaneForm | Follower, rtol: float, share: float = 1.0) -> Following:
+    """A run that begins, with the scene as `ready` has prepared it."""
+    return (LaneMarch if isinstance(one, LaneForm) else March)(problem, one, rtol, share)  # type: ignore[arg-type]
 
 
 def _kept(problem: Problem, rtol: float) -> tuple[Any, ...]:
@@ -246,7 +219,7 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
         return None
     refused = 0
     for share in BEGINNINGS:
-        march = March(problem, one, rtol, share)
+        march = march_of(problem, one, rtol, share)
         out = np.empty((march.width, t_out.size))
         outcome = _through(march, pieces, t_out, out, progress)
         if outcome is Outcome.LOST:
@@ -261,12 +234,12 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
             look = partial(_look, replace(problem, charge=False), rtol)
             run.continuous = closed_form(problem, look, rtol)
             return run
-        refused += int(march.course.counters[blockforms.REFUSED])
+        refused += march.stats[1]
     return None
 
 
 def _through(
-    march: March, pieces: list[Piece], t_out: FloatArray, out: FloatArray, progress: Progress | None
+    march: Following, pieces: list[Piece], t_out: FloatArray, out: FloatArray, progress: Progress | None
 ) -> Outcome:  # fmt: skip
     """Integrate all pieces, up to the first that is not MET."""
     problem = march.problem

@@ -16,7 +16,8 @@ from fingerspice.results.record import Record
 from fingerspice.solve.outputs import at_breakpoints
 from fingerspice.solve.pieces import pieces_of
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings import March, Outcome, ready
+from fingerspice.solve.following import Outcome
+from fingerspice.solve.recordings import march_of, ready
 from fingerspice.solve.runs import Run
 from fingerspice.solve.simulation import integrated, own_rtol, state_error
 from fingerspice.waveforms.samples import Samples
@@ -76,7 +77,7 @@ class BySamples:
         pieces, one = pieces_of(problem), ready(problem, own)
         assert pieces is not None
         assert one is not None
-        self.pieces, self.march, self.place, self.written = pieces, March(problem, one, own), 0, 0
+        self.pieces, self.march, self.place, self.written = pieces, march_of(problem, one, own), 0, 0
 
     @staticmethod
     def serve(problem: Problem, plan: Plan, rtol: float) -> bool:
@@ -90,21 +91,11 @@ class BySamples:
         return self.place == len(self.pieces)
 
     def mark(self) -> Mark:
-        m = self.march
-        numbers: dict[str, Any] = {
-            "t": m.t,
-            "share": m.share,
-            "loudest": m.loudest,
-            "u_last": m.u_last,
-            "spacing": m.spacing,
-        }
-        numbers["led"] = m.led
-        arrays = [x.tolist() for x in m.mark()]
-        return {"written": self.written, "place": self.place, "numbers": numbers, "arrays": arrays}
+        return {"written": self.written, "place": self.place, "march": self.march.mark()}
 
     def go_to(self, mark: Mark) -> None:
         self.written, self.place = mark["written"], mark["place"]
-        self.march.stand(mark["numbers"], mark["arrays"])
+        self.march.stand(mark["march"])
 
     def advance(self) -> tuple[FloatArray, FloatArray] | None:
         """Times (s) and rows of the next piece; None where the method for recordings fails on it."""

@@ -1,0 +1,290 @@
+"""Spans of samples in lanes (`engine.lanestep`), the weights of their steps, and what is read from states at samples."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.engine.lanestep import INNER, NODES, PER_MODE, area_rows, step
+
+# Samples that are read and written at once.
+TILE = 16
+# Coefficients of the Lagrange polynomials through Lobatto's nodes.
+_BASIS = np.ascontiguousarray(np.linalg.inv(np.vander((0.0, *INNER, 1.0), increasing=True)).T)
+# Largest rate times length for which moments follow from the highest one, and that from its series.
+_EARLY = 1.0
+
+
+@jit_rows
+def _moments(n: int, top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
+    """Integrals of exp(-y (1 - x)) x^j over [0, 1] for y = rate h (n,), into the rows j = 0 to `top` of m."""
+    longest = 0.0
+    for i in range(n):
+        longest = max(longest, rate * h[i])
+    terms, term = 1, 1.0
+    while term > 1e-17 and terms < 24:
+        term *= min(longest, _EARLY) / (top + 1 + terms)
+        terms += 1
+    last = top * n
+    for i in range(n):
+        m[last + i] = 1.0
+    for j in range(terms, 0, -1):
+        share = rate / (top + 1 + j)
+        for i in range(n):
+            m[last + i] = 1.0 - share * h[i] * m[last + i]
+    for i in range(n):
+        m[last + i] /= top + 1
+    for j in range(top, 0, -1):
+        for i in range(n):
+            m[(j - 1) * n + i] = (1.0 - rate * h[i] * m[j * n + i]) / j
+    if longest > _EARLY:
+        for i in range(n):
+            y = rate * h[i]
+            if y > _EARLY:
+                m[i] = -math.expm1(-y) / y
+                for j in range(1, top + 1):
+                    m[j * n + i] = (1.0 - j * m[(j - 1) * n + i]) / y
+
+
+@jit_rows
+def weigh(rates: FloatArray, gain: FloatArray, h: FloatArray, weights: FloatArray) -> None:
+    """Weights of steps of the lengths h (n,), into rows of n: `PER_MODE` for each mode, then h."""
+    n, m = h.size, rates.size
+    for k in range(m):
+        drive = weights[(k * PER_MODE + 4 * (NODES - 1)) * n :]
+        for node in range(NODES - 1):
+            at, row = INNER[node] if node < NODES - 2 else 1.0, (k * PER_MODE + 4 * node) * n
+            # The rows of the drives' weights hold the moments until the end.
+            _moments(n, 1 if node < NODES - 2 else NODES - 1, rates[k] * at, h, drive)
+            for i in range(n):
+                m0, m1, length = drive[i], drive[n + i], at * h[i]
+                weights[row + i] = 1.0 - rates[k] * length * m0
+                weights[row + n + i] = gain[k] * length * (m0 - at * m1)
+                weights[row + 2 * n + i] = gain[k] * length * at * m1
+                weights[row + 3 * n + i] = length * m0
+        for i in range(n):
+            m0, m1, m2, m3 = drive[i], drive[n + i], drive[2 * n + i], drive[3 * n + i]
+            for j in range(NODES):
+                own = _BASIS[j, 0] * m0 + _BASIS[j, 1] * m1 + _BASIS[j, 2] * m2 + _BASIS[j, 3] * m3
+                drive[j * n + i] = h[i] * own
+    for i in range(n):
+        weights[m * PER_MODE * n + i] = h[i]
+
+
+@jit
+def begin(marks: Any, c: Any, still: FloatArray, starts: FloatArray, source: FloatArray, state: FloatArray) -> None:
+    """Put the lanes at the modes `starts` (m, lanes) under a source (lanes,); the rider begins at 0.
+
+    `still` are the weights of a step of length 0.
+    """
+    lanes, m = len(marks.lanes), len(marks.modes)
+    state[:] = 0.0
+    for i in range(lanes):
+        state[2 * lanes + i] = source[i]
+        for k in range(m):
+            state[(3 + k) * lanes + i] = starts[k, i]
+    step(marks, c, still, state, source, 0.0, 1.0)
+
+
+@jit
+def span(
+    marks: Any, c: Any, rates: FloatArray, gain: FloatArray, weights: FloatArray, h: FloatArray, x: FloatArray,
+    first: IntArray, count: int, parts: int, tol: float, state: FloatArray, kept: FloatArray,
+) -> int:  # fmt: skip
+    """Advance the lanes by `count` samples, each in `parts` steps, and keep modes and rider at the samples.
+
+    Parameters
+    ----------
+    rates, gain : ndarray, shape (m,)
+    weights : ndarray
+        Of one step; where every lane has its own, they are computed here.
+    h : ndarray, shape (n,)
+        Distance (s) from each sample to the next, where lanes have their own.
+    x, first : ndarray, shape (n + 1,) and (lanes,)
+        The source (V), and the sample of each lane's start.
+    tol : float
+        Change (V) of the gap voltage against what is kept already, at which the lanes may stop; negative for none.
+    state : ndarray
+        Of the lanes, see `begin`.
+    kept : ndarray, shape (m + rider, lanes, count + 1)
+
+    Returns
+    -------
+    int
+        Number of samples advanced by.
+    """
+    lanes, m, rows = len(marks.lanes), len(marks.modes), kept.shape[0]
+    after, found = np.empty(TILE * lanes), np.empty(TILE * rows * lanes)
+    length = np.empty(lanes)
+    done = 0
+    while done < count:
+        size = min(TILE, count - done)
+        for i in range(lanes):
+            for k in range(size):
+                after[k * lanes + i] = x[first[i] + done + 1 + k]
+        for k in range(size):
+            if len(marks.own) > 0:
+                for i in range(lanes):
+                    length[i] = h[first[i] + done + k] / parts
+                weigh(rates, gain, length, weights)
+            for p in range(parts):
+                step(marks, c, weights, state, after[k * lanes :], p / parts, (p + 1) / parts)
+            for i in range(rows * lanes):
+                found[k * rows * lanes + i] = state[3 * lanes + i]
+        off = 0.0
+        for i in range(lanes):
+            change = 0.0
+            for k in range(m):
+                change += abs(c.shape[k] * (state[(3 + k) * lanes + i] - kept[k, i, done + size]))
+            off = max(off, change) if change == change else math.inf
+        stops = off <= tol
+        if stops:
+            for k in range(m, rows):
+                for i in range(lanes):
+                    shift = state[(3 + k) * lanes + i] - kept[k, i, done + size]
+                    for j in range(done + size + 1, count + 1):
+                        kept[k, i, j] += shift
+        for row in range(rows):
+            for i in range(lanes):
+                for k in range(size):
+                    kept[row, i, done + 1 + k] = found[(k * rows + row) * lanes + i]
+        done += size
+        if stops:
+            break
+    return done
+
+
+@jit
+def along(
+    marks: Any, rates: FloatArray, gain: FloatArray, weights: FloatArray, h: FloatArray, x: FloatArray,
+    first: IntArray, count: int, z: FloatArray,
+) -> None:  # fmt: skip
+    """Advance modes z (m, lanes) by `count` samples with the area at its reference."""
+    lanes, m = len(marks.lanes), len(marks.modes)
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    length, now = np.empty(lanes), np.empty(lanes)
+    for i in range(lanes):
+        now[i] = x[first[i]]
+    after = np.empty(lanes)
+    for t in range(count):
+        for i in range(lanes):
+            after[i] = x[first[i] + t + 1]
+        if len(marks.own) > 0:
+            for i in range(lanes):
+                length[i] = h[first[i] + t]
+            weigh(rates, gain, length, weights)
+        for k in range(m):
+            p = k * PER_MODE + 4 * (NODES - 2)
+            for i in range(lanes):
+                z[k, i] = (
+                    weights[p * wide + i * each] * z[k, i]
+                    + weights[(p + 1) * wide + i * each] * now[i]
+                    + weights[(p + 2) * wide + i * each] * after[i]
+                )
+        for i in range(lanes):
+            now[i] = after[i]
+
+
+@jit_rows
+def project(n: int, k: float, x: FloatArray, columns: FloatArray, z: FloatArray, out: FloatArray) -> None:
+    """k x + columns z in n places: x, out (n,), columns (m,), z (m or more, n)."""
+    for i in range(n):
+        out[i] = k * x[i]
+    for row in range(columns.size):
+        share = columns[row]
+        for i in range(n):
+            out[i] += share * z[row, i]
+
+
+@jit_rows
+def largest(n: int, x: FloatArray) -> float:
+    """Largest |x|; inf if any is NaN."""
+    most, total = 0.0, 0.0
+    for i in range(n):
+        value = abs(x[i])
+        most = value if value > most else most
+        total += value
+    return most if total == total else math.inf
+
+
+@jit
+def charges(
+    n: int, c: Any, rates: FloatArray, gain: FloatArray, x: FloatArray, slope: FloatArray, z: FloatArray,
+    row: FloatArray, charge: FloatArray, current: FloatArray,
+) -> None:  # fmt: skip
+    """Charge (C) and current (A) in n places, from the source (V), its slope (V/s), and modes and rider (m + 1, n).
+
+    `row` (n,) is scratch.
+    """
+    m = rates.size
+    project(n, c.k, x, c.shape, z, row)
+    for i in range(n):
+        charge[i] = row[i]
+        row[i] = abs(row[i]) * c.scale + c.shift
+    area_rows(n, c.moved, row, current)
+    for i in range(n):
+        charge[i] = z[m, i] + (current[i] if charge[i] >= 0.0 else -current[i])
+    area_rows(n, c.area, row, current)
+    for i in range(n):
+        s, q = x[i], current[i]
+        part, total, rise = c.by_source[0] * s, c.by_source[1] * s, c.k * slope[i]
+        for k in range(m):
+            part += c.by_modes[k] * z[k, i]
+            rate = gain[k] * s - rates[k] * z[k, i]
+            rise += c.shape[k] * rate
+            total += c.held[k] * rate
+            charge[i] += c.held[k] * z[k, i]
+        for t in range(c.tap_s.size):
+            g = c.tap_s[t] * s
+            for k in range(m):
+                g += c.taps[t, k] * z[k, i]
+            g *= q
+            part += c.by_drives[0, t] * g
+            total += c.by_drives[1, t] * g
+            for k in range(m):
+                rise += c.shape[k] * c.feed[k, t] * g
+                total += c.held[k] * c.feed[k, t] * g
+        current[i] = total + (c.moved_by * rise - q / c.q0 * part) / (c.q0 + q)
+
+
+@jit
+def show(
+    count: int, k: float, columns: FloatArray, x: FloatArray, first: IntArray, kept: FloatArray, out: FloatArray
+) -> float:  # fmt: skip
+    """k x + columns z at the samples 0 to `count` of every lane, into `out` (lanes, count + 1); the largest |value|."""
+    most = 0.0
+    for i in range(first.size):
+        project(count + 1, k, x[first[i] :], columns, kept[:, i], out[i])
+        most = max(most, largest(count + 1, out[i]))
+    return most
+
+
+@jit
+def within(
+    marks: Any, c: Any, rates: FloatArray, gain: FloatArray, still: FloatArray, starts: FloatArray, x: FloatArray,
+    to: FloatArray, h: FloatArray, parts: int, state: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Modes and rider (rows, n) after steps of lengths h (n,) from `starts` (rows, n), while the source goes from x to
+    `to`; each in `parts`."""
+    lanes, m, rows = len(marks.lanes), len(marks.modes), starts.shape[0]
+    weights = np.empty((m * PER_MODE + 1) * lanes)
+    modes, before, after, length = np.empty((m, lanes)), np.empty(lanes), np.empty(lanes), np.empty(lanes)
+    for first in range(0, h.size, lanes):
+        for i in range(lanes):
+            j = min(first + i, h.size - 1)
+            before[i], after[i], length[i] = x[j], to[j], h[j] / parts
+            for k in range(m):
+                modes[k, i] = starts[k, j]
+        begin(marks, c, still, modes, before, state)
+        weigh(rates, gain, length, weights)
+        for p in range(parts):
+            step(marks, c, weights, state, after, p / parts, (p + 1) / parts)
+        for i in range(min(lanes, h.size - first)):
+            for k in range(rows):
+                out[k, first + i] = state[(3 + k) * lanes + i]
+            for k in range(m, rows):
+                out[k, first + i] += starts[k, first + i]

@@ -1,0 +1,404 @@
+"""Recordings of stacks under `local`: a block of samples as pieces in lanes, with stated errors.
+
+All pieces of a block are followed at once (`engine.lanes`). Their starts are first those of the stack with its area
+held; after each sweep they are corrected by what the modes decay by in a piece, until the gap voltage no longer
+changes. Then a window of each piece, where the source moves most, is followed by steps half as long. The difference is
+the error of the window; a piece adds as much more as it is longer, and hands it on to the pieces after it, as the modes
+decay: once as if all errors were alike, and once as if they came by chance.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
+from fingerspice.engine.lanes import along, begin, charges, project, show, span, within
+from fingerspice.results.outcome import State
+from fingerspice.solve.following import Following, Outcome
+from fingerspice.solve.laneform import LANES, LaneForm
+from fingerspice.solve.pieces import Piece
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import excess_of
+from fingerspice.solve.stackstate import StackState, from_stack
+
+# Steps of a sample, by level.
+PARTS = (1, 2, 4, 8, 16, 32, 64)
+# Stated over seen error; of the charge, further.
+SAFETY, OF_CHARGE = 2.0, 1.5
+# Changes of starts that may be left, over the error asked for.
+OF_STARTS = 0.05
+# A window over its piece, and the fewest samples in one.
+WINDOW, FEWEST = 1.0 / 16.0, 8
+# Excess below which the next block has steps twice as long, and what half the length divides an error by at least.
+COARSER, FINER = 1.0 / 60.0, 5.0
+# The rate that stands for 0, 1/s.
+_STILL = 1e-9
+
+
+class Block:
+    """A row of samples, at once in `LANES` pieces.
+
+    Parameters
+    ----------
+    form : LaneForm
+    x : ndarray, shape (n + 1,)
+        The source at the samples, V.
+    h : ndarray, shape (n,) or (1,)
+        Distances of the samples, or their common distance, s.
+    starts_run : bool
+        Whether the run starts here, with a jump perhaps: the first piece is then checked at its start.
+    """
+
+    def __init__(self, form: LaneForm, x: FloatArray, h: FloatArray, starts_run: bool) -> None:
+        self.form, self.n, self.own = form, x.size - 1, h.size > 1
+        self.count = -(-self.n // LANES)
+        beyond = self.count * LANES - self.n
+        # The source stays at its last value behind the end.
+        self.x = np.concatenate([x, np.full(beyond, x[-1])]) if beyond else x
+        self.h = np.concatenate([h, np.zeros(beyond)]) if self.own and beyond else h
+        self.first = self.count * np.arange(LANES)
+        self.starts_run, self.marks = starts_run, form.marks(self.own)
+        self.m, rows = form.rates.size, form.rates.size + int(form.charge)
+        self.rates = np.append(form.rates, np.full(rows - self.m, _STILL))
+        self.room, self.scratch = form.room(self.own)
+        self.still = form.weights(np.zeros(LANES if self.own else 1))
+        self.kept = np.zeros((rows, LANES, self.count + 1))
+        self.sweeps = 0
+
+    @cached_property
+    def lengths(self) -> FloatArray:
+        """Durations of the pieces, s."""
+        if not self.own:
+            return np.full(LANES, self.count * self.h[0])
+        return np.asarray(self.h.reshape(LANES, self.count).sum(axis=1))
+
+    @cached_property
+    def handed(self) -> FloatArray:
+        """What is left at the start of each piece of the modes at the start of the block and the ends of the pieces.
+
+        Shape (rows, LANES, 1 + LANES).
+        """
+        ends = np.concatenate([[0.0], np.cumsum(self.lengths)])
+        since = ends[:LANES, None] - ends[None, :]
+        left = np.exp(-self.rates[:, None, None] * np.maximum(since, 0.0))
+        return np.asarray(np.where(np.tri(LANES, 1 + LANES, dtype=bool), left, 0.0))
+
+    def weights(self, parts: int) -> FloatArray:
+        return self.scratch if self.own else self.form.weights(self.h / parts)
+
+    def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> int:
+        form = self.form
+        return int(span(
+            self.marks, form.lanes, form.rates, form.gain, self.weights(parts), self.h, self.x, first, count, parts,
+            tol, self.room, kept,
+        ))  # fmt: skip
+
+    def _begin(self, starts: FloatArray, first: IntArray) -> None:
+        begin(self.marks, self.form.lanes, self.still, np.ascontiguousarray(starts), self.x[first], self.room)
+
+    def solve(self, start: FloatArray, parts: int, tol: float) -> bool:
+        """Follow all pieces from `start` (rows,), until the gap voltage is known to `tol` (V); False where it is not.
+
+        The states at the samples go into `kept`.
+        """
+        form, m = self.form, self.m
+        own = np.zeros((m, LANES))
+        along(
+            self.marks, form.rates, form.gain, self.weights(1), self.h, self.x, self.first, self.count, own
+        )  # fmt: skip
+        handed = self.handed[:m]
+        starts = np.einsum("kij,kj->ki", handed, np.concatenate([start[:m, None], own], axis=1))
+        for sweep in range(LANES + 1):
+            self._begin(starts, self.first)
+            self.kept[:m, :, 0], self.kept[m:, :, 0] = starts, 0.0
+            done = self._span(self.first, self.count, parts, tol if sweep else -1.0, self.kept)
+            self.sweeps += 1
+            off = self.kept[:m, :, -1] - np.roll(starts, -1, axis=1)
+            off[:, -1] = 0.0
+            change = np.einsum("kij,kj->ki", handed[..., 1:], off)
+            largest = np.abs(form.lanes.shape @ np.abs(change)).max()
+            if not largest < math.inf:
+                return False
+            if largest <= tol or done < self.count:
+                break
+            starts += change
+        else:
+            return False
+        if form.charge:
+            ends = self.kept[m, :, -1]
+            self.kept[m] += (start[m] + np.concatenate([[0.0], np.cumsum(ends)[:-1]]))[:, None]
+        return True
+
+    @cached_property
+    def voltages(self) -> FloatArray:
+        """Gap voltages (V) at the samples of each piece, shape (LANES, count + 1), after `solve`."""
+        return self.shown(self.form.lanes.k, self.form.lanes.shape)
+
+    def shown(self, k: float, columns: FloatArray) -> FloatArray:
+        """k x + columns z at the samples of each piece."""
+        out = np.empty((LANES, self.count + 1))
+        show(self.count, k, np.ascontiguousarray(columns), self.x, self.first, self.kept, out)
+        return out
+
+    def flat(self, rows: FloatArray) -> FloatArray:
+        """Values (LANES, count + 1) of the pieces as one row of the samples, without the last one."""
+        return rows[:, :-1].reshape(-1)[: self.n]
+
+    def end(self) -> FloatArray:
+        """The state (rows,) at the last sample."""
+        lane = (self.n - 1) // self.count
+        return np.array(self.kept[:, lane, self.n - lane * self.count])
+
+    def check(self, parts: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Follow a window of every piece by twice as many steps.
+
+        Returns
+        -------
+        off : ndarray, shape (rows, LANES, width + 1)
+            Differences of the states, 0 in pieces that are not checked.
+        u : ndarray, shape (LANES, width + 1)
+            Gap voltages, V.
+        share : ndarray, shape (2, rows, LANES)
+            What a piece adds over what its window does, if all errors are alike, and of squares.
+        seen : ndarray of bool, shape (LANES,)
+            Which pieces were checked.
+        """
+        count, width = self.count, min(self.count, max(FEWEST, round(self.count * WINDOW)))
+        many = count // width
+        moves = np.abs(np.diff(self.x)).reshape(LANES, count)[:, : many * width].reshape(LANES, many, width).max(axis=2)
+        whole = np.arange(width, many * width + 1, width) + self.first[:, None] <= self.n
+        place = np.argmax(np.where(whole, moves, -1.0), axis=1)
+        seen = whole.any(axis=1)
+        if self.starts_run:
+            place[0] = 0
+        at, lane = place * width, np.arange(LANES)
+        index = at[:, None] + np.arange(width + 1)
+        coarse = self.kept[:, lane[:, None], index]
+        fine = np.zeros_like(coarse)
+        fine[:, :, 0] = coarse[:, :, 0]
+        self._begin(coarse[: self.m, :, 0], self.first + at)
+        self._span(self.first + at, width, 2 * parts, -1.0, fine)
+        seen[0] = True
+        fine[self.m :, :, 1:] += coarse[self.m :, :, :1]
+        off = np.where(seen[:, None], fine - coarse, 0.0)
+        u = np.take_along_axis(self.voltages, index, axis=1)
+        took = np.full(LANES, width * self.h[0])
+        if self.own:
+            took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
+        y, window = self.rates[:, None] * self.lengths, self.rates[:, None] * np.maximum(took, 1e-30)
+        share = np.array([np.expm1(-y) / np.expm1(-window), np.expm1(-2.0 * y) / np.expm1(-2.0 * window)])
+        return off, u, share, seen
+
+    def carried(self, off: FloatArray, share: FloatArray, before: FloatArray) -> FloatArray:
+        """Errors of the modes from the pieces before, at the start of each piece, and at the end: (2, rows, LANES + 1).
+
+        The first row adds them up as if they were alike, the other one squares, as if they came by chance; `before`
+        (2, rows) are those at the start of the block.
+        """
+        own = np.stack([off[:, :, -1] * share[0], off[:, :, -1] ** 2 * share[1]])
+        out = np.empty((2, self.rates.size, LANES + 1))
+        for i, handed in enumerate((self.handed, self.handed**2)):
+            parts = np.concatenate([before[i][:, None], own[i]], axis=1)
+            out[i, :, :LANES] = np.einsum("kij,kj->ki", handed, parts)
+        lane = (self.n - 1) // self.count
+        left = np.exp(-self.rates * self.lengths[lane])
+        out[0, :, LANES] = left * out[0, :, lane] + own[0, :, lane]
+        out[1, :, LANES] = left**2 * out[1, :, lane] + own[1, :, lane]
+        return out
+
+    def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
+        """Source (V; n,) and states (rows, n) `since` (s) after samples of these numbers, whose steps are `length`."""
+        lane = number // self.count
+        z = np.ascontiguousarray(self.kept[:, lane, number - lane * self.count])
+        x = self.x[number]
+        if not since.any():
+            return x, z
+        to, out = x + (self.x[number + 1] - x) * (since / length), np.empty_like(z)
+        form, marks = self.form, self.form.marks(True)
+        room, _ = form.room(True)
+        still = form.weights(np.zeros(LANES))
+        within(marks, form.lanes, form.rates, form.gain, still, z, x, to, since, parts, room, out)
+        return to, out
+
+
+class LaneMarch(Following):
+    """A recording of a stack in progress, block by block."""
+
+    def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
+        start, rows = problem.inner, form.rates.size + int(form.charge)
+        super().__init__(problem, rtol, share, float(form.system.model.k_gap), form.system.k_shown.size + 2 * form.charge)
+        self.form = form
+        state = form.system.project[0] @ start.y[:-1]
+        self.z = np.append(state, start.y[-1] - form.charge_at(state, start.u_gap)) if form.charge else state
+        self.u_last = start.u_before
+        self.level, self.outputs, self.steps, self.refused, self.sweeps = 0, 0, 0, 0, 0
+        self.before = np.zeros((2, rows))
+        # Largest gap voltage (V) and errors seen of gap voltage (V), force (N), nodes (V) and charge (C).
+        self.peak, self.errors = 0.0, np.zeros(4)
+
+    def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
+        h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
+        self.heard(values)
+        block = Block(self.form, values, h, self.t == self.problem.t_start)
+        while True:
+            parts = PARTS[self.level]
+            tol = OF_STARTS * self.rtol * self.scale
+            excess = math.inf
+            if block.solve(self.z, parts, tol):
+                block.__dict__.pop("voltages", None)
+                peak = float(np.abs(block.voltages.reshape(-1)[: self._last(block)]).max())
+                if not peak <= self.form.u_top:
+                    return Outcome.LOST
+                excess, errors, before = self._judge(block, parts, max(peak, self.peak))
+            if excess <= 1.0:
+                break
+            self.refused += parts * block.n
+            if self.level + 1 == len(PARTS):
+                return Outcome.NOT_MET
+            finer = math.ceil(math.log(excess) / math.log(FINER)) if excess < math.inf else 1
+            self.level = min(self.level + max(1, finer), len(PARTS) - 1)
+        self.peak, self.errors, self.before = max(peak, self.peak), np.maximum(errors, self.errors), before
+        self.steps += parts * block.n
+        self.sweeps += block.sweeps
+        self._write(piece, block, parts, t_out, out)
+        self.z, self.t, self.u_last = block.end(), piece.stop, float(values[-1])
+        if excess < COARSER and self.level > 0:
+            self.level -= 1
+        return Outcome.MET
+
+    @staticmethod
+    def _last(block: Block) -> int:
+        lane = (block.n - 1) // block.count
+        return lane * (block.count + 1) + block.n - lane * block.count + 1
+
+    def _judge(self, block: Block, parts: int, peak: float) -> tuple[float, FloatArray, FloatArray]:
+        """Excess of the stated over the allowed error, the errors seen so far, and those that the block hands on."""
+        form, m = self.form, block.m
+        off, u, share, _ = block.check(parts)
+        carried = block.carried(off, share, self.before)
+        own = np.stack([off[:, :, -1] * share[0], off[:, :, -1] ** 2 * share[1]])
+
+        def largest(columns: FloatArray, held: FloatArray) -> float:
+            """Of what is carried into the pieces and added in them, of a sum of the modes."""
+            alike = np.abs(columns @ held[0, :m, :LANES]) + np.abs(columns @ own[0, :m])
+            return float((alike + np.sqrt(columns**2 @ (held[1, :m, :LANES] + own[1, :m]))).max())
+
+        shape = form.lanes.shape
+        du = np.einsum("k,kij->ij", shape, off[:m])
+        # A fast mode adds nothing over its window, and what it misses there is seen.
+        over = largest(shape, carried)
+        force = form.force(np.array([peak, 1.001 * peak]))
+        steep = float(force[1] - force[0]) / (1e-3 * peak) if peak > 0.0 else 0.0
+        errors = np.zeros(4)
+        errors[0] = np.abs(du).max() + over
+        errors[1] = np.abs(form.force(u + du) - form.force(u)).max() + steep * over
+        for columns in form.system.node[0]:
+            errors[2] = max(errors[2], np.abs(np.einsum("k,kij->ij", columns, off[:m])).max() + largest(columns, carried))
+        if form.charge:
+            held = abs(carried[0, m, :LANES]) + abs(own[0, m]) + np.sqrt(carried[1, m, :LANES] + own[1, m])
+            moved = form.lanes.moved_by * du / form.inverse_area(u)
+            most = form.lanes.moved_by / float(form.inverse_area(np.array(peak)))
+            moved += np.einsum("k,kij->ij", form.lanes.held, off[:m]) + off[m]
+            errors[3] = np.abs(moved).max() + held.max() + most * over + largest(form.lanes.held, carried)
+        excess = self._excess(np.maximum(errors, self.errors), peak)
+        if self.share < 1.0:
+            none = np.zeros_like(carried)
+            alone = np.abs(du).max() + largest(shape, none)
+            excess = max(excess, SAFETY * alone / (self.share * self.rtol * max(peak, self.least)))
+        return excess, errors, carried[:, :, LANES]
+
+    def _excess(self, errors: FloatArray, peak: float) -> float:
+        gaps, _, _ = self._stated(errors, peak)
+        gaps[0, 0], gaps[0, 1] = max(gaps[0, 0], self.least), max(gaps[0, 1], float(self.form.force(np.array(self.least))))
+        return excess_of(gaps, self.problem.rounding) / self.rtol
+
+    def _write(self, piece: Piece, block: Block, parts: int, t_out: FloatArray, out: FloatArray) -> None:
+        """Write the outputs before the end of a block."""
+        first, n = self.outputs, block.n
+        slack = 8e-16 * (abs(piece.start) + n * piece.spacing)
+        last = first + int(np.searchsorted(t_out[first:], piece.stop - slack))
+        if last == first:
+            return
+        t, self.outputs = t_out[first:last], last
+        if piece.times is None:
+            number = np.clip(np.floor((t - piece.start + slack) / piece.spacing).astype(np.int64), 0, n - 1)
+            since, length = t - piece.start - number * piece.spacing, np.full(t.size, piece.spacing)
+        else:
+            number = np.clip(np.searchsorted(piece.times, t + slack, side="right") - 1, 0, n - 1)
+            since, length = t - piece.times[number], block.h[number]
+        since[np.abs(since) <= slack] = 0.0
+        since = np.clip(since, 0.0, length)
+        if t.size == n and not since.any() and number[0] == 0 and number[-1] == n - 1:
+            x, z = block.x[:n], np.ascontiguousarray([block.flat(row) for row in block.kept])
+        else:
+            x, z = block.at(number, since, length, parts)
+        self._show(x, z, (block.x[number + 1] - block.x[number]) / length, out[:, first:last])
+
+    def _show(self, x: FloatArray, z: FloatArray, slope: FloatArray, out: FloatArray) -> None:
+        """Write outputs, from the source (V), its slope (V/s) and the states (rows, n), into the columns of `out`."""
+        system, n = self.form.system, x.size
+        row, charge, current = np.empty((3, n))
+        for column in range(system.k_shown.size):
+            project(n, float(system.k_shown[column]), x, system.shown[0, column], z, row)
+            out[column] = row
+        if self.form.charge:
+            form = self.form
+            charges(n, form.lanes, form.rates, form.gain, x, slope, z, row, charge, current)
+            out[-2], out[-1] = charge, current
+
+    def finish(self, t_out: FloatArray, out: FloatArray) -> None:
+        count = t_out.size - self.outputs
+        x, z = np.full(count, self.u_last), np.repeat(self.z[:, None], count, axis=1)
+        if count:
+            here, slope = self.at_end()
+            x[:] = here
+            self._show(x, z, np.full(count, slope), out[:, self.outputs :])
+        self.outputs = t_out.size
+
+    def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
+        rows, turn = out[:, : t.size].T, self.problem.scene.shown.turn
+        if self.problem.scene.shown.is_turned:
+            rows[:, : turn.size] *= turn
+        return rows
+
+    def state(self) -> State:
+        form, start = self.form, self.problem.inner
+        m = form.rates.size
+        u_gap = float(form.lanes.shape @ self.z[:m] + form.lanes.k * self.u_last)
+        y = np.append(form.system.live[0] @ self.z[:m], self.z[m] + form.charge_at(self.z[:m], u_gap) if form.charge else start.y[-1])
+        return from_stack(self.problem.scene, StackState(self.t, y, self.u_last, u_gap, start.offset))
+
+    def stated(self) -> tuple[FloatArray, float, float | None]:
+        return self._stated(self.errors, self.peak)
+
+    def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
+        form, u_peak = self.form, self.problem.scene.u_peak
+        missed, force = form.missed, float(form.force(np.array(peak)))
+        floor = 4e-16 * (peak + form.lanes.k * max(u_peak, self.loudest)) + missed * peak
+        left = OF_STARTS * self.rtol * self.scale
+        u_error = SAFETY * float(errors[0]) + left + floor
+        f_error = SAFETY * float(errors[1]) + (2.0 * (floor + left) / (peak or 1.0) + missed) * force
+        node_error = SAFETY * float(errors[2]) + left + 4e-16 * (peak + u_peak) + missed * peak
+        charge_error = None
+        if form.charge:
+            stored = float(form.system.model.slow[-3]) * form.system.model.area0
+            charge_error = OF_CHARGE * SAFETY * float(errors[3]) + stored * (left + missed * peak)
+            charge_error += 4e-16 * stored * (u_peak + peak) * (1.0 + self.steps)
+        return np.array([[peak, force, u_error, f_error]]), node_error, charge_error
+
+    @property
+    def stats(self) -> tuple[int, int, int]:
+        return self.steps, self.refused, 3 * self.steps
+
+    def mark(self) -> dict[str, Any]:
+        names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "sweeps", "peak")
+        arrays = {name: getattr(self, name).tolist() for name in ("z", "before", "errors")}
+        return {name: getattr(self, name) for name in names} | arrays
+
+    def stand(self, mark: dict[str, Any]) -> None:
+        for name, value in mark.items():
+            setattr(self, name, np.array(value) if isinstance(value, list) else value)
