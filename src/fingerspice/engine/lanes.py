@@ -212,55 +212,76 @@ def largest(n: int, x: FloatArray) -> float:
 
 
 @jit
-def charges(
-    n: int, c: Any, rates: FloatArray, gain: FloatArray, x: FloatArray, slope: FloatArray, z: FloatArray,
-    row: FloatArray, charge: FloatArray, current: FloatArray,
+def show(
+    k: float, columns: FloatArray, x: FloatArray, first: IntArray, count: int, n: int, kept: FloatArray,
+    out: FloatArray,
 ) -> None:  # fmt: skip
-    """Charge (C) and current (A) in n places, from the source (V), its slope (V/s), and modes and rider (m + 1, n).
+    """k x + columns z at the samples 0 to n - 1, of which each lane has `count` from `first` on, into `out` (n,).
 
-    `row` (n,) is scratch.
+    The last lane reads one more, where the number of samples asks for it.
     """
-    m = rates.size
-    project(n, c.k, x, c.shape, z, row)
-    for i in range(n):
-        charge[i] = row[i]
-        row[i] = abs(row[i]) * c.scale + c.shift
-    area_rows(n, c.moved, row, current)
-    for i in range(n):
-        charge[i] = z[m, i] + (current[i] if charge[i] >= 0.0 else -current[i])
-    area_rows(n, c.area, row, current)
-    for i in range(n):
-        s, q = x[i], current[i]
-        part, total, rise = c.by_source[0] * s, c.by_source[1] * s, c.k * slope[i]
-        for k in range(m):
-            part += c.by_modes[k] * z[k, i]
-            rate = gain[k] * s - rates[k] * z[k, i]
-            rise += c.shape[k] * rate
-            total += c.held[k] * rate
-            charge[i] += c.held[k] * z[k, i]
-        for t in range(c.tap_s.size):
-            g = c.tap_s[t] * s
-            for k in range(m):
-                g += c.taps[t, k] * z[k, i]
-            g *= q
-            part += c.by_drives[0, t] * g
-            total += c.by_drives[1, t] * g
-            for k in range(m):
-                rise += c.shape[k] * c.feed[k, t] * g
-                total += c.held[k] * c.feed[k, t] * g
-        current[i] = total + (c.moved_by * rise - q / c.q0 * part) / (c.q0 + q)
+    for i in range(first.size):
+        size = n - first[i] if i + 1 == first.size else min(count, n - first[i])
+        if size > 0:
+            project(size, k, x[first[i] :], columns, kept[:, i], out[first[i] :])
 
 
 @jit
-def show(
-    count: int, k: float, columns: FloatArray, x: FloatArray, first: IntArray, kept: FloatArray, out: FloatArray
-) -> float:  # fmt: skip
-    """k x + columns z at the samples 0 to `count` of every lane, into `out` (lanes, count + 1); the largest |value|."""
-    most = 0.0
+def charges(
+    c: Any, rates: FloatArray, gain: FloatArray, x: FloatArray, slope: FloatArray, first: IntArray, count: int, n: int,
+    kept: FloatArray, charge: FloatArray, current: FloatArray,
+) -> None:  # fmt: skip
+    """Charge (C) and current (A), as `show`, from the source (V), its slope (V/s), and modes and rider."""
+    m, row = rates.size, np.empty(count)
+    for lane in range(first.size):
+        size, at = min(count, n - first[lane]), first[lane]
+        if size <= 0:
+            break
+        z, q, p = kept[:, lane], current[at:], charge[at:]
+        project(size, c.k, x[at:], c.shape, z, row)
+        for i in range(size):
+            p[i] = row[i]
+            row[i] = abs(row[i]) * c.scale + c.shift
+        area_rows(size, c.moved, row, q)
+        for i in range(size):
+            p[i] = z[m, i] + (q[i] if p[i] >= 0.0 else -q[i])
+        area_rows(size, c.area, row, q)
+        for i in range(size):
+            s = x[at + i]
+            part, total, rise = c.by_source[0] * s, c.by_source[1] * s, c.k * slope[at + i]
+            for k in range(m):
+                part += c.by_modes[k] * z[k, i]
+                rate = gain[k] * s - rates[k] * z[k, i]
+                rise += c.shape[k] * rate
+                total += c.held[k] * rate
+                p[i] += c.held[k] * z[k, i]
+            for t in range(c.tap_s.size):
+                g = c.tap_s[t] * s
+                for k in range(m):
+                    g += c.taps[t, k] * z[k, i]
+                g *= q[i]
+                part += c.by_drives[0, t] * g
+                total += c.by_drives[1, t] * g
+                for k in range(m):
+                    rise += c.shape[k] * c.feed[k, t] * g
+                    total += c.held[k] * c.feed[k, t] * g
+            q[i] = total + (c.moved_by * rise - q[i] / c.q0 * part) / (c.q0 + q[i])
+
+
+@jit
+def busiest(x: FloatArray, first: IntArray, count: int, width: int, n: int, place: IntArray) -> None:
+    """Where each lane's source moves most between two samples: the first sample of one of its windows of `width`.
+
+    Windows end before sample n; -1 where no window does.
+    """
     for i in range(first.size):
-        project(count + 1, k, x[first[i] :], columns, kept[:, i], out[i])
-        most = max(most, largest(count + 1, out[i]))
-    return most
+        most, place[i] = -1.0, -1
+        for at in range(first[i], min(first[i] + count, n) - width + 1, width):
+            moves = 0.0
+            for j in range(at, at + width):
+                moves = max(moves, abs(x[j + 1] - x[j]))
+            if moves > most:
+                most, place[i] = moves, at - first[i]
 
 
 @jit

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
-from fingerspice.engine.lanes import along, begin, charges, project, show, span, within
+from fingerspice.engine.lanes import along, begin, busiest, charges, largest, show, span, within
 from fingerspice.results.outcome import State
 from fingerspice.solve.following import Following, Outcome
 from fingerspice.solve.laneform import LANES, LaneForm
@@ -135,25 +135,17 @@ class Block:
 
     @cached_property
     def voltages(self) -> FloatArray:
-        """Gap voltages (V) at the samples of each piece, shape (LANES, count + 1), after `solve`."""
-        return self.shown(self.form.lanes.k, self.form.lanes.shape)
-
-    def shown(self, k: float, columns: FloatArray) -> FloatArray:
-        """k x + columns z at the samples of each piece."""
-        out = np.empty((LANES, self.count + 1))
-        show(self.count, k, np.ascontiguousarray(columns), self.x, self.first, self.kept, out)
+        """Gap voltages (V) at the samples, shape (n + 1,), after `solve`."""
+        c, out = self.form.lanes, np.empty(self.n + 1)
+        show(c.k, c.shape, self.x, self.first, self.count, self.n + 1, self.kept, out)
         return out
-
-    def flat(self, rows: FloatArray) -> FloatArray:
-        """Values (LANES, count + 1) of the pieces as one row of the samples, without the last one."""
-        return rows[:, :-1].reshape(-1)[: self.n]
 
     def end(self) -> FloatArray:
         """The state (rows,) at the last sample."""
         lane = (self.n - 1) // self.count
         return np.array(self.kept[:, lane, self.n - lane * self.count])
 
-    def check(self, parts: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def check(self, parts: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Follow a window of every piece by twice as many steps.
 
         Returns
@@ -164,34 +156,27 @@ class Block:
             Gap voltages, V.
         share : ndarray, shape (2, rows, LANES)
             What a piece adds over what its window does, if all errors are alike, and of squares.
-        seen : ndarray of bool, shape (LANES,)
-            Which pieces were checked.
         """
-        count, width = self.count, min(self.count, max(FEWEST, round(self.count * WINDOW)))
-        many = count // width
-        moves = np.abs(np.diff(self.x)).reshape(LANES, count)[:, : many * width].reshape(LANES, many, width).max(axis=2)
-        whole = np.arange(width, many * width + 1, width) + self.first[:, None] <= self.n
-        place = np.argmax(np.where(whole, moves, -1.0), axis=1)
-        seen = whole.any(axis=1)
+        width, place = min(self.count, max(FEWEST, round(self.count * WINDOW))), np.empty(LANES, np.int64)
+        busiest(self.x, self.first, self.count, width, self.n, place)
         if self.starts_run:
             place[0] = 0
-        at, lane = place * width, np.arange(LANES)
+        seen, at = place >= 0, np.maximum(place, 0)
         index = at[:, None] + np.arange(width + 1)
-        coarse = self.kept[:, lane[:, None], index]
+        coarse = self.kept[:, np.arange(LANES)[:, None], index]
         fine = np.zeros_like(coarse)
         fine[:, :, 0] = coarse[:, :, 0]
         self._begin(coarse[: self.m, :, 0], self.first + at)
         self._span(self.first + at, width, 2 * parts, -1.0, fine)
-        seen[0] = True
         fine[self.m :, :, 1:] += coarse[self.m :, :, :1]
         off = np.where(seen[:, None], fine - coarse, 0.0)
-        u = np.take_along_axis(self.voltages, index, axis=1)
+        u = self.voltages[np.minimum(self.first[:, None] + index, self.n)]
         took = np.full(LANES, width * self.h[0])
         if self.own:
             took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
         y, window = self.rates[:, None] * self.lengths, self.rates[:, None] * np.maximum(took, 1e-30)
         share = np.array([np.expm1(-y) / np.expm1(-window), np.expm1(-2.0 * y) / np.expm1(-2.0 * window)])
-        return off, u, share, seen
+        return off, u, share
 
     def carried(self, off: FloatArray, share: FloatArray, before: FloatArray) -> FloatArray:
         """Errors of the modes from the pieces before, at the start of each piece, and at the end: (2, rows, LANES + 1).
@@ -250,7 +235,7 @@ class LaneMarch(Following):
             excess = math.inf
             if block.solve(self.z, parts, tol):
                 block.__dict__.pop("voltages", None)
-                peak = float(np.abs(block.voltages.reshape(-1)[: self._last(block)]).max())
+                peak = float(largest(block.n + 1, block.voltages))
                 if not peak <= self.form.u_top:
                     return Outcome.LOST
                 excess, errors, before = self._judge(block, parts, max(peak, self.peak))
@@ -270,19 +255,14 @@ class LaneMarch(Following):
             self.level -= 1
         return Outcome.MET
 
-    @staticmethod
-    def _last(block: Block) -> int:
-        lane = (block.n - 1) // block.count
-        return lane * (block.count + 1) + block.n - lane * block.count + 1
-
     def _judge(self, block: Block, parts: int, peak: float) -> tuple[float, FloatArray, FloatArray]:
         """Excess of the stated over the allowed error, the errors seen so far, and those that the block hands on."""
         form, m = self.form, block.m
-        off, u, share, _ = block.check(parts)
+        off, u, share = block.check(parts)
         carried = block.carried(off, share, self.before)
         own = np.stack([off[:, :, -1] * share[0], off[:, :, -1] ** 2 * share[1]])
 
-        def largest(columns: FloatArray, held: FloatArray) -> float:
+        def added(columns: FloatArray, held: FloatArray) -> float:
             """Of what is carried into the pieces and added in them, of a sum of the modes."""
             alike = np.abs(columns @ held[0, :m, :LANES]) + np.abs(columns @ own[0, :m])
             return float((alike + np.sqrt(columns**2 @ (held[1, :m, :LANES] + own[1, :m]))).max())
@@ -290,24 +270,24 @@ class LaneMarch(Following):
         shape = form.lanes.shape
         du = np.einsum("k,kij->ij", shape, off[:m])
         # A fast mode adds nothing over its window, and what it misses there is seen.
-        over = largest(shape, carried)
+        over = added(shape, carried)
         force = form.force(np.array([peak, 1.001 * peak]))
         steep = float(force[1] - force[0]) / (1e-3 * peak) if peak > 0.0 else 0.0
         errors = np.zeros(4)
         errors[0] = np.abs(du).max() + over
         errors[1] = np.abs(form.force(u + du) - form.force(u)).max() + steep * over
         for columns in form.system.node[0]:
-            errors[2] = max(errors[2], np.abs(np.einsum("k,kij->ij", columns, off[:m])).max() + largest(columns, carried))
+            errors[2] = max(errors[2], np.abs(np.einsum("k,kij->ij", columns, off[:m])).max() + added(columns, carried))
         if form.charge:
             held = abs(carried[0, m, :LANES]) + abs(own[0, m]) + np.sqrt(carried[1, m, :LANES] + own[1, m])
             moved = form.lanes.moved_by * du / form.inverse_area(u)
             most = form.lanes.moved_by / float(form.inverse_area(np.array(peak)))
             moved += np.einsum("k,kij->ij", form.lanes.held, off[:m]) + off[m]
-            errors[3] = np.abs(moved).max() + held.max() + most * over + largest(form.lanes.held, carried)
+            errors[3] = np.abs(moved).max() + held.max() + most * over + added(form.lanes.held, carried)
         excess = self._excess(np.maximum(errors, self.errors), peak)
         if self.share < 1.0:
             none = np.zeros_like(carried)
-            alone = np.abs(du).max() + largest(shape, none)
+            alone = np.abs(du).max() + added(shape, none)
             excess = max(excess, SAFETY * alone / (self.share * self.rtol * max(peak, self.least)))
         return excess, errors, carried[:, :, LANES]
 
@@ -323,40 +303,34 @@ class LaneMarch(Following):
         last = first + int(np.searchsorted(t_out[first:], piece.stop - slack))
         if last == first:
             return
-        t, self.outputs = t_out[first:last], last
-        if piece.times is None:
-            number = np.clip(np.floor((t - piece.start + slack) / piece.spacing).astype(np.int64), 0, n - 1)
-            since, length = t - piece.start - number * piece.spacing, np.full(t.size, piece.spacing)
-        else:
-            number = np.clip(np.searchsorted(piece.times, t + slack, side="right") - 1, 0, n - 1)
-            since, length = t - piece.times[number], block.h[number]
+        t, self.outputs, rows = t_out[first:last], last, out[:, first:last]
+        even = piece.times is None
+        samples = piece.start + piece.spacing * np.arange(n) if even else piece.times[:-1]
+        if t.size == n and np.abs(t - samples).max() <= slack:
+            self._show(block.x, np.diff(block.x[: n + 1]) / block.h[:n], block.first, block.kept, rows)
+            return
+        number = np.clip(np.searchsorted(samples, t + slack, side="right") - 1, 0, n - 1)
+        length = np.broadcast_to(block.h, n)[number] if even else block.h[number]
+        since = t - samples[number]
         since[np.abs(since) <= slack] = 0.0
-        since = np.clip(since, 0.0, length)
-        if t.size == n and not since.any() and number[0] == 0 and number[-1] == n - 1:
-            x, z = block.x[:n], np.ascontiguousarray([block.flat(row) for row in block.kept])
-        else:
-            x, z = block.at(number, since, length, parts)
-        self._show(x, z, (block.x[number + 1] - block.x[number]) / length, out[:, first:last])
+        x, z = block.at(number, np.clip(since, 0.0, length), length, parts)
+        self._show(x, (block.x[number + 1] - block.x[number]) / length, np.zeros(1, np.int64), z[:, None], rows)
 
-    def _show(self, x: FloatArray, z: FloatArray, slope: FloatArray, out: FloatArray) -> None:
-        """Write outputs, from the source (V), its slope (V/s) and the states (rows, n), into the columns of `out`."""
-        system, n = self.form.system, x.size
-        row, charge, current = np.empty((3, n))
-        for column in range(system.k_shown.size):
-            project(n, float(system.k_shown[column]), x, system.shown[0, column], z, row)
-            out[column] = row
-        if self.form.charge:
-            form = self.form
-            charges(n, form.lanes, form.rates, form.gain, x, slope, z, row, charge, current)
-            out[-2], out[-1] = charge, current
+    def _show(self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, out: FloatArray) -> None:
+        """Write outputs into the columns of `out`: from the source (V), its slope (V/s), and states as in `Block`."""
+        form, n = self.form, out.shape[1]
+        count = n if first.size == 1 else int(first[1])
+        for column, k in enumerate(form.system.k_shown.tolist()):
+            show(k, form.system.shown[0, column], x, first, count, n, kept, out[column])
+        if form.charge:
+            charges(form.lanes, form.rates, form.gain, x, slope, first, count, n, kept, out[-2], out[-1])
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
         count = t_out.size - self.outputs
-        x, z = np.full(count, self.u_last), np.repeat(self.z[:, None], count, axis=1)
         if count:
-            here, slope = self.at_end()
-            x[:] = here
-            self._show(x, z, np.full(count, slope), out[:, self.outputs :])
+            here, slope = (np.full(count, value) for value in self.at_end())
+            z = np.repeat(self.z[:, None, None], count, axis=2)
+            self._show(here, slope, np.zeros(1, np.int64), z, out[:, self.outputs :])
         self.outputs = t_out.size
 
     def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
