@@ -20,59 +20,75 @@ _EARLY = 1.0
 
 
 @jit_rows
-def _moments(n: int, top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
-    """Integrals of exp(-y (1 - x)) x^j over [0, 1] for y = rate h (n,), into the rows j = 0 to `top` of m."""
-    longest = 0.0
+def _series(n: int, share: float, h: FloatArray, m: FloatArray) -> None:
     for i in range(n):
-        longest = max(longest, rate * h[i])
+        m[i] = 1.0 - share * h[i] * m[i]
+
+
+@jit_rows
+def _below(n: int, rate: float, j: int, h: FloatArray, m: FloatArray, lower: FloatArray) -> None:
+    over = 1.0 / j
+    for i in range(n):
+        lower[i] = (1.0 - rate * h[i] * m[i]) * over
+
+
+@jit
+def _moments(top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
+    """Integrals of exp(-y (1 - x)) x^j over [0, 1] for y = rate h (n,), into the rows j = 0 to `top` of m."""
+    n, longest = h.size, rate * h.max()
     terms, term = 1, 1.0
     while term > 1e-17 and terms < 24:
         term *= min(longest, _EARLY) / (top + 1 + terms)
         terms += 1
-    last = top * n
-    for i in range(n):
-        m[last + i] = 1.0
+    highest = m[top]
+    highest[:] = 1.0
     for j in range(terms, 0, -1):
-        share = rate / (top + 1 + j)
-        for i in range(n):
-            m[last + i] = 1.0 - share * h[i] * m[last + i]
-    for i in range(n):
-        m[last + i] /= top + 1
+        _series(n, rate / (top + 1 + j), h, highest)
+    highest *= 1.0 / (top + 1)
     for j in range(top, 0, -1):
-        for i in range(n):
-            m[(j - 1) * n + i] = (1.0 - rate * h[i] * m[j * n + i]) / j
+        _below(n, rate, j, h, m[j], m[j - 1])
     if longest > _EARLY:
         for i in range(n):
             y = rate * h[i]
             if y > _EARLY:
-                m[i] = -math.expm1(-y) / y
+                m[0, i] = -math.expm1(-y) / y
                 for j in range(1, top + 1):
-                    m[j * n + i] = (1.0 - j * m[(j - 1) * n + i]) / y
+                    m[j, i] = (1.0 - j * m[j - 1, i]) / y
 
 
 @jit_rows
-def weigh(rates: FloatArray, gain: FloatArray, h: FloatArray, weights: FloatArray) -> None:
-    """Weights of steps of the lengths h (n,), into rows of n: `PER_MODE` for each mode, then h."""
-    n, m = h.size, rates.size
-    for k in range(m):
-        drive = weights[(k * PER_MODE + 4 * (NODES - 1)) * n :]
-        for node in range(NODES - 1):
-            at, row = INNER[node] if node < NODES - 2 else 1.0, (k * PER_MODE + 4 * node) * n
-            # The rows of the drives' weights hold the moments until the end.
-            _moments(n, 1 if node < NODES - 2 else NODES - 1, rates[k] * at, h, drive)
-            for i in range(n):
-                m0, m1, length = drive[i], drive[n + i], at * h[i]
-                weights[row + i] = 1.0 - rates[k] * length * m0
-                weights[row + n + i] = gain[k] * length * (m0 - at * m1)
-                weights[row + 2 * n + i] = gain[k] * length * at * m1
-                weights[row + 3 * n + i] = length * m0
-        for i in range(n):
-            m0, m1, m2, m3 = drive[i], drive[n + i], drive[2 * n + i], drive[3 * n + i]
-            for j in range(NODES):
-                own = _BASIS[j, 0] * m0 + _BASIS[j, 1] * m1 + _BASIS[j, 2] * m2 + _BASIS[j, 3] * m3
-                drive[j * n + i] = h[i] * own
+def _until(
+    n: int, rate: float, gain: float, at: float, h: FloatArray, m0: FloatArray, m1: FloatArray, decay: FloatArray,
+    first: FloatArray, last: FloatArray, held: FloatArray,
+) -> None:  # fmt: skip
+    """Weights up to the place `at`: decay, both ends of the source, and a drive that is held."""
     for i in range(n):
-        weights[m * PER_MODE * n + i] = h[i]
+        length = at * h[i]
+        decay[i] = 1.0 - rate * length * m0[i]
+        first[i] = gain * length * (m0[i] - at * m1[i])
+        last[i] = gain * length * at * m1[i]
+        held[i] = length * m0[i]
+
+
+@jit_rows
+def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = h[i] * (c[0] * m[0, i] + c[1] * m[1, i] + c[2] * m[2, i] + c[3] * m[3, i])
+
+
+@jit
+def weigh(rates: FloatArray, gain: FloatArray, h: FloatArray, weights: FloatArray) -> None:
+    """Weights of steps of the lengths h (n,), into the rows (n,) of `weights`: `PER_MODE` for each mode, then h."""
+    n, m = h.size, np.empty((NODES, h.size))
+    for k in range(rates.size):
+        own = weights[k * PER_MODE :]
+        for node in range(NODES - 1):
+            at, rows = INNER[node] if node < NODES - 2 else 1.0, own[4 * node :]
+            _moments(1 if node < NODES - 2 else NODES - 1, rates[k] * at, h, m)
+            _until(n, rates[k], gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2], rows[3])
+        for j in range(NODES):
+            _drive(n, _BASIS[j], h, m, own[4 * (NODES - 1) + j])
+    weights[rates.size * PER_MODE] = h
 
 
 @jit
@@ -87,7 +103,7 @@ def begin(marks: Any, c: Any, still: FloatArray, starts: FloatArray, source: Flo
         state[2 * lanes + i] = source[i]
         for k in range(m):
             state[(3 + k) * lanes + i] = starts[k, i]
-    step(marks, c, still, state, source, 0.0, 1.0)
+    step(marks, c, still.reshape(-1), state, source, 0.0, 1.0)
 
 
 @jit
@@ -100,7 +116,7 @@ def span(
     Parameters
     ----------
     rates, gain : ndarray, shape (m,)
-    weights : ndarray
+    weights : ndarray, shape (rows, 1) or (rows, lanes)
         Of one step; where every lane has its own, they are computed here.
     h : ndarray, shape (n,)
         Distance (s) from each sample to the next, where lanes have their own.
@@ -119,7 +135,7 @@ def span(
     """
     lanes, m, rows = len(marks.lanes), len(marks.modes), kept.shape[0]
     after, found = np.empty(TILE * lanes), np.empty(TILE * rows * lanes)
-    length = np.empty(lanes)
+    length, flat = np.empty(lanes), weights.reshape(-1)
     done = 0
     while done < count:
         size = min(TILE, count - done)
@@ -132,7 +148,7 @@ def span(
                     length[i] = h[first[i] + done + k] / parts
                 weigh(rates, gain, length, weights)
             for p in range(parts):
-                step(marks, c, weights, state, after[k * lanes :], p / parts, (p + 1) / parts)
+                step(marks, c, flat, state, after[k * lanes :], p / parts, (p + 1) / parts)
             for i in range(rows * lanes):
                 found[k * rows * lanes + i] = state[3 * lanes + i]
         off = 0.0
@@ -159,32 +175,19 @@ def span(
 
 
 @jit
-def along(
-    marks: Any, rates: FloatArray, gain: FloatArray, weights: FloatArray, h: FloatArray, x: FloatArray,
-    first: IntArray, count: int, z: FloatArray,
-) -> None:  # fmt: skip
-    """Advance modes z (m, lanes) by `count` samples with the area at its reference."""
-    lanes, m = len(marks.lanes), len(marks.modes)
-    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    length, now = np.empty(lanes), np.empty(lanes)
+def along(weights: FloatArray, x: FloatArray, first: IntArray, count: int, z: FloatArray) -> None:
+    """Advance modes z (m, lanes) by `count` samples with the area at its reference and steps of one length."""
+    lanes, now, after = first.size, np.empty(first.size), np.empty(first.size)
     for i in range(lanes):
         now[i] = x[first[i]]
-    after = np.empty(lanes)
     for t in range(count):
         for i in range(lanes):
             after[i] = x[first[i] + t + 1]
-        if len(marks.own) > 0:
-            for i in range(lanes):
-                length[i] = h[first[i] + t]
-            weigh(rates, gain, length, weights)
-        for k in range(m):
+        for k in range(z.shape[0]):
             p = k * PER_MODE + 4 * (NODES - 2)
+            decay, before, last = weights[p, 0], weights[p + 1, 0], weights[p + 2, 0]
             for i in range(lanes):
-                z[k, i] = (
-                    weights[p * wide + i * each] * z[k, i]
-                    + weights[(p + 1) * wide + i * each] * now[i]
-                    + weights[(p + 2) * wide + i * each] * after[i]
-                )
+                z[k, i] = decay * z[k, i] + before * now[i] + last * after[i]
         for i in range(lanes):
             now[i] = after[i]
 
@@ -292,7 +295,7 @@ def within(
     """Modes and rider (rows, n) after steps of lengths h (n,) from `starts` (rows, n), while the source goes from x to
     `to`; each in `parts`."""
     lanes, m, rows = len(marks.lanes), len(marks.modes), starts.shape[0]
-    weights = np.empty((m * PER_MODE + 1) * lanes)
+    weights = np.empty((m * PER_MODE + 1, lanes))
     modes, before, after, length = np.empty((m, lanes)), np.empty(lanes), np.empty(lanes), np.empty(lanes)
     for first in range(0, h.size, lanes):
         for i in range(lanes):
@@ -303,7 +306,7 @@ def within(
         begin(marks, c, still, modes, before, state)
         weigh(rates, gain, length, weights)
         for p in range(parts):
-            step(marks, c, weights, state, after, p / parts, (p + 1) / parts)
+            step(marks, c, weights.reshape(-1), state, after, p / parts, (p + 1) / parts)
         for i in range(min(lanes, h.size - first)):
             for k in range(rows):
                 out[k, first + i] = state[(3 + k) * lanes + i]

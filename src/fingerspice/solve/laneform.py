@@ -64,11 +64,11 @@ class LaneForm:
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
         rows = self.rates.size * PER_MODE + 1
-        return np.zeros(places(self.marks(own))[-1] * LANES), np.zeros(rows * (LANES if own else 1))
+        return np.zeros(places(self.marks(own))[-1] * LANES), np.zeros((rows, LANES if own else 1))
 
     def weights(self, h: FloatArray) -> FloatArray:
         """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
-        out = np.zeros((self.rates.size * PER_MODE + 1) * h.size)
+        out = np.empty((self.rates.size * PER_MODE + 1, h.size))
         weigh(self.rates, self.gain, h, out)
         return out
 

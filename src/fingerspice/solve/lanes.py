@@ -107,15 +107,14 @@ class Block:
         """
         form, m = self.form, self.m
         own = np.zeros((m, LANES))
-        along(
-            self.marks, form.rates, form.gain, self.weights(1), self.h, self.x, self.first, self.count, own
-        )  # fmt: skip
+        # A guess, for which uneven points may count as even ones.
+        along(form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
         handed = self.handed[:m]
         starts = np.einsum("kij,kj->ki", handed, np.concatenate([start[:m, None], own], axis=1))
         for sweep in range(LANES + 1):
             self._begin(starts, self.first)
             self.kept[:m, :, 0], self.kept[m:, :, 0] = starts, 0.0
-            done = self._span(self.first, self.count, parts, tol if sweep else -1.0, self.kept)
+            done = self._span(self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
             self.sweeps += 1
             off = self.kept[:m, :, -1] - np.roll(starts, -1, axis=1)
             off[:, -1] = 0.0
