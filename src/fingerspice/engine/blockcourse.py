@@ -17,13 +17,12 @@ class Charges(NamedTuple):
     """Rows of a block for the charge."""
 
     q: FloatArray  # (4, n): 1/A at the ends of the steps and at `PLACES`, 1/m^2
-    # (10, n): Rate of the charge at 0, 1/4, 1/2, 3/4 and 1 of each step (A), the charge gained in the step, the error
-    # of this gain, and, in steps of several samples, the triangles of the rate at `PLACES` times the step length (C)
+    # (7, n): Rate of the charge at 0, 1/4, 1/2, 3/4 and 1 of each step (A), the charge gained in the step, and the error
+    # of this gain (C)
     steps: FloatArray
-    # z, rest, current, error (n,): Charge (C), that without c r G(u), and current (A) at the starts of the steps, and
-    # error of the slowest layer's voltage (V)
+    # z, current, error (n,): Charge (C) and current (A) at the starts of the steps, and error of the slowest layer's
+    # voltage (V)
     z: FloatArray
-    rest: FloatArray
     current: FloatArray
     error: FloatArray
     # h, t (n,): Lengths of the steps, and their limits, s; the limits are needed for outputs within steps only
@@ -35,16 +34,14 @@ class Course(NamedTuple):
     """State and scratch arrays of the loop along a recording.
 
     `w` (m,) are the modes, and the rows of `error` (2, m) the parts of their error that quadrature and sweeps leave;
-    `inner` are the rows at samples within steps of several (`engine.blockcoarse`), and
-    `spare` (3, n) is scratch for single outputs; `engine.blockforms` lists the entries of `control`,
-    `counters` and `checks` (LEVELS, 9).
+    `spare` (3, n) is scratch for single outputs; `engine.blockforms` lists the entries of `control`, `counters` and
+    `checks` (LEVELS, N_CHECKS).
     """
 
     model: Model
     form: Form
     shown: Shown
     room: Room
-    inner: Room
     charges: Charges
     spare: FloatArray
     w: FloatArray
@@ -57,7 +54,7 @@ class Course(NamedTuple):
 def new_charges() -> Charges:
     """Rows for one block, all zero."""
     n = BLOCK + 8
-    return Charges(np.zeros((4, n)), np.zeros((10, n)), *np.zeros((6, n)))
+    return Charges(np.zeros((4, n)), np.zeros((7, n)), *np.zeros((5, n)))
 
 
 @jit

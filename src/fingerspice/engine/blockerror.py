@@ -14,15 +14,15 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import charge_block
 from fingerspice.engine.blockcheck import FORCE, gap_into, in_place
-from fingerspice.engine.blockcourse import Course, inverse_area_at
+from fingerspice.engine.blockcourse import Course
 from fingerspice.engine.blockforms import (
     CHECKED,
     ERROR_F,
     ERROR_Q,
     ERROR_U,
     ERROR_V,
-    GROWTH,
     LEVEL,
+    LEVELS,
     MEAN_Q,
     MIDDLE,
     OF_CHARGE,
@@ -30,10 +30,8 @@ from fingerspice.engine.blockforms import (
     OF_GAP,
     OF_NODES,
     OF_ORDER,
-    ONE,
     PEAK_F,
     PEAK_U,
-    PLACES,
     RATIO,
     REFUSED,
     STEPS,
@@ -61,10 +59,6 @@ CAUTION, LEAST = 2.0, 0.01
 PARTS = 8
 # Below this share of the error allowed, changes show nothing but rounding.
 SHOWING = 1e-3
-# Steps twice as long are taken where their error is expected to be below this fraction of the one allowed, and those of
-# several samples below the second: many blocks with all of the error allowed would add up to more than was asked for,
-# and a piece would be taken again. What is known of the error's growth is forgotten by the third factor in each block.
-SPARE, SPARE_LONG, FORGETTING = 1.0, 0.3, 0.97
 
 
 @jit_rows
@@ -263,10 +257,6 @@ def accept(
     )  # fmt: skip
     peak = largest_of(n + 1, gap)
     control[PEAK_F] = max(control[PEAK_F], largest_of(n + 1, room.jumps))
-    if level < ONE:
-        for place in range(len(PLACES)):
-            peak = max(peak, largest_of(n, room.u_within[place]))
-        control[PEAK_F] = max(control[PEAK_F], c.shown.stress * peak * peak / inverse_area_at(c.form, peak)[0])
     control[PEAK_U] = max(control[PEAK_U], peak)
     quadrature, others = checked[OF_GAP] * seen, left + magnified * carried
     within = max(checked[OF_GAP], checked[WITHIN]) * seen
@@ -293,30 +283,16 @@ def accept(
 
 
 @jit_within
-def refine(c: Course, level: int, most: int, n: int, local: float, tol: float) -> None:
-    """Go to shorter steps, with at most `most` halvings, as the error `local` (V) of a block is above `tol`."""
+def refine(c: Course, level: int, n: int, local: float, tol: float) -> None:
+    """Go to shorter steps, as the error `local` (V) of a block is above `tol`."""
     halvings = max(1.0, math.ceil(0.25 * math.log2(local / tol))) if local < math.inf else 1.0
-    c.control[LEVEL] = min(float(most), level + halvings)
+    c.control[LEVEL] = min(LEVELS - 1.0, level + halvings)
     c.counters[REFUSED] += n
-
-
-@jit_within
-def learn_growth(c: Course, level: int, longer: float, seen: float) -> None:
-    """Learn how much larger the error seen of steps twice as long is, from the two errors of the same samples (V).
-
-    Only where the longer ones have several samples: halvings of a sample follow the order.
-    """
-    if level <= ONE and longer < math.inf and seen > 0.0:
-        c.checks[level, GROWTH] = max(c.checks[level, GROWTH], longer / seen)
 
 
 @jit_within
 def may_coarsen(c: Course, level: int, seen: float, left: float, tol: float) -> bool:
     """Whether steps twice as long would meet `tol`, after a block with these errors (V)."""
-    if level > c.control[LEVEL]:
-        # At the end of a recording, steps are shorter than they need be.
-        return False
     checks = c.checks
-    checks[level, GROWTH] = OF_ORDER + FORGETTING * (checks[level, GROWTH] - OF_ORDER)
     share = max(checks[level, OF_GAP], checks[level - 1, OF_GAP] if checks[level - 1, CHECKED] > 0.0 else 0.0)
-    return bool(checks[level, GROWTH] * share * seen + left < (SPARE if level > ONE else SPARE_LONG) * tol)
+    return bool(OF_ORDER * share * seen + left < tol)

@@ -9,9 +9,8 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.blockrows import PAD
 
-# Number of steps in a block. Step lengths (levels): several samples, where those vary little, the longest first; then
-# one sample, with the number ONE, and its halvings.
-BLOCK, ONE, LEVELS = 256, 2, 9
+# Number of steps in a block; number of step lengths (levels): one sample, and its halvings.
+BLOCK, LEVELS = 256, 7
 # Largest degree of the polynomial for 1/A.
 MOST_DEGREE = 28
 # Places of a step besides its ends: its middle, and the two at which the error is measured.
@@ -24,16 +23,13 @@ LEVEL, REFERENCE, PEAK_U, PEAK_F, ERROR_U, ERROR_F, MARGIN, Z, PEAK_Q, ERROR_Q, 
 MEAN_Q = 13
 # Part of a change that a sweep is expected to leave, over the areas' distance from the reference; 0 if not known.
 RATIO = 14
-# Number of samples in each step of the present block, 1 for halvings.
-SPAN = 15
-N_CONTROL = 16
+N_CONTROL = 15
 # Entries of a row of `Course.checks`, one for each step length. What is left, once it is corrected, of the errors seen
 # of gap voltage and force, and of a stack's charge, as shares; what is left of the error of nodes and of a network's
 # charges, and of the gap voltage within a network's steps, over the error seen of the gap voltage (V/V and C/V). The
-# largest of these (V), and the number of blocks until the next check, now and after the last one. How many times larger
-# the error seen may be with steps twice as long.
-OF_GAP, OF_FORCE, OF_NODES, OF_CHARGE, WITHIN, CHECKED, UNTIL_CHECK, WAITED, GROWTH = range(9)
-N_SHARES, N_CHECKS = 5, 9
+# largest of these (V), and the number of blocks until the next check, now and after the last one.
+OF_GAP, OF_FORCE, OF_NODES, OF_CHARGE, WITHIN, CHECKED, UNTIL_CHECK, WAITED = range(8)
+N_SHARES, N_CHECKS = 5, 8
 # By their order, errors grow by so much.
 OF_ORDER = 16.0
 # Share that is assumed at least, and before the first check.
@@ -43,36 +39,12 @@ OUTPUT, STEPS, REFUSED, SWEEPS = range(4)
 N_COUNTERS = 4
 
 
-class Coarse(NamedTuple):
-    """Weights of steps of several samples, for each of the `ONE` longest step lengths.
-
-    Within a step the source is the straight line between its ends and three triangles, whose tops are at `PLACES`; the
-    triangles are a quarter of the step wide to either side. A further index is the place within a step.
-    """
-
-    bump: FloatArray  # (r, ONE, m, 3): Contribution of the triangles to a mode at the end of a step
-    bump_within: FloatArray  # (r, ONE, 3, P, 3): The same to the projections at `PLACES`
-    decay: FloatArray  # (r, ONE, 3, m): From the start of a step to `PLACES`
-    # source, bump_to, drive, defect (r, ONE, 3, m, 2): As `Form.source`, `bump`, `Form.drive` and `Form.defect`, up to
-    # `PLACES`
-    source: FloatArray
-    bump_to: FloatArray
-    drive: FloatArray
-    defect: FloatArray
-    share: FloatArray  # (r, ONE, 3, m, 2): As `Form.share`
-    # (r, ONE, m, T, 3): Contribution of triangles of the drives to a mode at the end of a step, less that to the
-    # parabolas
-    hat: FloatArray
-    hat_to: FloatArray  # (r, ONE, 3, m, T, 3): The same up to `PLACES`
-    slope: FloatArray  # (4 k + 1,): Derivative of 1/A by |u|, a polynomial as `Form.area`
-
-
 class Form(NamedTuple):
     """A stack around reference areas, and the weights of steps of one length and its halves.
 
     r references, `LEVELS` step lengths, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step:
-    the gap voltage (under `mobile` its modes' part alone), the taps, and what the slowest layer stores and leaks by
-    (see `engine.blockcharge`).
+    the gap voltage (under `mobile` its modes' part alone), the taps, and in a stack the slowest layer's voltage (see
+    `engine.blockcharge`).
     """
 
     mobile: bool  # Charge law. Then the last drive is (1/q - 1/q0) U.
@@ -112,8 +84,6 @@ class Form(NamedTuple):
     # place of the parabola through it
     pulse: FloatArray
     pulse_within: FloatArray
-    coarse: Coarse
-    longest: int  # The longest step length that is used: 0 in stacks under `local`, else `ONE`
 
 
 class Shown(NamedTuple):
@@ -130,7 +100,6 @@ class Shown(NamedTuple):
     stress: float  # Force per area and squared gap voltage, Pa/V^2
     kink: FloatArray  # (T,): Derivative by |u_gap| at 0 V of the factor of each drive. N counts as a factor times xi.
     area_kink: float  # dA/d|u| at 0 V, m^2/V
-    moved: FloatArray  # c r G(|u|) under `local`, a polynomial as `Form.area`, C
     charge: bool  # Whether the charge follows from that, as in a stack
     bend: FloatArray  # (C,): Share of N in each column; no entry in a stack
     flows: int  # Number of the last columns that are charges of a network, whose rates are outputs, too
@@ -149,14 +118,10 @@ class Room(NamedTuple):
     `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked, and at last gap
     voltages and forces within some of its steps. `where` are the numbers of the steps that cross 0 V, and `crossed`,
     `jumps` and `bends` describe their kinks, one after the other.
-    `bumps` are the heights (V) of the triangles of `Coarse`, in steps of several samples, and `hats` those of the
-    triangles that they cause in the drives.
     `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
     """
 
     s: FloatArray
-    bumps: FloatArray
-    hats: FloatArray
     s_within: FloatArray
     w: FloatArray
     own: FloatArray
@@ -189,7 +154,7 @@ def new_room(modes: int, drives: int, projections: int, shown: Shown) -> Room:
     n = BLOCK + PAD
     kept = 4 + shown.node.shape[1] + shown.flows + int(shown.charge)
     return Room(
-        np.zeros(n), np.zeros((3, n)), np.zeros((drives, 3, n)), np.zeros(n), np.zeros((modes, n)),
+        np.zeros(n), np.zeros(n), np.zeros((modes, n)),
         np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n), np.zeros((projections, n)),
         np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)), np.zeros(n), np.zeros((3, n)),
         np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
@@ -201,7 +166,7 @@ def new_room(modes: int, drives: int, projections: int, shown: Shown) -> Room:
 def new_control() -> FloatArray:
     """The entries of `control` at the start of a run."""
     control = np.zeros(N_CONTROL)
-    control[MARGIN], control[LEVEL], control[SPAN] = 1.0, ONE, 1.0
+    control[MARGIN] = 1.0
     return control
 
 
@@ -210,7 +175,6 @@ def new_checks(shown: Shown) -> FloatArray:
     checks = np.zeros((LEVELS, N_CHECKS))
     checks[:, :N_SHARES] = UNCHECKED
     checks[:, WITHIN] = 0.0
-    checks[:, GROWTH] = OF_ORDER
     if shown.flows > 0:
         checks[:, OF_CHARGE] = UNCHECKED * shown.capacitance
     return checks

@@ -9,8 +9,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit, jit_inline
-from fingerspice.engine.blockcharge import HATS, moved_rows, moved_with, triangle_until, weights_until
-from fingerspice.engine.blockcoarse import bump_at, bump_response
+from fingerspice.engine.blockcharge import weights_until
 from fingerspice.engine.blockcourse import Course, bend_at, inverse_area_at, steepness
 from fingerspice.engine.blockcurrent import current_at
 from fingerspice.engine.blockforms import (
@@ -18,9 +17,7 @@ from fingerspice.engine.blockforms import (
     LAST_QUARTER,
     MIDDLE,
     OUTPUT,
-    PLACES,
     REFERENCE,
-    SPAN,
     U_GAP,
     Form,
     Z,
@@ -101,7 +98,6 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
         cubic, fourth = 128.0 / 3.0 * (1.5 * both + mostly_early), -128.0 / 3.0 * both
         forced = linear * found[1] + at * (square * found[2] + at * (cubic * found[3] + at * fourth * found[4]))
         w[k] = w[k] * math.exp(-z) + h * at * (whole * found[0] + at * forced)
-        w[k] += bump_response(c, r, k, h, i, at, found[:3])
         if pulse != 0.0:
             # The parabola through the part of N that is exp(-rate t), and its response.
             shown = found[0] + at * (
@@ -131,25 +127,16 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
 
 
 @jit
-def _charge_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, u: float) -> float:
-    """Charge (C) at fraction `at` of step i, where the modes w and the gap voltage u (V) are known."""
-    form, room, own, shown = c.form, c.room, c.charges, c.shown
-    p = form.tap_s.size - 2
-    stored, followed, area = 0.0, 0.0, form.area0
+def _charge_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> float:
+    """Charge (C) at fraction `at` of step i, where the modes w are known."""
+    form, room, own = c.form, c.room, c.charges
+    p, stored = form.tap_s.size - 1, 0.0
     for k in range(w.size):
         stored += form.taps[r, p, k] * (w[k] - room.w[k, i])
-    if not form.mobile:
-        followed = moved_with(shown.moved, form.scale, form.shift, u)
-        followed -= moved_with(shown.moved, form.scale, form.shift, room.u[i])
-        area = 1.0 / own.q[0, i]
     rates = 0.0
     for j, weight in enumerate(weights_until(at)):
         rates += weight * own.steps[j, i]
-    charge: float = own.z[i] + followed + c.model.slow[c.model.slow.size - 3] * area * stored + h * rates
-    if c.control[SPAN] > 1.0:
-        for place in range(len(PLACES)):
-            charge += triangle_until(at, PLACES[place]) * own.steps[HATS + place, i]
-    return charge
+    return float(own.z[i] + c.model.slow[c.model.slow.size - 3] * form.area0 * stored + h * rates)
 
 
 @jit
@@ -230,7 +217,7 @@ def _gap_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, g: Fl
     The modes and drives there go into w and g.
     """
     form, room, model = c.form, c.room, c.model
-    source = room.s[i] + at * (room.s[i + 1] - room.s[i]) + bump_at(c, i, at)[0]
+    source = room.s[i] + at * (room.s[i + 1] - room.s[i])
     for k in range(w.size):
         w[k] = room.w[k, i]
     if at > 0.0:
@@ -293,7 +280,7 @@ def _write_point(
     if shown.flows > 0:
         _write_flows(c, r, w, g, source, slope, u, out[n:, place])
     if shown.charge:
-        out[n, place] = _charge_at(c, r, h, i, at, w, u)
+        out[n, place] = _charge_at(c, r, h, i, at, w)
         out[n + 1, place] = current_at(c, r, w, g, source, slope, u)
 
 
@@ -307,7 +294,7 @@ def write_points(c: Course, r: int, n: int, slack: float, t_out: FloatArray, out
             i += 1
         since = t_out[place] - t[i]
         at = 0.0 if since <= slack else min(since / h[i], 1.0)
-        _write_point(c, r, h[i], i, at, (s[i + 1] - s[i] + bump_at(c, i, at)[1]) / h[i], out, place)
+        _write_point(c, r, h[i], i, at, (s[i + 1] - s[i]) / h[i], out, place)
 
 
 @jit
@@ -318,12 +305,9 @@ def write_end(c: Course, value: float, slope: float, t_out: FloatArray, out: Flo
     for k in range(c.w.size):
         room.w[k, 0] = c.w[k]
     room.s[0] = room.s[1] = value
-    c.control[SPAN] = 1.0
     room.u[0] = c.control[U_GAP]
     look_at_ends(form, room, r, 1, FIRST_NEWTON)
     c.charges.z[0] = c.control[Z]
-    if not form.mobile:
-        moved_rows(1, c.shown.moved, form.scale, form.shift, room.u, c.charges.current, c.charges.z)
     c.charges.q[0, 0] = 1.0
     c.charges.steps[:, 0] = 0.0
     for place in range(c.counters[OUTPUT], t_out.size):

@@ -110,7 +110,8 @@ def begin(marks: Any, c: Any, still: FloatArray, starts: FloatArray, source: Flo
 def span(
     marks: Any, c: Any, rates: FloatArray, gain: FloatArray, weights: FloatArray, h: FloatArray, x: FloatArray,
     first: IntArray, count: int, parts: int, tol: float, state: FloatArray, kept: FloatArray,
-) -> int:  # fmt: skip
+    left: FloatArray,
+) -> bool:  # fmt: skip
     """Advance the lanes by `count` samples, each in `parts` steps, and keep modes and rider at the samples.
 
     Parameters
@@ -128,10 +129,13 @@ def span(
         Of the lanes, see `begin`.
     kept : ndarray, shape (m + rider, lanes, count + 1)
 
+    left : ndarray, shape (m,)
+        Largest changes of the modes where the lanes stop; left alone if they do not.
+
     Returns
     -------
-    int
-        Number of samples advanced by.
+    bool
+        Whether the lanes stopped.
     """
     lanes, m, rows = len(marks.lanes), len(marks.modes), kept.shape[0]
     after, found = np.empty(TILE * lanes), np.empty(TILE * rows * lanes)
@@ -159,6 +163,10 @@ def span(
             off = max(off, change) if change == change else math.inf
         stops = off <= tol
         if stops:
+            for k in range(m):
+                left[k] = 0.0
+                for i in range(lanes):
+                    left[k] = max(left[k], abs(state[(3 + k) * lanes + i] - kept[k, i, done + size]))
             for k in range(m, rows):
                 for i in range(lanes):
                     shift = state[(3 + k) * lanes + i] - kept[k, i, done + size]
@@ -170,8 +178,8 @@ def span(
                     kept[row, i, done + 1 + k] = found[(k * rows + row) * lanes + i]
         done += size
         if stops:
-            break
-    return done
+            return True
+    return False
 
 
 @jit

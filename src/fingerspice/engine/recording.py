@@ -10,16 +10,6 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit
 from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, keep, note
-from fingerspice.engine.blockcoarse import (
-    fitting,
-    halved,
-    is_smooth,
-    load_source,
-    may_be_longer,
-    most_samples,
-    span_of,
-    steps_of,
-)
 from fingerspice.engine.blockcourse import Course, steepness
 from fingerspice.engine.blockerror import (
     accept,
@@ -27,19 +17,18 @@ from fingerspice.engine.blockerror import (
     error_left,
     further_sweep,
     learn,
-    learn_growth,
     may_coarsen,
     quadrature_error,
     refine,
 )
 from fingerspice.engine.blockforms import (
+    BLOCK,
     LEVEL,
     LEVELS,
     MARGIN,
     MEAN_Q,
     N_SHARES,
     OF_GAP,
-    ONE,
     RATIO,
     REFERENCE,
     REFUSED,
@@ -55,6 +44,17 @@ from fingerspice.engine.relaxation import FIRST_NEWTON, LEAST_MARGIN, look_at_en
 
 # Codes returned by `march`.
 DONE, NOT_CLOSED, TOO_COARSE = range(3)
+
+
+@jit
+def _load(c: Course, values: FloatArray, at: int, count: int, level: int) -> None:
+    """The source in the steps of `count` samples from number `at` on."""
+    s, sub = c.room.s, 1 << level
+    for j in range(count):
+        here = values[at + j]
+        for i in range(sub):
+            s[j * sub + i] = here + (i / sub) * (values[at + j + 1] - here)
+    s[count * sub] = values[at + count]
 
 
 @jit
@@ -154,29 +154,29 @@ def _check(
     c: Course, values: FloatArray, at: int, count: int, r: int, level: int, h: float, seen: float
 ) -> None:  # fmt: skip
     """Solve `count` samples by steps of length h and half of it, and note what is left of errors such as `seen` (V)."""
-    control, m, n, half = c.control, c.w.size, steps_of(level, count), most_samples(level + 1)
+    control, m, n, half = c.control, c.w.size, count << level, BLOCK >> level + 1
     errors, off, w, u = np.zeros(N_SHARES), np.zeros(N_SHARES), c.w.copy(), control[U_GAP]
     before = control.copy()
     tol = OF_SWEEPS * seen
-    load_source(c, values, at, count, level)
+    _load(c, values, at, count, level)
     begin_block(c, r, c.w, u)
     change, _, seen, magnified = _solve(c, r, level, h, n, tol)
     closed = change < math.inf
     if closed:
         _finish(c, r, level, h, n)
-        keep(c, r, h, n, halved(level), seen, magnified, errors)
+        keep(c, r, h, n, 1 << level, seen, magnified, errors)
         control[:] = before
     for done in range(0, count if closed else 0, half):
         part = min(half, count - done)
-        n = steps_of(level + 1, part)
-        load_source(c, values, at + done, part, level + 1)
+        n = part << level + 1
+        _load(c, values, at + done, part, level + 1)
         begin_block(c, r, w, u)
         change, _, _, _ = _solve(c, r, level + 1, 0.5 * h, n, tol)
         closed = change < math.inf
         if not closed:
             break
         _finish(c, r, level + 1, 0.5 * h, n)
-        compare(c, r, 0.5 * h, steps_of(level, done), n, halved(level + 1), off)
+        compare(c, r, 0.5 * h, done << level, n, 2 << level, off)
         for k in range(m):
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
@@ -195,24 +195,17 @@ def march(
     """
     c, values = borrow(c), borrow(values)
     form, room, control = c.form, c.room, c.control
-    # Where a block was checked last: none is checked twice at a step length. The same of the last one refused, and the
-    # error it showed (V).
-    last, refused = (-1, 0), (-1, 0, 0.0)
+    # Where a block was checked last: none is checked twice at a step length.
+    last = (-1, 0)
     while at < stop:
-        r, level = int(control[REFERENCE]), fitting(int(control[LEVEL]), stop - at)
-        h, span = spacing * span_of(level) / halved(level), span_of(level)
-        count = min(most_samples(level), (stop - at) // span * span)
-        n = steps_of(level, count)
-        load_source(c, values, at, count, level)
-        if not is_smooth(c, n):
-            control[LEVEL] = level + 1.0
-            continue
+        r, level = int(control[REFERENCE]), int(control[LEVEL])
+        h, count = spacing / (1 << level), min(BLOCK >> level, stop - at)
+        n = count << level
+        _load(c, values, at, count, level)
         begin_block(c, r, c.w, control[U_GAP])
         if change_reference(c, r):
             continue
         change, margin, seen, magnified = _solve(c, r, level, h, n, tol)
-        if refused[0] == at and refused[1] + 1 == level:
-            learn_growth(c, level, refused[2], seen)
         left = 0.0
         local = max(c.checks[level, OF_GAP], c.checks[level, WITHIN]) * seen
         if local <= tol:
@@ -231,8 +224,7 @@ def march(
         if not local <= tol:
             if level + 1 == LEVELS or margin <= LEAST_MARGIN:
                 return TOO_COARSE if change < math.inf else NOT_CLOSED
-            refine(c, level, LEVELS - 1, n, local, tol)
-            refused = (at, level, seen)
+            refine(c, level, n, local, tol)
             continue
         control[MARGIN] = min(control[MARGIN], margin)
         for k in range(c.w.size):
@@ -244,6 +236,6 @@ def march(
         accept(c, r, level, n, seen, left, magnified, left / max(change + seen, left) if left > 0.0 else 0.0)
         write_block(c, r, level, count, h, start + at * spacing, t_out, out)
         at += count
-        if level > form.longest and may_coarsen(c, level, seen, left, tol) and (level > ONE or may_be_longer(c, n)):
+        if level > 0 and may_coarsen(c, level, seen, left, tol):
             control[LEVEL] = level - 1.0
     return DONE

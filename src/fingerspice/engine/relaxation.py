@@ -34,13 +34,11 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.blockcourse import inverse_area_at
-from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, ONE, PLACES, Form, Room
-from fingerspice.engine.blockhats import add_hats, find_hats, hats_at, look_at_middle
+from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, PLACES, Form, Room
 from fingerspice.engine.blockkinks import add_where, find_crossings, kink_at, kink_rows, respond_to_kinks
 from fingerspice.engine.blockrows import (
     PAD,
     add,
-    add_bumps,
     add_three,
     add_two,
     area_rows,
@@ -135,8 +133,6 @@ def _project(form: Form, room: Room, r: int, level: int, place: int, n: int, p: 
     modes_into(n, 0, form.within[r, level, place, p], room.w, x)
     if form.faded[r, level] > 0.0:
         add(n, form.pulse_within[r, level, place, p], room.pulse, x)
-    if level < ONE:
-        add_bumps(n, form.coarse.bump_within[r, level, place, p], room.bumps, x)
 
 
 @jit_within
@@ -161,11 +157,6 @@ def _project_three(form: Form, room: Room, r: int, level: int, place: int, n: in
         add(n, by_pulse[0], room.pulse, x)
         add(n, by_pulse[1], room.pulse, y)
         add(n, by_pulse[2], room.pulse, z)
-    if level < ONE:
-        by_bumps = form.coarse.bump_within[r, level, place]
-        add_bumps(n, by_bumps[0], room.bumps, x)
-        add_bumps(n, by_bumps[1], room.bumps, y)
-        add_bumps(n, by_bumps[2], room.bumps, z)
 
 
 @jit_within
@@ -307,8 +298,6 @@ def relax(
     for i in range(n + 1):
         room.u[i] = room.before[i] = form.k_gap * room.s[i] + charged
     both_ends(n, 0.5, 0.5, room.u, room.u_within[MIDDLE])
-    if level < ONE:
-        add(n, form.k_gap, room.bumps[MIDDLE], room.u_within[MIDDLE])
     for k in range(modes):
         for t in range(drives):
             room.kinked[k, t] = h * form.feed[r, k, t] * kink[t]
@@ -323,10 +312,6 @@ def relax(
             )  # fmt: skip
             if fades:
                 add(n, form.pulse[r, level, k], room.pulse, own)
-            if level < ONE:
-                add_bumps(n, form.coarse.bump[r, level, k], room.bumps, own)
-                if sweep >= KINKED:
-                    add_hats(room, form.coarse.hat[r, level, k], n, own)
         if sweep >= KINKED:
             _add_kinks(form, room, r, level, h, n)
         for k in range(modes):
@@ -335,11 +320,7 @@ def relax(
         if sweep >= KINKED:
             keep_drives(room, n)
         margin = _look(form, room, r, level, MIDDLE, n, newton)
-        if level < ONE:
-            look_at_middle(form, room, n)
         margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
-        if level < ONE:
-            find_hats(form, room, n)
         if fades:
             scaled(n, -1.0, room.pulse, room.changed_pulse)
             _pulses(form, room, r, level, h, n)
@@ -381,8 +362,6 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
                 faded = form.faded[r, level]
                 shown = weight[0] + weight[1] * math.exp(-0.5 * faded) + weight[2] * math.exp(-faded)
                 add(n, shown - math.exp(-faded * PLACES[place]), room.pulse, off)
-            if level < ONE:
-                hats_at(n, place, weight[1], room.hats[t], off)
             kink_at(
                 count, room.where, kink[t], PLACES[place], room.crossed, room.jumps, room.bends, room.end[1 + t], off
             )  # fmt: skip

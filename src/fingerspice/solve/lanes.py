@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.lanes import along, begin, busiest, charges, largest, show, span, within
 from fingerspice.results.outcome import State
 from fingerspice.solve.following import Following, Outcome
@@ -35,6 +35,8 @@ OF_STARTS = 0.05
 WINDOW, FEWEST = 1.0 / 16.0, 8
 # Excess below which the next block has steps twice as long, and what half the length divides an error by at least.
 COARSER, FINER = 1.0 / 60.0, 5.0
+# Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
+LUCK = 2.0
 # The rate that stands for 0, 1/s.
 _STILL = 1e-9
 
@@ -67,7 +69,7 @@ class Block:
         self.room, self.scratch = form.room(self.own)
         self.still = form.weights(np.zeros(LANES if self.own else 1))
         self.kept = np.zeros((rows, LANES, self.count + 1))
-        self.sweeps = 0
+        self.sweeps, self.left = 0, np.zeros(self.m)
 
     @cached_property
     def lengths(self) -> FloatArray:
@@ -90,11 +92,11 @@ class Block:
     def weights(self, parts: int) -> FloatArray:
         return self.scratch if self.own else self.form.weights(self.h / parts)
 
-    def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> int:
+    def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
         form = self.form
-        return int(span(
+        return bool(span(
             self.marks, form.lanes, form.rates, form.gain, self.weights(parts), self.h, self.x, first, count, parts,
-            tol, self.room, kept,
+            tol, self.room, kept, self.left,
         ))  # fmt: skip
 
     def _begin(self, starts: FloatArray, first: IntArray) -> None:
@@ -114,15 +116,18 @@ class Block:
         for sweep in range(LANES + 1):
             self._begin(starts, self.first)
             self.kept[:m, :, 0], self.kept[m:, :, 0] = starts, 0.0
-            done = self._span(self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
+            stops = self._span(self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
             self.sweeps += 1
+            if stops:
+                break
             off = self.kept[:m, :, -1] - np.roll(starts, -1, axis=1)
             off[:, -1] = 0.0
             change = np.einsum("kij,kj->ki", handed[..., 1:], off)
-            largest = np.abs(form.lanes.shape @ np.abs(change)).max()
+            self.left = np.abs(change).max(axis=1)
+            largest = float(np.abs(form.lanes.shape) @ self.left)
             if not largest < math.inf:
                 return False
-            if largest <= tol or done < self.count:
+            if largest <= tol:
                 break
             starts += change
         else:
@@ -144,7 +149,7 @@ class Block:
         lane = (self.n - 1) // self.count
         return np.array(self.kept[:, lane, self.n - lane * self.count])
 
-    def check(self, parts: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def check(self, parts: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Follow a window of every piece by twice as many steps.
 
         Returns
@@ -153,8 +158,10 @@ class Block:
             Differences of the states, 0 in pieces that are not checked.
         u : ndarray, shape (LANES, width + 1)
             Gap voltages, V.
-        share : ndarray, shape (2, rows, LANES)
-            What a piece adds over what its window does, if all errors are alike, and of squares.
+        share : ndarray, shape (rows, LANES)
+            What a piece adds over what its window does, if all errors are alike.
+        share_of_products : ndarray, shape (rows, rows, LANES)
+            The same of products of two errors, if they come by chance.
         """
         width, place = min(self.count, max(FEWEST, round(self.count * WINDOW))), np.empty(LANES, np.int64)
         busiest(self.x, self.first, self.count, width, self.n, place)
@@ -174,25 +181,23 @@ class Block:
         if self.own:
             took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
         y, window = self.rates[:, None] * self.lengths, self.rates[:, None] * np.maximum(took, 1e-30)
-        share = np.array([np.expm1(-y) / np.expm1(-window), np.expm1(-2.0 * y) / np.expm1(-2.0 * window)])
-        return off, u, share
+        share, of_products = (
+            np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
+        )
+        return off, u, share, of_products
 
-    def carried(self, off: FloatArray, share: FloatArray, before: FloatArray) -> FloatArray:
-        """Errors of the modes from the pieces before, at the start of each piece, and at the end: (2, rows, LANES + 1).
+    def hand_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
+        """Errors at the start of each piece, and at the end of the block, shape (*kinds, LANES + 1).
 
-        The first row adds them up as if they were alike, the other one squares, as if they came by chance; `before`
-        (2, rows) are those at the start of the block.
+        Pieces add `added` (*kinds, LANES), and `before` (*kinds,) is there at the start. Of one error for each row, or
+        of the products of two.
         """
-        own = np.stack([off[:, :, -1] * share[0], off[:, :, -1] ** 2 * share[1]])
-        out = np.empty((2, self.rates.size, LANES + 1))
-        for i, handed in enumerate((self.handed, self.handed**2)):
-            parts = np.concatenate([before[i][:, None], own[i]], axis=1)
-            out[i, :, :LANES] = np.einsum("kij,kj->ki", handed, parts)
-        lane = (self.n - 1) // self.count
+        handed, lane = self.handed, (self.n - 1) // self.count
         left = np.exp(-self.rates * self.lengths[lane])
-        out[0, :, LANES] = left * out[0, :, lane] + own[0, :, lane]
-        out[1, :, LANES] = left**2 * out[1, :, lane] + own[1, :, lane]
-        return out
+        if before.ndim == 2:
+            handed, left = handed[:, None] * handed, left[:, None] * left
+        at_starts = np.einsum("...ij,...j->...i", handed, np.concatenate([before[..., None], added], axis=-1))
+        return np.append(at_starts, (left * at_starts[..., lane] + added[..., lane])[..., None], axis=-1)
 
     def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
         """Source (V; n,) and states (rows, n) `since` (s) after samples of these numbers, whose steps are `length`."""
@@ -214,13 +219,16 @@ class LaneMarch(Following):
 
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
         start, rows = problem.inner, form.rates.size + int(form.charge)
-        super().__init__(problem, rtol, share, float(form.system.model.k_gap), form.system.k_shown.size + 2 * form.charge)
+        super().__init__(
+            problem, rtol, share, float(form.system.model.k_gap), form.system.k_shown.size + 2 * form.charge
+        )
         self.form = form
         state = form.system.project[0] @ start.y[:-1]
         self.z = np.append(state, start.y[-1] - form.charge_at(state, start.u_gap)) if form.charge else state
         self.u_last = start.u_before
         self.level, self.outputs, self.steps, self.refused, self.sweeps = 0, 0, 0, 0, 0
-        self.before = np.zeros((2, rows))
+        # Errors of the states so far, as if they were alike, and products of two, as if they came by chance.
+        self.alike, self.chance = np.zeros(rows), np.zeros((rows, rows))
         # Largest gap voltage (V) and errors seen of gap voltage (V), force (N), nodes (V) and charge (C).
         self.peak, self.errors = 0.0, np.zeros(4)
 
@@ -237,7 +245,7 @@ class LaneMarch(Following):
                 peak = float(largest(block.n + 1, block.voltages))
                 if not peak <= self.form.u_top:
                     return Outcome.LOST
-                excess, errors, before = self._judge(block, parts, max(peak, self.peak))
+                excess, errors, handed = self._judge(block, parts, max(peak, self.peak))
             if excess <= 1.0:
                 break
             self.refused += parts * block.n
@@ -245,7 +253,8 @@ class LaneMarch(Following):
                 return Outcome.NOT_MET
             finer = math.ceil(math.log(excess) / math.log(FINER)) if excess < math.inf else 1
             self.level = min(self.level + max(1, finer), len(PARTS) - 1)
-        self.peak, self.errors, self.before = max(peak, self.peak), np.maximum(errors, self.errors), before
+        self.peak, self.errors = max(peak, self.peak), np.maximum(errors, self.errors)
+        self.alike, self.chance = handed
         self.steps += parts * block.n
         self.sweeps += block.sweeps
         self._write(piece, block, parts, t_out, out)
@@ -254,45 +263,53 @@ class LaneMarch(Following):
             self.level -= 1
         return Outcome.MET
 
-    def _judge(self, block: Block, parts: int, peak: float) -> tuple[float, FloatArray, FloatArray]:
+    def _judge(self, block: Block, parts: int, peak: float) -> tuple[float, FloatArray, tuple[FloatArray, FloatArray]]:
         """Excess of the stated over the allowed error, the errors seen so far, and those that the block hands on."""
         form, m = self.form, block.m
-        off, u, share = block.check(parts)
-        carried = block.carried(off, share, self.before)
-        own = np.stack([off[:, :, -1] * share[0], off[:, :, -1] ** 2 * share[1]])
+        off, u, share, of_products = block.check(parts)
+        own = off[:, :, -1]
+        products = own[:, None] * own
+        alike, chance = block.hand_on(own * share, self.alike), block.hand_on(products * of_products, self.chance)
+        # At the end of a piece, with what it adds beyond its window.
+        alike_there = alike[:, :LANES] + own * (share - 1.0)
+        chance_there = chance[..., :LANES] + products * (of_products - 1.0)
 
-        def added(columns: FloatArray, held: FloatArray) -> float:
-            """Of what is carried into the pieces and added in them, of a sum of the modes."""
-            alike = np.abs(columns @ held[0, :m, :LANES]) + np.abs(columns @ own[0, :m])
-            return float((alike + np.sqrt(columns**2 @ (held[1, :m, :LANES] + own[1, :m]))).max())
+        def added(columns: FloatArray) -> float:
+            """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
+            n = columns.size
+            lucky = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there[:n, :n]), 0.0))
+            more = np.maximum(lucky, np.abs(columns @ alike_there[:n]) - LUCK * lucky)
+            return float(more.max() + np.abs(columns[:m]) @ block.left / SAFETY)
 
-        shape = form.lanes.shape
-        du = np.einsum("k,kij->ij", shape, off[:m])
-        # A fast mode adds nothing over its window, and what it misses there is seen.
-        over = added(shape, carried)
+        def seen(columns: FloatArray) -> FloatArray:
+            return np.asarray(np.einsum("k,kij->ij", columns, off[: columns.size]))
+
+        c = form.lanes
+        du, over, errors = seen(c.shape), added(c.shape), np.zeros(4)
         force = form.force(np.array([peak, 1.001 * peak]))
         steep = float(force[1] - force[0]) / (1e-3 * peak) if peak > 0.0 else 0.0
-        errors = np.zeros(4)
         errors[0] = np.abs(du).max() + over
         errors[1] = np.abs(form.force(u + du) - form.force(u)).max() + steep * over
         for columns in form.system.node[0]:
-            errors[2] = max(errors[2], np.abs(np.einsum("k,kij->ij", columns, off[:m])).max() + added(columns, carried))
+            errors[2] = max(errors[2], np.abs(seen(columns)).max() + added(columns))
         if form.charge:
-            held = abs(carried[0, m, :LANES]) + abs(own[0, m]) + np.sqrt(carried[1, m, :LANES] + own[1, m])
-            moved = form.lanes.moved_by * du / form.inverse_area(u)
-            most = form.lanes.moved_by / float(form.inverse_area(np.array(peak)))
-            moved += np.einsum("k,kij->ij", form.lanes.held, off[:m]) + off[m]
-            errors[3] = np.abs(moved).max() + held.max() + most * over + added(form.lanes.held, carried)
+            area = 1.0 / form.inverse_area(u)
+            charge = np.append(c.held, 1.0)
+            errors[3] = np.abs(seen(charge) + c.moved_by * area * du).max()
+            charge[:m] += c.moved_by / c.q0 * c.shape
+            errors[3] += added(charge) + c.moved_by * np.abs(area - 1.0 / c.q0).max() * over
         excess = self._excess(np.maximum(errors, self.errors), peak)
         if self.share < 1.0:
-            none = np.zeros_like(carried)
-            alone = np.abs(du).max() + added(shape, none)
+            alone = np.abs(du).max() + np.abs(c.shape @ (own * (share - 1.0))[:m]).max()
             excess = max(excess, SAFETY * alone / (self.share * self.rtol * max(peak, self.least)))
-        return excess, errors, carried[:, :, LANES]
+        return excess, errors, (alike[:, LANES], chance[..., LANES])
 
     def _excess(self, errors: FloatArray, peak: float) -> float:
         gaps, _, _ = self._stated(errors, peak)
-        gaps[0, 0], gaps[0, 1] = max(gaps[0, 0], self.least), max(gaps[0, 1], float(self.form.force(np.array(self.least))))
+        gaps[0, 0], gaps[0, 1] = (
+            max(gaps[0, 0], self.least),
+            max(gaps[0, 1], float(self.form.force(np.array(self.least)))),
+        )
         return excess_of(gaps, self.problem.rounding) / self.rtol
 
     def _write(self, piece: Piece, block: Block, parts: int, t_out: FloatArray, out: FloatArray) -> None:
@@ -342,7 +359,10 @@ class LaneMarch(Following):
         form, start = self.form, self.problem.inner
         m = form.rates.size
         u_gap = float(form.lanes.shape @ self.z[:m] + form.lanes.k * self.u_last)
-        y = np.append(form.system.live[0] @ self.z[:m], self.z[m] + form.charge_at(self.z[:m], u_gap) if form.charge else start.y[-1])
+        y = np.append(
+            form.system.live[0] @ self.z[:m],
+            self.z[m] + form.charge_at(self.z[:m], u_gap) if form.charge else start.y[-1],
+        )
         return from_stack(self.problem.scene, StackState(self.t, y, self.u_last, u_gap, start.offset))
 
     def stated(self) -> tuple[FloatArray, float, float | None]:
@@ -352,14 +372,13 @@ class LaneMarch(Following):
         form, u_peak = self.form, self.problem.scene.u_peak
         missed, force = form.missed, float(form.force(np.array(peak)))
         floor = 4e-16 * (peak + form.lanes.k * max(u_peak, self.loudest)) + missed * peak
-        left = OF_STARTS * self.rtol * self.scale
-        u_error = SAFETY * float(errors[0]) + left + floor
-        f_error = SAFETY * float(errors[1]) + (2.0 * (floor + left) / (peak or 1.0) + missed) * force
-        node_error = SAFETY * float(errors[2]) + left + 4e-16 * (peak + u_peak) + missed * peak
+        u_error = SAFETY * float(errors[0]) + floor
+        f_error = SAFETY * float(errors[1]) + (2.0 * floor / (peak or 1.0) + missed) * force
+        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + missed * peak
         charge_error = None
         if form.charge:
             stored = float(form.system.model.slow[-3]) * form.system.model.area0
-            charge_error = OF_CHARGE * SAFETY * float(errors[3]) + stored * (left + missed * peak)
+            charge_error = OF_CHARGE * SAFETY * float(errors[3]) + stored * missed * peak
             charge_error += 4e-16 * stored * (u_peak + peak) * (1.0 + self.steps)
         return np.array([[peak, force, u_error, f_error]]), node_error, charge_error
 
@@ -369,7 +388,7 @@ class LaneMarch(Following):
 
     def mark(self) -> dict[str, Any]:
         names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "sweeps", "peak")
-        arrays = {name: getattr(self, name).tolist() for name in ("z", "before", "errors")}
+        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors")}
         return {name: getattr(self, name) for name in names} | arrays
 
     def stand(self, mark: dict[str, Any]) -> None:

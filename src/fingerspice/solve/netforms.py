@@ -19,7 +19,8 @@ from fingerspice.engine.model import Model
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
-from fingerspice.solve.forms import AREA_SHARE, FADED, Follower, weighted
+from fingerspice.solve.forms import FADED, Follower, weighted
+from fingerspice.solve.laneform import AREA_SHARE
 from fingerspice.solve.netmodal import Modal, Reduced
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene
@@ -83,7 +84,7 @@ class Finger(Follower):
             one.rates[None], one.gain[None], one.drives[None], one.taps[None], one.tap_s, spacing, self._fast(spacing),
             mobile=False, q0=np.array([reduced.q0]), area=self.area, scale=self.scale, shift=-1.0,
             k_gap=float(one.tap_s[0]), area0=1.0 / reduced.q0, kappa=reduced.kappa, bend=self.bend,
-            bent=one.taps[1:-1, :n] @ reduced.absorbed, longest=blockforms.ONE,
+            bent=one.taps[1:-1, :n] @ reduced.absorbed,
         )  # fmt: skip
 
     def _fast(self, spacing: float) -> int:
@@ -127,10 +128,8 @@ class Finger(Follower):
         w[n:] = start.y[n : start.y.size if m > n else n] - held[n:]
         control, counters = blockforms.new_control(), np.zeros(blockforms.N_COUNTERS, np.int64)
         control[blockforms.U_GAP] = one.taps[0] @ w + one.tap_s[0] * s[reduced.source]
-        # The rows at samples within steps of several are never used.
-        room = blockforms.new_room(m, drives, drives + 1, self.shown)
         return Course(
-            self._model, form, self.shown, room, room, new_charges(),
+            self._model, form, self.shown, blockforms.new_room(m, drives, drives + 1, self.shown), new_charges(),
             np.zeros((3, max(m, drives, 5))), w, np.zeros((2, m)), control, counters, blockforms.new_checks(self.shown),
         )  # fmt: skip
 
@@ -211,7 +210,7 @@ def _shown(
     none = np.zeros((1, m, m))
     return blockforms.Shown(
         modal.columns[None], modal.k, modal.nodes[None], nodes, none[0, :1], none, none, float(contact.stress(1.0)),
-        kinks, 0.0, np.zeros(1), False, modal.bends, m - n,
+        kinks, 0.0, False, modal.bends, m - n,
         float(problem.network.capacitance(reduced.area0).sum()), moves,
     )  # fmt: skip
 

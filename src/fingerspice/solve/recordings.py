@@ -193,7 +193,9 @@ def ready(problem: Problem, rtol: float) -> LaneForm | Follower | None:
     """The scene prepared for this method, cached by decade; None where it does not apply."""
     kept, *key = _kept(problem, rtol)
     make = finger if problem.scene.stack is None else followed if problem.scene.net.mobile else prepared
-    one: LaneForm | Follower | None = kept_with(kept, ("followed", *key), MOST_FORMS, partial(make, problem, _decade(rtol)))
+    one: LaneForm | Follower | None = kept_with(
+        kept, ("followed", *key), MOST_FORMS, partial(make, problem, _decade(rtol))
+    )
     return one
 
 

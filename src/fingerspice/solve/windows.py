@@ -13,10 +13,10 @@ from fingerspice.circuit.network import Network
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.plan import Plan
 from fingerspice.results.record import Record
+from fingerspice.solve.following import Outcome
 from fingerspice.solve.outputs import at_breakpoints
 from fingerspice.solve.pieces import pieces_of
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.following import Outcome
 from fingerspice.solve.recordings import march_of, ready
 from fingerspice.solve.runs import Run
 from fingerspice.solve.simulation import integrated, own_rtol, state_error
