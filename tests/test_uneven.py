@@ -9,11 +9,9 @@ import pytest
 from scipy import integrate
 
 import fingerspice as fs
-from fingerspice.engine.blockforms import PLACES
-from fingerspice.engine.unevenweights import new_steps, weigh
-from fingerspice.solve.forms import followed
+from fingerspice.engine.lanes import weigh
+from fingerspice.engine.lanestep import INNER, PER_MODE
 from fingerspice.solve.pieces import LEAST_POINTS
-from fingerspice.solve.simulation import asked
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 DISPERSIVE = (CIRCUITS / "fingerpad.cir").read_text().replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE  d=350u")
@@ -127,27 +125,26 @@ def test_what_it_does_not_serve_is_stepped() -> None:
 
 
 def test_weights_are_integrals_of_decaying_exponentials_times_polynomials() -> None:
-    circuit, (t, _) = circuit_of("SKIN"), points(2)
-    problem = asked(
-        fs.Circuit.replace(circuit, {}), t_stop=t[-1], t_eval=None, charge_law=None, area="coupled", start="deck",
-        charge=True, rtol=1e-6,
-    )  # fmt: skip
-    one = followed(problem, 1e-6)
-    assert one is not None
-    form, steps, h = one.form(1e-5), new_steps(one.system.rates.shape[1]), np.zeros(520)
     # From steps much shorter than the time constants to much longer ones.
-    h[:40] = np.geomspace(1e-7, 0.3, 40)
-    weigh(form, steps, h, 0, 40)
-    nodes = np.array([0.0, 0.5, 1.0])
-    lines = [np.poly1d(np.polyfit(nodes, np.eye(3)[i], 2)) for i in range(3)]
-    for k, rate in enumerate(form.rates[0]):
-        for i in range(0, 40, 3):
-            z = rate * h[i]
-            for place, at in enumerate((*PLACES, 1.0)):
-                assert steps.decay[k, place, i] == pytest.approx(np.exp(-z * at), rel=1e-13, abs=1e-300)
-                for node, line in enumerate(lines):
-                    found, _ = integrate.quad(
-                        lambda x, z=z, at=at, line=line: np.exp(-z * (at - x)) * line(x), max(0.0, at - 40.0 / z), at,
-                        epsabs=1e-14, epsrel=1e-13,
-                    )  # fmt: skip
-                    assert steps.parabola[k, place, node, i] == pytest.approx(h[i] * found, rel=1e-9, abs=1e-12 * h[i])
+    rates, gain, h = np.array([0.0, 3.0, 4e3]), np.array([1.0, -2.0, 5.0]), np.geomspace(1e-7, 0.3, 14)
+    found = np.empty((3 * PER_MODE + 1, h.size))
+    weigh(rates, gain, h, found)
+    nodes = np.array([0.0, *INNER, 1.0])
+    cubics = [np.poly1d(np.polyfit(nodes, np.eye(4)[i], 3)) for i in range(4)]
+    ends = [np.poly1d([-1.0, 1.0]), np.poly1d([1.0, 0.0])]
+    for k, rate in enumerate(rates):
+        for i, length in enumerate(h):
+            z, own = rate * length, found[k * PER_MODE :, i]
+
+            def integral(poly: np.poly1d, at: float, z: float = z) -> float:
+                early = 0.0 if z == 0.0 else max(0.0, at - 40.0 / z)
+                return float(integrate.quad(
+                    lambda x: np.exp(-z * (at - x)) * poly(x), early, at, epsabs=1e-14, epsrel=1e-13
+                )[0])  # fmt: skip
+
+            for node, at in enumerate(nodes[1:]):
+                true = [np.exp(-z * at), *(gain[k] * length * integral(end, at) for end in ends)]
+                true.append(length * integral(np.poly1d([1.0]), at))
+                assert own[4 * node : 4 * node + 4] == pytest.approx(true, rel=1e-9, abs=1e-12 * length + 3e-16)
+            true = [length * integral(cubic, 1.0) for cubic in cubics]
+            assert own[12:16] == pytest.approx(true, rel=1e-9, abs=1e-12 * length)

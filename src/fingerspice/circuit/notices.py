@@ -112,15 +112,7 @@ def scenes_warnings(
 ) -> Iterator[str]:
     """Warnings about several scenes: unusual values, sources that miss the run, a SKIN whose single frequency is wrong.
 
-    Parameters
-    ----------
-    circuit : Circuit
-    t_stop : float or None
-        As in `circuit_warnings`.
-    scenes : mapping of str to ndarray, shape (n,)
-        Path to the values that a parameter has in the scenes.
-    skin : str
-        As in `batch`.
+    `t_stop` is as in `circuit_warnings`, `skin` as in `batch`, and `scenes` has the values (n,) of each parameter.
     """
     for path, values in scenes.items():
         for end in sorted({values.min(), values.max()}):

@@ -1,7 +1,7 @@
 """Charge of the blocks of a recording.
 
-The charge of a stack under `mobile` is computed through the layer that leaks slowest, as in `engine.charge`: what that
-layer stores is c A0 v exactly, where v is the modes' part of its voltage, and its leakage currents are left to quadrature.
+The charge of a stack under `mobile` is computed through the layer that leaks slowest, as in `engine.charge`. What that
+layer stores is c A0 v exactly, where v is the modes' part of its voltage; its leakage is left to quadrature.
 """
 
 from __future__ import annotations
@@ -83,8 +83,9 @@ def _add_decaying(n: int, start: float, decay: float, out: FloatArray) -> None:
 def charge_block(c: Course, r: int, n: int, of_seen: float, local: float, others: bool) -> None:
     """Charge at the ends of a block's steps, and its error: the share `of_seen` of what is seen of it and of the modes.
 
-    `local` is the error of the gap voltage (V) that this block itself makes: it changes the area, with which the modes' part of the slowest layer's voltage grows. Errors of `others`, by the sweeps and of earlier blocks,
-    are added. The projections that only the charge needs are known, and `Charges.h`.
+    `local` is the error of the gap voltage (V) that this block itself makes: it changes the area, with which the modes'
+    part of the slowest layer's voltage grows. Errors of `others`, by the sweeps and of earlier blocks, are added. The
+    projections that only the charge needs are known, and `Charges.h`.
     """
     form, room, own, slow, v = c.form, c.room, c.charges, c.model.slow, c.form.tap_s.size - 1
     for place in range(len(PLACES)):

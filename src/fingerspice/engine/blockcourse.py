@@ -17,8 +17,8 @@ class Charges(NamedTuple):
     """Rows of a block for the charge."""
 
     q: FloatArray  # (4, n): 1/A at the ends of the steps and at `PLACES`, 1/m^2
-    # (7, n): Rate of the charge at 0, 1/4, 1/2, 3/4 and 1 of each step (A), the charge gained in the step, and the error
-    # of this gain (C)
+    # (7, n): Rate of the charge at 0, 1/4, 1/2, 3/4 and 1 of each step (A), the charge gained in the step, and its
+    # error (C)
     steps: FloatArray
     # z, current, error (n,): Charge (C) and current (A) at the starts of the steps, and error of the slowest layer's
     # voltage (V)

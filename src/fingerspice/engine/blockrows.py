@@ -35,20 +35,6 @@ def add_three(
 
 
 @jit_rows
-def add_bumps(n: int, c: FloatArray, bumps: FloatArray, out: FloatArray) -> None:
-    """Add the three rows of `bumps` with the weights c (3,)."""
-    for i in range(n):
-        out[i] += c[0] * bumps[0, i] + c[1] * bumps[1, i] + c[2] * bumps[2, i]
-
-
-@jit_rows
-def add_with_bumps(n: int, a: float, x: FloatArray, c: FloatArray, bumps: FloatArray, out: FloatArray) -> None:
-    """The same, and a x."""
-    for i in range(n):
-        out[i] += a * x[i] + c[0] * bumps[0, i] + c[1] * bumps[1, i] + c[2] * bumps[2, i]
-
-
-@jit_rows
 def both_ends(n: int, a: float, b: float, x: FloatArray, out: FloatArray) -> None:
     for i in range(n):
         out[i] = a * x[i] + b * x[i + 1]

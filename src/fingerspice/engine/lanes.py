@@ -1,4 +1,4 @@
-"""Spans of samples in lanes (`engine.lanestep`), the weights of their steps, and what is read from states at samples."""
+"""Spans of samples in lanes (`engine.lanestep`), weights of their steps, and what is read from states at samples."""
 
 from __future__ import annotations
 
@@ -108,15 +108,13 @@ def begin(marks: Any, c: Any, still: FloatArray, starts: FloatArray, source: Flo
 
 @jit
 def span(
-    marks: Any, c: Any, rates: FloatArray, gain: FloatArray, weights: FloatArray, h: FloatArray, x: FloatArray,
-    first: IntArray, count: int, parts: int, tol: float, state: FloatArray, kept: FloatArray,
-    left: FloatArray,
+    marks: Any, c: Any, weights: FloatArray, h: FloatArray, x: FloatArray, first: IntArray, count: int, parts: int,
+    tol: float, state: FloatArray, kept: FloatArray, left: FloatArray,
 ) -> bool:  # fmt: skip
     """Advance the lanes by `count` samples, each in `parts` steps, and keep modes and rider at the samples.
 
     Parameters
     ----------
-    rates, gain : ndarray, shape (m,)
     weights : ndarray, shape (rows, 1) or (rows, lanes)
         Of one step; where every lane has its own, they are computed here.
     h : ndarray, shape (n,)
@@ -150,7 +148,7 @@ def span(
             if len(marks.own) > 0:
                 for i in range(lanes):
                     length[i] = h[first[i] + done + k] / parts
-                weigh(rates, gain, length, weights)
+                weigh(c.rates, c.gain, length, weights)
             for p in range(parts):
                 step(marks, c, flat, state, after[k * lanes :], p / parts, (p + 1) / parts)
             for i in range(rows * lanes):
@@ -239,11 +237,11 @@ def show(
 
 @jit
 def charges(
-    c: Any, rates: FloatArray, gain: FloatArray, x: FloatArray, slope: FloatArray, first: IntArray, count: int, n: int,
+    c: Any, x: FloatArray, slope: FloatArray, first: IntArray, count: int, n: int,
     kept: FloatArray, charge: FloatArray, current: FloatArray,
 ) -> None:  # fmt: skip
     """Charge (C) and current (A), as `show`, from the source (V), its slope (V/s), and modes and rider."""
-    m, row = rates.size, np.empty(count)
+    rates, gain, m, row = c.rates, c.gain, c.rates.size, np.empty(count)
     for lane in range(first.size):
         size, at = min(count, n - first[lane]), first[lane]
         if size <= 0:
@@ -297,7 +295,7 @@ def busiest(x: FloatArray, first: IntArray, count: int, width: int, n: int, plac
 
 @jit
 def within(
-    marks: Any, c: Any, rates: FloatArray, gain: FloatArray, still: FloatArray, starts: FloatArray, x: FloatArray,
+    marks: Any, c: Any, still: FloatArray, starts: FloatArray, x: FloatArray,
     to: FloatArray, h: FloatArray, parts: int, state: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Modes and rider (rows, n) after steps of lengths h (n,) from `starts` (rows, n), while the source goes from x to
@@ -312,7 +310,7 @@ def within(
             for k in range(m):
                 modes[k, i] = starts[k, j]
         begin(marks, c, still, modes, before, state)
-        weigh(rates, gain, length, weights)
+        weigh(c.rates, c.gain, length, weights)
         for p in range(parts):
             step(marks, c, weights.reshape(-1), state, after, p / parts, (p + 1) / parts)
         for i in range(min(lanes, h.size - first)):

@@ -9,10 +9,10 @@ The drives g are taken at Lobatto's four nodes, where the state is predicted wit
 the modes' response to the source and to the cubic through the drives is exact. Where u crosses 0 V, g has a kink, of
 which the integral and the first moment that the rule misses are known on the straight line of u, and are added.
 
-A rider is one more mode of rate 0, of which nothing depends. Its rate is (A - 1/q0) P + R, where P is a sum of modes,
-source and drives, R one of source and drives; it has a kink of its own. It is the source's charge without two parts that
-are known exactly: G(u), the integral of A over the gap voltage times `moved_by`, which holds all that depends on the
-source's slope, and `held` z, which holds what follows from the modes at the area 1/q0.
+A rider is one more mode of rate 0, on which nothing depends. Its rate is (A - 1/q0) P + R, where P is a sum of modes,
+source and drives, R one of source and drives; it has a kink of its own. It is the charge of the source without what is
+known exactly: G(u), the integral of A over the gap voltage times `moved_by`, which holds all that depends on the slope
+of the source, and `held` z, which holds what follows from the modes at the area 1/q0.
 
 Arrays hold one row of `lanes` values after the other. Weights are shared by all lanes, or each lane has its own. What
 has to be known to the compiler are the lengths of the tuples in `Marks`.
@@ -48,6 +48,8 @@ class Marks(NamedTuple):
 class Lanes(NamedTuple):
     """Constants of a scene in this form."""
 
+    rates: FloatArray  # (m,): 1/s
+    gain: FloatArray  # (m,)
     shape: FloatArray  # (m,): V/V
     k: float
     taps: FloatArray  # (T, m)

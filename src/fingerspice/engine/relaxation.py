@@ -116,15 +116,6 @@ def _drives(
 
 
 @jit_within
-def drives_at(form: Form, r: int, n: int, room: Room, place: int) -> float:
-    """Drives at one place within the steps, from its projections and gap voltages; the least distance to the fold."""
-    return _drives(
-        form, form.q0[r], n, NEWTON, room.s_within, room.within[place], room.u_within[place], room.z, room.slope,
-        room.g_within[place],
-    )  # fmt: skip
-
-
-@jit_within
 def _project(form: Form, room: Room, r: int, level: int, place: int, n: int, p: int) -> None:
     """Projection p at one place within the steps."""
     x = _row_within(form, room, place, p)

@@ -70,11 +70,12 @@ class Following(ABC):
         """Start counting outputs from 0, for a new array of outputs."""
         self.outputs = 0
 
-    def at_end(self) -> tuple[float, float]:
-        """The source's value (V) and slope (V/s) at the end of the run."""
-        stop, after = self.problem.t_stop, 1e-3 * self.usual
-        here, later = self.wave.value([stop, stop + after]).tolist()
-        return here, (later - here) / after
+    @property
+    def slope_after(self) -> float:
+        """The source's slope after the end of the run, V/s."""
+        after = 1e-3 * self.usual
+        here, later = self.wave.value([self.problem.t_stop, self.problem.t_stop + after]).tolist()
+        return float(later - here) / after
 
     @abstractmethod
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:

@@ -44,32 +44,23 @@ class LaneForm:
     missed: float  # Relative error of the polynomial of 1/A
 
     @property
-    def rates(self) -> FloatArray:
-        """Decay rates of the modes, 1/s; shape (m,)."""
-        return self.system.rates[0]
-
-    @property
-    def gain(self) -> FloatArray:
-        return self.system.gain[0]
-
-    @property
     def u_top(self) -> float:
         """Largest gap voltage that the polynomial covers, V."""
         return self.system.u_top
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
-        return _marks(self.rates.size, self.lanes.tap_s.size, self.charge, own)
+        return _marks(self.lanes.rates.size, self.lanes.tap_s.size, self.charge, own)
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
-        rows = self.rates.size * PER_MODE + 1
+        rows = self.lanes.rates.size * PER_MODE + 1
         return np.zeros(places(self.marks(own))[-1] * LANES), np.zeros((rows, LANES if own else 1))
 
     def weights(self, h: FloatArray) -> FloatArray:
         """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
-        out = np.empty((self.rates.size * PER_MODE + 1, h.size))
-        weigh(self.rates, self.gain, h, out)
+        out = np.empty((self.lanes.rates.size * PER_MODE + 1, h.size))
+        weigh(self.lanes.rates, self.lanes.gain, h, out)
         return out
 
     def inverse_area(self, u: FloatArray) -> FloatArray:
@@ -148,8 +139,9 @@ def _constants(system: System, area: FloatArray, shift: float, kink: float, area
     by_drives = np.array([rest @ feed, rest @ feed / system.q0[0] - held @ feed])
     shape, taps, tap_s, feed = map(np.ascontiguousarray, (system.gap[0], system.tap[0], system.tap_k, feed))
     return Lanes(
-        shape, float(model.k_gap), taps, tap_s, feed, area, float(system.scale), shift, float(system.q0[0]), kink,
-        by_modes, by_source, by_drives, held, area_kink, _moved(system, area, shift, c * ratio), c * ratio,
+        rates, gain, shape, float(model.k_gap), taps, tap_s, feed, area, float(system.scale), shift,
+        float(system.q0[0]), kink, by_modes, by_source, by_drives, held, area_kink,
+        _moved(system, area, shift, c * ratio), c * ratio,
     )  # fmt: skip
 
 

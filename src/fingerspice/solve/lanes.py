@@ -27,8 +27,8 @@ from fingerspice.solve.stackstate import StackState, from_stack
 
 # Steps of a sample, by level.
 PARTS = (1, 2, 4, 8, 16, 32, 64)
-# Stated over seen error; of the charge, further.
-SAFETY, OF_CHARGE = 2.0, 1.5
+# Stated over seen errors of voltages and charge, and of the force.
+SAFETY, OF_FORCE = 2.0, 1.5
 # Changes of starts that may be left, over the error asked for.
 OF_STARTS = 0.05
 # A window over its piece, and the fewest samples in one.
@@ -64,8 +64,8 @@ class Block:
         self.h = np.concatenate([h, np.zeros(beyond)]) if self.own and beyond else h
         self.first = self.count * np.arange(LANES)
         self.starts_run, self.marks = starts_run, form.marks(self.own)
-        self.m, rows = form.rates.size, form.rates.size + int(form.charge)
-        self.rates = np.append(form.rates, np.full(rows - self.m, _STILL))
+        self.m, rows = form.lanes.rates.size, form.lanes.rates.size + int(form.charge)
+        self.rates = np.append(form.lanes.rates, np.full(rows - self.m, _STILL))
         self.room, self.scratch = form.room(self.own)
         self.still = form.weights(np.zeros(LANES if self.own else 1))
         self.kept = np.zeros((rows, LANES, self.count + 1))
@@ -95,7 +95,7 @@ class Block:
     def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
         form = self.form
         return bool(span(
-            self.marks, form.lanes, form.rates, form.gain, self.weights(parts), self.h, self.x, first, count, parts,
+            self.marks, form.lanes, self.weights(parts), self.h, self.x, first, count, parts,
             tol, self.room, kept, self.left,
         ))  # fmt: skip
 
@@ -210,7 +210,7 @@ class Block:
         form, marks = self.form, self.form.marks(True)
         room, _ = form.room(True)
         still = form.weights(np.zeros(LANES))
-        within(marks, form.lanes, form.rates, form.gain, still, z, x, to, since, parts, room, out)
+        within(marks, form.lanes, still, z, x, to, since, parts, room, out)
         return to, out
 
 
@@ -218,7 +218,7 @@ class LaneMarch(Following):
     """A recording of a stack in progress, block by block."""
 
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
-        start, rows = problem.inner, form.rates.size + int(form.charge)
+        start, rows = problem.inner, form.lanes.rates.size + int(form.charge)
         super().__init__(
             problem, rtol, share, float(form.system.model.k_gap), form.system.k_shown.size + 2 * form.charge
         )
@@ -320,13 +320,13 @@ class LaneMarch(Following):
         if last == first:
             return
         t, self.outputs, rows = t_out[first:last], last, out[:, first:last]
-        even = piece.times is None
-        samples = piece.start + piece.spacing * np.arange(n) if even else piece.times[:-1]
+        times = piece.times
+        samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
         if t.size == n and np.abs(t - samples).max() <= slack:
             self._show(block.x, np.diff(block.x[: n + 1]) / block.h[:n], block.first, block.kept, rows)
             return
         number = np.clip(np.searchsorted(samples, t + slack, side="right") - 1, 0, n - 1)
-        length = np.broadcast_to(block.h, n)[number] if even else block.h[number]
+        length = np.broadcast_to(block.h[:n], n)[number]
         since = t - samples[number]
         since[np.abs(since) <= slack] = 0.0
         x, z = block.at(number, np.clip(since, 0.0, length), length, parts)
@@ -339,12 +339,12 @@ class LaneMarch(Following):
         for column, k in enumerate(form.system.k_shown.tolist()):
             show(k, form.system.shown[0, column], x, first, count, n, kept, out[column])
         if form.charge:
-            charges(form.lanes, form.rates, form.gain, x, slope, first, count, n, kept, out[-2], out[-1])
+            charges(form.lanes, x, slope, first, count, n, kept, out[-2], out[-1])
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
         count = t_out.size - self.outputs
         if count:
-            here, slope = (np.full(count, value) for value in self.at_end())
+            here, slope = np.full(count, self.u_last), np.full(count, self.slope_after)
             z = np.repeat(self.z[:, None, None], count, axis=2)
             self._show(here, slope, np.zeros(1, np.int64), z, out[:, self.outputs :])
         self.outputs = t_out.size
@@ -357,7 +357,7 @@ class LaneMarch(Following):
 
     def state(self) -> State:
         form, start = self.form, self.problem.inner
-        m = form.rates.size
+        m = form.lanes.rates.size
         u_gap = float(form.lanes.shape @ self.z[:m] + form.lanes.k * self.u_last)
         y = np.append(
             form.system.live[0] @ self.z[:m],
@@ -373,12 +373,12 @@ class LaneMarch(Following):
         missed, force = form.missed, float(form.force(np.array(peak)))
         floor = 4e-16 * (peak + form.lanes.k * max(u_peak, self.loudest)) + missed * peak
         u_error = SAFETY * float(errors[0]) + floor
-        f_error = SAFETY * float(errors[1]) + (2.0 * floor / (peak or 1.0) + missed) * force
+        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (peak or 1.0) + missed) * force
         node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + missed * peak
         charge_error = None
         if form.charge:
             stored = float(form.system.model.slow[-3]) * form.system.model.area0
-            charge_error = OF_CHARGE * SAFETY * float(errors[3]) + stored * missed * peak
+            charge_error = SAFETY * float(errors[3]) + stored * missed * peak
             charge_error += 4e-16 * stored * (u_peak + peak) * (1.0 + self.steps)
         return np.array([[peak, force, u_error, f_error]]), node_error, charge_error
 

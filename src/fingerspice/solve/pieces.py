@@ -19,9 +19,8 @@ from fingerspice.waveforms.samples import Samples
 LEAST_SAMPLES, PIECE = 64, 1 << 16
 # Fewest points of a PWL at uneven times for which its own steps pay, whose loop has to be compiled once.
 LEAST_POINTS = 1000
-# Longest step on a line between two points, over their median distance, and in time constants of the fastest leak that
-# depends on the area: beyond that the errors stated were too small in a fifth of the runs.
-LONGEST, SLOW_ENOUGH = 4.0, 4.0
+# Longest step on a line between two points, over their median distance.
+LONGEST = 4.0
 
 
 @dataclass(frozen=True)
@@ -61,18 +60,13 @@ class Piece:
 def driving(problem: Problem) -> Samples | PWL | None:
     """The recording that drives a stack, or one source of a network whose other sources are at 0; else None.
 
-    For a stack under `local` it may also be a PWL with many points, without jump in the run and without leaks that are
-    fast beside their distances.
+    For a stack under `local` it may also be a PWL with many points, without jump in the run.
     """
     if problem.scene.stack is not None:
         wave = problem.waveform
         samples = as_samples(wave)
         if samples is None and isinstance(wave, PWL) and wave.repeat is None and not problem.scene.net.mobile:
-            points, model = _points(problem, wave), problem.scene.model
-            if points is None or model is None:
-                return None
-            decays = np.diff(points).max() * float(model.rate0.max()) / model.area0
-            return wave if decays <= SLOW_ENOUGH else None
+            return None if _points(problem, wave) is None else wave
         return samples
     found = recording_of(problem)
     return None if found is None else found[1]

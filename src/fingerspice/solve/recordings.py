@@ -140,7 +140,7 @@ class March(Following):
         self.course = self.course._replace(form=self._form(self.spacing or self.usual))
 
     @property
-    def outputs(self) -> int:  # type: ignore[override]
+    def outputs(self) -> int:
         return int(self.course.counters[blockforms.OUTPUT])
 
     @outputs.setter
@@ -148,8 +148,7 @@ class March(Following):
         self.course.counters[blockforms.OUTPUT] = count
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
-        here, slope = self.at_end()
-        write_end(self.course, self.u_last, slope, read_only(t_out), out)
+        write_end(self.course, self.u_last, self.slope_after, read_only(t_out), out)
 
     def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
         return self.one.rows(self.problem, t, left, out)
@@ -201,7 +200,7 @@ def ready(problem: Problem, rtol: float) -> LaneForm | Follower | None:
 
 def march_of(problem: Problem, one: LaneForm | Follower, rtol: float, share: float = 1.0) -> Following:
     """A run that begins, with the scene as `ready` has prepared it."""
-    return (LaneMarch if isinstance(one, LaneForm) else March)(problem, one, rtol, share)  # type: ignore[arg-type]
+    return LaneMarch(problem, one, rtol, share) if isinstance(one, LaneForm) else March(problem, one, rtol, share)
 
 
 def _kept(problem: Problem, rtol: float) -> tuple[Any, ...]:
