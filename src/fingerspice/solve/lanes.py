@@ -17,6 +17,7 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.lanes import along, begin, busiest, charges, largest, show, span, within
+from fingerspice.engine.lanestep import NODES
 from fingerspice.results.outcome import State
 from fingerspice.solve.following import Following, Outcome
 from fingerspice.solve.laneform import LANES, LaneForm
@@ -69,7 +70,7 @@ class Block:
         self.room, self.scratch = form.room(self.own)
         self.still = form.weights(np.zeros(LANES if self.own else 1))
         self.kept = np.zeros((rows, LANES, self.count + 1))
-        self.sweeps, self.left = 0, np.zeros(self.m)
+        self.left = np.zeros(self.m)
 
     @cached_property
     def lengths(self) -> FloatArray:
@@ -107,7 +108,8 @@ class Block:
 
         The states at the samples go into `kept`.
         """
-        form, m = self.form, self.m
+        form, m, self.sweeps = self.form, self.m, 0
+        self.__dict__.pop("voltages", None)
         own = np.zeros((m, LANES))
         # A guess, for which uneven points may count as even ones.
         along(form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
@@ -226,7 +228,7 @@ class LaneMarch(Following):
         state = form.system.project[0] @ start.y[:-1]
         self.z = np.append(state, start.y[-1] - form.charge_at(state, start.u_gap)) if form.charge else state
         self.u_last = start.u_before
-        self.level, self.outputs, self.steps, self.refused, self.sweeps = 0, 0, 0, 0, 0
+        self.level, self.outputs, self.steps, self.refused, self.evaluated = 0, 0, 0, 0, 0
         # Errors of the states so far, as if they were alike, and products of two, as if they came by chance.
         self.alike, self.chance = np.zeros(rows), np.zeros((rows, rows))
         # Largest gap voltage (V) and errors seen of gap voltage (V), force (N), nodes (V) and charge (C).
@@ -240,8 +242,9 @@ class LaneMarch(Following):
             parts = PARTS[self.level]
             tol = OF_STARTS * self.rtol * self.scale
             excess = math.inf
-            if block.solve(self.z, parts, tol):
-                block.__dict__.pop("voltages", None)
+            solved = block.solve(self.z, parts, tol)
+            self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
+            if solved:
                 peak = float(largest(block.n + 1, block.voltages))
                 if not peak <= self.form.u_top:
                     return Outcome.LOST
@@ -256,7 +259,6 @@ class LaneMarch(Following):
         self.peak, self.errors = max(peak, self.peak), np.maximum(errors, self.errors)
         self.alike, self.chance = handed
         self.steps += parts * block.n
-        self.sweeps += block.sweeps
         self._write(piece, block, parts, t_out, out)
         self.z, self.t, self.u_last = block.end(), piece.stop, float(values[-1])
         if excess < COARSER and self.level > 0:
@@ -306,10 +308,8 @@ class LaneMarch(Following):
 
     def _excess(self, errors: FloatArray, peak: float) -> float:
         gaps, _, _ = self._stated(errors, peak)
-        gaps[0, 0], gaps[0, 1] = (
-            max(gaps[0, 0], self.least),
-            max(gaps[0, 1], float(self.form.force(np.array(self.least)))),
-        )
+        least = self.least, float(self.form.force(np.array(self.least)))
+        gaps[0, :2] = np.maximum(gaps[0, :2], least)
         return excess_of(gaps, self.problem.rounding) / self.rtol
 
     def _write(self, piece: Piece, block: Block, parts: int, t_out: FloatArray, out: FloatArray) -> None:
@@ -384,10 +384,10 @@ class LaneMarch(Following):
 
     @property
     def stats(self) -> tuple[int, int, int]:
-        return self.steps, self.refused, 3 * self.steps
+        return self.steps, self.refused, self.evaluated
 
     def mark(self) -> dict[str, Any]:
-        names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "sweeps", "peak")
+        names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak")
         arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors")}
         return {name: getattr(self, name) for name in names} | arrays
 
