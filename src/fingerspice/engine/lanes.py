@@ -9,7 +9,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lanestep import INNER, NODES, PER_MODE, area_rows, step
+from fingerspice.engine.lanestep import INNER, NODES, PER_MODE, SOURCES, polynomial_rows, step
 
 # Samples that are read and written at once.
 TILE = 16
@@ -93,7 +93,7 @@ def weigh(rates: FloatArray, gain: FloatArray, h: FloatArray, weights: FloatArra
 
 @jit
 def begin(marks: Any, c: Any, still: FloatArray, starts: FloatArray, source: FloatArray, state: FloatArray) -> None:
-    """Put the lanes at the modes `starts` (m, lanes) under a source (lanes,); the rider begins at 0.
+    """Put the lanes at the modes `starts` (m, lanes) under a source (lanes,).
 
     `still` are the weights of a step of length 0.
     """
@@ -102,7 +102,7 @@ def begin(marks: Any, c: Any, still: FloatArray, starts: FloatArray, source: Flo
     for i in range(lanes):
         state[2 * lanes + i] = source[i]
         for k in range(m):
-            state[(3 + k) * lanes + i] = starts[k, i]
+            state[(SOURCES + k) * lanes + i] = starts[k, i]
     step(marks, c, still.reshape(-1), state, source, 0.0, 1.0)
 
 
@@ -111,7 +111,7 @@ def span(
     marks: Any, c: Any, weights: FloatArray, h: FloatArray, x: FloatArray, first: IntArray, count: int, parts: int,
     tol: float, state: FloatArray, kept: FloatArray, left: FloatArray,
 ) -> bool:  # fmt: skip
-    """Advance the lanes by `count` samples, each in `parts` steps, and keep modes and rider at the samples.
+    """Advance the lanes by `count` samples, each in `parts` steps, and keep the modes at the samples.
 
     Parameters
     ----------
@@ -122,21 +122,20 @@ def span(
     x, first : ndarray, shape (n + 1,) and (lanes,)
         The source (V), and the sample of each lane's start.
     tol : float
-        Change (V) of the gap voltage against what is kept already, at which the lanes may stop; negative for none.
+        Change (V) of xi against what is kept already, at which the lanes may stop; negative for none.
     state : ndarray
         Of the lanes, see `begin`.
-    kept : ndarray, shape (m + rider, lanes, count + 1)
-
+    kept : ndarray, shape (m, lanes, count + 1)
     left : ndarray, shape (m,)
-        Largest changes of the modes where the lanes stop; left alone if they do not.
+        Largest changes of the active modes where the lanes stop; left alone if they do not.
 
     Returns
     -------
     bool
         Whether the lanes stopped.
     """
-    lanes, m, rows = len(marks.lanes), len(marks.modes), kept.shape[0]
-    after, found = np.empty(TILE * lanes), np.empty(TILE * rows * lanes)
+    lanes, m, active = len(marks.lanes), len(marks.modes), len(marks.active)
+    after, found = np.empty(TILE * lanes), np.empty(TILE * m * lanes)
     length, flat = np.empty(lanes), weights.reshape(-1)
     done = 0
     while done < count:
@@ -151,29 +150,29 @@ def span(
                 weigh(c.rates, c.gain, length, weights)
             for p in range(parts):
                 step(marks, c, flat, state, after[k * lanes :], p / parts, (p + 1) / parts)
-            for i in range(rows * lanes):
-                found[k * rows * lanes + i] = state[3 * lanes + i]
+            for i in range(m * lanes):
+                found[k * m * lanes + i] = state[SOURCES * lanes + i]
         off = 0.0
         for i in range(lanes):
             change = 0.0
-            for k in range(m):
-                change += abs(c.shape[k] * (state[(3 + k) * lanes + i] - kept[k, i, done + size]))
+            for k in range(active):
+                change += abs(c.shape[k] * (state[(SOURCES + k) * lanes + i] - kept[k, i, done + size]))
             off = max(off, change) if change == change else math.inf
         stops = off <= tol
         if stops:
-            for k in range(m):
+            for k in range(active):
                 left[k] = 0.0
                 for i in range(lanes):
-                    left[k] = max(left[k], abs(state[(3 + k) * lanes + i] - kept[k, i, done + size]))
-            for k in range(m, rows):
+                    left[k] = max(left[k], abs(state[(SOURCES + k) * lanes + i] - kept[k, i, done + size]))
+            for k in range(active, m):
                 for i in range(lanes):
-                    shift = state[(3 + k) * lanes + i] - kept[k, i, done + size]
+                    shift = state[(SOURCES + k) * lanes + i] - kept[k, i, done + size]
                     for j in range(done + size + 1, count + 1):
                         kept[k, i, j] += shift
-        for row in range(rows):
+        for row in range(m):
             for i in range(lanes):
                 for k in range(size):
-                    kept[row, i, done + 1 + k] = found[(k * rows + row) * lanes + i]
+                    kept[row, i, done + 1 + k] = found[(k * m + row) * lanes + i]
         done += size
         if stops:
             return True
@@ -236,45 +235,61 @@ def show(
 
 
 @jit
-def charges(
-    c: Any, x: FloatArray, slope: FloatArray, first: IntArray, count: int, n: int,
-    kept: FloatArray, charge: FloatArray, current: FloatArray,
+def bends(c: Any, n: int, xi: FloatArray, out: FloatArray) -> None:
+    """N (V m^2) at xi (n,)."""
+    x = np.empty(n)
+    for i in range(n):
+        x[i] = abs(xi[i]) * c.scale + c.shift
+    polynomial_rows(n, c.bend, x, out)
+    for i in range(n):
+        out[i] = out[i] if xi[i] >= 0.0 else -out[i]
+
+
+@jit
+def flow(
+    c: Any, k: float, columns: FloatArray, share: float, x: FloatArray, slope: FloatArray, first: IntArray, count: int,
+    n: int, kept: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Charge (C) and current (A), as `show`, from the source (V), its slope (V/s), and modes and rider."""
-    rates, gain, m, row = c.rates, c.gain, c.rates.size, np.empty(count)
+    """Rate of k x + columns z + share N at the samples, as `show`; `slope` (n,) is the source's, V/s."""
+    m, leaks, drives = c.rates.size, c.tap_s.size, c.feed.shape[1]
+    xi, power, q, bend = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    # Shares of source and drives in the rates of the quantity and of xi.
+    by_s, by_s_xi = 0.0, 0.0
+    by_g, by_g_xi = np.zeros(drives), np.zeros(drives)
+    for j in range(m):
+        by_s += columns[j] * c.gain[j]
+        by_s_xi += c.shape[j] * c.gain[j]
+        for t in range(drives):
+            by_g[t] += columns[j] * c.feed[j, t]
+            by_g_xi[t] += c.shape[j] * c.feed[j, t]
     for lane in range(first.size):
         size, at = min(count, n - first[lane]), first[lane]
         if size <= 0:
             break
-        z, q, p = kept[:, lane], current[at:], charge[at:]
-        project(size, c.k, x[at:], c.shape, z, row)
+        z, rate = kept[:, lane], out[at:]
+        project(size, c.k, x[at:], c.shape, z, xi)
         for i in range(size):
-            p[i] = row[i]
-            row[i] = abs(row[i]) * c.scale + c.shift
-        area_rows(size, c.moved, row, q)
-        for i in range(size):
-            p[i] = z[m, i] + (q[i] if p[i] >= 0.0 else -q[i])
-        area_rows(size, c.area, row, q)
+            power[i] = abs(xi[i]) * c.scale + c.shift
+        polynomial_rows(size, c.area, power, q)
+        bends(c, size, xi, bend)
         for i in range(size):
             s = x[at + i]
-            part, total, rise = c.by_source[0] * s, c.by_source[1] * s, c.k * slope[at + i]
-            for k in range(m):
-                part += c.by_modes[k] * z[k, i]
-                rate = gain[k] * s - rates[k] * z[k, i]
-                rise += c.shape[k] * rate
-                total += c.held[k] * rate
-                p[i] += c.held[k] * z[k, i]
-            for t in range(c.tap_s.size):
-                g = c.tap_s[t] * s
-                for k in range(m):
-                    g += c.taps[t, k] * z[k, i]
-                g *= q[i]
-                part += c.by_drives[0, t] * g
-                total += c.by_drives[1, t] * g
-                for k in range(m):
-                    rise += c.shape[k] * c.feed[k, t] * g
-                    total += c.held[k] * c.feed[k, t] * g
-            q[i] = total + (c.moved_by * rise - q[i] / c.q0 * part) / (c.q0 + q[i])
+            total, rise = by_s * s + k * slope[at + i], by_s_xi * s + c.k * slope[at + i]
+            for j in range(m):
+                total -= columns[j] * c.rates[j] * z[j, i]
+                rise -= c.shape[j] * c.rates[j] * z[j, i]
+            for t in range(drives):
+                g = bend[i]
+                if t < leaks:
+                    g = c.tap_s[t] * s + c.bent[t] * bend[i]
+                    for j in range(m):
+                        g += c.taps[t, j] * z[j, i]
+                    g *= q[i]
+                total += by_g[t] * g
+                rise += by_g_xi[t] * g
+            # N' = e / (1 + kappa e) by xi, where e = A - 1/q0.
+            e = -q[i] / (c.q0 * (c.q0 + q[i]))
+            rate[i] = total + share * e / (1.0 + c.kappa * e) * rise
 
 
 @jit
@@ -298,9 +313,8 @@ def within(
     marks: Any, c: Any, still: FloatArray, starts: FloatArray, x: FloatArray,
     to: FloatArray, h: FloatArray, parts: int, state: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Modes and rider (rows, n) after steps of lengths h (n,) from `starts` (rows, n), while the source goes from x to
-    `to`; each in `parts`."""
-    lanes, m, rows = len(marks.lanes), len(marks.modes), starts.shape[0]
+    """Modes (m, n) after steps of lengths h (n,) from `starts` (m, n), in `parts`; the source goes from x to `to`."""
+    lanes, m = len(marks.lanes), len(marks.modes)
     weights = np.empty((m * PER_MODE + 1, lanes))
     modes, before, after, length = np.empty((m, lanes)), np.empty(lanes), np.empty(lanes), np.empty(lanes)
     for first in range(0, h.size, lanes):
@@ -314,7 +328,5 @@ def within(
         for p in range(parts):
             step(marks, c, weights.reshape(-1), state, after, p / parts, (p + 1) / parts)
         for i in range(min(lanes, h.size - first)):
-            for k in range(rows):
-                out[k, first + i] = state[(3 + k) * lanes + i]
-            for k in range(m, rows):
-                out[k, first + i] += starts[k, first + i]
+            for k in range(m):
+                out[k, first + i] = state[(SOURCES + k) * lanes + i]

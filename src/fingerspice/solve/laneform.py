@@ -1,8 +1,9 @@
-"""Stacks under `local` prepared for steps in lanes (`engine.lanestep`): modes, drives, the charge, and outputs."""
+"""Circuits with one finger under `local`, prepared for steps in lanes (`engine.lanestep`): stacks."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import cast
@@ -11,16 +12,19 @@ import numpy as np
 from numpy.polynomial import chebyshev as series_of
 from numpy.polynomial.polynomial import polyder, polyval
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.circuit.statespace import Stack
 from fingerspice.engine.blockforms import MOST_DEGREE
-from fingerspice.engine.lanes import weigh
+from fingerspice.engine.lanes import bends, weigh
 from fingerspice.engine.lanestep import PER_MODE, Lanes, Marks, places
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import N_PACKED
+from fingerspice.results.outcome import State
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK
-from fingerspice.solve.track import system_of
+from fingerspice.solve.stackstate import StackState, from_stack
+from fingerspice.solve.track import as_recorded, system_of
 
 # Number of lanes, whose rows fill the processor's vectors, and in which a recording goes as so many pieces.
 LANES = 32
@@ -35,22 +39,48 @@ _ONE_REFERENCE = 1e12
 
 
 @dataclass(frozen=True)
-class LaneForm:
-    """A stack prepared for recordings, for all tolerances of one decade."""
+class Shown:
+    """Quantities k s + columns z + bends N."""
 
-    system: System
+    columns: FloatArray  # (C, m)
+    k: FloatArray  # (C,)
+    bends: FloatArray  # (C,)
+
+
+@dataclass(frozen=True)
+class LaneForm(ABC):
+    """A circuit prepared for recordings, for all tolerances of one decade."""
+
     lanes: Lanes
-    charge: bool
-    missed: float  # Relative error of the polynomial of 1/A
+    active: int  # Number of modes that are not passive
+    rows: Shown  # What is recorded: voltages, then charges
+    nodes: Shown
+    flows: int  # Number of charges, whose rates are recorded, too
+    stress: float  # Force per area and squared gap voltage, Pa/V^2
+    gain: float  # Largest gap voltage to expect for a peak of the source of 1, V/V or V/A
+    u_top: float  # Largest gap voltage that the polynomials cover, V
+    # missed, missed_bend: Errors of the polynomials: of 1/A, relative, and of N, V m^2
+    missed: float
+    missed_bend: float
+    held: float  # Capacitance of what stores the charges, F
+    source: int  # Number of the source that is not 0
 
-    @property
-    def u_top(self) -> float:
-        """Largest gap voltage that the polynomial covers, V."""
-        return self.system.u_top
+    @abstractmethod
+    def start(self, problem: Problem) -> FloatArray:
+        """The modes (m,) at the start of a run."""
+
+    @abstractmethod
+    def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
+        """The state at modes z (m,) and `t` (s), where the source has the value `u_last`."""
+
+    @abstractmethod
+    def recorded(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
+        """Outputs at times `t` (s), rows of voltages, charges and their rates, as rows of a record."""
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
-        return _marks(self.lanes.rates.size, self.lanes.tap_s.size, self.charge, own)
+        leaks = self.lanes.tap_s.size
+        return _marks(self.lanes.rates.size, self.active, leaks, self.lanes.feed.shape[1] - leaks, own)
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
@@ -63,25 +93,62 @@ class LaneForm:
         weigh(self.lanes.rates, self.lanes.gain, h, out)
         return out
 
-    def inverse_area(self, u: FloatArray) -> FloatArray:
-        """1/A at gap voltages (V), 1/m^2."""
+    def inverse_area(self, xi: FloatArray) -> FloatArray:
+        """1/A, 1/m^2."""
         c = self.lanes
-        return np.asarray(c.q0 + polyval(np.abs(u) * c.scale + c.shift, c.area))
+        return np.asarray(c.q0 + polyval(np.abs(xi) * c.scale + c.shift, c.area))
 
-    def force(self, u: FloatArray) -> FloatArray:
-        """Force (N) at gap voltages (V)."""
-        return np.asarray(self.system.stress * u * u / self.inverse_area(u))
+    def bend(self, xi: FloatArray) -> FloatArray:
+        """N, V m^2."""
+        flat, out = np.ravel(xi), np.empty(np.size(xi))
+        bends(self.lanes, flat.size, flat, out)
+        return out.reshape(np.shape(xi))
 
-    def charge_at(self, z: FloatArray, u: float) -> float:
-        """The charge (C) besides the rider, at modes z (m,) and a gap voltage u (V)."""
-        c = self.lanes
-        return float(c.held @ z) + math.copysign(float(polyval(abs(u) * c.scale + c.shift, c.moved)), u)
+    def gap(self, xi: FloatArray) -> FloatArray:
+        """Gap voltages, V."""
+        return np.asarray(xi - self.lanes.kappa * self.bend(xi)) if self.lanes.kappa > 0.0 else xi
+
+    def force(self, xi: FloatArray) -> FloatArray:
+        """Force, N."""
+        u = self.gap(xi)
+        return np.asarray(self.stress * u * u / self.inverse_area(xi))
+
+    def xi(self, z: FloatArray, source: float) -> float:
+        """xi (V) at modes z (m,)."""
+        return float(self.lanes.shape @ z + self.lanes.k * source)
 
 
 @lru_cache(maxsize=64)
-def _marks(modes: int, drives: int, rider: bool, own: bool) -> Marks:
-    sizes = (modes, drives, int(rider), LANES, int(own))
-    return Marks(*((0,) * size for size in sizes))
+def _marks(modes: int, active: int, leaks: int, bend: int, own: bool) -> Marks:
+    return Marks(*((0,) * size for size in (modes, active, leaks, bend, LANES, int(own))))
+
+
+@dataclass(frozen=True)
+class StackForm(LaneForm):
+    """A stack prepared for recordings; the charge is its last mode, where it is wanted."""
+
+    system: System
+
+    def _rest(self, z: FloatArray, u_gap: float) -> float:
+        """The charge (C) but for its mode, without what is held at the source's own share."""
+        charge = self.rows.columns[-1, : self.active] @ z[: self.active]
+        return float(charge + self.rows.bends[-1] * self.bend(np.array([u_gap]))[0])
+
+    def start(self, problem: Problem) -> FloatArray:
+        start = problem.inner
+        z = self.system.project[0] @ start.y[:-1]
+        if not self.flows:
+            return np.asarray(z)
+        return np.append(z, start.y[-1] - self._rest(z, start.u_gap) - self.rows.k[-1] * start.u_before)
+
+    def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
+        start, n, u_gap = problem.inner, self.active, self.xi(z, u_last)
+        charge = z[n] + self._rest(z, u_gap) + self.rows.k[-1] * u_last if self.flows else start.y[-1]
+        y = np.append(self.system.live[0] @ z[:n], charge)
+        return from_stack(problem.scene, StackState(t, y, u_last, u_gap, start.offset))
+
+    def recorded(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
+        return as_recorded(problem, self.system.model, out[:, : t.size].T, np.empty(0))
 
 
 def rounded_peak(peak: float) -> float:
@@ -89,21 +156,79 @@ def rounded_peak(peak: float) -> float:
     return 2.0 ** (math.ceil(4.0 * math.log2(peak)) / 4.0) if peak > 0.0 else 0.0
 
 
-def prepared(problem: Problem, rtol: float) -> LaneForm | None:
-    """The scene prepared for recordings with about its peak; None where no polynomial represents 1/A well enough."""
+def stack(problem: Problem, rtol: float) -> StackForm | None:
+    """The stack prepared for recordings with about its peak; None where no polynomial represents 1/A well enough."""
     scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
     peak = rounded_peak(scene.u_peak)
     system = system_of(scene, decade, BEYOND_PEAK * peak, _ONE_REFERENCE, peak)
     found = area_powers(system, AREA_SHARE * rtol)
-    if found is None:
+    assert scene.stack is not None
+    if found is None or scene.stack.gap is None or scene.stack.g_area[scene.stack.gap] > 0.0:
         return None
     area, missed = found
-    at_rest, q0 = -system.lo * system.scale - 1.0, float(system.q0[0])
-    q_rest = float(polyval(at_rest, area))
-    kink = float(polyval(at_rest, polyder(area))) * system.scale
+    model, shift, q0 = system.model, -system.lo * system.scale - 1.0, float(system.q0[0])
     area[0] -= q0
-    c = _constants(system, area, at_rest, kink, -kink / q_rest**2)
-    return LaneForm(system, c, problem.charge, missed)
+    kink = float(polyval(shift, polyder(area))) * system.scale
+    rates, gain, feed, taps, shape = system.rates[0], system.gain[0], system.feed[0], system.tap[0], system.gap[0]
+    n, flows = rates.size, int(problem.charge)
+    columns, k, bent = system.shown[0], system.k_shown, np.zeros(system.k_shown.size)
+    if flows:
+        column, stored, gain_of, feed_of, moved = _charge(system, scene.stack)
+        rates, gain, feed = np.append(rates, 0.0), np.append(gain, gain_of), np.vstack([feed, feed_of])
+        columns = np.vstack([_wider(columns), np.append(column, 1.0)])
+        k, bent = np.append(k, stored), np.append(bent, moved)
+        taps, shape = _wider(taps), np.append(shape, 0.0)
+    nodes = system.node[0]
+    lanes = Lanes(
+        np.ascontiguousarray(rates), np.ascontiguousarray(gain), np.ascontiguousarray(shape), float(model.k_gap),
+        np.ascontiguousarray(taps), np.ascontiguousarray(system.tap_k), np.zeros(system.tap_k.size),
+        np.ascontiguousarray(feed), area, _bend(system, area), float(system.scale), float(shift), q0,
+        0.0, np.full(system.tap_k.size, kink),
+    )  # fmt: skip
+    return StackForm(
+        lanes, n, Shown(columns, k, bent), Shown(_wider(nodes) if flows else nodes, system.k_node, 0.0 * system.k_node),
+        flows, system.stress, float(model.k_gap), system.u_top, missed, missed * system.u_top / q0,
+        float(model.slow[-3]) * model.area0, 0, system,
+    )  # fmt: skip
+
+
+def _wider(rows: FloatArray) -> FloatArray:
+    """Rows (n, m) with a column of zeros behind them."""
+    return np.hstack([rows, np.zeros((len(rows), 1))])
+
+
+def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:
+    """The charge as columns z + k s + y + moved N, y' = gain s + feed g; these five.
+
+    Through the slowest layer, i = A0 (c v' + g v) + G v + j, where v = share s + own z is its voltage, and j the current
+    that follows from the change of the area (`solve.netmodal`): c_gap N' + A0 (q - q0) (G v - G_gap u).
+    """
+    model, area0 = system.model, 1.0 / float(system.q0[0])
+    rates, own = system.rates[0], system.slow[0]
+    share, c, g_area, g_total = cast("list[float]", model.slow[rates.size :].tolist())
+    leak = (g_area * area0 + g_total) * own
+    over = np.divide(leak, rates, out=np.zeros_like(leak), where=rates > 0.0)
+    order = np.array(stack.state_order)
+    leaking = order[stack.g_total[order] > 0.0]
+    slow = int(np.argmin(stack.leak_rates(model.area0)))
+    turned = (leaking == slow).astype(float) - (leaking == stack.gap)
+    gain = (g_area * area0 + g_total) * share + float(over @ system.gain[0])
+    feed = over @ system.feed[0] + area0 * stack.g_total[leaking] * turned
+    return area0 * c * own - over, area0 * c * share, gain, feed, float(stack.c[stack.gap])
+
+
+def _bend(system: System, area: FloatArray) -> FloatArray:
+    """N as a polynomial in the variable of `area`, which is 1/A - q0."""
+    q0 = float(system.q0[0])
+    q = polyval(_NODES, area)
+    series = _INTEGRAL @ (-q / (q0 * (q0 + q))) / system.scale
+    kept = series[: np.flatnonzero(np.abs(series) > 1e-16 * np.abs(series).max())[-1] + 1]
+    # A number of terms that the compiled evaluation takes.
+    kept = np.append(kept, np.zeros(-(kept.size - 1) % 4))
+    powers = np.empty(kept.size)
+    chebyshev.to_powers(kept, powers)
+    powers[0] -= polyval(-system.lo * system.scale - 1.0, powers)
+    return powers
 
 
 def area_powers(system: System, tol: float) -> tuple[FloatArray, float] | None:
@@ -123,36 +248,3 @@ def area_powers(system: System, tol: float) -> tuple[FloatArray, float] | None:
             chebyshev.to_powers(kept, out)
             return out, missed
     return None
-
-
-def _constants(system: System, area: FloatArray, shift: float, kink: float, area_kink: float) -> Lanes:
-    model, rates, gain, feed, own = system.model, system.rates[0], system.gain[0], system.feed[0], system.slow[0]
-    share, c, g_area, g_total = cast("list[float]", model.slow[rates.size :].tolist())
-    # i = A (c v' + g_area v) + g_total v, where v = share s + own z is the slowest layer's voltage (`engine.model`), of
-    # which v - (share / k) u does not depend on the source's slope.
-    ratio = share / model.k_gap
-    rest = c * (own - ratio * system.gap[0])
-    by_modes, leak = g_area * own - rest * rates, g_total * own
-    held = np.where(rates > 0.0, -(by_modes / system.q0[0] + leak) / np.where(rates > 0.0, rates, 1.0), 0.0)
-    by_source = np.array([g_area * share + rest @ gain, 0.0])
-    by_source[1] = by_source[0] / system.q0[0] + g_total * share - held @ gain
-    by_drives = np.array([rest @ feed, rest @ feed / system.q0[0] - held @ feed])
-    shape, taps, tap_s, feed = map(np.ascontiguousarray, (system.gap[0], system.tap[0], system.tap_k, feed))
-    return Lanes(
-        rates, gain, shape, float(model.k_gap), taps, tap_s, feed, area, float(system.scale), shift,
-        float(system.q0[0]), kink, by_modes, by_source, by_drives, held, area_kink,
-        _moved(system, area, shift, c * ratio), c * ratio,
-    )  # fmt: skip
-
-
-def _moved(system: System, area: FloatArray, at_rest: float, by: float) -> FloatArray:
-    """`by` times the integral of A over the gap voltage: a polynomial in the variable of 1/A - q0, 0 at 0 V."""
-    q = polyval(_NODES, area) + system.q0[0]
-    series = by / system.scale * (_INTEGRAL @ (1.0 / q))
-    kept = series[: np.flatnonzero(np.abs(series) > 1e-16 * np.abs(series).max())[-1] + 1]
-    # A number of terms that the compiled evaluation takes.
-    kept = np.append(kept, np.zeros(-(kept.size - 1) % 4))
-    powers = np.empty(kept.size)
-    chebyshev.to_powers(kept, powers)
-    powers[0] -= polyval(at_rest, powers)
-    return powers

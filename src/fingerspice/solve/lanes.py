@@ -1,6 +1,6 @@
-"""Recordings of stacks under `local`: a block of samples as pieces in lanes, with stated errors.
+"""Recordings of one finger under `local`: a block of samples as pieces in lanes, with stated errors.
 
-All pieces of a block are followed at once (`engine.lanes`). Their starts are first those of the stack with its area
+All pieces of a block are followed at once (`engine.lanes`). Their starts are first those of the circuit with its area
 held; after each sweep they are corrected by what the modes decay by in a piece, until the gap voltage no longer
 changes. Then a window of each piece, where the source moves most, is followed by steps half as long. The difference is
 the error of the window; a piece adds as much more as it is longer, and hands it on to the pieces after it, as the modes
@@ -10,25 +10,26 @@ decay: once as if all errors were alike, and once as if they came by chance.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.engine.lanes import along, begin, busiest, charges, largest, show, span, within
+from fingerspice.engine.lanes import along, begin, busiest, flow, largest, show, span, within
 from fingerspice.engine.lanestep import NODES
-from fingerspice.results.outcome import State
-from fingerspice.solve.following import Following, Outcome
-from fingerspice.solve.laneform import LANES, LaneForm
+from fingerspice.results.outcome import State, Status
+from fingerspice.solve.following import LED_SHARE, Following, Outcome
+from fingerspice.solve.laneform import LANES, LaneForm, Shown
+from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.pieces import Piece
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import excess_of
-from fingerspice.solve.stackstate import StackState, from_stack
 
 # Steps of a sample, by level.
 PARTS = (1, 2, 4, 8, 16, 32, 64)
-# Stated over seen errors of voltages and charge, and of the force.
+# Stated over seen errors of voltages and charges, and of the force.
 SAFETY, OF_FORCE = 2.0, 1.5
 # Changes of starts that may be left, over the error asked for.
 OF_STARTS = 0.05
@@ -40,6 +41,7 @@ COARSER, FINER = 1.0 / 60.0, 5.0
 LUCK = 2.0
 # The rate that stands for 0, 1/s.
 _STILL = 1e-9
+_ONE_ROW = np.zeros(1, np.int64)
 
 
 class Block:
@@ -49,7 +51,7 @@ class Block:
     ----------
     form : LaneForm
     x : ndarray, shape (n + 1,)
-        The source at the samples, V.
+        The source at the samples.
     h : ndarray, shape (n,) or (1,)
         Distances of the samples, or their common distance, s.
     starts_run : bool
@@ -64,13 +66,12 @@ class Block:
         self.x = np.concatenate([x, np.full(beyond, x[-1])]) if beyond else x
         self.h = np.concatenate([h, np.zeros(beyond)]) if self.own and beyond else h
         self.first = self.count * np.arange(LANES)
-        self.starts_run, self.marks = starts_run, form.marks(self.own)
-        self.m, rows = form.lanes.rates.size, form.lanes.rates.size + int(form.charge)
-        self.rates = np.append(form.lanes.rates, np.full(rows - self.m, _STILL))
+        self.starts_run, self.marks, self.active = starts_run, form.marks(self.own), form.active
+        self.rates = np.maximum(form.lanes.rates, _STILL)
         self.room, self.scratch = form.room(self.own)
         self.still = form.weights(np.zeros(LANES if self.own else 1))
-        self.kept = np.zeros((rows, LANES, self.count + 1))
-        self.left = np.zeros(self.m)
+        self.kept = np.zeros((self.rates.size, LANES, self.count + 1))
+        self.left = np.zeros(self.rates.size)
 
     @cached_property
     def lengths(self) -> FloatArray:
@@ -83,71 +84,70 @@ class Block:
     def handed(self) -> FloatArray:
         """What is left at the start of each piece of the modes at the start of the block and the ends of the pieces.
 
-        Shape (rows, LANES, 1 + LANES).
+        Shape (m, LANES, 1 + LANES).
         """
         ends = np.concatenate([[0.0], np.cumsum(self.lengths)])
         since = ends[:LANES, None] - ends[None, :]
         left = np.exp(-self.rates[:, None, None] * np.maximum(since, 0.0))
         return np.asarray(np.where(np.tri(LANES, 1 + LANES, dtype=bool), left, 0.0))
 
-    def weights(self, parts: int) -> FloatArray:
+    def _weights(self, parts: int) -> FloatArray:
         return self.scratch if self.own else self.form.weights(self.h / parts)
 
     def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
-        form = self.form
         return bool(span(
-            self.marks, form.lanes, self.weights(parts), self.h, self.x, first, count, parts,
-            tol, self.room, kept, self.left,
+            self.marks, self.form.lanes, self._weights(parts), self.h, self.x, first, count, parts, tol, self.room,
+            kept, self.left,
         ))  # fmt: skip
 
     def _begin(self, starts: FloatArray, first: IntArray) -> None:
         begin(self.marks, self.form.lanes, self.still, np.ascontiguousarray(starts), self.x[first], self.room)
 
     def solve(self, start: FloatArray, parts: int, tol: float) -> bool:
-        """Follow all pieces from `start` (rows,), until the gap voltage is known to `tol` (V); False where it is not.
+        """Follow all pieces from `start` (m,), until xi is known to `tol` (V); False where it is not.
 
         The states at the samples go into `kept`.
         """
-        form, m, self.sweeps = self.form, self.m, 0
-        self.__dict__.pop("voltages", None)
-        own = np.zeros((m, LANES))
+        form, active, self.sweeps = self.form, self.active, 0
+        self.__dict__.pop("xi", None)
+        own = np.zeros_like(self.kept[:, :, 0])
         # A guess, for which uneven points may count as even ones.
         along(form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
-        handed = self.handed[:m]
-        starts = np.einsum("kij,kj->ki", handed, np.concatenate([start[:m, None], own], axis=1))
+        starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[:, None], own], axis=1))
+        starts[active:] = 0.0
         for sweep in range(LANES + 1):
             self._begin(starts, self.first)
-            self.kept[:m, :, 0], self.kept[m:, :, 0] = starts, 0.0
+            self.kept[:, :, 0] = starts
             stops = self._span(self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
             self.sweeps += 1
             if stops:
                 break
-            off = self.kept[:m, :, -1] - np.roll(starts, -1, axis=1)
+            off = self.kept[:active, :, -1] - np.roll(starts[:active], -1, axis=1)
             off[:, -1] = 0.0
-            change = np.einsum("kij,kj->ki", handed[..., 1:], off)
-            self.left = np.abs(change).max(axis=1)
-            largest = float(np.abs(form.lanes.shape) @ self.left)
-            if not largest < math.inf:
+            change = np.einsum("kij,kj->ki", self.handed[:active, :, 1:], off)
+            self.left[:active] = np.abs(change).max(axis=1)
+            most = float(np.abs(form.lanes.shape) @ self.left)
+            if not most < math.inf:
                 return False
-            if largest <= tol:
+            if most <= tol:
                 break
-            starts += change
+            starts[:active] += change
         else:
             return False
-        if form.charge:
-            ends = self.kept[m, :, -1]
-            self.kept[m] += (start[m] + np.concatenate([[0.0], np.cumsum(ends)[:-1]]))[:, None]
+        # Passive modes have begun at 0 in every piece.
+        ends = np.cumsum(self.kept[active:, :, -1], axis=1)
+        self.kept[active:] += (start[active:, None] + np.pad(ends, ((0, 0), (1, 0)))[:, :-1])[:, :, None]
         return True
 
     @cached_property
-    def voltages(self) -> FloatArray:
-        """Gap voltages (V) at the samples, shape (n + 1,), after `solve`."""
+    def xi(self) -> FloatArray:
+        """xi (V) at the samples, shape (n + 1,), after `solve`."""
         c, out = self.form.lanes, np.empty(self.n + 1)
         show(c.k, c.shape, self.x, self.first, self.count, self.n + 1, self.kept, out)
         return out
 
     def end(self) -> FloatArray:
-        """The state (rows,) at the last sample."""
+        """The state (m,) at the last sample."""
         lane = (self.n - 1) // self.count
         return np.array(self.kept[:, lane, self.n - lane * self.count])
 
@@ -156,13 +156,13 @@ class Block:
 
         Returns
         -------
-        off : ndarray, shape (rows, LANES, width + 1)
+        off : ndarray, shape (m, LANES, width + 1)
             Differences of the states, 0 in pieces that are not checked.
-        u : ndarray, shape (LANES, width + 1)
-            Gap voltages, V.
-        share : ndarray, shape (rows, LANES)
+        xi : ndarray, shape (LANES, width + 1)
+            V.
+        share : ndarray, shape (m, LANES)
             What a piece adds over what its window does, if all errors are alike.
-        share_of_products : ndarray, shape (rows, rows, LANES)
+        share_of_products : ndarray, shape (m, m, LANES)
             The same of products of two errors, if they come by chance.
         """
         width, place = min(self.count, max(FEWEST, round(self.count * WINDOW))), np.empty(LANES, np.int64)
@@ -174,11 +174,10 @@ class Block:
         coarse = self.kept[:, np.arange(LANES)[:, None], index]
         fine = np.zeros_like(coarse)
         fine[:, :, 0] = coarse[:, :, 0]
-        self._begin(coarse[: self.m, :, 0], self.first + at)
+        self._begin(fine[:, :, 0], self.first + at)
         self._span(self.first + at, width, 2 * parts, -1.0, fine)
-        fine[self.m :, :, 1:] += coarse[self.m :, :, :1]
         off = np.where(seen[:, None], fine - coarse, 0.0)
-        u = self.voltages[np.minimum(self.first[:, None] + index, self.n)]
+        xi = self.xi[np.minimum(self.first[:, None] + index, self.n)]
         took = np.full(LANES, width * self.h[0])
         if self.own:
             took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
@@ -186,12 +185,12 @@ class Block:
         share, of_products = (
             np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
         )
-        return off, u, share, of_products
+        return off, xi, share, of_products
 
     def hand_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
         """Errors at the start of each piece, and at the end of the block, shape (*kinds, LANES + 1).
 
-        Pieces add `added` (*kinds, LANES), and `before` (*kinds,) is there at the start. Of one error for each row, or
+        Pieces add `added` (*kinds, LANES), and `before` (*kinds,) is there at the start. Of one error for each mode, or
         of the products of two.
         """
         handed, lane = self.handed, (self.n - 1) // self.count
@@ -202,51 +201,45 @@ class Block:
         return np.append(at_starts, (left * at_starts[..., lane] + added[..., lane])[..., None], axis=-1)
 
     def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
-        """Source (V; n,) and states (rows, n) `since` (s) after samples of these numbers, whose steps are `length`."""
+        """Source (n,) and modes (m, n) `since` (s) after samples of these numbers, whose steps are `length` (s)."""
         lane = number // self.count
         z = np.ascontiguousarray(self.kept[:, lane, number - lane * self.count])
         x = self.x[number]
         if not since.any():
             return x, z
-        to, out = x + (self.x[number + 1] - x) * (since / length), np.empty_like(z)
-        form, marks = self.form, self.form.marks(True)
-        room, _ = form.room(True)
-        still = form.weights(np.zeros(LANES))
-        within(marks, form.lanes, still, z, x, to, since, parts, room, out)
+        to, out, form = x + (self.x[number + 1] - x) * (since / length), np.empty_like(z), self.form
+        still, (room, _) = form.weights(np.zeros(LANES)), form.room(True)
+        within(form.marks(True), form.lanes, still, z, x, to, since, parts, room, out)
         return to, out
 
 
 class LaneMarch(Following):
-    """A recording of a stack in progress, block by block."""
+    """A recording of one finger under `local` in progress, block by block."""
 
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
-        start, rows = problem.inner, form.lanes.rates.size + int(form.charge)
-        super().__init__(
-            problem, rtol, share, float(form.system.model.k_gap), form.system.k_shown.size + 2 * form.charge
-        )
-        self.form = form
-        state = form.system.project[0] @ start.y[:-1]
-        self.z = np.append(state, start.y[-1] - form.charge_at(state, start.u_gap)) if form.charge else state
-        self.u_last = start.u_before
+        super().__init__(problem, rtol, share, form.gain, form.rows.k.size + form.flows)
+        self.form, self.z, m = form, form.start(problem), form.lanes.rates.size
+        self.u_last = float(problem.initial.s_before[form.source])
         self.level, self.outputs, self.steps, self.refused, self.evaluated = 0, 0, 0, 0, 0
-        # Errors of the states so far, as if they were alike, and products of two, as if they came by chance.
-        self.alike, self.chance = np.zeros(rows), np.zeros((rows, rows))
-        # Largest gap voltage (V) and errors seen of gap voltage (V), force (N), nodes (V) and charge (C).
-        self.peak, self.errors = 0.0, np.zeros(4)
+        # Errors of the modes so far, as if they were alike, and products of two, as if they came by chance.
+        self.alike, self.chance = np.zeros(m), np.zeros((m, m))
+        # Largest xi (V), and errors seen of gap voltage (V), force (N), nodes (V) and charges (C); errors that are
+        # stated of the piece that the ordinary engine has integrated.
+        self.peak, self.errors, self.led = 0.0, np.zeros(4), np.zeros(4)
 
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
-        h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
         self.heard(values)
+        if piece.led:
+            return self._lead(piece, values, t_out, out)
+        h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
         block = Block(self.form, values, h, self.t == self.problem.t_start)
         while True:
-            parts = PARTS[self.level]
-            tol = OF_STARTS * self.rtol * self.scale
-            excess = math.inf
-            solved = block.solve(self.z, parts, tol)
+            parts, excess = PARTS[self.level], math.inf
+            solved = block.solve(self.z, parts, OF_STARTS * self.rtol * self.scale)
             self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
             if solved:
-                peak = float(largest(block.n + 1, block.voltages))
-                if not peak <= self.form.u_top:
+                peak = float(largest(block.n + 1, block.xi))
+                if not self.form.gap(np.array(peak)) <= self.form.u_top:
                     return Outcome.LOST
                 excess, errors, handed = self._judge(block, parts, max(peak, self.peak))
             if excess <= 1.0:
@@ -265,10 +258,27 @@ class LaneMarch(Following):
             self.level -= 1
         return Outcome.MET
 
+    def _lead(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
+        """Integrate a piece by the ordinary engine, and take over its state."""
+        count = int(np.searchsorted(t_out, piece.stop - 1e-9 * piece.spacing))
+        problem = replace(self.problem, t_start=piece.start, t_stop=piece.stop, first=piece.start)
+        run = solve_ordinary(
+            problem, LED_SHARE * self.rtol, t_out[:count], np.zeros(count, bool), repeat=False
+        )  # fmt: skip
+        if run.status is not Status.SUCCESS:
+            return Outcome.LOST
+        out[:, :count] = run.rows.T[: self.width]
+        self.outputs, self.t, self.u_last = count, piece.stop, float(values[-1])
+        self.z = self.form.start(replace(self.problem, initial=run.state))
+        self.peak = abs(self.form.xi(self.z, self.u_last))
+        error = run.error
+        self.led = np.array([error.u_gap, error.f_el, error.v_nodes or 0.0, error.q_source or 0.0])
+        return Outcome.MET
+
     def _judge(self, block: Block, parts: int, peak: float) -> tuple[float, FloatArray, tuple[FloatArray, FloatArray]]:
         """Excess of the stated over the allowed error, the errors seen so far, and those that the block hands on."""
-        form, m = self.form, block.m
-        off, u, share, of_products = block.check(parts)
+        form, active = self.form, block.active
+        off, xi, share, of_products = block.check(parts)
         own = off[:, :, -1]
         products = own[:, None] * own
         alike, chance = block.hand_on(own * share, self.alike), block.hand_on(products * of_products, self.chance)
@@ -278,31 +288,28 @@ class LaneMarch(Following):
 
         def added(columns: FloatArray) -> float:
             """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
-            n = columns.size
-            lucky = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there[:n, :n]), 0.0))
-            more = np.maximum(lucky, np.abs(columns @ alike_there[:n]) - LUCK * lucky)
-            return float(more.max() + np.abs(columns[:m]) @ block.left / SAFETY)
+            lucky = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there), 0.0))
+            more = np.maximum(lucky, np.abs(columns @ alike_there) - LUCK * lucky)
+            return float(more.max() + np.abs(columns[:active]) @ block.left[:active] / SAFETY)
 
-        def seen(columns: FloatArray) -> FloatArray:
-            return np.asarray(np.einsum("k,kij->ij", columns, off[: columns.size]))
-
-        c = form.lanes
-        du, over, errors = seen(c.shape), added(c.shape), np.zeros(4)
-        force = form.force(np.array([peak, 1.001 * peak]))
-        steep = float(force[1] - force[0]) / (1e-3 * peak) if peak > 0.0 else 0.0
-        errors[0] = np.abs(du).max() + over
-        errors[1] = np.abs(form.force(u + du) - form.force(u)).max() + steep * over
-        for columns in form.system.node[0]:
-            errors[2] = max(errors[2], np.abs(seen(columns)).max() + added(columns))
-        if form.charge:
-            area = 1.0 / form.inverse_area(u)
-            charge = np.append(c.held, 1.0)
-            errors[3] = np.abs(seen(charge) + c.moved_by * area * du).max()
-            charge[:m] += c.moved_by / c.q0 * c.shape
-            errors[3] += added(charge) + c.moved_by * np.abs(area - 1.0 / c.q0).max() * over
+        c, errors = form.lanes, np.zeros(4)
+        dxi = np.einsum("k,kij->ij", c.shape, off)
+        over, dn = added(c.shape), form.bend(xi + dxi) - form.bend(xi)
+        near = np.array([peak, 1.001 * peak])
+        step = 1e-3 * peak or 1.0
+        errors[0] = np.abs(dxi - c.kappa * dn).max() + abs(float(np.diff(form.gap(near))[0])) / step * over
+        errors[1] = np.abs(form.force(xi + dxi) - form.force(xi)).max()
+        errors[1] += abs(float(np.diff(form.force(near))[0])) / step * over
+        # N changes most at the largest voltage, where the area is farthest from the reference, or at rest.
+        bent = max(abs(1.0 / float(form.inverse_area(np.array(at))) - 1.0 / c.q0) for at in (0.0, peak)) * over
+        charges = Shown(form.rows.columns[-form.flows :], form.rows.k, form.rows.bends[-form.flows :])
+        for i, shown in enumerate((form.nodes, charges) if form.flows else (form.nodes,)):
+            for columns, bend in zip(shown.columns, shown.bends, strict=True):
+                seen = float(np.abs(np.einsum("k,kij->ij", columns, off) + bend * dn).max())
+                errors[2 + i] = max(errors[2 + i], seen + added(columns) + abs(bend) * bent)
         excess = self._excess(np.maximum(errors, self.errors), peak)
         if self.share < 1.0:
-            alone = np.abs(du).max() + np.abs(c.shape @ (own * (share - 1.0))[:m]).max()
+            alone = np.abs(dxi).max() + np.abs(c.shape @ (own * (share - 1.0))).max()
             excess = max(excess, SAFETY * alone / (self.share * self.rtol * max(peak, self.least)))
         return excess, errors, (alike[:, LANES], chance[..., LANES])
 
@@ -330,57 +337,55 @@ class LaneMarch(Following):
         since = t - samples[number]
         since[np.abs(since) <= slack] = 0.0
         x, z = block.at(number, np.clip(since, 0.0, length), length, parts)
-        self._show(x, (block.x[number + 1] - block.x[number]) / length, np.zeros(1, np.int64), z[:, None], rows)
+        self._show(x, (block.x[number + 1] - block.x[number]) / length, _ONE_ROW, z[:, None], rows)
 
     def _show(self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, out: FloatArray) -> None:
-        """Write outputs into the columns of `out`: from the source (V), its slope (V/s), and states as in `Block`."""
-        form, n = self.form, out.shape[1]
-        count = n if first.size == 1 else int(first[1])
-        for column, k in enumerate(form.system.k_shown.tolist()):
-            show(k, form.system.shown[0, column], x, first, count, n, kept, out[column])
-        if form.charge:
-            charges(form.lanes, x, slope, first, count, n, kept, out[-2], out[-1])
+        """Write outputs into the columns of `out`: from the source, its slope (1/s), and modes as in `Block`."""
+        form, c, n = self.form, self.form.lanes, out.shape[1]
+        count, shown, bend = n if first.size == 1 else int(first[1]), form.rows, np.zeros(0)
+        if shown.bends.any():
+            xi = np.empty(n)
+            show(c.k, c.shape, x, first, count, n, kept, xi)
+            bend = form.bend(xi)
+        for i, k in enumerate(shown.k.tolist()):
+            show(k, shown.columns[i], x, first, count, n, kept, out[i])
+            if shown.bends[i] != 0.0:
+                out[i] += shown.bends[i] * bend
+        for i in range(shown.k.size - form.flows, shown.k.size):
+            rate = out[i + form.flows]
+            flow(c, shown.k[i], shown.columns[i], shown.bends[i], x, slope, first, count, n, kept, rate)
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
         count = t_out.size - self.outputs
         if count:
             here, slope = np.full(count, self.u_last), np.full(count, self.slope_after)
             z = np.repeat(self.z[:, None, None], count, axis=2)
-            self._show(here, slope, np.zeros(1, np.int64), z, out[:, self.outputs :])
+            self._show(here, slope, _ONE_ROW, z, out[:, self.outputs :])
         self.outputs = t_out.size
 
     def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
-        rows, turn = out[:, : t.size].T, self.problem.scene.shown.turn
-        if self.problem.scene.shown.is_turned:
-            rows[:, : turn.size] *= turn
-        return rows
+        return self.form.recorded(self.problem, t, left, out)
 
     def state(self) -> State:
-        form, start = self.form, self.problem.inner
-        m = form.lanes.rates.size
-        u_gap = float(form.lanes.shape @ self.z[:m] + form.lanes.k * self.u_last)
-        y = np.append(
-            form.system.live[0] @ self.z[:m],
-            self.z[m] + form.charge_at(self.z[:m], u_gap) if form.charge else start.y[-1],
-        )
-        return from_stack(self.problem.scene, StackState(self.t, y, self.u_last, u_gap, start.offset))
+        return self.form.state(self.problem, self.z, self.t, self.u_last)
 
     def stated(self) -> tuple[FloatArray, float, float | None]:
         return self._stated(self.errors, self.peak)
 
     def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
-        form, u_peak = self.form, self.problem.scene.u_peak
-        missed, force = form.missed, float(form.force(np.array(peak)))
-        floor = 4e-16 * (peak + form.lanes.k * max(u_peak, self.loudest)) + missed * peak
-        u_error = SAFETY * float(errors[0]) + floor
-        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (peak or 1.0) + missed) * force
-        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + missed * peak
+        form, largest_source = self.form, max(self.problem.scene.u_peak, self.loudest)
+        missed, at = form.missed, np.array(peak)
+        u, force = float(form.gap(at)), float(form.force(at))
+        floor = 4e-16 * (peak + form.gain * largest_source) + missed * peak + form.lanes.kappa * form.missed_bend
+        u_error = SAFETY * float(errors[0]) + floor + self.led[0]
+        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force + self.led[1]
+        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + self.problem.scene.u_peak) + missed * peak + self.led[2]
         charge_error = None
-        if form.charge:
-            stored = float(form.system.model.slow[-3]) * form.system.model.area0
-            charge_error = SAFETY * float(errors[3]) + stored * missed * peak
-            charge_error += 4e-16 * stored * (u_peak + peak) * (1.0 + self.steps)
-        return np.array([[peak, force, u_error, f_error]]), node_error, charge_error
+        if self.problem.charge:
+            charge_error = SAFETY * float(errors[3]) + self.led[3]
+            charge_error += form.missed_bend * float(np.abs(form.rows.bends[-form.flows :]).max())
+            charge_error += 4e-16 * form.held * (self.problem.largest + peak) * (1.0 + self.steps)
+        return np.array([[u, force, u_error, f_error]]), node_error, charge_error
 
     @property
     def stats(self) -> tuple[int, int, int]:
@@ -388,7 +393,7 @@ class LaneMarch(Following):
 
     def mark(self) -> dict[str, Any]:
         names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak")
-        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors")}
+        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors", "led")}
         return {name: getattr(self, name) for name in names} | arrays
 
     def stand(self, mark: dict[str, Any]) -> None:

@@ -22,9 +22,9 @@ from fingerspice.engine.blockforms import BLOCK, Form
 from fingerspice.engine.blockpoints import write_end
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
-from fingerspice.solve.following import ATTEMPTS, Following, Outcome
+from fingerspice.solve.following import ATTEMPTS, LED_SHARE, Following, Outcome
 from fingerspice.solve.forms import Follower, followed
-from fingerspice.solve.laneform import LaneForm, prepared, rounded_peak
+from fingerspice.solve.laneform import LaneForm, rounded_peak, stack
 from fingerspice.solve.lanes import LaneMarch
 from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.netforms import finger
@@ -39,8 +39,6 @@ ENOUGH = 0.85
 # Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
 # and add up, a later piece cannot make up for errors of the earlier ones.
 BEGINNINGS = (1.0, 0.03)
-# Error allowed in the piece that the ordinary engine integrates, relative to the error asked for.
-LED_SHARE = 0.03
 # Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, sample spacing, peak and
 # thread.
 MOST_FORMS = 16
@@ -191,7 +189,7 @@ def _decade(rtol: float) -> float:
 def ready(problem: Problem, rtol: float) -> LaneForm | Follower | None:
     """The scene prepared for this method, cached by decade; None where it does not apply."""
     kept, *key = _kept(problem, rtol)
-    make = finger if problem.scene.stack is None else followed if problem.scene.net.mobile else prepared
+    make = finger if problem.scene.stack is None else followed if problem.scene.net.mobile else stack
     one: LaneForm | Follower | None = kept_with(
         kept, ("followed", *key), MOST_FORMS, partial(make, problem, _decade(rtol))
     )
