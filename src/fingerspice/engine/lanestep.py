@@ -129,11 +129,10 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
                     state[(w_at + leaks + t) * lanes + i] += c.taps[t, k] * z
             state[(u_at + j) * lanes + i] = xi
             state[x_at * lanes + i] = abs(xi) * c.scale + c.shift
-        x, q = state[x_at * lanes :], state[(x_at + 1) * lanes :]
-        polynomial_rows(lanes, c.area, x, q)
+        polynomial_rows(lanes, c.area, state[x_at * lanes :], state[(x_at + 1) * lanes :])
         if drives > leaks:
             bend = state[(g_at + j * drives + leaks) * lanes :]
-            polynomial_rows(lanes, c.bend, x, bend)
+            polynomial_rows(lanes, c.bend, state[x_at * lanes :], bend)
             for i in range(lanes):
                 bend[i] = bend[i] if state[(u_at + j) * lanes + i] >= 0.0 else -bend[i]
                 for t in range(leaks):
@@ -147,14 +146,14 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
         th, h = state[(x_at + 4) * lanes + i], weights[length * wide + i * each]
         for k in range(m):
             p = k * PER_MODE + 4 * (last - 1)
-            decay = weights[p * wide + i * each]
             z = (
-                decay * state[(SOURCES + k) * lanes + i]
+                weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
                 + weights[(p + 1) * wide + i * each] * state[i]
                 + weights[(p + 2) * wide + i * each] * state[lanes + i]
             )
-            # What begins at the kink decays to the end of the step.
-            late = h * (decay + th * (1.0 - decay))
+            # What begins at the kink decays to the end of the step, about as exp(-x).
+            x = c.rates[k] * h * (1.0 - th)
+            late = h / (1.0 + x * (1.0 + x * (0.5 + x / 6.0)))
             for t in range(drives):
                 fed = late * state[(x_at + 5 + t) * lanes + i]
                 for j in range(NODES):

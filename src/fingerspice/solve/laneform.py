@@ -198,7 +198,7 @@ def _wider(rows: FloatArray) -> FloatArray:
 
 
 def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:
-    """The charge as columns z + k s + y + moved N, y' = gain s + feed g; these five.
+    """The charge as columns z + k s + y + moved N, y' = gain s + feed g: these.
 
     Through the slowest layer, i = A0 (c v' + g v) + G v + j, where v = share s + own z is its voltage, and j the current
     that follows from the change of the area (`solve.netmodal`): c_gap N' + A0 (q - q0) (G v - G_gap u).

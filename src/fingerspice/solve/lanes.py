@@ -55,7 +55,7 @@ class Block:
     h : ndarray, shape (n,) or (1,)
         Distances of the samples, or their common distance, s.
     starts_run : bool
-        Whether the run starts here, with a jump perhaps: the first piece is then checked at its start.
+        Whether the run starts here, perhaps with a jump: the first piece is then checked at its start.
     """
 
     def __init__(self, form: LaneForm, x: FloatArray, h: FloatArray, starts_run: bool) -> None:
@@ -232,7 +232,7 @@ class LaneMarch(Following):
         if piece.led:
             return self._lead(piece, values, t_out, out)
         h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
-        block = Block(self.form, values, h, self.t == self.problem.t_start)
+        block = Block(self.form, values, h, self.steps == 0)
         while True:
             parts, excess = PARTS[self.level], math.inf
             solved = block.solve(self.z, parts, OF_STARTS * self.rtol * self.scale)
@@ -379,7 +379,9 @@ class LaneMarch(Following):
         floor = 4e-16 * (peak + form.gain * largest_source) + missed * peak + form.lanes.kappa * form.missed_bend
         u_error = SAFETY * float(errors[0]) + floor + self.led[0]
         f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force + self.led[1]
-        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + self.problem.scene.u_peak) + missed * peak + self.led[2]
+        node_error = (
+            SAFETY * float(errors[2]) + 4e-16 * (peak + self.problem.scene.u_peak) + missed * peak + self.led[2]
+        )
         charge_error = None
         if self.problem.charge:
             charge_error = SAFETY * float(errors[3]) + self.led[3]
