@@ -1,16 +1,14 @@
 """One step of many lanes: an explicit step of the exponential integrator, whose innermost loops run over the lanes.
 
-A circuit with one finger under `local`, in modes around a reference 1/A = q0, under a source s that is straight in the
-step (`solve.netmodal` has the equations; in a stack kappa and the drive N are 0):
+A stack under `local`, in modes around a reference 1/A = q0 (`engine.system`), under a source s that is straight in the
+step:
 
-    z' = -rates z + gain s + feed g            xi = k s + shape z        u = xi - kappa N(xi)
-    g_t = (1/A - q0) (tap_s s + taps z + bent N)_t,  and N as the last drive
+    z' = -rates z + gain s + feed g,   u = k s + shape z,   g_t = (1/A(|u|) - q0) (tap_s s + taps z)_t
 
-1/A and N, the integral of A - 1/q0 over the gap voltage u, are polynomials in |xi|. The drives g are taken at Lobatto's
-four nodes, where the state is predicted with the drives held at their last value; the modes' response to the source and
-to the cubic through the drives is exact. Where xi crosses 0 V, g has a kink, of which the integral and the first moment
-that the rule misses are known on the straight line of xi, and are added. The last modes may be passive: nothing depends
-on them, such as charges.
+1/A is a polynomial in the gap voltage |u|. The drives g are taken at Lobatto's four nodes, where the state is predicted
+with the drives held at their last value; the modes' response to the source and to the cubic through the drives is
+exact. Where u crosses 0 V, g has a kink, of which the integral and the first moment that the rule misses are known on
+the straight line of u, and are added. The last modes may be passive: nothing depends on them, such as the charge.
 
 Arrays hold one row of `lanes` values after the other. Weights are shared by all lanes, or each lane has its own. What
 has to be known to the compiler are the lengths of the tuples in `Marks`.
@@ -40,38 +38,35 @@ class Marks(NamedTuple):
 
     modes: tuple[int, ...]  # All of them
     active: tuple[int, ...]  # Those that are not passive
-    leaks: tuple[int, ...]  # Drives but N
-    bend: tuple[int, ...]  # One entry if N is a drive, or none
+    drives: tuple[int, ...]
     lanes: tuple[int, ...]
     own: tuple[int, ...]  # One entry if each lane has its own weights, or none
 
 
 class Lanes(NamedTuple):
-    """Constants of a circuit in this form; T drives, of which L are leaks."""
+    """Constants of a stack in this form."""
 
     rates: FloatArray  # (m,): 1/s
     gain: FloatArray  # (m,)
     shape: FloatArray  # (m,): V/V
     k: float
-    taps: FloatArray  # (L, m)
-    # tap_s, bent (L,)
-    tap_s: FloatArray
-    bent: FloatArray
+    taps: FloatArray  # (T, m)
+    tap_s: FloatArray  # (T,)
     feed: FloatArray  # (m, T)
-    # area, bend (4 j + 1,): 1/A - q0 (1/m^2), and N (V m^2) for positive xi, as polynomials in `scale` |xi| + `shift`
+    # area, bend (4 j + 1,): Polynomials in `scale` |u| + `shift`: 1/A - q0 (1/m^2), and N (V m^2), the integral of
+    # A - 1/q0 over the gap voltage from 0 V, at positive ones
     area: FloatArray
     bend: FloatArray
     scale: float
     shift: float
     q0: float
-    kappa: float  # 1/m^2
-    kinks: FloatArray  # (T,): Derivatives by |xi| at 0 V: of 1/A, and of N / xi
+    kink: float  # d(1/A)/d|u| at 0 V
 
 
 def places(marks: Marks) -> tuple[int, ...]:
     """Numbers of the first rows of the state's parts, and of all rows; the order is that of `step`."""
-    m, leaks, drives = len(marks.modes), len(marks.leaks), len(marks.leaks) + len(marks.bend)
-    sizes = (SOURCES, m, NODES, NODES * drives, 2 * leaks, 5 + drives)
+    m, drives = len(marks.modes), len(marks.drives)
+    sizes = (SOURCES, m, NODES, NODES * drives, 2 * drives, 5 + drives)
     return tuple(np.cumsum((0, *sizes)).tolist())
 
 
@@ -93,13 +88,12 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
 
     `weights` are those of the part's length.
     """
-    lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
-    drives, last = leaks + len(marks.bend), NODES - 1
+    lanes, m, active, drives = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.drives)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     u_at = SOURCES + m
     g_at = u_at + NODES
     w_at = g_at + NODES * drives
-    x_at = w_at + 2 * leaks
+    x_at = w_at + 2 * drives
     length = m * PER_MODE
     for i in range(lanes):
         before = state[2 * lanes + i]
@@ -110,9 +104,9 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
         for i in range(lanes):
             s0, s1 = state[i], state[lanes + i]
             s = s0 + at * (s1 - s0)
-            xi = c.k * s
-            for t in range(leaks):
-                state[(w_at + leaks + t) * lanes + i] = c.tap_s[t] * s
+            u = c.k * s
+            for t in range(drives):
+                state[(w_at + drives + t) * lanes + i] = c.tap_s[t] * s
             for k in range(active):
                 p = k * PER_MODE + 4 * (j - 1)
                 fed = 0.0
@@ -124,28 +118,21 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
                     + weights[(p + 2) * wide + i * each] * s1
                     + weights[(p + 3) * wide + i * each] * fed
                 )
-                xi += c.shape[k] * z
-                for t in range(leaks):
-                    state[(w_at + leaks + t) * lanes + i] += c.taps[t, k] * z
-            state[(u_at + j) * lanes + i] = xi
-            state[x_at * lanes + i] = abs(xi) * c.scale + c.shift
+                u += c.shape[k] * z
+                for t in range(drives):
+                    state[(w_at + drives + t) * lanes + i] += c.taps[t, k] * z
+            state[(u_at + j) * lanes + i] = u
+            state[x_at * lanes + i] = abs(u) * c.scale + c.shift
         polynomial_rows(lanes, c.area, state[x_at * lanes :], state[(x_at + 1) * lanes :])
-        if drives > leaks:
-            bend = state[(g_at + j * drives + leaks) * lanes :]
-            polynomial_rows(lanes, c.bend, state[x_at * lanes :], bend)
+        for t in range(drives):
             for i in range(lanes):
-                bend[i] = bend[i] if state[(u_at + j) * lanes + i] >= 0.0 else -bend[i]
-                for t in range(leaks):
-                    state[(w_at + leaks + t) * lanes + i] += c.bent[t] * bend[i]
-        for t in range(leaks):
-            for i in range(lanes):
-                w = state[(w_at + leaks + t) * lanes + i]
+                w = state[(w_at + drives + t) * lanes + i]
                 state[(g_at + j * drives + t) * lanes + i] = state[(x_at + 1) * lanes + i] * w
-    _kinks(lanes, leaks, drives, u_at, w_at, x_at, c.kinks, state)
+    _kinks(lanes, drives, u_at, w_at, x_at, c.kink, state)
     for i in range(lanes):
         th, h = state[(x_at + 4) * lanes + i], weights[length * wide + i * each]
         for k in range(m):
-            p = k * PER_MODE + 4 * (last - 1)
+            p = k * PER_MODE + 4 * (NODES - 2)
             z = (
                 weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
                 + weights[(p + 1) * wide + i * each] * state[i]
@@ -161,25 +148,25 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
                 z += c.feed[k, t] * fed
             state[(SOURCES + k) * lanes + i] = z
     for i in range(lanes):
-        xi = c.k * state[lanes + i]
+        u = c.k * state[lanes + i]
         for k in range(active):
-            xi += c.shape[k] * state[(SOURCES + k) * lanes + i]
-        state[u_at * lanes + i] = xi
+            u += c.shape[k] * state[(SOURCES + k) * lanes + i]
+        state[u_at * lanes + i] = u
         if b == 1.0:
             state[2 * lanes + i] = state[lanes + i]
         for t in range(drives):
-            state[(g_at + t) * lanes + i] = state[(g_at + last * drives + t) * lanes + i]
-        for t in range(leaks):
-            state[(w_at + t) * lanes + i] = state[(w_at + leaks + t) * lanes + i]
+            state[(g_at + t) * lanes + i] = state[(g_at + (NODES - 1) * drives + t) * lanes + i]
+        for t in range(drives):
+            state[(w_at + t) * lanes + i] = state[(w_at + drives + t) * lanes + i]
 
 
 @jit_within
 def _kinks(
-    lanes: int, leaks: int, drives: int, u_at: int, w_at: int, x_at: int, kinks: FloatArray, state: FloatArray
+    lanes: int, drives: int, u_at: int, w_at: int, x_at: int, kink: float, state: FloatArray
 ) -> None:  # fmt: skip
-    """What the rule misses of |xi| times 1 and t, in a step of length 1, and of the drives' kinks.
+    """What the rule misses of |u| times 1 and t, in a step of length 1, and of the drives' kinks.
 
-    On the straight line of xi from u0 to u1, which is 0 at th: int |u| = (u0^2 + u1^2) / (2 |u1 - u0|) and
+    On the straight line of u from u0 to u1, which is 0 at th: int |u| = (u0^2 + u1^2) / (2 |u1 - u0|) and
     int |u| (t - th) = |u1 - u0| ((1 - th)^3 - th^3) / 3, less Lobatto's sums of both.
     """
     for i in range(lanes):
@@ -198,9 +185,7 @@ def _kinks(
         state[(x_at + 3) * lanes + i] = k1 if crossed else 0.0
         state[(x_at + 4) * lanes + i] = th if crossed else 0.0
     for t in range(drives):
-        first = w_at + t if t < leaks else u_at
-        second = w_at + leaks + t if t < leaks else u_at + NODES - 1
         for i in range(lanes):
             k0, k1, th = state[(x_at + 2) * lanes + i], state[(x_at + 3) * lanes + i], state[(x_at + 4) * lanes + i]
-            w0, w1 = state[first * lanes + i], state[second * lanes + i]
-            state[(x_at + 5 + t) * lanes + i] = kinks[t] * (k0 * w0 + (k0 * th + k1) * (w1 - w0))
+            w0, w1 = state[(w_at + t) * lanes + i], state[(w_at + drives + t) * lanes + i]
+            state[(x_at + 5 + t) * lanes + i] = kink * (k0 * w0 + (k0 * th + k1) * (w1 - w0))
