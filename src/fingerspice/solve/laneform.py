@@ -169,7 +169,7 @@ def _wider(rows: FloatArray) -> FloatArray:
 def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:
     """The charge as columns z + k s + y + moved N with y' = gain s + feed g.
 
-    Through the slowest layer, i = A0 (c v' + g v) + G v + j, where v = share s + own z is its voltage, and j the current
+    Through the slowest layer, i = A0 (c v' + g v) + G v + j, where v = share s + own z is its voltage and j the current
     by the change of the area (`solve.netmodal`): c_gap N' + A0 (q - q0) (G v - G_gap u).
     """
     model, area0 = system.model, 1.0 / float(system.q0[0])
