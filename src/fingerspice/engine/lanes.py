@@ -122,7 +122,7 @@ def span(
     x, first : ndarray, shape (n + 1,) and (lanes,)
         The source (V), and the sample of each lane's start.
     tol : float
-        Change (V) of the gap voltage against what is kept already, at which the lanes may stop; negative for none.
+        Change (V) of xi against what is kept already, at which the lanes may stop; negative for none.
     state : ndarray
         Of the lanes, see `begin`.
     kept : ndarray, shape (m, lanes, count + 1)
@@ -235,14 +235,14 @@ def show(
 
 
 @jit
-def bends(c: Any, n: int, u: FloatArray, out: FloatArray) -> None:
-    """N (V m^2) at gap voltages u (n,)."""
+def bends(c: Any, n: int, xi: FloatArray, out: FloatArray) -> None:
+    """N (V m^2) at xi (n,)."""
     x = np.empty(n)
     for i in range(n):
-        x[i] = abs(u[i]) * c.scale + c.shift
+        x[i] = abs(xi[i]) * c.scale + c.shift
     polynomial_rows(n, c.bend, x, out)
     for i in range(n):
-        out[i] = out[i] if u[i] >= 0.0 else -out[i]
+        out[i] = out[i] if xi[i] >= 0.0 else -out[i]
 
 
 @jit
@@ -251,38 +251,45 @@ def flow(
     n: int, kept: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Rate of k x + columns z + share N at the samples, as `show`; `slope` (n,) is the source's, V/s."""
-    m, drives, x_now, q = c.rates.size, c.tap_s.size, np.empty(count), np.empty(count)
-    # Shares of source and drives in the rates of the quantity and of the gap voltage.
-    by_s, by_s_u, by_g, by_g_u = 0.0, 0.0, np.zeros(drives), np.zeros(drives)
+    m, leaks, drives = c.rates.size, c.tap_s.size, c.feed.shape[1]
+    xi, power, q, bend = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    # Shares of source and drives in the rates of the quantity and of xi.
+    by_s, by_s_xi = 0.0, 0.0
+    by_g, by_g_xi = np.zeros(drives), np.zeros(drives)
     for j in range(m):
         by_s += columns[j] * c.gain[j]
-        by_s_u += c.shape[j] * c.gain[j]
+        by_s_xi += c.shape[j] * c.gain[j]
         for t in range(drives):
             by_g[t] += columns[j] * c.feed[j, t]
-            by_g_u[t] += c.shape[j] * c.feed[j, t]
+            by_g_xi[t] += c.shape[j] * c.feed[j, t]
     for lane in range(first.size):
         size, at = min(count, n - first[lane]), first[lane]
         if size <= 0:
             break
         z, rate = kept[:, lane], out[at:]
-        project(size, c.k, x[at:], c.shape, z, x_now)
+        project(size, c.k, x[at:], c.shape, z, xi)
         for i in range(size):
-            x_now[i] = abs(x_now[i]) * c.scale + c.shift
-        polynomial_rows(size, c.area, x_now, q)
+            power[i] = abs(xi[i]) * c.scale + c.shift
+        polynomial_rows(size, c.area, power, q)
+        bends(c, size, xi, bend)
         for i in range(size):
             s = x[at + i]
-            total, rise = by_s * s + k * slope[at + i], by_s_u * s + c.k * slope[at + i]
+            total, rise = by_s * s + k * slope[at + i], by_s_xi * s + c.k * slope[at + i]
             for j in range(m):
                 total -= columns[j] * c.rates[j] * z[j, i]
                 rise -= c.shape[j] * c.rates[j] * z[j, i]
             for t in range(drives):
-                g = c.tap_s[t] * s
-                for j in range(m):
-                    g += c.taps[t, j] * z[j, i]
-                total += by_g[t] * g * q[i]
-                rise += by_g_u[t] * g * q[i]
-            # N' = A - 1/q0 by the gap voltage.
-            rate[i] = total - share * q[i] / (c.q0 * (c.q0 + q[i])) * rise
+                g = bend[i]
+                if t < leaks:
+                    g = c.tap_s[t] * s + c.bent[t] * bend[i]
+                    for j in range(m):
+                        g += c.taps[t, j] * z[j, i]
+                    g *= q[i]
+                total += by_g[t] * g
+                rise += by_g_xi[t] * g
+            # N' = e / (1 + kappa e) by xi, where e = A - 1/q0.
+            e = -q[i] / (c.q0 * (c.q0 + q[i]))
+            rate[i] = total + share * e / (1.0 + c.kappa * e) * rise
 
 
 @jit

@@ -1,8 +1,9 @@
-"""Stacks under `local` prepared for steps in lanes (`engine.lanestep`): modes, drives, the charge, and outputs."""
+"""Circuits with one finger under `local`, prepared for steps in lanes (`engine.lanestep`): stacks."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import cast
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.polynomial import chebyshev as series_of
 from numpy.polynomial.polynomial import polyder, polyval
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.statespace import Stack
 from fingerspice.engine.blockforms import MOST_DEGREE
 from fingerspice.engine.lanes import bends, weigh
@@ -23,7 +24,7 @@ from fingerspice.results.outcome import State
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK
 from fingerspice.solve.stackstate import StackState, from_stack
-from fingerspice.solve.track import system_of
+from fingerspice.solve.track import as_recorded, system_of
 
 # Number of lanes, whose rows fill the processor's vectors, and in which a recording goes as so many pieces.
 LANES = 32
@@ -47,24 +48,39 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class LaneForm:
-    """A stack prepared for recordings, for all tolerances of one decade."""
+class LaneForm(ABC):
+    """A circuit prepared for recordings, for all tolerances of one decade."""
 
-    system: System
     lanes: Lanes
-    active: int  # Number of modes that are not passive: the charge is one more, where it is wanted
-    rows: Shown  # What is recorded: voltages, and the charge
+    active: int  # Number of modes that are not passive
+    rows: Shown  # What is recorded: voltages, then charges
     nodes: Shown
-    missed: float  # Relative error of the polynomial of 1/A
+    flows: int  # Number of charges, whose rates are recorded, too
+    stress: float  # Force per area and squared gap voltage, Pa/V^2
+    gain: float  # Largest gap voltage to expect for a peak of the source of 1, V/V or V/A
+    u_top: float  # Largest gap voltage that the polynomials cover, V
+    # missed, missed_bend: Errors of the polynomials: of 1/A, relative, and of N, V m^2
+    missed: float
+    missed_bend: float
+    held: float  # Capacitance of what stores the charges, F
+    source: int  # Number of the source that is not 0
 
-    @property
-    def charge(self) -> bool:
-        """Whether the charge is wanted."""
-        return self.lanes.rates.size > self.active
+    @abstractmethod
+    def start(self, problem: Problem) -> FloatArray:
+        """The modes (m,) at the start of a run."""
+
+    @abstractmethod
+    def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
+        """The state at modes z (m,) and `t` (s), where the source has the value `u_last`."""
+
+    @abstractmethod
+    def recorded(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
+        """Outputs at times `t` (s), rows of voltages, charges and their rates, as rows of a record."""
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
-        return _marks(self.lanes.rates.size, self.active, self.lanes.tap_s.size, own)
+        leaks = self.lanes.tap_s.size
+        return _marks(self.lanes.rates.size, self.active, leaks, self.lanes.feed.shape[1] - leaks, own)
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
@@ -77,49 +93,62 @@ class LaneForm:
         weigh(self.lanes.rates, self.lanes.gain, h, out)
         return out
 
-    def inverse_area(self, u: FloatArray) -> FloatArray:
-        """1/A at gap voltages (V), 1/m^2."""
+    def inverse_area(self, xi: FloatArray) -> FloatArray:
+        """1/A, 1/m^2."""
         c = self.lanes
-        return np.asarray(c.q0 + polyval(np.abs(u) * c.scale + c.shift, c.area))
+        return np.asarray(c.q0 + polyval(np.abs(xi) * c.scale + c.shift, c.area))
 
-    def bend(self, u: FloatArray) -> FloatArray:
-        """N at gap voltages (V), V m^2."""
-        flat, out = np.ravel(u), np.empty(np.size(u))
+    def bend(self, xi: FloatArray) -> FloatArray:
+        """N, V m^2."""
+        flat, out = np.ravel(xi), np.empty(np.size(xi))
         bends(self.lanes, flat.size, flat, out)
-        return out.reshape(np.shape(u))
+        return out.reshape(np.shape(xi))
 
-    def force(self, u: FloatArray) -> FloatArray:
-        """Force (N) at gap voltages (V)."""
-        return np.asarray(self.system.stress * u * u / self.inverse_area(u))
+    def gap(self, xi: FloatArray) -> FloatArray:
+        """Gap voltages, V."""
+        return np.asarray(xi - self.lanes.kappa * self.bend(xi)) if self.lanes.kappa > 0.0 else xi
 
-    def gap(self, z: FloatArray, source: float) -> float:
-        """The gap voltage (V) at modes z (m,)."""
+    def force(self, xi: FloatArray) -> FloatArray:
+        """Force, N."""
+        u = self.gap(xi)
+        return np.asarray(self.stress * u * u / self.inverse_area(xi))
+
+    def xi(self, z: FloatArray, source: float) -> float:
+        """xi (V) at modes z (m,)."""
         return float(self.lanes.shape @ z + self.lanes.k * source)
-
-    def _rest(self, z: FloatArray, u_gap: float, source: float) -> float:
-        """The charge (C) but for its mode."""
-        charge = self.rows.columns[-1, : self.active] @ z[: self.active] + self.rows.k[-1] * source
-        return float(charge + self.rows.bends[-1] * self.bend(np.array([u_gap]))[0])
-
-    def start(self, problem: Problem) -> FloatArray:
-        """The modes (m,) at the start of a run."""
-        start = problem.inner
-        z = self.system.project[0] @ start.y[:-1]
-        if not self.charge:
-            return np.asarray(z)
-        return np.append(z, start.y[-1] - self._rest(z, start.u_gap, start.u_before))
-
-    def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
-        """The state at modes z (m,) and `t` (s), where the source has the value `u_last` (V)."""
-        start, u_gap = problem.inner, self.gap(z, u_last)
-        charge = z[-1] + self._rest(z, u_gap, u_last) if self.charge else start.y[-1]
-        y = np.append(self.system.live[0] @ z[: self.active], charge)
-        return from_stack(problem.scene, StackState(t, y, u_last, u_gap, start.offset))
 
 
 @lru_cache(maxsize=64)
-def _marks(modes: int, active: int, drives: int, own: bool) -> Marks:
-    return Marks(*((0,) * size for size in (modes, active, drives, LANES, int(own))))
+def _marks(modes: int, active: int, leaks: int, bend: int, own: bool) -> Marks:
+    return Marks(*((0,) * size for size in (modes, active, leaks, bend, LANES, int(own))))
+
+
+@dataclass(frozen=True)
+class StackForm(LaneForm):
+    """A stack prepared for recordings; the charge is its last mode, where it is wanted."""
+
+    system: System
+
+    def _rest(self, z: FloatArray, u_gap: float) -> float:
+        """The charge (C) but for its mode, without what is held at the source's own share."""
+        charge = self.rows.columns[-1, : self.active] @ z[: self.active]
+        return float(charge + self.rows.bends[-1] * self.bend(np.array([u_gap]))[0])
+
+    def start(self, problem: Problem) -> FloatArray:
+        start = problem.inner
+        z = self.system.project[0] @ start.y[:-1]
+        if not self.flows:
+            return np.asarray(z)
+        return np.append(z, start.y[-1] - self._rest(z, start.u_gap) - self.rows.k[-1] * start.u_before)
+
+    def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
+        start, n, u_gap = problem.inner, self.active, self.xi(z, u_last)
+        charge = z[n] + self._rest(z, u_gap) + self.rows.k[-1] * u_last if self.flows else start.y[-1]
+        y = np.append(self.system.live[0] @ z[:n], charge)
+        return from_stack(problem.scene, StackState(t, y, u_last, u_gap, start.offset))
+
+    def recorded(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
+        return as_recorded(problem, self.system.model, out[:, : t.size].T, np.empty(0))
 
 
 def rounded_peak(peak: float) -> float:
@@ -127,7 +156,7 @@ def rounded_peak(peak: float) -> float:
     return 2.0 ** (math.ceil(4.0 * math.log2(peak)) / 4.0) if peak > 0.0 else 0.0
 
 
-def prepared(problem: Problem, rtol: float) -> LaneForm | None:
+def stack(problem: Problem, rtol: float) -> StackForm | None:
     """The stack prepared for recordings with about its peak; None where no polynomial represents 1/A well enough."""
     scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
     peak = rounded_peak(scene.u_peak)
@@ -141,24 +170,26 @@ def prepared(problem: Problem, rtol: float) -> LaneForm | None:
     area[0] -= q0
     kink = float(polyval(shift, polyder(area))) * system.scale
     rates, gain, feed, taps, shape = system.rates[0], system.gain[0], system.feed[0], system.tap[0], system.gap[0]
-    n, nodes = rates.size, system.node[0]
+    n, flows = rates.size, int(problem.charge)
     columns, k, bent = system.shown[0], system.k_shown, np.zeros(system.k_shown.size)
-    if problem.charge:
+    if flows:
         column, stored, gain_of, feed_of, moved = _charge(system, scene.stack)
         rates, gain, feed = np.append(rates, 0.0), np.append(gain, gain_of), np.vstack([feed, feed_of])
         columns = np.vstack([_wider(columns), np.append(column, 1.0)])
-        k, bent, nodes = np.append(k, stored), np.append(bent, moved), _wider(nodes)
+        k, bent = np.append(k, stored), np.append(bent, moved)
         taps, shape = _wider(taps), np.append(shape, 0.0)
-    rates, gain, shape, taps, tap_s, feed = map(
-        np.ascontiguousarray, (rates, gain, shape, taps, system.tap_k, feed)
-    )  # fmt: skip
+    nodes = system.node[0]
     lanes = Lanes(
-        rates, gain, shape, float(model.k_gap), taps, tap_s, feed, area, _bend(system, area), float(system.scale),
-        float(shift), q0, kink,
+        np.ascontiguousarray(rates), np.ascontiguousarray(gain), np.ascontiguousarray(shape), float(model.k_gap),
+        np.ascontiguousarray(taps), np.ascontiguousarray(system.tap_k), np.zeros(system.tap_k.size),
+        np.ascontiguousarray(feed), area, _bend(system, area), float(system.scale), float(shift), q0,
+        0.0, np.full(system.tap_k.size, kink), -1,
     )  # fmt: skip
-    return LaneForm(
-        system, lanes, n, Shown(columns, k, bent), Shown(nodes, system.k_node, np.zeros(len(nodes))), missed
-    )
+    return StackForm(
+        lanes, n, Shown(columns, k, bent), Shown(_wider(nodes) if flows else nodes, system.k_node, 0.0 * system.k_node),
+        flows, system.stress, float(model.k_gap), system.u_top, missed, missed * system.u_top / q0,
+        float(model.slow[-3]) * model.area0, 0, system,
+    )  # fmt: skip
 
 
 def _wider(rows: FloatArray) -> FloatArray:
@@ -167,10 +198,10 @@ def _wider(rows: FloatArray) -> FloatArray:
 
 
 def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:
-    """The charge as columns z + k s + y + moved N with y' = gain s + feed g.
+    """The charge as columns z + k s + y + moved N, y' = gain s + feed g: these.
 
-    Through the slowest layer, i = A0 (c v' + g v) + G v + j, where v = share s + own z is its voltage and j the current
-    by the change of the area (`solve.netmodal`): c_gap N' + A0 (q - q0) (G v - G_gap u).
+    Through the slowest layer, i = A0 (c v' + g v) + G v + j, where v = share s + own z is its voltage, and j the current
+    that follows from the change of the area (`solve.netmodal`): c_gap N' + A0 (q - q0) (G v - G_gap u).
     """
     model, area0 = system.model, 1.0 / float(system.q0[0])
     rates, own = system.rates[0], system.slow[0]

@@ -1,6 +1,6 @@
-"""Recordings of stacks under `local`: a block of samples as pieces in lanes, with stated errors.
+"""Recordings of one finger under `local`: a block of samples as pieces in lanes, with stated errors.
 
-All pieces of a block are followed at once (`engine.lanes`). Their starts are first those of the stack with its area
+All pieces of a block are followed at once (`engine.lanes`). Their starts are first those of the circuit with its area
 held; after each sweep they are corrected by what the modes decay by in a piece, until the gap voltage no longer
 changes. Then a window of each piece, where the source moves most, is followed by steps half as long. The difference is
 the error of the window; a piece adds as much more as it is longer, and hands it on to the pieces after it, as the modes
@@ -10,6 +10,7 @@ decay: once as if all errors were alike, and once as if they came by chance.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -18,13 +19,13 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.lanes import along, begin, busiest, flow, largest, show, span, within
 from fingerspice.engine.lanestep import NODES
-from fingerspice.results.outcome import State
-from fingerspice.solve.following import Following, Outcome
-from fingerspice.solve.laneform import LANES, LaneForm
+from fingerspice.results.outcome import State, Status
+from fingerspice.solve.following import LED_SHARE, Following, Outcome
+from fingerspice.solve.laneform import LANES, LaneForm, Shown
+from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.pieces import Piece
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import excess_of
-from fingerspice.solve.track import as_recorded
 
 # Steps of a sample, by level.
 PARTS = (1, 2, 4, 8, 16, 32, 64)
@@ -50,7 +51,7 @@ class Block:
     ----------
     form : LaneForm
     x : ndarray, shape (n + 1,)
-        The source at the samples, V.
+        The source at the samples.
     h : ndarray, shape (n,) or (1,)
         Distances of the samples, or their common distance, s.
     starts_run : bool
@@ -103,12 +104,12 @@ class Block:
         begin(self.marks, self.form.lanes, self.still, np.ascontiguousarray(starts), self.x[first], self.room)
 
     def solve(self, start: FloatArray, parts: int, tol: float) -> bool:
-        """Follow all pieces from `start` (m,), until the gap voltage is known to `tol` (V); False where it is not.
+        """Follow all pieces from `start` (m,), until xi is known to `tol` (V); False where it is not.
 
         The states at the samples go into `kept`.
         """
         form, active, self.sweeps = self.form, self.active, 0
-        self.__dict__.pop("voltages", None)
+        self.__dict__.pop("xi", None)
         own = np.zeros_like(self.kept[:, :, 0])
         # A guess, for which uneven points may count as even ones.
         along(form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
@@ -139,8 +140,8 @@ class Block:
         return True
 
     @cached_property
-    def voltages(self) -> FloatArray:
-        """Gap voltages (V) at the samples, shape (n + 1,), after `solve`."""
+    def xi(self) -> FloatArray:
+        """xi (V) at the samples, shape (n + 1,), after `solve`."""
         c, out = self.form.lanes, np.empty(self.n + 1)
         show(c.k, c.shape, self.x, self.first, self.count, self.n + 1, self.kept, out)
         return out
@@ -157,8 +158,8 @@ class Block:
         -------
         off : ndarray, shape (m, LANES, width + 1)
             Differences of the states, 0 in pieces that are not checked.
-        u : ndarray, shape (LANES, width + 1)
-            Gap voltages, V.
+        xi : ndarray, shape (LANES, width + 1)
+            V.
         share : ndarray, shape (m, LANES)
             What a piece adds over what its window does, if all errors are alike.
         share_of_products : ndarray, shape (m, m, LANES)
@@ -176,7 +177,7 @@ class Block:
         self._begin(fine[:, :, 0], self.first + at)
         self._span(self.first + at, width, 2 * parts, -1.0, fine)
         off = np.where(seen[:, None], fine - coarse, 0.0)
-        u = self.voltages[np.minimum(self.first[:, None] + index, self.n)]
+        xi = self.xi[np.minimum(self.first[:, None] + index, self.n)]
         took = np.full(LANES, width * self.h[0])
         if self.own:
             took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
@@ -184,7 +185,7 @@ class Block:
         share, of_products = (
             np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
         )
-        return off, u, share, of_products
+        return off, xi, share, of_products
 
     def hand_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
         """Errors at the start of each piece, and at the end of the block, shape (*kinds, LANES + 1).
@@ -200,7 +201,7 @@ class Block:
         return np.append(at_starts, (left * at_starts[..., lane] + added[..., lane])[..., None], axis=-1)
 
     def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
-        """Source (V; n,) and modes (m, n) `since` (s) after samples of these numbers, whose steps are `length` (s)."""
+        """Source (n,) and modes (m, n) `since` (s) after samples of these numbers, whose steps are `length` (s)."""
         lane = number // self.count
         z = np.ascontiguousarray(self.kept[:, lane, number - lane * self.count])
         x = self.x[number]
@@ -213,21 +214,23 @@ class Block:
 
 
 class LaneMarch(Following):
-    """A recording of a stack in progress, block by block."""
+    """A recording of one finger under `local` in progress, block by block."""
 
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
-        gain = float(form.system.model.k_gap)
-        super().__init__(problem, rtol, share, gain, form.rows.k.size + int(form.charge))
+        super().__init__(problem, rtol, share, form.gain, form.rows.k.size + form.flows)
         self.form, self.z, m = form, form.start(problem), form.lanes.rates.size
-        self.u_last = problem.inner.u_before
+        self.u_last = float(problem.initial.s_before[form.source])
         self.level, self.outputs, self.steps, self.refused, self.evaluated = 0, 0, 0, 0, 0
         # Errors of the modes so far, as if they were alike, and products of two, as if they came by chance.
         self.alike, self.chance = np.zeros(m), np.zeros((m, m))
-        # Largest gap voltage (V), and errors seen of gap voltage (V), force (N), nodes (V) and charge (C).
-        self.peak, self.errors = 0.0, np.zeros(4)
+        # Largest xi (V), and errors seen of gap voltage (V), force (N), nodes (V) and charges (C); errors that are
+        # stated of the piece that the ordinary engine has integrated.
+        self.peak, self.errors, self.led = 0.0, np.zeros(4), np.zeros(4)
 
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
         self.heard(values)
+        if piece.led:
+            return self._lead(piece, values, t_out, out)
         h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
         block = Block(self.form, values, h, self.steps == 0)
         while True:
@@ -235,8 +238,8 @@ class LaneMarch(Following):
             solved = block.solve(self.z, parts, OF_STARTS * self.rtol * self.scale)
             self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
             if solved:
-                peak = float(largest(block.n + 1, block.voltages))
-                if not peak <= self.form.system.u_top:
+                peak = float(largest(block.n + 1, block.xi))
+                if not self.form.gap(np.array(peak)) <= self.form.u_top:
                     return Outcome.LOST
                 excess, errors, handed = self._judge(block, parts, max(peak, self.peak))
             if excess <= 1.0:
@@ -255,10 +258,27 @@ class LaneMarch(Following):
             self.level -= 1
         return Outcome.MET
 
+    def _lead(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
+        """Integrate a piece by the ordinary engine, and take over its state."""
+        count = int(np.searchsorted(t_out, piece.stop - 1e-9 * piece.spacing))
+        problem = replace(self.problem, t_start=piece.start, t_stop=piece.stop, first=piece.start)
+        run = solve_ordinary(
+            problem, LED_SHARE * self.rtol, t_out[:count], np.zeros(count, bool), repeat=False
+        )  # fmt: skip
+        if run.status is not Status.SUCCESS:
+            return Outcome.LOST
+        out[:, :count] = run.rows.T[: self.width]
+        self.outputs, self.t, self.u_last = count, piece.stop, float(values[-1])
+        self.z = self.form.start(replace(self.problem, initial=run.state))
+        self.peak = abs(self.form.xi(self.z, self.u_last))
+        error = run.error
+        self.led = np.array([error.u_gap, error.f_el, error.v_nodes or 0.0, error.q_source or 0.0])
+        return Outcome.MET
+
     def _judge(self, block: Block, parts: int, peak: float) -> tuple[float, FloatArray, tuple[FloatArray, FloatArray]]:
         """Excess of the stated over the allowed error, the errors seen so far, and those that the block hands on."""
         form, active = self.form, block.active
-        off, u, share, of_products = block.check(parts)
+        off, xi, share, of_products = block.check(parts)
         own = off[:, :, -1]
         products = own[:, None] * own
         alike, chance = block.hand_on(own * share, self.alike), block.hand_on(products * of_products, self.chance)
@@ -273,21 +293,23 @@ class LaneMarch(Following):
             return float(more.max() + np.abs(columns[:active]) @ block.left[:active] / SAFETY)
 
         c, errors = form.lanes, np.zeros(4)
-        du = np.einsum("k,kij->ij", c.shape, off)
-        over, dn = added(c.shape), form.bend(u + du) - form.bend(u)
-        force = form.force(np.array([peak, 1.001 * peak]))
-        steep = float(force[1] - force[0]) / (1e-3 * peak) if peak > 0.0 else 0.0
-        errors[0] = np.abs(du).max() + over
-        errors[1] = np.abs(form.force(u + du) - form.force(u)).max() + steep * over
+        dxi = np.einsum("k,kij->ij", c.shape, off)
+        over, dn = added(c.shape), form.bend(xi + dxi) - form.bend(xi)
+        near = np.array([peak, 1.001 * peak])
+        step = 1e-3 * peak or 1.0
+        errors[0] = np.abs(dxi - c.kappa * dn).max() + abs(float(np.diff(form.gap(near))[0])) / step * over
+        errors[1] = np.abs(form.force(xi + dxi) - form.force(xi)).max()
+        errors[1] += abs(float(np.diff(form.force(near))[0])) / step * over
         # N changes most at the largest voltage, where the area is farthest from the reference, or at rest.
-        bent = float(np.abs(1.0 / form.inverse_area(np.array([0.0, peak])) - 1.0 / c.q0).max()) * over
-        rows = [(2, columns, 0.0) for columns in form.nodes.columns]
-        for i, columns, bend in rows + ([(3, form.rows.columns[-1], form.rows.bends[-1])] if form.charge else []):
-            seen = float(np.abs(np.einsum("k,kij->ij", columns, off) + bend * dn).max())
-            errors[i] = max(errors[i], seen + added(columns) + abs(bend) * bent)
+        bent = max(abs(1.0 / float(form.inverse_area(np.array(at))) - 1.0 / c.q0) for at in (0.0, peak)) * over
+        charges = Shown(form.rows.columns[-form.flows :], form.rows.k, form.rows.bends[-form.flows :])
+        for i, shown in enumerate((form.nodes, charges) if form.flows else (form.nodes,)):
+            for columns, bend in zip(shown.columns, shown.bends, strict=True):
+                seen = float(np.abs(np.einsum("k,kij->ij", columns, off) + bend * dn).max())
+                errors[2 + i] = max(errors[2 + i], seen + added(columns) + abs(bend) * bent)
         excess = self._excess(np.maximum(errors, self.errors), peak)
         if self.share < 1.0:
-            alone = np.abs(du).max() + np.abs(c.shape @ (own * (share - 1.0))).max()
+            alone = np.abs(dxi).max() + np.abs(c.shape @ (own * (share - 1.0))).max()
             excess = max(excess, SAFETY * alone / (self.share * self.rtol * max(peak, self.least)))
         return excess, errors, (alike[:, LANES], chance[..., LANES])
 
@@ -318,18 +340,20 @@ class LaneMarch(Following):
         self._show(x, (block.x[number + 1] - block.x[number]) / length, _ONE_ROW, z[:, None], rows)
 
     def _show(self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, out: FloatArray) -> None:
-        """Write outputs into the columns of `out`: from the source (V), its slope (V/s), and modes as in `Block`."""
+        """Write outputs into the columns of `out`: from the source, its slope (1/s), and modes as in `Block`."""
         form, c, n = self.form, self.form.lanes, out.shape[1]
-        count, shown = n if first.size == 1 else int(first[1]), form.rows
-        if form.charge:
-            u = np.empty(n)
-            show(c.k, c.shape, x, first, count, n, kept, u)
-            bend = form.bend(u)
+        count, shown, bend = n if first.size == 1 else int(first[1]), form.rows, np.zeros(0)
+        if shown.bends.any():
+            xi = np.empty(n)
+            show(c.k, c.shape, x, first, count, n, kept, xi)
+            bend = form.bend(xi)
         for i, k in enumerate(shown.k.tolist()):
             show(k, shown.columns[i], x, first, count, n, kept, out[i])
-        if form.charge:
-            out[-2] += shown.bends[-1] * bend
-            flow(c, shown.k[-1], shown.columns[-1], shown.bends[-1], x, slope, first, count, n, kept, out[-1])
+            if shown.bends[i] != 0.0:
+                out[i] += shown.bends[i] * bend
+        for i in range(shown.k.size - form.flows, shown.k.size):
+            rate = out[i + form.flows]
+            flow(c, shown.k[i], shown.columns[i], shown.bends[i], x, slope, first, count, n, kept, rate)
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
         count = t_out.size - self.outputs
@@ -340,7 +364,7 @@ class LaneMarch(Following):
         self.outputs = t_out.size
 
     def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
-        return as_recorded(self.problem, self.form.system.model, out[:, : t.size].T, np.empty(0))
+        return self.form.recorded(self.problem, t, left, out)
 
     def state(self) -> State:
         return self.form.state(self.problem, self.z, self.t, self.u_last)
@@ -349,18 +373,21 @@ class LaneMarch(Following):
         return self._stated(self.errors, self.peak)
 
     def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
-        form, u_peak = self.form, self.problem.scene.u_peak
-        missed, force = form.missed, float(form.force(np.array(peak)))
-        floor = 4e-16 * (peak + form.lanes.k * max(u_peak, self.loudest)) + missed * peak
-        u_error = SAFETY * float(errors[0]) + floor
-        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (peak or 1.0) + missed) * force
-        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + missed * peak
+        form, largest_source = self.form, max(self.problem.scene.u_peak, self.loudest)
+        missed, at = form.missed, np.array(peak)
+        u, force = float(form.gap(at)), float(form.force(at))
+        floor = 4e-16 * (peak + form.gain * largest_source) + missed * peak + form.lanes.kappa * form.missed_bend
+        u_error = SAFETY * float(errors[0]) + floor + self.led[0]
+        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force + self.led[1]
+        node_error = (
+            SAFETY * float(errors[2]) + 4e-16 * (peak + self.problem.scene.u_peak) + missed * peak + self.led[2]
+        )
         charge_error = None
-        if form.charge:
-            stored = float(form.system.model.slow[-3]) * form.system.model.area0
-            charge_error = SAFETY * float(errors[3]) + stored * missed * peak
-            charge_error += 4e-16 * stored * (u_peak + peak) * (1.0 + self.steps)
-        return np.array([[peak, force, u_error, f_error]]), node_error, charge_error
+        if self.problem.charge:
+            charge_error = SAFETY * float(errors[3]) + self.led[3]
+            charge_error += form.missed_bend * float(np.abs(form.rows.bends[-form.flows :]).max())
+            charge_error += 4e-16 * form.held * (self.problem.largest + peak) * (1.0 + self.steps)
+        return np.array([[u, force, u_error, f_error]]), node_error, charge_error
 
     @property
     def stats(self) -> tuple[int, int, int]:
@@ -368,7 +395,7 @@ class LaneMarch(Following):
 
     def mark(self) -> dict[str, Any]:
         names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak")
-        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors")}
+        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors", "led")}
         return {name: getattr(self, name) for name in names} | arrays
 
     def stand(self, mark: dict[str, Any]) -> None:
