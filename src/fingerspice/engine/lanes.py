@@ -253,17 +253,6 @@ def show(
 
 
 @jit
-def bends(c: Any, n: int, u: FloatArray, out: FloatArray) -> None:
-    """N (V m^2) at gap voltages u (n,)."""
-    x = np.empty(n)
-    for i in range(n):
-        x[i] = abs(u[i]) * c.scale + c.shift
-    polynomial_rows(n, c.bend, x, out)
-    for i in range(n):
-        out[i] = out[i] if u[i] >= 0.0 else -out[i]
-
-
-@jit
 def flow(
     c: Any, k: float, columns: FloatArray, share: float, x: FloatArray, slope: FloatArray, first: IntArray, count: int,
     n: int, kept: FloatArray, out: FloatArray,

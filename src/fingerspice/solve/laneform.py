@@ -14,8 +14,8 @@ from numpy.polynomial.polynomial import polyder, polyval
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.statespace import Stack
 from fingerspice.engine.blockforms import MOST_DEGREE
-from fingerspice.engine.lanes import bends, weigh
-from fingerspice.engine.lanestep import PER_MODE, Lanes, Marks, places
+from fingerspice.engine.lanes import weigh
+from fingerspice.engine.lanestep import PER_MODE, Lanes, Marks, places, polynomial_rows
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import N_PACKED
@@ -77,16 +77,20 @@ class LaneForm:
         weigh(self.lanes.rates, self.lanes.gain, h, out)
         return out
 
+    def _polynomial(self, powers: FloatArray, u: FloatArray) -> FloatArray:
+        x = np.ravel(np.abs(u) * self.lanes.scale + self.lanes.shift)
+        out = np.empty(x.size)
+        polynomial_rows(x.size, powers, x, out)
+        return out.reshape(np.shape(u))
+
     def inverse_area(self, u: FloatArray) -> FloatArray:
         """1/A at gap voltages (V), 1/m^2."""
-        c = self.lanes
-        return np.asarray(c.q0 + polyval(np.abs(u) * c.scale + c.shift, c.area))
+        return np.asarray(self.lanes.q0 + self._polynomial(self.lanes.area, u))
 
     def bend(self, u: FloatArray) -> FloatArray:
         """N at gap voltages (V), V m^2."""
-        flat, out = np.ravel(u), np.empty(np.size(u))
-        bends(self.lanes, flat.size, flat, out)
-        return out.reshape(np.shape(u))
+        found = self._polynomial(self.lanes.bend, u)
+        return np.where(u >= 0.0, found, -found)
 
     def force(self, u: FloatArray) -> FloatArray:
         """Force (N) at gap voltages (V)."""

@@ -133,9 +133,9 @@ class Block:
             starts[:active] += change
         else:
             return False
-        # Passive modes have begun at 0 in every piece.
-        ends = np.cumsum(self.kept[active:, :, -1], axis=1)
-        self.kept[active:] += (start[active:, None] + np.pad(ends, ((0, 0), (1, 0)))[:, :-1])[:, :, None]
+        for k in range(active, start.size):
+            # Passive modes have begun at 0 in every piece.
+            self.kept[k] += np.cumsum(np.append(start[k], self.kept[k, :-1, -1]))[:, None]
         return True
 
     @cached_property
@@ -274,7 +274,7 @@ class LaneMarch(Following):
 
         c, errors = form.lanes, np.zeros(4)
         du = np.einsum("k,kij->ij", c.shape, off)
-        over, dn = added(c.shape), form.bend(u + du) - form.bend(u)
+        over, dn = added(c.shape), form.bend(u + du) - form.bend(u) if form.charge else du
         force = form.force(np.array([peak, 1.001 * peak]))
         steep = float(force[1] - force[0]) / (1e-3 * peak) if peak > 0.0 else 0.0
         errors[0] = np.abs(du).max() + over
@@ -307,8 +307,9 @@ class LaneMarch(Following):
         t, self.outputs, rows = t_out[first:last], last, out[:, first:last]
         times = piece.times
         samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
-        if t.size == n and np.abs(t - samples).max() <= slack:
-            self._show(block.x, np.diff(block.x[: n + 1]) / block.h[:n], block.first, block.kept, rows)
+        if t.size == n and largest(n, t - samples) <= slack:
+            slope = np.diff(block.x[: n + 1]) / block.h[:n] if self.form.charge else block.x
+            self._show(block.x, slope, block.first, block.kept, rows)
             return
         number = np.clip(np.searchsorted(samples, t + slack, side="right") - 1, 0, n - 1)
         length = np.broadcast_to(block.h[:n], n)[number]
