@@ -252,44 +252,55 @@ def show(
             project(size, k, x[first[i] :], columns, kept[:, i], out[first[i] :])
 
 
+@jit_rows
+def _add_product(n: int, a: float, q: FloatArray, g: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] += a * q[i] * g[i]
+
+
+@jit_rows
+def _by_area(
+    n: int, q0: float, k: float, k_u: float, share: float, slope: FloatArray, q: FloatArray, rise: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Add what follows from the source's slope and from N' = A - 1/q0 by the gap voltage, whose rate is `rise`."""
+    for i in range(n):
+        by_gap = q[i] / (q0 * (q0 + q[i])) * (rise[i] + k_u * slope[i])
+        out[i] += k * slope[i] - share * by_gap
+
+
 @jit
 def flow(
     c: Any, k: float, columns: FloatArray, share: float, x: FloatArray, slope: FloatArray, first: IntArray, count: int,
     n: int, kept: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Rate of k x + columns z + share N at the samples, as `show`; `slope` (n,) is the source's, V/s."""
-    m, drives, x_now, q = c.rates.size, c.tap_s.size, np.empty(count), np.empty(count)
-    # Shares of source and drives in the rates of the quantity and of the gap voltage.
-    by_s, by_s_u, by_g, by_g_u = 0.0, 0.0, np.zeros(drives), np.zeros(drives)
+    m, drives = c.rates.size, c.tap_s.size
+    rise, q, g = np.empty(count), np.empty(count), np.empty(count)
+    # Shares of source, modes and drives in the rates of the quantity and of the gap voltage.
+    by_s, by_z, by_g = np.zeros(2), np.zeros((2, m)), np.zeros((2, drives))
     for j in range(m):
-        by_s += columns[j] * c.gain[j]
-        by_s_u += c.shape[j] * c.gain[j]
-        for t in range(drives):
-            by_g[t] += columns[j] * c.feed[j, t]
-            by_g_u[t] += c.shape[j] * c.feed[j, t]
+        for row, own in enumerate((columns[j], c.shape[j])):
+            by_s[row] += own * c.gain[j]
+            by_z[row, j] = -own * c.rates[j]
+            for t in range(drives):
+                by_g[row, t] += own * c.feed[j, t]
     for lane in range(first.size):
         size, at = min(count, n - first[lane]), first[lane]
         if size <= 0:
             break
-        z, rate = kept[:, lane], out[at:]
-        project(size, c.k, x[at:], c.shape, z, x_now)
+        z, s, rate = kept[:, lane], x[at:], out[at:]
+        project(size, c.k, s, c.shape, z, g)
         for i in range(size):
-            x_now[i] = abs(x_now[i]) * c.scale + c.shift
-        polynomial_rows(size, c.area, x_now, q)
-        for i in range(size):
-            s = x[at + i]
-            total, rise = by_s * s + k * slope[at + i], by_s_u * s + c.k * slope[at + i]
-            for j in range(m):
-                total -= columns[j] * c.rates[j] * z[j, i]
-                rise -= c.shape[j] * c.rates[j] * z[j, i]
-            for t in range(drives):
-                g = c.tap_s[t] * s
-                for j in range(m):
-                    g += c.taps[t, j] * z[j, i]
-                total += by_g[t] * g * q[i]
-                rise += by_g_u[t] * g * q[i]
-            # N' = A - 1/q0 by the gap voltage.
-            rate[i] = total - share * q[i] / (c.q0 * (c.q0 + q[i])) * rise
+            g[i] = abs(g[i]) * c.scale + c.shift
+        polynomial_rows(size, c.area, g, q)
+        project(size, by_s[0], s, by_z[0], z, rate)
+        project(size, by_s[1], s, by_z[1], z, rise)
+        for t in range(drives):
+            project(size, c.tap_s[t], s, c.taps[t], z, g)
+            _add_product(size, by_g[0, t], q, g, rate)
+            _add_product(size, by_g[1, t], q, g, rise)
+        _by_area(size, c.q0, k, c.k, share, slope[at:], q, rise, rate)
 
 
 @jit
