@@ -39,7 +39,7 @@ figures: $(VENV)/.run
 
 test: $(VENV)/.test
 	@sh tests/get_programs.sh
-	@echo "running the whole suite: about 8 minutes on two cores"
+	@echo "running the whole suite: about half an hour on two cores"
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal
 
 stress: $(VENV)/.test
