@@ -28,12 +28,12 @@ from fingerspice.solve.track import as_recorded
 
 # Steps of a sample, by level.
 PARTS = (1, 2, 4, 8, 16, 32, 64)
-# Stated over seen errors of voltages and charges, and of the force.
-SAFETY, OF_FORCE = 2.0, 1.5
+# Stated over seen errors.
+SAFETY = 2.0
 # Changes of starts that may be left, over the error asked for.
 OF_STARTS = 0.05
 # A window over its piece, and the fewest samples in one.
-WINDOW, FEWEST = 1.0 / 16.0, 8
+WINDOW, FEWEST = 1.0 / 16.0, 32
 # Excess below which the next block has steps twice as long, and what half the length divides an error by at least.
 COARSER, FINER = 1.0 / 60.0, 5.0
 # Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
@@ -270,7 +270,7 @@ class LaneMarch(Following):
             """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
             lucky = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there), 0.0))
             more = np.maximum(lucky, np.abs(columns @ alike_there) - LUCK * lucky)
-            return float(more.max() + np.abs(columns[:active]) @ block.left[:active] / SAFETY)
+            return float(more.max() + np.abs(columns[:active]) @ block.left[:active])
 
         c, errors = form.lanes, np.zeros(4)
         du = np.einsum("k,kij->ij", c.shape, off)
@@ -353,7 +353,7 @@ class LaneMarch(Following):
         missed, force = form.missed, float(form.force(np.array(peak)))
         floor = 4e-16 * (peak + form.lanes.k * max(u_peak, self.loudest)) + missed * peak
         u_error = SAFETY * float(errors[0]) + floor
-        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (peak or 1.0) + missed) * force
+        f_error = SAFETY * float(errors[1]) + (2.0 * floor / (peak or 1.0) + missed) * force
         node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + missed * peak
         charge_error = None
         if form.charge:
