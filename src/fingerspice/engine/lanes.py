@@ -9,12 +9,10 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lanestep import INNER, NODES, PER_MODE, SOURCES, polynomial_rows, step
+from fingerspice.engine.lanestep import BASIS, INNER, NODES, PER_MODE, SOURCES, polynomial_rows, step
 
 # Samples that are read and written at once.
 TILE = 16
-# Coefficients of the Lagrange polynomials through Lobatto's nodes.
-_BASIS = np.ascontiguousarray(np.linalg.inv(np.vander((0.0, *INNER, 1.0), increasing=True)).T)
 # Largest rate times length for which moments follow from the highest one, and that from its series.
 _EARLY = 1.0
 
@@ -30,6 +28,27 @@ def _below(n: int, rate: float, j: int, h: FloatArray, m: FloatArray, lower: Flo
     over = 1.0 / j
     for i in range(n):
         lower[i] = (1.0 - rate * h[i] * m[i]) * over
+
+
+@jit_rows
+def _decays(n: int, rate: float, h: FloatArray, out: FloatArray) -> None:
+    """exp(-rate h), by its series at a 64th of the exponent; 0 from an exponent of 40 on."""
+    for i in range(n):
+        out[i] = 1.0
+    for j in range(16, 0, -1):
+        share = rate / (64.0 * j)
+        for i in range(n):
+            out[i] = 1.0 - min(share * h[i], 0.625 / j) * out[i]
+    for _ in range(6):
+        for i in range(n):
+            out[i] *= out[i]
+
+
+@jit_rows
+def _late(n: int, j: int, rate: float, h: FloatArray, lower: FloatArray, m: FloatArray) -> None:
+    for i in range(n):
+        y = rate * h[i]
+        m[i] = (1.0 - j * lower[i]) / y if y > _EARLY else m[i]
 
 
 @jit
@@ -48,12 +67,11 @@ def _moments(top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
     for j in range(top, 0, -1):
         _below(n, rate, j, h, m[j], m[j - 1])
     if longest > _EARLY:
-        for i in range(n):
-            y = rate * h[i]
-            if y > _EARLY:
-                m[0, i] = -math.expm1(-y) / y
-                for j in range(1, top + 1):
-                    m[j, i] = (1.0 - j * m[j - 1, i]) / y
+        decay = m[NODES]
+        _decays(n, rate, h, decay)
+        _late(n, 1, rate, h, decay, m[0])
+        for j in range(1, top + 1):
+            _late(n, j, rate, h, m[j - 1], m[j])
 
 
 @jit_rows
@@ -79,7 +97,7 @@ def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray)
 @jit
 def weigh(rates: FloatArray, gain: FloatArray, h: FloatArray, weights: FloatArray) -> None:
     """Weights of steps of the lengths h (n,), into the rows (n,) of `weights`: `PER_MODE` for each mode, then h."""
-    n, m = h.size, np.empty((NODES, h.size))
+    n, m = h.size, np.empty((NODES + 1, h.size))
     for k in range(rates.size):
         own = weights[k * PER_MODE :]
         for node in range(NODES - 1):
@@ -87,7 +105,7 @@ def weigh(rates: FloatArray, gain: FloatArray, h: FloatArray, weights: FloatArra
             _moments(1 if node < NODES - 2 else NODES - 1, rates[k] * at, h, m)
             _until(n, rates[k], gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2], rows[3])
         for j in range(NODES):
-            _drive(n, _BASIS[j], h, m, own[4 * (NODES - 1) + j])
+            _drive(n, BASIS[j], h, m, own[4 * (NODES - 1) + j])
     weights[rates.size * PER_MODE] = h
 
 

@@ -27,6 +27,8 @@ from fingerspice.base.compiled import jit_rows, jit_within
 INNER = (0.5 - 0.1 * 5.0**0.5, 0.5 + 0.1 * 5.0**0.5)
 _OUTER_WEIGHT, _INNER_WEIGHT = 1.0 / 12.0, 5.0 / 12.0
 NODES = 4
+# Coefficients of the Lagrange polynomials through the nodes.
+BASIS = np.ascontiguousarray(np.linalg.inv(np.vander((0.0, *INNER, 1.0), increasing=True)).T)
 # Weights of a mode: decay, both ends of the source, and the drive held, up to each later node; then of four drives.
 PER_MODE = 4 * (NODES - 1) + NODES
 # Rows of the lanes' state before those of the modes: the source at both ends of a part, and at the last sample.
@@ -66,7 +68,7 @@ class Lanes(NamedTuple):
 def places(marks: Marks) -> tuple[int, ...]:
     """Numbers of the first rows of the state's parts, and of all rows; the order is that of `step`."""
     m, drives = len(marks.modes), len(marks.drives)
-    sizes = (SOURCES, m, NODES, NODES * drives, 2 * drives, 5 + drives)
+    sizes = (SOURCES, m, NODES, NODES * drives, 2 * drives, 5 + NODES + drives)
     return tuple(np.cumsum((0, *sizes)).tolist())
 
 
@@ -102,47 +104,49 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
     for j in range(1, NODES):
         at = INNER[0] if j == 1 else INNER[1] if j == 2 else 1.0
         for i in range(lanes):
-            s0, s1 = state[i], state[lanes + i]
-            s = s0 + at * (s1 - s0)
-            u = c.k * s
+            s = state[i] + at * (state[lanes + i] - state[i])
+            state[(u_at + j) * lanes + i] = c.k * s
             for t in range(drives):
                 state[(w_at + drives + t) * lanes + i] = c.tap_s[t] * s
-            for k in range(active):
-                p = k * PER_MODE + 4 * (j - 1)
+        for k in range(active):
+            p = k * PER_MODE + 4 * (j - 1)
+            for i in range(lanes):
                 fed = 0.0
                 for t in range(drives):
                     fed += c.feed[k, t] * state[(g_at + (j - 1) * drives + t) * lanes + i]
                 z = (
                     weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
-                    + weights[(p + 1) * wide + i * each] * s0
-                    + weights[(p + 2) * wide + i * each] * s1
+                    + weights[(p + 1) * wide + i * each] * state[i]
+                    + weights[(p + 2) * wide + i * each] * state[lanes + i]
                     + weights[(p + 3) * wide + i * each] * fed
                 )
-                u += c.shape[k] * z
+                state[(u_at + j) * lanes + i] += c.shape[k] * z
                 for t in range(drives):
                     state[(w_at + drives + t) * lanes + i] += c.taps[t, k] * z
-            state[(u_at + j) * lanes + i] = u
-            state[x_at * lanes + i] = abs(u) * c.scale + c.shift
+        for i in range(lanes):
+            state[x_at * lanes + i] = abs(state[(u_at + j) * lanes + i]) * c.scale + c.shift
         polynomial_rows(lanes, c.area, state[x_at * lanes :], state[(x_at + 1) * lanes :])
         for t in range(drives):
             for i in range(lanes):
                 w = state[(w_at + drives + t) * lanes + i]
                 state[(g_at + j * drives + t) * lanes + i] = state[(x_at + 1) * lanes + i] * w
-    _kinks(lanes, drives, u_at, w_at, x_at, c.kink, state)
     for i in range(lanes):
-        th, h = state[(x_at + 4) * lanes + i], weights[length * wide + i * each]
-        for k in range(m):
-            p = k * PER_MODE + 4 * (NODES - 2)
+        state[(x_at + 1) * lanes + i] = weights[length * wide + i * each]
+    _kinks(lanes, drives, u_at, w_at, x_at, c.kink, state)
+    for k in range(m):
+        p = k * PER_MODE + 4 * (NODES - 2)
+        for i in range(lanes):
+            # What begins at the kink decays to the end of the step, by the cubic through what begins at the nodes.
+            late = state[(x_at + 4 + NODES) * lanes + i]
+            for j in range(NODES - 1):
+                late += weights[(p - 4 * j) * wide + i * each] * state[(x_at + 5 + j) * lanes + i]
             z = (
                 weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
                 + weights[(p + 1) * wide + i * each] * state[i]
                 + weights[(p + 2) * wide + i * each] * state[lanes + i]
             )
-            # What begins at the kink decays to the end of the step, about as exp(-x).
-            x = c.rates[k] * h * (1.0 - th)
-            late = h / (1.0 + x * (1.0 + x * (0.5 + x / 6.0)))
             for t in range(drives):
-                fed = late * state[(x_at + 5 + t) * lanes + i]
+                fed = late * state[(x_at + 5 + NODES + t) * lanes + i]
                 for j in range(NODES):
                     fed += weights[(p + 4 + j) * wide + i * each] * state[(g_at + j * drives + t) * lanes + i]
                 z += c.feed[k, t] * fed
@@ -180,12 +184,15 @@ def _kinks(
         k0 = 0.5 * (u0 * u0 + u1 * u1) * over - c0 - c1 - e0 - e1
         k1 = abs(d) * (om * om * om - th * th * th) / 3.0
         k1 += c0 * th - c1 * om - e0 * (INNER[0] - th) - e1 * (INNER[1] - th)
-        crossed = u0 * u1 < 0.0
+        crossed, length = u0 * u1 < 0.0, state[(x_at + 1) * lanes + i]
         state[(x_at + 2) * lanes + i] = k0 if crossed else 0.0
         state[(x_at + 3) * lanes + i] = k1 if crossed else 0.0
         state[(x_at + 4) * lanes + i] = th if crossed else 0.0
+        for j in range(NODES):
+            share = BASIS[j, 0] + th * (BASIS[j, 1] + th * (BASIS[j, 2] + th * BASIS[j, 3]))
+            state[(x_at + 5 + j) * lanes + i] = length * share if crossed else 0.0
     for t in range(drives):
         for i in range(lanes):
             k0, k1, th = state[(x_at + 2) * lanes + i], state[(x_at + 3) * lanes + i], state[(x_at + 4) * lanes + i]
             w0, w1 = state[(w_at + t) * lanes + i], state[(w_at + drives + t) * lanes + i]
-            state[(x_at + 5 + t) * lanes + i] = kink * (k0 * w0 + (k0 * th + k1) * (w1 - w0))
+            state[(x_at + 5 + NODES + t) * lanes + i] = kink * (k0 * w0 + (k0 * th + k1) * (w1 - w0))
