@@ -122,11 +122,13 @@ def scenes_warnings(
     stop = t_stop or (circuit.tran.stop if circuit.tran is not None else math.nan)
     if not any(path.startswith(f"{e.name}.") for e in driving(circuit) for path in scenes):
         yield from course_warnings(circuit, 0.0, stop, t_stop is None)
-    own = [f"{e.name}.f" for e in circuit.by_device("SKIN") if skin == "own"]
+    if skin != "own":
+        return
+    own = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     on = driving_sources(circuit) if own else []
     clocks = [f"{e.name}.{name}" for e in on for name in ("frequency", "carrier")]
     if not any(path in scenes for path in (*own, *clocks)):
-        yield from (text for text in circuit_warnings(circuit, t_stop) if _TAKES in text and skin == "own")
+        yield from (text for text in circuit_warnings(circuit, t_stop) if _TAKES in text)
     elif len(on) == 1 and on[0].waveform is not None and on[0].waveform.fundamental is not None:
         fixed = np.array(on[0].waveform.fundamental.frequency)
         at = next((scenes[path] for path in clocks if path in scenes), fixed)

@@ -9,7 +9,8 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lanestep import BASIS, INNER, NODES, PER_MODE, SOURCES, polynomial_rows, step
+from fingerspice.engine.blockrows import area_rows, of_source_and_modes
+from fingerspice.engine.lanestep import BASIS, INNER, NODES, PER_MODE, SOURCES, step
 
 # Samples that are read and written at once.
 TILE = 16
@@ -215,28 +216,6 @@ def along(weights: FloatArray, x: FloatArray, first: IntArray, count: int, z: Fl
             now[i] = after[i]
 
 
-@jit_rows
-def project(n: int, k: float, x: FloatArray, columns: FloatArray, z: FloatArray, out: FloatArray) -> None:
-    """k x + columns z in n places: x, out (n,), columns (m,), z (m or more, n)."""
-    for i in range(n):
-        out[i] = k * x[i]
-    for row in range(columns.size):
-        share = columns[row]
-        for i in range(n):
-            out[i] += share * z[row, i]
-
-
-@jit_rows
-def largest(n: int, x: FloatArray) -> float:
-    """Largest |x|; inf if any is NaN."""
-    most, total = 0.0, 0.0
-    for i in range(n):
-        value = abs(x[i])
-        most = value if value > most else most
-        total += value
-    return most if total == total else math.inf
-
-
 @jit
 def show(
     k: float, columns: FloatArray, x: FloatArray, first: IntArray, count: int, n: int, kept: FloatArray,
@@ -249,7 +228,7 @@ def show(
     for i in range(first.size):
         size = n - first[i] if i + 1 == first.size else min(count, n - first[i])
         if size > 0:
-            project(size, k, x[first[i] :], columns, kept[:, i], out[first[i] :])
+            of_source_and_modes(size, k, x[first[i] :], columns, kept[:, i], out[first[i] :])
 
 
 @jit_rows
@@ -290,14 +269,12 @@ def flow(
         if size <= 0:
             break
         z, s, rate = kept[:, lane], x[at:], out[at:]
-        project(size, c.k, s, c.shape, z, g)
-        for i in range(size):
-            g[i] = abs(g[i]) * c.scale + c.shift
-        polynomial_rows(size, c.area, g, q)
-        project(size, by_s[0], s, by_z[0], z, rate)
-        project(size, by_s[1], s, by_z[1], z, rise)
+        of_source_and_modes(size, c.k, s, c.shape, z, g)
+        area_rows(size, c.area, c.scale, c.shift, 0.0, g, q)
+        of_source_and_modes(size, by_s[0], s, by_z[0], z, rate)
+        of_source_and_modes(size, by_s[1], s, by_z[1], z, rise)
         for t in range(drives):
-            project(size, c.tap_s[t], s, c.taps[t], z, g)
+            of_source_and_modes(size, c.tap_s[t], s, c.taps[t], z, g)
             _add_product(size, by_g[0, t], q, g, rate)
             _add_product(size, by_g[1, t], q, g, rise)
         _by_area(size, c.q0, k, c.k, share, slope[at:], q, rise, rate)

@@ -14,10 +14,6 @@ from fingerspice.solve.pieces import Piece, driving, spacing_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run
 
-# Attempts at a piece.
-ATTEMPTS = 4
-# Error allowed in the piece that the ordinary engine integrates, relative to the error asked for.
-LED_SHARE = 0.03
 # The error of a piece is related to the peaks up to its end, or to this share of the largest gap voltage that the
 # source may cause: noise before the first loud sound need not be exact relative to itself.
 LEAST_PEAK = 1e-3

@@ -14,8 +14,9 @@ from numpy.polynomial.polynomial import polyder, polyval
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.statespace import Stack
 from fingerspice.engine.blockforms import MOST_DEGREE
+from fingerspice.engine.blockrows import area_rows
 from fingerspice.engine.lanes import weigh
-from fingerspice.engine.lanestep import PER_MODE, Lanes, Marks, places, polynomial_rows
+from fingerspice.engine.lanestep import PER_MODE, Lanes, Marks, state_size
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import N_PACKED
@@ -54,7 +55,7 @@ class LaneForm:
     lanes: Lanes
     active: int  # Number of modes that are not passive: the charge is one more, where it is wanted
     rows: Shown  # What is recorded: voltages, and the charge
-    nodes: Shown
+    nodes: FloatArray  # (n_node, m): Voltages of the nodes from the modes, V/V
     missed: float  # Relative error of the polynomial of 1/A
 
     @property
@@ -69,7 +70,7 @@ class LaneForm:
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
         rows = self.lanes.rates.size * PER_MODE + 1
-        return np.zeros(places(self.marks(own))[-1] * LANES), np.zeros((rows, LANES if own else 1))
+        return np.zeros(state_size(self.marks(own))), np.zeros((rows, LANES if own else 1))
 
     def weights(self, h: FloatArray) -> FloatArray:
         """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
@@ -78,9 +79,8 @@ class LaneForm:
         return out
 
     def _polynomial(self, powers: FloatArray, u: FloatArray) -> FloatArray:
-        x = np.ravel(np.abs(u) * self.lanes.scale + self.lanes.shift)
-        out = np.empty(x.size)
-        polynomial_rows(x.size, powers, x, out)
+        c, flat, out = self.lanes, np.ravel(u), np.empty(np.size(u))
+        area_rows(flat.size, powers, c.scale, c.shift, 0.0, flat, out)
         return out.reshape(np.shape(u))
 
     def inverse_area(self, u: FloatArray) -> FloatArray:
@@ -160,9 +160,7 @@ def prepared(problem: Problem, rtol: float) -> LaneForm | None:
         rates, gain, shape, float(model.k_gap), taps, tap_s, feed, area, _bend(system, area), float(system.scale),
         float(shift), q0, kink,
     )  # fmt: skip
-    return LaneForm(
-        system, lanes, n, Shown(columns, k, bent), Shown(nodes, system.k_node, np.zeros(len(nodes))), missed
-    )
+    return LaneForm(system, lanes, n, Shown(columns, k, bent), nodes, missed)
 
 
 def _wider(rows: FloatArray) -> FloatArray:

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.engine.lanes import along, begin, busiest, flow, largest, show, span, within
+from fingerspice.engine.blockrows import largest_of
+from fingerspice.engine.lanes import along, begin, busiest, flow, show, span, within
 from fingerspice.engine.lanestep import NODES
 from fingerspice.results.outcome import State
 from fingerspice.solve.following import Following, Outcome
@@ -235,7 +236,7 @@ class LaneMarch(Following):
             solved = block.solve(self.z, parts, OF_STARTS * self.rtol * self.scale)
             self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
             if solved:
-                peak = float(largest(block.n + 1, block.voltages))
+                peak = float(largest_of(block.n + 1, block.voltages))
                 if not peak <= self.form.system.u_top:
                     return Outcome.LOST
                 excess, errors, handed = self._judge(block, parts, max(peak, self.peak))
@@ -281,7 +282,7 @@ class LaneMarch(Following):
         errors[1] = np.abs(form.force(u + du) - form.force(u)).max() + steep * over
         # N changes most at the largest voltage, where the area is farthest from the reference, or at rest.
         bent = float(np.abs(1.0 / form.inverse_area(np.array([0.0, peak])) - 1.0 / c.q0).max()) * over
-        rows = [(2, columns, 0.0) for columns in form.nodes.columns]
+        rows = [(2, columns, 0.0) for columns in form.nodes]
         for i, columns, bend in rows + ([(3, form.rows.columns[-1], form.rows.bends[-1])] if form.charge else []):
             seen = float(np.abs(np.einsum("k,kij->ij", columns, off) + bend * dn).max())
             errors[i] = max(errors[i], seen + added(columns) + abs(bend) * bent)
@@ -307,7 +308,7 @@ class LaneMarch(Following):
         t, self.outputs, rows = t_out[first:last], last, out[:, first:last]
         times = piece.times
         samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
-        if t.size == n and largest(n, t - samples) <= slack:
+        if t.size == n and largest_of(n, t - samples) <= slack:
             slope = np.diff(block.x[: n + 1]) / block.h[:n] if self.form.charge else block.x
             self._show(block.x, slope, block.first, block.kept, rows)
             return

@@ -22,7 +22,7 @@ from fingerspice.engine.blockforms import BLOCK, Form
 from fingerspice.engine.blockpoints import write_end
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
-from fingerspice.solve.following import ATTEMPTS, LED_SHARE, Following, Outcome
+from fingerspice.solve.following import Following, Outcome
 from fingerspice.solve.forms import Follower, followed
 from fingerspice.solve.laneform import LaneForm, prepared, rounded_peak
 from fingerspice.solve.lanes import LaneMarch
@@ -32,8 +32,10 @@ from fingerspice.solve.pieces import Piece, pieces_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, closed_form, excess_of, kept_with
 
-# Error allowed in a block, relative to the error asked for; ratio of stated to estimated error.
-SHARE, SAFETY = 0.28, 1.75
+# Error allowed in a block, relative to the error asked for; ratio of stated to estimated error; attempts at a piece.
+SHARE, SAFETY, ATTEMPTS = 0.28, 1.75, 4
+# Error allowed in the piece that the ordinary engine integrates, relative to the error asked for.
+LED_SHARE = 0.03
 # Share of the error asked for that another attempt at a piece is to have.
 ENOUGH = 0.85
 # Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
