@@ -73,7 +73,7 @@ def state_size(marks: Marks) -> int:
 
 @jit_rows
 def _polynomial_rows(n: int, powers: FloatArray, x: FloatArray, out: FloatArray) -> None:
-    """A polynomial of degree 4 k at x (n,): in a step a tenth faster than `blockrows.area_rows`, which has no row of x."""
+    """A polynomial of degree 4 k at x (n,): a tenth faster in a step than `area_rows`, which has no row of x."""
     last = powers.size - 1
     for i in range(n):
         out[i] = powers[last]
