@@ -9,11 +9,14 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.blockrows import area_rows, of_source_and_modes
-from fingerspice.engine.lanestep import BASIS, INNER, NODES, PER_MODE, SOURCES, step
+from fingerspice.engine.blockrows import add, area_rows, of_source_and_modes, sign_as
+from fingerspice.engine.lanestep import BASIS, INNER, NODES, PER_MODE, PER_MODE_BENT, SOURCES, rise_of, step
 
 # Samples that are read and written at once.
 TILE = 16
+# Coefficients from x on of the quartic that is 0 at the nodes and has the slope 1 at the end of the step.
+_POWERS: list[float] = np.poly(np.array([0.0, *INNER, 1.0]))[3::-1].tolist()
+_QUARTIC = np.array(_POWERS) / (np.array(_POWERS) @ np.arange(1.0, NODES + 1.0))
 # Largest rate times length for which moments follow from the highest one, and that from its series.
 _EARLY = 1.0
 
@@ -68,7 +71,7 @@ def _moments(top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
     for j in range(top, 0, -1):
         _below(n, rate, j, h, m[j], m[j - 1])
     if longest > _EARLY:
-        decay = m[NODES]
+        decay = m[NODES + 1]
         _decays(n, rate, h, decay)
         _late(n, 1, rate, h, decay, m[0])
         for j in range(1, top + 1):
@@ -90,6 +93,12 @@ def _until(
 
 
 @jit_rows
+def _line(n: int, at: float, h: FloatArray, m1: FloatArray, end: FloatArray) -> None:
+    for i in range(n):
+        end[i] = at * h[i] * m1[i]
+
+
+@jit_rows
 def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
     for i in range(n):
         out[i] = h[i] * (c[0] * m[0, i] + c[1] * m[1, i] + c[2] * m[2, i] + c[3] * m[3, i])
@@ -97,17 +106,26 @@ def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray)
 
 @jit
 def weigh(rates: FloatArray, gain: FloatArray, h: FloatArray, weights: FloatArray) -> None:
-    """Weights of steps of the lengths h (n,), into the rows (n,) of `weights`: `PER_MODE` for each mode, then h."""
-    n, m = h.size, np.empty((NODES + 1, h.size))
-    for k in range(rates.size):
+    """Weights of steps of the lengths h (n,), into the rows (n,) of `weights`.
+
+    These are `PER_MODE` for each mode, then h, and if there are more, `PER_MODE_BENT` for each mode.
+    """
+    n, m, count = h.size, np.empty((NODES + 2, h.size)), rates.size
+    bent = weights.shape[0] > count * PER_MODE + 1
+    for k in range(count):
         own = weights[k * PER_MODE :]
         for node in range(NODES - 1):
             at, rows = INNER[node] if node < NODES - 2 else 1.0, own[4 * node :]
-            _moments(1 if node < NODES - 2 else NODES - 1, rates[k] * at, h, m)
+            top = 1 if node < NODES - 2 else NODES if bent else NODES - 1
+            _moments(top, rates[k] * at, h, m)
             _until(n, rates[k], gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2], rows[3])
+            if bent:
+                _line(n, at, h, m[1], weights[count * PER_MODE + 1 + k * PER_MODE_BENT + node])
         for j in range(NODES):
             _drive(n, BASIS[j], h, m, own[4 * (NODES - 1) + j])
-    weights[rates.size * PER_MODE] = h
+        if bent:
+            _drive(n, _QUARTIC, h, m[1:], weights[count * PER_MODE + 1 + k * PER_MODE_BENT + NODES - 1])
+    weights[count * PER_MODE] = h
 
 
 @jit
@@ -141,7 +159,7 @@ def span(
     x, first : ndarray, shape (n + 1,) and (lanes,)
         The source (V), and the sample of each lane's start.
     tol : float
-        Change (V) of the gap voltage against what is kept already, at which the lanes may stop; negative for none.
+        Change (V) of xi against what is kept already, at which the lanes may stop; negative for none.
     state : ndarray
         Of the lanes, see `begin`.
     kept : ndarray, shape (m, lanes, count + 1)
@@ -239,13 +257,12 @@ def _add_product(n: int, a: float, q: FloatArray, g: FloatArray, out: FloatArray
 
 @jit_rows
 def _by_area(
-    n: int, q0: float, k: float, k_u: float, share: float, slope: FloatArray, q: FloatArray, rise: FloatArray,
-    out: FloatArray,
+    n: int, q0: float, kappa: float, k: float, k_xi: float, share: float, slope: FloatArray, q: FloatArray,
+    rate: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Add what follows from the source's slope and from N' = A - 1/q0 by the gap voltage, whose rate is `rise`."""
+    """Add what follows from the source's slope, and from N by xi (`rise_of`), of which `rate` is the part by modes."""
     for i in range(n):
-        by_gap = q[i] / (q0 * (q0 + q[i])) * (rise[i] + k_u * slope[i])
-        out[i] += k * slope[i] - share * by_gap
+        out[i] += k * slope[i] + share * rise_of(q0, kappa, q[i]) * (rate[i] + k_xi * slope[i])
 
 
 @jit
@@ -254,9 +271,9 @@ def flow(
     n: int, kept: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Rate of k x + columns z + share N at the samples, as `show`; `slope` (n,) is the source's, V/s."""
-    m, drives = c.rates.size, c.tap_s.size
-    rise, q, g = np.empty(count), np.empty(count), np.empty(count)
-    # Shares of source, modes and drives in the rates of the quantity and of the gap voltage.
+    m, leaks, drives = c.rates.size, c.tap_s.size, c.feed.shape[1]
+    rise, q, g, bend = np.empty(count), np.empty(count), np.empty(count), np.zeros(count)
+    # Shares of source, modes and drives in the rates of the quantity and of xi.
     by_s, by_z, by_g = np.zeros(2), np.zeros((2, m)), np.zeros((2, drives))
     for j in range(m):
         for row, own in enumerate((columns[j], c.shape[j])):
@@ -271,18 +288,25 @@ def flow(
         z, s, rate = kept[:, lane], x[at:], out[at:]
         of_source_and_modes(size, c.k, s, c.shape, z, g)
         area_rows(size, c.area, c.scale, c.shift, 0.0, g, q)
+        if drives > leaks:
+            area_rows(size, c.bend, c.scale, c.shift, 0.0, g, bend)
+            sign_as(size, g, bend)
         of_source_and_modes(size, by_s[0], s, by_z[0], z, rate)
         of_source_and_modes(size, by_s[1], s, by_z[1], z, rise)
-        for t in range(drives):
+        if drives > leaks:
+            add(size, by_g[0, leaks], bend, rate)
+            add(size, by_g[1, leaks], bend, rise)
+        for t in range(leaks):
             of_source_and_modes(size, c.tap_s[t], s, c.taps[t], z, g)
+            add(size, c.bent[t], bend, g)
             _add_product(size, by_g[0, t], q, g, rate)
             _add_product(size, by_g[1, t], q, g, rise)
-        _by_area(size, c.q0, k, c.k, share, slope[at:], q, rise, rate)
+        _by_area(size, c.q0, c.kappa, k, c.k, share, slope[at:], q, rise, rate)
 
 
 @jit
 def busiest(x: FloatArray, first: IntArray, count: int, width: int, n: int, place: IntArray) -> None:
-    """Where each lane's source moves most between two samples: the first sample of one of its windows of `width`.
+    """Where x moves most between two samples of each lane: the first sample of one of its windows of `width`.
 
     Windows end before sample n; -1 where no window does.
     """
@@ -303,7 +327,8 @@ def within(
 ) -> None:  # fmt: skip
     """Modes (m, n) after steps of lengths h (n,) from `starts` (m, n), in `parts`; the source goes from x to `to`."""
     lanes, m = len(marks.lanes), len(marks.modes)
-    weights = np.empty((m * PER_MODE + 1, lanes))
+    rows = still.size // lanes
+    weights = np.empty((rows, lanes))
     modes, before, after, length = np.empty((m, lanes)), np.empty(lanes), np.empty(lanes), np.empty(lanes)
     for first in range(0, h.size, lanes):
         for i in range(lanes):

@@ -1,8 +1,9 @@
-"""Stacks under `local` prepared for steps in lanes (`engine.lanestep`): modes, drives, the charge, and outputs."""
+"""Circuits with one finger under `local`, prepared for steps in lanes (`engine.lanestep`): stacks."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import cast
@@ -16,7 +17,7 @@ from fingerspice.circuit.statespace import Stack
 from fingerspice.engine.blockforms import MOST_DEGREE
 from fingerspice.engine.blockrows import area_rows
 from fingerspice.engine.lanes import weigh
-from fingerspice.engine.lanestep import PER_MODE, Lanes, Marks, state_size
+from fingerspice.engine.lanestep import PER_MODE, PER_MODE_BENT, Lanes, Marks, rows_of
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import N_PACKED
@@ -24,7 +25,7 @@ from fingerspice.results.outcome import State
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK
 from fingerspice.solve.stackstate import StackState, from_stack
-from fingerspice.solve.track import system_of
+from fingerspice.solve.track import as_recorded, system_of
 
 # Number of lanes, whose rows fill the processor's vectors, and in which a recording goes as so many pieces.
 LANES = 32
@@ -48,82 +49,113 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class LaneForm:
-    """A stack prepared for recordings, for all tolerances of one decade."""
+class LaneForm(ABC):
+    """A circuit prepared for recordings, for all tolerances of one decade."""
 
-    system: System
     lanes: Lanes
-    active: int  # Number of modes that are not passive: the charge is one more, where it is wanted
-    rows: Shown  # What is recorded: voltages, and the charge
-    nodes: FloatArray  # (n_node, m): Voltages of the nodes from the modes, V/V
-    missed: float  # Relative error of the polynomial of 1/A
+    active: int  # Number of modes that are not passive
+    rows: Shown  # What is recorded: voltages, and the charges
+    nodes: Shown
+    flows: int  # Number of charges, whose rates are recorded, too
+    stress: float  # Force per area and squared gap voltage, Pa/V^2
+    gain: float  # Largest gap voltage to expect for a peak of the source of 1, V/V or V/A
+    u_top: float  # Largest gap voltage that the polynomials cover, V
+    # missed, missed_bend: Errors of the polynomials: of 1/A, relative, and of N, V m^2
+    missed: float
+    missed_bend: float
+    held: float  # Capacitance of what stores the charges, F
 
-    @property
-    def charge(self) -> bool:
-        """Whether the charge is wanted."""
-        return self.lanes.rates.size > self.active
+    @abstractmethod
+    def start(self, problem: Problem) -> tuple[FloatArray, float]:
+        """The modes (m,) and the source at the start of a run."""
+
+    @abstractmethod
+    def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
+        """The state at modes z (m,) and `t` (s), where the source has the value `u_last`."""
+
+    @abstractmethod
+    def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
+        """Rows of a record from those of `rows` and of the charges' rates, (C, n)."""
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
-        return _marks(self.lanes.rates.size, self.active, self.lanes.tap_s.size, own)
+        leaks = self.lanes.tap_s.size
+        return _marks(self.lanes.rates.size, self.active, leaks, self.lanes.feed.shape[1] - leaks, own)
+
+    @property
+    def _weights(self) -> int:
+        modes, bent = self.lanes.rates.size, self.lanes.feed.shape[1] > self.lanes.tap_s.size
+        return modes * (PER_MODE + (PER_MODE_BENT if bent else 0)) + 1
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
-        rows = self.lanes.rates.size * PER_MODE + 1
-        return np.zeros(state_size(self.marks(own))), np.zeros((rows, LANES if own else 1))
+        return np.zeros(rows_of(self.marks(own)).end * LANES), np.zeros((self._weights, LANES if own else 1))
 
     def weights(self, h: FloatArray) -> FloatArray:
         """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
-        out = np.empty((self.lanes.rates.size * PER_MODE + 1, h.size))
+        out = np.empty((self._weights, h.size))
         weigh(self.lanes.rates, self.lanes.gain, h, out)
         return out
 
-    def _polynomial(self, powers: FloatArray, u: FloatArray) -> FloatArray:
-        c, flat, out = self.lanes, np.ravel(u), np.empty(np.size(u))
+    def _polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
+        c, flat, out = self.lanes, np.ravel(xi), np.empty(np.size(xi))
         area_rows(flat.size, powers, c.scale, c.shift, 0.0, flat, out)
-        return out.reshape(np.shape(u))
+        return out.reshape(np.shape(xi))
 
-    def inverse_area(self, u: FloatArray) -> FloatArray:
-        """1/A at gap voltages (V), 1/m^2."""
-        return np.asarray(self.lanes.q0 + self._polynomial(self.lanes.area, u))
+    def inverse_area(self, xi: FloatArray) -> FloatArray:
+        """1/A, 1/m^2."""
+        return np.asarray(self.lanes.q0 + self._polynomial(self.lanes.area, xi))
 
-    def bend(self, u: FloatArray) -> FloatArray:
-        """N at gap voltages (V), V m^2."""
-        found = self._polynomial(self.lanes.bend, u)
-        return np.where(u >= 0.0, found, -found)
+    def bend(self, xi: FloatArray) -> FloatArray:
+        """N, V m^2."""
+        found = self._polynomial(self.lanes.bend, xi)
+        return np.where(xi >= 0.0, found, -found)
 
-    def force(self, u: FloatArray) -> FloatArray:
-        """Force (N) at gap voltages (V)."""
-        return np.asarray(self.system.stress * u * u / self.inverse_area(u))
+    def gap(self, xi: FloatArray) -> FloatArray:
+        """Gap voltages, V."""
+        return np.asarray(xi - self.lanes.kappa * self.bend(xi)) if self.lanes.kappa > 0.0 else xi
 
-    def gap(self, z: FloatArray, source: float) -> float:
-        """The gap voltage (V) at modes z (m,)."""
+    def force(self, xi: FloatArray) -> FloatArray:
+        """Force, N."""
+        u = self.gap(xi)
+        return np.asarray(self.stress * u * u / self.inverse_area(xi))
+
+    def xi(self, z: FloatArray, source: float) -> float:
+        """xi (V) at modes z (m,)."""
         return float(self.lanes.shape @ z + self.lanes.k * source)
+
+
+@lru_cache(maxsize=64)
+def _marks(modes: int, active: int, leaks: int, bend: int, own: bool) -> Marks:
+    return Marks(*((0,) * size for size in (modes, active, leaks, bend, LANES, int(own))))
+
+
+@dataclass(frozen=True)
+class StackForm(LaneForm):
+    """A stack prepared for recordings; the charge is its last mode, where it is wanted."""
+
+    system: System
 
     def _rest(self, z: FloatArray, u_gap: float, source: float) -> float:
         """The charge (C) but for its mode."""
         charge = self.rows.columns[-1, : self.active] @ z[: self.active] + self.rows.k[-1] * source
         return float(charge + self.rows.bends[-1] * self.bend(np.array([u_gap]))[0])
 
-    def start(self, problem: Problem) -> FloatArray:
-        """The modes (m,) at the start of a run."""
+    def start(self, problem: Problem) -> tuple[FloatArray, float]:
         start = problem.inner
         z = self.system.project[0] @ start.y[:-1]
-        if not self.charge:
-            return np.asarray(z)
-        return np.append(z, start.y[-1] - self._rest(z, start.u_gap, start.u_before))
+        if self.flows:
+            z = np.append(z, start.y[-1] - self._rest(z, start.u_gap, start.u_before))
+        return np.asarray(z), start.u_before
 
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
-        """The state at modes z (m,) and `t` (s), where the source has the value `u_last` (V)."""
-        start, u_gap = problem.inner, self.gap(z, u_last)
-        charge = z[-1] + self._rest(z, u_gap, u_last) if self.charge else start.y[-1]
+        start, u_gap = problem.inner, self.xi(z, u_last)
+        charge = z[-1] + self._rest(z, u_gap, u_last) if self.flows else start.y[-1]
         y = np.append(self.system.live[0] @ z[: self.active], charge)
         return from_stack(problem.scene, StackState(t, y, u_last, u_gap, start.offset))
 
-
-@lru_cache(maxsize=64)
-def _marks(modes: int, active: int, drives: int, own: bool) -> Marks:
-    return Marks(*((0,) * size for size in (modes, active, drives, LANES, int(own))))
+    def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
+        return as_recorded(problem, self.system.model, out.T, np.empty(0))
 
 
 def rounded_peak(peak: float) -> float:
@@ -131,7 +163,7 @@ def rounded_peak(peak: float) -> float:
     return 2.0 ** (math.ceil(4.0 * math.log2(peak)) / 4.0) if peak > 0.0 else 0.0
 
 
-def prepared(problem: Problem, rtol: float) -> LaneForm | None:
+def stack(problem: Problem, rtol: float) -> StackForm | None:
     """The stack prepared for recordings with about its peak; None where no polynomial represents 1/A well enough."""
     scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
     peak = rounded_peak(scene.u_peak)
@@ -143,24 +175,29 @@ def prepared(problem: Problem, rtol: float) -> LaneForm | None:
     area, missed = found
     model, shift, q0 = system.model, -system.lo * system.scale - 1.0, float(system.q0[0])
     area[0] -= q0
-    kink = float(polyval(shift, polyder(area))) * system.scale
+    slope = slopes(area, float(system.scale))
     rates, gain, feed, taps, shape = system.rates[0], system.gain[0], system.feed[0], system.tap[0], system.gap[0]
     n, nodes = rates.size, system.node[0]
-    columns, k, bent = system.shown[0], system.k_shown, np.zeros(system.k_shown.size)
+    columns, k, moves = system.shown[0], system.k_shown, np.zeros(system.k_shown.size)
     if problem.charge:
         column, stored, gain_of, feed_of, moved = _charge(system, scene.stack)
         rates, gain, feed = np.append(rates, 0.0), np.append(gain, gain_of), np.vstack([feed, feed_of])
         columns = np.vstack([_wider(columns), np.append(column, 1.0)])
-        k, bent, nodes = np.append(k, stored), np.append(bent, moved), _wider(nodes)
+        k, moves, nodes = np.append(k, stored), np.append(moves, moved), _wider(nodes)
         taps, shape = _wider(taps), np.append(shape, 0.0)
     rates, gain, shape, taps, tap_s, feed = map(
         np.ascontiguousarray, (rates, gain, shape, taps, system.tap_k, feed)
     )  # fmt: skip
+    leaks = tap_s.size
     lanes = Lanes(
-        rates, gain, shape, float(model.k_gap), taps, tap_s, feed, area, _bend(system, area), float(system.scale),
-        float(shift), q0, kink,
+        rates, gain, shape, float(model.k_gap), taps, tap_s, np.zeros(leaks), feed, area, slope, _bend(system, area),
+        float(system.scale), float(shift), q0, 0.0, np.full(leaks, polyval(shift, slope)), 0,
     )  # fmt: skip
-    return LaneForm(system, lanes, n, Shown(columns, k, bent), nodes, missed)
+    return StackForm(
+        lanes, n, Shown(columns, k, moves), Shown(nodes, system.k_node, 0.0 * system.k_node), int(problem.charge),
+        system.stress, float(model.k_gap), system.u_top, missed, missed * system.u_top / q0,
+        float(model.slow[-3]) * model.area0, system,
+    )  # fmt: skip
 
 
 def _wider(rows: FloatArray) -> FloatArray:
@@ -186,6 +223,11 @@ def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, Flo
     gain = (g_area * area0 + g_total) * share + float(over @ system.gain[0])
     feed = over @ system.feed[0] + area0 * stack.g_total[leaking] * turned
     return area0 * c * own - over, area0 * c * share, gain, feed, float(stack.c[stack.gap])
+
+
+def slopes(area: FloatArray, scale: float) -> FloatArray:
+    """Derivative by xi of a polynomial in `scale` xi, with as many terms."""
+    return np.append(scale * polyder(area), 0.0)
 
 
 def _bend(system: System, area: FloatArray) -> FloatArray:

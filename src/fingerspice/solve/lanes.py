@@ -1,7 +1,7 @@
-"""Recordings of stacks under `local`: a block of samples as pieces in lanes, with stated errors.
+"""Recordings of one finger under `local`: a block of samples as pieces in lanes, with stated errors.
 
-All pieces of a block are followed at once (`engine.lanes`). Their starts are first those of the stack with its area
-held; after each sweep they are corrected by what the modes decay by in a piece, until the gap voltage no longer
+All pieces of a block are followed at once (`engine.lanes`). Their starts are first those of the circuit with its
+area held; after each sweep they are corrected by what the modes decay by in a piece, until the gap voltage no longer
 changes. Then a window of each piece, where the source moves most, is followed by steps half as long. The difference is
 the error of the window; a piece adds as much more as it is longer, and hands it on to the pieces after it, as the modes
 decay: once as if all errors were alike, and once as if they came by chance.
@@ -10,6 +10,7 @@ decay: once as if all errors were alike, and once as if they came by chance.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -19,13 +20,13 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.blockrows import largest_of
 from fingerspice.engine.lanes import along, begin, busiest, flow, show, span, within
 from fingerspice.engine.lanestep import NODES
-from fingerspice.results.outcome import State
+from fingerspice.results.outcome import State, Status
 from fingerspice.solve.following import Following, Outcome
-from fingerspice.solve.laneform import LANES, LaneForm
+from fingerspice.solve.laneform import LANES, LaneForm, Shown
+from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.pieces import Piece
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import excess_of
-from fingerspice.solve.track import as_recorded
 
 # Steps of a sample, by level.
 PARTS = (1, 2, 4, 8, 16, 32, 64)
@@ -37,6 +38,12 @@ OF_STARTS = 0.05
 WINDOW, FEWEST = 1.0 / 16.0, 32
 # Excess below which the next block has steps twice as long, and what half the length divides an error by at least.
 COARSER, FINER = 1.0 / 60.0, 5.0
+# Error allowed in a piece that the ordinary engine integrates, over the error asked for.
+LED_SHARE = 0.03
+# What leaks by the error of the polynomial of 1/A over what is stored, times that error: as seen in offset recordings.
+LEAKED = 0.3
+# In a network, factor of the steps to a time between two samples, which no window checks.
+BETWEEN = 4
 # Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
 LUCK = 2.0
 # The rate that stands for 0, 1/s.
@@ -104,12 +111,12 @@ class Block:
         begin(self.marks, self.form.lanes, self.still, np.ascontiguousarray(starts), self.x[first], self.room)
 
     def solve(self, start: FloatArray, parts: int, tol: float) -> bool:
-        """Follow all pieces from `start` (m,), until the gap voltage is known to `tol` (V); False where it is not.
+        """Follow all pieces from `start` (m,), until xi is known to `tol` (V); False where it is not.
 
         The states at the samples go into `kept`.
         """
         form, active, self.sweeps = self.form, self.active, 0
-        self.__dict__.pop("voltages", None)
+        self.__dict__.pop("xi", None)
         own = np.zeros_like(self.kept[:, :, 0])
         # A guess, for which uneven points may count as even ones.
         along(form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
@@ -140,11 +147,22 @@ class Block:
         return True
 
     @cached_property
-    def voltages(self) -> FloatArray:
-        """Gap voltages (V) at the samples, shape (n + 1,), after `solve`."""
+    def xi(self) -> FloatArray:
+        """xi (V) at the samples, shape (n + 1,), after `solve`."""
         c, out = self.form.lanes, np.empty(self.n + 1)
         show(c.k, c.shape, self.x, self.first, self.count, self.n + 1, self.kept, out)
         return out
+
+    @property
+    def _by_piece(self) -> FloatArray:
+        """|xi| (V) at the samples of each piece, shape (LANES, count)."""
+        return np.pad(np.abs(self.xi[:-1]), (0, LANES * self.count - self.n)).reshape(LANES, self.count)
+
+    @property
+    def peaks(self) -> FloatArray:
+        """Largest |xi| (V) at the samples of each piece, and at the next one."""
+        own = self._by_piece.max(axis=1)
+        return np.asarray(np.maximum(own, np.append(own[1:], abs(self.xi[-1]))))
 
     def end(self) -> FloatArray:
         """The state (m,) at the last sample."""
@@ -158,26 +176,27 @@ class Block:
         -------
         off : ndarray, shape (m, LANES, width + 1)
             Differences of the states, 0 in pieces that are not checked.
-        u : ndarray, shape (LANES, width + 1)
-            Gap voltages, V.
+        xi : ndarray, shape (LANES, width + 1)
+            V.
         share : ndarray, shape (m, LANES)
             What a piece adds over what its window does, if all errors are alike.
         share_of_products : ndarray, shape (m, m, LANES)
             The same of products of two errors, if they come by chance.
         """
-        width, place = min(self.count, max(FEWEST, round(self.count * WINDOW))), np.empty(LANES, np.int64)
-        busiest(self.x, self.first, self.count, width, self.n, place)
-        if self.starts_run:
-            place[0] = 0
-        seen, at = place >= 0, np.maximum(place, 0)
+        width, lanes = min(self.count, max(FEWEST, round(self.count * WINDOW))), np.arange(LANES)
+        off, at = np.zeros((self.rates.size, LANES, width + 1)), np.zeros(LANES, np.int64)
+        for place in self._windows(width):
+            first = np.maximum(place, 0)
+            coarse = self.kept[:, lanes[:, None], first[:, None] + np.arange(width + 1)]
+            fine = np.zeros_like(coarse)
+            fine[:, :, 0] = coarse[:, :, 0]
+            self._begin(fine[:, :, 0], self.first + first)
+            self._span(self.first + first, width, 2 * parts, -1.0, fine)
+            found = np.where((place >= 0)[:, None], fine - coarse, 0.0)
+            worse = self._in_xi(found) > self._in_xi(off)
+            off[:, worse], at[worse] = found[:, worse], first[worse]
         index = at[:, None] + np.arange(width + 1)
-        coarse = self.kept[:, np.arange(LANES)[:, None], index]
-        fine = np.zeros_like(coarse)
-        fine[:, :, 0] = coarse[:, :, 0]
-        self._begin(fine[:, :, 0], self.first + at)
-        self._span(self.first + at, width, 2 * parts, -1.0, fine)
-        off = np.where(seen[:, None], fine - coarse, 0.0)
-        u = self.voltages[np.minimum(self.first[:, None] + index, self.n)]
+        xi = self.xi[np.minimum(self.first[:, None] + index, self.n)]
         took = np.full(LANES, width * self.h[0])
         if self.own:
             took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
@@ -185,7 +204,27 @@ class Block:
         share, of_products = (
             np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
         )
-        return off, u, share, of_products
+        return off, xi, share, of_products
+
+    def _windows(self, width: int) -> list[IntArray]:
+        """Where windows begin in each piece, -1 for none: where the source moves most, and at the start of a run.
+
+        With N as a drive, errors are large where |xi| is, too.
+        """
+        place = np.empty(LANES, np.int64)
+        busiest(self.x, self.first, self.count, width, self.n, place)
+        if self.starts_run:
+            place[0] = 0
+        if not self.marks.bend:
+            return [place]
+        largest = np.minimum(
+            np.argmax(self._by_piece, axis=1) - width // 2, np.minimum(self.count, self.n - self.first) - width
+        )
+        return [place, np.where(place >= 0, np.maximum(largest, 0), -1)]
+
+    def _in_xi(self, off: FloatArray) -> FloatArray:
+        """Largest changes of xi (V) in each lane by changes of the modes (m, LANES, width + 1)."""
+        return np.asarray(np.abs(np.einsum("k,kij->ij", self.form.lanes.shape, off)).max(axis=1))
 
     def hand_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
         """Errors at the start of each piece, and at the end of the block, shape (*kinds, LANES + 1).
@@ -208,27 +247,30 @@ class Block:
         if not since.any():
             return x, z
         to, out, form = x + (self.x[number + 1] - x) * (since / length), np.empty_like(z), self.form
+        parts *= BETWEEN if self.marks.bend else 1
         still, (room, _) = form.weights(np.zeros(LANES)), form.room(True)
         within(form.marks(True), form.lanes, still, z, x, to, since, parts, room, out)
         return to, out
 
 
 class LaneMarch(Following):
-    """A recording of a stack in progress, block by block."""
+    """A recording of one finger under `local` in progress, block by block."""
 
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
-        gain = float(form.system.model.k_gap)
-        super().__init__(problem, rtol, share, gain, form.rows.k.size + int(form.charge))
-        self.form, self.z, m = form, form.start(problem), form.lanes.rates.size
-        self.u_last = problem.inner.u_before
+        super().__init__(problem, rtol, share, form.gain, form.rows.k.size + form.flows)
+        self.form, m = form, form.lanes.rates.size
+        self.z, self.u_last = form.start(problem)
         self.level, self.outputs, self.steps, self.refused, self.evaluated = 0, 0, 0, 0, 0
         # Errors of the modes so far, as if they were alike, and products of two, as if they came by chance.
         self.alike, self.chance = np.zeros(m), np.zeros((m, m))
-        # Largest gap voltage (V), and errors seen of gap voltage (V), force (N), nodes (V) and charge (C).
-        self.peak, self.errors = 0.0, np.zeros(4)
+        # Largest |xi| (V), and errors seen of gap voltage (V), force (N), nodes (V) and charges (C); errors that are
+        # stated of the piece that the ordinary engine has integrated.
+        self.peak, self.errors, self.led = 0.0, np.zeros(4), np.zeros(4)
 
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
         self.heard(values)
+        if piece.led:
+            return self._lead(piece, values, t_out, out)
         h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
         block = Block(self.form, values, h, self.steps == 0)
         while True:
@@ -236,8 +278,8 @@ class LaneMarch(Following):
             solved = block.solve(self.z, parts, OF_STARTS * self.rtol * self.scale)
             self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
             if solved:
-                peak = float(largest_of(block.n + 1, block.voltages))
-                if not peak <= self.form.system.u_top:
+                peak = float(largest_of(block.n + 1, block.xi))
+                if not self.form.gap(np.array(peak)) <= self.form.u_top:
                     return Outcome.LOST
                 excess, errors, handed = self._judge(block, parts, max(peak, self.peak))
             if excess <= 1.0:
@@ -256,10 +298,26 @@ class LaneMarch(Following):
             self.level -= 1
         return Outcome.MET
 
+    def _lead(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
+        """Integrate a piece by the ordinary engine, and take over its state."""
+        count = int(np.searchsorted(t_out, piece.stop - 1e-9 * piece.spacing))
+        problem = replace(self.problem, t_start=piece.start, t_stop=piece.stop, first=piece.start)
+        run = solve_ordinary(
+            problem, LED_SHARE * self.rtol, t_out[:count], np.zeros(count, bool), repeat=False
+        )  # fmt: skip
+        if run.status is not Status.SUCCESS:
+            return Outcome.LOST
+        out[:, :count] = run.rows.T[: self.width]
+        self.z, _ = self.form.start(replace(self.problem, initial=run.state))
+        self.outputs, self.t, self.u_last = count, piece.stop, float(values[-1])
+        self.peak, error = abs(self.form.xi(self.z, self.u_last)), run.error
+        self.led = np.array([error.u_gap, error.f_el, error.v_nodes or 0.0, error.q_source or 0.0])
+        return Outcome.MET
+
     def _judge(self, block: Block, parts: int, peak: float) -> tuple[float, FloatArray, tuple[FloatArray, FloatArray]]:
         """Excess of the stated over the allowed error, the errors seen so far, and those that the block hands on."""
         form, active = self.form, block.active
-        off, u, share, of_products = block.check(parts)
+        off, xi, share, of_products = block.check(parts)
         own = off[:, :, -1]
         products = own[:, None] * own
         alike, chance = block.hand_on(own * share, self.alike), block.hand_on(products * of_products, self.chance)
@@ -267,28 +325,31 @@ class LaneMarch(Following):
         alike_there = alike[:, :LANES] + own * (share - 1.0)
         chance_there = chance[..., :LANES] + products * (of_products - 1.0)
 
-        def added(columns: FloatArray) -> float:
+        def added(columns: FloatArray) -> FloatArray:
             """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
             lucky = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there), 0.0))
             more = np.maximum(lucky, np.abs(columns @ alike_there) - LUCK * lucky)
-            return float(more.max() + np.abs(columns[:active]) @ block.left[:active])
+            return np.asarray(more + np.abs(columns[:active]) @ block.left[:active])
 
         c, errors = form.lanes, np.zeros(4)
-        du = np.einsum("k,kij->ij", c.shape, off)
-        over, dn = added(c.shape), form.bend(u + du) - form.bend(u) if form.charge else du
-        force = form.force(np.array([peak, 1.001 * peak]))
-        steep = float(force[1] - force[0]) / (1e-3 * peak) if peak > 0.0 else 0.0
-        errors[0] = np.abs(du).max() + over
-        errors[1] = np.abs(form.force(u + du) - form.force(u)).max() + steep * over
-        # N changes most at the largest voltage, where the area is farthest from the reference, or at rest.
-        bent = float(np.abs(1.0 / form.inverse_area(np.array([0.0, peak])) - 1.0 / c.q0).max()) * over
-        rows = [(2, columns, 0.0) for columns in form.nodes]
-        for i, columns, bend in rows + ([(3, form.rows.columns[-1], form.rows.bends[-1])] if form.charge else []):
-            seen = float(np.abs(np.einsum("k,kij->ij", columns, off) + bend * dn).max())
-            errors[i] = max(errors[i], seen + added(columns) + abs(bend) * bent)
+        dxi = np.einsum("k,kij->ij", c.shape, off)
+        over, dn = added(c.shape), form.bend(xi + dxi) - form.bend(xi) if form.rows.bends.any() else dxi
+        # What the gap voltage, N and the force change by with xi, at most in each piece: at its peak, or at rest.
+        top = np.maximum(block.peaks, 1e-9 * peak)
+        e = 1.0 / form.inverse_area(np.stack([np.zeros(LANES), top])) - 1.0 / c.q0
+        u_steep, n_steep = (np.abs(x / (1.0 + c.kappa * e)).max(axis=0) for x in (1.0, e))
+        steep = (form.force(1.001 * top) - form.force(top)) / (1e-3 * top + 1e-300)
+        errors[0] = (np.abs(dxi - c.kappa * dn).max(axis=1) + u_steep * over).max()
+        errors[1] = (np.abs(form.force(xi + dxi) - form.force(xi)).max(axis=1) + steep * over).max()
+        first = form.rows.k.size - form.flows
+        charges = Shown(form.rows.columns[first:], form.rows.k[first:], form.rows.bends[first:])
+        for i, shown in ((2, form.nodes), (3, charges)):
+            for columns, bend in zip(shown.columns, shown.bends, strict=True):
+                seen = np.abs(np.einsum("k,kij->ij", columns, off) + bend * dn).max(axis=1)
+                errors[i] = max(errors[i], (seen + added(columns) + abs(bend) * n_steep * over).max())
         excess = self._excess(np.maximum(errors, self.errors), peak)
         if self.share < 1.0:
-            alone = np.abs(du).max() + np.abs(c.shape @ (own * (share - 1.0))).max()
+            alone = np.abs(dxi).max() + np.abs(c.shape @ (own * (share - 1.0))).max()
             excess = max(excess, SAFETY * alone / (self.share * self.rtol * max(peak, self.least)))
         return excess, errors, (alike[:, LANES], chance[..., LANES])
 
@@ -309,7 +370,7 @@ class LaneMarch(Following):
         times = piece.times
         samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
         if t.size == n and largest_of(n, t - samples) <= slack:
-            slope = np.diff(block.x[: n + 1]) / block.h[:n] if self.form.charge else block.x
+            slope = np.diff(block.x[: n + 1]) / block.h[:n] if self.form.flows else block.x
             self._show(block.x, slope, block.first, block.kept, rows)
             return
         number = np.clip(np.searchsorted(samples, t + slack, side="right") - 1, 0, n - 1)
@@ -320,18 +381,19 @@ class LaneMarch(Following):
         self._show(x, (block.x[number + 1] - block.x[number]) / length, _ONE_ROW, z[:, None], rows)
 
     def _show(self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, out: FloatArray) -> None:
-        """Write outputs into the columns of `out`: from the source (V), its slope (V/s), and modes as in `Block`."""
+        """Write outputs into the columns of `out`: from the source, its slope (1/s), and modes as in `Block`."""
         form, c, n = self.form, self.form.lanes, out.shape[1]
-        count, shown = n if first.size == 1 else int(first[1]), form.rows
-        if form.charge:
-            u = np.empty(n)
-            show(c.k, c.shape, x, first, count, n, kept, u)
-            bend = form.bend(u)
-        for i, k in enumerate(shown.k.tolist()):
+        count, shown, first_flow = n if first.size == 1 else int(first[1]), form.rows, form.rows.k.size - form.flows
+        if shown.bends.any():
+            xi = np.empty(n)
+            show(c.k, c.shape, x, first, count, n, kept, xi)
+            bend = form.bend(xi)
+        for i, (k, share) in enumerate(zip(shown.k.tolist(), shown.bends.tolist(), strict=True)):
             show(k, shown.columns[i], x, first, count, n, kept, out[i])
-        if form.charge:
-            out[-2] += shown.bends[-1] * bend
-            flow(c, shown.k[-1], shown.columns[-1], shown.bends[-1], x, slope, first, count, n, kept, out[-1])
+            if share != 0.0:
+                out[i] += share * bend
+            if i >= first_flow:
+                flow(c, k, shown.columns[i], share, x, slope, first, count, n, kept, out[i + form.flows])
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
         count = t_out.size - self.outputs
@@ -342,7 +404,7 @@ class LaneMarch(Following):
         self.outputs = t_out.size
 
     def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
-        return as_recorded(self.problem, self.form.system.model, out[:, : t.size].T, np.empty(0))
+        return self.form.recorded(self.problem, out[:, : t.size])
 
     def state(self) -> State:
         return self.form.state(self.problem, self.z, self.t, self.u_last)
@@ -352,17 +414,19 @@ class LaneMarch(Following):
 
     def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
         form, u_peak = self.form, self.problem.scene.u_peak
-        missed, force = form.missed, float(form.force(np.array(peak)))
-        floor = 4e-16 * (peak + form.lanes.k * max(u_peak, self.loudest)) + missed * peak
-        u_error = SAFETY * float(errors[0]) + floor
-        f_error = SAFETY * float(errors[1]) + (2.0 * floor / (peak or 1.0) + missed) * force
-        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + missed * peak
+        missed, at, led = form.missed, np.array(peak), self.led.tolist()
+        u, force = float(form.gap(at)), float(form.force(at))
+        floor = 4e-16 * (peak + form.gain * max(u_peak, self.loudest)) + missed * peak
+        floor += form.lanes.kappa * form.missed_bend
+        u_error = SAFETY * float(errors[0]) + floor + led[0]
+        f_error = SAFETY * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force + led[1]
+        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + missed * peak + led[2]
         charge_error = None
-        if form.charge:
-            stored = float(form.system.model.slow[-3]) * form.system.model.area0
-            charge_error = SAFETY * float(errors[3]) + stored * missed * peak
-            charge_error += 4e-16 * stored * (u_peak + peak) * (1.0 + self.steps)
-        return np.array([[peak, force, u_error, f_error]]), node_error, charge_error
+        if form.flows:
+            charge_error = SAFETY * float(errors[3]) + led[3]
+            charge_error += form.missed_bend * float(np.abs(form.rows.bends[-form.flows :]).max())
+            charge_error += (LEAKED * missed + 4e-16 * (1.0 + self.steps)) * form.held * (self.problem.largest + peak)
+        return np.array([[u, force, u_error, f_error]]), node_error, charge_error
 
     @property
     def stats(self) -> tuple[int, int, int]:
@@ -370,7 +434,7 @@ class LaneMarch(Following):
 
     def mark(self) -> dict[str, Any]:
         names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak")
-        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors")}
+        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors", "led")}
         return {name: getattr(self, name) for name in names} | arrays
 
     def stand(self, mark: dict[str, Any]) -> None:

@@ -1,27 +1,23 @@
-"""One finger in a network prepared for recordings: `solve.netmodal` in the form of `engine.relaxation`."""
+"""One finger in a network prepared for recordings: `solve.netmodal` in the form of `engine.lanestep`."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import chebyshev as series_of
 from numpy.polynomial.polynomial import polyder, polyval
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.engine import blockforms
-from fingerspice.engine.blockcourse import Course, new_charges
-from fingerspice.engine.blockforms import Form
-from fingerspice.engine.model import Model
+from fingerspice.engine.blockforms import MOST_DEGREE
+from fingerspice.engine.lanestep import Lanes
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
-from fingerspice.solve.forms import FADED, Follower, weighted
-from fingerspice.solve.laneform import AREA_SHARE
-from fingerspice.solve.netmodal import Modal, Reduced
+from fingerspice.solve.laneform import AREA_SHARE, LaneForm, Shown, slopes
+from fingerspice.solve.netmodal import Reduced
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene
 from fingerspice.waveforms.recorded import as_samples
@@ -66,96 +62,49 @@ def is_followed(scene: Scene, circuit: Circuit) -> bool:
 
 
 @dataclass(frozen=True)
-class Finger(Follower):
-    """A network prepared for recordings."""
+class NetworkForm(LaneForm):
+    """A network prepared for recordings; the charges are its last modes, where they are wanted."""
 
     reduced: Reduced
-    modal: Modal
-    # area, bend: 1/A and N, see `Form`; `scale` is that of their variable
-    area: FloatArray
-    bend: FloatArray
-    scale: float
-    missed_bend: float  # Error of N, V m^2
-
-    def form(self, spacing: float) -> Form:
-        one, reduced = self.modal, self.reduced
-        n = reduced.absorbed.size
-        return weighted(
-            one.rates[None], one.gain[None], one.drives[None], one.taps[None], one.tap_s, spacing, self._fast(spacing),
-            mobile=False, q0=np.array([reduced.q0]), area=self.area, scale=self.scale, shift=-1.0,
-            k_gap=float(one.tap_s[0]), area0=1.0 / reduced.q0, kappa=reduced.kappa, bend=self.bend,
-            bent=one.taps[1:-1, :n] @ reduced.absorbed,
-        )  # fmt: skip
-
-    def _fast(self, spacing: float) -> int:
-        """The mode with the largest share in kappa of those that decay within a small part of a spacing (s), or -1."""
-        rates, absorbed = self.reduced.modes.rates, self.reduced.absorbed
-        shares = np.where(rates * spacing > FADED, np.abs(self.modal.taps[0, : rates.size] * absorbed), 0.0)
-        return int(np.argmax(shares)) if shares.max(initial=0.0) > 0.0 else -1
-
-    @cached_property
-    def _model(self) -> Model:
-        """What the compiled loop reads of a stack's model."""
-        nothing, reduced = np.zeros(0), self.reduced
-        return Model(
-            False, True, np.zeros(1), np.zeros(1), np.zeros(1), float(self.modal.tap_s[0]), nothing, 1.0, np.zeros(4),
-            1.0 / reduced.q0, np.inf, reduced.scene.net.curves[reduced.moving],
-        )  # fmt: skip
-
-    def _bend(self, xi: float) -> float:
-        value = float(polyval(abs(xi) * self.scale - 1.0, self.bend))
-        return value if xi >= 0.0 else -value
 
     def _bend_at(self, u: float) -> float:
         """N at a gap voltage u (V), from xi by Newton's method."""
-        xi, kappa, q0 = float(u), self.reduced.kappa, self.reduced.q0
+        xi, c = float(u), self.lanes
         for _ in range(50):
-            e = 1.0 / polyval(abs(xi) * self.scale - 1.0, self.area) - 1.0 / q0
-            step = float((xi - kappa * self._bend(xi) - u) * (1.0 + kappa * e))
+            at = np.array(xi)
+            e = 1.0 / float(self.inverse_area(at)) - 1.0 / c.q0
+            step = (xi - c.kappa * float(self.bend(at)) - u) * (1.0 + c.kappa * e)
             xi -= step
             if abs(step) <= 1e-15 * abs(xi):
                 break
-        return self._bend(xi)
+        return float(self.bend(np.array(xi)))
 
-    def course(self, problem: Problem, form: Form) -> Course:
-        start, one, reduced = problem.initial, self.modal, self.reduced
-        n, m, drives = reduced.absorbed.size, *one.drives.shape
+    def start(self, problem: Problem) -> tuple[FloatArray, float]:
+        start, reduced, n = problem.initial, self.reduced, self.active
         x, s, net = start.y[:n], start.s_before, reduced.scene.net
         bend = self._bend_at(float(net.p[reduced.gap] @ x + net.q[reduced.gap] @ s))
-        w = np.zeros(m)
-        w[:n] = reduced.modes.inverse @ (x + reduced.modes.follow @ s) - reduced.absorbed * bend
-        held = one.columns @ w + one.bends * bend + one.k * s[reduced.source]
-        w[n:] = start.y[n : start.y.size if m > n else n] - held[n:]
-        control, counters = blockforms.new_control(), np.zeros(blockforms.N_COUNTERS, np.int64)
-        control[blockforms.U_GAP] = one.taps[0] @ w + one.tap_s[0] * s[reduced.source]
-        return Course(
-            self._model, form, self.shown, blockforms.new_room(m, drives, drives + 1, self.shown), new_charges(),
-            np.zeros((3, max(m, drives, 5))), w, np.zeros((2, m)), control, counters, blockforms.new_checks(self.shown),
-        )  # fmt: skip
+        z = np.zeros(self.lanes.rates.size)
+        z[:n] = reduced.modes.inverse @ (x + reduced.modes.follow @ s) - reduced.absorbed * bend
+        held = self.rows.columns @ z + self.rows.bends * bend + self.rows.k * s[reduced.source]
+        z[n:] = start.y[n : n + self.flows] - held[n:]
+        return z, float(s[reduced.source])
 
-    def rows(self, problem: Problem, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
-        rows = out[:, : t.size].T
-        if problem.charge:
-            return rows
-        return np.hstack([rows, np.tile(problem.initial.y[self.reduced.absorbed.size :], (t.size, 1))])
-
-    def state(self, problem: Problem, course: Course, t: float, u_last: float) -> State:
-        one, xi = self.modal, float(course.control[blockforms.U_GAP])
-        y = problem.initial.y.copy()
-        y[: one.k.size] = one.columns @ course.w + one.bends * self._bend(xi) + one.k * u_last
+    def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
+        shown, xi, y = self.rows, self.xi(z, u_last), problem.initial.y.copy()
+        y[: shown.k.size] = shown.columns @ z + shown.bends * float(self.bend(np.array(xi))) + shown.k * u_last
         s = np.zeros(len(problem.waveforms))
         s[self.reduced.source] = u_last
         sign = np.ones(problem.scene.net.gap.size)
         sign[self.reduced.moving] = 1.0 if xi >= 0.0 else -1.0
         return State(t, y, s, sign, problem.scene.charge_law)
 
-    def charge_error(self, problem: Problem, course: Course, peak_u: float) -> float:
-        held = self.shown.capacitance * (problem.largest + peak_u)
-        missed = self.missed_bend * float(np.abs(self.modal.bends[self.reduced.absorbed.size :]).max(initial=0.0))
-        return missed + 4e-16 * held * (1.0 + int(course.counters[blockforms.STEPS]))
+    def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
+        if self.flows:
+            return out.T
+        return np.hstack([out.T, np.tile(problem.initial.y[self.active :], (out.shape[1], 1))])
 
 
-def finger(problem: Problem, rtol: float) -> Finger | None:
+def finger(problem: Problem, rtol: float) -> NetworkForm | None:
     """The network prepared for recordings, or None where this form does not apply or no polynomial is good enough."""
     found, scene = recording_of(problem), problem.scene
     if found is None or not is_followed(scene, problem.circuit):
@@ -171,47 +120,28 @@ def finger(problem: Problem, rtol: float) -> Finger | None:
     one = reduced.modal()
     modal = reduced.with_charges(one) if problem.charge else one
     curves = _curves(scene.net.curves[moving], reduced.q0, reduced.kappa, scene.u_top, AREA_SHARE * rtol)
-    if modal is None or curves is None:
+    contact = problem.network.contacts[moving]
+    if modal is None or curves is None or contact is None:
         return None
     area, bend, scale, missed, missed_bend = curves
-    q_rest, q_top = float(polyval(-1.0, area)), float(polyval(1.0, area))
+    area[0] -= reduced.q0
+    slope, n, m = slopes(area, scale), reduced.absorbed.size, modal.rates.size
     # 1/A - q0 has the kink of 1/A, and N the part N''(0) xi |xi| / 2.
-    kinks = np.append(
-        np.full(reduced.leaking.size, scale * float(polyval(-1.0, polyder(area)))),
-        0.5 * scale**2 * float(polyval(-1.0, polyder(bend, 2))),
-    )
-    shown = _shown(problem, reduced, modal, kinks, 1.0 / q_rest, 1.0 / q_top)
-    return Finger(
-        shown,
-        share,
-        scene.u_top,
-        q_rest,
-        missed,
-        reduced.kappa * missed_bend,
-        reduced,
-        modal,
-        area,
-        bend,
-        scale,
-        missed_bend,
-    )
-
-
-def _shown(
-    problem: Problem, reduced: Reduced, modal: Modal, kinks: FloatArray, at_rest: float, at_top: float
-) -> blockforms.Shown:
-    """Constants of the outputs, from the kinks of the drives and the areas (m^2) at 0 V and at the top."""
-    contact, n, m = problem.network.contacts[reduced.moving], reduced.absorbed.size, modal.rates.size
-    assert contact is not None
-    nodes = modal.nodes[:, :n] @ reduced.absorbed
-    moves = max(abs(area - 1.0 / reduced.q0) for area in (at_rest, at_top)) * np.array(
-        [np.abs(nodes).max(initial=0.0), np.abs(modal.bends[n:]).max(initial=0.0)]
-    )
-    none = np.zeros((1, m, m))
-    return blockforms.Shown(
-        modal.columns[None], modal.k, modal.nodes[None], nodes, none[0, :1], none, none, float(contact.stress(1.0)),
-        kinks, 0.0, False, modal.bends, m - n,
-        float(problem.network.capacitance(reduced.area0).sum()), moves,
+    kinks = np.full(reduced.leaking.size + 1, polyval(-1.0, slope))
+    kinks[-1] = 0.5 * scale**2 * polyval(-1.0, polyder(bend, 2))
+    rates, gain, shape, taps, tap_s, bent, feed = map(np.ascontiguousarray, (
+        modal.rates, modal.gain, modal.taps[0], modal.taps[1:-1], modal.tap_s[1:-1],
+        modal.taps[1:-1, :n] @ reduced.absorbed, modal.drives,
+    ))  # fmt: skip
+    acting = np.abs(modal.taps[0, :n] * reduced.absorbed) * reduced.modes.rates
+    lanes = Lanes(
+        rates, gain, shape, float(modal.tap_s[0]), taps, tap_s, bent, feed, area, slope, bend, scale, -1.0, reduced.q0,
+        reduced.kappa, kinks, int(np.argmax(acting)),
+    )  # fmt: skip
+    nodes = Shown(modal.nodes, np.zeros(len(modal.nodes)), modal.nodes[:, :n] @ reduced.absorbed)
+    return NetworkForm(
+        lanes, n, Shown(modal.columns, modal.k, modal.bends), nodes, m - n, float(contact.stress(1.0)), share,
+        scene.u_top, missed, missed_bend, float(problem.network.capacitance(reduced.area0).sum()), reduced,
     )  # fmt: skip
 
 
@@ -262,7 +192,7 @@ def _curves(
 
 def _powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
     """A Chebyshev series in powers, of a degree that is a multiple of 4, and what it lacks; empty if too much."""
-    for degree in range(4, blockforms.MOST_DEGREE + 1, 4):
+    for degree in range(4, MOST_DEGREE + 1, 4):
         off = float(np.abs(series[degree + 1 :]).sum())
         if off <= tol:
             out = np.empty(degree + 1)

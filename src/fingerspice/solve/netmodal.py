@@ -1,4 +1,4 @@
-"""One finger in a network, in the form of `engine.relaxation`, so that a recording needs one step a sample there, too.
+"""One finger in a network, in the form of `engine.lanestep`, so that a recording needs one step a sample there, too.
 
 In modes at a reference area A0 a network is v' = -rates v + gain s + feed j, u = tap v + tap_s s, where each cell whose
 area moves carries a current beside that at A0 (see `engine.netrows`). Under the local law, and with e = A - A0, it is

@@ -24,7 +24,7 @@ from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.solve.following import Following, Outcome
 from fingerspice.solve.forms import Follower, followed
-from fingerspice.solve.laneform import LaneForm, prepared, rounded_peak
+from fingerspice.solve.laneform import LaneForm, rounded_peak, stack
 from fingerspice.solve.lanes import LaneMarch
 from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.netforms import finger
@@ -191,7 +191,7 @@ def _decade(rtol: float) -> float:
 def ready(problem: Problem, rtol: float) -> LaneForm | Follower | None:
     """The scene prepared for this method, cached by decade; None where it does not apply."""
     kept, *key = _kept(problem, rtol)
-    make = finger if problem.scene.stack is None else followed if problem.scene.net.mobile else prepared
+    make = finger if problem.scene.stack is None else followed if problem.scene.net.mobile else stack
     one: LaneForm | Follower | None = kept_with(
         kept, ("followed", *key), MOST_FORMS, partial(make, problem, _decade(rtol))
     )
