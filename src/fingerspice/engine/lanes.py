@@ -17,6 +17,19 @@ TILE = 16
 # Coefficients from x on of the quartic that is 0 at the nodes and has the slope 1 at the end of the step.
 _POWERS: list[float] = np.poly(np.array([0.0, *INNER, 1.0]))[3::-1].tolist()
 _QUARTIC = np.array(_POWERS) / (np.array(_POWERS) @ np.arange(1.0, NODES + 1.0))
+
+
+def _through(nodes: tuple[float, ...], until: float) -> FloatArray:
+    """Coefficients of the Lagrange polynomials through nodes, for x from 0 at 0 to 1 at `until`, times `until`."""
+    found = np.linalg.inv(np.vander(np.array(nodes) / until, increasing=True)).T
+    return np.pad(until * found, ((0, 0), (0, NODES - len(nodes))))
+
+
+# Weights in a network at each later node: of the leaks, which are known at the nodes before, and of N.
+_PLACES = (0.0, *INNER, 1.0)
+_PREDICTED = np.ascontiguousarray(np.vstack([
+    _through(_PLACES[:count], _PLACES[node]) for node in range(1, NODES) for count in (node, node + 1)
+]))  # fmt: skip
 # Largest rate times length for which moments follow from the highest one, and that from its series.
 _EARLY = 1.0
 
@@ -93,39 +106,50 @@ def _until(
 
 
 @jit_rows
-def _line(n: int, at: float, h: FloatArray, m1: FloatArray, end: FloatArray) -> None:
-    for i in range(n):
-        end[i] = at * h[i] * m1[i]
-
-
-@jit_rows
 def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
     for i in range(n):
         out[i] = h[i] * (c[0] * m[0, i] + c[1] * m[1, i] + c[2] * m[2, i] + c[3] * m[3, i])
 
 
 @jit
-def weigh(rates: FloatArray, gain: FloatArray, h: FloatArray, weights: FloatArray) -> None:
-    """Weights of steps of the lengths h (n,), into the rows (n,) of `weights`.
+def _shares(c: Any, weights: FloatArray) -> None:
+    """Shares of N at a node in xi, and in what 1/A - q0 multiplies, from its weights in all modes."""
+    count, leaks = c.rates.size, c.tap_s.size
+    first = count * (PER_MODE + PER_MODE_BENT) + 1
+    weights[first:] = 0.0
+    for node in range(1, NODES):
+        for k in range(count):
+            own = weights[count * PER_MODE + 1 + k * PER_MODE_BENT + node * node - 1 + 2 * node]
+            for i in range(own.size):
+                by = c.feed[k, leaks] * own[i]
+                weights[first + (node - 1) * (1 + leaks), i] += c.shape[k] * by
+                for t in range(leaks):
+                    weights[first + (node - 1) * (1 + leaks) + 1 + t, i] += c.taps[t, k] * by
 
-    These are `PER_MODE` for each mode, then h, and if there are more, `PER_MODE_BENT` for each mode.
-    """
-    n, m, count = h.size, np.empty((NODES + 2, h.size)), rates.size
-    bent = weights.shape[0] > count * PER_MODE + 1
+
+@jit
+def weigh(c: Any, h: FloatArray, weights: FloatArray) -> None:
+    """Weights of steps of the lengths h (n,), into the rows (n,) of `weights`, in the order of `lanestep`."""
+    rates, n, m, count = c.rates, h.size, np.empty((NODES + 2, h.size)), c.rates.size
+    bent = c.feed.shape[1] > c.tap_s.size
     for k in range(count):
-        own = weights[k * PER_MODE :]
+        own, more = weights[k * PER_MODE :], weights[count * PER_MODE + 1 + k * PER_MODE_BENT :]
         for node in range(NODES - 1):
             at, rows = INNER[node] if node < NODES - 2 else 1.0, own[4 * node :]
-            top = 1 if node < NODES - 2 else NODES if bent else NODES - 1
+            top = NODES if bent else 1 if node < NODES - 2 else NODES - 1
             _moments(top, rates[k] * at, h, m)
-            _until(n, rates[k], gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2], rows[3])
+            _until(n, rates[k], c.gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2], rows[3])
             if bent:
-                _line(n, at, h, m[1], weights[count * PER_MODE + 1 + k * PER_MODE_BENT + node])
+                first = (node + 1) ** 2 - 1
+                for j in range(2 * node + 3):
+                    _drive(n, _PREDICTED[first + j], h, m, more[first + j])
         for j in range(NODES):
             _drive(n, BASIS[j], h, m, own[4 * (NODES - 1) + j])
         if bent:
-            _drive(n, _QUARTIC, h, m[1:], weights[count * PER_MODE + 1 + k * PER_MODE_BENT + NODES - 1])
+            _drive(n, _QUARTIC, h, m[1:], more[NODES**2 - 1])
     weights[count * PER_MODE] = h
+    if bent:
+        _shares(c, weights)
 
 
 @jit
@@ -184,7 +208,7 @@ def span(
             if len(marks.own) > 0:
                 for i in range(lanes):
                     length[i] = h[first[i] + done + k] / parts
-                weigh(c.rates, c.gain, length, weights)
+                weigh(c, length, weights)
             for p in range(parts):
                 step(marks, c, flat, state, after[k * lanes :], p / parts, (p + 1) / parts)
             for i in range(m * lanes):
@@ -337,7 +361,7 @@ def within(
             for k in range(m):
                 modes[k, i] = starts[k, j]
         begin(marks, c, still, modes, before, state)
-        weigh(c.rates, c.gain, length, weights)
+        weigh(c, length, weights)
         for p in range(parts):
             step(marks, c, weights.reshape(-1), state, after, p / parts, (p + 1) / parts)
         for i in range(min(lanes, h.size - first)):

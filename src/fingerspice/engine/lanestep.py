@@ -8,13 +8,13 @@ step:
 In a stack xi is the gap voltage u, and 1/A a polynomial in |u|. In a network N, the integral of A - 1/q0 over u, is one
 more drive, behind the leaks: u + kappa N = xi, and both 1/A and N are polynomials in |xi| (`solve.netmodal`).
 
-The drives g are taken at Lobatto's four nodes, where the state is predicted with the leaks held at their last value and
-N as a line from the start of the step to the node, which is an equation for xi there. The modes' response to the source
-and to the cubic through the drives is exact. Where xi crosses 0 V, g has a kink, of which the integral and the first
-moment that the rule misses are known on the straight line of xi, and are added. In a network the slope of N at the end
-of the step is known, too, and makes the cubic a quartic; modes that decay within a small part of a sample begin where
-they soon are, and what they leave on the way decays beside them. The last modes may be passive: nothing depends on
-them, such as a charge.
+The drives g are taken at Lobatto's four nodes. There the state of a stack is predicted with the drives held at their
+last value; in a network with the polynomial through the leaks at the nodes before and through N at these and the node
+itself, which is an equation for xi. The modes' response to the source and to the cubic through the drives is exact.
+Where xi crosses 0 V, g has a kink, of which the integral and the first moment that the rule misses are known on the
+straight line of xi, and are added. In a network the slope of N at the end of the step is known, too, and makes the
+cubic a quartic; modes that decay within a small part of a sample begin where they soon are, and what they leave on the
+way decays beside them. The last modes may be passive: nothing depends on them, such as a charge.
 
 Arrays hold one row of `lanes` values after the other. Weights are shared by all lanes, or each lane has its own. What
 has to be known to the compiler are the lengths of the tuples in `Marks`.
@@ -38,9 +38,10 @@ BASIS = np.ascontiguousarray(np.linalg.inv(np.vander((0.0, *INNER, 1.0), increas
 _END_SLOPES = BASIS @ np.array([0.0, 1.0, 2.0, 3.0])
 # Weights of a mode: decay, both ends of the source, and the drive held, up to each later node; then of four drives.
 PER_MODE = 4 * (NODES - 1) + NODES
-# In a network behind those of all modes and the step's length: the end of a line through a drive up to each later node,
-# and a slope at the end of the step.
-PER_MODE_BENT = NODES
+# In a network behind those of all modes and the step's length, for each mode: for node j of the later ones leaks at the
+# j nodes before, from row j^2 - 1 on, and N at these and itself; then a slope at the end of the step. Behind them, for
+# each of these nodes, the share of N there in xi and in what 1/A - q0 multiplies.
+PER_MODE_BENT = NODES**2
 # Rows of the lanes' state before those of the modes: the source at both ends of a part, and at the last sample.
 SOURCES = 3
 # Time constants in a step from which on a mode is taken to follow the drives.
@@ -90,8 +91,7 @@ class _Rows(NamedTuple):
     g: int  # Drives at the nodes
     w: int  # What 1/A - q0 multiplies at the start, and at the latest node
     scratch: int
-    # In a network: dN/dxi at the latest node; shares of N there in xi, and in what 1/A - q0 multiplies
-    rise: int
+    q: int  # In a network: 1/A - q0 at the latest node, and its derivative by |xi|
     gone: int  # What modes have beside where they soon are, and by which this changes the drives
     end: int
 
@@ -103,9 +103,8 @@ def rows_of(marks: Any) -> _Rows:
     g = xi + NODES
     w = g + NODES * drives
     scratch = w + 2 * leaks
-    rise = scratch + 5 + NODES + drives
-    gone = rise + 2 + leaks
-    return _Rows(xi, g, w, scratch, rise, gone, gone + m + drives if drives > leaks else rise)
+    q = scratch + 5 + NODES + drives
+    return _Rows(xi, g, w, scratch, q, q + 2, q + 2 + m + drives if drives > leaks else q)
 
 
 _rows_of = jit_within(rows_of)
@@ -137,8 +136,7 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
         before = state[2 * lanes + i]
         change = after[i] - before
         state[i], state[lanes + i] = before + a * change, before + b * change
-    if drives > leaks:
-        _smooth(marks, c, weights, a == 0.0, state)
+    fades = drives > leaks and a == 0.0 and _smooth(marks, c, weights, state)
     for j in range(1, NODES):
         until = INNER[0] if j == 1 else INNER[1] if j == 2 else 1.0
         for i in range(lanes):
@@ -146,51 +144,92 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
             state[(at.xi + j) * lanes + i] = c.k * s
             for t in range(leaks):
                 state[(at.w + leaks + t) * lanes + i] = c.tap_s[t] * s
-            if drives > leaks:
-                for t in range(1 + leaks):
-                    state[(at.rise + 1 + t) * lanes + i] = 0.0
         for k in range(active):
-            p, end = k * PER_MODE + 4 * (j - 1), length + 1 + k * PER_MODE_BENT + j - 1
+            p = k * PER_MODE + 4 * (j - 1)
             for i in range(lanes):
-                held, fed = weights[(p + 3) * wide + i * each], 0.0
-                for t in range(leaks):
-                    fed += c.feed[k, t] * state[(at.g + (j - 1) * drives + t) * lanes + i]
-                z = (
+                state[at.scratch * lanes + i] = (
                     weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
                     + weights[(p + 1) * wide + i * each] * state[i]
                     + weights[(p + 2) * wide + i * each] * state[lanes + i]
-                    + held * fed
                 )
-                if drives > leaks:
-                    by = weights[end * wide + i * each]
-                    z += c.feed[k, leaks] * (held - by) * state[(at.g + leaks) * lanes + i]
-                    state[(at.rise + 1) * lanes + i] += c.shape[k] * c.feed[k, leaks] * by
+            if drives > leaks:
+                _add_predicted(marks, c, k, j, weights, state)
+            else:
+                for i in range(lanes):
+                    fed = 0.0
                     for t in range(leaks):
-                        state[(at.rise + 2 + t) * lanes + i] += c.taps[t, k] * c.feed[k, leaks] * by
+                        fed += c.feed[k, t] * state[(at.g + (j - 1) * drives + t) * lanes + i]
+                    state[at.scratch * lanes + i] += weights[(p + 3) * wide + i * each] * fed
+            for i in range(lanes):
+                z = state[at.scratch * lanes + i]
                 state[(at.xi + j) * lanes + i] += c.shape[k] * z
                 for t in range(leaks):
                     state[(at.w + leaks + t) * lanes + i] += c.taps[t, k] * z
-        _drives(marks, c, j, j - 1, state)
+        _drives(marks, c, weights, j, j - 1, j - 1, state)
     for i in range(lanes):
         state[(at.scratch + 1) * lanes + i] = weights[length * wide + i * each]
     _kinks(marks, c.kinks, state)
     _advance(marks, c, weights, state)
     if drives > leaks:
         _bend_end(marks, c, weights, state)
-        _settle(marks, c, weights, state)
+        if fades:
+            _fade(marks, c, weights, state)
+        _end(marks, c, state)
     else:
         for i in range(lanes):
             xi = c.k * state[lanes + i]
             for k in range(active):
                 xi += c.shape[k] * state[(SOURCES + k) * lanes + i]
             state[at.xi * lanes + i] = xi
-    for i in range(lanes):
-        if b == 1.0:
+            for t in range(drives):
+                state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * drives + t) * lanes + i]
+            for t in range(leaks):
+                state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
+    if b == 1.0:
+        for i in range(lanes):
             state[2 * lanes + i] = state[lanes + i]
-        for t in range(drives):
-            state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * drives + t) * lanes + i]
+
+
+@jit_within
+def _add_predicted(marks: Any, c: Any, k: int, j: int, weights: FloatArray, state: FloatArray) -> None:
+    """Add mode k's response to leaks and N at the nodes before j to the first row of scratch."""
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), _rows_of(marks)
+    drives, own = leaks + 1, len(marks.modes) * PER_MODE + k * PER_MODE_BENT + j * j
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    for node in range(j):
+        for i in range(lanes):
+            fed = 0.0
+            for t in range(leaks):
+                fed += c.feed[k, t] * state[(at.g + node * drives + t) * lanes + i]
+            bend = c.feed[k, leaks] * state[(at.g + node * drives + leaks) * lanes + i]
+            by_leaks, by_bend = weights[(own + node) * wide + i * each], weights[(own + j + node) * wide + i * each]
+            state[at.scratch * lanes + i] += by_leaks * fed + by_bend * bend
+
+
+@jit_within
+def _end(marks: Any, c: Any, state: FloatArray) -> None:
+    """xi and the drives at the end of a step, from the modes there and on the tangents at the last node, to node 0."""
+    lanes, active, leaks, at = len(marks.lanes), len(marks.active), len(marks.leaks), _rows_of(marks)
+    drives, last = leaks + 1, NODES - 1
+    for i in range(lanes):
+        state[at.xi * lanes + i] = c.k * state[lanes + i]
         for t in range(leaks):
-            state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
+            state[(at.w + t) * lanes + i] = c.tap_s[t] * state[lanes + i]
+    for k in range(active):
+        for i in range(lanes):
+            z = state[(SOURCES + k) * lanes + i]
+            state[at.xi * lanes + i] += c.shape[k] * z
+            for t in range(leaks):
+                state[(at.w + t) * lanes + i] += c.taps[t, k] * z
+    for i in range(lanes):
+        xi, found, q = state[at.xi * lanes + i], state[(at.xi + last) * lanes + i], state[at.q * lanes + i]
+        bend = state[(at.g + last * drives + leaks) * lanes + i]
+        bend -= q / (c.q0 * (c.q0 + q) - c.kappa * q) * (xi - found)
+        q += state[(at.q + 1) * lanes + i] * (abs(xi) - abs(found))
+        state[at.q * lanes + i], state[(at.g + leaks) * lanes + i] = q, bend
+        for t in range(leaks):
+            w = state[(at.w + t) * lanes + i] + c.bent[t] * bend
+            state[(at.w + t) * lanes + i], state[(at.g + t) * lanes + i] = w, q * w
 
 
 @jit_within
@@ -222,41 +261,51 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
 
 
 @jit_within
-def _drives(marks: Any, c: Any, j: int, before: int, state: FloatArray) -> None:
+def _drives(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shared: int, state: FloatArray) -> None:
     """Drives at node j, from xi there, but for N, and from what 1/A - q0 multiplies there.
 
-    In a network xi = X + B N(xi), where X is given in its row, and B in the row after `rise`. It is solved once on the
-    tangent of N at node `before`, and again on the one at that place.
+    In a network xi = X + B N(xi), where X is given, and B is the share number `shared`, or 0 if that is negative. It is
+    solved on the tangent of N at node `before`, and once more on the one at the place that is found. Tangents have the
+    slope -q / d, d = q0 (q0 + q) - kappa q, where 1/A = q0 + q.
     """
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), _rows_of(marks)
     drives, x = leaks + len(marks.bend), at.scratch
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    count = len(marks.modes)
+    share_at, on = count * (PER_MODE + PER_MODE_BENT) + 1 + max(shared, 0) * (1 + leaks), 1.0 if shared >= 0 else 0.0
     if drives > leaks:
         for i in range(lanes):
             there, bend = state[(at.xi + before) * lanes + i], state[(at.g + before * drives + leaks) * lanes + i]
-            share, rest = state[(at.rise + 1) * lanes + i], state[(at.xi + j) * lanes + i]
-            state[(x + 2) * lanes + i] = rest
-            guess = there + (rest + share * bend - there) / (1.0 - share * state[at.rise * lanes + i])
-            state[(at.xi + j) * lanes + i] = guess
+            share, q = on * weights[share_at * wide + i * each], state[at.q * lanes + i]
+            without = state[(at.xi + j) * lanes + i]
+            d = c.q0 * (c.q0 + q) - c.kappa * q
+            state[(x + 2) * lanes + i] = without
+            state[(at.xi + j) * lanes + i] = there + d * ((without + share * bend - there) / (d + share * q))
     for i in range(lanes):
         state[x * lanes + i] = abs(state[(at.xi + j) * lanes + i]) * c.scale + c.shift
     _polynomial_rows(lanes, c.area, state[x * lanes :], state[(x + 1) * lanes :])
     if drives > leaks:
-        _polynomial_rows(lanes, c.slope, state[x * lanes :], state[(x + 3) * lanes :])
+        _polynomial_rows(lanes, c.slope, state[x * lanes :], state[(at.q + 1) * lanes :])
         _polynomial_rows(lanes, c.bend, state[x * lanes :], state[(x + 4) * lanes :])
         for i in range(lanes):
-            xi, q = state[(at.xi + j) * lanes + i], state[(x + 1) * lanes + i]
-            bend, share = state[(x + 4) * lanes + i], state[(at.rise + 1) * lanes + i]
+            xi, q, share = (
+                state[(at.xi + j) * lanes + i],
+                state[(x + 1) * lanes + i],
+                on * weights[share_at * wide + i * each],
+            )
+            bend = state[(x + 4) * lanes + i]
             bend = bend if xi >= 0.0 else -bend
-            rise = rise_of(c.q0, c.kappa, q)
-            change = (state[(x + 2) * lanes + i] + share * bend - xi) / (1.0 - share * rise)
-            bend += rise * change
-            q += state[(x + 3) * lanes + i] * (abs(xi + change) - abs(xi))
-            state[(at.xi + j) * lanes + i] = xi + change
+            d = c.q0 * (c.q0 + q) - c.kappa * q
+            by = (state[(x + 2) * lanes + i] + share * bend - xi) / (d + share * q)
+            bend -= q * by
+            found = xi + d * by
+            q += state[(at.q + 1) * lanes + i] * (abs(found) - abs(xi))
+            state[(at.xi + j) * lanes + i] = found
             state[(x + 1) * lanes + i] = q
-            state[at.rise * lanes + i] = rise_of(c.q0, c.kappa, q)
+            state[at.q * lanes + i] = q
             state[(at.g + j * drives + leaks) * lanes + i] = bend
             for t in range(leaks):
-                more = c.bent[t] + state[(at.rise + 2 + t) * lanes + i]
+                more = c.bent[t] + on * weights[(share_at + 1 + t) * wide + i * each]
                 state[(at.w + leaks + t) * lanes + i] += more * bend
     for t in range(leaks):
         for i in range(lanes):
@@ -265,82 +314,80 @@ def _drives(marks: Any, c: Any, j: int, before: int, state: FloatArray) -> None:
 
 
 @jit_within
-def rise_of(q0: float, kappa: float, q: float) -> float:
-    """dN/dxi where 1/A - q0 = q: e / (1 + kappa e), e = A - 1/q0."""
-    return -q / (q0 * (q0 + q) - kappa * q)
+def _changes(marks: Any, c: Any, weights: FloatArray, node: int, state: FloatArray) -> None:
+    """Change of N in a step at its rate at node 0 or the last one, into the first row of scratch.
 
-
-@jit_within
-def _rate(marks: Any, c: Any, weights: FloatArray, node: int, state: FloatArray) -> None:
-    """dN/dt at node 0 or the last one into the first row of scratch; modes that have faded follow source and N."""
+    Modes that have faded follow the source and N.
+    """
     lanes, active, leaks, at = len(marks.lanes), len(marks.active), len(marks.leaks), _rows_of(marks)
-    drives = leaks + 1
+    drives, x = leaks + 1, at.scratch
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     length = len(marks.modes) * PER_MODE
     for i in range(lanes):
-        h = weights[length * wide + i * each]
-        slope, rise = (state[lanes + i] - state[i]) / (h + 1e-300), state[at.rise * lanes + i]
-        s = state[i] if node == 0 else state[lanes + i]
-        rate, share = c.k * slope, 0.0
-        for k in range(active):
-            own = c.gain[k] * s - c.rates[k] * state[(SOURCES + k) * lanes + i]
+        state[x * lanes + i] = c.k * (state[lanes + i] - state[i])
+        state[(x + 2) * lanes + i] = 0.0
+    for k in range(active):
+        rate, over, shape, gain, feed = c.rates[k], 1.0 / (c.rates[k] + 1e-300), c.shape[k], c.gain[k], c.feed[k, leaks]
+        for i in range(lanes):
+            h = weights[length * wide + i * each]
+            own = gain * (state[i] if node == 0 else state[lanes + i]) - rate * state[(SOURCES + k) * lanes + i]
             for t in range(drives):
                 own += c.feed[k, t] * state[(at.g + node * drives + t) * lanes + i]
-            follows = c.rates[k] * h > FADED
-            rate += c.shape[k] * (c.gain[k] * slope / c.rates[k] if follows else own)
-            share += c.shape[k] * c.feed[k, leaks] / c.rates[k] if follows else 0.0
-        state[at.scratch * lanes + i] = rise * rate / (1.0 - share * rise)
+            follows = rate * h > FADED
+            state[x * lanes + i] += shape * (gain * (state[lanes + i] - state[i]) * over if follows else h * own)
+            state[(x + 2) * lanes + i] += shape * feed * over if follows else 0.0
+    for i in range(lanes):
+        q = state[at.q * lanes + i]
+        d = c.q0 * (c.q0 + q) - c.kappa * q
+        state[x * lanes + i] *= -q / (d + state[(x + 2) * lanes + i] * q)
 
 
 @jit_within
-def _smooth(marks: Any, c: Any, weights: FloatArray, begins: bool, state: FloatArray) -> None:
+def _smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
     """Put modes that fade within the first step of a sample where they soon are, on the new line of the source.
 
-    What this changes of them and of the drives is kept in the rows from `gone` on.
+    What this changes of them and of the drives is kept in the rows from `gone` on. Whether there are such modes.
     """
     lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
     drives, last, at = leaks + 1, NODES - 1, _rows_of(marks)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    for i in range((m + drives) * lanes):
-        state[at.gone * lanes + i] = 0.0
     fades = False
-    for i in range(lanes if each else 1):
+    for i in range(lanes if len(marks.own) > 0 else 1):
         fades = fades or c.rates[c.fast] * weights[m * PER_MODE * wide + i * each] > FADED
-    if not (begins and fades):
-        return
-    _rate(marks, c, weights, 0, state)
+    if not fades:
+        return False
+    _changes(marks, c, weights, 0, state)
     for i in range(lanes):
-        s, h = state[i], weights[m * PER_MODE * wide + i * each]
-        slope = (state[lanes + i] - s) / (h + 1e-300)
-        xi = c.k * s
+        state[(at.xi + last) * lanes + i] = c.k * state[i]
         for t in range(leaks):
-            state[(at.w + leaks + t) * lanes + i] = c.tap_s[t] * s
-        for k in range(active):
-            z, rate = state[(SOURCES + k) * lanes + i], c.rates[k]
-            if rate * h > FADED:
-                fed = c.gain[k] * s
-                for t in range(drives):
-                    fed += c.feed[k, t] * state[(at.g + t) * lanes + i]
-                changes = c.gain[k] * slope + c.feed[k, leaks] * state[at.scratch * lanes + i]
-                soon = (fed - changes / rate) / rate
-                state[(at.gone + k) * lanes + i] = z - soon
-                state[(SOURCES + k) * lanes + i] = soon
-                z = soon
-            xi += c.shape[k] * z
+            state[(at.w + leaks + t) * lanes + i] = c.tap_s[t] * state[i]
+    for k in range(active):
+        rate, over, gain, feed = c.rates[k], 1.0 / (c.rates[k] + 1e-300), c.gain[k], c.feed[k, leaks]
+        for i in range(lanes):
+            z, h = state[(SOURCES + k) * lanes + i], weights[m * PER_MODE * wide + i * each]
+            fed = gain * state[i]
+            for t in range(drives):
+                fed += c.feed[k, t] * state[(at.g + t) * lanes + i]
+            changes = gain * (state[lanes + i] - state[i]) + feed * state[at.scratch * lanes + i]
+            soon = (fed - changes / (rate * h + 1e-300)) * over
+            soon = soon if rate * h > FADED else z
+            state[(at.gone + k) * lanes + i] = z - soon
+            state[(SOURCES + k) * lanes + i] = soon
+            state[(at.xi + last) * lanes + i] += c.shape[k] * soon
             for t in range(leaks):
-                state[(at.w + leaks + t) * lanes + i] += c.taps[t, k] * z
-        state[(at.xi + last) * lanes + i] = xi
-        for t in range(1 + leaks):
-            state[(at.rise + 1 + t) * lanes + i] = 0.0
-    _drives(marks, c, last, 0, state)
+                state[(at.w + leaks + t) * lanes + i] += c.taps[t, k] * soon
+    _drives(marks, c, weights, last, 0, -1, state)
     for i in range(lanes):
         state[at.xi * lanes + i] = state[(at.xi + last) * lanes + i]
+        for k in range(active, m):
+            state[(at.gone + k) * lanes + i] = 0.0
         for t in range(drives):
             smooth = state[(at.g + last * drives + t) * lanes + i]
             state[(at.gone + m + t) * lanes + i] = state[(at.g + t) * lanes + i] - smooth
             state[(at.g + t) * lanes + i] = smooth
         for t in range(leaks):
             state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
+    return True
 
 
 @jit_within
@@ -349,64 +396,41 @@ def _bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> Non
     lanes, m, leaks, at = len(marks.lanes), len(marks.modes), len(marks.leaks), _rows_of(marks)
     drives = leaks + 1
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    _rate(marks, c, weights, NODES - 1, state)
+    _changes(marks, c, weights, NODES - 1, state)
     for i in range(lanes):
-        lacks = state[at.scratch * lanes + i] * weights[m * PER_MODE * wide + i * each]
         for j in range(NODES):
-            lacks -= _END_SLOPES[j] * state[(at.g + j * drives + leaks) * lanes + i]
-        state[at.scratch * lanes + i] = lacks
+            of_cubic = _END_SLOPES[j] * state[(at.g + j * drives + leaks) * lanes + i]
+            state[at.scratch * lanes + i] -= of_cubic
     for k in range(m):
-        p = m * PER_MODE + 1 + k * PER_MODE_BENT + NODES - 1
+        p = m * PER_MODE + (k + 1) * PER_MODE_BENT
         for i in range(lanes):
             by = c.feed[k, leaks] * weights[p * wide + i * each]
             state[(SOURCES + k) * lanes + i] += by * state[at.scratch * lanes + i]
 
 
 @jit_within
-def _settle(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
-    """N at the end of a step anew with the modes there, and modes and drives by it; then what fades in the step."""
-    lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
-    drives, last, at = leaks + 1, NODES - 1, _rows_of(marks)
+def _fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
+    """Add what is left of what `_smooth` has taken, and of what it has caused."""
+    lanes, m, leaks, at = len(marks.lanes), len(marks.modes), len(marks.leaks), _rows_of(marks)
+    drives, last = leaks + 1, NODES - 1
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    by = 4 * last + last
-    for i in range(lanes):
-        bend, xi, share = state[(at.g + last * drives + leaks) * lanes + i], c.k * state[lanes + i], 0.0
-        state[(at.g + leaks) * lanes + i] = bend
-        state[at.xi * lanes + i] = state[(at.xi + last) * lanes + i]
-        for k in range(active):
-            xi += c.shape[k] * state[(SOURCES + k) * lanes + i]
-            share += c.shape[k] * c.feed[k, leaks] * weights[(k * PER_MODE + by) * wide + i * each]
-        state[(at.xi + last) * lanes + i] = xi - share * bend
-        state[(at.rise + 1) * lanes + i] = share
-        for t in range(leaks):
-            w, more = c.tap_s[t] * state[lanes + i], 0.0
-            for k in range(active):
-                own = c.feed[k, leaks] * weights[(k * PER_MODE + by) * wide + i * each]
-                w += c.taps[t, k] * (state[(SOURCES + k) * lanes + i] - own * bend)
-                more += c.taps[t, k] * own
-            state[(at.w + leaks + t) * lanes + i] = w
-            state[(at.rise + 2 + t) * lanes + i] = more
-    _drives(marks, c, last, 0, state)
-    rate = c.rates[c.fast]
-    for i in range(lanes):
-        change = state[(at.g + last * drives + leaks) * lanes + i] - state[(at.g + leaks) * lanes + i]
-        state[at.xi * lanes + i] = state[(at.xi + last) * lanes + i]
-        h = weights[m * PER_MODE * wide + i * each]
-        faded = weights[(c.fast * PER_MODE + 4 * (last - 1)) * wide + i * each]
-        for k in range(m):
-            decay = weights[(k * PER_MODE + 4 * (last - 1)) * wide + i * each]
-            apart = c.rates[k] - rate
-            pulse = h * faded if abs(apart) < 1e-6 * rate else (faded - decay) / apart
-            fed = 0.0
+    rate, p = c.rates[c.fast], c.fast * PER_MODE + 4 * (last - 1)
+    for k in range(m):
+        apart = c.rates[k] - rate
+        over, alike = 1.0 / (apart if apart != 0.0 else 1.0), abs(apart) < 1e-6 * rate
+        for i in range(lanes):
+            h, faded = weights[m * PER_MODE * wide + i * each], weights[p * wide + i * each]
+            decay, fed = weights[(k * PER_MODE + 4 * (last - 1)) * wide + i * each], 0.0
             for t in range(drives):
                 fed += c.feed[k, t] * state[(at.gone + m + t) * lanes + i]
             left = decay * state[(at.gone + k) * lanes + i]
-            if k < active:
-                state[at.xi * lanes + i] += c.shape[k] * left
-            more = c.feed[k, leaks] * weights[(k * PER_MODE + by) * wide + i * each] * change
-            state[(SOURCES + k) * lanes + i] += more + left + pulse * fed
-        for t in range(drives):
-            state[(at.g + last * drives + t) * lanes + i] += faded * state[(at.gone + m + t) * lanes + i]
+            state[(SOURCES + k) * lanes + i] += left + (h * faded if alike else (faded - decay) * over) * fed
+
+
+@jit_within
+def rise_of(q0: float, kappa: float, q: float) -> float:
+    """dN/dxi where 1/A = q0 + q: e / (1 + kappa e), e = A - 1/q0."""
+    return -q / (q0 * (q0 + q) - kappa * q)
 
 
 @jit_within

@@ -17,7 +17,7 @@ from fingerspice.circuit.statespace import Stack
 from fingerspice.engine.blockforms import MOST_DEGREE
 from fingerspice.engine.blockrows import area_rows
 from fingerspice.engine.lanes import weigh
-from fingerspice.engine.lanestep import PER_MODE, PER_MODE_BENT, Lanes, Marks, rows_of
+from fingerspice.engine.lanestep import NODES, PER_MODE, PER_MODE_BENT, Lanes, Marks, rows_of
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import N_PACKED
@@ -84,8 +84,9 @@ class LaneForm(ABC):
 
     @property
     def _weights(self) -> int:
-        modes, bent = self.lanes.rates.size, self.lanes.feed.shape[1] > self.lanes.tap_s.size
-        return modes * (PER_MODE + (PER_MODE_BENT if bent else 0)) + 1
+        modes, leaks = self.lanes.rates.size, self.lanes.tap_s.size
+        bent = self.lanes.feed.shape[1] > leaks
+        return modes * PER_MODE + 1 + (modes * PER_MODE_BENT + (NODES - 1) * (1 + leaks) if bent else 0)
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
@@ -94,7 +95,7 @@ class LaneForm(ABC):
     def weights(self, h: FloatArray) -> FloatArray:
         """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
         out = np.empty((self._weights, h.size))
-        weigh(self.lanes.rates, self.lanes.gain, h, out)
+        weigh(self.lanes, h, out)
         return out
 
     def _polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:

@@ -36,8 +36,9 @@ SAFETY = 2.0
 OF_STARTS = 0.05
 # A window over its piece, and the fewest samples in one.
 WINDOW, FEWEST = 1.0 / 16.0, 32
-# Excess below which the next block has steps twice as long, and what half the length divides an error by at least.
-COARSER, FINER = 1.0 / 60.0, 5.0
+# Excess below which the next block has steps twice as long, and what half the length divides an error by at least: in a
+# stack, and in a network.
+COARSER, FINER = 1.0 / 60.0, (5.0, 8.0)
 # Error allowed in a piece that the ordinary engine integrates, over the error asked for.
 LED_SHARE = 0.03
 # What leaks by the error of the polynomial of 1/A over what is stored, times that error: as seen in offset recordings.
@@ -287,7 +288,8 @@ class LaneMarch(Following):
             self.refused += parts * block.n
             if self.level + 1 == len(PARTS):
                 return Outcome.NOT_MET
-            finer = math.ceil(math.log(excess) / math.log(FINER)) if excess < math.inf else 1
+            divides = FINER[1] if block.marks.bend else FINER[0]
+            finer = math.ceil(math.log(excess) / math.log(divides)) if excess < math.inf else 1
             self.level = min(self.level + max(1, finer), len(PARTS) - 1)
         self.peak, self.errors = max(peak, self.peak), np.maximum(errors, self.errors)
         self.alike, self.chance = handed
