@@ -75,7 +75,11 @@ class LaneForm(ABC):
 
     @abstractmethod
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        """Rows of a record from those of `rows` and of the charges' rates, (C, n)."""
+        """Rows of a record from `out` (`width`, n), which begins with those of `rows` and of the charges' rates."""
+
+    def width(self, problem: Problem) -> int:
+        """Number of rows of the outputs."""
+        return self.rows.k.size + self.flows
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""

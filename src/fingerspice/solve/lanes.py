@@ -38,7 +38,7 @@ OF_STARTS = 0.05
 WINDOW, FEWEST = 1.0 / 16.0, 32
 # Excess below which the next block has steps twice as long, and what half the length divides an error by at least: in a
 # stack, and in a network.
-COARSER, FINER = 1.0 / 60.0, (5.0, 8.0)
+COARSER, FINER = 1.0 / 60.0, (5.0, 12.0)
 # Error allowed in a piece that the ordinary engine integrates, over the error asked for.
 LED_SHARE = 0.03
 # What leaks by the error of the polynomial of 1/A over what is stored, times that error: as seen in offset recordings.
@@ -184,7 +184,8 @@ class Block:
         share_of_products : ndarray, shape (m, m, LANES)
             The same of products of two errors, if they come by chance.
         """
-        width, lanes = min(self.count, max(FEWEST, round(self.count * WINDOW))), np.arange(LANES)
+        width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + len(self.marks.bend)))))
+        lanes = np.arange(LANES)
         off, at = np.zeros((self.rates.size, LANES, width + 1)), np.zeros(LANES, np.int64)
         for place in self._windows(width):
             first = np.maximum(place, 0)
@@ -258,7 +259,7 @@ class LaneMarch(Following):
     """A recording of one finger under `local` in progress, block by block."""
 
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
-        super().__init__(problem, rtol, share, form.gain, form.rows.k.size + form.flows)
+        super().__init__(problem, rtol, share, form.gain, form.width(problem))
         self.form, m = form, form.lanes.rates.size
         self.z, self.u_last = form.start(problem)
         self.level, self.outputs, self.steps, self.refused, self.evaluated = 0, 0, 0, 0, 0

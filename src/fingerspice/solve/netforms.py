@@ -98,10 +98,13 @@ class NetworkForm(LaneForm):
         sign[self.reduced.moving] = 1.0 if xi >= 0.0 else -1.0
         return State(t, y, s, sign, problem.scene.charge_law)
 
+    def width(self, problem: Problem) -> int:
+        return super().width(problem) if self.flows else problem.initial.y.size
+
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        if self.flows:
-            return out.T
-        return np.hstack([out.T, np.tile(problem.initial.y[self.active :], (out.shape[1], 1))])
+        if not self.flows:
+            out[self.active :] = problem.initial.y[self.active :, None]
+        return out.T
 
 
 def finger(problem: Problem, rtol: float) -> NetworkForm | None:
@@ -161,26 +164,21 @@ def _curves(
     None where no allowed degree is enough.
     """
     at = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
-    to_series = np.linalg.inv(series_of.chebvander(at, _POINTS - 1))
+    to_series = np.linalg.inv(_chebyshev(at, _POINTS))
     area = to_series @ (1.0 / inverse_area_array(0.5 * top * (at + 1.0), curve)[0])
     integral = series_of.chebint(area, lbnd=-1.0) * 0.5 * top
-
-    def n_at(u: FloatArray) -> FloatArray:
-        return np.asarray(series_of.chebval(2.0 * u / top - 1.0, integral) - u / q0)
-
-    def area_at(u: FloatArray) -> FloatArray:
-        return np.asarray(series_of.chebval(2.0 * u / top - 1.0, area))
-
     # The range of xi ends where the gap voltage reaches `top`.
-    xi_top = float(top + kappa * n_at(np.array(top)))
+    xi_top = float(top + kappa * (integral.sum() - top / q0))
     xi = 0.5 * xi_top * (at + 1.0)
     u = xi * top / xi_top
     for _ in range(50):
-        step = (u + kappa * n_at(u) - xi) / (1.0 + kappa * (area_at(u) - 1.0 / q0))
-        u = np.clip(u - step, 0.0, top)
+        basis = _chebyshev(2.0 * u / top - 1.0, _POINTS + 1)
+        n, a = basis @ integral - u / q0, basis[:, :-1] @ area
+        step = (u + kappa * n - xi) / (1.0 + kappa * (a - 1.0 / q0))
         if np.abs(step).max() <= 1e-15 * top:
             break
-    inverse, bend = to_series @ (1.0 / area_at(u)), to_series @ n_at(u)
+        u = np.clip(u - step, 0.0, top)
+    inverse, bend = to_series @ (1.0 / a), to_series @ n
     one, off_one = _powers(inverse, tol * abs(float(inverse[0])))
     # N acts at full strength, on charges too: compared with the whole integral of A.
     other, off_other = _powers(bend, tol * xi_top / q0)
@@ -188,6 +186,11 @@ def _curves(
         return None
     other[0] -= polyval(-1.0, other)
     return one, other, 2.0 / xi_top, off_one / abs(float(inverse[0])), off_other
+
+
+def _chebyshev(x: FloatArray, count: int) -> FloatArray:
+    """The first Chebyshev polynomials at x (n,) from -1 to 1, shape (n, count)."""
+    return np.asarray(np.cos(np.arange(count) * np.arccos(np.clip(x, -1.0, 1.0))[:, None]))
 
 
 def _powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
