@@ -10,14 +10,11 @@ voltage, force, nodes and charges have shares of their own.
 
 from __future__ import annotations
 
-import numpy as np
-
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import charge_block
 from fingerspice.engine.blockcourse import Course
 from fingerspice.engine.blockforms import (
-    BLOCK,
     CHECKED,
     COLLECTED,
     ERROR_Q,
@@ -30,10 +27,8 @@ from fingerspice.engine.blockforms import (
     OF_NODES,
     UNTIL_CHECK,
     WAITED,
-    WITHIN,
 )
-from fingerspice.engine.blockpoints import APART, show_within
-from fingerspice.engine.blockrows import add, largest_of, modes_into, scaled
+from fingerspice.engine.blockrows import largest_of, modes_into, scaled
 
 # The share stated is so many times the one measured, and at least so much of the one stated before.
 CAUTION, REMEMBERED = 1.3, 0.7
@@ -63,11 +58,11 @@ def _enlarge(n: int, area0: float, q: FloatArray, x: FloatArray) -> None:
 
 
 @jit_rows
-def _largest_product(n: int, u: FloatArray, q: FloatArray, kappa: float, q0: float, error: FloatArray) -> float:
-    """Largest |u error| / q, where an error of xi is less of one of u (see `blockerror.accept`)."""
+def _largest_product(n: int, u: FloatArray, q: FloatArray, error: FloatArray) -> float:
+    """Largest |u error| / q."""
     largest = 0.0
     for i in range(n):
-        a = abs(u[i] * error[i]) / (q[i] + kappa * (1.0 - q[i] / q0))
+        a = abs(u[i] * error[i]) / q[i]
         largest = a if a > largest else largest
     return largest
 
@@ -83,20 +78,6 @@ def _largest_difference(n: int, x: FloatArray, y: FloatArray) -> float:
 
 
 @jit_within
-def in_place(c: Course, magnified: float) -> float:
-    """The ratio `magnified` of errors, where it is not known in every place, as it is in a network."""
-    return 1.0 if c.form.bend.size > 0 else magnified
-
-
-@jit_within
-def gap_into(c: Course, n: int, out: FloatArray) -> None:
-    """The gap voltages at the ends of the steps, V."""
-    scaled(n, 1.0, c.room.u, out)
-    if c.form.bend.size > 0:
-        add(n, -c.form.kappa, c.room.g[c.room.g.shape[0] - 1], out)
-
-
-@jit_within
 def is_due(c: Course, level: int, n: int, seen: float, left: float, tol: float) -> bool:
     """Whether to check a block with these errors of the gap voltage by quadrature and sweeps (V).
 
@@ -106,7 +87,7 @@ def is_due(c: Course, level: int, n: int, seen: float, left: float, tol: float) 
     noted = c.checks[level]
     if noted[UNTIL_CHECK] > 0.0 and not seen > LOUDER * noted[CHECKED]:
         return False
-    matters = c.shown.flows > 0 or noted[OF_GAP] * seen > MATTERS * left
+    matters = noted[OF_GAP] * seen > MATTERS * left
     shows = seen > ROUNDING * largest_of(n + 1, c.room.u) and LEAST_SHARE * seen <= tol
     return level + 1 < LEVELS and matters and shows
 
@@ -116,73 +97,49 @@ def _row(c: Course, r: int, j: int, n: int, out: FloatArray) -> None:
     """Row j of what is compared in n places: gap voltage, force, voltages of the nodes but for the source, charges."""
     form, room, shown, q = c.form, c.room, c.shown, c.charges.q[0]
     node, charge = j - 2, j - 2 - shown.node.shape[1]
-    if charge >= 0 and shown.charge:
+    if charge >= 0:
         scaled(n, 1.0, c.charges.z, out)
-    elif charge >= 0:
-        column = shown.k.size - shown.flows + charge
-        scaled(n, shown.k[column], room.s, out)
-        modes_into(n, 0, shown.columns[r, column], room.w, out)
-        add(n, shown.bend[column], room.g[room.g.shape[0] - 1], out)
     elif node >= 0:
         scaled(n, 0.0, room.s, out)
         modes_into(n, 0, shown.node[r, node], room.w, out)
-        if form.bend.size > 0:
-            add(n, shown.node_bend[node], room.g[room.g.shape[0] - 1], out)
-        if form.mobile:
-            _enlarge(n, form.area0, q, out)
+        _enlarge(n, form.area0, q, out)
     else:
-        gap_into(c, n, out)
+        scaled(n, 1.0, room.u, out)
         if j == 1:
             _forces(n, shown.stress, q, out)
 
 
 @jit
-def keep(
-    c: Course, r: int, h: float, n: int, sub: int, seen: float, magnified: float, errors: FloatArray
-) -> None:  # fmt: skip
+def keep(c: Course, r: int, n: int, seen: float, magnified: float, errors: FloatArray) -> None:
     """Keep what a corrected solution of n steps shows, and note the errors seen, of which shares are left, in `errors`.
 
-    `sub` steps of length h (s) make a sample. `seen` is the error of the gap voltage (V), and `magnified` is as in
+    `seen` is the error of the gap voltage (V), and `magnified` is as in
     `blockerror.accept`. The projections that the charge needs are known.
     """
     room, control = c.room, c.control
     if c.shown.charge:
         control[COLLECTED] = control[ERROR_Q] = 0.0
         charge_block(c, r, n, 1.0, seen, False)
-    last = room.kept.shape[0] - 2
-    for j in range(last):
+    for j in range(room.kept.shape[0]):
         _row(c, r, j, n + 1, room.kept[j])
-    if c.form.bend.size > 0:
-        show_within(c, r, h, 0, n // sub, sub, 1.0, room.kept[last:])
-    steepest = _largest_product(n + 1, room.kept[0], c.charges.q[0], c.form.kappa, c.form.q0[r], room.before)
+    steepest = _largest_product(n + 1, room.kept[0], c.charges.q[0], room.before)
     errors[:] = seen
-    errors[OF_FORCE] = FORCE * in_place(c, magnified) * c.shown.stress * steepest
+    errors[OF_FORCE] = FORCE * magnified * c.shown.stress * steepest
     if c.shown.charge:
         errors[OF_CHARGE] = control[ERROR_Q]
 
 
 @jit
-def compare(c: Course, r: int, h: float, first: int, n: int, sub: int, errors: FloatArray) -> None:
-    """Note the largest differences of n steps to what was kept, from its step `first` on, in `errors`.
-
-    `sub` of the steps, which have the length h (s), make a sample.
-    """
+def compare(c: Course, r: int, first: int, n: int, errors: FloatArray) -> None:
+    """Note the largest differences of n steps to what was kept, from its step `first` on, in `errors`."""
     room = c.room
     if c.shown.charge:
         charge_block(c, r, n, 1.0, 0.0, False)
-    last = room.kept.shape[0] - 2
-    for j in range(last):
+    for j in range(room.kept.shape[0]):
         _row(c, r, j, n + 1, room.slope)
         charge = j >= 2 + c.shown.node.shape[1]
         kind = (OF_GAP, OF_FORCE)[j] if j < 2 else OF_CHARGE if charge else OF_NODES
         errors[kind] = max(errors[kind], _largest_difference(n // 2 + 1, room.kept[j, first:], room.slope))
-    if c.form.bend.size > 0:
-        count, sample = n // sub, 2 * first // sub
-        within = np.empty((2, BLOCK // APART))
-        show_within(c, r, h, sample, count, sub, 2.0, within)
-        for place in range((sample + APART - 1) // APART, (sample + count - 1) // APART + 1):
-            errors[WITHIN] = max(errors[WITHIN], abs(room.kept[last, place] - within[0, place]))
-            errors[OF_FORCE] = max(errors[OF_FORCE], abs(room.kept[last + 1, place] - within[1, place]))
 
 
 @jit_within
@@ -192,8 +149,7 @@ def note(c: Course, level: int, closed: bool, seen: FloatArray, off: FloatArray)
     if closed:
         for kind in range(N_SHARES):
             share = CAUTION * off[kind] / seen[kind] if seen[kind] > 0.0 else 0.0
-            if kind != OF_CHARGE or c.shown.charge:
-                share = max(share, LEAST_SHARE)
+            share = max(share, LEAST_SHARE)
             noted[kind] = max(share, REMEMBERED * noted[kind]) if noted[CHECKED] > 0.0 else share
         noted[CHECKED] = max(seen[OF_GAP], noted[CHECKED])
     noted[WAITED] = min(max(1.0, RARER * noted[WAITED]), MOST_WAIT)

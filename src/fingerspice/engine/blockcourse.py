@@ -1,4 +1,4 @@
-"""State of the loops over blocks of a recording, and 1/A, N and their slopes at single voltages."""
+"""State of the loops over blocks of a recording, and 1/A with its slope at single voltages."""
 
 from __future__ import annotations
 
@@ -66,20 +66,3 @@ def inverse_area_at(form: Form, u: float) -> tuple[float, float]:
         slope = slope * x + q
         q = q * x + form.area[j]
     return q, (slope if u >= 0.0 else -slope) * form.scale
-
-
-@jit
-def bend_at(form: Form, xi: float) -> float:
-    """N of `blockforms.Form`, V m^2."""
-    x, value = abs(xi) * form.scale + form.shift, 0.0
-    for j in range(form.bend.size - 1, -1, -1):
-        value = value * x + form.bend[j]
-    return value if xi >= 0.0 else -value
-
-
-@jit
-def steepness(form: Form, xi: float) -> float:
-    """Derivative of the gap voltage by xi; 1 in a stack."""
-    q, _ = inverse_area_at(form, xi)
-    share: float = 1.0 + form.kappa * (1.0 / q - 1.0 / form.q0[0])
-    return 1.0 / share

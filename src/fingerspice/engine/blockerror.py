@@ -13,12 +13,11 @@ import math
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.blockcharge import charge_block
-from fingerspice.engine.blockcheck import FORCE, gap_into, in_place
+from fingerspice.engine.blockcheck import FORCE
 from fingerspice.engine.blockcourse import Course
 from fingerspice.engine.blockforms import (
     CHECKED,
     ERROR_F,
-    ERROR_Q,
     ERROR_U,
     ERROR_V,
     LEVEL,
@@ -37,7 +36,6 @@ from fingerspice.engine.blockforms import (
     STEPS,
     U_GAP,
     UNTIL_CHECK,
-    WITHIN,
 )
 from fingerspice.engine.blockrows import (
     PAD,
@@ -63,12 +61,12 @@ SHOWING = 1e-3
 
 @jit_rows
 def _force_rows(
-    n: int, stress: float, u: FloatArray, q: FloatArray, kappa: float, q0: float, a: float, seen: FloatArray,
-    left: FloatArray, slope: FloatArray, force: FloatArray, off: FloatArray,
+    n: int, stress: float, u: FloatArray, q: FloatArray, a: float, seen: FloatArray, left: FloatArray,
+    slope: FloatArray, force: FloatArray, off: FloatArray,
 ) -> float:  # fmt: skip
-    """Half the derivative of the force by xi, the force, and the error of the force, each in its row; the mean q.
+    """Half the derivative of the force by the gap voltage, the force, and its error, each in its row; the mean q.
 
-    The error of xi is a |seen| + |left|. The derivative does not contain that of the area.
+    The error of the gap voltage is a |seen| + |left|. The derivative does not contain that of the area.
     """
     total = 0.0
     for i in range(n):
@@ -76,9 +74,6 @@ def _force_rows(
         slope[i] = stress * x / q[i]
         force[i] = slope[i] * x
         total += q[i]
-    if kappa != 0.0:
-        for i in range(n):
-            slope[i] *= q[i] / (q[i] + kappa * (1.0 - q[i] / q0))
     for i in range(n):
         off[i] = slope[i] * (a * abs(seen[i]) + abs(left[i]))
     return total / n
@@ -120,9 +115,6 @@ def correct(c: Course, r: int, n: int) -> None:
 def further_sweep(c: Course, r: int, level: int, n: int) -> None:
     """What a further sweep would change in the modes, into `Room.further`."""
     form, room = c.form, c.room
-    fades = form.faded[r, level] > 0.0
-    if fades:
-        add(n, 1.0, room.pulse, room.changed_pulse)
     for k in range(c.w.size):
         inc = room.inc[k, PAD:]
         scaled(n, 0.0, room.s, inc)
@@ -131,8 +123,6 @@ def further_sweep(c: Course, r: int, level: int, n: int) -> None:
             add_three(
                 n, by[0], room.changed[t], by[1], room.changed_within[t], by[2], room.changed[t, 1:], inc
             )  # fmt: skip
-        if fades:
-            add(n, form.pulse[r, level, k], room.changed_pulse, inc)
         room.further[k, 0] = 0.0
         recursion(n, form.decay[r, level, k], room.inc[k], room.other, room.further[k])
 
@@ -187,20 +177,6 @@ def _node_error(c: Course, r: int, n: int, known: float) -> float:
 
 
 @jit_within
-def _charge_error(c: Course, r: int, n: int, share: float) -> float:
-    """Largest error of a network's charges in a block by sweeps and earlier blocks, C.
-
-    A charge may be a small difference of large ones, whose errors a further sweep shows but for the part `share`.
-    """
-    worst = 0.0
-    for i in range(c.shown.k.size - c.shown.flows, c.shown.k.size):
-        row = c.shown.columns[r, i]
-        swept = _largest_sum(c, row, c.room.further, n, c.room.slope) + share * _most(c, row)
-        worst = max(worst, swept + _carried(c, row))
-    return worst
-
-
-@jit_within
 def _most(c: Course, row: FloatArray) -> float:
     """Most that a further sweep may change in the quantity `row` (m,) @ modes, by the largest changes of modes."""
     total = 0.0
@@ -236,39 +212,29 @@ def _force_error(c: Course, r: int, n: int) -> float:
 
 
 @jit
-def accept(
-    c: Course, r: int, level: int, n: int, seen: float, left: float, magnified: float, share: float
-) -> None:  # fmt: skip
+def accept(c: Course, r: int, level: int, n: int, seen: float, left: float, magnified: float) -> None:
     """Account for the peaks and errors of an accepted block, and move to its end.
 
-    `seen` and `left` are the errors of the gap voltage by the quadrature and by the sweeps, V, `magnified` the ratio of
-    such an error to one of the first projection, and `share` the part of a change that a sweep leaves. Row 2 of
-    `Course.spare` has the decay of every mode over the block, and `Charges.h` the lengths of its steps.
+    `seen` and `left` are the errors of the gap voltage by the quadrature and by the sweeps, V, and `magnified` the
+    ratio of such an error to one of the first projection. Row 2 of `Course.spare` has the decay of every mode over the
+    block, and `Charges.h` the lengths of its steps.
     """
     room, control, checked = c.room, c.control, c.checks[level]
     carried = _carried(c, c.form.taps[r, 0])
-    gap = room.u
-    if c.form.bend.size > 0:
-        gap = room.s_within
-        gap_into(c, n + 1, gap)
     control[MEAN_Q] = _force_rows(
-        n + 1, c.shown.stress, gap, c.charges.q[0], c.form.kappa, c.form.q0[r], checked[OF_FORCE], room.before,
-        room.slope, room.crossed, room.jumps, room.bends,
+        n + 1, c.shown.stress, room.u, c.charges.q[0], checked[OF_FORCE], room.before, room.slope, room.crossed,
+        room.jumps, room.bends,
     )  # fmt: skip
-    peak = largest_of(n + 1, gap)
+    peak = largest_of(n + 1, room.u)
     control[PEAK_F] = max(control[PEAK_F], largest_of(n + 1, room.jumps))
     control[PEAK_U] = max(control[PEAK_U], peak)
     quadrature, others = checked[OF_GAP] * seen, left + magnified * carried
-    within = max(checked[OF_GAP], checked[WITHIN]) * seen
-    control[ERROR_U] = max(control[ERROR_U], within + others)
-    control[ERROR_F] = max(control[ERROR_F], FORCE * in_place(c, magnified) * _force_error(c, r, n))
+    control[ERROR_U] = max(control[ERROR_U], quadrature + others)
+    control[ERROR_F] = max(control[ERROR_F], FORCE * magnified * _force_error(c, r, n))
     for k in range(c.w.size):
         c.spare[0, k] = largest_of(n + 1, room.further[k])
-    if c.shown.flows > 0:
-        error = _charge_error(c, r, n, share) + checked[OF_CHARGE] * seen + c.shown.moves[1] * others
-        control[ERROR_Q] = max(control[ERROR_Q], error)
     # An error of the gap voltage changes the area, and thereby other voltages.
-    known = checked[OF_NODES] * seen + (within - quadrature) + c.shown.moves[0] * others
+    known = checked[OF_NODES] * seen + others
     error = _node_error(c, r, n, max(control[ERROR_V] - known, 0.0) / magnified)
     control[ERROR_V] = max(control[ERROR_V], known + magnified * error)
     if c.shown.charge:

@@ -25,11 +25,10 @@ MEAN_Q = 13
 RATIO = 14
 N_CONTROL = 15
 # Entries of a row of `Course.checks`, one for each step length. What is left, once it is corrected, of the errors seen
-# of gap voltage and force, and of a stack's charge, as shares; what is left of the error of nodes and of a network's
-# charges, and of the gap voltage within a network's steps, over the error seen of the gap voltage (V/V and C/V). The
-# largest of these (V), and the number of blocks until the next check, now and after the last one.
-OF_GAP, OF_FORCE, OF_NODES, OF_CHARGE, WITHIN, CHECKED, UNTIL_CHECK, WAITED = range(8)
-N_SHARES, N_CHECKS = 5, 8
+# of gap voltage, force and charge, as shares; what is left of the error of nodes over the error seen of the gap voltage
+# (V/V). The largest of these (V), and the number of blocks until the next check, now and after the last one.
+OF_GAP, OF_FORCE, OF_NODES, OF_CHARGE, CHECKED, UNTIL_CHECK, WAITED = range(7)
+N_SHARES, N_CHECKS = 4, 7
 # By their order, errors grow by so much.
 OF_ORDER = 16.0
 # Share that is assumed at least, and before the first check.
@@ -43,11 +42,10 @@ class Form(NamedTuple):
     """A stack around reference areas, and the weights of steps of one length and its halves.
 
     r references, `LEVELS` step lengths, m modes, T drives g_t, and P projections at the ends and `PLACES` of a step:
-    the gap voltage (under `mobile` its modes' part alone), the taps, and in a stack the slowest layer's voltage (see
-    `engine.blockcharge`).
+    the modes' part of the gap voltage, the taps, and the slowest layer's voltage (see `engine.blockcharge`). The last
+    drive is (1/q - 1/q0) U.
     """
 
-    mobile: bool  # Charge law. Then the last drive is (1/q - 1/q0) U.
     q0: FloatArray  # (r,)
     rates: FloatArray
     gain: FloatArray
@@ -72,18 +70,6 @@ class Form(NamedTuple):
     shift: float
     k_gap: float
     area0: float
-    kappa: float  # 1/m^2; 0 in a stack
-    # (4 l + 1,): N (V m^2) for positive xi, as `area`; no entry in a stack. In a network N is the last drive, which has
-    # no tap.
-    bend: FloatArray
-    bent: FloatArray  # (T - 1,): Share of N in each tap; no entry in a stack
-    # The mode that decays within a small part of a step and has the largest share in kappa; -1 if there is none
-    fast: int
-    faded: FloatArray  # (r, LEVELS): Its rate times the step length; 0 where that is too small
-    # pulse, pulse_within (r, LEVELS, m): What a part exp(-rate t) of N adds to the modes and to the projections, in
-    # place of the parabola through it
-    pulse: FloatArray
-    pulse_within: FloatArray
 
 
 class Shown(NamedTuple):
@@ -92,32 +78,24 @@ class Shown(NamedTuple):
     columns: FloatArray  # (r, C, m): Recorded voltages over k U
     k: FloatArray  # (C,)
     node: FloatArray  # (r, n_node, m): Voltages of the nodes, as `columns`
-    node_bend: FloatArray  # (n_node,): Share of N in them; no entry in a stack
     slow: FloatArray  # (r, m): The slowest layer's share of each mode (see `Model.slow`)
     # live, project (r, m, m): From modes to live voltages and back
     live: FloatArray
     project: FloatArray
     stress: float  # Force per area and squared gap voltage, Pa/V^2
-    kink: FloatArray  # (T,): Derivative by |u_gap| at 0 V of the factor of each drive. N counts as a factor times xi.
+    kink: FloatArray  # (T,): Derivative by |u_gap| at 0 V of the factor of each drive
     area_kink: float  # dA/d|u| at 0 V, m^2/V
-    charge: bool  # Whether the charge follows from that, as in a stack
-    bend: FloatArray  # (C,): Share of N in each column; no entry in a stack
-    flows: int  # Number of the last columns that are charges of a network, whose rates are outputs, too
-    capacitance: float  # Sum of all capacitances of the network, F, where there are such columns
-    # (2,): Largest error of a node's voltage (V), and of such a charge (C), that the area causes, per volt of the gap
-    # voltage's error
-    moves: FloatArray
+    charge: bool  # Whether the charge is wanted
 
 
 class Room(NamedTuple):
     """Rows of a block to work in: of the source, modes, increments, projections, drives, and single ones.
 
-    `changed`, `changed_within` (the middle) and `changed_pulse` are drives with their sign reversed as a sweep finds
+    `changed` and `changed_within` (the middle) are drives with their sign reversed as a sweep finds
     them, and then their changes; `further` is what a further sweep would change in the modes, and `own` their
     quadrature error.
-    `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked, and at last gap
-    voltages and forces within some of its steps. `where` are the numbers of the steps that cross 0 V, and `crossed`,
-    `jumps` and `bends` describe their kinks, one after the other.
+    `kept` are the gap voltages, forces, nodes' voltages and charges of a solution to be checked. `where` are the
+    numbers of the steps that cross 0 V, and `crossed`, `jumps` and `bends` describe their kinks, one after the other.
     `kinked` is no row: the weights (m, T) of the kink of each drive in each mode.
     """
 
@@ -139,11 +117,9 @@ class Room(NamedTuple):
     crossed: FloatArray
     jumps: FloatArray
     bends: FloatArray
-    pulse: FloatArray
     kinked: FloatArray
     changed: FloatArray
     changed_within: FloatArray
-    changed_pulse: FloatArray
     further: FloatArray
     kept: FloatArray
     where: IntArray
@@ -152,13 +128,13 @@ class Room(NamedTuple):
 def new_room(modes: int, drives: int, projections: int, shown: Shown) -> Room:
     """Room for a form of so many, and for what is shown of it."""
     n = BLOCK + PAD
-    kept = 4 + shown.node.shape[1] + shown.flows + int(shown.charge)
+    kept = 2 + shown.node.shape[1] + int(shown.charge)
     return Room(
         np.zeros(n), np.zeros(n), np.zeros((modes, n)),
         np.zeros((modes, n)), np.zeros((modes, n)), np.zeros(n), np.zeros((projections, n)),
         np.zeros((3, projections, n)), np.zeros((drives, n)), np.zeros((3, drives, n)), np.zeros(n), np.zeros((3, n)),
-        np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
-        np.zeros((modes, drives)), np.zeros((drives, n)), np.zeros((drives, n)), np.zeros(n), np.zeros((modes, n)),
+        np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
+        np.zeros((modes, drives)), np.zeros((drives, n)), np.zeros((drives, n)), np.zeros((modes, n)),
         np.zeros((kept, n)), np.zeros(n, np.int64),
     )  # fmt: skip
 
@@ -170,11 +146,8 @@ def new_control() -> FloatArray:
     return control
 
 
-def new_checks(shown: Shown) -> FloatArray:
+def new_checks() -> FloatArray:
     """Nothing checked yet."""
     checks = np.zeros((LEVELS, N_CHECKS))
     checks[:, :N_SHARES] = UNCHECKED
-    checks[:, WITHIN] = 0.0
-    if shown.flows > 0:
-        checks[:, OF_CHARGE] = UNCHECKED * shown.capacitance
     return checks

@@ -8,7 +8,7 @@ from fingerspice.engine.blockcourse import Course
 from fingerspice.engine.blockcurrent import current_block
 from fingerspice.engine.blockforms import OUTPUT
 from fingerspice.engine.blockpoints import write_points
-from fingerspice.engine.blockrows import add, largest_off, modes_into, of_source_and_modes, scaled
+from fingerspice.engine.blockrows import largest_off, modes_into, scaled
 
 
 @jit
@@ -22,14 +22,10 @@ def _spread(step: int, count: int, x: FloatArray, out: FloatArray) -> None:
 def _column(c: Course, r: int, column: int, n: int, row: FloatArray) -> None:
     """A recorded voltage at the starts of n steps, into `row`."""
     form, shown, room = c.form, c.shown, c.room
-    if form.mobile:
-        scaled(n, 0.0, room.s, row)
-        modes_into(n, 0, shown.columns[r, column], room.w, row)
-        for i in range(n):
-            row[i] = shown.k[column] * room.s[i] + form.area0 * c.charges.q[0, i] * row[i]
-    else:
-        of_source_and_modes(n, shown.k[column], room.s, shown.columns[r, column], room.w, row)
-        add(n, shown.bend[column], room.g[room.g.shape[0] - 1], row)
+    scaled(n, 0.0, room.s, row)
+    modes_into(n, 0, shown.columns[r, column], room.w, row)
+    for i in range(n):
+        row[i] = shown.k[column] * room.s[i] + form.area0 * c.charges.q[0, i] * row[i]
 
 
 @jit
@@ -50,7 +46,7 @@ def write_block(
     c: Course, r: int, level: int, count: int, h: float, start: float, t_out: FloatArray, out: FloatArray
 ) -> None:  # fmt: skip
     """Write the outputs of a block of `count` samples from its start (s) on, without those at its very end."""
-    shown, n, first = c.shown, count << level, c.counters[OUTPUT]
+    n, first = count << level, c.counters[OUTPUT]
     slack = 8e-16 * (abs(start) + n * h)
     end, size, last = start + n * h - slack, t_out.size, first + count
     aligned = last <= size and t_out[last - 1] < end and (last == size or t_out[last] >= end)
@@ -61,7 +57,7 @@ def write_block(
             last += 1
     if last == first:
         return
-    if not aligned or shown.flows > 0:
+    if not aligned:
         for i in range(n + 1):
             c.charges.t[i] = start + i * h
         write_points(c, r, n, slack, t_out, out, last)

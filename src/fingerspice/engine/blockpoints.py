@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
-from fingerspice.base.compiled import jit, jit_inline
+from fingerspice.base.compiled import jit
 from fingerspice.engine.blockcharge import weights_until
-from fingerspice.engine.blockcourse import Course, bend_at, inverse_area_at, steepness
+from fingerspice.engine.blockcourse import Course, inverse_area_at
 from fingerspice.engine.blockcurrent import current_at
 from fingerspice.engine.blockforms import (
     FIRST_QUARTER,
@@ -26,48 +24,16 @@ from fingerspice.engine.blockkinks import after_kink, crossing
 from fingerspice.engine.relaxation import FIRST_NEWTON, look_at_ends
 from fingerspice.numerics.moments import moments
 
-# Fractions of a step at which checks compare what is within steps, in one of so many samples: after each sample, fast
-# modes of a network decay.
-APART = 4
-PLACES_WITHIN = (0.015625, 0.0625, 0.1875, 0.4375)
-
-
-@jit_inline
-def missed_at(at: float, early: float, late: float) -> float:
-    """What a drive has besides its parabola at a fraction of a step, from what it has at the quarters of the step.
-
-    A polynomial of fourth degree, which is 0 at the ends and in the middle.
-    """
-    return -128.0 / 3.0 * at * (at - 0.5) * (at - 1.0) * ((early + late) * at - (0.75 * early + 0.25 * late))
-
 
 @jit
 def _crossing_of(c: Course, i: int) -> tuple[float, float, float]:
     """`crossing` of step i, as in `relaxation`."""
     form, room = c.form, c.room
-    start, middle, stop = room.u[i], room.u_within[MIDDLE, i], room.u[i + 1]
-    if form.mobile:
-        share = form.area0 * inverse_area_at(form, 0.0)[0]
-        start = form.k_gap * room.s[i] + share * room.end[0, i]
-        middle = 0.5 * form.k_gap * (room.s[i] + room.s[i + 1]) + share * room.within[MIDDLE, 0, i]
-        stop = form.k_gap * room.s[i + 1] + share * room.end[0, i + 1]
+    share = form.area0 * inverse_area_at(form, 0.0)[0]
+    start = form.k_gap * room.s[i] + share * room.end[0, i]
+    middle = 0.5 * form.k_gap * (room.s[i] + room.s[i + 1]) + share * room.within[MIDDLE, 0, i]
+    stop = form.k_gap * room.s[i + 1] + share * room.end[0, i + 1]
     return crossing(start, middle, stop)
-
-
-@jit
-def _add_kink(c: Course, i: int, at: float, g: FloatArray) -> None:
-    """Add to the drives at fraction `at` of step i what their kink has besides the parabola through it."""
-    zero, jump, bend = _crossing_of(c, i)
-    if jump == 0.0:
-        return
-    middle, last = 4.0 * at * (1.0 - at), at * (2.0 * at - 1.0)
-    since, early, rest = max(at - zero, 0.0), max(0.5 - zero, 0.0), 1.0 - zero
-    ramp = since - middle * early - last * rest
-    square = since * since - middle * early * early - last * rest * rest
-    for t in range(g.size):
-        x, slope = c.room.end[1 + t, i], c.room.end[1 + t, i + 1] - c.room.end[1 + t, i]
-        there = x + zero * slope
-        g[t] += c.shown.kink[t] * jump * (there * ramp + (slope + bend * there) * square)
 
 
 @jit
@@ -75,9 +41,6 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
     """Modes at fraction `at` > 0 of step i, along the polynomials through the drives at all five places."""
     form, room, found = c.form, c.room, c.spare[2, :5]
     drives = room.g.shape[0]
-    pulse = room.pulse[i] if form.fast >= 0 else 0.0
-    half = math.exp(-0.5 * form.rates[r, max(form.fast, 0)] * h)
-    whole_step = half * half
     for k in range(w.size):
         z = form.rates[r, k] * h * at
         moments(z, found)
@@ -92,22 +55,12 @@ def _modes_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) -> 
             early, late = room.g_within[FIRST_QUARTER, t, i], room.g_within[LAST_QUARTER, t, i]
             both += form.feed[r, k, t] * (early + late)
             mostly_early += form.feed[r, k, t] * (0.75 * early + 0.25 * late)
-        # The parabola and what it misses at the quarters, as in `missed_at`.
+        # The parabola, and what it misses at the quarters: a quartic, 0 at the ends and in the middle.
         linear += 64.0 / 3.0 * mostly_early
         square -= 64.0 / 3.0 * (both + 3.0 * mostly_early)
         cubic, fourth = 128.0 / 3.0 * (1.5 * both + mostly_early), -128.0 / 3.0 * both
         forced = linear * found[1] + at * (square * found[2] + at * (cubic * found[3] + at * fourth * found[4]))
         w[k] = w[k] * math.exp(-z) + h * at * (whole * found[0] + at * forced)
-        if pulse != 0.0:
-            # The parabola through the part of N that is exp(-rate t), and its response.
-            shown = found[0] + at * (
-                (4.0 * half - 3.0 - whole_step) * found[1] + 2.0 * at * (1.0 - 2.0 * half + whole_step) * found[2]
-            )
-            true = math.exp(-z)
-            if k != form.fast:
-                gone = form.rates[r, form.fast] * h * at
-                true = (math.exp(-gone) - true) / (z - gone)
-            w[k] += form.feed[r, k, drives - 1] * pulse * h * at * (true - shown)
     zero, jump, bend = _crossing_of(c, i)
     if jump > 0.0:
         early, rest, since = max(0.5 - zero, 0.0), 1.0 - zero, max(at - zero, 0.0)
@@ -140,79 +93,19 @@ def _charge_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray) ->
 
 
 @jit
-def _follow_fast(c: Course, r: int, since: float, source: float, w: FloatArray, g: FloatArray) -> None:
-    """Correct the mode that follows N at once, and the drive N, for what the parabola misses `since` (s) after a node.
-
-    The ends and the middle of a step need no correction. Between them the parabola misses a kink of the slope.
-    """
-    form, last = c.form, g.size - 1
-    rate = form.rates[r, form.fast]
-    start, shown = w[form.fast], g[last]
-    share = form.feed[r, form.fast, last] / rate * (1.0 - math.exp(-rate * since))
-    for _ in range(3):
-        xi = form.k_gap * source
-        for k in range(w.size):
-            xi += form.taps[r, 0, k] * w[k]
-        g[last] = bend_at(form, xi)
-        w[form.fast] = start + share * (g[last] - shown)
-
-
-@jit
-def _write_flows(
-    c: Course, r: int, w: FloatArray, g: FloatArray, source: float, slope: float, xi: float, out: FloatArray
-) -> None:  # fmt: skip
-    """Write the rates (A) of the columns that are charges; `slope` is the source's, V/s."""
-    form, shown = c.form, c.shown
-    for i in range(shown.flows):
-        out[i] = shown.k[shown.k.size - shown.flows + i] * slope
-    rate_xi = form.k_gap * slope
-    for k in range(w.size):
-        rate = form.gain[r, k] * source - form.rates[r, k] * w[k]
-        for t in range(g.size):
-            rate += form.feed[r, k, t] * g[t]
-        rate_xi += form.taps[r, 0, k] * rate
-        for i in range(shown.flows):
-            out[i] += shown.columns[r, shown.k.size - shown.flows + i, k] * rate
-    q, _ = inverse_area_at(form, xi)
-    rate_bend = (1.0 / q - 1.0 / form.q0[r]) * steepness(form, xi) * rate_xi
-    for i in range(shown.flows):
-        out[i] += shown.bend[shown.k.size - shown.flows + i] * rate_bend
-
-
-@jit
-def _network_drives(
-    c: Course, r: int, h: float, i: int, at: float, source: float, w: FloatArray, g: FloatArray
-) -> None:  # fmt: skip
-    """Drives of a network at fraction `at` of step i, along their polynomials; the modes w there follow a fast N."""
-    form, room = c.form, c.room
-    first, middle, last = (2.0 * at - 1.0) * (at - 1.0), 4.0 * at * (1.0 - at), at * (2.0 * at - 1.0)
-    for t in range(g.size):
-        g[t] = first * room.g[t, i] + middle * room.g_within[MIDDLE, t, i] + last * room.g[t, i + 1]
-        g[t] += missed_at(at, room.g_within[FIRST_QUARTER, t, i], room.g_within[LAST_QUARTER, t, i])
-    if form.fast >= 0:
-        faded = form.rates[r, form.fast] * h
-        parabola = first + middle * math.exp(-0.5 * faded) + last * math.exp(-faded)
-        g[g.size - 1] += room.pulse[i] * (math.exp(-faded * at) - parabola)
-    if at > 0.0:
-        _add_kink(c, i, at, g)
-        if form.fast >= 0:
-            _follow_fast(c, r, h * at, source, w, g)
-
-
-@jit
-def _stack_drives(form: Form, r: int, source: float, u: float, w: FloatArray, g: FloatArray) -> None:
-    """Drives of a stack at a gap voltage u (V) and the modes w."""
+def _drives(form: Form, r: int, source: float, u: float, w: FloatArray, g: FloatArray) -> None:
+    """Drives at a gap voltage u (V) and the modes w."""
     q0, q = form.q0[r], inverse_area_at(form, u)[0]
     for t in range(g.size):
         x = form.tap_s[1 + t] * source
         for k in range(w.size):
             x += form.taps[r, 1 + t, k] * w[k]
-        g[t] = (1.0 / q - 1.0 / q0) * x if form.mobile and t + 1 == g.size else (q - q0) * x
+        g[t] = (1.0 / q - 1.0 / q0) * x if t + 1 == g.size else (q - q0) * x
 
 
 @jit
 def _gap_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, g: FloatArray) -> tuple[float, float, float]:
-    """Gap voltage (in a network xi) at fraction `at` of step i, source (V), and enlargement of the modes' parts by 1/A.
+    """Gap voltage at fraction `at` of step i, source (V), and enlargement of the modes' parts by 1/A.
 
     The modes and drives there go into w and g.
     """
@@ -222,42 +115,18 @@ def _gap_at(c: Course, r: int, h: float, i: int, at: float, w: FloatArray, g: Fl
         w[k] = room.w[k, i]
     if at > 0.0:
         _modes_at(c, r, h, i, at, w)
-    if form.bend.size > 0:
-        _network_drives(c, r, h, i, at, source, w, g)
     x_gap = 0.0
     for k in range(w.size):
         x_gap += form.taps[r, 0, k] * w[k]
-    u, scale = model.k_gap * source + x_gap, 1.0
-    if form.mobile:
-        u = (2.0 * at - 1.0) * (at - 1.0) * room.u[i]
-        if at > 0.0:
-            u += 4.0 * at * (1.0 - at) * room.u_within[MIDDLE, i] + at * (2.0 * at - 1.0) * room.u[i + 1]
-        for _ in range(3):
-            q, dq = inverse_area_at(form, u)
-            b = model.area0 * x_gap
-            u -= (u - model.k_gap * source - b * q) / (1.0 - b * dq)
-        scale = model.area0 * inverse_area_at(form, u)[0]
-    if form.bend.size == 0:
-        _stack_drives(form, r, source, u, w, g)
-    return u, source, scale
-
-
-@jit
-def show_within(c: Course, r: int, h: float, first: int, count: int, sub: int, stretch: float, out: FloatArray) -> None:
-    """Gap voltages (V) and forces (N) of a network within steps of length h (s), into the two rows of `out`.
-
-    They are those after one in `APART` of `count` samples, at `PLACES_WITHIN` x `stretch`. `sub` steps make a sample,
-    and `first` is the number of the first sample.
-    """
-    w, g = np.empty(c.w.size), np.empty(c.room.g.shape[0])
-    for j in range(count):
-        place, rest = divmod(first + j, APART)
-        if rest == 0:
-            at = PLACES_WITHIN[place % len(PLACES_WITHIN)] * stretch
-            xi, _, _ = _gap_at(c, r, h, j * sub, at, w, g)
-            u = xi - c.form.kappa * bend_at(c.form, xi)
-            q, _ = inverse_area_at(c.form, xi)
-            out[0, place], out[1, place] = u, c.shown.stress * u * u / q
+    u = (2.0 * at - 1.0) * (at - 1.0) * room.u[i]
+    if at > 0.0:
+        u += 4.0 * at * (1.0 - at) * room.u_within[MIDDLE, i] + at * (2.0 * at - 1.0) * room.u[i + 1]
+    for _ in range(3):
+        q, dq = inverse_area_at(form, u)
+        b = model.area0 * x_gap
+        u -= (u - model.k_gap * source - b * q) / (1.0 - b * dq)
+    _drives(form, r, source, u, w, g)
+    return u, source, model.area0 * inverse_area_at(form, u)[0]
 
 
 @jit
@@ -265,20 +134,15 @@ def _write_point(
     c: Course, r: int, h: float, i: int, at: float, slope: float, out: FloatArray, place: int
 ) -> None:  # fmt: skip
     """Write one output at fraction `at` of step i; `slope` is the source's slope there, V/s."""
-    form, room, shown = c.form, c.room, c.shown
+    room, shown = c.room, c.shown
     w, g = c.spare[0, : c.w.size], c.spare[1, : room.g.shape[0]]
     u, source, scale = _gap_at(c, r, h, i, at, w, g)
     n = shown.k.size
-    bent = bend_at(form, u) if form.bend.size > 0 else 0.0
     for column in range(n):
         v = 0.0
         for k in range(w.size):
             v += shown.columns[r, column, k] * w[k]
-        if form.bend.size > 0:
-            v += shown.bend[column] * bent
         out[column, place] = shown.k[column] * source + scale * v
-    if shown.flows > 0:
-        _write_flows(c, r, w, g, source, slope, u, out[n:, place])
     if shown.charge:
         out[n, place] = _charge_at(c, r, h, i, at, w)
         out[n + 1, place] = current_at(c, r, w, g, source, slope, u)

@@ -5,8 +5,6 @@ Each is a function of its own, so that the compiler turns it into vector instruc
 
 from __future__ import annotations
 
-import math
-
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
 
@@ -211,22 +209,6 @@ def sign_as(n: int, x: FloatArray, out: FloatArray) -> None:
     """Give each entry the sign of x."""
     for i in range(n):
         out[i] = out[i] if x[i] >= 0.0 else -out[i]
-
-
-@jit_rows
-def pulse_rows(
-    n: int, h: float, kappa: float, q0: float, faded: float, z: FloatArray, slope: FloatArray, bend: FloatArray,
-    middle: FloatArray, out: FloatArray,
-) -> None:  # fmt: skip
-    """Size of the part exp(-faded x) of N in each step, x from 0 to 1, where xi starts with this slope, into `out`.
-
-    N is given at the ends and in the middle; the rest of it is a parabola.
-    """
-    over = faded - 3.0 + 4.0 * math.exp(-0.5 * faded) - math.exp(-faded)
-    for i in range(n):
-        e = -z[i] / (q0 * (q0 + z[i]))
-        true = h * slope[i] * e / (1.0 + kappa * e)
-        out[i] = (4.0 * middle[i] - 3.0 * bend[i] - bend[i + 1] - true) / over
 
 
 @jit_rows

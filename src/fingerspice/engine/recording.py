@@ -10,7 +10,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.borrowing import borrow
 from fingerspice.base.compiled import jit
 from fingerspice.engine.blockcheck import OF_SWEEPS, compare, is_due, keep, note
-from fingerspice.engine.blockcourse import Course, steepness
+from fingerspice.engine.blockcourse import Course
 from fingerspice.engine.blockerror import (
     accept,
     correct,
@@ -34,7 +34,6 @@ from fingerspice.engine.blockforms import (
     REFUSED,
     SWEEPS,
     U_GAP,
-    WITHIN,
     Form,
 )
 from fingerspice.engine.blockoutput import write_block
@@ -118,15 +117,12 @@ def _solve(c: Course, r: int, level: int, h: float, n: int, tol: float) -> tuple
     form, room = c.form, c.room
     change, margin, sweeps = relax(form, room, r, level, h, c.shown.kink, n, tol, c.control[RATIO])
     c.counters[SWEEPS] += sweeps
-    # An error of xi is one of the gap voltage, enlarged where the area at 0 V is smaller than the reference.
-    magnified = steepness(form, 0.0)
     if not change < math.inf:
-        return change, margin, math.inf, magnified
+        return change, margin, math.inf, 1.0
     misfit(form, room, r, level, h, c.shown.kink, n)
-    if form.mobile:
-        area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
-        # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
-        magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin
+    area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
+    # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
+    magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin
     return change, margin, magnified * quadrature_error(c, r, level, n), magnified
 
 
@@ -164,7 +160,7 @@ def _check(
     closed = change < math.inf
     if closed:
         _finish(c, r, level, h, n)
-        keep(c, r, h, n, 1 << level, seen, magnified, errors)
+        keep(c, r, n, seen, magnified, errors)
         control[:] = before
     for done in range(0, count if closed else 0, half):
         part = min(half, count - done)
@@ -176,7 +172,7 @@ def _check(
         if not closed:
             break
         _finish(c, r, level + 1, 0.5 * h, n)
-        compare(c, r, 0.5 * h, done << level, n, 2 << level, off)
+        compare(c, r, done << level, n, off)
         for k in range(m):
             w[k] = c.room.w[k, n]
         u = c.room.u[n]
@@ -207,7 +203,7 @@ def march(
             continue
         change, margin, seen, magnified = _solve(c, r, level, h, n, tol)
         left = 0.0
-        local = max(c.checks[level, OF_GAP], c.checks[level, WITHIN]) * seen
+        local = c.checks[level, OF_GAP] * seen
         if local <= tol:
             correct(c, r, n)
             further_sweep(c, r, level, n)
@@ -233,7 +229,7 @@ def march(
             c.charges.h[i] = h
         if c.shown.charge:
             project_for_charge(form, room, r, level, n)
-        accept(c, r, level, n, seen, left, magnified, left / max(change + seen, left) if left > 0.0 else 0.0)
+        accept(c, r, level, n, seen, left, magnified)
         write_block(c, r, level, count, h, start + at * spacing, t_out, out)
         at += count
         if level > 0 and may_coarsen(c, level, seen, left, tol):

@@ -7,17 +7,9 @@ exponential Simpson rule, of fourth order. All steps of a block are solved toget
 follow by a recursion, from the modes the gap voltage and the next g. Each sweep reduces the error to a share of about
 |q - q0| / q0, and is a set of loops over rows of hundreds of steps, which use the processor's vectors fully.
 
-In a network the area also changes the finger's displacement current, as in `solve.netforms`: there the gap voltage u
-follows from xi = tap w + tap U, which is 0 with it, by u + kappa N(u) = xi, and N is one more drive and part of each
-tap. 1/A and N are polynomials in |xi|, and what is said here of u holds for xi.
-
 1/A has a kink where the gap voltage is 0, so that g contains kink |u| x, with x the voltage that q multiplies. u and x
 are almost straight lines across the kink. What begins of |u| x there, a straight line and a square, is known; the
 modes' response to it, less that to the parabola through it, is known in closed form, and is added.
-
-In a network a mode may decay within a small part of a step. After each sample, where the slope of the source jumps, N
-then has a part a exp(-rate t) that no parabola shows. Its size a follows from the slope of N at the start of the step,
-and the response to it is known in closed form, too.
 
 The error is measured at 1/4 and 3/4 of every step, where the interpolation error of the parabola gives the quadrature
 error (Boole's rule against Simpson's). If it is too large, the block is repeated with steps half as long. Otherwise
@@ -54,10 +46,8 @@ from fingerspice.engine.blockrows import (
     of_two,
     product_of,
     products_of,
-    pulse_rows,
     recursion,
     scaled,
-    sign_as,
     sum_of,
     three_at_ends,
     three_within,
@@ -68,9 +58,9 @@ PARABOLA = np.array([[0.0, 1.0, 0.0], [0.375, 0.75, -0.125], [-0.125, 0.75, 0.37
 # Most sweeps of a block, and the fraction of the error allowed that the last one may leave.
 MOST_SWEEPS, LEFT = 40, 0.8
 # Each sweep reduces the error of a stack by about the largest relative distance of the areas from the reference; under
-# `mobile` the ratio is up to twice as large, and near a fold larger still. So much is assumed at least, in networks a
-# fixed share, until a block has shown what it is (`learn` in `engine.blockerror`).
-LEAST_RATIO, SLOWER, OF_NETWORKS, MOST_RATIO = 0.001, 1.8, 0.018, 0.9
+# `mobile` the ratio is up to twice as large, and near a fold larger still. So much is assumed at least, until a block
+# has shown what it is (`learn` in `engine.blockerror`).
+LEAST_RATIO, SLOWER, MOST_RATIO = 0.001, 1.8, 0.9
 # First sweep in which the places of the kinks and the rate of convergence are known well enough.
 KINKED = 1
 # Newton steps for the gap voltage under `mobile`, in the first sweep and in later ones; and the smallest distance to
@@ -83,71 +73,42 @@ def _drives(
     form: Form, q0: float, n: int, newton: int, s: FloatArray, x: FloatArray, u: FloatArray, z: FloatArray,
     slope: FloatArray, g: FloatArray,
 ) -> float:  # fmt: skip
-    """Drives from the projections x (P, n); the least distance to the fold.
-
-    The gap voltages u follow from the first projection under `mobile`, and are given otherwise.
-    """
-    margin = 1.0
-    drives = g.shape[0]
-    if form.mobile:
-        for _ in range(newton):
-            margin = newton_rows(
-                n, form.area, form.scale, form.shift, form.k_gap, form.area0, s, x[0], u, z, slope
-            )  # fmt: skip
-        drives -= 1
+    """Gap voltages and drives from the projections x (P, n); the least distance to the fold."""
+    margin, drives = 1.0, g.shape[0] - 1
+    for _ in range(newton):
+        margin = newton_rows(n, form.area, form.scale, form.shift, form.k_gap, form.area0, s, x[0], u, z, slope)
     area_rows(n, form.area, form.scale, form.shift, q0, u, z)
-    if form.bend.size > 0:
-        drives -= 1
-        area_rows(n, form.bend, form.scale, form.shift, 0.0, u, g[drives])
-        sign_as(n, u, g[drives])
-        for t in range(drives):
-            add(n, form.bent[t], g[drives], x[1 + t])
     t = 0
     while t + 1 < drives:
         products_of(n, z, x[1 + t], g[t], x[2 + t], g[1 + t])
         t += 2
     if t < drives:
         product_of(n, z, x[1 + t], g[t])
-    if form.mobile:
-        last, share = g[drives], x[1 + drives]
-        for i in range(n):
-            last[i] = -z[i] / (q0 * (q0 + z[i])) * share[i]
+    last, share = g[drives], x[1 + drives]
+    for i in range(n):
+        last[i] = -z[i] / (q0 * (q0 + z[i])) * share[i]
     return margin
 
 
 @jit_within
 def _project(form: Form, room: Room, r: int, level: int, place: int, n: int, p: int) -> None:
     """Projection p at one place within the steps."""
-    x = _row_within(form, room, place, p)
+    x = room.within[place, p]
     by_s, by_g = form.within_s[r, level, place, p], form.within_g[r, level, place, p]
     forced_by(n, by_s, by_g, room.s, room.g, room.g_within[MIDDLE], x)
     modes_into(n, 0, form.within[r, level, place, p], room.w, x)
-    if form.faded[r, level] > 0.0:
-        add(n, form.pulse_within[r, level, place, p], room.pulse, x)
-
-
-@jit_within
-def _row_within(form: Form, room: Room, place: int, p: int) -> FloatArray:
-    """Where projection p goes: the first one is the gap voltage, but for `mobile`."""
-    row: FloatArray = room.within[place, p] if form.mobile or p > 0 else room.u_within[place]
-    return row
 
 
 @jit_within
 def _project_three(form: Form, room: Room, r: int, level: int, place: int, n: int) -> None:
     """The first three projections at one place within the steps, of two modes and two drives or more."""
-    x, y, z = _row_within(form, room, place, 0), room.within[place, 1], room.within[place, 2]
+    x, y, z = room.within[place, 0], room.within[place, 1], room.within[place, 2]
     by_w, by_g = form.within[r, level, place], form.within_g[r, level, place]
     three_within(n, form.within_s[r, level, place], by_w, by_g, room.s, room.w, room.g, room.g_within[MIDDLE], x, y, z)
     modes_into_three(n, by_w, room.w, x, y, z)
     drives_into(n, 2, by_g[0], room.g, room.g_within[MIDDLE], x)
     drives_into(n, 2, by_g[1], room.g, room.g_within[MIDDLE], y)
     drives_into(n, 2, by_g[2], room.g, room.g_within[MIDDLE], z)
-    if form.faded[r, level] > 0.0:
-        by_pulse = form.pulse_within[r, level, place]
-        add(n, by_pulse[0], room.pulse, x)
-        add(n, by_pulse[1], room.pulse, y)
-        add(n, by_pulse[2], room.pulse, z)
 
 
 @jit_within
@@ -159,8 +120,7 @@ def _look(form: Form, room: Room, r: int, level: int, place: int, n: int, newton
         first = 3
     for p in range(first, 1 + g.shape[0]):
         _project(form, room, r, level, place, n, p)
-    if form.mobile:
-        both_ends(n, 1.0 - PLACES[place], PLACES[place], room.s, room.s_within)
+    both_ends(n, 1.0 - PLACES[place], PLACES[place], room.s, room.s_within)
     return _drives(
         form, form.q0[r], n, newton, room.s_within, room.within[place], room.u_within[place], room.z, room.slope, g
     )  # fmt: skip
@@ -169,8 +129,7 @@ def _look(form: Form, room: Room, r: int, level: int, place: int, n: int, newton
 @jit_within
 def project_at_ends(form: Form, room: Room, r: int, n: int, p: int) -> None:
     """Projection p at the ends of the steps."""
-    c, x = form.taps[r, p], room.end[p] if form.mobile or p > 0 else room.u
-    of_source_and_modes(n, form.tap_s[p], room.s, c, room.w, x)
+    of_source_and_modes(n, form.tap_s[p], room.s, form.taps[r, p], room.w, room.end[p])
 
 
 @jit_within
@@ -178,9 +137,9 @@ def look_at_ends(form: Form, room: Room, r: int, n: int, newton: int) -> float:
     """Gap voltages and drives at the ends of the steps."""
     first = 0
     if form.rates.shape[1] > 1 and room.g.shape[0] > 1:
-        first, x = 3, room.end[0] if form.mobile else room.u
-        three_at_ends(n, form.tap_s, form.taps[r], room.s, room.w, x, room.end[1], room.end[2])
-        modes_into_three(n, form.taps[r], room.w, x, room.end[1], room.end[2])
+        first = 3
+        three_at_ends(n, form.tap_s, form.taps[r], room.s, room.w, room.end[0], room.end[1], room.end[2])
+        modes_into_three(n, form.taps[r], room.w, room.end[0], room.end[1], room.end[2])
     for p in range(first, 1 + room.g.shape[0]):
         project_at_ends(form, room, r, n, p)
     return _drives(form, form.q0[r], n, newton, room.s, room.end, room.u, room.z, room.slope, room.g)
@@ -199,12 +158,8 @@ def project_for_charge(form: Form, room: Room, r: int, level: int, n: int) -> No
 def find_kinks(form: Form, room: Room, n: int) -> int:
     """Crossings of 0 V, and the jumps of the slope of |u| there; how many steps have one.
 
-    Under `mobile` u is bent there, too. What it would be with the area at 0 V is not, and crosses 0 V at the same time.
+    u is bent there, too. What it would be with the area at 0 V is not, and crosses 0 V at the same time.
     """
-    if not form.mobile:
-        count = find_crossings(n, room.u, room.where)
-        kink_rows(count, room.where, room.u, room.u_within[MIDDLE], room.crossed, room.jumps, room.bends)
-        return count
     share, middle = form.area0 * inverse_area_at(form, 0.0)[0], room.other[PAD:]
     of_two(n + 1, form.k_gap, room.s, share, room.end[0], room.slope)
     both_ends(n, 0.5 * form.k_gap, 0.5 * form.k_gap, room.s, middle)
@@ -230,20 +185,6 @@ def _add_kinks(form: Form, room: Room, r: int, level: int, h: float, n: int) -> 
 
 
 @jit_within
-def _pulses(form: Form, room: Room, r: int, level: int, h: float, n: int) -> None:
-    """The size a of the fast part of N in each step, into `room.pulse`, from a look at the ends of the steps."""
-    last, xi = room.g.shape[0] - 1, room.slope
-    both_ends(n, -form.k_gap / h, form.k_gap / h, room.s, xi)
-    for k in range(form.rates.shape[1]):
-        share = form.taps[r, 0, k]
-        add_two(n, share * form.gain[r, k], room.s, -share * form.rates[r, k], room.w[k], xi)
-        for t in range(last + 1):
-            add(n, share * form.feed[r, k, t], room.g[t], xi)
-    q0, faded = form.q0[r], form.faded[r, level]
-    pulse_rows(n, h, form.kappa, q0, faded, room.z, xi, room.g[last], room.g_within[MIDDLE, last], room.pulse)
-
-
-@jit_within
 def keep_drives(room: Room, n: int) -> None:
     """Keep the drives, with their sign reversed, before a sweep computes new ones."""
     for t in range(room.g.shape[0]):
@@ -262,9 +203,7 @@ def ratio_of(form: Form, room: Room, r: int, n: int, margin: float, known: float
     strayed = largest_of(n + 1, room.z) / form.q0[r]
     if known > 0.0:
         return float(min(max(known * strayed, LEAST_RATIO), MOST_RATIO))
-    if form.bend.size > 0:
-        return max(seen, OF_NETWORKS)
-    strayed *= SLOWER / margin if form.mobile else 1.0
+    strayed *= SLOWER / margin
     return float(max(seen, min(max(strayed, LEAST_RATIO), MOST_RATIO)))
 
 
@@ -293,16 +232,12 @@ def relax(
         for t in range(drives):
             room.kinked[k, t] = h * form.feed[r, k, t] * kink[t]
     last, margin, over = math.inf, 1.0, 1.0 / tol if tol > 0.0 else 1.0
-    fades = form.faded[r, level] > 0.0
-    scaled(n, 0.0, room.s, room.pulse)
     for sweep in range(MOST_SWEEPS):
         for k in range(modes):
             own = room.inc[k, PAD:]
             forced_by(
                 n, form.source[r, level, k], form.drive[r, level, k], room.s, room.g, room.g_within[MIDDLE], own
             )  # fmt: skip
-            if fades:
-                add(n, form.pulse[r, level, k], room.pulse, own)
         if sweep >= KINKED:
             _add_kinks(form, room, r, level, h, n)
         for k in range(modes):
@@ -312,9 +247,6 @@ def relax(
             keep_drives(room, n)
         margin = _look(form, room, r, level, MIDDLE, n, newton)
         margin = min(margin, look_at_ends(form, room, r, n + 1, newton))
-        if fades:
-            scaled(n, -1.0, room.pulse, room.changed_pulse)
-            _pulses(form, room, r, level, h, n)
         if sweep > 0 and not margin > LEAST_MARGIN:
             return math.inf, margin, sweep
         if not abs(room.u[n]) < math.inf:
@@ -338,21 +270,15 @@ def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArra
     for k in range(form.rates.shape[1]):
         scaled(n, 0.0, room.s, room.inc[k, PAD:])
     for place in (FIRST_QUARTER, LAST_QUARTER):
-        if form.mobile:
-            weight = PARABOLA[place]
-            both_ends(n, weight[0], weight[2], room.u, room.u_within[place])
-            add(n, weight[1], room.u_within[MIDDLE], room.u_within[place])
+        weight = PARABOLA[place]
+        both_ends(n, weight[0], weight[2], room.u, room.u_within[place])
+        add(n, weight[1], room.u_within[MIDDLE], room.u_within[place])
         _look(form, room, r, level, place, n, NEWTON)
         for t in range(room.g.shape[0]):
-            off, weight = room.g_within[place, t], PARABOLA[place]
+            off = room.g_within[place, t]
             add_three(
                 n, -weight[0], room.g[t], -weight[1], room.g_within[MIDDLE, t], -weight[2], room.g[t, 1:], off
             )  # fmt: skip
-            if t + 1 == room.g.shape[0] and form.faded[r, level] > 0.0:
-                # What the parabola shows of the fast part is known, and is corrected in the step.
-                faded = form.faded[r, level]
-                shown = weight[0] + weight[1] * math.exp(-0.5 * faded) + weight[2] * math.exp(-faded)
-                add(n, shown - math.exp(-faded * PLACES[place]), room.pulse, off)
             kink_at(
                 count, room.where, kink[t], PLACES[place], room.crossed, room.jumps, room.bends, room.end[1 + t], off
             )  # fmt: skip

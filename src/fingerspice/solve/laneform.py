@@ -257,12 +257,19 @@ def area_powers(system: System, tol: float) -> tuple[FloatArray, float] | None:
     series = np.asarray(system.model.curve[2 + N_PACKED :])
     if not system.scale > 0.0 or series.size < 2:
         return None
-    for degree in range(4, min(MOST_DEGREE, series.size + 2) + 1, 4):
-        missed = float(np.abs(series[degree + 1 :]).sum() / np.abs(series[0]))
-        if missed <= tol:
+    least = abs(float(series[0]))
+    powers, off = as_powers(series, tol * least)
+    return (powers, off / least) if powers.size else None
+
+
+def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
+    """A Chebyshev series in powers, of a degree 4 k, and what that lacks; empty if more than `tol`."""
+    for degree in range(4, MOST_DEGREE + 1, 4):
+        off = float(np.abs(series[degree + 1 :]).sum())
+        if off <= tol:
             kept = np.zeros(degree + 1)
             kept[: min(series.size, degree + 1)] = series[: degree + 1]
             out = np.empty(degree + 1)
             chebyshev.to_powers(kept, out)
-            return out, missed
-    return None
+            return out, off
+    return np.empty(0), 0.0

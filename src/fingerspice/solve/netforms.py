@@ -11,12 +11,10 @@ from numpy.polynomial.polynomial import polyder, polyval
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.engine.blockforms import MOST_DEGREE
 from fingerspice.engine.lanestep import Lanes
-from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
-from fingerspice.solve.laneform import AREA_SHARE, LaneForm, Shown, slopes
+from fingerspice.solve.laneform import AREA_SHARE, LaneForm, Shown, as_powers, slopes
 from fingerspice.solve.netmodal import Reduced
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene
@@ -179,9 +177,9 @@ def _curves(
             break
         u = np.clip(u - step, 0.0, top)
     inverse, bend = to_series @ (1.0 / a), to_series @ n
-    one, off_one = _powers(inverse, tol * abs(float(inverse[0])))
+    one, off_one = as_powers(inverse, tol * abs(float(inverse[0])))
     # N acts at full strength, on charges too: compared with the whole integral of A.
-    other, off_other = _powers(bend, tol * xi_top / q0)
+    other, off_other = as_powers(bend, tol * xi_top / q0)
     if one.size == 0 or other.size == 0:
         return None
     other[0] -= polyval(-1.0, other)
@@ -191,14 +189,3 @@ def _curves(
 def _chebyshev(x: FloatArray, count: int) -> FloatArray:
     """The first Chebyshev polynomials at x (n,) from -1 to 1, shape (n, count)."""
     return np.asarray(np.cos(np.arange(count) * np.arccos(np.clip(x, -1.0, 1.0))[:, None]))
-
-
-def _powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
-    """A Chebyshev series in powers, of a degree that is a multiple of 4, and what it lacks; empty if too much."""
-    for degree in range(4, MOST_DEGREE + 1, 4):
-        off = float(np.abs(series[degree + 1 :]).sum())
-        if off <= tol:
-            out = np.empty(degree + 1)
-            chebyshev.to_powers(np.ascontiguousarray(series[: degree + 1]), out)
-            return out, off
-    return np.empty(0), 0.0

@@ -1,6 +1,6 @@
 """Runs under a recorded source, sample by sample, in pieces of fixed length.
 
-Stacks under `local` go in lanes (`solve.lanes`), others block by block (`engine.recording`).
+One finger under `local` goes in lanes (`solve.lanes`), stacks under `mobile` go block by block (`engine.recording`).
 
 The error of each piece is judged at its end, independently of later pieces. Its outputs are therefore the same however
 long the run is, and whether all outputs are held in one array or streamed in chunks.
@@ -20,13 +20,12 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
 from fingerspice.engine import blockforms, recording
 from fingerspice.engine.blockforms import BLOCK, Form
 from fingerspice.engine.blockpoints import write_end
-from fingerspice.results.outcome import State, Status
+from fingerspice.results.outcome import State
 from fingerspice.results.record import Record
 from fingerspice.solve.following import Following, Outcome
-from fingerspice.solve.forms import Follower, followed
+from fingerspice.solve.forms import Followed, followed
 from fingerspice.solve.laneform import LaneForm, rounded_peak, stack
 from fingerspice.solve.lanes import LaneMarch
-from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.netforms import finger
 from fingerspice.solve.pieces import Piece, pieces_of
 from fingerspice.solve.problem import Problem
@@ -34,8 +33,6 @@ from fingerspice.solve.runs import Progress, Run, closed_form, excess_of, kept_w
 
 # Error allowed in a block, relative to the error asked for; ratio of stated to estimated error; attempts at a piece.
 SHARE, SAFETY, ATTEMPTS = 0.28, 1.75, 4
-# Error allowed in the piece that the ordinary engine integrates, relative to the error asked for.
-LED_SHARE = 0.03
 # Share of the error asked for that another attempt at a piece is to have.
 ENOUGH = 0.85
 # Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
@@ -47,18 +44,11 @@ MOST_FORMS = 16
 
 
 class March(Following):
-    """A recording of a network, or of a stack under `mobile`, in progress.
+    """A recording of a stack under `mobile` in progress."""
 
-    Attributes
-    ----------
-    led : list of float
-        Stated errors of the piece that the ordinary engine has integrated: gap voltage (V), force (N), nodes (V) and
-        charge (C).
-    """
-
-    def __init__(self, problem: Problem, one: Follower, rtol: float, share: float = 1.0) -> None:
-        super().__init__(problem, rtol, share, one.share, one.width)
-        self.one, self.spacing, self.led = one, 0.0, [0.0] * 4
+    def __init__(self, problem: Problem, one: Followed, rtol: float, share: float = 1.0) -> None:
+        super().__init__(problem, rtol, share, one.system.model.k_gap, one.width)
+        self.one, self.spacing = one, 0.0
         self.course = one.course(problem, self._form(self.usual))
 
     def _form(self, spacing: float) -> Form:
@@ -69,12 +59,10 @@ class March(Following):
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
         """Integrate a piece with the source's `values` (V), and write the outputs before its end as rows of `out`."""
         one, control, t_out = self.one, self.course.control, read_only(t_out)
-        if piece.led:
-            return self._lead(piece, values, t_out, out)
         if piece.spacing != self.spacing:
             # The source may jump where the spacing changes, and does so at the start of the run.
             self.course, self.spacing = self.course._replace(form=self._form(piece.spacing)), piece.spacing
-            self.course.checks[:] = blockforms.new_checks(one.shown)
+            self.course.checks[:] = blockforms.new_checks()
             if not recording.jump(self.course, float(values[0])):
                 return Outcome.LOST
         self.heard(values)
@@ -84,7 +72,7 @@ class March(Following):
             code = recording.march(
                 self.course, values, 0, values.size - 1, piece.start, piece.spacing, tol, t_out, out
             )  # fmt: skip
-            if code != recording.DONE or control[blockforms.PEAK_U] > one.u_top:
+            if code != recording.DONE or control[blockforms.PEAK_U] > one.system.u_top:
                 return Outcome.LOST
             gaps, _, _ = self.stated()
             gaps[0, 0], gaps[0, 1] = max(gaps[0, 0], self.least), max(gaps[0, 1], self._force(self.least))
@@ -97,25 +85,6 @@ class March(Following):
             self.course.counters[blockforms.REFUSED] = refused
             self.share *= ENOUGH / excess
         return Outcome.NOT_MET
-
-    def _lead(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
-        """Integrate a piece by the ordinary engine, and take over its state."""
-        count = int(np.searchsorted(t_out, piece.stop - 1e-9 * piece.spacing))
-        problem = replace(self.problem, t_start=piece.start, t_stop=piece.stop, first=piece.start)
-        run = solve_ordinary(
-            problem, LED_SHARE * self.rtol, t_out[:count], np.zeros(count, bool), repeat=False
-        )  # fmt: skip
-        if run.status is not Status.SUCCESS:
-            return Outcome.LOST
-        out[:, :count] = run.rows.T[: self.width]
-        self.course = self.one.course(replace(self.problem, initial=run.state), self.course.form)
-        self.course.counters[blockforms.OUTPUT] = count
-        control, error, (gap,) = self.course.control, run.error, run.gaps
-        control[blockforms.PEAK_U], control[blockforms.PEAK_F] = gap[0], gap[1]
-        self.led = [error.u_gap, error.f_el, error.v_nodes or 0.0, error.q_source or 0.0]
-        self.loudest, self.u_last = float(np.abs(values).max()), float(values[-1])
-        self.t, self.spacing = piece.stop, 0.0
-        return Outcome.MET
 
     def _force(self, u_gap: float) -> float:
         """Force (N) at a gap voltage (V), with the area at 0 V."""
@@ -130,7 +99,7 @@ class March(Following):
             x[:] = kept
 
     def mark(self) -> dict[str, Any]:
-        names = ("t", "share", "loudest", "u_last", "spacing", "led")
+        names = ("t", "share", "loudest", "u_last", "spacing")
         return {name: getattr(self, name) for name in names} | {"parts": [x.tolist() for x in self._parts()]}
 
     def stand(self, mark: dict[str, Any]) -> None:
@@ -161,16 +130,14 @@ class March(Following):
         peak_u, peak_f = float(control[blockforms.PEAK_U]), float(control[blockforms.PEAK_F])
         # Round-off adds to the errors estimated in the blocks.
         missed = self.one.missed
-        floor = 4e-16 * (peak_u + self.one.share * max(u_peak, self.loudest))
-        floor += missed * peak_u + self.one.missed_u
-        u_error = SAFETY * float(control[blockforms.ERROR_U]) + floor + self.led[0]
-        f_error = SAFETY * float(control[blockforms.ERROR_F]) + self.led[1]
+        floor = 4e-16 * (peak_u + self.gain * max(u_peak, self.loudest)) + missed * peak_u
+        u_error = SAFETY * float(control[blockforms.ERROR_U]) + floor
+        f_error = SAFETY * float(control[blockforms.ERROR_F])
         f_error += (2.0 * floor / (peak_u or 1.0) + missed) * peak_f
-        node_error = SAFETY * float(control[blockforms.ERROR_V]) + self.led[2]
-        node_error += 4e-16 * (peak_u + u_peak) + missed * peak_u + self.one.missed_u
+        node_error = SAFETY * float(control[blockforms.ERROR_V]) + 4e-16 * (peak_u + u_peak) + missed * peak_u
         charge_error = None
         if self.problem.charge:
-            charge_error = SAFETY * float(control[blockforms.ERROR_Q]) + self.led[3]
+            charge_error = SAFETY * float(control[blockforms.ERROR_Q])
             charge_error += self.one.charge_error(self.problem, self.course, peak_u)
         return np.array([[peak_u, peak_f, u_error, f_error]]), node_error, charge_error
 
@@ -188,17 +155,17 @@ def _decade(rtol: float) -> float:
     return float(10.0 ** np.floor(np.log10(rtol)))
 
 
-def ready(problem: Problem, rtol: float) -> LaneForm | Follower | None:
+def ready(problem: Problem, rtol: float) -> LaneForm | Followed | None:
     """The scene prepared for this method, cached by decade; None where it does not apply."""
     kept, *key = _kept(problem, rtol)
     make = finger if problem.scene.stack is None else followed if problem.scene.net.mobile else stack
-    one: LaneForm | Follower | None = kept_with(
+    one: LaneForm | Followed | None = kept_with(
         kept, ("followed", *key), MOST_FORMS, partial(make, problem, _decade(rtol))
     )
     return one
 
 
-def march_of(problem: Problem, one: LaneForm | Follower, rtol: float, share: float = 1.0) -> Following:
+def march_of(problem: Problem, one: LaneForm | Followed, rtol: float, share: float = 1.0) -> Following:
     """A run that begins, with the scene as `ready` has prepared it."""
     return LaneMarch(problem, one, rtol, share) if isinstance(one, LaneForm) else March(problem, one, rtol, share)
 
