@@ -91,7 +91,7 @@ class _Rows(NamedTuple):
     g: int  # Drives at the nodes
     w: int  # What 1/A - q0 multiplies at the start, and at the latest node
     scratch: int
-    q: int  # In a network: 1/A - q0 at the latest node, and its derivative by |xi|
+    q: int  # In a network: 1/A - q0 at the latest node, its derivative by |xi|, and dN/dxi where fading modes soon are
     gone: int  # What modes have beside where they soon are, and by which this changes the drives
     end: int
 
@@ -104,7 +104,7 @@ def rows_of(marks: Any) -> _Rows:
     w = g + NODES * drives
     scratch = w + 2 * leaks
     q = scratch + 5 + NODES + drives
-    return _Rows(xi, g, w, scratch, q, q + 2, q + 2 + m + drives if drives > leaks else q)
+    return _Rows(xi, g, w, scratch, q, q + 3, q + 3 + m + drives if drives > leaks else q)
 
 
 _rows_of = jit_within(rows_of)
@@ -379,6 +379,7 @@ def _smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
     _drives(marks, c, weights, last, 0, -1, state)
     for i in range(lanes):
         state[at.xi * lanes + i] = state[(at.xi + last) * lanes + i]
+        state[(at.q + 2) * lanes + i] = rise_of(c.q0, c.kappa, state[at.q * lanes + i])
         for k in range(active, m):
             state[(at.gone + k) * lanes + i] = 0.0
         for t in range(drives):
@@ -410,21 +411,28 @@ def _bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> Non
 
 @jit_within
 def _fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
-    """Add what is left of what `_smooth` has taken, and of what it has caused."""
-    lanes, m, leaks, at = len(marks.lanes), len(marks.modes), len(marks.leaks), _rows_of(marks)
-    drives, last = leaks + 1, NODES - 1
-    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    rate, p = c.rates[c.fast], c.fast * PER_MODE + 4 * (last - 1)
+    """Add what is left of what `_smooth` has taken, and the modes' response to it by N and, as one, by the leaks."""
+    lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
+    at, wide, each = _rows_of(marks), 1, 0
+    if len(marks.own) > 0:
+        wide, each = lanes, 1
+    end = 4 * (NODES - 2)
     for k in range(m):
-        apart = c.rates[k] - rate
-        over, alike = 1.0 / (apart if apart != 0.0 else 1.0), abs(apart) < 1e-6 * rate
-        for i in range(lanes):
-            h, faded = weights[m * PER_MODE * wide + i * each], weights[p * wide + i * each]
-            decay, fed = weights[(k * PER_MODE + 4 * (last - 1)) * wide + i * each], 0.0
-            for t in range(drives):
-                fed += c.feed[k, t] * state[(at.gone + m + t) * lanes + i]
-            left = decay * state[(at.gone + k) * lanes + i]
-            state[(SOURCES + k) * lanes + i] += left + (h * faded if alike else (faded - decay) * over) * fed
+        for f in range(active):
+            apart = c.rates[k] - c.rates[f]
+            over, alike = 1.0 / (apart if apart != 0.0 else 1.0), abs(apart) <= 1e-6 * c.rates[f]
+            for i in range(lanes):
+                decay, faded = (
+                    weights[(k * PER_MODE + end) * wide + i * each],
+                    weights[(f * PER_MODE + end) * wide + i * each],
+                )
+                gone = state[(at.gone + f) * lanes + i]
+                fed = c.feed[k, leaks] * state[(at.q + 2) * lanes + i] * c.shape[f] * gone
+                if f == c.fast:
+                    for t in range(leaks):
+                        fed += c.feed[k, t] * state[(at.gone + m + t) * lanes + i]
+                pulse = weights[m * PER_MODE * wide + i * each] * faded if alike else (faded - decay) * over
+                state[(SOURCES + k) * lanes + i] += pulse * fed + (decay * gone if k == f else 0.0)
 
 
 @jit_within

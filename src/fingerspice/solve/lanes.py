@@ -30,19 +30,22 @@ from fingerspice.solve.runs import excess_of
 
 # Steps of a sample, by level.
 PARTS = (1, 2, 4, 8, 16, 32, 64)
-# Stated over seen errors.
-SAFETY = 2.0
-# Changes of starts that may be left, over the error asked for.
-OF_STARTS = 0.05
+# Stated over seen errors, of voltages and charges, and of the force.
+SAFETY, OF_FORCE = 2.0, 1.5
+# Changes of starts that may be left, over the error asked for; and over the voltages, as rounding leaves so much.
+OF_STARTS, LEAST_CHANGE, SHORT = 0.01, 1e-14, 1024
 # A window over its piece, and the fewest samples in one.
 WINDOW, FEWEST = 1.0 / 16.0, 32
 # Excess below which the next block has steps twice as long, and what half the length divides an error by at least: in a
 # stack, and in a network.
 COARSER, FINER = 1.0 / 60.0, (5.0, 12.0)
-# Error allowed in a piece that the ordinary engine integrates, over the error asked for.
-LED_SHARE = 0.03
+# Error allowed in a piece that the ordinary engine integrates, over the error asked for, and at most.
+LED_SHARE, LED_MOST = 0.003, 1e-8
+# Relative change of a voltage over that of the area which causes it, at most: what scales with the area divides the
+# voltage with what does not.
+DIVIDED = 0.5
 # What leaks by the error of the polynomial of 1/A over what is stored, times that error: as seen in offset recordings.
-LEAKED = 0.3
+LEAKED = 0.2
 # In a network, factor of the steps to a time between two samples, which no window checks.
 BETWEEN = 4
 # Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
@@ -277,7 +280,9 @@ class LaneMarch(Following):
         block = Block(self.form, values, h, self.steps == 0)
         while True:
             parts, excess = PARTS[self.level], math.inf
-            solved = block.solve(self.z, parts, OF_STARTS * self.rtol * self.scale)
+            # Another sweep over short pieces costs little.
+            left = max(OF_STARTS * min(block.count / SHORT, 1.0) * self.rtol, LEAST_CHANGE)
+            solved = block.solve(self.z, parts, left * self.scale)
             self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
             if solved:
                 peak = float(largest_of(block.n + 1, block.xi))
@@ -306,7 +311,7 @@ class LaneMarch(Following):
         count = int(np.searchsorted(t_out, piece.stop - 1e-9 * piece.spacing))
         problem = replace(self.problem, t_start=piece.start, t_stop=piece.stop, first=piece.start)
         run = solve_ordinary(
-            problem, LED_SHARE * self.rtol, t_out[:count], np.zeros(count, bool), repeat=False
+            problem, min(LED_SHARE * self.rtol, LED_MOST), t_out[:count], np.zeros(count, bool), repeat=False
         )  # fmt: skip
         if run.status is not Status.SUCCESS:
             return Outcome.LOST
@@ -332,7 +337,7 @@ class LaneMarch(Following):
             """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
             lucky = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there), 0.0))
             more = np.maximum(lucky, np.abs(columns @ alike_there) - LUCK * lucky)
-            return np.asarray(more + np.abs(columns[:active]) @ block.left[:active])
+            return np.asarray(more + np.abs(columns[:active]) @ block.left[:active] / SAFETY)
 
         c, errors = form.lanes, np.zeros(4)
         dxi = np.einsum("k,kij->ij", c.shape, off)
@@ -419,11 +424,11 @@ class LaneMarch(Following):
         form, u_peak = self.form, self.problem.scene.u_peak
         missed, at, led = form.missed, np.array(peak), self.led.tolist()
         u, force = float(form.gap(at)), float(form.force(at))
-        floor = 4e-16 * (peak + form.gain * max(u_peak, self.loudest)) + missed * peak
+        floor = 4e-16 * (peak + form.gain * max(u_peak, self.loudest)) + DIVIDED * missed * peak
         floor += form.lanes.kappa * form.missed_bend
         u_error = SAFETY * float(errors[0]) + floor + led[0]
-        f_error = SAFETY * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force + led[1]
-        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + missed * peak + led[2]
+        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force + led[1]
+        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + floor + led[2]
         charge_error = None
         if form.flows:
             charge_error = SAFETY * float(errors[3]) + led[3]

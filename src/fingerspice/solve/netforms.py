@@ -11,7 +11,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.engine.lanestep import Lanes
+from fingerspice.engine.lanestep import FADED, Lanes
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
 from fingerspice.solve.laneform import AREA_SHARE, LaneForm, Shown, as_powers, slopes
@@ -24,6 +24,11 @@ from fingerspice.waveforms.waveform import DC
 
 # Number of Chebyshev points for the area over the gap voltage, and frequencies at which the gap's share is looked at.
 _POINTS, _FREQUENCIES = 64, 65
+# Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
+# what they leave together is known but for about 1e-8.
+OF_MANY, ACTING = 1e-7, 1e-3
+# Error of the polynomials for larger errors asked for, too: terms cost little.
+COARSEST = 1e-5
 # Reference area: that at this share of the largest gap voltage to expect.
 _TYPICAL = 0.5
 
@@ -120,7 +125,7 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
     reduced = Reduced(scene, source, area0)
     one = reduced.modal()
     modal = reduced.with_charges(one) if problem.charge else one
-    curves = _curves(scene.net.curves[moving], reduced.q0, reduced.kappa, scene.u_top, AREA_SHARE * rtol)
+    curves = _curves(scene.net.curves[moving], reduced.q0, reduced.kappa, scene.u_top, AREA_SHARE * min(rtol, COARSEST))
     contact = problem.network.contacts[moving]
     if modal is None or curves is None or contact is None:
         return None
@@ -134,10 +139,13 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
         modal.rates, modal.gain, modal.taps[0], modal.taps[1:-1], modal.tap_s[1:-1],
         modal.taps[1:-1, :n] @ reduced.absorbed, modal.drives,
     ))  # fmt: skip
-    acting = np.abs(modal.taps[0, :n] * reduced.absorbed) * reduced.modes.rates
+    shares = np.abs(modal.taps[0, :n] * reduced.absorbed)
+    fading = (reduced.modes.rates > FADED * wave.rate) & (shares > ACTING * reduced.kappa)
+    if rtol < OF_MANY and np.count_nonzero(fading) > 1:
+        return None
     lanes = Lanes(
         rates, gain, shape, float(modal.tap_s[0]), taps, tap_s, bent, feed, area, slope, bend, scale, -1.0, reduced.q0,
-        reduced.kappa, kinks, int(np.argmax(acting)),
+        reduced.kappa, kinks, int(np.argmax(shares * reduced.modes.rates)),
     )  # fmt: skip
     nodes = Shown(modal.nodes, np.zeros(len(modal.nodes)), modal.nodes[:, :n] @ reduced.absorbed)
     return NetworkForm(
