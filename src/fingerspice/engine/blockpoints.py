@@ -10,16 +10,7 @@ from fingerspice.base.compiled import jit
 from fingerspice.engine.blockcharge import weights_until
 from fingerspice.engine.blockcourse import Course, inverse_area_at
 from fingerspice.engine.blockcurrent import current_at
-from fingerspice.engine.blockforms import (
-    FIRST_QUARTER,
-    LAST_QUARTER,
-    MIDDLE,
-    OUTPUT,
-    REFERENCE,
-    U_GAP,
-    Form,
-    Z,
-)
+from fingerspice.engine.blockforms import FIRST_QUARTER, LAST_QUARTER, MIDDLE, OUTPUT, REFERENCE, U_GAP, Form, Z
 from fingerspice.engine.blockkinks import after_kink, crossing
 from fingerspice.engine.relaxation import FIRST_NEWTON, look_at_ends
 from fingerspice.numerics.moments import moments

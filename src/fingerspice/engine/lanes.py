@@ -10,7 +10,8 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.blockrows import add, area_rows, of_source_and_modes, sign_as
-from fingerspice.engine.lanestep import BASIS, INNER, NODES, PER_MODE, PER_MODE_BENT, SOURCES, rise_of, step
+from fingerspice.engine.lanerows import BASIS, INNER, NODES, PER_MODE, PER_MODE_BENT, SOURCES, rise_of
+from fingerspice.engine.lanestep import step
 
 # Samples that are read and written at once.
 TILE = 16

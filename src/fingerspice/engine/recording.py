@@ -119,7 +119,7 @@ def _solve(c: Course, r: int, level: int, h: float, n: int, tol: float) -> tuple
     c.counters[SWEEPS] += sweeps
     if not change < math.inf:
         return change, margin, math.inf, 1.0
-    misfit(form, room, r, level, h, c.shown.kink, n)
+    misfit(form, room, r, level, c.shown.kink, n)
     area_rows(n + 1, form.area, form.scale, form.shift, 0.0, room.u, c.charges.q[0])
     # The gap voltage contains the state times 1/A, and a near fold magnifies its error.
     magnified = form.area0 * largest_of(n + 1, c.charges.q[0]) / margin

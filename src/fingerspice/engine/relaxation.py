@@ -264,7 +264,7 @@ def relax(
 
 
 @jit_within
-def misfit(form: Form, room: Room, r: int, level: int, h: float, kink: FloatArray, n: int) -> None:
+def misfit(form: Form, room: Room, r: int, level: int, kink: FloatArray, n: int) -> None:
     """Error of the modes that each step adds, into `room.inc`: Boole's rule less Simpson's."""
     count = find_kinks(form, room, n)
     for k in range(form.rates.shape[1]):

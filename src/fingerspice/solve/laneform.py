@@ -16,8 +16,8 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.statespace import Stack
 from fingerspice.engine.blockforms import MOST_DEGREE
 from fingerspice.engine.blockrows import area_rows
+from fingerspice.engine.lanerows import NODES, PER_MODE, PER_MODE_BENT, Lanes, Marks, rows_of
 from fingerspice.engine.lanes import weigh
-from fingerspice.engine.lanestep import NODES, PER_MODE, PER_MODE_BENT, Lanes, Marks, rows_of
 from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import N_PACKED

@@ -11,7 +11,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.engine.lanestep import FADED, Lanes
+from fingerspice.engine.lanerows import FADED, Lanes
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
 from fingerspice.solve.laneform import AREA_SHARE, LaneForm, Shown, as_powers, slopes

@@ -1,0 +1,228 @@
+"""What a network adds to a step of lanes (`engine.lanestep`): N as a drive, and modes that fade within a sample."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit_within
+from fingerspice.engine.lanerows import (
+    END_SLOPES,
+    FADED,
+    NODES,
+    PER_MODE,
+    PER_MODE_BENT,
+    SOURCES,
+    places,
+    polynomial_rows,
+    rise_of,
+)
+
+
+@jit_within
+def drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shared: int, state: FloatArray) -> None:
+    """Drives at node j, from xi there, but for N, and from what 1/A - q0 multiplies there.
+
+    In a network xi = X + B N(xi), where X is given, and B is the share number `shared`, or 0 if that is negative. It is
+    solved on the tangent of N at node `before`, and once more on the one at the place that is found. Tangents have the
+    slope -q / d, d = q0 (q0 + q) - kappa q, where 1/A = q0 + q.
+    """
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    drives, x = leaks + len(marks.bend), at.scratch
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    count = len(marks.modes)
+    share_at, on = count * (PER_MODE + PER_MODE_BENT) + 1 + max(shared, 0) * (1 + leaks), 1.0 if shared >= 0 else 0.0
+    if drives > leaks:
+        for i in range(lanes):
+            there, bend = state[(at.xi + before) * lanes + i], state[(at.g + before * drives + leaks) * lanes + i]
+            share, q = on * weights[share_at * wide + i * each], state[at.q * lanes + i]
+            without = state[(at.xi + j) * lanes + i]
+            d = c.q0 * (c.q0 + q) - c.kappa * q
+            state[(x + 2) * lanes + i] = without
+            state[(at.xi + j) * lanes + i] = there + d * ((without + share * bend - there) / (d + share * q))
+    for i in range(lanes):
+        state[x * lanes + i] = abs(state[(at.xi + j) * lanes + i]) * c.scale + c.shift
+    polynomial_rows(lanes, c.area, state[x * lanes :], state[(x + 1) * lanes :])
+    if drives > leaks:
+        polynomial_rows(lanes, c.slope, state[x * lanes :], state[(at.q + 1) * lanes :])
+        polynomial_rows(lanes, c.bend, state[x * lanes :], state[(x + 4) * lanes :])
+        for i in range(lanes):
+            xi, q = state[(at.xi + j) * lanes + i], state[(x + 1) * lanes + i]
+            share, bend = on * weights[share_at * wide + i * each], state[(x + 4) * lanes + i]
+            bend = bend if xi >= 0.0 else -bend
+            d = c.q0 * (c.q0 + q) - c.kappa * q
+            by = (state[(x + 2) * lanes + i] + share * bend - xi) / (d + share * q)
+            bend -= q * by
+            found = xi + d * by
+            q += state[(at.q + 1) * lanes + i] * (abs(found) - abs(xi))
+            state[(at.xi + j) * lanes + i] = found
+            state[(x + 1) * lanes + i] = q
+            state[at.q * lanes + i] = q
+            state[(at.g + j * drives + leaks) * lanes + i] = bend
+            for t in range(leaks):
+                more = c.bent[t] + on * weights[(share_at + 1 + t) * wide + i * each]
+                state[(at.w + leaks + t) * lanes + i] += more * bend
+    for t in range(leaks):
+        for i in range(lanes):
+            w = state[(at.w + leaks + t) * lanes + i]
+            state[(at.g + j * drives + t) * lanes + i] = state[(x + 1) * lanes + i] * w
+
+
+@jit_within
+def add_predicted(marks: Any, c: Any, k: int, j: int, weights: FloatArray, state: FloatArray) -> None:
+    """Add mode k's response to leaks and N at the nodes before j to the first row of scratch."""
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    drives, own = leaks + 1, len(marks.modes) * PER_MODE + k * PER_MODE_BENT + j * j
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    for node in range(j):
+        for i in range(lanes):
+            fed = 0.0
+            for t in range(leaks):
+                fed += c.feed[k, t] * state[(at.g + node * drives + t) * lanes + i]
+            bend = c.feed[k, leaks] * state[(at.g + node * drives + leaks) * lanes + i]
+            by_leaks, by_bend = weights[(own + node) * wide + i * each], weights[(own + j + node) * wide + i * each]
+            state[at.scratch * lanes + i] += by_leaks * fed + by_bend * bend
+
+
+@jit_within
+def _changes(marks: Any, c: Any, weights: FloatArray, node: int, state: FloatArray) -> None:
+    """Change of N in a step at its rate at node 0 or the last one, into the first row of scratch.
+
+    Modes that have faded follow the source and N.
+    """
+    lanes, active, leaks, at = len(marks.lanes), len(marks.active), len(marks.leaks), places(marks)
+    drives, x = leaks + 1, at.scratch
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    length = len(marks.modes) * PER_MODE
+    for i in range(lanes):
+        state[x * lanes + i] = c.k * (state[lanes + i] - state[i])
+        state[(x + 2) * lanes + i] = 0.0
+    for k in range(active):
+        rate, over, shape, gain, feed = c.rates[k], 1.0 / (c.rates[k] + 1e-300), c.shape[k], c.gain[k], c.feed[k, leaks]
+        for i in range(lanes):
+            h = weights[length * wide + i * each]
+            own = gain * (state[i] if node == 0 else state[lanes + i]) - rate * state[(SOURCES + k) * lanes + i]
+            for t in range(drives):
+                own += c.feed[k, t] * state[(at.g + node * drives + t) * lanes + i]
+            follows = rate * h > FADED
+            state[x * lanes + i] += shape * (gain * (state[lanes + i] - state[i]) * over if follows else h * own)
+            state[(x + 2) * lanes + i] += shape * feed * over if follows else 0.0
+    for i in range(lanes):
+        q = state[at.q * lanes + i]
+        d = c.q0 * (c.q0 + q) - c.kappa * q
+        state[x * lanes + i] *= -q / (d + state[(x + 2) * lanes + i] * q)
+
+
+@jit_within
+def smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
+    """Put modes that fade within the first step of a sample where they soon are, on the new line of the source.
+
+    What this changes of them and of the drives is kept in the rows from `gone` on. Whether there are such modes.
+    """
+    lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
+    drives, last, at = leaks + 1, NODES - 1, places(marks)
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    fades = False
+    for i in range(lanes if len(marks.own) > 0 else 1):
+        fades = fades or c.rates[c.fast] * weights[m * PER_MODE * wide + i * each] > FADED
+    if not fades:
+        return False
+    _changes(marks, c, weights, 0, state)
+    for i in range(lanes):
+        state[(at.xi + last) * lanes + i] = c.k * state[i]
+        for t in range(leaks):
+            state[(at.w + leaks + t) * lanes + i] = c.tap_s[t] * state[i]
+    for k in range(active):
+        rate, over, gain, feed = c.rates[k], 1.0 / (c.rates[k] + 1e-300), c.gain[k], c.feed[k, leaks]
+        for i in range(lanes):
+            z, h = state[(SOURCES + k) * lanes + i], weights[m * PER_MODE * wide + i * each]
+            fed = gain * state[i]
+            for t in range(drives):
+                fed += c.feed[k, t] * state[(at.g + t) * lanes + i]
+            changes = gain * (state[lanes + i] - state[i]) + feed * state[at.scratch * lanes + i]
+            soon = (fed - changes / (rate * h + 1e-300)) * over
+            soon = soon if rate * h > FADED else z
+            state[(at.gone + k) * lanes + i] = z - soon
+            state[(SOURCES + k) * lanes + i] = soon
+            state[(at.xi + last) * lanes + i] += c.shape[k] * soon
+            for t in range(leaks):
+                state[(at.w + leaks + t) * lanes + i] += c.taps[t, k] * soon
+    drives_at(marks, c, weights, last, 0, -1, state)
+    for i in range(lanes):
+        state[at.xi * lanes + i] = state[(at.xi + last) * lanes + i]
+        state[(at.q + 2) * lanes + i] = rise_of(c.q0, c.kappa, state[at.q * lanes + i])
+        for k in range(active, m):
+            state[(at.gone + k) * lanes + i] = 0.0
+        for t in range(drives):
+            smooth = state[(at.g + last * drives + t) * lanes + i]
+            state[(at.gone + m + t) * lanes + i] = state[(at.g + t) * lanes + i] - smooth
+            state[(at.g + t) * lanes + i] = smooth
+        for t in range(leaks):
+            state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
+    return True
+
+
+@jit_within
+def bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
+    """Add the modes' response to what the cubic through N lacks, whose slope at the end of the step is known."""
+    lanes, m, leaks, at = len(marks.lanes), len(marks.modes), len(marks.leaks), places(marks)
+    drives = leaks + 1
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    _changes(marks, c, weights, NODES - 1, state)
+    for i in range(lanes):
+        for j in range(NODES):
+            of_cubic = END_SLOPES[j] * state[(at.g + j * drives + leaks) * lanes + i]
+            state[at.scratch * lanes + i] -= of_cubic
+    for k in range(m):
+        p = m * PER_MODE + (k + 1) * PER_MODE_BENT
+        for i in range(lanes):
+            by = c.feed[k, leaks] * weights[p * wide + i * each]
+            state[(SOURCES + k) * lanes + i] += by * state[at.scratch * lanes + i]
+
+
+@jit_within
+def fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
+    """Add what is left of what `smooth` has taken, and the modes' response to it by N and, as one, by the leaks."""
+    lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
+    at, end = places(marks), 4 * (NODES - 2)
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    for k in range(m):
+        for f in range(active):
+            apart = c.rates[k] - c.rates[f]
+            over, alike = 1.0 / (apart if apart != 0.0 else 1.0), abs(apart) <= 1e-6 * c.rates[f]
+            for i in range(lanes):
+                decay = weights[(k * PER_MODE + end) * wide + i * each]
+                faded = weights[(f * PER_MODE + end) * wide + i * each]
+                gone = state[(at.gone + f) * lanes + i]
+                fed = c.feed[k, leaks] * state[(at.q + 2) * lanes + i] * c.shape[f] * gone
+                if f == c.fast:
+                    for t in range(leaks):
+                        fed += c.feed[k, t] * state[(at.gone + m + t) * lanes + i]
+                pulse = weights[m * PER_MODE * wide + i * each] * faded if alike else (faded - decay) * over
+                state[(SOURCES + k) * lanes + i] += pulse * fed + (decay * gone if k == f else 0.0)
+
+
+@jit_within
+def end_bent(marks: Any, c: Any, state: FloatArray) -> None:
+    """xi and the drives at the end of a step, from the modes there and on the tangents at the last node, to node 0."""
+    lanes, active, leaks, at = len(marks.lanes), len(marks.active), len(marks.leaks), places(marks)
+    drives, last = leaks + 1, NODES - 1
+    for i in range(lanes):
+        state[at.xi * lanes + i] = c.k * state[lanes + i]
+        for t in range(leaks):
+            state[(at.w + t) * lanes + i] = c.tap_s[t] * state[lanes + i]
+    for k in range(active):
+        for i in range(lanes):
+            z = state[(SOURCES + k) * lanes + i]
+            state[at.xi * lanes + i] += c.shape[k] * z
+            for t in range(leaks):
+                state[(at.w + t) * lanes + i] += c.taps[t, k] * z
+    for i in range(lanes):
+        xi, found, q = state[at.xi * lanes + i], state[(at.xi + last) * lanes + i], state[at.q * lanes + i]
+        bend = state[(at.g + last * drives + leaks) * lanes + i]
+        bend -= q / (c.q0 * (c.q0 + q) - c.kappa * q) * (xi - found)
+        q += state[(at.q + 1) * lanes + i] * (abs(xi) - abs(found))
+        state[at.q * lanes + i], state[(at.g + leaks) * lanes + i] = q, bend
+        for t in range(leaks):
+            w = state[(at.w + t) * lanes + i] + c.bent[t] * bend
+            state[(at.w + t) * lanes + i], state[(at.g + t) * lanes + i] = w, q * w

@@ -1,0 +1,226 @@
+"""A block of a recording in lanes: its pieces followed from starts that are corrected, and windows of them checked.
+
+All pieces are followed at once (`engine.lanes`). Their starts are first those of the circuit with its area held; after
+each sweep they are corrected by what the modes decay by in a piece, until xi no longer changes.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.engine.lanes import along, begin, busiest, show, span, within
+from fingerspice.solve.laneform import LANES, LaneForm
+
+# A window over its piece, and the fewest samples in one.
+WINDOW, FEWEST = 1.0 / 16.0, 32
+# In a network, factor of the steps to a time between two samples, which no window checks.
+BETWEEN = 4
+# The rate that stands for 0, 1/s.
+_STILL = 1e-9
+
+
+class Block:
+    """A row of samples, at once in `LANES` pieces.
+
+    Parameters
+    ----------
+    form : LaneForm
+    x : ndarray, shape (n + 1,)
+        The source at the samples, V.
+    h : ndarray, shape (n,) or (1,)
+        Distances of the samples, or their common distance, s.
+    starts_run : bool
+        Whether the run starts here, perhaps with a jump: the first piece is then checked at its start.
+    """
+
+    def __init__(self, form: LaneForm, x: FloatArray, h: FloatArray, starts_run: bool) -> None:
+        self.form, self.n, self.own = form, x.size - 1, h.size > 1
+        self.count = -(-self.n // LANES)
+        beyond = self.count * LANES - self.n
+        # The source stays at its last value behind the end.
+        self.x = np.concatenate([x, np.full(beyond, x[-1])]) if beyond else x
+        self.h = np.concatenate([h, np.zeros(beyond)]) if self.own and beyond else h
+        self.first = self.count * np.arange(LANES)
+        self.starts_run, self.marks, self.active = starts_run, form.marks(self.own), form.active
+        self.rates = np.maximum(form.lanes.rates, _STILL)
+        self.room, self.scratch = form.room(self.own)
+        self.still = form.weights(np.zeros(LANES if self.own else 1))
+        self.kept = np.zeros((self.rates.size, LANES, self.count + 1))
+        self.left = np.zeros(self.rates.size)
+
+    @cached_property
+    def lengths(self) -> FloatArray:
+        """Durations of the pieces, s."""
+        if not self.own:
+            return np.full(LANES, self.count * self.h[0])
+        return np.asarray(self.h.reshape(LANES, self.count).sum(axis=1))
+
+    @cached_property
+    def handed(self) -> FloatArray:
+        """What is left at the start of each piece of the modes at the start of the block and the ends of the pieces.
+
+        Shape (m, LANES, 1 + LANES).
+        """
+        ends = np.concatenate([[0.0], np.cumsum(self.lengths)])
+        since = ends[:LANES, None] - ends[None, :]
+        left = np.exp(-self.rates[:, None, None] * np.maximum(since, 0.0))
+        return np.asarray(np.where(np.tri(LANES, 1 + LANES, dtype=bool), left, 0.0))
+
+    def _weights(self, parts: int) -> FloatArray:
+        return self.scratch if self.own else self.form.weights(self.h / parts)
+
+    def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
+        return bool(span(
+            self.marks, self.form.lanes, self._weights(parts), self.h, self.x, first, count, parts, tol, self.room,
+            kept, self.left,
+        ))  # fmt: skip
+
+    def _begin(self, starts: FloatArray, first: IntArray) -> None:
+        begin(self.marks, self.form.lanes, self.still, np.ascontiguousarray(starts), self.x[first], self.room)
+
+    def solve(self, start: FloatArray, parts: int, tol: float) -> bool:
+        """Follow all pieces from `start` (m,), until xi is known to `tol` (V); False where it is not.
+
+        The states at the samples go into `kept`.
+        """
+        form, active, self.sweeps = self.form, self.active, 0
+        self.__dict__.pop("xi", None)
+        own = np.zeros_like(self.kept[:, :, 0])
+        # A guess, for which uneven points may count as even ones.
+        along(form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
+        starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[:, None], own], axis=1))
+        starts[active:] = 0.0
+        for sweep in range(LANES + 1):
+            self._begin(starts, self.first)
+            self.kept[:, :, 0] = starts
+            stops = self._span(self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
+            self.sweeps += 1
+            if stops:
+                break
+            off = self.kept[:active, :, -1] - np.roll(starts[:active], -1, axis=1)
+            off[:, -1] = 0.0
+            change = np.einsum("kij,kj->ki", self.handed[:active, :, 1:], off)
+            self.left[:active] = np.abs(change).max(axis=1)
+            most = float(np.abs(form.lanes.shape) @ self.left)
+            if not most < math.inf:
+                return False
+            if most <= tol:
+                break
+            starts[:active] += change
+        else:
+            return False
+        for k in range(active, start.size):
+            # Passive modes have begun at 0 in every piece.
+            self.kept[k] += np.cumsum(np.append(start[k], self.kept[k, :-1, -1]))[:, None]
+        return True
+
+    @cached_property
+    def xi(self) -> FloatArray:
+        """xi (V) at the samples, shape (n + 1,), after `solve`."""
+        c, out = self.form.lanes, np.empty(self.n + 1)
+        show(c.k, c.shape, self.x, self.first, self.count, self.n + 1, self.kept, out)
+        return out
+
+    @property
+    def _by_piece(self) -> FloatArray:
+        """|xi| (V) at the samples of each piece, shape (LANES, count)."""
+        return np.pad(np.abs(self.xi[:-1]), (0, LANES * self.count - self.n)).reshape(LANES, self.count)
+
+    @property
+    def peaks(self) -> FloatArray:
+        """Largest |xi| (V) at the samples of each piece, and at the next one."""
+        own = self._by_piece.max(axis=1)
+        return np.asarray(np.maximum(own, np.append(own[1:], abs(self.xi[-1]))))
+
+    def end(self) -> FloatArray:
+        """The state (m,) at the last sample."""
+        lane = (self.n - 1) // self.count
+        return np.array(self.kept[:, lane, self.n - lane * self.count])
+
+    def check(self, parts: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Follow a window of every piece by twice as many steps.
+
+        Returns
+        -------
+        off : ndarray, shape (m, LANES, width + 1)
+            Differences of the states, 0 in pieces that are not checked.
+        xi : ndarray, shape (LANES, width + 1)
+            V.
+        share : ndarray, shape (m, LANES)
+            What a piece adds over what its window does, if all errors are alike.
+        share_of_products : ndarray, shape (m, m, LANES)
+            The same of products of two errors, if they come by chance.
+        """
+        width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + len(self.marks.bend)))))
+        lanes = np.arange(LANES)
+        off, at = np.zeros((self.rates.size, LANES, width + 1)), np.zeros(LANES, np.int64)
+        for place in self._windows(width):
+            first = np.maximum(place, 0)
+            coarse = self.kept[:, lanes[:, None], first[:, None] + np.arange(width + 1)]
+            fine = np.zeros_like(coarse)
+            fine[:, :, 0] = coarse[:, :, 0]
+            self._begin(fine[:, :, 0], self.first + first)
+            self._span(self.first + first, width, 2 * parts, -1.0, fine)
+            found = np.where((place >= 0)[:, None], fine - coarse, 0.0)
+            worse = self._in_xi(found) > self._in_xi(off)
+            off[:, worse], at[worse] = found[:, worse], first[worse]
+        index = at[:, None] + np.arange(width + 1)
+        xi = self.xi[np.minimum(self.first[:, None] + index, self.n)]
+        took = np.full(LANES, width * self.h[0])
+        if self.own:
+            took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
+        y, window = self.rates[:, None] * self.lengths, self.rates[:, None] * np.maximum(took, 1e-30)
+        share, of_products = (
+            np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
+        )
+        return off, xi, share, of_products
+
+    def _windows(self, width: int) -> list[IntArray]:
+        """Where windows begin in each piece, -1 for none: where the source moves most, and at the start of a run.
+
+        With N as a drive, errors are large where |xi| is, too.
+        """
+        place = np.empty(LANES, np.int64)
+        busiest(self.x, self.first, self.count, width, self.n, place)
+        if self.starts_run:
+            place[0] = 0
+        if not self.marks.bend:
+            return [place]
+        largest = np.minimum(
+            np.argmax(self._by_piece, axis=1) - width // 2, np.minimum(self.count, self.n - self.first) - width
+        )
+        return [place, np.where(place >= 0, np.maximum(largest, 0), -1)]
+
+    def _in_xi(self, off: FloatArray) -> FloatArray:
+        """Largest changes of xi (V) in each lane by changes of the modes (m, LANES, width + 1)."""
+        return np.asarray(np.abs(np.einsum("k,kij->ij", self.form.lanes.shape, off)).max(axis=1))
+
+    def hand_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
+        """Errors at the start of each piece, and at the end of the block, shape (*kinds, LANES + 1).
+
+        Pieces add `added` (*kinds, LANES), and `before` (*kinds,) is there at the start. Of one error for each mode, or
+        of the products of two.
+        """
+        handed, lane = self.handed, (self.n - 1) // self.count
+        left = np.exp(-self.rates * self.lengths[lane])
+        if before.ndim == 2:
+            handed, left = handed[:, None] * handed, left[:, None] * left
+        at_starts = np.einsum("...ij,...j->...i", handed, np.concatenate([before[..., None], added], axis=-1))
+        return np.append(at_starts, (left * at_starts[..., lane] + added[..., lane])[..., None], axis=-1)
+
+    def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
+        """Source (V; n,) and modes (m, n) `since` (s) after samples of these numbers, whose steps are `length` (s)."""
+        lane = number // self.count
+        z = np.ascontiguousarray(self.kept[:, lane, number - lane * self.count])
+        x = self.x[number]
+        if not since.any():
+            return x, z
+        to, out, form = x + (self.x[number + 1] - x) * (since / length), np.empty_like(z), self.form
+        parts *= BETWEEN if self.marks.bend else 1
+        still, (room, _) = form.weights(np.zeros(LANES)), form.room(True)
+        within(form.marks(True), form.lanes, still, z, x, to, since, parts, room, out)
+        return to, out
