@@ -1,8 +1,8 @@
 """Recordings of one finger under `local`: a block of samples as pieces in lanes, with stated errors.
 
 Once all pieces of a block are followed (`solve.laneblock`), a window of each, where the source moves most, is followed
-by steps half as long. The difference is the error of the window; a piece adds as much more as it is longer, and hands it
-on to the pieces after it, as the modes decay: once as if all errors were alike, and once as if they came by chance.
+by steps half as long. The difference is the error of the window; a piece adds as much more as it is longer, and hands
+it on to the pieces after it, as the modes decay: once as if all errors were alike, and once as if they came by chance.
 """
 
 from __future__ import annotations
