@@ -9,8 +9,8 @@ import pytest
 from scipy import integrate
 
 import fingerspice as fs
+from fingerspice.engine.lanerows import INNER, PER_MODE, PER_MODE_BENT, Lanes
 from fingerspice.engine.lanes import weigh
-from fingerspice.engine.lanestep import INNER, PER_MODE
 from fingerspice.solve.pieces import LEAST_POINTS
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
@@ -127,8 +127,14 @@ def test_what_it_does_not_serve_is_stepped() -> None:
 def test_weights_are_integrals_of_decaying_exponentials_times_polynomials() -> None:
     # From steps much shorter than the time constants to much longer ones.
     rates, gain, h = np.array([0.0, 3.0, 4e3]), np.array([1.0, -2.0, 5.0]), np.geomspace(1e-7, 0.3, 14)
-    found = np.empty((3 * PER_MODE + 1, h.size))
-    weigh(rates, gain, h, found)
+    none = np.zeros(1)
+    # With one leak and N, as in a network.
+    lanes = Lanes(
+        rates, gain, np.zeros(3), 0.0, np.zeros((1, 3)), none, none, np.zeros((3, 2)), none, none, none, 1.0, 0.0, 1.0,
+        0.0, np.zeros(2), 0,
+    )  # fmt: skip
+    found = np.empty((3 * (PER_MODE + PER_MODE_BENT) + 1 + 6, h.size))
+    weigh(lanes, h, found)
     nodes = np.array([0.0, *INNER, 1.0])
     cubics = [np.poly1d(np.polyfit(nodes, np.eye(4)[i], 3)) for i in range(4)]
     ends = [np.poly1d([-1.0, 1.0]), np.poly1d([1.0, 0.0])]
@@ -148,3 +154,15 @@ def test_weights_are_integrals_of_decaying_exponentials_times_polynomials() -> N
                 assert own[4 * node : 4 * node + 4] == pytest.approx(true, rel=1e-9, abs=1e-12 * length + 3e-16)
             true = [length * integral(cubic, 1.0) for cubic in cubics]
             assert own[12:16] == pytest.approx(true, rel=1e-9, abs=1e-12 * length)
+            bent = found[3 * PER_MODE + 1 + k * PER_MODE_BENT :, i]
+            for node in range(1, 4):
+                true = [
+                    length * integral(np.poly1d(np.polyfit(nodes[:count], np.eye(count)[j], count - 1)), nodes[node])
+                    for count in (node, node + 1)
+                    for j in range(count)
+                ]
+                rows = slice(node**2 - 1, (node + 1) ** 2 - 1)
+                assert bent[rows] == pytest.approx(true, rel=1e-9, abs=2e-12 * length)
+            quartic = np.poly1d(nodes, True)
+            quartic /= quartic.deriv()(1.0)
+            assert bent[15] == pytest.approx(length * integral(quartic, 1.0), rel=1e-9, abs=1e-12 * length)
