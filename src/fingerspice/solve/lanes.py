@@ -42,7 +42,7 @@ LED_SHARE, LED_MOST = 0.003, 1e-8
 # voltage with what does not.
 DIVIDED = 0.5
 # What leaks by the error of the polynomial of 1/A over what is stored, times that error: as seen in offset recordings.
-LEAKED = 0.2
+LEAKED = 0.1
 # Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
 LUCK = 2.0
 _ONE_ROW = np.zeros(1, np.int64)

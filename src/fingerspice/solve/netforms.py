@@ -26,7 +26,7 @@ from fingerspice.waveforms.waveform import DC
 _POINTS, _FREQUENCIES = 64, 65
 # Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
 # what they leave together is known but for about 1e-8.
-OF_MANY, ACTING = 1e-7, 1e-3
+OF_MANY, ACTING = 1e-7, 0.05
 # Error of the polynomials for larger errors asked for, too: terms cost little.
 COARSEST = 1e-5
 # Reference area: that at this share of the largest gap voltage to expect.
