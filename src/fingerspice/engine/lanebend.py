@@ -1,4 +1,7 @@
-"""What a network adds to a step of lanes (`engine.lanestep`): N as a drive, and modes that fade within a sample."""
+"""What a network adds to a step of lanes (`engine.lanestep`): N as a drive, and modes that fade within a sample.
+
+`add_predicted` serves stacks under `mobile`, too.
+"""
 
 from __future__ import annotations
 
@@ -72,16 +75,18 @@ def drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shar
 def add_predicted(marks: Any, c: Any, k: int, j: int, weights: FloatArray, state: FloatArray) -> None:
     """Add mode k's response to leaks and N at the nodes before j to the first row of scratch."""
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives, own = leaks + 1, len(marks.modes) * PER_MODE + k * PER_MODE_BENT + j * j
+    drives, own = leaks + len(marks.bend), len(marks.modes) * PER_MODE + k * PER_MODE_BENT + j * j
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for node in range(j):
         for i in range(lanes):
             fed = 0.0
             for t in range(leaks):
                 fed += c.feed[k, t] * state[(at.g + node * drives + t) * lanes + i]
-            bend = c.feed[k, leaks] * state[(at.g + node * drives + leaks) * lanes + i]
-            by_leaks, by_bend = weights[(own + node) * wide + i * each], weights[(own + j + node) * wide + i * each]
-            state[at.scratch * lanes + i] += by_leaks * fed + by_bend * bend
+            fed *= weights[(own + node) * wide + i * each]
+            if drives > leaks:
+                by = c.feed[k, leaks] * weights[(own + j + node) * wide + i * each]
+                fed += by * state[(at.g + node * drives + leaks) * lanes + i]
+            state[at.scratch * lanes + i] += fed
 
 
 @jit_within
@@ -154,9 +159,9 @@ def smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
         for k in range(active, m):
             state[(at.gone + k) * lanes + i] = 0.0
         for t in range(drives):
-            smooth = state[(at.g + last * drives + t) * lanes + i]
-            state[(at.gone + m + t) * lanes + i] = state[(at.g + t) * lanes + i] - smooth
-            state[(at.g + t) * lanes + i] = smooth
+            soon = state[(at.g + last * drives + t) * lanes + i]
+            state[(at.gone + m + t) * lanes + i] = state[(at.g + t) * lanes + i] - soon
+            state[(at.g + t) * lanes + i] = soon
         for t in range(leaks):
             state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
     return True
@@ -220,7 +225,7 @@ def end_bent(marks: Any, c: Any, state: FloatArray) -> None:
     for i in range(lanes):
         xi, found, q = state[at.xi * lanes + i], state[(at.xi + last) * lanes + i], state[at.q * lanes + i]
         bend = state[(at.g + last * drives + leaks) * lanes + i]
-        bend -= q / (c.q0 * (c.q0 + q) - c.kappa * q) * (xi - found)
+        bend += rise_of(c.q0, c.kappa, q) * (xi - found)
         q += state[(at.q + 1) * lanes + i] * (abs(xi) - abs(found))
         state[at.q * lanes + i], state[(at.g + leaks) * lanes + i] = q, bend
         for t in range(leaks):

@@ -22,9 +22,9 @@ BASIS = np.ascontiguousarray(np.linalg.inv(np.vander((0.0, *INNER, 1.0), increas
 END_SLOPES = BASIS @ np.array([0.0, 1.0, 2.0, 3.0])
 # Weights of a mode: decay, both ends of the source, and the drive held, up to each later node; then of four drives.
 PER_MODE = 4 * (NODES - 1) + NODES
-# In a network behind those of all modes and the step's length, for each mode: for node j of the later ones leaks at the
-# j nodes before, from row j^2 - 1 on, and N at these and itself; then a slope at the end of the step. Behind them, for
-# each of these nodes, the share of N there in xi and in what 1/A - q0 multiplies.
+# In a network and under `mobile` behind those of all modes and the step's length, for each mode: for node j of the later ones leaks at the
+# j nodes before, from row j^2 - 1 on, and N at these and itself; then a slope at the end of the step. Behind them, in a
+# network for each of these nodes, the share of N there in xi and in what 1/A - q0 multiplies.
 PER_MODE_BENT = NODES**2
 # Rows of the lanes' state before those of the modes: the source at both ends of a part, and at the last sample.
 SOURCES = 3
@@ -38,7 +38,9 @@ class Marks(NamedTuple):
     modes: tuple[int, ...]  # All of them
     active: tuple[int, ...]  # Those that are not passive
     leaks: tuple[int, ...]  # Drives but N
-    bend: tuple[int, ...]  # One entry if N is a drive, or none
+    # bend, mobile: One entry if N is a drive, or if the charge law is `mobile`; or none
+    bend: tuple[int, ...]
+    mobile: tuple[int, ...]
     lanes: tuple[int, ...]
     own: tuple[int, ...]  # One entry if each lane has its own weights, or none
 
@@ -49,14 +51,14 @@ class Lanes(NamedTuple):
     rates: FloatArray  # (m,): 1/s
     gain: FloatArray  # (m,)
     shape: FloatArray  # (m,): V/V
-    k: float
+    k: float  # V/V or V/A
     taps: FloatArray  # (L, m)
     # tap_s, bent (L,)
     tap_s: FloatArray
     bent: FloatArray
     feed: FloatArray  # (m, T)
-    # area, slope, bend (4 j + 1,): Polynomials in `scale` |xi| + `shift`: 1/A - q0 (1/m^2), its derivative by |xi|, and
-    # N (V m^2) at positive xi
+    # area, slope, bend (4 j + 1,): Polynomials in `scale` |xi| + `shift`, or |u| under `mobile`: 1/A - q0 (1/m^2), its
+    # derivative, and N (V m^2) at positive xi
     area: FloatArray
     slope: FloatArray
     bend: FloatArray
@@ -64,7 +66,10 @@ class Lanes(NamedTuple):
     shift: float
     q0: float
     kappa: float  # 1/m^2; 0 in a stack
-    kinks: FloatArray  # (T,): Derivatives by |xi| at 0 V: of 1/A, and of N / xi
+    kinks: FloatArray  # (T,): Derivatives by |xi| at 0 V of the factors of the drives; of N, of N / xi
+    # rest, steep: 1/A - q0 (1/m^2) at 0 V, and its derivative
+    rest: float
+    steep: float
     fast: int  # The mode through which N acts fastest on xi
 
 
@@ -75,8 +80,12 @@ class Rows(NamedTuple):
     g: int  # Drives at the nodes
     w: int  # What 1/A - q0 multiplies at the start, and at the latest node
     scratch: int
-    q: int  # In a network: 1/A - q0 at the latest node, its derivative by |xi|, and dN/dxi where fading modes soon are
+    q: int  # 1/A - q0 at the latest node, its derivative, and in a network dN/dxi where fading modes soon are, or B
+    # In a network:
     gone: int  # What modes have beside where they soon are, and by which this changes the drives
+    # Under `mobile`:
+    fold: int  # Least distance to the fold, less 1, with its sign reversed
+    flat: int  # xi with the area at 0 V at the start, and at the latest node
     end: int
 
 
@@ -88,7 +97,8 @@ def rows_of(marks: Any) -> Rows:
     w = g + NODES * drives
     scratch = w + 2 * leaks
     q = scratch + 5 + NODES + drives
-    return Rows(xi, g, w, scratch, q, q + 3, q + 3 + m + drives if drives > leaks else q)
+    more = m + drives if drives > leaks else 3 if len(marks.mobile) > 0 else 0
+    return Rows(xi, g, w, scratch, q, q + 3, q + 3, q + 4, q + 3 + more if more > 0 else q)
 
 
 places = jit_within(rows_of)

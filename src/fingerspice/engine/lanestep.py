@@ -1,16 +1,17 @@
 """One step of many lanes: an explicit step of the exponential integrator, whose innermost loops run over the lanes.
 
-A circuit with one finger under `local`, in modes around a reference 1/A = q0, under a source s that is straight in the
+A circuit with one finger, in modes around a reference 1/A = q0, under a source s that is straight in the
 step:
 
     z' = -rates z + gain s + feed g,   xi = k s + shape z,   g_t = (1/A - q0) (tap_s s + taps z + bent N)_t
 
-In a stack xi is the gap voltage u, and 1/A a polynomial in |u|. In a network N, the integral of A - 1/q0 over u, is one
+In a stack xi is the gap voltage u, and 1/A a polynomial in |u|; under `mobile` u follows from xi and the part of it
+that the modes have (`engine.lanemobile`). In a network N, the integral of A - 1/q0 over u, is one
 more drive, behind the leaks: u + kappa N = xi, and both 1/A and N are polynomials in |xi| (`solve.netmodal`).
 
 The drives g are taken at Lobatto's four nodes. There the state of a stack is predicted with the drives held at their
-last value; in a network with the polynomial through the leaks at the nodes before and through N at these and the node
-itself, which is an equation for xi. The modes' response to the source and to the cubic through the drives is exact.
+last value; under `mobile` and in a network with the polynomial through the leaks at the nodes before, and through N at
+these and the node itself, which is an equation for xi. The modes' response to the source and to the cubic through the drives is exact.
 Where xi crosses 0 V, g has a kink, of which the integral and the first moment that the rule misses are known on the
 straight line of xi, and are added. In a network the slope of N at the end of the step is known, too, and makes the
 cubic a quartic; modes that decay within a small part of a sample begin where they soon are, and what they leave on the
@@ -24,6 +25,7 @@ from typing import Any
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
 from fingerspice.engine.lanebend import add_predicted, bend_end, drives_at, end_bent, fade, smooth
+from fingerspice.engine.lanemobile import drives_under_mobile, end_mobile, weaken_kinks
 from fingerspice.engine.lanerows import (
     BASIS,
     FADED,
@@ -67,7 +69,7 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
                     + weights[(p + 1) * wide + i * each] * state[i]
                     + weights[(p + 2) * wide + i * each] * state[lanes + i]
                 )
-            if drives > leaks:
+            if drives > leaks or len(marks.mobile) > 0:
                 add_predicted(marks, c, k, j, weights, state)
             else:
                 for i in range(lanes):
@@ -80,16 +82,21 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
                 state[(at.xi + j) * lanes + i] += c.shape[k] * z
                 for t in range(leaks):
                     state[(at.w + leaks + t) * lanes + i] += c.taps[t, k] * z
-        drives_at(marks, c, weights, j, j - 1, j - 1, state)
+        if len(marks.mobile) > 0:
+            drives_under_mobile(marks, c, j, j - 1, state)
+        else:
+            drives_at(marks, c, weights, j, j - 1, j - 1, state)
     for i in range(lanes):
         state[(at.scratch + 1) * lanes + i] = weights[length * wide + i * each]
-    _kinks(marks, c.kinks, state)
+    _kinks(marks, c, state)
     _advance(marks, c, weights, state)
     if drives > leaks:
         bend_end(marks, c, weights, state)
         if fades:
             fade(marks, c, weights, state)
         end_bent(marks, c, state)
+    elif len(marks.mobile) > 0:
+        end_mobile(marks, c, state)
     else:
         for i in range(lanes):
             xi = c.k * state[lanes + i]
@@ -134,7 +141,7 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
 
 
 @jit_within
-def _kinks(marks: Any, kinks: FloatArray, state: FloatArray) -> None:
+def _kinks(marks: Any, c: Any, state: FloatArray) -> None:
     """What the rule misses of |xi| times 1 and t, in a step of length 1, and of the drives' kinks.
 
     On the straight line of xi from u0 to u1, which is 0 at th: int |u| = (u0^2 + u1^2) / (2 |u1 - u0|) and
@@ -143,8 +150,9 @@ def _kinks(marks: Any, kinks: FloatArray, state: FloatArray) -> None:
     lanes, leaks, drives = len(marks.lanes), len(marks.leaks), len(marks.leaks) + len(marks.bend)
     at = places(marks)
     x = at.scratch
+    begins, ends = (at.flat, at.flat + 1) if len(marks.mobile) > 0 else (at.xi, at.xi + NODES - 1)
     for i in range(lanes):
-        u0, u1 = state[at.xi * lanes + i], state[(at.xi + NODES - 1) * lanes + i]
+        u0, u1 = state[begins * lanes + i], state[ends * lanes + i]
         d = u1 - u0
         over = 1.0 / (abs(d) + 1e-300)
         th = abs(u0) * over
@@ -161,9 +169,11 @@ def _kinks(marks: Any, kinks: FloatArray, state: FloatArray) -> None:
         for j in range(NODES):
             share = BASIS[j, 0] + th * (BASIS[j, 1] + th * (BASIS[j, 2] + th * BASIS[j, 3]))
             state[(x + 5 + j) * lanes + i] = length * share if crossed else 0.0
+    if len(marks.mobile) > 0:
+        weaken_kinks(marks, c, state)
     for t in range(drives):
         first, second = (at.w + t, at.w + leaks + t) if t < leaks else (at.xi, at.xi + NODES - 1)
         for i in range(lanes):
             k0, k1, th = state[(x + 2) * lanes + i], state[(x + 3) * lanes + i], state[(x + 4) * lanes + i]
             w0, w1 = state[first * lanes + i], state[second * lanes + i]
-            state[(x + 5 + NODES + t) * lanes + i] = kinks[t] * (k0 * w0 + (k0 * th + k1) * (w1 - w0))
+            state[(x + 5 + NODES + t) * lanes + i] = c.kinks[t] * (k0 * w0 + (k0 * th + k1) * (w1 - w0))

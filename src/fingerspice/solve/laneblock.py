@@ -6,13 +6,15 @@ each sweep they are corrected by what the modes decay by in a piece, until xi no
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.engine.lanes import along, begin, busiest, show, span, within
+from fingerspice.engine.lanereadout import show
+from fingerspice.engine.lanerows import rows_of
+from fingerspice.engine.lanes import along, begin, busiest, span, within
 from fingerspice.solve.laneform import LANES, LaneForm
 
 # A window over its piece, and the fewest samples in one.
@@ -21,6 +23,21 @@ WINDOW, FEWEST = 1.0 / 16.0, 32
 BETWEEN = 4
 # The rate that stands for 0, 1/s.
 _STILL = 1e-9
+
+
+@dataclass(frozen=True)
+class Window:
+    """What steps half as long change in a window of every piece."""
+
+    # z, off (rows, LANES, width + 1): States of the steps that are checked, and the differences; 0 in pieces that are
+    # not checked
+    z: FloatArray
+    off: FloatArray
+    # source, xi (LANES, width + 1): V
+    source: FloatArray
+    xi: FloatArray
+    share: FloatArray  # (m, LANES): What a piece adds over what its window does, if all errors are alike
+    of_products: FloatArray  # (m, m, LANES): The same of products of two errors, if they come by chance
 
 
 class Block:
@@ -49,7 +66,9 @@ class Block:
         self.rates = np.maximum(form.lanes.rates, _STILL)
         self.room, self.scratch = form.room(self.own)
         self.still = form.weights(np.zeros(LANES if self.own else 1))
-        self.kept = np.zeros((self.rates.size, LANES, self.count + 1))
+        self.m = self.rates.size
+        # States at the samples: the modes, and under `mobile` the gap voltage.
+        self.kept = np.zeros((self.m + int(form.mobile), LANES, self.count + 1))
         self.left = np.zeros(self.rates.size)
 
     @cached_property
@@ -79,8 +98,18 @@ class Block:
             kept, self.left,
         ))  # fmt: skip
 
-    def _begin(self, starts: FloatArray, first: IntArray) -> None:
+    def _begin(self, starts: FloatArray, first: IntArray, kept: FloatArray) -> None:
         begin(self.marks, self.form.lanes, self.still, np.ascontiguousarray(starts), self.x[first], self.room)
+        kept[: self.m, :, 0], kept[self.m :, :, 0] = starts, self._row(rows_of(self.marks).xi)
+
+    def _row(self, number: int) -> FloatArray:
+        return self.room[number * LANES :][:LANES]
+
+    @property
+    def on_one_branch(self) -> bool:
+        """Whether the gap voltage at the end of a piece is that at the start of the next one, but for a percent."""
+        off = self.kept[self.m :, :-1, -1] - self.kept[self.m :, 1:, 0]
+        return bool(np.all(np.abs(off) <= 0.01 * np.abs(self.kept[self.m :]).max(initial=0.0)))
 
     def solve(self, start: FloatArray, parts: int, tol: float) -> bool:
         """Follow all pieces from `start` (m,), until xi is known to `tol` (V); False where it is not.
@@ -88,17 +117,20 @@ class Block:
         The states at the samples go into `kept`.
         """
         form, active, self.sweeps = self.form, self.active, 0
+        # Least distances to the fold; the last sweep may stop before the end of the pieces.
+        margins = [1.0]
         self.__dict__.pop("xi", None)
-        own = np.zeros_like(self.kept[:, :, 0])
+        own = np.zeros((self.m, LANES))
         # A guess, for which uneven points may count as even ones.
         along(form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
-        starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[:, None], own], axis=1))
+        starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[: self.m, None], own], axis=1))
         starts[active:] = 0.0
         for sweep in range(LANES + 1):
-            self._begin(starts, self.first)
-            self.kept[:, :, 0] = starts
+            self._begin(starts, self.first, self.kept)
             stops = self._span(self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
             self.sweeps += 1
+            margins.append(1.0 - float(self._row(rows_of(self.marks).fold).max()) if form.mobile else 1.0)
+            self.margin = min(margins[-2:])
             if stops:
                 break
             off = self.kept[:active, :, -1] - np.roll(starts[:active], -1, axis=1)
@@ -106,14 +138,14 @@ class Block:
             change = np.einsum("kij,kj->ki", self.handed[:active, :, 1:], off)
             self.left[:active] = np.abs(change).max(axis=1)
             most = float(np.abs(form.lanes.shape) @ self.left)
-            if not most < math.inf:
+            if not most < np.inf:
                 return False
             if most <= tol:
                 break
             starts[:active] += change
         else:
             return False
-        for k in range(active, start.size):
+        for k in range(active, self.m):
             # Passive modes have begun at 0 in every piece.
             self.kept[k] += np.cumsum(np.append(start[k], self.kept[k, :-1, -1]))[:, None]
         return True
@@ -121,8 +153,8 @@ class Block:
     @cached_property
     def xi(self) -> FloatArray:
         """xi (V) at the samples, shape (n + 1,), after `solve`."""
-        c, out = self.form.lanes, np.empty(self.n + 1)
-        show(c.k, c.shape, self.x, self.first, self.count, self.n + 1, self.kept, out)
+        (k, columns), out = self.form.xi, np.empty(self.n + 1)
+        show(k, columns, self.x, self.first, self.count, self.n + 1, self.kept, out)
         return out
 
     @property
@@ -137,39 +169,26 @@ class Block:
         return np.asarray(np.maximum(own, np.append(own[1:], abs(self.xi[-1]))))
 
     def end(self) -> FloatArray:
-        """The state (m,) at the last sample."""
+        """The state at the last sample."""
         lane = (self.n - 1) // self.count
         return np.array(self.kept[:, lane, self.n - lane * self.count])
 
-    def check(self, parts: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Follow a window of every piece by twice as many steps.
-
-        Returns
-        -------
-        off : ndarray, shape (m, LANES, width + 1)
-            Differences of the states, 0 in pieces that are not checked.
-        xi : ndarray, shape (LANES, width + 1)
-            V.
-        share : ndarray, shape (m, LANES)
-            What a piece adds over what its window does, if all errors are alike.
-        share_of_products : ndarray, shape (m, m, LANES)
-            The same of products of two errors, if they come by chance.
-        """
+    def check(self, parts: int) -> Window:
+        """Follow a window of every piece by twice as many steps."""
         width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + len(self.marks.bend)))))
         lanes = np.arange(LANES)
-        off, at = np.zeros((self.rates.size, LANES, width + 1)), np.zeros(LANES, np.int64)
+        off, at = np.zeros((len(self.kept), LANES, width + 1)), np.zeros(LANES, np.int64)
         for place in self._windows(width):
             first = np.maximum(place, 0)
             coarse = self.kept[:, lanes[:, None], first[:, None] + np.arange(width + 1)]
             fine = np.zeros_like(coarse)
-            fine[:, :, 0] = coarse[:, :, 0]
-            self._begin(fine[:, :, 0], self.first + first)
+            self._begin(coarse[: self.m, :, 0], self.first + first, fine)
             self._span(self.first + first, width, 2 * parts, -1.0, fine)
             found = np.where((place >= 0)[:, None], fine - coarse, 0.0)
             worse = self._in_xi(found) > self._in_xi(off)
             off[:, worse], at[worse] = found[:, worse], first[worse]
         index = at[:, None] + np.arange(width + 1)
-        xi = self.xi[np.minimum(self.first[:, None] + index, self.n)]
+        number = np.minimum(self.first[:, None] + index, self.n)
         took = np.full(LANES, width * self.h[0])
         if self.own:
             took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
@@ -177,7 +196,8 @@ class Block:
         share, of_products = (
             np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
         )
-        return off, xi, share, of_products
+        z = self.kept[:, lanes[:, None], index]
+        return Window(z, off, self.x[number], self.xi[number], share, of_products)
 
     def _windows(self, width: int) -> list[IntArray]:
         """Where windows begin in each piece, -1 for none: where the source moves most, and at the start of a run.
@@ -197,7 +217,7 @@ class Block:
 
     def _in_xi(self, off: FloatArray) -> FloatArray:
         """Largest changes of xi (V) in each lane by changes of the modes (m, LANES, width + 1)."""
-        return np.asarray(np.abs(np.einsum("k,kij->ij", self.form.lanes.shape, off)).max(axis=1))
+        return np.asarray(np.abs(np.einsum("k,kij->ij", self.form.xi[1], off)).max(axis=1))
 
     def hand_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
         """Errors at the start of each piece, and at the end of the block, shape (*kinds, LANES + 1).
@@ -213,7 +233,7 @@ class Block:
         return np.append(at_starts, (left * at_starts[..., lane] + added[..., lane])[..., None], axis=-1)
 
     def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
-        """Source (V; n,) and modes (m, n) `since` (s) after samples of these numbers, whose steps are `length` (s)."""
+        """Source (V; n,) and states (rows, n) `since` (s) after samples of these numbers, whose steps are `length` (s)."""
         lane = number // self.count
         z = np.ascontiguousarray(self.kept[:, lane, number - lane * self.count])
         x = self.x[number]

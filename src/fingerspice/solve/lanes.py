@@ -1,35 +1,28 @@
-"""Recordings of one finger under `local`: a block of samples as pieces in lanes, with stated errors.
-
-Once all pieces of a block are followed (`solve.laneblock`), a window of each, where the source moves most, is followed
-by steps half as long. The difference is the error of the window; a piece adds as much more as it is longer, and hands
-it on to the pieces after it, as the modes decay: once as if all errors were alike, and once as if they came by chance.
-"""
+"""Recordings of one finger, block by block in lanes (`solve.laneblock`), with stated errors (`solve.laneerrors`)."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from enum import Enum
 from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.engine.blockrows import largest_of
+from fingerspice.engine.lanereadout import flow, largest_of, show
 from fingerspice.engine.lanerows import NODES
-from fingerspice.engine.lanes import flow, show
 from fingerspice.results.outcome import State, Status
-from fingerspice.solve.following import Following, Outcome
 from fingerspice.solve.laneblock import Block
-from fingerspice.solve.laneform import LANES, LaneForm, Shown
+from fingerspice.solve.laneerrors import OF_FORCE, SAFETY, Judged, judge
+from fingerspice.solve.laneform import LaneForm
 from fingerspice.solve.marching import solve as solve_ordinary
-from fingerspice.solve.pieces import Piece
+from fingerspice.solve.pieces import Piece, driving, spacing_of
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import excess_of
+from fingerspice.solve.runs import Run, excess_of
 
 # Steps of a sample, by level.
 PARTS = (1, 2, 4, 8, 16, 32, 64)
-# Stated over seen errors, of voltages and charges, and of the force.
-SAFETY, OF_FORCE = 2.0, 1.5
 # Changes of starts that may be left, over the error asked for, and in pieces of fewer samples less; and over the
 # voltages, as rounding leaves so much.
 OF_STARTS, LEAST_CHANGE, SHORT = 0.01, 1e-14, 1024
@@ -38,36 +31,87 @@ OF_STARTS, LEAST_CHANGE, SHORT = 0.01, 1e-14, 1024
 COARSER, FINER = 1.0 / 60.0, (5.0, 12.0)
 # Error allowed in a piece that the ordinary engine integrates, over the error asked for, and at most.
 LED_SHARE, LED_MOST = 0.003, 1e-8
-# Relative change of a voltage over that of the area which causes it, at most: what scales with the area divides the
-# voltage with what does not.
+# Relative change of a voltage over that of the area which causes it, at most, under `local`: what scales with the area
+# divides the voltage with what does not.
 DIVIDED = 0.5
+# Least distance to the fold that is followed.
+LEAST_MARGIN = 0.2
 # What leaks by the error of the polynomial of 1/A over what is stored, times that error: as seen in offset recordings.
 LEAKED = 0.1
-# Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
-LUCK = 2.0
 _ONE_ROW = np.zeros(1, np.int64)
+# The error of a piece is related to the peaks up to its end, or to this share of the largest gap voltage that the
+# source may cause: noise before the first loud sound need not be exact relative to itself.
+LEAST_PEAK = 1e-3
 
 
-class LaneMarch(Following):
-    """A recording of one finger under `local` in progress, block by block."""
+class Outcome(Enum):
+    """Outcome of a piece: its error is met, or not met, or this method cannot integrate it (LOST)."""
+
+    MET, NOT_MET, LOST = range(3)
+
+
+class LaneMarch:
+    """A recording of one finger in progress, piece by piece.
+
+    Attributes
+    ----------
+    t : float
+        Time reached, s.
+    share : float
+        Factor of the error allowed, reduced where errors of earlier pieces add up.
+    loudest : float
+        Largest |U| of the source so far, V.
+    u_last : float
+        Value of the source at `t`, V.
+    outputs : int
+        Number of outputs written since `begin_outputs`.
+    width : int
+        Number of rows of the outputs.
+    margin : float
+        Least distance to the fold so far.
+    """
 
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
-        super().__init__(problem, rtol, share, form.gain, form.width(problem))
-        self.form, m = form, form.lanes.rates.size
+        self.problem, self.form, self.rtol, self.share, self.width = problem, form, rtol, share, form.width(problem)
+        wave = driving(problem)
+        assert wave is not None
+        self.wave, self.usual, self.t, self.loudest = wave, spacing_of(wave), problem.t_start, 0.0
+        held = float(np.abs(problem.initial.y).max(initial=0.0))
+        self.least = max(held, LEAST_PEAK * problem.scene.u_peak * form.gain)
+        # Modes, behind them under `mobile` the gap voltage, and the source.
         self.z, self.u_last = form.start(problem)
-        self.level, self.outputs, self.steps, self.refused, self.evaluated = 0, 0, 0, 0, 0
+        self.level, self.outputs, self.steps, self.refused, self.evaluated, self.margin = 0, 0, 0, 0, 0, 1.0
         # Errors of the modes so far, as if they were alike, and products of two, as if they came by chance.
+        m = form.lanes.rates.size
         self.alike, self.chance = np.zeros(m), np.zeros((m, m))
         # Largest |xi| (V), and errors seen of gap voltage (V), force (N), nodes (V) and charges (C); errors that are
         # stated of the piece that the ordinary engine has integrated.
         self.peak, self.errors, self.led = 0.0, np.zeros(4), np.zeros(4)
 
+    @property
+    def scale(self) -> float:
+        """Gap voltage to which errors are related, V."""
+        return max(self.loudest * self.form.gain, self.least)
+
+    def begin_outputs(self) -> None:
+        """Start counting outputs from 0, for a new array of outputs."""
+        self.outputs = 0
+
+    @property
+    def slope_after(self) -> float:
+        """The source's slope after the end of the run, V/s."""
+        after = 1e-3 * self.usual
+        here, later = self.wave.value([self.problem.t_stop, self.problem.t_stop + after]).tolist()
+        return float(later - here) / after
+
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
-        self.heard(values)
+        """Integrate a piece with the source's `values` (V), and write the outputs before its end as rows of `out`."""
+        self.loudest = max(self.loudest, float(values.max()), -float(values.min()))
         if piece.led:
             return self._lead(piece, values, t_out, out)
         h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
         block = Block(self.form, values, h, self.steps == 0)
+        starts_at = self.form.after(self.z, float(values[0]))
         while True:
             parts, excess = PARTS[self.level], math.inf
             # Another sweep over short pieces costs little.
@@ -76,9 +120,10 @@ class LaneMarch(Following):
             self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
             if solved:
                 peak = float(largest_of(block.n + 1, block.xi))
-                if not self.form.gap(np.array(peak)) <= self.form.u_top:
+                if not (self.form.gap(np.array(peak)) <= self.form.u_top and self._on_branch(block, starts_at, peak)):
                     return Outcome.LOST
-                excess, errors, handed = self._judge(block, parts, max(peak, self.peak))
+                seen = judge(block, parts, max(peak, self.peak), self.alike, self.chance)
+                excess = self._excess(seen, max(peak, self.peak))
             if excess <= 1.0:
                 break
             self.refused += parts * block.n
@@ -87,14 +132,19 @@ class LaneMarch(Following):
             divides = FINER[1] if block.marks.bend else FINER[0]
             finer = math.ceil(math.log(excess) / math.log(divides)) if excess < math.inf else 1
             self.level = min(self.level + max(1, finer), len(PARTS) - 1)
-        self.peak, self.errors = max(peak, self.peak), np.maximum(errors, self.errors)
-        self.alike, self.chance = handed
+        self.peak, self.errors = max(peak, self.peak), np.maximum(seen.errors, self.errors)
+        self.alike, self.chance, self.margin = seen.alike, seen.chance, min(self.margin, block.margin)
         self.steps += parts * block.n
         self._write(piece, block, parts, t_out, out)
         self.z, self.t, self.u_last = block.end(), piece.stop, float(values[-1])
         if excess < COARSER and self.level > 0:
             self.level -= 1
         return Outcome.MET
+
+    def _on_branch(self, block: Block, start: float, peak: float) -> bool:
+        """Whether the gap voltage stays clear of folds, and on the branch on which it starts."""
+        near = block.n == 0 or not self.form.mobile or abs(block.xi[0] - start) <= 0.01 * peak
+        return near and block.on_one_branch and block.margin > LEAST_MARGIN
 
     def _lead(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
         """Integrate a piece by the ordinary engine, and take over its state."""
@@ -108,54 +158,19 @@ class LaneMarch(Following):
         out[:, :count] = run.rows.T[: self.width]
         self.z, _ = self.form.start(replace(self.problem, initial=run.state))
         self.outputs, self.t, self.u_last = count, piece.stop, float(values[-1])
-        self.peak, error = abs(self.form.xi(self.z, self.u_last)), run.error
+        self.peak, error = abs(self.form.xi_at(self.z, self.u_last)), run.error
         self.led = np.array([error.u_gap, error.f_el, error.v_nodes or 0.0, error.q_source or 0.0])
         return Outcome.MET
 
-    def _judge(self, block: Block, parts: int, peak: float) -> tuple[float, FloatArray, tuple[FloatArray, FloatArray]]:
-        """Excess of the stated over the allowed error, the errors seen so far, and those that the block hands on."""
-        form, active = self.form, block.active
-        off, xi, share, of_products = block.check(parts)
-        own = off[:, :, -1]
-        products = own[:, None] * own
-        alike, chance = block.hand_on(own * share, self.alike), block.hand_on(products * of_products, self.chance)
-        # At the end of a piece, with what it adds beyond its window.
-        alike_there = alike[:, :LANES] + own * (share - 1.0)
-        chance_there = chance[..., :LANES] + products * (of_products - 1.0)
-
-        def added(columns: FloatArray) -> FloatArray:
-            """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
-            lucky = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there), 0.0))
-            more = np.maximum(lucky, np.abs(columns @ alike_there) - LUCK * lucky)
-            return np.asarray(more + np.abs(columns[:active]) @ block.left[:active] / SAFETY)
-
-        c, errors = form.lanes, np.zeros(4)
-        dxi = np.einsum("k,kij->ij", c.shape, off)
-        over, dn = added(c.shape), form.bend(xi + dxi) - form.bend(xi) if form.rows.bends.any() else dxi
-        # What the gap voltage, N and the force change by with xi, at most in each piece: at its peak, or at rest.
-        top = np.maximum(block.peaks, 1e-9 * peak)
-        e = 1.0 / form.inverse_area(np.stack([np.zeros(LANES), top])) - 1.0 / c.q0
-        u_steep, n_steep = (np.abs(x / (1.0 + c.kappa * e)).max(axis=0) for x in (1.0, e))
-        steep = (form.force(1.001 * top) - form.force(top)) / (1e-3 * top + 1e-300)
-        errors[0] = (np.abs(dxi - c.kappa * dn).max(axis=1) + u_steep * over).max()
-        errors[1] = (np.abs(form.force(xi + dxi) - form.force(xi)).max(axis=1) + steep * over).max()
-        first = form.rows.k.size - form.flows
-        charges = Shown(form.rows.columns[first:], form.rows.k[first:], form.rows.bends[first:])
-        for i, shown in ((2, form.nodes), (3, charges)):
-            for columns, bend in zip(shown.columns, shown.bends, strict=True):
-                seen = np.abs(np.einsum("k,kij->ij", columns, off) + bend * dn).max(axis=1)
-                errors[i] = max(errors[i], (seen + added(columns) + abs(bend) * n_steep * over).max())
-        excess = self._excess(np.maximum(errors, self.errors), peak)
-        if self.share < 1.0:
-            alone = np.abs(dxi).max() + np.abs(c.shape @ (own * (share - 1.0))).max()
-            excess = max(excess, SAFETY * alone / (self.share * self.rtol * max(peak, self.least)))
-        return excess, errors, (alike[:, LANES], chance[..., LANES])
-
-    def _excess(self, errors: FloatArray, peak: float) -> float:
-        gaps, _, _ = self._stated(errors, peak)
+    def _excess(self, seen: Judged, peak: float) -> float:
+        """Excess of the stated over the allowed error, with a block's."""
+        gaps, _, _ = self._stated(np.maximum(seen.errors, self.errors), peak)
         least = self.least, float(self.form.force(np.array(self.least)))
         gaps[0, :2] = np.maximum(gaps[0, :2], least)
-        return excess_of(gaps, self.problem.rounding) / self.rtol
+        excess = excess_of(gaps, self.problem.rounding) / self.rtol
+        if self.share < 1.0:
+            excess = max(excess, SAFETY * seen.alone / (self.share * self.rtol * max(peak, self.least)))
+        return excess
 
     def _write(self, piece: Piece, block: Block, parts: int, t_out: FloatArray, out: FloatArray) -> None:
         """Write the outputs before the end of a block."""
@@ -182,18 +197,23 @@ class LaneMarch(Following):
         """Write outputs into the columns of `out`: from the source, its slope (1/s), and modes as in `Block`."""
         form, c, n = self.form, self.form.lanes, out.shape[1]
         count, shown, first_flow = n if first.size == 1 else int(first[1]), form.rows, form.rows.k.size - form.flows
-        if shown.bends.any():
+        if shown.bends.any() or shown.by_area.any():
+            k, columns = form.xi
             xi = np.empty(n)
-            show(c.k, c.shape, x, first, count, n, kept, xi)
-            bend = form.bend(xi)
+            show(k, columns, x, first, count, n, kept, xi)
+            moved, inverse = form.moved(xi, x[:n]), form.inverse_area(xi) if form.mobile else xi
         for i, (k, share) in enumerate(zip(shown.k.tolist(), shown.bends.tolist(), strict=True)):
-            show(k, shown.columns[i], x, first, count, n, kept, out[i])
-            if share != 0.0:
-                out[i] += share * bend
+            by_area = shown.by_area[i]
+            show(0.0 if by_area else k, shown.columns[i], x, first, count, n, kept, out[i])
+            if by_area:
+                out[i] = out[i] * inverse + k * x[:n]
+            elif share != 0.0:
+                out[i] += share * moved
             if i >= first_flow:
                 flow(c, k, shown.columns[i], share, x, slope, first, count, n, kept, out[i + form.flows])
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
+        """Write the outputs at the end of the run."""
         count = t_out.size - self.outputs
         if count:
             here, slope = np.full(count, self.u_last), np.full(count, self.slope_after)
@@ -201,20 +221,24 @@ class LaneMarch(Following):
             self._show(here, slope, _ONE_ROW, z, out[:, self.outputs :])
         self.outputs = t_out.size
 
-    def rows(self, t: FloatArray, left: BoolArray, out: FloatArray) -> FloatArray:
-        return self.form.recorded(self.problem, out[:, : t.size])
+    def rows(self, count: int, out: FloatArray) -> FloatArray:
+        """The first outputs as rows of a record."""
+        return self.form.recorded(self.problem, out[:, :count])
 
     def state(self) -> State:
+        """The state reached."""
         return self.form.state(self.problem, self.z, self.t, self.u_last)
 
     def stated(self) -> tuple[FloatArray, float, float | None]:
+        """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C), so far."""
         return self._stated(self.errors, self.peak)
 
     def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
         form, u_peak = self.form, self.problem.scene.u_peak
         missed, at, led = form.missed, np.array(peak), self.led.tolist()
         u, force = float(form.gap(at)), float(form.force(at))
-        floor = 4e-16 * (peak + form.gain * max(u_peak, self.loudest)) + DIVIDED * missed * peak
+        floor = 4e-16 * (peak + form.gain * max(u_peak, self.loudest))
+        floor += (1.0 / self.margin if form.mobile else DIVIDED) * missed * peak
         floor += form.lanes.kappa * form.missed_bend
         u_error = SAFETY * float(errors[0]) + floor + led[0]
         f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force + led[1]
@@ -226,15 +250,21 @@ class LaneMarch(Following):
             charge_error += (LEAKED * missed + 4e-16 * (1.0 + self.steps)) * form.held * (self.problem.largest + peak)
         return np.array([[u, force, u_error, f_error]]), node_error, charge_error
 
-    @property
-    def stats(self) -> tuple[int, int, int]:
-        return self.steps, self.refused, self.evaluated
-
     def mark(self) -> dict[str, Any]:
-        names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak")
+        """The state of the integration as plain data, which `stand` restores in another march through the same run."""
+        names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak", "margin")
         arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors", "led")}
         return {name: getattr(self, name) for name in names} | arrays
 
     def stand(self, mark: dict[str, Any]) -> None:
+        """Restore the state of another march through the same run."""
         for name, value in mark.items():
             setattr(self, name, np.array(value) if isinstance(value, list) else value)
+
+    def run(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Run:
+        """The run so far, with the given outputs."""
+        stats = {"steps": self.steps, "rejected": self.refused, "zeros": 0}
+        run = Run(t, left, rows, Status.SUCCESS, self.evaluated, stats, self.state())
+        run.gaps, run.node_error, run.charge_error = self.stated()
+        run.margin, run.by_layer = self.margin, self.problem.scene.stack is not None
+        return run

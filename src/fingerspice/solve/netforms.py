@@ -6,15 +6,14 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import chebyshev as series_of
 from numpy.polynomial.polynomial import polyder, polyval
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.engine.lanerows import FADED, Lanes
-from fingerspice.physics.contact import inverse_area, inverse_area_array
+from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
-from fingerspice.solve.laneform import AREA_SHARE, LaneForm, Shown, as_powers, slopes
+from fingerspice.solve.laneform import AREA_SHARE, LaneForm, Shown, curves, slopes
 from fingerspice.solve.netmodal import Reduced
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene
@@ -22,8 +21,8 @@ from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import DC
 
-# Number of Chebyshev points for the area over the gap voltage, and frequencies at which the gap's share is looked at.
-_POINTS, _FREQUENCIES = 64, 65
+# Number of frequencies at which the gap's share is looked at.
+_FREQUENCIES = 65
 # Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
 # what they leave together is known but for about 1e-8.
 OF_MANY, ACTING = 1e-7, 0.05
@@ -93,7 +92,7 @@ class NetworkForm(LaneForm):
         return z, float(s[reduced.source])
 
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
-        shown, xi, y = self.rows, self.xi(z, u_last), problem.initial.y.copy()
+        shown, xi, y = self.rows, self.xi_at(z, u_last), problem.initial.y.copy()
         y[: shown.k.size] = shown.columns @ z + shown.bends * float(self.bend(np.array(xi))) + shown.k * u_last
         s = np.zeros(len(problem.waveforms))
         s[self.reduced.source] = u_last
@@ -125,12 +124,12 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
     reduced = Reduced(scene, source, area0)
     one = reduced.modal()
     modal = reduced.with_charges(one) if problem.charge else one
-    curves = _curves(scene.net.curves[moving], reduced.q0, reduced.kappa, scene.u_top, AREA_SHARE * min(rtol, COARSEST))
+    share_of = AREA_SHARE * min(rtol, COARSEST)
+    found_curves = curves(scene.net.curves[moving], reduced.q0, reduced.kappa, scene.u_top, share_of)
     contact = problem.network.contacts[moving]
-    if modal is None or curves is None or contact is None:
+    if modal is None or found_curves is None or contact is None:
         return None
-    area, bend, scale, missed, missed_bend = curves
-    area[0] -= reduced.q0
+    area, bend, scale, missed, missed_bend = found_curves
     slope, n, m = slopes(area, scale), reduced.absorbed.size, modal.rates.size
     # 1/A - q0 has the kink of 1/A, and N the part N''(0) xi |xi| / 2.
     kinks = np.full(reduced.leaking.size + 1, polyval(-1.0, slope))
@@ -145,12 +144,15 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
         return None
     lanes = Lanes(
         rates, gain, shape, float(modal.tap_s[0]), taps, tap_s, bent, feed, area, slope, bend, scale, -1.0, reduced.q0,
-        reduced.kappa, kinks, int(np.argmax(shares * reduced.modes.rates)),
+        reduced.kappa, kinks, float(polyval(-1.0, area)), float(polyval(-1.0, slope)),
+        int(np.argmax(shares * reduced.modes.rates)),
     )  # fmt: skip
-    nodes = Shown(modal.nodes, np.zeros(len(modal.nodes)), modal.nodes[:, :n] @ reduced.absorbed)
+    still, moved = np.zeros(len(modal.nodes)), modal.nodes[:, :n] @ reduced.absorbed
+    nodes = Shown(modal.nodes, still, moved, still > 0.0)
     return NetworkForm(
-        lanes, n, Shown(modal.columns, modal.k, modal.bends), nodes, m - n, float(contact.stress(1.0)), share,
-        scene.u_top, missed, missed_bend, float(problem.network.capacitance(reduced.area0).sum()), reduced,
+        lanes, n, False, Shown(modal.columns, modal.k, modal.bends, np.zeros(modal.k.size, bool)), nodes, m - n,
+        float(contact.stress(1.0)), share, scene.u_top, missed, missed_bend,
+        float(problem.network.capacitance(reduced.area0).sum()), reduced,
     )  # fmt: skip
 
 
@@ -160,40 +162,3 @@ def _largest_share(reduced: Reduced, rate: float, stop: float) -> float:
     one = reduced.modal()
     response = one.tap_s[0] + (one.taps[0] * one.gain / (1j * omega[:, None] + one.rates)).sum(axis=1)
     return float(np.abs(response).max())
-
-
-def _curves(
-    curve: FloatArray, q0: float, kappa: float, top: float, tol: float
-) -> tuple[FloatArray, FloatArray, float, float, float] | None:
-    """1/A and N as polynomials in xi, their `scale`, and their errors (relative, and in V m^2).
-
-    None where no allowed degree is enough.
-    """
-    at = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
-    to_series = np.linalg.inv(_chebyshev(at, _POINTS))
-    area = to_series @ (1.0 / inverse_area_array(0.5 * top * (at + 1.0), curve)[0])
-    integral = series_of.chebint(area, lbnd=-1.0) * 0.5 * top
-    # The range of xi ends where the gap voltage reaches `top`.
-    xi_top = float(top + kappa * (integral.sum() - top / q0))
-    xi = 0.5 * xi_top * (at + 1.0)
-    u = xi * top / xi_top
-    for _ in range(50):
-        basis = _chebyshev(2.0 * u / top - 1.0, _POINTS + 1)
-        n, a = basis @ integral - u / q0, basis[:, :-1] @ area
-        step = (u + kappa * n - xi) / (1.0 + kappa * (a - 1.0 / q0))
-        if np.abs(step).max() <= 1e-15 * top:
-            break
-        u = np.clip(u - step, 0.0, top)
-    inverse, bend = to_series @ (1.0 / a), to_series @ n
-    one, off_one = as_powers(inverse, tol * abs(float(inverse[0])))
-    # N acts at full strength, on charges too: compared with the whole integral of A.
-    other, off_other = as_powers(bend, tol * xi_top / q0)
-    if one.size == 0 or other.size == 0:
-        return None
-    other[0] -= polyval(-1.0, other)
-    return one, other, 2.0 / xi_top, off_one / abs(float(inverse[0])), off_other
-
-
-def _chebyshev(x: FloatArray, count: int) -> FloatArray:
-    """The first Chebyshev polynomials at x (n,) from -1 to 1, shape (n, count)."""
-    return np.asarray(np.cos(np.arange(count) * np.arccos(np.clip(x, -1.0, 1.0))[:, None]))

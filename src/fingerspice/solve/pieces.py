@@ -60,12 +60,12 @@ class Piece:
 def driving(problem: Problem) -> Samples | PWL | None:
     """The recording that drives a stack, or one source of a network whose other sources are at 0; else None.
 
-    For a stack under `local` it may also be a PWL with many points, without jump in the run.
+    For a stack it may also be a PWL with many points, without jump in the run.
     """
     if problem.scene.stack is not None:
         wave = problem.waveform
         samples = as_samples(wave)
-        if samples is None and isinstance(wave, PWL) and wave.repeat is None and not problem.scene.net.mobile:
+        if samples is None and isinstance(wave, PWL) and wave.repeat is None:
             return None if _points(problem, wave) is None else wave
         return samples
     found = recording_of(problem)

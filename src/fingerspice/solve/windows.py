@@ -13,11 +13,11 @@ from fingerspice.circuit.network import Network
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.plan import Plan
 from fingerspice.results.record import Record
-from fingerspice.solve.following import Outcome
+from fingerspice.solve.lanes import LaneMarch, Outcome
 from fingerspice.solve.outputs import at_breakpoints
 from fingerspice.solve.pieces import pieces_of
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings import march_of, ready
+from fingerspice.solve.recordings import ready
 from fingerspice.solve.runs import Run
 from fingerspice.solve.simulation import integrated, own_rtol, state_error
 from fingerspice.waveforms.samples import Samples
@@ -77,7 +77,7 @@ class BySamples:
         pieces, one = pieces_of(problem), ready(problem, own)
         assert pieces is not None
         assert one is not None
-        self.pieces, self.march, self.place, self.written = pieces, march_of(problem, one, own), 0, 0
+        self.pieces, self.march, self.place, self.written = pieces, LaneMarch(problem, one, own), 0, 0
 
     @staticmethod
     def serve(problem: Problem, plan: Plan, rtol: float) -> bool:
@@ -111,7 +111,7 @@ class BySamples:
             march.finish(run_at, out)
         count = march.outputs
         t, self.written, self.place = t[:count], self.written + count, self.place + 1
-        return t, march.rows(run_at[:count], np.zeros(count, bool), out)
+        return t, march.rows(count, out)
 
     def _until(self, t: float) -> int:
         """A number of outputs that includes all outputs up to time t (s), and a few more."""

@@ -1,0 +1,158 @@
+"""Weights of steps of lanes (`engine.lanestep`), for each of their lengths."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.engine.lanerows import BASIS, INNER, INNER_WEIGHT, NODES, OUTER_WEIGHT, PER_MODE, PER_MODE_BENT
+
+# Coefficients from x on of the quartic that is 0 at the nodes and has the slope 1 at the end of the step.
+_POWERS: list[float] = np.poly(np.array([0.0, *INNER, 1.0]))[3::-1].tolist()
+_QUARTIC = np.array(_POWERS) / (np.array(_POWERS) @ np.arange(1.0, NODES + 1.0))
+
+
+def _through(nodes: tuple[float, ...], until: float) -> FloatArray:
+    """Coefficients of the Lagrange polynomials through nodes, for x from 0 at 0 to 1 at `until`, times `until`."""
+    found = np.linalg.inv(np.vander(np.array(nodes) / until, increasing=True)).T
+    return np.pad(until * found, ((0, 0), (0, NODES - len(nodes))))
+
+
+# Weights in a network at each later node: of the leaks, which are known at the nodes before, and of N.
+_PLACES = (0.0, *INNER, 1.0)
+_PREDICTED = np.ascontiguousarray(np.vstack([
+    _through(_PLACES[:count], _PLACES[node]) for node in range(1, NODES) for count in (node, node + 1)
+]))  # fmt: skip
+# The first prediction misses the slope of the leaks. Without rates, these shares of the leaks at each node make the step
+# Kutta's of fourth order with Lobatto's nodes, so that the predictions' errors cancel at its end.
+_KUTTA = np.zeros((NODES, NODES))
+_KUTTA[2, 1] = INNER[1] / (2.0 * INNER[0])
+_KUTTA[3, 2] = 1.0 / (24.0 * OUTER_WEIGHT * _KUTTA[2, 1] * INNER[0])
+_KUTTA[3, 1] = ((1.0 / 6.0 - INNER_WEIGHT * _KUTTA[2, 1] * INNER[0]) / OUTER_WEIGHT - _KUTTA[3, 2] * INNER[1]) / INNER[0]
+for _node in (2, 3):
+    _own = _PREDICTED[_node**2 - 1 :][:_node]
+    _KUTTA[_node, 0] = _PLACES[_node] - _KUTTA[_node].sum()
+    _own[:, 0] += _KUTTA[_node, :_node] - _own @ (1.0 / np.arange(1.0, NODES + 1.0))
+# Largest rate times length for which moments follow from the highest one, and that from its series.
+_EARLY = 1.0
+
+
+@jit_rows
+def _series(n: int, share: float, h: FloatArray, m: FloatArray) -> None:
+    for i in range(n):
+        m[i] = 1.0 - share * h[i] * m[i]
+
+
+@jit_rows
+def _below(n: int, rate: float, j: int, h: FloatArray, m: FloatArray, lower: FloatArray) -> None:
+    over = 1.0 / j
+    for i in range(n):
+        lower[i] = (1.0 - rate * h[i] * m[i]) * over
+
+
+@jit_rows
+def _decays(n: int, rate: float, h: FloatArray, out: FloatArray) -> None:
+    """exp(-rate h), by its series at a 64th of the exponent; 0 from an exponent of 40 on."""
+    for i in range(n):
+        out[i] = 1.0
+    for j in range(16, 0, -1):
+        share = rate / (64.0 * j)
+        for i in range(n):
+            out[i] = 1.0 - min(share * h[i], 0.625 / j) * out[i]
+    for _ in range(6):
+        for i in range(n):
+            out[i] *= out[i]
+
+
+@jit_rows
+def _late(n: int, j: int, rate: float, h: FloatArray, lower: FloatArray, m: FloatArray) -> None:
+    for i in range(n):
+        y = rate * h[i]
+        m[i] = (1.0 - j * lower[i]) / y if y > _EARLY else m[i]
+
+
+@jit
+def _moments(top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
+    """Integrals of exp(-y (1 - x)) x^j over [0, 1] for y = rate h (n,), into the rows j = 0 to `top` of m."""
+    n, longest = h.size, rate * h.max()
+    terms, term = 1, 1.0
+    while term > 1e-17 and terms < 24:
+        term *= min(longest, _EARLY) / (top + 1 + terms)
+        terms += 1
+    highest = m[top]
+    highest[:] = 1.0
+    for j in range(terms, 0, -1):
+        _series(n, rate / (top + 1 + j), h, highest)
+    highest *= 1.0 / (top + 1)
+    for j in range(top, 0, -1):
+        _below(n, rate, j, h, m[j], m[j - 1])
+    if longest > _EARLY:
+        decay = m[NODES + 1]
+        _decays(n, rate, h, decay)
+        _late(n, 1, rate, h, decay, m[0])
+        for j in range(1, top + 1):
+            _late(n, j, rate, h, m[j - 1], m[j])
+
+
+@jit_rows
+def _until(
+    n: int, rate: float, gain: float, at: float, h: FloatArray, m0: FloatArray, m1: FloatArray, decay: FloatArray,
+    first: FloatArray, last: FloatArray, held: FloatArray,
+) -> None:  # fmt: skip
+    """Weights up to the place `at`: decay, both ends of the source, and a drive that is held."""
+    for i in range(n):
+        length = at * h[i]
+        decay[i] = 1.0 - rate * length * m0[i]
+        first[i] = gain * length * (m0[i] - at * m1[i])
+        last[i] = gain * length * at * m1[i]
+        held[i] = length * m0[i]
+
+
+@jit_rows
+def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] = h[i] * (c[0] * m[0, i] + c[1] * m[1, i] + c[2] * m[2, i] + c[3] * m[3, i])
+
+
+@jit
+def _shares(c: Any, weights: FloatArray) -> None:
+    """Shares of N at a node in xi, and in what 1/A - q0 multiplies, from its weights in all modes."""
+    count, leaks = c.rates.size, c.tap_s.size
+    first = count * (PER_MODE + PER_MODE_BENT) + 1
+    weights[first:] = 0.0
+    for node in range(1, NODES):
+        for k in range(count):
+            own = weights[count * PER_MODE + 1 + k * PER_MODE_BENT + node * node - 1 + 2 * node]
+            for i in range(own.size):
+                by = c.feed[k, leaks] * own[i]
+                weights[first + (node - 1) * (1 + leaks), i] += c.shape[k] * by
+                for t in range(leaks):
+                    weights[first + (node - 1) * (1 + leaks) + 1 + t, i] += c.taps[t, k] * by
+
+
+@jit
+def weigh(c: Any, h: FloatArray, weights: FloatArray) -> None:
+    """Weights of steps of the lengths h (n,), into the rows (n,) of `weights`, in the order of `lanestep`."""
+    rates, n, m, count = c.rates, h.size, np.empty((NODES + 2, h.size)), c.rates.size
+    more_rows = weights.shape[0] > count * PER_MODE + 1
+    for k in range(count):
+        own, more = weights[k * PER_MODE :], weights[count * PER_MODE + 1 + k * PER_MODE_BENT :]
+        for node in range(NODES - 1):
+            at, rows = INNER[node] if node < NODES - 2 else 1.0, own[4 * node :]
+            top = NODES if more_rows else 1 if node < NODES - 2 else NODES - 1
+            _moments(top, rates[k] * at, h, m)
+            _until(n, rates[k], c.gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2], rows[3])
+            if more_rows:
+                first = (node + 1) ** 2 - 1
+                for j in range(2 * node + 3):
+                    _drive(n, _PREDICTED[first + j], h, m, more[first + j])
+        for j in range(NODES):
+            _drive(n, BASIS[j], h, m, own[4 * (NODES - 1) + j])
+        if more_rows:
+            _drive(n, _QUARTIC, h, m[1:], more[NODES**2 - 1])
+    weights[count * PER_MODE] = h
+    if c.feed.shape[1] > c.tap_s.size:
+        _shares(c, weights)

@@ -1,0 +1,112 @@
+"""Errors of a block of a recording in lanes.
+
+A window of each piece, where the source moves most, is followed by steps half as long. The difference is the error of
+the window; a piece adds as much more as it is longer, and hands it on to the pieces after it, as the modes decay: once
+as if all errors were alike, and once as if they came by chance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.solve.laneblock import Block, Window
+from fingerspice.solve.laneform import LANES, LaneForm, Shown
+
+# Stated over seen errors, of voltages and charges, and of the force.
+SAFETY, OF_FORCE = 2.0, 1.5
+# Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
+LUCK = 2.0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Errors that are seen of a block, without safety."""
+
+    errors: FloatArray  # (4,): Of gap voltage (V), force (N), nodes (V) and charges (C)
+    alone: float  # Error of xi (V) that a single piece makes
+    alike: FloatArray  # (m,): Errors of the modes that the block hands on, as if they were alike
+    chance: FloatArray  # (m, m): Products of two, as if they came by chance
+
+
+@dataclass(frozen=True)
+class _Steep:
+    """What an error of xi changes in each piece, at most: between 0 V and its peak."""
+
+    u: FloatArray  # (LANES,): Gap voltage, V/V
+    force: FloatArray  # N/V
+    moved: FloatArray  # What `Shown.bends` multiplies, m^2
+    inverse: FloatArray  # 1/A, 1/m^2/V
+
+
+def _steep(form: LaneForm, block: Block, top: FloatArray) -> _Steep:
+    c = form.lanes
+    inverse = form.inverse_area(np.stack([np.zeros(LANES), top]))
+    force = (form.force(1.001 * top) - form.force(top)) / (1e-3 * top)
+    if not form.mobile:
+        e = 1.0 / inverse - 1.0 / c.q0
+        u, moved = (np.abs(x / (1.0 + c.kappa * e)).max(axis=0) for x in (1.0, e))
+        return _Steep(u, force, moved, np.zeros(LANES))
+    u = inverse.max(axis=0) / c.q0 / block.margin
+    steep = np.abs(form.slope(np.stack([np.zeros(LANES), top]))) * u
+    source = float(np.abs(block.x).max())
+    return _Steep(u, force * u, (source * steep / inverse**2).max(axis=0), steep.max(axis=0))
+
+
+def _changes(form: LaneForm, shown: Shown, window: Window, xi: FloatArray) -> FloatArray:
+    """Changes of quantities in windows (C, LANES, width + 1), where xi goes to other values."""
+    m = form.lanes.rates.size
+    found = np.einsum("ck,kij->cij", shown.columns, window.off[:m])
+    if shown.by_area.any():
+        inverse, other = form.inverse_area(window.xi), form.inverse_area(xi)
+        whole = np.einsum("ck,kij->cij", shown.columns[shown.by_area], window.z[:m])
+        found[shown.by_area] = other * found[shown.by_area] + (other - inverse) * whole
+    if shown.bends.any():
+        moved = form.moved(xi, window.source) - form.moved(window.xi, window.source)
+        found += shown.bends[:, None, None] * moved
+    return np.asarray(found)
+
+
+def judge(block: Block, parts: int, peak: float, alike: FloatArray, chance: FloatArray) -> Judged:
+    """Errors of a block that has been followed in `parts` steps a sample.
+
+    Parameters
+    ----------
+    peak : float
+        Largest |xi| so far, V.
+    alike, chance : ndarray, shape (m,) and (m, m)
+        Errors at the start, as in `Judged`.
+    """
+    form, active = block.form, block.active
+    c, window = form.lanes, block.check(parts)
+    own = window.off[: c.rates.size, :, -1]
+    products = own[:, None] * own
+    handed, lucky = block.hand_on(own * window.share, alike), block.hand_on(products * window.of_products, chance)
+    # At the end of a piece, with what it adds beyond its window.
+    alike_there = handed[:, :LANES] + own * (window.share - 1.0)
+    chance_there = lucky[..., :LANES] + products * (window.of_products - 1.0)
+
+    def added(columns: FloatArray) -> FloatArray:
+        """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
+        by_chance = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there), 0.0))
+        more = np.maximum(by_chance, np.abs(columns @ alike_there) - LUCK * by_chance)
+        return np.asarray(more + np.abs(columns[:active]) @ block.left[:active] / SAFETY)
+
+    errors, over, top = np.zeros(4), added(c.shape), np.maximum(block.peaks, 1e-9 * peak + 1e-300)
+    steep, xi = _steep(form, block, top), window.xi + np.einsum("k,kij->ij", form.xi[1], window.off)
+    for i, of, by in ((0, form.gap, steep.u), (1, form.force, steep.force)):
+        errors[i] = (np.abs(of(xi) - of(window.xi)).max(axis=1) + by * over).max()
+    first = form.rows.k.size - form.flows
+    for i, shown in ((2, form.nodes), (3, form.rows.behind(first))):
+        seen = np.abs(_changes(form, shown, window, xi)).max(axis=-1, initial=0.0)
+        for row, columns, bend, by_area in zip(seen, shown.columns, shown.bends, shown.by_area, strict=True):
+            more = added(columns) + abs(bend) * steep.moved * over
+            if by_area:
+                whole = np.abs(np.einsum("k,kij->ij", columns, window.z[: c.rates.size])).max(axis=1)
+                more = added(columns) * steep.u * c.q0 + whole * steep.inverse * over
+            errors[i] = max(errors[i], (row + more).max())
+    alone = np.abs(np.einsum("k,kij->ij", c.shape, window.off[: c.rates.size])).max()
+    alone += np.abs(c.shape @ (own * (window.share - 1.0))).max()
+    return Judged(errors, float(alone), handed[:, LANES], lucky[..., LANES])
