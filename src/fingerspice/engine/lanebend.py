@@ -1,7 +1,4 @@
-"""What a network adds to a step of lanes (`engine.lanestep`): N as a drive, and modes that fade within a sample.
-
-`add_predicted` serves stacks under `mobile`, too.
-"""
+"""What a network adds to a step of lanes (`engine.lanestep`): N as a drive, and modes that fade within a sample."""
 
 from __future__ import annotations
 
@@ -19,6 +16,7 @@ from fingerspice.engine.lanerows import (
     places,
     polynomial_rows,
     rise_of,
+    weights_at,
 )
 
 
@@ -72,21 +70,15 @@ def drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shar
 
 
 @jit_within
-def add_predicted(marks: Any, c: Any, k: int, j: int, weights: FloatArray, state: FloatArray) -> None:
-    """Add mode k's response to leaks and N at the nodes before j to the first row of scratch."""
+def add_bend(marks: Any, c: Any, k: int, j: int, weights: FloatArray, state: FloatArray) -> None:
+    """Add mode k's response to N at the nodes before j to the first row of scratch."""
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives, own = leaks + len(marks.bend), len(marks.modes) * PER_MODE + k * PER_MODE_BENT + j * j
+    drives, own = leaks + 1, len(marks.modes) * PER_MODE + 1 + k * PER_MODE_BENT + (j - 1) * (j + 2) // 2
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for node in range(j):
         for i in range(lanes):
-            fed = 0.0
-            for t in range(leaks):
-                fed += c.feed[k, t] * state[(at.g + node * drives + t) * lanes + i]
-            fed *= weights[(own + node) * wide + i * each]
-            if drives > leaks:
-                by = c.feed[k, leaks] * weights[(own + j + node) * wide + i * each]
-                fed += by * state[(at.g + node * drives + leaks) * lanes + i]
-            state[at.scratch * lanes + i] += fed
+            by = c.feed[k, leaks] * weights[(own + node) * wide + i * each]
+            state[at.scratch * lanes + i] += by * state[(at.g + node * drives + leaks) * lanes + i]
 
 
 @jit_within
@@ -189,7 +181,7 @@ def bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
 def fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """Add what is left of what `smooth` has taken, and the modes' response to it by N and, as one, by the leaks."""
     lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
-    at, end = places(marks), 4 * (NODES - 2)
+    at, end = places(marks), weights_at(NODES - 1)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for k in range(m):
         for f in range(active):

@@ -20,12 +20,13 @@ NODES = 4
 # Coefficients of the Lagrange polynomials through the nodes, and their slopes at the end of the step.
 BASIS = np.ascontiguousarray(np.linalg.inv(np.vander((0.0, *INNER, 1.0), increasing=True)).T)
 END_SLOPES = BASIS @ np.array([0.0, 1.0, 2.0, 3.0])
-# Weights of a mode: decay, both ends of the source, and the drive held, up to each later node; then of four drives.
-PER_MODE = 4 * (NODES - 1) + NODES
-# In a network and under `mobile` behind those of all modes and the step's length, for each mode: for node j of the later ones leaks at the
-# j nodes before, from row j^2 - 1 on, and N at these and itself; then a slope at the end of the step. Behind them, in a
-# network for each of these nodes, the share of N there in xi and in what 1/A - q0 multiplies.
-PER_MODE_BENT = NODES**2
+# Weights of a mode: decay, both ends of the source, and leaks at the j nodes before, up to each later node j, from row
+# `weights_at(j)` on; then of the cubic through drives at all nodes.
+PER_MODE = 3 * (NODES - 1) + NODES * (NODES - 1) // 2 + NODES
+# In a network behind those of all modes and the step's length, for each mode: N at node j and those before, from row
+# (j - 1) (j + 2) / 2 on; then a slope at the end of the step. Behind them, for each of these nodes, the share of N there
+# in xi and in what 1/A - q0 multiplies.
+PER_MODE_BENT = (NODES - 1) * (NODES + 2) // 2 + 1
 # Rows of the lanes' state before those of the modes: the source at both ends of a part, and at the last sample.
 SOURCES = 3
 # Time constants in a step from which on a mode is taken to follow the drives.
@@ -102,6 +103,12 @@ def rows_of(marks: Any) -> Rows:
 
 
 places = jit_within(rows_of)
+
+
+@jit_within
+def weights_at(j: int) -> int:
+    """First row of a mode's weights for node j; for `NODES` that of the cubic."""
+    return 3 * (j - 1) + j * (j - 1) // 2
 
 
 @jit_rows

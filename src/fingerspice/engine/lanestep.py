@@ -9,9 +9,8 @@ In a stack xi is the gap voltage u, and 1/A a polynomial in |u|; under `mobile` 
 that the modes have (`engine.lanemobile`). In a network N, the integral of A - 1/q0 over u, is one
 more drive, behind the leaks: u + kappa N = xi, and both 1/A and N are polynomials in |xi| (`solve.netmodal`).
 
-The drives g are taken at Lobatto's four nodes. There the state of a stack is predicted with the drives held at their
-last value; under `mobile` and in a network with the polynomial through the leaks at the nodes before, and through N at
-these and the node itself, which is an equation for xi. The modes' response to the source and to the cubic through the drives is exact.
+The drives g are taken at Lobatto's four nodes. There the state is predicted with polynomials through the leaks at the
+nodes before, and through N at these and the node itself, which is an equation for xi. The modes' response to the source and to the cubic through the drives is exact.
 Where xi crosses 0 V, g has a kink, of which the integral and the first moment that the rule misses are known on the
 straight line of xi, and are added. In a network the slope of N at the end of the step is known, too, and makes the
 cubic a quartic; modes that decay within a small part of a sample begin where they soon are, and what they leave on the
@@ -24,7 +23,7 @@ from typing import Any
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
-from fingerspice.engine.lanebend import add_predicted, bend_end, drives_at, end_bent, fade, smooth
+from fingerspice.engine.lanebend import add_bend, bend_end, drives_at, end_bent, fade, smooth
 from fingerspice.engine.lanemobile import drives_under_mobile, end_mobile, weaken_kinks
 from fingerspice.engine.lanerows import (
     BASIS,
@@ -36,6 +35,7 @@ from fingerspice.engine.lanerows import (
     PER_MODE,
     SOURCES,
     places,
+    weights_at,
 )
 
 
@@ -62,21 +62,21 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
             for t in range(leaks):
                 state[(at.w + leaks + t) * lanes + i] = c.tap_s[t] * s
         for k in range(active):
-            p = k * PER_MODE + 4 * (j - 1)
+            p = k * PER_MODE + weights_at(j)
             for i in range(lanes):
                 state[at.scratch * lanes + i] = (
                     weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
                     + weights[(p + 1) * wide + i * each] * state[i]
                     + weights[(p + 2) * wide + i * each] * state[lanes + i]
                 )
-            if drives > leaks or len(marks.mobile) > 0:
-                add_predicted(marks, c, k, j, weights, state)
-            else:
+            for node in range(j):
                 for i in range(lanes):
                     fed = 0.0
                     for t in range(leaks):
-                        fed += c.feed[k, t] * state[(at.g + (j - 1) * drives + t) * lanes + i]
-                    state[at.scratch * lanes + i] += weights[(p + 3) * wide + i * each] * fed
+                        fed += c.feed[k, t] * state[(at.g + node * drives + t) * lanes + i]
+                    state[at.scratch * lanes + i] += weights[(p + 3 + node) * wide + i * each] * fed
+            if drives > leaks:
+                add_bend(marks, c, k, j, weights, state)
             for i in range(lanes):
                 z = state[at.scratch * lanes + i]
                 state[(at.xi + j) * lanes + i] += c.shape[k] * z
@@ -119,12 +119,13 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
     drives, late_at = leaks + len(marks.bend), at.scratch + 5
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for k in range(m):
-        p = k * PER_MODE + 4 * (NODES - 2)
+        own = k * PER_MODE
+        p, cubic = own + weights_at(NODES - 1), own + weights_at(NODES)
         for i in range(lanes):
             # What begins at the kink decays to the end of the step, by the cubic through what begins at the nodes.
             late = state[(late_at + NODES - 1) * lanes + i]
             for j in range(NODES - 1):
-                late += weights[(p - 4 * j) * wide + i * each] * state[(late_at + j) * lanes + i]
+                late += weights[(own + weights_at(NODES - 1 - j)) * wide + i * each] * state[(late_at + j) * lanes + i]
             if drives > leaks:
                 late *= 1.0 if c.rates[k] * state[(at.scratch + 1) * lanes + i] < FADED else 0.0
             z = (
@@ -135,7 +136,7 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
             for t in range(drives):
                 fed = late * state[(late_at + NODES + t) * lanes + i]
                 for j in range(NODES):
-                    fed += weights[(p + 4 + j) * wide + i * each] * state[(at.g + j * drives + t) * lanes + i]
+                    fed += weights[(cubic + j) * wide + i * each] * state[(at.g + j * drives + t) * lanes + i]
                 z += c.feed[k, t] * fed
             state[(SOURCES + k) * lanes + i] = z
 

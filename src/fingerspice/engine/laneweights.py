@@ -8,7 +8,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lanerows import BASIS, INNER, INNER_WEIGHT, NODES, OUTER_WEIGHT, PER_MODE, PER_MODE_BENT
+from fingerspice.engine.lanerows import BASIS, INNER, NODES, PER_MODE, PER_MODE_BENT, weights_at
 
 # Coefficients from x on of the quartic that is 0 at the nodes and has the slope 1 at the end of the step.
 _POWERS: list[float] = np.poly(np.array([0.0, *INNER, 1.0]))[3::-1].tolist()
@@ -21,21 +21,15 @@ def _through(nodes: tuple[float, ...], until: float) -> FloatArray:
     return np.pad(until * found, ((0, 0), (0, NODES - len(nodes))))
 
 
-# Weights in a network at each later node: of the leaks, which are known at the nodes before, and of N.
 _PLACES = (0.0, *INNER, 1.0)
-_PREDICTED = np.ascontiguousarray(np.vstack([
-    _through(_PLACES[:count], _PLACES[node]) for node in range(1, NODES) for count in (node, node + 1)
-]))  # fmt: skip
-# The first prediction misses the slope of the leaks. Without rates, these shares of the leaks at each node make the step
-# Kutta's of fourth order with Lobatto's nodes, so that the predictions' errors cancel at its end.
-_KUTTA = np.zeros((NODES, NODES))
-_KUTTA[2, 1] = INNER[1] / (2.0 * INNER[0])
-_KUTTA[3, 2] = 1.0 / (24.0 * OUTER_WEIGHT * _KUTTA[2, 1] * INNER[0])
-_KUTTA[3, 1] = ((1.0 / 6.0 - INNER_WEIGHT * _KUTTA[2, 1] * INNER[0]) / OUTER_WEIGHT - _KUTTA[3, 2] * INNER[1]) / INNER[0]
-for _node in (2, 3):
-    _own = _PREDICTED[_node**2 - 1 :][:_node]
-    _KUTTA[_node, 0] = _PLACES[_node] - _KUTTA[_node].sum()
-    _own[:, 0] += _KUTTA[_node, :_node] - _own @ (1.0 / np.arange(1.0, NODES + 1.0))
+# At each later node weights of the leaks, which are known at the nodes before, and of N.
+_LEAKS, _BENDS = (
+    np.ascontiguousarray(np.vstack([_through(_PLACES[: j + more], _PLACES[j]) for j in range(1, NODES)]))
+    for more in (0, 1)
+)
+# The first prediction misses the slope of the leaks. The second one is given the opposite error, so that both cancel at
+# the end of the step, whose method is then of third order.
+_LEAKS[1:3, 0] += np.array([-0.5, 0.5]) * INNER[0]
 # Largest rate times length for which moments follow from the highest one, and that from its series.
 _EARLY = 1.0
 
@@ -100,21 +94,23 @@ def _moments(top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
 @jit_rows
 def _until(
     n: int, rate: float, gain: float, at: float, h: FloatArray, m0: FloatArray, m1: FloatArray, decay: FloatArray,
-    first: FloatArray, last: FloatArray, held: FloatArray,
+    first: FloatArray, last: FloatArray,
 ) -> None:  # fmt: skip
-    """Weights up to the place `at`: decay, both ends of the source, and a drive that is held."""
+    """Weights up to the place `at`: decay, and both ends of the source."""
     for i in range(n):
         length = at * h[i]
         decay[i] = 1.0 - rate * length * m0[i]
         first[i] = gain * length * (m0[i] - at * m1[i])
         last[i] = gain * length * at * m1[i]
-        held[i] = length * m0[i]
 
 
 @jit_rows
-def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
+def _drive(n: int, terms: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
     for i in range(n):
-        out[i] = h[i] * (c[0] * m[0, i] + c[1] * m[1, i] + c[2] * m[2, i] + c[3] * m[3, i])
+        out[i] = h[i] * c[0] * m[0, i]
+    for j in range(1, terms):
+        for i in range(n):
+            out[i] += h[i] * c[j] * m[j, i]
 
 
 @jit
@@ -125,7 +121,7 @@ def _shares(c: Any, weights: FloatArray) -> None:
     weights[first:] = 0.0
     for node in range(1, NODES):
         for k in range(count):
-            own = weights[count * PER_MODE + 1 + k * PER_MODE_BENT + node * node - 1 + 2 * node]
+            own = weights[count * PER_MODE + 1 + k * PER_MODE_BENT + (node - 1) * (node + 2) // 2 + node]
             for i in range(own.size):
                 by = c.feed[k, leaks] * own[i]
                 weights[first + (node - 1) * (1 + leaks), i] += c.shape[k] * by
@@ -137,22 +133,23 @@ def _shares(c: Any, weights: FloatArray) -> None:
 def weigh(c: Any, h: FloatArray, weights: FloatArray) -> None:
     """Weights of steps of the lengths h (n,), into the rows (n,) of `weights`, in the order of `lanestep`."""
     rates, n, m, count = c.rates, h.size, np.empty((NODES + 2, h.size)), c.rates.size
-    more_rows = weights.shape[0] > count * PER_MODE + 1
+    bent = c.feed.shape[1] > c.tap_s.size
     for k in range(count):
         own, more = weights[k * PER_MODE :], weights[count * PER_MODE + 1 + k * PER_MODE_BENT :]
-        for node in range(NODES - 1):
-            at, rows = INNER[node] if node < NODES - 2 else 1.0, own[4 * node :]
-            top = NODES if more_rows else 1 if node < NODES - 2 else NODES - 1
-            _moments(top, rates[k] * at, h, m)
-            _until(n, rates[k], c.gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2], rows[3])
-            if more_rows:
-                first = (node + 1) ** 2 - 1
-                for j in range(2 * node + 3):
-                    _drive(n, _PREDICTED[first + j], h, m, more[first + j])
+        for j in range(1, NODES):
+            at, rows = INNER[j - 1] if j < NODES - 1 else 1.0, own[weights_at(j) :]
+            _moments(NODES if bent else j, rates[k] * at, h, m)
+            _until(n, rates[k], c.gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2])
+            for node in range(j):
+                _drive(n, j, _LEAKS[j * (j - 1) // 2 + node], h, m, rows[3 + node])
+            if bent:
+                first = (j - 1) * (j + 2) // 2
+                for node in range(j + 1):
+                    _drive(n, j + 1, _BENDS[first + node], h, m, more[first + node])
         for j in range(NODES):
-            _drive(n, BASIS[j], h, m, own[4 * (NODES - 1) + j])
-        if more_rows:
-            _drive(n, _QUARTIC, h, m[1:], more[NODES**2 - 1])
+            _drive(n, NODES, BASIS[j], h, m, own[weights_at(NODES) + j])
+        if bent:
+            _drive(n, NODES, _QUARTIC, h, m[1:], more[PER_MODE_BENT - 1])
     weights[count * PER_MODE] = h
-    if c.feed.shape[1] > c.tap_s.size:
+    if bent:
         _shares(c, weights)

@@ -89,8 +89,7 @@ class LaneForm(ABC):
     def _weights(self) -> int:
         modes, leaks = self.lanes.rates.size, self.lanes.tap_s.size
         bent = self.lanes.feed.shape[1] > leaks
-        more = modes * PER_MODE_BENT if bent or self.mobile else 0
-        return modes * PER_MODE + 1 + more + ((NODES - 1) * (1 + leaks) if bent else 0)
+        return modes * PER_MODE + 1 + (modes * PER_MODE_BENT + (NODES - 1) * (1 + leaks) if bent else 0)
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""

@@ -28,7 +28,7 @@ PARTS = (1, 2, 4, 8, 16, 32, 64)
 OF_STARTS, LEAST_CHANGE, SHORT = 0.01, 1e-14, 1024
 # Excess below which the next block has steps twice as long, and what half the length divides an error by at least: in a
 # stack, and in a network.
-COARSER, FINER = 1.0 / 60.0, (5.0, 12.0)
+COARSER, FINER = 1.0 / 60.0, (8.0, 12.0)
 # Error allowed in a piece that the ordinary engine integrates, over the error asked for, and at most.
 LED_SHARE, LED_MOST = 0.003, 1e-8
 # Relative change of a voltage over that of the area which causes it, at most, under `local`: what scales with the area
