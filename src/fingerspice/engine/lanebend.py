@@ -12,11 +12,11 @@ from fingerspice.engine.lanerows import (
     NODES,
     PER_MODE,
     PER_MODE_BENT,
+    PER_NODE,
     SOURCES,
     places,
     polynomial_rows,
     rise_of,
-    weights_at,
 )
 
 
@@ -181,7 +181,7 @@ def bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
 def fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """Add what is left of what `smooth` has taken, and the modes' response to it by N and, as one, by the leaks."""
     lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
-    at, end = places(marks), weights_at(NODES - 1)
+    at, end = places(marks), PER_NODE * (NODES - 2)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for k in range(m):
         for f in range(active):

@@ -20,12 +20,13 @@ NODES = 4
 # Coefficients of the Lagrange polynomials through the nodes, and their slopes at the end of the step.
 BASIS = np.ascontiguousarray(np.linalg.inv(np.vander((0.0, *INNER, 1.0), increasing=True)).T)
 END_SLOPES = BASIS @ np.array([0.0, 1.0, 2.0, 3.0])
-# Weights of a mode: decay, both ends of the source, and leaks at the j nodes before, up to each later node j, from row
-# `weights_at(j)` on; then of the cubic through drives at all nodes.
-PER_MODE = 3 * (NODES - 1) + NODES * (NODES - 1) // 2 + NODES
+# Weights of a mode up to each later node: decay, both ends of the source, and leaks at all nodes but the last, 0 from
+# that node on; then of the cubic through drives at all nodes.
+PER_NODE = 3 + NODES - 1
+PER_MODE = PER_NODE * (NODES - 1) + NODES
 # In a network behind those of all modes and the step's length, for each mode: N at node j and those before, from row
-# (j - 1) (j + 2) / 2 on; then a slope at the end of the step. Behind them, for each of these nodes, the share of N there
-# in xi and in what 1/A - q0 multiplies.
+# (j - 1) (j + 2) / 2 on; then a slope at the end of the step. Behind them, for each node, the share of N in xi there,
+# and in what 1/A - q0 multiplies.
 PER_MODE_BENT = (NODES - 1) * (NODES + 2) // 2 + 1
 # Rows of the lanes' state before those of the modes: the source at both ends of a part, and at the last sample.
 SOURCES = 3
@@ -79,6 +80,7 @@ class Rows(NamedTuple):
 
     xi: int  # At the nodes
     g: int  # Drives at the nodes
+    fed: int  # What the leaks feed to each mode at the nodes
     w: int  # What 1/A - q0 multiplies at the start, and at the latest node
     scratch: int
     q: int  # 1/A - q0 at the latest node, its derivative, and in a network dN/dxi where fading modes soon are, or B
@@ -95,20 +97,15 @@ def rows_of(marks: Any) -> Rows:
     m, leaks, drives = len(marks.modes), len(marks.leaks), len(marks.leaks) + len(marks.bend)
     xi = SOURCES + m
     g = xi + NODES
-    w = g + NODES * drives
+    fed = g + NODES * drives
+    w = fed + NODES * m
     scratch = w + 2 * leaks
     q = scratch + 5 + NODES + drives
     more = m + drives if drives > leaks else 3 if len(marks.mobile) > 0 else 0
-    return Rows(xi, g, w, scratch, q, q + 3, q + 3, q + 4, q + 3 + more if more > 0 else q)
+    return Rows(xi, g, fed, w, scratch, q, q + 3, q + 3, q + 4, q + 3 + more if more > 0 else q)
 
 
 places = jit_within(rows_of)
-
-
-@jit_within
-def weights_at(j: int) -> int:
-    """First row of a mode's weights for node j; for `NODES` that of the cubic."""
-    return 3 * (j - 1) + j * (j - 1) // 2
 
 
 @jit_rows

@@ -9,7 +9,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.lanerows import NODES, PER_MODE, SOURCES, places, weights_at
+from fingerspice.engine.lanerows import NODES, PER_MODE, PER_NODE, SOURCES, places
 from fingerspice.engine.lanestep import step
 from fingerspice.engine.laneweights import weigh
 
@@ -122,7 +122,7 @@ def along(weights: FloatArray, x: FloatArray, first: IntArray, count: int, z: Fl
         for i in range(lanes):
             after[i] = x[first[i] + t + 1]
         for k in range(z.shape[0]):
-            p = k * PER_MODE + weights_at(NODES - 1)
+            p = k * PER_MODE + PER_NODE * (NODES - 2)
             decay, before, last = weights[p, 0], weights[p + 1, 0], weights[p + 2, 0]
             for i in range(lanes):
                 z[k, i] = decay * z[k, i] + before * now[i] + last * after[i]
@@ -151,7 +151,10 @@ def within(
     marks: Any, c: Any, still: FloatArray, starts: FloatArray, x: FloatArray,
     to: FloatArray, h: FloatArray, parts: int, state: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """States as in `span` (rows, n) after steps of lengths h (n,) from `starts` (m, n), in `parts`; the source goes from x to `to`."""
+    """States as in `span` (rows, n) after steps of lengths h (n,), in `parts`, from `starts` (m, n).
+
+    The source goes from x to `to`.
+    """
     lanes, m = len(marks.lanes), len(marks.modes)
     rows = still.size // lanes
     weights = np.empty((rows, lanes))

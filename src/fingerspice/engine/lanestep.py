@@ -6,15 +6,16 @@ step:
     z' = -rates z + gain s + feed g,   xi = k s + shape z,   g_t = (1/A - q0) (tap_s s + taps z + bent N)_t
 
 In a stack xi is the gap voltage u, and 1/A a polynomial in |u|; under `mobile` u follows from xi and the part of it
-that the modes have (`engine.lanemobile`). In a network N, the integral of A - 1/q0 over u, is one
-more drive, behind the leaks: u + kappa N = xi, and both 1/A and N are polynomials in |xi| (`solve.netmodal`).
+that the modes have (`engine.lanemobile`). In a network N, the integral of A - 1/q0 over u, is one more drive, behind
+the leaks: u + kappa N = xi, and both 1/A and N are polynomials in |xi| (`solve.netmodal`).
 
 The drives g are taken at Lobatto's four nodes. There the state is predicted with polynomials through the leaks at the
-nodes before, and through N at these and the node itself, which is an equation for xi. The modes' response to the source and to the cubic through the drives is exact.
-Where xi crosses 0 V, g has a kink, of which the integral and the first moment that the rule misses are known on the
-straight line of xi, and are added. In a network the slope of N at the end of the step is known, too, and makes the
-cubic a quartic; modes that decay within a small part of a sample begin where they soon are, and what they leave on the
-way decays beside them. The last modes may be passive: nothing depends on them, such as a charge.
+nodes before, and through N at these and the node itself, which is an equation for xi. The modes' response to the source
+and to the cubic through the drives is exact. Where xi crosses 0 V, g has a kink, of which the integral and the first
+moment that the rule misses are known on the straight line of xi, and are added. In a network the slope of N at the end
+of the step is known, too, and makes the cubic a quartic; modes that decay within a small part of a sample begin where
+they soon are, and what they leave on the way decays beside them. The last modes may be passive: nothing depends on
+them, such as a charge.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from fingerspice.engine.lanerows import (
     NODES,
     OUTER_WEIGHT,
     PER_MODE,
+    PER_NODE,
     SOURCES,
     places,
-    weights_at,
 )
 
 
@@ -54,6 +55,7 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
         change = after[i] - before
         state[i], state[lanes + i] = before + a * change, before + b * change
     fades = drives > leaks and a == 0.0 and smooth(marks, c, weights, state)
+    _feed(marks, c, 0, state)
     for j in range(1, NODES):
         until = INNER[0] if j == 1 else INNER[1] if j == 2 else 1.0
         for i in range(lanes):
@@ -62,19 +64,16 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
             for t in range(leaks):
                 state[(at.w + leaks + t) * lanes + i] = c.tap_s[t] * s
         for k in range(active):
-            p = k * PER_MODE + weights_at(j)
+            p, fed = k * PER_MODE + (j - 1) * PER_NODE, at.fed + k * NODES
             for i in range(lanes):
                 state[at.scratch * lanes + i] = (
                     weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
                     + weights[(p + 1) * wide + i * each] * state[i]
                     + weights[(p + 2) * wide + i * each] * state[lanes + i]
+                    + weights[(p + 3) * wide + i * each] * state[fed * lanes + i]
+                    + weights[(p + 4) * wide + i * each] * state[(fed + 1) * lanes + i]
+                    + weights[(p + 5) * wide + i * each] * state[(fed + 2) * lanes + i]
                 )
-            for node in range(j):
-                for i in range(lanes):
-                    fed = 0.0
-                    for t in range(leaks):
-                        fed += c.feed[k, t] * state[(at.g + node * drives + t) * lanes + i]
-                    state[at.scratch * lanes + i] += weights[(p + 3 + node) * wide + i * each] * fed
             if drives > leaks:
                 add_bend(marks, c, k, j, weights, state)
             for i in range(lanes):
@@ -86,6 +85,7 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
             drives_under_mobile(marks, c, j, j - 1, state)
         else:
             drives_at(marks, c, weights, j, j - 1, j - 1, state)
+        _feed(marks, c, j, state)
     for i in range(lanes):
         state[(at.scratch + 1) * lanes + i] = weights[length * wide + i * each]
     _kinks(marks, c, state)
@@ -113,19 +113,31 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
 
 
 @jit_within
+def _feed(marks: Any, c: Any, j: int, state: FloatArray) -> None:
+    """What the leaks at node j feed to each mode."""
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    first = at.g + j * (leaks + len(marks.bend))
+    for k in range(len(marks.modes)):
+        for i in range(lanes):
+            fed = 0.0
+            for t in range(leaks):
+                fed += c.feed[k, t] * state[(first + t) * lanes + i]
+            state[(at.fed + k * NODES + j) * lanes + i] = fed
+
+
+@jit_within
 def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """The modes at the end of a step, from the drives at its nodes and what the rule misses of them."""
     lanes, m, leaks, at = len(marks.lanes), len(marks.modes), len(marks.leaks), places(marks)
     drives, late_at = leaks + len(marks.bend), at.scratch + 5
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for k in range(m):
-        own = k * PER_MODE
-        p, cubic = own + weights_at(NODES - 1), own + weights_at(NODES)
+        p, fed = k * PER_MODE + PER_NODE * (NODES - 2), at.fed + k * NODES
         for i in range(lanes):
             # What begins at the kink decays to the end of the step, by the cubic through what begins at the nodes.
             late = state[(late_at + NODES - 1) * lanes + i]
             for j in range(NODES - 1):
-                late += weights[(own + weights_at(NODES - 1 - j)) * wide + i * each] * state[(late_at + j) * lanes + i]
+                late += weights[(p - PER_NODE * j) * wide + i * each] * state[(late_at + j) * lanes + i]
             if drives > leaks:
                 late *= 1.0 if c.rates[k] * state[(at.scratch + 1) * lanes + i] < FADED else 0.0
             z = (
@@ -134,10 +146,12 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
                 + weights[(p + 2) * wide + i * each] * state[lanes + i]
             )
             for t in range(drives):
-                fed = late * state[(late_at + NODES + t) * lanes + i]
-                for j in range(NODES):
-                    fed += weights[(cubic + j) * wide + i * each] * state[(at.g + j * drives + t) * lanes + i]
-                z += c.feed[k, t] * fed
+                z += c.feed[k, t] * late * state[(late_at + NODES + t) * lanes + i]
+            for j in range(NODES):
+                drive = state[(fed + j) * lanes + i]
+                if drives > leaks:
+                    drive += c.feed[k, leaks] * state[(at.g + j * drives + leaks) * lanes + i]
+                z += weights[(p + PER_NODE + j) * wide + i * each] * drive
             state[(SOURCES + k) * lanes + i] = z
 
 

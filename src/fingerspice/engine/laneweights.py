@@ -8,7 +8,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lanerows import BASIS, INNER, NODES, PER_MODE, PER_MODE_BENT, weights_at
+from fingerspice.engine.lanerows import BASIS, INNER, NODES, PER_MODE, PER_MODE_BENT, PER_NODE
 
 # Coefficients from x on of the quartic that is 0 at the nodes and has the slope 1 at the end of the step.
 _POWERS: list[float] = np.poly(np.array([0.0, *INNER, 1.0]))[3::-1].tolist()
@@ -137,9 +137,10 @@ def weigh(c: Any, h: FloatArray, weights: FloatArray) -> None:
     for k in range(count):
         own, more = weights[k * PER_MODE :], weights[count * PER_MODE + 1 + k * PER_MODE_BENT :]
         for j in range(1, NODES):
-            at, rows = INNER[j - 1] if j < NODES - 1 else 1.0, own[weights_at(j) :]
+            at, rows = INNER[j - 1] if j < NODES - 1 else 1.0, own[(j - 1) * PER_NODE :]
             _moments(NODES if bent else j, rates[k] * at, h, m)
             _until(n, rates[k], c.gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2])
+            rows[3 : 3 + NODES - 1] = 0.0
             for node in range(j):
                 _drive(n, j, _LEAKS[j * (j - 1) // 2 + node], h, m, rows[3 + node])
             if bent:
@@ -147,7 +148,7 @@ def weigh(c: Any, h: FloatArray, weights: FloatArray) -> None:
                 for node in range(j + 1):
                     _drive(n, j + 1, _BENDS[first + node], h, m, more[first + node])
         for j in range(NODES):
-            _drive(n, NODES, BASIS[j], h, m, own[weights_at(NODES) + j])
+            _drive(n, NODES, BASIS[j], h, m, own[(NODES - 1) * PER_NODE + j])
         if bent:
             _drive(n, NODES, _QUARTIC, h, m[1:], more[PER_MODE_BENT - 1])
     weights[count * PER_MODE] = h

@@ -233,7 +233,7 @@ class Block:
         return np.append(at_starts, (left * at_starts[..., lane] + added[..., lane])[..., None], axis=-1)
 
     def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
-        """Source (V; n,) and states (rows, n) `since` (s) after samples of these numbers, whose steps are `length` (s)."""
+        """Source (V; n,) and states (rows, n) `since` (s) after samples with these numbers, in `parts` steps."""
         lane = number // self.count
         z = np.ascontiguousarray(self.kept[:, lane, number - lane * self.count])
         x = self.x[number]

@@ -195,8 +195,9 @@ def curves(
         u = np.clip(u - step, 0.0, top)
     inverse, bend = to_series @ (1.0 / a), to_series @ n
     one, off_one = as_powers(inverse, tol * abs(float(inverse[0])))
-    # N acts at full strength, on charges too: compared with the whole integral of A.
-    other, off_other = as_powers(bend, tol * xi_top / q0)
+    # N acts at full strength, on charges too: compared with the whole integral of A. In a stack no step needs it.
+    of_bend = tol if kappa > 0.0 else max(1e-3 * tol, min(tol, 1e-13))
+    other, off_other = as_powers(bend, of_bend * xi_top / q0)
     if one.size == 0 or other.size == 0:
         return None
     one[0] -= q0
