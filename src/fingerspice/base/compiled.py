@@ -244,5 +244,3 @@ jit_fused = _cached(fastmath={"contract"}, noalias=True)
 jit_rows = _cached(fastmath={"contract", "reassoc"}, noalias=True)
 # Inlined by LLVM: a call with a tuple of arrays would cost as much as the work.
 jit_within = _cached(forceinline=True)
-# Inlined by numba before compilation, for the same reason.
-jit_inline = _cached(inline="always")

@@ -14,7 +14,7 @@ from fingerspice.engine.lanereadout import flow, largest_of, show
 from fingerspice.engine.lanerows import NODES
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.laneblock import Block
-from fingerspice.solve.laneerrors import OF_FORCE, SAFETY, Judged, judge
+from fingerspice.solve.laneerrors import OF_CHARGE, OF_FORCE, SAFETY, Judged, judge
 from fingerspice.solve.laneform import LaneForm
 from fingerspice.solve.marching import solve as solve_ordinary
 from fingerspice.solve.pieces import Piece, driving, spacing_of
@@ -245,7 +245,7 @@ class LaneMarch:
         node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + floor + led[2]
         charge_error = None
         if form.flows:
-            charge_error = SAFETY * float(errors[3]) + led[3]
+            charge_error = OF_CHARGE * float(errors[3]) + led[3]
             charge_error += form.missed_bend * float(np.abs(form.rows.bends[-form.flows :]).max())
             charge_error += (LEAKED * missed + 4e-16 * (1.0 + self.steps)) * form.held * (self.problem.largest + peak)
         return np.array([[u, force, u_error, f_error]]), node_error, charge_error
