@@ -15,8 +15,7 @@ from fingerspice.engine.lanerows import NODES
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.laneblock import Block
 from fingerspice.solve.laneerrors import OF_CHARGE, OF_FORCE, SAFETY, Judged, judge
-from fingerspice.solve.laneform import LaneForm
-from fingerspice.solve.marching import solve as solve_ordinary
+from fingerspice.solve.laneform import LANES, LaneForm
 from fingerspice.solve.pieces import Piece, driving, spacing_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run, excess_of
@@ -29,8 +28,8 @@ OF_STARTS, LEAST_CHANGE, SHORT = 0.01, 1e-14, 1024
 # Excess below which the next block has steps twice as long, and what half the length divides an error by at least: in a
 # stack, and in a network.
 COARSER, FINER = 1.0 / 60.0, (8.0, 12.0)
-# Error allowed in a piece that the ordinary engine integrates, over the error asked for, and at most.
-LED_SHARE, LED_MOST = 0.003, 1e-8
+# Steps of a piece that grows in each lane, and the first one over the shortest time constant.
+GROWN, EARLY = 8, 0.05
 # Relative change of a voltage over that of the area which causes it, at most, under `local`: what scales with the area
 # divides the voltage with what does not.
 DIVIDED = 0.5
@@ -42,6 +41,8 @@ _ONE_ROW = np.zeros(1, np.int64)
 # The error of a piece is related to the peaks up to its end, or to this share of the largest gap voltage that the
 # source may cause: noise before the first loud sound need not be exact relative to itself.
 LEAST_PEAK = 1e-3
+# In the first sample of a network it is this share, as the errors of the polynomials stand beside a small peak there.
+LEAST_AT_START = 0.1
 
 
 class Outcome(Enum):
@@ -77,16 +78,17 @@ class LaneMarch:
         assert wave is not None
         self.wave, self.usual, self.t, self.loudest = wave, spacing_of(wave), problem.t_start, 0.0
         held = float(np.abs(problem.initial.y).max(initial=0.0))
-        self.least = max(held, LEAST_PEAK * problem.scene.u_peak * form.gain)
+        # Of a source of current the scene knows no peak.
+        self.expected = form.gain * (problem.scene.u_peak or wave.peak(0.0, problem.t_stop))
+        self.least = max(held, LEAST_PEAK * self.expected)
         # Modes, behind them under `mobile` the gap voltage, and the source.
         self.z, self.u_last = form.start(problem)
         self.level, self.outputs, self.steps, self.refused, self.evaluated, self.margin = 0, 0, 0, 0, 0, 1.0
         # Errors of the modes so far, as if they were alike, and products of two, as if they came by chance.
         m = form.lanes.rates.size
         self.alike, self.chance = np.zeros(m), np.zeros((m, m))
-        # Largest |xi| (V), and errors seen of gap voltage (V), force (N), nodes (V) and charges (C); errors that are
-        # stated of the piece that the ordinary engine has integrated.
-        self.peak, self.errors, self.led = 0.0, np.zeros(4), np.zeros(4)
+        # Largest |xi| (V), and errors seen of gap voltage (V), force (N), nodes (V) and charges (C).
+        self.peak, self.errors = 0.0, np.zeros(4)
 
     @property
     def scale(self) -> float:
@@ -107,8 +109,8 @@ class LaneMarch:
     def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
         """Integrate a piece with the source's `values` (V), and write the outputs before its end as rows of `out`."""
         self.loudest = max(self.loudest, float(values.max()), -float(values.min()))
-        if piece.led:
-            return self._lead(piece, values, t_out, out)
+        if piece.grows:
+            piece, values = self._growing(piece, values)
         h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
         block = Block(self.form, values, h, self.steps == 0)
         starts_at = self.form.after(self.z, float(values[0]))
@@ -123,7 +125,7 @@ class LaneMarch:
                 if not (self.form.gap(np.array(peak)) <= self.form.u_top and self._on_branch(block, starts_at, peak)):
                     return Outcome.LOST
                 seen = judge(block, parts, max(peak, self.peak), self.alike, self.chance)
-                excess = self._excess(seen, max(peak, self.peak))
+                excess = self._excess(seen, max(peak, self.peak), LEAST_AT_START if piece.grows else LEAST_PEAK)
             if excess <= 1.0:
                 break
             self.refused += parts * block.n
@@ -137,36 +139,34 @@ class LaneMarch:
         self.steps += parts * block.n
         self._write(piece, block, parts, t_out, out)
         self.z, self.t, self.u_last = block.end(), piece.stop, float(values[-1])
-        if excess < COARSER and self.level > 0:
+        if piece.grows:
+            self.level = 0
+        elif excess < COARSER and self.level > 0:
             self.level -= 1
         return Outcome.MET
+
+    def _growing(self, piece: Piece, values: FloatArray) -> tuple[Piece, FloatArray]:
+        """A piece on one line of the source, with steps that grow from a part of the shortest time constant on."""
+        span = piece.stop - piece.start
+        shortest = min(EARLY / float(self.form.lanes.rates.max()), span / (LANES * GROWN))
+        share = np.append(0.0, np.geomspace(shortest / span, 1.0, LANES * GROWN))
+        share[-1] = 1.0
+        line = values[0] + share * (values[-1] - values[0])
+        return replace(piece, times=piece.start + share * span), line
 
     def _on_branch(self, block: Block, start: float, peak: float) -> bool:
         """Whether the gap voltage stays clear of folds, and on the branch on which it starts."""
         near = block.n == 0 or not self.form.mobile or abs(block.xi[0] - start) <= 0.01 * peak
         return near and block.on_one_branch and block.margin > LEAST_MARGIN
 
-    def _lead(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
-        """Integrate a piece by the ordinary engine, and take over its state."""
-        count = int(np.searchsorted(t_out, piece.stop - 1e-9 * piece.spacing))
-        problem = replace(self.problem, t_start=piece.start, t_stop=piece.stop, first=piece.start)
-        run = solve_ordinary(
-            problem, min(LED_SHARE * self.rtol, LED_MOST), t_out[:count], np.zeros(count, bool), repeat=False
-        )  # fmt: skip
-        if run.status is not Status.SUCCESS:
-            return Outcome.LOST
-        out[:, :count] = run.rows.T[: self.width]
-        self.z, _ = self.form.start(replace(self.problem, initial=run.state))
-        self.outputs, self.t, self.u_last = count, piece.stop, float(values[-1])
-        self.peak, error = abs(self.form.xi_at(self.z, self.u_last)), run.error
-        self.led = np.array([error.u_gap, error.f_el, error.v_nodes or 0.0, error.q_source or 0.0])
-        return Outcome.MET
+    def _excess(self, seen: Judged, peak: float, share: float) -> float:
+        """Excess of the stated over the allowed error, with a block's.
 
-    def _excess(self, seen: Judged, peak: float) -> float:
-        """Excess of the stated over the allowed error, with a block's."""
+        It is related to a `share` of the largest gap voltage to expect at least.
+        """
         gaps, _, _ = self._stated(np.maximum(seen.errors, self.errors), peak)
-        least = self.least, float(self.form.force(np.array(self.least)))
-        gaps[0, :2] = np.maximum(gaps[0, :2], least)
+        least = max(self.least, share * self.expected)
+        gaps[0, :2] = np.maximum(gaps[0, :2], [least, float(self.form.force(np.array(least)))])
         excess = excess_of(gaps, self.problem.rounding) / self.rtol
         if self.share < 1.0:
             excess = max(excess, SAFETY * seen.alone / (self.share * self.rtol * max(peak, self.least)))
@@ -235,17 +235,17 @@ class LaneMarch:
 
     def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
         form, u_peak = self.form, self.problem.scene.u_peak
-        missed, at, led = form.missed, np.array(peak), self.led.tolist()
+        missed, at = form.missed, np.array(peak)
         u, force = float(form.gap(at)), float(form.force(at))
         floor = 4e-16 * (peak + form.gain * max(u_peak, self.loudest))
         floor += (1.0 / self.margin if form.mobile else DIVIDED) * missed * peak
         floor += form.lanes.kappa * form.missed_bend
-        u_error = SAFETY * float(errors[0]) + floor + led[0]
-        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force + led[1]
-        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + floor + led[2]
+        u_error = SAFETY * float(errors[0]) + floor
+        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force
+        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + floor
         charge_error = None
         if form.flows:
-            charge_error = OF_CHARGE * float(errors[3]) + led[3]
+            charge_error = OF_CHARGE * float(errors[3])
             charge_error += form.missed_bend * float(np.abs(form.rows.bends[-form.flows :]).max())
             charge_error += (LEAKED * missed + 4e-16 * (1.0 + self.steps)) * form.held * (self.problem.largest + peak)
         return np.array([[u, force, u_error, f_error]]), node_error, charge_error
@@ -253,7 +253,7 @@ class LaneMarch:
     def mark(self) -> dict[str, Any]:
         """The state of the integration as plain data, which `stand` restores in another march through the same run."""
         names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak", "margin")
-        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors", "led")}
+        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors")}
         return {name: getattr(self, name) for name in names} | arrays
 
     def stand(self, mark: dict[str, Any]) -> None:

@@ -34,9 +34,9 @@ class Piece:
     # samples
     first: int = 0
     last: int = 0
-    # Whether the ordinary engine integrates it: where a run of a network starts, the source may jump, after which fast
+    # Whether its steps grow from its start on: where a run of a network starts, the source may jump, after which fast
     # modes decay that no step of a sample resolves
-    led: bool = False
+    grows: bool = False
     # (n,): Of the points of a PWL at uneven times, s; None for samples. `spacing` is then the mean distance in the run.
     times: FloatArray | None = None
 
@@ -125,16 +125,16 @@ def pieces_of(problem: Problem) -> list[Piece] | None:
     ):
         # In most of the run the source is one long line, of which the other methods need few steps.
         return None
-    led, begin, end = problem.scene.stack is None, wave.start + first * spacing, wave.start + last * spacing
+    grows, begin, end = problem.scene.stack is None, wave.start + first * spacing, wave.start + last * spacing
     early = begin - t0 > 1e-6 * spacing
     edges = [first, *range((first // PIECE + 1) * PIECE, last, PIECE), last]
-    if led and not early:
+    if grows and not early:
         edges.insert(1, first + 1)
     out = [Piece(wave.start + a * spacing, spacing, a, b) for a, b in itertools.pairwise(edges) if a < b]
     if early:
         out.insert(0, Piece(t0, begin - t0))
-    if led:
-        out[0] = replace(out[0], led=True)
+    if grows:
+        out[0] = replace(out[0], grows=True)
     if t1 - end > 1e-6 * spacing:
         out.append(Piece(end, t1 - end))
     return out
