@@ -181,7 +181,7 @@ class Block:
         for place in self._windows(width):
             first = np.maximum(place, 0)
             coarse = self.kept[:, lanes[:, None], first[:, None] + np.arange(width + 1)]
-            fine = np.zeros_like(coarse)
+            fine = np.zeros(coarse.shape)
             self._begin(coarse[: self.m, :, 0], self.first + first, fine)
             self._span(self.first + first, width, 2 * parts, -1.0, fine)
             found = np.where((place >= 0)[:, None], fine - coarse, 0.0)
