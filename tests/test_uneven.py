@@ -9,8 +9,8 @@ import pytest
 from scipy import integrate
 
 import fingerspice as fs
-from fingerspice.engine.lanerows import INNER, PER_MODE, PER_MODE_BENT, Lanes
-from fingerspice.engine.lanes import weigh
+from fingerspice.engine.lanerows import INNER, Lanes, weighed
+from fingerspice.engine.laneweights import weigh
 from fingerspice.solve.pieces import LEAST_POINTS
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
@@ -133,19 +133,19 @@ def through(nodes: np.ndarray, j: int) -> np.poly1d:
 def test_weights_are_integrals_of_decaying_exponentials_times_polynomials() -> None:
     # From steps much shorter than the time constants to much longer ones.
     rates, gain, h = np.array([0.0, 3.0, 4e3]), np.array([1.0, -2.0, 5.0]), np.geomspace(1e-7, 0.3, 14)
-    none = np.zeros(1)
-    # With one leak and N, as in a network.
-    lanes = Lanes(
-        rates, gain, np.zeros(3), 0.0, np.zeros((1, 3)), none, none, np.zeros((3, 2)), none, none, none, 1.0, 0.0, 1.0,
-        0.0, np.zeros(2), 0.0, 0.0, 0,
-    )  # fmt: skip
-    found = np.empty((3 * (PER_MODE + PER_MODE_BENT) + 1 + 6, h.size))
-    weigh(lanes, h, found)
-    nodes = np.array([0.0, *INNER, 1.0])
+    none, nodes, rows = np.zeros(1), np.array([0.0, *INNER, 1.0]), weighed(3, 3, 1, 1)
     ends = [np.poly1d([-1.0, 1.0]), np.poly1d([1.0, 0.0])]
     for k, rate in enumerate(rates):
+        # With one leak and N, as in a network, and with this mode alone in xi.
+        lanes = Lanes(
+            rates, gain, np.eye(3)[k], 0.0, np.zeros((1, 3)), none, none, np.ones((3, 2)), none, none, none, 1.0, 0.0,
+            1.0, 0.0, np.zeros(2), 0.0, 0.0, 0,
+        )  # fmt: skip
+        found = np.empty((rows.end, h.size))
+        weigh(lanes, 3, h, found)
         for i, length in enumerate(h):
-            z, own = rate * length, found[k * PER_MODE :, i]
+            z, own = rate * length, found[k * rows.mode :, i]
+            at_nodes = found[rows.node : rows.end, i].reshape(3, 2, rows.one)[:, 0]
 
             def integral(poly: np.poly1d, at: float, z: float = z) -> float:
                 early = 0.0 if z == 0.0 else max(0.0, at - 40.0 / z)
@@ -153,23 +153,23 @@ def test_weights_are_integrals_of_decaying_exponentials_times_polynomials() -> N
                     lambda x: np.exp(-z * (at - x)) * poly(x), early, at, epsabs=1e-14, epsrel=1e-13
                 )[0])  # fmt: skip
 
-            for node, at in enumerate(nodes[1:]):
-                true = [np.exp(-z * at), *(gain[k] * length * integral(end, at) for end in ends)]
-                assert own[6 * node : 6 * node + 3] == pytest.approx(true, rel=1e-9, abs=1e-12 * length + 3e-16)
+            for node, at in enumerate(nodes[1:], 1):
+                row, close = at_nodes[node - 1], {"rel": 1e-9, "abs": 1e-12 * length + 3e-16}
+                assert row[:2] == pytest.approx([gain[k] * length * integral(end, at) for end in ends], **close)
+                assert row[2:5] == pytest.approx(np.exp(-z * at) * np.eye(3)[k], **close)
                 # Polynomials through the leaks at the nodes so far; the second lacks the error of the first.
-                true = [length * integral(through(nodes[: node + 1], j), at) for j in range(node + 1)]
-                if node == 1:
+                true = [length * integral(through(nodes[:node], j), at) for j in range(node)]
+                if node == 2:
                     lacks = 0.5 * nodes[1] * length * integral(np.poly1d([1.0]), at) / at
-                    true[:2] = [true[0] - lacks, true[1] + lacks]
-                leaks = own[6 * node + 3 : 6 * node + 6]
-                assert leaks == pytest.approx([*true, 0.0, 0.0][:3], rel=1e-9, abs=1e-12 * length)
+                    true = [true[0] - lacks, true[1] + lacks]
+                assert row[5:-1:2] == pytest.approx([*true, 0.0, 0.0][:3], **close)
+                true = [length * integral(through(nodes[: node + 1], j), at) for j in range(node + 1)]
+                assert row[6:-1:2] == pytest.approx([*true[:-1], 0.0, 0.0][:3], **close)
+                assert row[-1] == pytest.approx(true[-1], **close)
+            assert own[:3] == pytest.approx(np.exp(-z * (1.0 - nodes[:3])), **close)
+            assert own[3:5] == pytest.approx(row[:2])
             true = [length * integral(through(nodes, j), 1.0) for j in range(4)]
-            assert own[18:22] == pytest.approx(true, rel=1e-9, abs=1e-12 * length)
-            bent = found[3 * PER_MODE + 1 + k * PER_MODE_BENT :, i]
-            for node in range(1, 4):
-                true = [length * integral(through(nodes[: node + 1], j), nodes[node]) for j in range(node + 1)]
-                rows = slice((node - 1) * (node + 2) // 2, node * (node + 3) // 2)
-                assert bent[rows] == pytest.approx(true, rel=1e-9, abs=2e-12 * length)
+            assert own[5 : rows.mode - 1] == pytest.approx(np.repeat(true, 2), **close)
             quartic = np.poly1d(nodes, True)
             quartic /= quartic.deriv()(1.0)
-            assert bent[9] == pytest.approx(length * integral(quartic, 1.0), rel=1e-9, abs=1e-12 * length)
+            assert own[rows.mode - 1] == pytest.approx(length * integral(quartic, 1.0), **close)

@@ -10,29 +10,29 @@ from fingerspice.engine.lanerows import (
     END_SLOPES,
     FADED,
     NODES,
-    PER_MODE,
-    PER_MODE_BENT,
-    PER_NODE,
     SOURCES,
     places,
     polynomial_rows,
+    project,
     rise_of,
+    weights_of,
 )
 
 
 @jit_within
-def drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shared: int, state: FloatArray) -> None:
+def drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shares: bool, state: FloatArray) -> None:
     """Drives at node j, from xi there, but for N, and from what 1/A - q0 multiplies there.
 
-    In a network xi = X + B N(xi), where X is given, and B is the share number `shared`, or 0 if that is negative. It is
+    In a network xi = X + B N(xi), where X is given, and B is the share of N at this node, or 0 if it has none. It is
     solved on the tangent of N at node `before`, and once more on the one at the place that is found. Tangents have the
     slope -q / d, d = q0 (q0 + q) - kappa q, where 1/A = q0 + q.
     """
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     drives, x = leaks + len(marks.bend), at.scratch
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    count = len(marks.modes)
-    share_at, on = count * (PER_MODE + PER_MODE_BENT) + 1 + max(shared, 0) * (1 + leaks), 1.0 if shared >= 0 else 0.0
+    # The share of xi, and with steps of `one` those of what 1/A - q0 multiplies.
+    one, on = weights_of(marks).one, 1.0 if shares else 0.0
+    share_at = weights_of(marks).node + (j - 1) * (1 + leaks) * one + one - 1
     if drives > leaks:
         for i in range(lanes):
             there, bend = state[(at.xi + before) * lanes + i], state[(at.g + before * drives + leaks) * lanes + i]
@@ -61,24 +61,12 @@ def drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shar
             state[at.q * lanes + i] = q
             state[(at.g + j * drives + leaks) * lanes + i] = bend
             for t in range(leaks):
-                more = c.bent[t] + on * weights[(share_at + 1 + t) * wide + i * each]
+                more = c.bent[t] + on * weights[(share_at + (1 + t) * one) * wide + i * each]
                 state[(at.w + leaks + t) * lanes + i] += more * bend
     for t in range(leaks):
         for i in range(lanes):
             w = state[(at.w + leaks + t) * lanes + i]
             state[(at.g + j * drives + t) * lanes + i] = state[(x + 1) * lanes + i] * w
-
-
-@jit_within
-def add_bend(marks: Any, c: Any, k: int, j: int, weights: FloatArray, state: FloatArray) -> None:
-    """Add mode k's response to N at the nodes before j to the first row of scratch."""
-    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives, own = leaks + 1, len(marks.modes) * PER_MODE + 1 + k * PER_MODE_BENT + (j - 1) * (j + 2) // 2
-    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    for node in range(j):
-        for i in range(lanes):
-            by = c.feed[k, leaks] * weights[(own + node) * wide + i * each]
-            state[at.scratch * lanes + i] += by * state[(at.g + node * drives + leaks) * lanes + i]
 
 
 @jit_within
@@ -90,7 +78,7 @@ def _changes(marks: Any, c: Any, weights: FloatArray, node: int, state: FloatArr
     lanes, active, leaks, at = len(marks.lanes), len(marks.active), len(marks.leaks), places(marks)
     drives, x = leaks + 1, at.scratch
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    length = len(marks.modes) * PER_MODE
+    length = weights_of(marks).length
     for i in range(lanes):
         state[x * lanes + i] = c.k * (state[lanes + i] - state[i])
         state[(x + 2) * lanes + i] = 0.0
@@ -119,20 +107,16 @@ def smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
     lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
     drives, last, at = leaks + 1, NODES - 1, places(marks)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    fades = False
+    fades, length = False, weights_of(marks).length
     for i in range(lanes if len(marks.own) > 0 else 1):
-        fades = fades or c.rates[c.fast] * weights[m * PER_MODE * wide + i * each] > FADED
+        fades = fades or c.rates[c.fast] * weights[length * wide + i * each] > FADED
     if not fades:
         return False
     _changes(marks, c, weights, 0, state)
-    for i in range(lanes):
-        state[(at.xi + last) * lanes + i] = c.k * state[i]
-        for t in range(leaks):
-            state[(at.w + leaks + t) * lanes + i] = c.tap_s[t] * state[i]
     for k in range(active):
         rate, over, gain, feed = c.rates[k], 1.0 / (c.rates[k] + 1e-300), c.gain[k], c.feed[k, leaks]
         for i in range(lanes):
-            z, h = state[(SOURCES + k) * lanes + i], weights[m * PER_MODE * wide + i * each]
+            z, h = state[(SOURCES + k) * lanes + i], weights[length * wide + i * each]
             fed = gain * state[i]
             for t in range(drives):
                 fed += c.feed[k, t] * state[(at.g + t) * lanes + i]
@@ -141,10 +125,8 @@ def smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
             soon = soon if rate * h > FADED else z
             state[(at.gone + k) * lanes + i] = z - soon
             state[(SOURCES + k) * lanes + i] = soon
-            state[(at.xi + last) * lanes + i] += c.shape[k] * soon
-            for t in range(leaks):
-                state[(at.w + leaks + t) * lanes + i] += c.taps[t, k] * soon
-    drives_at(marks, c, weights, last, 0, -1, state)
+    project(marks, c, 0, at.xi + last, state)
+    drives_at(marks, c, weights, last, 0, False, state)
     for i in range(lanes):
         state[at.xi * lanes + i] = state[(at.xi + last) * lanes + i]
         state[(at.q + 2) * lanes + i] = rise_of(c.q0, c.kappa, state[at.q * lanes + i])
@@ -171,49 +153,39 @@ def bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
             of_cubic = END_SLOPES[j] * state[(at.g + j * drives + leaks) * lanes + i]
             state[at.scratch * lanes + i] -= of_cubic
     for k in range(m):
-        p = m * PER_MODE + (k + 1) * PER_MODE_BENT
+        p = (k + 1) * weights_of(marks).mode - 1
         for i in range(lanes):
-            by = c.feed[k, leaks] * weights[p * wide + i * each]
-            state[(SOURCES + k) * lanes + i] += by * state[at.scratch * lanes + i]
+            state[(SOURCES + k) * lanes + i] += weights[p * wide + i * each] * state[at.scratch * lanes + i]
 
 
 @jit_within
 def fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """Add what is left of what `smooth` has taken, and the modes' response to it by N and, as one, by the leaks."""
     lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
-    at, end = places(marks), PER_NODE * (NODES - 2)
+    at, rows = places(marks), weights_of(marks)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for k in range(m):
         for f in range(active):
             apart = c.rates[k] - c.rates[f]
             over, alike = 1.0 / (apart if apart != 0.0 else 1.0), abs(apart) <= 1e-6 * c.rates[f]
             for i in range(lanes):
-                decay = weights[(k * PER_MODE + end) * wide + i * each]
-                faded = weights[(f * PER_MODE + end) * wide + i * each]
+                decay = weights[k * rows.mode * wide + i * each]
+                faded = weights[f * rows.mode * wide + i * each]
                 gone = state[(at.gone + f) * lanes + i]
                 fed = c.feed[k, leaks] * state[(at.q + 2) * lanes + i] * c.shape[f] * gone
                 if f == c.fast:
                     for t in range(leaks):
                         fed += c.feed[k, t] * state[(at.gone + m + t) * lanes + i]
-                pulse = weights[m * PER_MODE * wide + i * each] * faded if alike else (faded - decay) * over
+                pulse = weights[rows.length * wide + i * each] * faded if alike else (faded - decay) * over
                 state[(SOURCES + k) * lanes + i] += pulse * fed + (decay * gone if k == f else 0.0)
 
 
 @jit_within
 def end_bent(marks: Any, c: Any, state: FloatArray) -> None:
     """xi and the drives at the end of a step, from the modes there and on the tangents at the last node, to node 0."""
-    lanes, active, leaks, at = len(marks.lanes), len(marks.active), len(marks.leaks), places(marks)
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     drives, last = leaks + 1, NODES - 1
-    for i in range(lanes):
-        state[at.xi * lanes + i] = c.k * state[lanes + i]
-        for t in range(leaks):
-            state[(at.w + t) * lanes + i] = c.tap_s[t] * state[lanes + i]
-    for k in range(active):
-        for i in range(lanes):
-            z = state[(SOURCES + k) * lanes + i]
-            state[at.xi * lanes + i] += c.shape[k] * z
-            for t in range(leaks):
-                state[(at.w + t) * lanes + i] += c.taps[t, k] * z
+    project(marks, c, 1, at.xi, state)
     for i in range(lanes):
         xi, found, q = state[at.xi * lanes + i], state[(at.xi + last) * lanes + i], state[at.q * lanes + i]
         bend = state[(at.g + last * drives + leaks) * lanes + i]
@@ -221,5 +193,5 @@ def end_bent(marks: Any, c: Any, state: FloatArray) -> None:
         q += state[(at.q + 1) * lanes + i] * (abs(xi) - abs(found))
         state[at.q * lanes + i], state[(at.g + leaks) * lanes + i] = q, bend
         for t in range(leaks):
-            w = state[(at.w + t) * lanes + i] + c.bent[t] * bend
+            w = state[(at.w + leaks + t) * lanes + i] + c.bent[t] * bend
             state[(at.w + t) * lanes + i], state[(at.g + t) * lanes + i] = w, q * w

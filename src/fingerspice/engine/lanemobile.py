@@ -10,7 +10,7 @@ from typing import Any
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_within
-from fingerspice.engine.lanerows import NODES, SOURCES, places, polynomial_rows
+from fingerspice.engine.lanerows import NODES, places, polynomial_rows, project
 
 
 @jit_within
@@ -53,17 +53,8 @@ def drives_under_mobile(marks: Any, c: Any, j: int, before: int, state: FloatArr
 @jit_within
 def end_mobile(marks: Any, c: Any, state: FloatArray) -> None:
     """Gap voltage and drives at the end of a step, from the modes there, to node 0."""
-    lanes, active, drives, at = len(marks.lanes), len(marks.active), len(marks.leaks), places(marks)
-    for i in range(lanes):
-        state[at.xi * lanes + i] = c.k * state[lanes + i]
-        for t in range(drives):
-            state[(at.w + drives + t) * lanes + i] = c.tap_s[t] * state[lanes + i]
-    for k in range(active):
-        for i in range(lanes):
-            z = state[(SOURCES + k) * lanes + i]
-            state[at.xi * lanes + i] += c.shape[k] * z
-            for t in range(drives):
-                state[(at.w + drives + t) * lanes + i] += c.taps[t, k] * z
+    lanes, drives, at = len(marks.lanes), len(marks.leaks), places(marks)
+    project(marks, c, 1, at.xi, state)
     drives_under_mobile(marks, c, 0, NODES - 1, state)
     for t in range(drives):
         for i in range(lanes):

@@ -20,14 +20,6 @@ NODES = 4
 # Coefficients of the Lagrange polynomials through the nodes, and their slopes at the end of the step.
 BASIS = np.ascontiguousarray(np.linalg.inv(np.vander((0.0, *INNER, 1.0), increasing=True)).T)
 END_SLOPES = BASIS @ np.array([0.0, 1.0, 2.0, 3.0])
-# Weights of a mode up to each later node: decay, both ends of the source, and leaks at all nodes but the last, 0 from
-# that node on; then of the cubic through drives at all nodes.
-PER_NODE = 3 + NODES - 1
-PER_MODE = PER_NODE * (NODES - 1) + NODES
-# In a network behind those of all modes and the step's length, for each mode: N at node j and those before, from row
-# (j - 1) (j + 2) / 2 on; then a slope at the end of the step. Behind them, for each node, the share of N in xi there,
-# and in what 1/A - q0 multiplies.
-PER_MODE_BENT = (NODES - 1) * (NODES + 2) // 2 + 1
 # Rows of the lanes' state before those of the modes: the source at both ends of a part, and at the last sample.
 SOURCES = 3
 # Time constants in a step from which on a mode is taken to follow the drives.
@@ -80,7 +72,6 @@ class Rows(NamedTuple):
 
     xi: int  # At the nodes
     g: int  # Drives at the nodes
-    fed: int  # What the leaks feed to each mode at the nodes
     w: int  # What 1/A - q0 multiplies at the start, and at the latest node
     scratch: int
     q: int  # 1/A - q0 at the latest node, its derivative, and in a network dN/dxi where fading modes soon are, or B
@@ -97,15 +88,65 @@ def rows_of(marks: Any) -> Rows:
     m, leaks, drives = len(marks.modes), len(marks.leaks), len(marks.leaks) + len(marks.bend)
     xi = SOURCES + m
     g = xi + NODES
-    fed = g + NODES * drives
-    w = fed + NODES * m
+    w = g + NODES * drives
     scratch = w + 2 * leaks
     q = scratch + 5 + NODES + drives
     more = m + drives if drives > leaks else 3 if len(marks.mobile) > 0 else 0
-    return Rows(xi, g, fed, w, scratch, q, q + 3, q + 3, q + 4, q + 3 + more if more > 0 else q)
+    return Rows(xi, g, w, scratch, q, q + 3, q + 3, q + 4, q + 3 + more if more > 0 else q)
 
 
 places = jit_within(rows_of)
+
+
+class Weighed(NamedTuple):
+    """Rows of the weights of a step.
+
+    Each mode has its decay, those from the inner nodes to the end, its response to the source at both ends, and to each
+    drive at each node; in a network also to what N has beside the cubic, by its slope at the end. Behind the row of the
+    step's length, each later node has xi, and what 1/A - q0 multiplies in each leak: by the source at both ends, by the
+    active modes, and by each drive at each node but the last; in a network also by N at this node.
+    """
+
+    mode: int  # Rows of a mode
+    length: int
+    node: int  # First row of those of nodes
+    one: int  # Rows of one quantity at a node
+    end: int
+
+
+def weighed(modes: int, active: int, leaks: int, bend: int) -> Weighed:
+    """The rows of the weights with so many modes, active modes, leaks, and 1 for a network."""
+    drives = leaks + bend
+    mode, one = 5 + NODES * drives + bend, 2 + active + (NODES - 1) * drives + bend
+    length = modes * mode
+    return Weighed(mode, length, length + 1, one, length + 1 + (NODES - 1) * (1 + leaks) * one)
+
+
+@jit_within
+def weights_of(marks: Any) -> Weighed:
+    """The same for the marks of compiled code."""
+    return _weighed(len(marks.modes), len(marks.active), len(marks.leaks), len(marks.bend))
+
+
+_weighed = jit_within(weighed)
+
+
+@jit_within
+def project(marks: Any, c: Any, place: int, to: int, state: FloatArray) -> None:
+    """xi, into row `to`, and what 1/A - q0 multiplies but for N, from the modes and the source at one end."""
+    lanes, active, leaks, at = len(marks.lanes), len(marks.active), len(marks.leaks), places(marks)
+    for i in range(lanes):
+        source = state[place * lanes + i]
+        xi = c.k * source
+        for k in range(active):
+            xi += c.shape[k] * state[(SOURCES + k) * lanes + i]
+        state[to * lanes + i] = xi
+    for t in range(leaks):
+        for i in range(lanes):
+            w = c.tap_s[t] * state[place * lanes + i]
+            for k in range(active):
+                w += c.taps[t, k] * state[(SOURCES + k) * lanes + i]
+            state[(at.w + leaks + t) * lanes + i] = w
 
 
 @jit_rows

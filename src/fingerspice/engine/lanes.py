@@ -9,7 +9,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.lanerows import NODES, PER_MODE, PER_NODE, SOURCES, places
+from fingerspice.engine.lanerows import SOURCES, places
 from fingerspice.engine.lanestep import step
 from fingerspice.engine.laneweights import weigh
 
@@ -80,7 +80,7 @@ def span(
             if len(marks.own) > 0:
                 for i in range(lanes):
                     length[i] = h[first[i] + done + k] / parts
-                weigh(c, length, weights)
+                weigh(c, active, length, weights)
             for p in range(parts):
                 step(marks, c, flat, state, after[k * lanes :], p / parts, (p + 1) / parts)
             for i in range(rows * lanes):
@@ -113,8 +113,11 @@ def span(
 
 
 @jit
-def along(weights: FloatArray, x: FloatArray, first: IntArray, count: int, z: FloatArray) -> None:
-    """Advance modes z (m, lanes) by `count` samples with the area at its reference and steps of one length."""
+def along(mode: int, weights: FloatArray, x: FloatArray, first: IntArray, count: int, z: FloatArray) -> None:
+    """Advance modes z (m, lanes) by `count` samples with the area at its reference and steps of one length.
+
+    `mode` is the number of rows of weights of a mode.
+    """
     lanes, now, after = first.size, np.empty(first.size), np.empty(first.size)
     for i in range(lanes):
         now[i] = x[first[i]]
@@ -122,8 +125,7 @@ def along(weights: FloatArray, x: FloatArray, first: IntArray, count: int, z: Fl
         for i in range(lanes):
             after[i] = x[first[i] + t + 1]
         for k in range(z.shape[0]):
-            p = k * PER_MODE + PER_NODE * (NODES - 2)
-            decay, before, last = weights[p, 0], weights[p + 1, 0], weights[p + 2, 0]
+            decay, before, last = weights[k * mode, 0], weights[k * mode + 3, 0], weights[k * mode + 4, 0]
             for i in range(lanes):
                 z[k, i] = decay * z[k, i] + before * now[i] + last * after[i]
         for i in range(lanes):
@@ -166,7 +168,7 @@ def within(
             for k in range(m):
                 modes[k, i] = starts[k, j]
         begin(marks, c, still, modes, before, state)
-        weigh(c, length, weights)
+        weigh(c, len(marks.active), length, weights)
         for p in range(parts):
             step(marks, c, weights.reshape(-1), state, after, p / parts, (p + 1) / parts)
         for i in range(min(lanes, h.size - first)):

@@ -24,7 +24,7 @@ from typing import Any
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
-from fingerspice.engine.lanebend import add_bend, bend_end, drives_at, end_bent, fade, smooth
+from fingerspice.engine.lanebend import bend_end, drives_at, end_bent, fade, smooth
 from fingerspice.engine.lanemobile import drives_under_mobile, end_mobile, weaken_kinks
 from fingerspice.engine.lanerows import (
     BASIS,
@@ -33,10 +33,9 @@ from fingerspice.engine.lanerows import (
     INNER_WEIGHT,
     NODES,
     OUTER_WEIGHT,
-    PER_MODE,
-    PER_NODE,
     SOURCES,
     places,
+    weights_of,
 )
 
 
@@ -46,48 +45,22 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
 
     `weights` are those of the part's length.
     """
-    lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
-    drives, at = leaks + len(marks.bend), places(marks)
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    drives = leaks + len(marks.bend)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    length = m * PER_MODE
     for i in range(lanes):
         before = state[2 * lanes + i]
         change = after[i] - before
         state[i], state[lanes + i] = before + a * change, before + b * change
     fades = drives > leaks and a == 0.0 and smooth(marks, c, weights, state)
-    _feed(marks, c, 0, state)
     for j in range(1, NODES):
-        until = INNER[0] if j == 1 else INNER[1] if j == 2 else 1.0
-        for i in range(lanes):
-            s = state[i] + until * (state[lanes + i] - state[i])
-            state[(at.xi + j) * lanes + i] = c.k * s
-            for t in range(leaks):
-                state[(at.w + leaks + t) * lanes + i] = c.tap_s[t] * s
-        for k in range(active):
-            p, fed = k * PER_MODE + (j - 1) * PER_NODE, at.fed + k * NODES
-            for i in range(lanes):
-                state[at.scratch * lanes + i] = (
-                    weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
-                    + weights[(p + 1) * wide + i * each] * state[i]
-                    + weights[(p + 2) * wide + i * each] * state[lanes + i]
-                    + weights[(p + 3) * wide + i * each] * state[fed * lanes + i]
-                    + weights[(p + 4) * wide + i * each] * state[(fed + 1) * lanes + i]
-                    + weights[(p + 5) * wide + i * each] * state[(fed + 2) * lanes + i]
-                )
-            if drives > leaks:
-                add_bend(marks, c, k, j, weights, state)
-            for i in range(lanes):
-                z = state[at.scratch * lanes + i]
-                state[(at.xi + j) * lanes + i] += c.shape[k] * z
-                for t in range(leaks):
-                    state[(at.w + leaks + t) * lanes + i] += c.taps[t, k] * z
+        _predict(marks, weights, j, state)
         if len(marks.mobile) > 0:
             drives_under_mobile(marks, c, j, j - 1, state)
         else:
-            drives_at(marks, c, weights, j, j - 1, j - 1, state)
-        _feed(marks, c, j, state)
+            drives_at(marks, c, weights, j, j - 1, True, state)
     for i in range(lanes):
-        state[(at.scratch + 1) * lanes + i] = weights[length * wide + i * each]
+        state[(at.scratch + 1) * lanes + i] = weights[weights_of(marks).length * wide + i * each]
     _kinks(marks, c, state)
     _advance(marks, c, weights, state)
     if drives > leaks:
@@ -100,7 +73,7 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
     else:
         for i in range(lanes):
             xi = c.k * state[lanes + i]
-            for k in range(active):
+            for k in range(len(marks.active)):
                 xi += c.shape[k] * state[(SOURCES + k) * lanes + i]
             state[at.xi * lanes + i] = xi
             for t in range(drives):
@@ -113,45 +86,47 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
 
 
 @jit_within
-def _feed(marks: Any, c: Any, j: int, state: FloatArray) -> None:
-    """What the leaks at node j feed to each mode."""
-    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    first = at.g + j * (leaks + len(marks.bend))
-    for k in range(len(marks.modes)):
+def _predict(marks: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
+    """xi at node j, and what 1/A - q0 multiplies there, from the start of the step and the drives at earlier nodes."""
+    lanes, active, leaks = len(marks.lanes), len(marks.active), len(marks.leaks)
+    at, rows = places(marks), weights_of(marks)
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    for p in range(1 + leaks):
+        first = rows.node + ((j - 1) * (1 + leaks) + p) * rows.one
+        to = at.xi + j if p == 0 else at.w + leaks + p - 1
         for i in range(lanes):
-            fed = 0.0
-            for t in range(leaks):
-                fed += c.feed[k, t] * state[(first + t) * lanes + i]
-            state[(at.fed + k * NODES + j) * lanes + i] = fed
+            x = weights[first * wide + i * each] * state[i] + weights[(first + 1) * wide + i * each] * state[lanes + i]
+            for k in range(active):
+                x += weights[(first + 2 + k) * wide + i * each] * state[(SOURCES + k) * lanes + i]
+            for n in range((NODES - 1) * (leaks + len(marks.bend))):
+                x += weights[(first + 2 + active + n) * wide + i * each] * state[(at.g + n) * lanes + i]
+            state[to * lanes + i] = x
 
 
 @jit_within
 def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """The modes at the end of a step, from the drives at its nodes and what the rule misses of them."""
-    lanes, m, leaks, at = len(marks.lanes), len(marks.modes), len(marks.leaks), places(marks)
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     drives, late_at = leaks + len(marks.bend), at.scratch + 5
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    for k in range(m):
-        p, fed = k * PER_MODE + PER_NODE * (NODES - 2), at.fed + k * NODES
+    for k in range(len(marks.modes)):
+        p = k * weights_of(marks).mode
         for i in range(lanes):
             # What begins at the kink decays to the end of the step, by the cubic through what begins at the nodes.
             late = state[(late_at + NODES - 1) * lanes + i]
             for j in range(NODES - 1):
-                late += weights[(p - PER_NODE * j) * wide + i * each] * state[(late_at + j) * lanes + i]
+                late += weights[(p + j) * wide + i * each] * state[(late_at + j) * lanes + i]
             if drives > leaks:
                 late *= 1.0 if c.rates[k] * state[(at.scratch + 1) * lanes + i] < FADED else 0.0
             z = (
                 weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
-                + weights[(p + 1) * wide + i * each] * state[i]
-                + weights[(p + 2) * wide + i * each] * state[lanes + i]
+                + weights[(p + 3) * wide + i * each] * state[i]
+                + weights[(p + 4) * wide + i * each] * state[lanes + i]
             )
             for t in range(drives):
                 z += c.feed[k, t] * late * state[(late_at + NODES + t) * lanes + i]
-            for j in range(NODES):
-                drive = state[(fed + j) * lanes + i]
-                if drives > leaks:
-                    drive += c.feed[k, leaks] * state[(at.g + j * drives + leaks) * lanes + i]
-                z += weights[(p + PER_NODE + j) * wide + i * each] * drive
+            for n in range(NODES * drives):
+                z += weights[(p + 5 + n) * wide + i * each] * state[(at.g + n) * lanes + i]
             state[(SOURCES + k) * lanes + i] = z
 
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lanerows import BASIS, INNER, NODES, PER_MODE, PER_MODE_BENT, PER_NODE
+from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.engine.lanerows import BASIS, INNER, NODES, weighed
 
 # Coefficients from x on of the quartic that is 0 at the nodes and has the slope 1 at the end of the step.
 _POWERS: list[float] = np.poly(np.array([0.0, *INNER, 1.0]))[3::-1].tolist()
@@ -30,6 +30,7 @@ _LEAKS, _BENDS = (
 # The first prediction misses the slope of the leaks. The second one is given the opposite error, so that both cancel at
 # the end of the step, whose method is then of third order.
 _LEAKS[1:3, 0] += np.array([-0.5, 0.5]) * INNER[0]
+_weighed = jit_within(weighed)
 # Largest rate times length for which moments follow from the highest one, and that from its series.
 _EARLY = 1.0
 
@@ -113,44 +114,69 @@ def _drive(n: int, terms: int, c: FloatArray, h: FloatArray, m: FloatArray, out:
             out[i] += h[i] * c[j] * m[j, i]
 
 
-@jit
-def _shares(c: Any, weights: FloatArray) -> None:
-    """Shares of N at a node in xi, and in what 1/A - q0 multiplies, from its weights in all modes."""
-    count, leaks = c.rates.size, c.tap_s.size
-    first = count * (PER_MODE + PER_MODE_BENT) + 1
-    weights[first:] = 0.0
-    for node in range(1, NODES):
-        for k in range(count):
-            own = weights[count * PER_MODE + 1 + k * PER_MODE_BENT + (node - 1) * (node + 2) // 2 + node]
-            for i in range(own.size):
-                by = c.feed[k, leaks] * own[i]
-                weights[first + (node - 1) * (1 + leaks), i] += c.shape[k] * by
-                for t in range(leaks):
-                    weights[first + (node - 1) * (1 + leaks) + 1 + t, i] += c.taps[t, k] * by
+@jit_rows
+def _add(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
+    for i in range(n):
+        out[i] += a * x[i]
 
 
 @jit
-def weigh(c: Any, h: FloatArray, weights: FloatArray) -> None:
-    """Weights of steps of the lengths h (n,), into the rows (n,) of `weights`, in the order of `lanestep`."""
-    rates, n, m, count = c.rates, h.size, np.empty((NODES + 2, h.size)), c.rates.size
-    bent = c.feed.shape[1] > c.tap_s.size
+def _gather(c: Any, k: int, j: int, active: int, found: FloatArray, weights: FloatArray) -> None:
+    """Add what mode k does to the quantities at node j, by its weights there.
+
+    `found` has the decay, the weights of the source, of the leaks at the nodes before, and of N at these and itself.
+    """
+    n, leaks, drives = found.shape[1], c.tap_s.size, c.feed.shape[1]
+    for p in range(1 + leaks):
+        by = c.shape[k] if p == 0 else c.taps[p - 1, k]
+        _add(n, by, found[0], weights[p, 2 + k])
+        _add(n, by, found[1], weights[p, 0])
+        _add(n, by, found[2], weights[p, 1])
+        for node in range(j):
+            for t in range(leaks):
+                _add(n, by * c.feed[k, t], found[3 + node], weights[p, 2 + active + node * drives + t])
+            if drives > leaks:
+                own = weights[p, 2 + active + node * drives + leaks]
+                _add(n, by * c.feed[k, leaks], found[3 + j + node], own)
+        if drives > leaks:
+            _add(n, by * c.feed[k, leaks], found[3 + 2 * j], weights[p, 2 + active + (NODES - 1) * drives])
+
+
+@jit
+def weigh(c: Any, active: int, h: FloatArray, weights: FloatArray) -> None:
+    """Weights of steps of the lengths h (n,), into the rows (n,) of `weights` (`engine.lanerows.Weighed`)."""
+    rates, n, m, count, leaks = c.rates, h.size, np.empty((NODES + 2, h.size)), c.rates.size, c.tap_s.size
+    drives, found = c.feed.shape[1], np.empty((3 + 2 * NODES, h.size))
+    bent = drives - leaks
+    mode, length, first, one, _ = _weighed(count, active, leaks, bent)
+    at_nodes = weights[first:].reshape((NODES - 1, 1 + leaks, one, n))
+    at_nodes[:] = 0.0
+    for j in range(1, NODES):
+        at = INNER[j - 1] if j < NODES - 1 else 1.0
+        for p in range(1 + leaks):
+            by = c.k if p == 0 else c.tap_s[p - 1]
+            at_nodes[j - 1, p, 0] = by * (1.0 - at)
+            at_nodes[j - 1, p, 1] = by * at
     for k in range(count):
-        own, more = weights[k * PER_MODE :], weights[count * PER_MODE + 1 + k * PER_MODE_BENT :]
+        own = weights[k * mode :]
         for j in range(1, NODES):
-            at, rows = INNER[j - 1] if j < NODES - 1 else 1.0, own[(j - 1) * PER_NODE :]
-            _moments(NODES if bent else j, rates[k] * at, h, m)
-            _until(n, rates[k], c.gain[k], at, h, m[0], m[1], rows[0], rows[1], rows[2])
-            rows[3 : 3 + NODES - 1] = 0.0
-            for node in range(j):
-                _drive(n, j, _LEAKS[j * (j - 1) // 2 + node], h, m, rows[3 + node])
-            if bent:
-                first = (j - 1) * (j + 2) // 2
-                for node in range(j + 1):
-                    _drive(n, j + 1, _BENDS[first + node], h, m, more[first + node])
+            at = INNER[j - 1] if j < NODES - 1 else 1.0
+            _moments(NODES if bent > 0 else j, rates[k] * at, h, m)
+            _until(n, rates[k], c.gain[k], at, h, m[0], m[1], found[0], found[1], found[2])
+            own[NODES - 1 - j] = found[0]
+            if k < active:
+                for node in range(j):
+                    _drive(n, j, _LEAKS[j * (j - 1) // 2 + node], h, m, found[3 + node])
+                for node in range((j + 1) * bent):
+                    _drive(n, j + 1, _BENDS[(j - 1) * (j + 2) // 2 + node], h, m, found[3 + j + node])
+                _gather(c, k, j, active, found, at_nodes[j - 1])
+        own[3] = found[1]
+        own[4] = found[2]
         for j in range(NODES):
-            _drive(n, NODES, BASIS[j], h, m, own[(NODES - 1) * PER_NODE + j])
-        if bent:
-            _drive(n, NODES, _QUARTIC, h, m[1:], more[PER_MODE_BENT - 1])
-    weights[count * PER_MODE] = h
-    if bent:
-        _shares(c, weights)
+            _drive(n, NODES, BASIS[j], h, m, found[3])
+            for t in range(drives):
+                own[5 + j * drives + t] = c.feed[k, t] * found[3]
+        if bent > 0:
+            _drive(n, NODES, _QUARTIC, h, m[1:], found[3])
+            own[mode - 1] = c.feed[k, leaks] * found[3]
+    weights[length] = h

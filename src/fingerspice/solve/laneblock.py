@@ -122,7 +122,7 @@ class Block:
         self.__dict__.pop("xi", None)
         own = np.zeros((self.m, LANES))
         # A guess, for which uneven points may count as even ones.
-        along(form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
+        along(form.weighed.mode, form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
         starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[: self.m, None], own], axis=1))
         starts[active:] = 0.0
         for sweep in range(LANES + 1):

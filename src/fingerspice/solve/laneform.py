@@ -12,7 +12,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.lanereadout import polynomial_of
-from fingerspice.engine.lanerows import NODES, PER_MODE, PER_MODE_BENT, Lanes, Marks, rows_of
+from fingerspice.engine.lanerows import Lanes, Marks, Weighed, rows_of, weighed
 from fingerspice.engine.laneweights import weigh
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area_array
@@ -86,19 +86,19 @@ class LaneForm(ABC):
         )  # fmt: skip
 
     @property
-    def _weights(self) -> int:
+    def weighed(self) -> Weighed:
+        """Rows of the weights."""
         modes, leaks = self.lanes.rates.size, self.lanes.tap_s.size
-        bent = self.lanes.feed.shape[1] > leaks
-        return modes * PER_MODE + 1 + (modes * PER_MODE_BENT + (NODES - 1) * (1 + leaks) if bent else 0)
+        return weighed(modes, self.active, leaks, self.lanes.feed.shape[1] - leaks)
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
-        return np.zeros(rows_of(self.marks(own)).end * LANES), np.zeros((self._weights, LANES if own else 1))
+        return np.zeros(rows_of(self.marks(own)).end * LANES), np.zeros((self.weighed.end, LANES if own else 1))
 
     def weights(self, h: FloatArray) -> FloatArray:
         """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
-        out = np.empty((self._weights, h.size))
-        weigh(self.lanes, h, out)
+        out = np.empty((self.weighed.end, h.size))
+        weigh(self.lanes, self.active, h, out)
         return out
 
     def _polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
