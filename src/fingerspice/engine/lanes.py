@@ -9,7 +9,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.lanerows import SOURCES, places
+from fingerspice.engine.lanerows import SOURCES, Marks, places
 from fingerspice.engine.lanestep import step
 from fingerspice.engine.laneweights import weigh
 
@@ -18,7 +18,7 @@ TILE = 16
 
 
 @jit
-def begin(marks: Any, c: Any, still: FloatArray, starts: FloatArray, source: FloatArray, state: FloatArray) -> None:
+def begin(marks: Marks, c: Any, still: FloatArray, starts: FloatArray, source: FloatArray, state: FloatArray) -> None:
     """Put the lanes at the modes `starts` (m, lanes) under a source (lanes,).
 
     `still` are the weights of a step of length 0.
