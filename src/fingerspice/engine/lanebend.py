@@ -182,10 +182,9 @@ def fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
 
 @jit_within
 def end_bent(marks: Any, c: Any, state: FloatArray) -> None:
-    """xi and the drives at the end of a step, from the modes there and on the tangents at the last node, to node 0."""
+    """The drives at the end of a step to node 0, from xi there, and on the tangents at the last node."""
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     drives, last = leaks + 1, NODES - 1
-    project(marks, c, 1, at.xi, state)
     for i in range(lanes):
         xi, found, q = state[at.xi * lanes + i], state[(at.xi + last) * lanes + i], state[at.q * lanes + i]
         bend = state[(at.g + last * drives + leaks) * lanes + i]

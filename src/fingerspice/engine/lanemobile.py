@@ -10,7 +10,7 @@ from typing import Any
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_within
-from fingerspice.engine.lanerows import NODES, places, polynomial_rows, project
+from fingerspice.engine.lanerows import places, polynomial_rows
 
 
 @jit_within
@@ -48,17 +48,6 @@ def drives_under_mobile(marks: Any, c: Any, j: int, before: int, state: FloatArr
             q, w = state[(x + 1) * lanes + i], state[(at.w + drives + t) * lanes + i]
             factor = q if t + 1 < drives else -q / (c.q0 * (c.q0 + q))
             state[(at.g + j * drives + t) * lanes + i] = factor * w
-
-
-@jit_within
-def end_mobile(marks: Any, c: Any, state: FloatArray) -> None:
-    """Gap voltage and drives at the end of a step, from the modes there, to node 0."""
-    lanes, drives, at = len(marks.lanes), len(marks.leaks), places(marks)
-    project(marks, c, 1, at.xi, state)
-    drives_under_mobile(marks, c, 0, NODES - 1, state)
-    for t in range(drives):
-        for i in range(lanes):
-            state[(at.w + t) * lanes + i] = state[(at.w + drives + t) * lanes + i]
 
 
 @jit_within

@@ -25,7 +25,7 @@ from typing import Any
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
 from fingerspice.engine.lanebend import bend_end, drives_at, end_bent, fade, smooth
-from fingerspice.engine.lanemobile import drives_under_mobile, end_mobile, weaken_kinks
+from fingerspice.engine.lanemobile import drives_under_mobile, weaken_kinks
 from fingerspice.engine.lanerows import (
     BASIS,
     FADED,
@@ -35,6 +35,7 @@ from fingerspice.engine.lanerows import (
     OUTER_WEIGHT,
     SOURCES,
     places,
+    project,
     weights_of,
 )
 
@@ -67,18 +68,16 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
         bend_end(marks, c, weights, state)
         if fades:
             fade(marks, c, weights, state)
+    project(marks, c, 1, at.xi, state)
+    if drives > leaks:
         end_bent(marks, c, state)
-    elif len(marks.mobile) > 0:
-        end_mobile(marks, c, state)
     else:
-        for i in range(lanes):
-            xi = c.k * state[lanes + i]
-            for k in range(len(marks.active)):
-                xi += c.shape[k] * state[(SOURCES + k) * lanes + i]
-            state[at.xi * lanes + i] = xi
-            for t in range(drives):
-                state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * drives + t) * lanes + i]
-            for t in range(leaks):
+        if len(marks.mobile) > 0:
+            drives_under_mobile(marks, c, 0, NODES - 1, state)
+        for t in range(drives):
+            for i in range(lanes):
+                if len(marks.mobile) == 0:
+                    state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * drives + t) * lanes + i]
                 state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
     if b == 1.0:
         for i in range(lanes):
