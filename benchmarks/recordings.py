@@ -2,8 +2,8 @@
 
 Noise of three bands, sampled at 48 kHz, drives Table 1's stack. Every contestant gives the gap voltage at every sample;
 its error over the first tenth of a second, relative to the peak, is taken against fingerspice's `exponential` method at
-1e-11. Contestants: whole calls of `fs.simulate` at four tolerances, with and without charge and current, and with the
-dispersive skin; a loop in numba (classical Runge-Kutta, one step per sample, the area from a table); scipy's LSODA,
+1e-11. Contestants: whole calls of `fs.simulate` at four tolerances, with and without charge and current, under the law
+`mobile`, and with the dispersive skin; a loop in numba (classical Runge-Kutta, one step per sample, the area from a table); scipy's LSODA,
 restarted at every sample; and, for a given area, scipy's lfilter. Then one finger behind an amplifier, on a floating
 body and under a current, beside the `exponential` method, which takes every sample as a corner of straight lines.
 
@@ -19,6 +19,7 @@ import platform
 import subprocess
 import tracemalloc
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +182,12 @@ def band(high: float, seconds: float, repeats: int) -> list[Report]:
                     found.u_gap,
                     values.size,
                 )
+        mobile = partial(run, circuit, values, charge=False, charge_law="mobile")
+        found = run(circuit, values[:CHECKED], 1e-11, method="exponential", charge_law="mobile").u_gap
+        most = float(np.abs(found).max())
+        for rtol in RTOLS[1:]:
+            name = f"fingerspice {rtol:g}, mobile"
+            note(name, partial(mobile, rtol), mobile(rtol).u_gap, values.size, exact=found, peak=most)
         loop = Loop(circuit)
         note("numba loop", lambda loop=loop: loop(values), loop(values), values.size)
         few = values[:1201]
