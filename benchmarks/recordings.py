@@ -3,9 +3,10 @@
 Noise of three bands, sampled at 48 kHz, drives Table 1's stack. Every contestant gives the gap voltage at every sample;
 its error over the first tenth of a second, relative to the peak, is taken against fingerspice's `exponential` method at
 1e-11. Contestants: whole calls of `fs.simulate` at four tolerances, with and without charge and current, under the law
-`mobile`, and with the dispersive skin; a loop in numba (classical Runge-Kutta, one step per sample, the area from a table); scipy's LSODA,
-restarted at every sample; and, for a given area, scipy's lfilter. Then one finger behind an amplifier, on a floating
-body and under a current, beside the `exponential` method, which takes every sample as a corner of straight lines.
+`mobile`, and with the dispersive skin; a loop in numba (classical Runge-Kutta, one step per sample, the area from a
+table); scipy's LSODA, restarted at every sample; and, for a given area, scipy's lfilter. Then one finger behind an
+amplifier, on a floating body and under a current, beside the `exponential` method, which takes every sample as a corner
+of straight lines.
 
 Run: python benchmarks/recordings.py [--quick]. Medians of 7, without compile time; writes results/recordings.json.
 """
