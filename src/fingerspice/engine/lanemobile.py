@@ -57,5 +57,6 @@ def weaken_kinks(marks: Any, c: Any, state: FloatArray) -> None:
     for i in range(lanes):
         b = c.steep * state[(at.q + 2) * lanes + i]
         by = 1.0 / (1.0 - b * b)
+        state[at.scratch * lanes + i] *= by
         state[(at.scratch + 2) * lanes + i] *= by
         state[(at.scratch + 3) * lanes + i] *= by

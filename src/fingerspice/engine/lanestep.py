@@ -39,6 +39,9 @@ from fingerspice.engine.lanerows import (
     weights_of,
 )
 
+# Time constants in a step from which on a mode's response to kinks is computed in closed form in a stack.
+QUICK = 0.25
+
 
 @jit_rows
 def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: FloatArray, a: float, b: float) -> None:
@@ -108,6 +111,7 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     drives, late_at = leaks + len(marks.bend), at.scratch + 5
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    limit = FADED if drives > leaks else QUICK
     for k in range(len(marks.modes)):
         p = k * weights_of(marks).mode
         for i in range(lanes):
@@ -115,8 +119,7 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
             late = state[(late_at + NODES - 1) * lanes + i]
             for j in range(NODES - 1):
                 late += weights[(p + j) * wide + i * each] * state[(late_at + j) * lanes + i]
-            if drives > leaks:
-                late *= 1.0 if c.rates[k] * state[(at.scratch + 1) * lanes + i] < FADED else 0.0
+            late *= 1.0 if c.rates[k] * state[(at.scratch + 1) * lanes + i] < limit else 0.0
             z = (
                 weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
                 + weights[(p + 3) * wide + i * each] * state[i]
@@ -127,6 +130,43 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
             for n in range(NODES * drives):
                 z += weights[(p + 5 + n) * wide + i * each] * state[(at.g + n) * lanes + i]
             state[(SOURCES + k) * lanes + i] = z
+        if drives == leaks:
+            quick = False
+            for i in range(lanes if len(marks.own) > 0 else 1):
+                quick = quick or c.rates[k] * state[(at.scratch + 1) * lanes + i] >= QUICK
+            if quick:
+                _add_kinks(marks, c, k, weights, state)
+
+
+@jit_within
+def _add_kinks(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatArray) -> None:
+    """Add the response of mode k, if it decays fast, to what the cubics miss of the drives' kinks.
+
+    These begin at th with a straight line and a square, to which the response is known.
+    """
+    lanes, drives, at = len(marks.lanes), len(marks.leaks), places(marks)
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    x, p = at.scratch, k * weights_of(marks).mode + 5 + drives
+    for i in range(lanes):
+        th, length = state[(x + 4) * lanes + i], state[(x + 1) * lanes + i]
+        y, rest, a, b = max(c.rates[k] * length, QUICK), 1.0 - th, max(INNER[0] - th, 0.0), max(INNER[1] - th, 0.0)
+        size = state[x * lanes + i] if c.rates[k] * length >= QUICK else 0.0
+        # The decay from th on, as the 64th power of a series.
+        v = min(y * rest, 40.0) / 64.0
+        left = 1.0 - v * (1.0 - v / 2.0 * (1.0 - v / 3.0 * (1.0 - v / 4.0 * (1.0 - v / 5.0 * (1.0 - v / 6.0)))))
+        for _ in range(6):
+            left *= left
+        straight = (rest - (1.0 - left) / y) / y
+        square = (rest * rest - 2.0 * straight) / y
+        for t in range(drives):
+            w, rise = state[(at.w + t) * lanes + i], state[(at.w + drives + t) * lanes + i]
+            rise -= w
+            w += th * rise
+            more = c.feed[k, t] * length * (w * straight + rise * square)
+            more -= weights[(p + t) * wide + i * each] * a * (w + rise * a)
+            more -= weights[(p + drives + t) * wide + i * each] * b * (w + rise * b)
+            more -= weights[(p + 2 * drives + t) * wide + i * each] * rest * (w + rise * rest)
+            state[(SOURCES + k) * lanes + i] += c.kinks[t] * size * more
 
 
 @jit_within
@@ -152,6 +192,7 @@ def _kinks(marks: Any, c: Any, state: FloatArray) -> None:
         k1 = abs(d) * (om * om * om - th * th * th) / 3.0
         k1 += c0 * th - c1 * om - e0 * (INNER[0] - th) - e1 * (INNER[1] - th)
         crossed, length = u0 * u1 < 0.0, state[(x + 1) * lanes + i]
+        state[x * lanes + i] = 2.0 * abs(d) if crossed else 0.0
         state[(x + 2) * lanes + i] = k0 if crossed else 0.0
         state[(x + 3) * lanes + i] = k1 if crossed else 0.0
         state[(x + 4) * lanes + i] = th if crossed else 0.0

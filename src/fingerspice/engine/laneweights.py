@@ -12,7 +12,7 @@ from fingerspice.engine.lanerows import BASIS, INNER, NODES, weighed
 
 # Coefficients from x on of the quartic that is 0 at the nodes and has the slope 1 at the end of the step.
 _POWERS: list[float] = np.poly(np.array([0.0, *INNER, 1.0]))[3::-1].tolist()
-_QUARTIC = np.array(_POWERS) / (np.array(_POWERS) @ np.arange(1.0, NODES + 1.0))
+_QUARTIC = np.array([_POWERS]) / (np.array(_POWERS) @ np.arange(1.0, NODES + 1.0))
 
 
 def _through(nodes: tuple[float, ...], until: float) -> FloatArray:
@@ -107,20 +107,16 @@ def _until(
 
 @jit_rows
 def _drive(n: int, terms: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
-    for i in range(n):
-        out[i] = h[i] * c[0] * m[0, i]
-    for j in range(1, terms):
+    """Weights of drives by the coefficients of their polynomials, one row of `c` each, into rows of `out`."""
+    for r in range(c.shape[0]):
         for i in range(n):
-            out[i] += h[i] * c[j] * m[j, i]
+            out[r, i] = c[r, 0] * h[i] * m[0, i]
+        for j in range(1, terms):
+            for i in range(n):
+                out[r, i] += c[r, j] * h[i] * m[j, i]
 
 
 @jit_rows
-def _add(n: int, a: float, x: FloatArray, out: FloatArray) -> None:
-    for i in range(n):
-        out[i] += a * x[i]
-
-
-@jit
 def _gather(c: Any, k: int, j: int, active: int, found: FloatArray, weights: FloatArray) -> None:
     """Add what mode k does to the quantities at node j, by its weights there.
 
@@ -129,17 +125,28 @@ def _gather(c: Any, k: int, j: int, active: int, found: FloatArray, weights: Flo
     n, leaks, drives = found.shape[1], c.tap_s.size, c.feed.shape[1]
     for p in range(1 + leaks):
         by = c.shape[k] if p == 0 else c.taps[p - 1, k]
-        _add(n, by, found[0], weights[p, 2 + k])
-        _add(n, by, found[1], weights[p, 0])
-        _add(n, by, found[2], weights[p, 1])
+        for i in range(n):
+            weights[p, 0, i] += by * found[1, i]
+            weights[p, 1, i] += by * found[2, i]
+            weights[p, 2 + k, i] = by * found[0, i]
         for node in range(j):
-            for t in range(leaks):
-                _add(n, by * c.feed[k, t], found[3 + node], weights[p, 2 + active + node * drives + t])
-            if drives > leaks:
-                own = weights[p, 2 + active + node * drives + leaks]
-                _add(n, by * c.feed[k, leaks], found[3 + j + node], own)
+            for t in range(drives):
+                row = 3 + node if t < leaks else 3 + j + node
+                for i in range(n):
+                    weights[p, 2 + active + node * drives + t, i] += by * c.feed[k, t] * found[row, i]
         if drives > leaks:
-            _add(n, by * c.feed[k, leaks], found[3 + 2 * j], weights[p, 2 + active + (NODES - 1) * drives])
+            for i in range(n):
+                weights[p, 2 + active + (NODES - 1) * drives, i] += by * c.feed[k, leaks] * found[3 + 2 * j, i]
+
+
+@jit_rows
+def _feed(c: Any, k: int, found: FloatArray, own: FloatArray) -> None:
+    """Weights of each drive at each node in mode k, from those of the nodes."""
+    drives = c.feed.shape[1]
+    for j in range(NODES):
+        for t in range(drives):
+            for i in range(found.shape[1]):
+                own[j * drives + t, i] = c.feed[k, t] * found[j, i]
 
 
 @jit
@@ -165,18 +172,15 @@ def weigh(c: Any, active: int, h: FloatArray, weights: FloatArray) -> None:
             _until(n, rates[k], c.gain[k], at, h, m[0], m[1], found[0], found[1], found[2])
             own[NODES - 1 - j] = found[0]
             if k < active:
-                for node in range(j):
-                    _drive(n, j, _LEAKS[j * (j - 1) // 2 + node], h, m, found[3 + node])
-                for node in range((j + 1) * bent):
-                    _drive(n, j + 1, _BENDS[(j - 1) * (j + 2) // 2 + node], h, m, found[3 + j + node])
+                _drive(n, j, _LEAKS[j * (j - 1) // 2 :][:j], h, m, found[3:])
+                if bent > 0:
+                    _drive(n, j + 1, _BENDS[(j - 1) * (j + 2) // 2 :][: j + 1], h, m, found[3 + j :])
                 _gather(c, k, j, active, found, at_nodes[j - 1])
         own[3] = found[1]
         own[4] = found[2]
-        for j in range(NODES):
-            _drive(n, NODES, BASIS[j], h, m, found[3])
-            for t in range(drives):
-                own[5 + j * drives + t] = c.feed[k, t] * found[3]
+        _drive(n, NODES, BASIS, h, m, found)
+        _feed(c, k, found, own[5:])
         if bent > 0:
-            _drive(n, NODES, _QUARTIC, h, m[1:], found[3])
-            own[mode - 1] = c.feed[k, leaks] * found[3]
+            _drive(n, NODES, _QUARTIC, h, m[1:], found)
+            own[mode - 1] = c.feed[k, leaks] * found[0]
     weights[length] = h
