@@ -1,7 +1,8 @@
 """What the law `mobile` adds to a step of lanes (`engine.lanestep`): the gap voltage follows from an equation.
 
 With 1/A = q0 + q, the gap voltage is u = X + B q(u), where X = k s + shape z and B = (X - k s) / q0. The last drive is
-A - 1/q0 times the source.
+g = A - 1/q0 times the source s. Where X has a share S of it, X = Y + S g, that is u = Y + C q(u) with
+C = (Y - (k + S / q0) s) / q0.
 """
 
 from __future__ import annotations
@@ -10,27 +11,32 @@ from typing import Any
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_within
-from fingerspice.engine.lanerows import places, polynomial_rows
+from fingerspice.engine.lanerows import INNER, places, polynomial_rows, weights_of
 
 
 @jit_within
-def drives_under_mobile(marks: Any, c: Any, j: int, before: int, state: FloatArray) -> None:
-    """Gap voltage and drives at node j, from X there, and from what multiplies the terms of the area there.
+def drives_under_mobile(marks: Any, c: Any, weights: FloatArray, j: int, before: int, state: FloatArray) -> None:
+    """Gap voltage and drives at node j, or for 0 at the end, from Y there, and from what multiplies 1/A - q0 there.
 
     The equation is solved on the tangent of q at node `before`, and once more on the one at the place that is found.
     """
-    lanes, drives, at = len(marks.lanes), len(marks.leaks), places(marks)
-    x, source, over = at.scratch, at.w + 2 * drives - 1, 1.0 / c.q0
-    flat = at.flat + (0 if j == 0 else 1)
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    x, over, flat, one = at.scratch, 1.0 / c.q0, at.flat + (0 if j == 0 else 1), weights_of(marks).one
+    # At the end X is known.
+    on, until = 1.0 if j > 0 else 0.0, INNER[0] if j == 1 else INNER[1] if j == 2 else 1.0
+    share_at = weights_of(marks).node + (max(j, 1) - 1) * (1 + leaks) * one + one - 1
     for i in range(lanes):
+        source = state[i] + until * (state[lanes + i] - state[i])
         whole, there, q = state[(at.xi + j) * lanes + i], state[(at.xi + before) * lanes + i], state[at.q * lanes + i]
-        share = (whole - c.k * state[source * lanes + i]) * over
+        share = (whole - (c.k + on * weights[share_at * wide + i * each] * over) * source) * over
         u = there + (whole + share * q - there) / (1.0 - share * state[(at.q + 1) * lanes + i])
         state[(at.q + 2) * lanes + i] = share
         state[flat * lanes + i] = whole + share * c.rest
         state[(at.xi + j) * lanes + i] = u
         state[x * lanes + i] = abs(u) * c.scale + c.shift
         state[(x + 2) * lanes + i] = whole
+        state[(x + 4) * lanes + i] = source
     polynomial_rows(lanes, c.area, state[x * lanes :], state[(x + 1) * lanes :])
     polynomial_rows(lanes, c.slope, state[x * lanes :], state[(x + 3) * lanes :])
     for i in range(lanes):
@@ -40,14 +46,16 @@ def drives_under_mobile(marks: Any, c: Any, j: int, before: int, state: FloatArr
         by = (state[(x + 2) * lanes + i] + share * q - u) / (1.0 - share * slope)
         q += slope * by
         state[(at.xi + j) * lanes + i] = u + by
-        state[(x + 1) * lanes + i] = q
         state[at.q * lanes + i], state[(at.q + 1) * lanes + i] = q, slope
-        state[at.fold * lanes + i] = max(state[at.fold * lanes + i], share * slope)
-    for t in range(drives):
-        for i in range(lanes):
-            q, w = state[(x + 1) * lanes + i], state[(at.w + drives + t) * lanes + i]
-            factor = q if t + 1 < drives else -q / (c.q0 * (c.q0 + q))
-            state[(at.g + j * drives + t) * lanes + i] = factor * w
+        if j == 0:
+            state[at.fold * lanes + i] = max(state[at.fold * lanes + i], share * slope)
+        last = -q / (c.q0 * (c.q0 + q)) * state[(x + 4) * lanes + i]
+        state[(at.g + j * (leaks + 1) + leaks) * lanes + i] = last
+        for t in range(leaks):
+            w = state[(at.w + leaks + t) * lanes + i]
+            w += on * weights[(share_at + (1 + t) * one) * wide + i * each] * last
+            state[(at.w + leaks + t) * lanes + i] = w
+            state[(at.g + j * (leaks + 1) + t) * lanes + i] = q * w
 
 
 @jit_within

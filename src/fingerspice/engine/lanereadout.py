@@ -69,24 +69,25 @@ def show(
 
 
 @jit_rows
-def _bend(n: int, xi: FloatArray, bend: FloatArray, a: float, out: FloatArray, b: float, other: FloatArray) -> None:
-    """Give N the sign of xi, and add it to two rows."""
+def _signed(n: int, xi: FloatArray, bend: FloatArray) -> None:
+    """Give N the sign of xi."""
     for i in range(n):
         bend[i] = bend[i] if xi[i] >= 0.0 else -bend[i]
-        out[i] += a * bend[i]
-        other[i] += b * bend[i]
 
 
 @jit_rows
-def _leak(
-    n: int, q0: float, of_area: bool, bent: float, bend: FloatArray, q: FloatArray, w: FloatArray, a: float,
-    out: FloatArray, b: float, other: FloatArray,
-) -> None:  # fmt: skip
-    """Add a drive to two rows: w + bent N times 1/A - q0, or A - 1/q0."""
+def _of_area(n: int, q0: float, q: FloatArray, s: FloatArray, out: FloatArray) -> None:
+    """A - 1/q0 times the source."""
     for i in range(n):
-        drive = (w[i] + bent * bend[i]) * (-q[i] / (q0 * (q0 + q[i])) if of_area else q[i])
-        out[i] += a * drive
-        other[i] += b * drive
+        out[i] = -q[i] / (q0 * (q0 + q[i])) * s[i]
+
+
+@jit_rows
+def _add(n: int, q: FloatArray, w: FloatArray, a: float, out: FloatArray, b: float, other: FloatArray) -> None:
+    """Add a product to two rows."""
+    for i in range(n):
+        out[i] += a * q[i] * w[i]
+        other[i] += b * q[i] * w[i]
 
 
 @jit_rows
@@ -121,9 +122,8 @@ def flow(
     Under `mobile` A x stands in the place of N, and gap voltages follow the modes in `kept`.
     """
     m, leaks, drives, mobile = c.rates.size, c.tap_s.size, c.feed.shape[1], kept.shape[0] > c.rates.size
-    rise, q, xi, w, bend, steep = (
-        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.zeros(count), np.empty(count)
-    )  # fmt: skip
+    rise, q, xi, w, steep = np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    bend, one = np.zeros(count), np.ones(count)
     # Shares of source, modes and drives in the rates of the quantity and of xi.
     by_s, by_z, by_g = np.zeros(2), np.zeros((2, m)), np.zeros((2, drives))
     for j in range(m):
@@ -145,13 +145,18 @@ def flow(
         polynomial_of(c.area, c.scale, c.shift, xi[:size], q)
         _of_source_and_modes(size, by_s[0], s, by_z[0], i, kept, rate)
         _of_source_and_modes(size, by_s[1], s, by_z[1], i, kept, rise)
-        if drives > leaks:
+        if mobile:
+            _of_area(size, c.q0, q, s, bend)
+        elif drives > leaks:
             polynomial_of(c.bend, c.scale, c.shift, xi[:size], bend)
-            _bend(size, xi, bend, by_g[0, leaks], rate, by_g[1, leaks], rise)
+            _signed(size, xi, bend)
+        if drives > leaks:
+            _add(size, one, bend, by_g[0, leaks], rate, by_g[1, leaks], rise)
         for t in range(leaks):
             _of_source_and_modes(size, c.tap_s[t], s, c.taps[t], i, kept, w)
-            of_area = mobile and t + 1 == leaks
-            _leak(size, c.q0, of_area, c.bent[t], bend, q, w, by_g[0, t], rate, by_g[1, t], rise)
+            for j in range(size):
+                w[j] += c.bent[t] * bend[j]
+            _add(size, q, w, by_g[0, t], rate, by_g[1, t], rise)
         if mobile:
             _under_mobile(size, c.q0, k, c.k, share, s, slope[at:], xi, q, steep, rise, rate)
         else:

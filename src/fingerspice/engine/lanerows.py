@@ -32,7 +32,8 @@ class Marks(NamedTuple):
     modes: tuple[int, ...]  # All of them
     active: tuple[int, ...]  # Those that are not passive
     leaks: tuple[int, ...]  # Drives but N
-    # bend, mobile: One entry if N is a drive, or if the charge law is `mobile`; or none
+    # bend, mobile: One entry if there is a drive beside the leaks (N in a network, or A - 1/q0 times the source under
+    # `mobile`), and under `mobile`; or none
     bend: tuple[int, ...]
     mobile: tuple[int, ...]
     lanes: tuple[int, ...]
@@ -91,7 +92,7 @@ def rows_of(marks: Any) -> Rows:
     w = g + NODES * drives
     scratch = w + 2 * leaks
     q = scratch + 5 + NODES + drives
-    more = m + drives if drives > leaks else 3 if len(marks.mobile) > 0 else 0
+    more = 3 if len(marks.mobile) > 0 else m + drives if drives > leaks else 0
     return Rows(xi, g, w, scratch, q, q + 3, q + 3, q + 4, q + 3 + more if more > 0 else q)
 
 

@@ -50,37 +50,39 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
     `weights` are those of the part's length.
     """
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives = leaks + len(marks.bend)
+    drives, bent = leaks + len(marks.bend), len(marks.bend) > len(marks.mobile)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for i in range(lanes):
         before = state[2 * lanes + i]
         change = after[i] - before
         state[i], state[lanes + i] = before + a * change, before + b * change
-    fades = drives > leaks and a == 0.0 and smooth(marks, c, weights, state)
+    fades = bent and a == 0.0 and smooth(marks, c, weights, state)
     for j in range(1, NODES):
         _predict(marks, weights, j, state)
         if len(marks.mobile) > 0:
-            drives_under_mobile(marks, c, j, j - 1, state)
+            drives_under_mobile(marks, c, weights, j, j - 1, state)
         else:
             drives_at(marks, c, weights, j, j - 1, True, state)
     for i in range(lanes):
         state[(at.scratch + 1) * lanes + i] = weights[weights_of(marks).length * wide + i * each]
     _kinks(marks, c, state)
     _advance(marks, c, weights, state)
-    if drives > leaks:
+    if bent:
         bend_end(marks, c, weights, state)
         if fades:
             fade(marks, c, weights, state)
     project(marks, c, 1, at.xi, state)
-    if drives > leaks:
+    if bent:
         end_bent(marks, c, state)
+    elif len(marks.mobile) > 0:
+        drives_under_mobile(marks, c, weights, 0, NODES - 1, state)
     else:
-        if len(marks.mobile) > 0:
-            drives_under_mobile(marks, c, 0, NODES - 1, state)
         for t in range(drives):
             for i in range(lanes):
-                if len(marks.mobile) == 0:
-                    state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * drives + t) * lanes + i]
+                state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * drives + t) * lanes + i]
+    if not bent:
+        for t in range(leaks):
+            for i in range(lanes):
                 state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
     if b == 1.0:
         for i in range(lanes):
@@ -111,7 +113,8 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     drives, late_at = leaks + len(marks.bend), at.scratch + 5
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    limit = FADED if drives > leaks else QUICK
+    bent = len(marks.bend) > len(marks.mobile)
+    limit = FADED if bent else QUICK
     for k in range(len(marks.modes)):
         p = k * weights_of(marks).mode
         for i in range(lanes):
@@ -130,7 +133,7 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
             for n in range(NODES * drives):
                 z += weights[(p + 5 + n) * wide + i * each] * state[(at.g + n) * lanes + i]
             state[(SOURCES + k) * lanes + i] = z
-        if drives == leaks:
+        if not bent:
             quick = False
             for i in range(lanes if len(marks.own) > 0 else 1):
                 quick = quick or c.rates[k] * state[(at.scratch + 1) * lanes + i] >= QUICK
@@ -144,7 +147,8 @@ def _add_kinks(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatArra
 
     These begin at th with a straight line and a square, to which the response is known.
     """
-    lanes, drives, at = len(marks.lanes), len(marks.leaks), places(marks)
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    drives = leaks + len(marks.bend)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     x, p = at.scratch, k * weights_of(marks).mode + 5 + drives
     for i in range(lanes):
@@ -159,7 +163,8 @@ def _add_kinks(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatArra
         straight = (rest - (1.0 - left) / y) / y
         square = (rest * rest - 2.0 * straight) / y
         for t in range(drives):
-            w, rise = state[(at.w + t) * lanes + i], state[(at.w + drives + t) * lanes + i]
+            w = state[(at.w + t if t < leaks else 0) * lanes + i]
+            rise = state[(at.w + leaks + t if t < leaks else 1) * lanes + i]
             rise -= w
             w += th * rise
             more = c.feed[k, t] * length * (w * straight + rise * square)
@@ -202,7 +207,8 @@ def _kinks(marks: Any, c: Any, state: FloatArray) -> None:
     if len(marks.mobile) > 0:
         weaken_kinks(marks, c, state)
     for t in range(drives):
-        first, second = (at.w + t, at.w + leaks + t) if t < leaks else (at.xi, at.xi + NODES - 1)
+        first, second = (0, 1) if len(marks.mobile) > 0 else (at.xi, at.xi + NODES - 1)
+        first, second = (at.w + t, at.w + leaks + t) if t < leaks else (first, second)
         for i in range(lanes):
             k0, k1, th = state[(x + 2) * lanes + i], state[(x + 3) * lanes + i], state[(x + 4) * lanes + i]
             w0, w1 = state[first * lanes + i], state[second * lanes + i]

@@ -175,7 +175,7 @@ class Block:
 
     def check(self, parts: int) -> Window:
         """Follow a window of every piece by twice as many steps."""
-        width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + len(self.marks.bend)))))
+        width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + self.form.bent))))
         lanes = np.arange(LANES)
         off, at = np.zeros((len(self.kept), LANES, width + 1)), np.zeros(LANES, np.int64)
         for place in self._windows(width):
@@ -208,7 +208,7 @@ class Block:
         busiest(self.x, self.first, self.count, width, self.n, place)
         if self.starts_run:
             place[0] = 0
-        if not self.marks.bend:
+        if not self.form.bent:
             return [place]
         largest = np.minimum(
             np.argmax(self._by_piece, axis=1) - width // 2, np.minimum(self.count, self.n - self.first) - width
@@ -240,7 +240,7 @@ class Block:
         if not since.any():
             return x, z
         to, out, form = x + (self.x[number + 1] - x) * (since / length), np.empty_like(z), self.form
-        parts *= BETWEEN if self.marks.bend else 1
+        parts *= BETWEEN if self.form.bent else 1
         still, (room, _) = form.weights(np.zeros(LANES)), form.room(True)
         within(form.marks(True), form.lanes, still, z, x, to, since, parts, room, out)
         return to, out

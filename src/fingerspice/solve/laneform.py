@@ -86,6 +86,11 @@ class LaneForm(ABC):
         )  # fmt: skip
 
     @property
+    def bent(self) -> bool:
+        """Whether N is a drive, as in a network."""
+        return not self.mobile and self.lanes.feed.shape[1] > self.lanes.tap_s.size
+
+    @property
     def weighed(self) -> Weighed:
         """Rows of the weights."""
         modes, leaks = self.lanes.rates.size, self.lanes.tap_s.size

@@ -131,7 +131,7 @@ class LaneMarch:
             self.refused += parts * block.n
             if self.level + 1 == len(PARTS):
                 return Outcome.NOT_MET
-            divides = FINER[1] if block.marks.bend else FINER[0]
+            divides = FINER[1] if self.form.bent else FINER[0]
             finer = math.ceil(math.log(excess) / math.log(divides)) if excess < math.inf else 1
             self.level = min(self.level + max(1, finer), len(PARTS) - 1)
         self.peak, self.errors = max(peak, self.peak), np.maximum(seen.errors, self.errors)

@@ -86,8 +86,7 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
     n, area0, shape, kinks, by = rates.size, model.area0, system.gap[0], np.full(tap_s.size, steep), 1.0
     if model.mobile:
         # The last drive is A - 1/q0 times the source.
-        feed, tap_s = np.column_stack([feed, system.push[0] / area0]), np.append(tap_s, 1.0)
-        taps, kinks = np.vstack([taps, np.zeros(n)]), np.append(kinks, -steep / (q0 + rest) ** 2)
+        feed, kinks = np.column_stack([feed, system.push[0] / area0]), np.append(kinks, -steep / (q0 + rest) ** 2)
         shape, by, missed_bend = area0 * q0 * shape, area0, missed * peak / q0
     columns, k, moves, nodes = by * system.shown[0], system.k_shown, np.zeros(system.k_shown.size), by * system.node[0]
     if problem.charge:
