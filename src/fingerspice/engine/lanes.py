@@ -113,26 +113,6 @@ def span(
 
 
 @jit
-def along(mode: int, weights: FloatArray, x: FloatArray, first: IntArray, count: int, z: FloatArray) -> None:
-    """Advance modes z (m, lanes) by `count` samples with the area at its reference and steps of one length.
-
-    `mode` is the number of rows of weights of a mode.
-    """
-    lanes, now, after = first.size, np.empty(first.size), np.empty(first.size)
-    for i in range(lanes):
-        now[i] = x[first[i]]
-    for t in range(count):
-        for i in range(lanes):
-            after[i] = x[first[i] + t + 1]
-        for k in range(z.shape[0]):
-            decay, before, last = weights[k * mode, 0], weights[k * mode + 3, 0], weights[k * mode + 4, 0]
-            for i in range(lanes):
-                z[k, i] = decay * z[k, i] + before * now[i] + last * after[i]
-        for i in range(lanes):
-            now[i] = after[i]
-
-
-@jit
 def busiest(x: FloatArray, first: IntArray, count: int, width: int, n: int, place: IntArray) -> None:
     """Where x moves most between two samples of each lane: the first sample of one of its windows of `width`.
 

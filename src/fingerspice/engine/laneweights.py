@@ -1,4 +1,4 @@
-"""Weights of steps of lanes (`engine.lanestep`), for each of their lengths."""
+"""Weights of steps of lanes (`engine.lanestep`) by their lengths, and steps with the area held."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.lanerows import BASIS, INNER, NODES, weighed
 
@@ -106,37 +106,39 @@ def _until(
 
 
 @jit_rows
-def _drive(n: int, terms: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
+def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
     """Weights of drives by the coefficients of their polynomials, one row of `c` each, into rows of `out`."""
     for r in range(c.shape[0]):
+        c0, c1, c2, c3 = c[r, 0], c[r, 1], c[r, 2], c[r, 3]
         for i in range(n):
-            out[r, i] = c[r, 0] * h[i] * m[0, i]
-        for j in range(1, terms):
-            for i in range(n):
-                out[r, i] += c[r, j] * h[i] * m[j, i]
+            out[r, i] = h[i] * (c0 * m[0, i] + c1 * m[1, i] + c2 * m[2, i] + c3 * m[3, i])
 
 
 @jit_rows
-def _gather(c: Any, k: int, j: int, active: int, found: FloatArray, weights: FloatArray) -> None:
+def _gather(
+    k: int, j: int, active: int, shape: FloatArray, taps: FloatArray, feed: FloatArray, found: FloatArray,
+    weights: FloatArray,
+) -> None:  # fmt: skip
     """Add what mode k does to the quantities at node j, by its weights there.
 
     `found` has the decay, the weights of the source, of the leaks at the nodes before, and of N at these and itself.
     """
-    n, leaks, drives = found.shape[1], c.tap_s.size, c.feed.shape[1]
+    n, leaks, drives = found.shape[1], taps.shape[0], feed.shape[1]
     for p in range(1 + leaks):
-        by = c.shape[k] if p == 0 else c.taps[p - 1, k]
+        by = shape[k] if p == 0 else taps[p - 1, k]
         for i in range(n):
             weights[p, 0, i] += by * found[1, i]
             weights[p, 1, i] += by * found[2, i]
             weights[p, 2 + k, i] = by * found[0, i]
         for node in range(j):
-            for t in range(drives):
-                row = 3 + node if t < leaks else 3 + j + node
+            for t in range(leaks):
+                share, row = by * feed[k, t], 2 + active + node * drives + t
                 for i in range(n):
-                    weights[p, 2 + active + node * drives + t, i] += by * c.feed[k, t] * found[row, i]
-        if drives > leaks:
+                    weights[p, row, i] += share * found[3 + node, i]
+        for node in range((j + 1) * (drives - leaks)):
+            share, row = by * feed[k, leaks], 2 + active + (node * drives + leaks if node < j else 3 * drives)
             for i in range(n):
-                weights[p, 2 + active + (NODES - 1) * drives, i] += by * c.feed[k, leaks] * found[3 + 2 * j, i]
+                weights[p, row, i] += share * found[3 + j + node, i]
 
 
 @jit_rows
@@ -152,7 +154,7 @@ def _feed(c: Any, k: int, found: FloatArray, own: FloatArray) -> None:
 @jit
 def weigh(c: Any, active: int, h: FloatArray, weights: FloatArray) -> None:
     """Weights of steps of the lengths h (n,), into the rows (n,) of `weights` (`engine.lanerows.Weighed`)."""
-    rates, n, m, count, leaks = c.rates, h.size, np.empty((NODES + 2, h.size)), c.rates.size, c.tap_s.size
+    rates, n, m, count, leaks = c.rates, h.size, np.zeros((NODES + 2, h.size)), c.rates.size, c.tap_s.size
     drives, found = c.feed.shape[1], np.empty((3 + 2 * NODES, h.size))
     bent = drives - leaks
     mode, length, first, one, _ = _weighed(count, active, leaks, bent)
@@ -172,15 +174,38 @@ def weigh(c: Any, active: int, h: FloatArray, weights: FloatArray) -> None:
             _until(n, rates[k], c.gain[k], at, h, m[0], m[1], found[0], found[1], found[2])
             own[NODES - 1 - j] = found[0]
             if k < active:
-                _drive(n, j, _LEAKS[j * (j - 1) // 2 :][:j], h, m, found[3:])
+                _drive(n, _LEAKS[j * (j - 1) // 2 :][:j], h, m, found[3:])
                 if bent > 0:
-                    _drive(n, j + 1, _BENDS[(j - 1) * (j + 2) // 2 :][: j + 1], h, m, found[3 + j :])
-                _gather(c, k, j, active, found, at_nodes[j - 1])
+                    _drive(n, _BENDS[(j - 1) * (j + 2) // 2 :][: j + 1], h, m, found[3 + j :])
+                _gather(k, j, active, c.shape, c.taps, c.feed, found, at_nodes[j - 1])
         own[3] = found[1]
         own[4] = found[2]
-        _drive(n, NODES, BASIS, h, m, found)
+        _drive(n, BASIS, h, m, found)
         _feed(c, k, found, own[5:])
         if bent > 0:
-            _drive(n, NODES, _QUARTIC, h, m[1:], found)
+            _drive(n, _QUARTIC, h, m[1:], found)
             own[mode - 1] = c.feed[k, leaks] * found[0]
     weights[length] = h
+
+
+@jit
+def along(c: Any, h: FloatArray, x: FloatArray, first: IntArray, count: int, z: FloatArray) -> None:
+    """Advance modes z (m, lanes) by `count` samples with the area at its reference.
+
+    h has the distance (s) from each sample to the next, or one for all.
+    """
+    lanes, each = first.size, 1 if h.size > 1 else 0
+    wide = lanes if each else 1
+    m, length, rows = np.empty((NODES + 2, wide)), np.full(wide, h[0]), np.empty((z.shape[0], 3, wide))
+    for t in range(count):
+        if each:
+            for i in range(lanes):
+                length[i] = h[first[i] + t]
+        for k in range(z.shape[0]):
+            own = rows[k]
+            if each or t == 0:
+                _moments(1, c.rates[k], length, m)
+                _until(wide, c.rates[k], c.gain[k], 1.0, length, m[0], m[1], own[0], own[1], own[2])
+            for i in range(lanes):
+                z[k, i] = own[0, i * each] * z[k, i] + own[1, i * each] * x[first[i] + t]
+                z[k, i] += own[2, i * each] * x[first[i] + t + 1]

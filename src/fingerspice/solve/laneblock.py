@@ -14,7 +14,8 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.lanereadout import show
 from fingerspice.engine.lanerows import rows_of
-from fingerspice.engine.lanes import along, begin, busiest, span, within
+from fingerspice.engine.lanes import begin, busiest, span, within
+from fingerspice.engine.laneweights import along
 from fingerspice.solve.laneform import LANES, LaneForm
 
 # A window over its piece, and the fewest samples in one.
@@ -121,8 +122,7 @@ class Block:
         margins = [1.0]
         self.__dict__.pop("xi", None)
         own = np.zeros((self.m, LANES))
-        # A guess, for which uneven points may count as even ones.
-        along(form.weighed.mode, form.weights(self.h.mean(keepdims=True)), self.x, self.first, self.count, own)
+        along(form.lanes, self.h, self.x, self.first, self.count, own)
         starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[: self.m, None], own], axis=1))
         starts[active:] = 0.0
         for sweep in range(LANES + 1):
