@@ -25,21 +25,6 @@ def _of_source_and_modes(
 
 
 @jit_rows
-def largest_of(n: int, x: FloatArray) -> float:
-    """Largest |x|, as the largest of a quarter each: so four comparisons need not wait for one another."""
-    a, b, c, d, m = 0.0, 0.0, 0.0, 0.0, n // 4
-    for i in range(m):
-        e, f, g, h = abs(x[i]), abs(x[m + i]), abs(x[2 * m + i]), abs(x[3 * m + i])
-        a = e if e > a else a
-        b = f if f > b else b
-        c = g if g > c else c
-        d = h if h > d else d
-    for i in range(4 * m, n):
-        a = max(a, abs(x[i]))
-    return max(max(a, b), max(c, d))
-
-
-@jit_rows
 def _variable(n: int, scale: float, shift: float, xi: FloatArray, x: FloatArray) -> None:
     for i in range(n):
         x[i] = abs(xi[i]) * scale + shift

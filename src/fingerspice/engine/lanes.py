@@ -113,22 +113,6 @@ def span(
 
 
 @jit
-def busiest(x: FloatArray, first: IntArray, count: int, width: int, n: int, place: IntArray) -> None:
-    """Where x moves most between two samples of each lane: the first sample of one of its windows of `width`.
-
-    Windows end before sample n; -1 where no window does.
-    """
-    for i in range(first.size):
-        most, place[i] = -1.0, -1
-        for at in range(first[i], min(first[i] + count, n) - width + 1, width):
-            moves = 0.0
-            for j in range(at, at + width):
-                moves = max(moves, abs(x[j + 1] - x[j]))
-            if moves > most:
-                most, place[i] = moves, at - first[i]
-
-
-@jit
 def within(
     marks: Any, c: Any, still: FloatArray, starts: FloatArray, x: FloatArray,
     to: FloatArray, h: FloatArray, parts: int, state: FloatArray, out: FloatArray,

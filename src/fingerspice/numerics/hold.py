@@ -12,7 +12,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, read_only
 from fingerspice.base.compiled import jit_fused
-from fingerspice.numerics.moments import weights as moment_weights
+from fingerspice.numerics.moments import moments
 
 _STRETCH = 500
 # Below, a number counts as zero, before it becomes a (slow) denormal one.
@@ -107,6 +107,9 @@ def first_order_hold(
     pairs = n + n % 2
     z, by, shares, state = np.zeros(pairs), np.zeros((pairs, 2)), np.zeros((direct.size, pairs)), np.zeros(pairs)
     z[:n], shares[:, :n], state[:n] = rates * dt, weights, w0
-    by[:n] = moment_weights(z[:n], (0.0, 1.0)) * (gains * dt)[:, None]
+    for one, row in zip(z[:n].tolist(), by, strict=False):
+        moments(one, row)
+    # Of a straight line, by its values at both ends.
+    by[:n] = np.column_stack([by[:n, 0] - by[:n, 1], by[:n, 1]]) * (gains * dt)[:, None]
     _hold(read_only(np.ascontiguousarray(u)), z, by, np.ascontiguousarray(direct), shares, state, y)
     return y, state[:n]

@@ -14,7 +14,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.lanereadout import show
 from fingerspice.engine.lanerows import rows_of
-from fingerspice.engine.lanes import begin, busiest, span, within
+from fingerspice.engine.lanes import begin, span, within
 from fingerspice.engine.laneweights import along
 from fingerspice.solve.laneform import LANES, LaneForm
 
@@ -204,8 +204,11 @@ class Block:
 
         With N as a drive, errors are large where |xi| is, too.
         """
-        place = np.empty(LANES, np.int64)
-        busiest(self.x, self.first, self.count, width, self.n, place)
+        moves, whole = np.abs(np.diff(self.x)), self.count - self.count % width
+        most = moves.reshape(LANES, self.count)[:, :whole].reshape(LANES, -1, width).max(axis=-1)
+        # Windows end before the last sample.
+        most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
+        place = np.where(most.max(axis=1) >= 0.0, width * np.argmax(most, axis=1), -1)
         if self.starts_run:
             place[0] = 0
         if not self.form.bent:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.engine.lanereadout import flow, largest_of, show
+from fingerspice.engine.lanereadout import flow, show
 from fingerspice.engine.lanerows import NODES
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.laneblock import Block
@@ -52,30 +52,14 @@ class Outcome(Enum):
 
 
 class LaneMarch:
-    """A recording of one finger in progress, piece by piece.
-
-    Attributes
-    ----------
-    t : float
-        Time reached, s.
-    share : float
-        Factor of the error allowed, reduced where errors of earlier pieces add up.
-    loudest : float
-        Largest |U| of the source so far, V.
-    u_last : float
-        Value of the source at `t`, V.
-    outputs : int
-        Number of outputs written since `begin_outputs`.
-    width : int
-        Number of rows of the outputs.
-    margin : float
-        Least distance to the fold so far.
-    """
+    """A recording of one finger in progress, piece by piece."""
 
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
+        # The error allowed is reduced to a `share` where errors of earlier pieces add up.
         self.problem, self.form, self.rtol, self.share, self.width = problem, form, rtol, share, form.width(problem)
         wave = driving(problem)
         assert wave is not None
+        # Time reached (s), and largest |U| of the source so far, V.
         self.wave, self.usual, self.t, self.loudest = wave, spacing_of(wave), problem.t_start, 0.0
         held = float(np.abs(problem.initial.y).max(initial=0.0))
         # Of a source of current the scene knows no peak.
@@ -121,7 +105,7 @@ class LaneMarch:
             solved = block.solve(self.z, parts, left * self.scale)
             self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
             if solved:
-                peak = float(largest_of(block.n + 1, block.xi))
+                peak = float(np.abs(block.xi).max())
                 if not (self.form.gap(np.array(peak)) <= self.form.u_top and self._on_branch(block, starts_at, peak)):
                     return Outcome.LOST
                 seen = judge(block, parts, max(peak, self.peak), self.alike, self.chance)
@@ -182,7 +166,7 @@ class LaneMarch:
         t, self.outputs, rows = t_out[first:last], last, out[:, first:last]
         times = piece.times
         samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
-        if t.size == n and largest_of(n, t - samples) <= slack:
+        if t.size == n and np.abs(t - samples).max() <= slack:
             slope = np.diff(block.x[: n + 1]) / block.h[:n] if self.form.flows else block.x
             self._show(block.x, slope, block.first, block.kept, rows)
             return
