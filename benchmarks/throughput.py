@@ -19,7 +19,7 @@ from scipy import signal
 
 import fingerspice as fs
 from fingerspice.numerics.hold import first_order_hold
-from fingerspice.numerics.moments import weights as moment_weights
+from fingerspice.numerics.moments import moments
 from timing import median_seconds
 
 HERE = Path(__file__).resolve().parent
@@ -40,8 +40,10 @@ def modal_gap(area: float) -> tuple[Any, Any, Any, Any]:
 def equivalent_filter(rates: Any, gains: Any, direct: Any, weights: Any) -> tuple[Any, Any]:
     """Numerator and denominator of the filter with the same first-order-hold response, for lfilter."""
     b, a = direct, np.array([1.0])
-    held = moment_weights(rates * DT, (0.0, 1.0))
-    for rate, gain, weight, (before, here) in zip(rates, gains, weights[0], held, strict=True):
+    found = np.empty(2)
+    for rate, gain, weight in zip(rates, gains, weights[0], strict=True):
+        moments(float(rate * DT), found)
+        here, before = found[1], found[0] - found[1]
         pole = np.array([1.0, -np.exp(-rate * DT)])
         part = weight * gain * DT * np.array([here, before])
         b = np.polyadd(np.convolve(b, pole), np.convolve(part, a))
