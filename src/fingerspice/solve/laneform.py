@@ -23,8 +23,9 @@ from fingerspice.solve.problem import Problem
 LANES = 32
 # Largest degree of the polynomial for 1/A.
 MOST_DEGREE = 28
-# Truncation error allowed for the polynomial of 1/A, relative to the error asked for.
-AREA_SHARE = 0.003
+# Truncation error allowed for the polynomial of 1/A, relative to the error asked for or to this one, if that is less:
+# terms cost little.
+_AREA_SHARE, _COARSEST = 0.003, 1e-5
 # Number of Chebyshev points for the area over the gap voltage.
 _POINTS = 64
 
@@ -177,12 +178,13 @@ def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
 
 
 def curves(
-    curve: FloatArray, q0: float, kappa: float, top: float, tol: float
+    curve: FloatArray, q0: float, kappa: float, top: float, rtol: float
 ) -> tuple[FloatArray, FloatArray, float, float, float] | None:
     """1/A - q0 and N as polynomials in `scale` xi - 1, the scale, and their errors (of 1/A relative, and V m^2).
 
-    They reach the gap voltage `top` (V). None where no allowed degree is enough for `tol`.
+    They reach the gap voltage `top` (V). None where no allowed degree is enough for errors of `rtol`.
     """
+    tol = _AREA_SHARE * min(rtol, _COARSEST)
     at = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
     to_series = np.linalg.inv(_chebyshev(at, _POINTS))
     area = to_series @ (1.0 / inverse_area_array(0.5 * top * (at + 1.0), curve)[0])

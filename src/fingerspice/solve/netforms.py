@@ -13,7 +13,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.engine.lanerows import FADED, Lanes
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
-from fingerspice.solve.laneform import AREA_SHARE, LaneForm, Shown, curves, slopes
+from fingerspice.solve.laneform import LaneForm, Shown, curves, slopes
 from fingerspice.solve.netmodal import Reduced
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene
@@ -26,8 +26,6 @@ _FREQUENCIES = 65
 # Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
 # what they leave together is known but for about 1e-8.
 OF_MANY, ACTING = 1e-7, 0.05
-# Error of the polynomials for larger errors asked for, too: terms cost little.
-COARSEST = 1e-5
 # Reference area: that at this share of the largest gap voltage to expect.
 _TYPICAL = 0.5
 
@@ -124,8 +122,7 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
     reduced = Reduced(scene, source, area0)
     one = reduced.modal()
     modal = reduced.with_charges(one) if problem.charge else one
-    share_of = AREA_SHARE * min(rtol, COARSEST)
-    found_curves = curves(scene.net.curves[moving], reduced.q0, reduced.kappa, scene.u_top, share_of)
+    found_curves = curves(scene.net.curves[moving], reduced.q0, reduced.kappa, scene.u_top, rtol)
     contact = problem.network.contacts[moving]
     if modal is None or found_curves is None or contact is None:
         return None

@@ -15,7 +15,7 @@ from fingerspice.engine.lanerows import Lanes
 from fingerspice.engine.model import dot, ramp
 from fingerspice.engine.system import System
 from fingerspice.results.outcome import State
-from fingerspice.solve.laneform import AREA_SHARE, LaneForm, Shown, curves, slopes
+from fingerspice.solve.laneform import LaneForm, Shown, curves, slopes
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK
 from fingerspice.solve.stackstate import StackState, from_stack
@@ -75,7 +75,7 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
     peak = rounded_peak(scene.u_peak)
     system = system_of(scene, decade, BEYOND_PEAK * peak, _ONE_REFERENCE, peak)
     model, q0, stack = system.model, float(system.q0[0]), scene.stack
-    found = curves(model.curve, q0, 0.0, system.u_top, AREA_SHARE * rtol)
+    found = curves(model.curve, q0, 0.0, system.u_top, rtol)
     assert stack is not None
     if found is None or stack.gap is None or (stack.g_area[stack.gap] > 0.0 and not model.mobile):
         return None
