@@ -15,9 +15,8 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.solve.laneblock import Block, Window
 from fingerspice.solve.laneform import LANES, LaneForm, Shown
 
-# Stated over seen errors, of voltages and the force, and of charges: as seen in recordings of
-# tests/recording_errors.py.
-SAFETY, OF_CHARGE = 2.25, 3.0
+# Stated over seen errors, of voltages, of the force and of charges: as seen in recordings of tests/recording_errors.py.
+SAFETY, OF_FORCE, OF_CHARGE = 2.25, 1.75, 2.5
 # Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
 LUCK = 2.0
 
@@ -93,7 +92,7 @@ def judge(block: Block, parts: int, peak: float, alike: FloatArray, chance: Floa
         """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
         by_chance = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there), 0.0))
         more = np.maximum(by_chance, np.abs(columns @ alike_there) - LUCK * by_chance)
-        return np.asarray(more + np.abs(columns[:active]) @ block.left[:active] / SAFETY)
+        return np.asarray(more + np.abs(columns[:active]) @ block.left[:active] / OF_FORCE)
 
     errors, over, top = np.zeros(4), added(c.shape), np.maximum(block.peaks, 1e-9 * peak + 1e-300)
     steep, xi = _steep(form, block, top), window.xi + np.einsum("k,kij->ij", form.xi[1], window.off)

@@ -14,7 +14,7 @@ from fingerspice.engine.lanereadout import flow, show
 from fingerspice.engine.lanerows import NODES
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.laneblock import Block
-from fingerspice.solve.laneerrors import OF_CHARGE, SAFETY, Judged, judge
+from fingerspice.solve.laneerrors import OF_CHARGE, OF_FORCE, SAFETY, Judged, judge
 from fingerspice.solve.laneform import LANES, LaneForm
 from fingerspice.solve.pieces import Piece, driving, spacing_of
 from fingerspice.solve.problem import Problem
@@ -225,7 +225,7 @@ class LaneMarch:
         floor += (1.0 / self.margin if form.mobile else DIVIDED) * missed * peak
         floor += form.lanes.kappa * form.missed_bend
         u_error = SAFETY * float(errors[0]) + floor
-        f_error = SAFETY * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force
+        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force
         node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + floor
         charge_error = None
         if form.flows:
