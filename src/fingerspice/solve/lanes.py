@@ -156,7 +156,7 @@ class LaneMarch:
 
     def _on_branch(self, block: Block, start: float, peak: float) -> bool:
         """Whether the gap voltage stays clear of folds, and on the branch on which it starts."""
-        near = block.n == 0 or not self.form.mobile or abs(block.xi[0] - start) <= 0.01 * peak
+        near = not self.form.mobile or abs(block.xi[0] - start) <= 0.01 * peak
         return near and block.on_one_branch and block.margin > LEAST_MARGIN
 
     def _excess(self, seen: Judged, peak: float, share: float) -> float:

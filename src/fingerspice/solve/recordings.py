@@ -26,8 +26,7 @@ from fingerspice.solve.stackform import rounded_peak, stack
 # Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
 # and add up, a later piece cannot make up for errors of the earlier ones.
 BEGINNINGS = (1.0, 0.03)
-# Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, sample spacing, peak and
-# thread.
+# Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, peak and thread.
 MOST_FORMS = 16
 
 
