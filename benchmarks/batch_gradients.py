@@ -1,4 +1,4 @@
-"""Cost of the derivatives of `fs.batch` in runs, and their errors, beside a loop over single runs with tangents.
+"""Cost of the derivatives of `fs.batch` in runs, and their errors, beside a loop over single runs.
 
 A scene is Table 1's stack with another gap, leak and amplitude; its derivatives are those of the mean force by these
 three. A call with derivatives and one without are timed in turn. Usage:

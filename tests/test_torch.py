@@ -293,8 +293,8 @@ def test_second_derivatives_are_refused(means: Any, shares: Any) -> None:
         first.sum().backward()
 
 
-def test_networks_are_refused() -> None:
-    with pytest.raises(InputError, match="no series stack with a GAP"):
+def test_what_is_no_finger_is_refused() -> None:
+    with pytest.raises(InputError, match="the circuit has 2 GAPs"):
         fs.torch.Simulator(fs.read_netlist(CIRCUITS / "two_fingers.cir"))
     with pytest.raises(InputError, match="the circuit is a str"):
         fs.torch.Simulator("fingerpad.cir")

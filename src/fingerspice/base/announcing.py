@@ -18,7 +18,6 @@ LONG = {
     ("engine.shooting.close_period", "Stack"): "the periodic state, about 25 s",
     ("engine.collocation.advance", "Nodal"): "implicit steps, about 15 s",
     ("engine.lockmarch.march", ""): "scenes in lockstep, about 20 s",
-    ("engine.tangent.follow", "System"): "derivatives, about 15 s",
 }
 _SHORT = "a small part, some seconds"
 _ONCE = "only once: later runs find it on the disk"

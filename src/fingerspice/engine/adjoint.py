@@ -1,6 +1,6 @@
 """Adjoint of a series stack under a recording: how one number that follows from a run changes with every sample.
 
-Along a run the tangent equations (`engine.tangent`) are linear, so that one backward sweep gives the derivatives of a
+Along a run the equations of small changes are linear, so that one backward sweep gives the derivatives of a
 scalar J by the source at all times (Cao, Li, Petzold and Serban 2003, section 2.1). In the modes of `engine.system`,
 with q = 1/A, z = q - q0 and the voltages or states X_t that the term of the area multiplies, it solves
 

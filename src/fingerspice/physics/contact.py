@@ -295,45 +295,6 @@ def inverse_area_array(u: FloatArray, curve: FloatArray) -> tuple[FloatArray, Fl
 
 
 @jit
-def area_slopes(u: float, area: float, contact: FloatArray, out: FloatArray) -> None:
-    """Derivatives of A_R by the gap voltage and by every constant of a contact.
-
-    Parameters
-    ----------
-    u, area : float
-        Gap voltage u >= 0 (V), or a little below, and A_R there, m^2.
-    contact : ndarray, shape (N_PACKED,)
-        See `Contact.packed`.
-    out : ndarray, shape (1 + N_PACKED,)
-        Receives dA/du (m^2/V), then the derivatives of A at fixed u by the entries of `contact`.
-    """
-    sigma = contact[4] * u * u
-    load = contact[5] + sigma * area
-    # A = A0 - (c2 mu^2 / A0) load^2 is a quadratic equation for A0 = area_unloaded y.
-    a0 = 0.5 * (area + math.sqrt(area * area + 4.0 * contact[7] * load * load))
-    log_y, x = math.log(a0 / contact[1]), contact[0] * u
-    # From ln y / m = log(1 + x y^p), with b = y^p / (1 + x y^p):
-    # (1/m - p x b) d ln y = b dx + x b ln y dp - ln y d(1/m).
-    b = math.exp(contact[3] * log_y)
-    b /= 1.0 + x * b
-    k = contact[7] / a0
-    rest = 1.0 + 2.0 * k * sigma * load
-    by_log = a0 * (1.0 + contact[7] * (load / a0) ** 2) / rest
-    by_load = -2.0 * k * load / rest
-    by_sigma = by_load * area
-    by_log_y = by_log / (contact[2] - contact[3] * x * b)
-    out[0] = by_log_y * b * contact[0] + 2.0 * by_sigma * contact[4] * u
-    out[1] = by_log_y * b * u
-    out[2] = by_log / contact[1]
-    out[3] = -by_log_y * log_y
-    out[4] = by_log_y * x * b * log_y
-    out[5] = by_sigma * u * u
-    out[6] = by_load
-    out[7] = 0.0
-    out[8] = -load * load / a0 / rest
-
-
-@jit
 def _ridge_area_slope(u: float, contact: FloatArray) -> tuple[float, float]:
     """A_R (m^2) and dA_R/du (m^2/V): `ridge_area` differentiated."""
     x = contact[0] * u

@@ -31,6 +31,7 @@ from fingerspice.solve.periodic import close_period
 from fingerspice.solve.planning import make_plan
 from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.runs import Progress, Run
+from fingerspice.solve.sensitivities import check_request, sensitivities_of
 from fingerspice.solve.times import to_ends
 from fingerspice.waveforms.waveform import DOUBLE, require
 
@@ -105,8 +106,7 @@ def simulate(
     progress : callable, optional
         Called with the fraction of the run that is done.
     sensitivities : sequence of str
-        Paths of parameters, as in `Circuit.replace`, by which signals and means are differentiated; the result is
-        `Solution.sensitivities`. For series stacks whose area is coupled; the run is then stepped.
+        Paths, as in `Circuit.replace`, by which signals and means are differentiated, with four more runs each.
 
     Returns
     -------
@@ -123,18 +123,19 @@ def simulate(
     # Of their own: results keep them, and the caller's array stays writable.
     times = None if t_eval is None else real_numbers("t_eval", t_eval, "numbers in s").copy()
     circuit = overridden(circuit, sources, parameters)
-    problem = asked(
-        circuit, t_stop=t_stop, t_eval=times, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol
-    )  # fmt: skip
+    wanted: dict[str, Any] = {"t_stop": t_stop, "charge_law": charge_law, "area": area, "start": start}
+    problem = asked(circuit, t_eval=times, charge=charge, rtol=rtol, **wanted)
     how = start if isinstance(start, str) else "given"
-    if not sensitivities:
-        return _given_back(run_problem(problem, times, rtol, method, progress, tier, how, jumps), throw)
-    from fingerspice.solve.sensitivities import check_request, sensitivities_of
+    compared = check_request(problem, sensitivities, method, how) if sensitivities else method
+    solution = run_problem(problem, times, rtol, method, progress, tier, how, jumps)
 
-    method = check_request(problem, sensitivities, method, how)
-    solution = run_problem(problem, times, rtol, method, progress, "coupled", how, jumps)
-    if solution.success:
-        solution = dataclasses.replace(solution, sensitivities=sensitivities_of(problem, solution, sensitivities, how))
+    def run(other: Circuit, finer: float) -> Solution:
+        at = None if times is None else times.copy()
+        varied = asked(other, t_eval=at, charge=False, rtol=finer, **wanted)
+        return run_problem(varied, at, finer, compared, None, tier, how, jumps)
+
+    if sensitivities and solution.success:
+        solution = dataclasses.replace(solution, sensitivities=sensitivities_of(problem, solution, sensitivities, run))
     return _given_back(solution, throw)
 
 

@@ -1,4 +1,4 @@
-"""Derivatives of a batch's means: the request, scenes in lockstep, and all others by the tangents of single runs."""
+"""Derivatives of a batch's means: the request, scenes in lockstep, and all others by those of single runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
@@ -56,11 +55,9 @@ def gradient_request(
     outputs = tuple(name for name in task.outputs if name in MEANS)
     if not outputs:
         raise InputError(f"gradients are asked for, and outputs has no mean; allowed: one of {', '.join(MEANS)}")
-    if not is_stack(circuit) or build_stack(circuit).contact is None:
-        raise InputError(
-            "gradients are asked for, and the circuit is no series stack with a GAP whose area follows the voltage; "
-            "allowed: such a stack"
-        )
+    if len(circuit.by_device("GAP")) != 1:
+        number = len(circuit.by_device("GAP"))
+        raise InputError(f"gradients are asked for, and the circuit has {number} GAPs; allowed: one")
     if len(set(paths)) < len(paths):
         raise InputError(f"gradients is {tuple(paths)!r}; allowed: every parameter once")
     for path in paths:
@@ -86,7 +83,7 @@ def gradient_request(
 def in_lockstep_by(circuit: Circuit, paths: Iterable[str], outputs: Sequence[str], rtol: float) -> bool:
     """Whether derivatives of outputs by parameters, with the values of all `paths` varying, can be those of lockstep.
 
-    If not, a batch takes the tangents of single runs, besides a run for every scene's outputs.
+    If not, a batch takes the derivatives of single runs, besides a run for every scene's outputs.
     """
     form = lockstep_form(circuit, {path.lower(): None for path in paths})
     if isinstance(form, str) or form.recording is not None:
@@ -175,7 +172,7 @@ def _lockstep(
 
 
 def _single(task: Task, wanted: Gradients, changes: Mapping[str, float], frequency: float) -> _Single:
-    """The derivatives of one scene by the tangents of its run; a refusal or failure is returned, not raised."""
+    """The derivatives of one scene by those of its run; a refusal or failure is returned, not raised."""
     try:
         circuit, rtol = task.circuit.varied(changes), max(OVER_PEAK * task.rtol, RTOL_RANGE[0])
         found = _differentiated(task, wanted, circuit, frequency, rtol)
@@ -209,7 +206,7 @@ def _differentiated(task: Task, wanted: Gradients, circuit: Circuit, frequency: 
             gained = float(getattr(ran, name.removesuffix("_mean"))[-1]) - float(getattr(ran, name))
             by[wanted.paths.index(wanted.longer)] -= gained * stop / (stop - start)
         values[name] = np.array([x / circuit.parameters[p].value for x, p in zip(by, wanted.paths, strict=True)])
-    # The tangents' error, as that of a change by all of the parameter, is about ten times that of the run.
+    # Their error, as that of a change by all of the parameter, is about ten times that of the run.
     return _Single(values, LIMIT * error_of(ran), ONE_BY_ONE, "")
 
 

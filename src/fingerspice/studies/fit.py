@@ -16,7 +16,6 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import scenes_warnings
-from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.batch import batch
 from fingerspice.studies.fitdata import IMPEDANCE, Data, data_of
@@ -214,10 +213,9 @@ def _task(
     require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
     target, scale = _target(table)
-    exact = is_stack(circuit) and build_stack(circuit).contact is not None and table.signal != IMPEDANCE
     every = tuple(one.path for one in unknowns)
     circuit, box = bounds_of(circuit, every, bounds or {})
-    return Task(circuit, table, unknowns, box, average, skin, rtol, charge_law, target, scale, exact)
+    return Task(circuit, table, unknowns, box, average, skin, rtol, charge_law, target, scale)
 
 
 def _target(table: Data) -> tuple[FloatArray, FloatArray]:
@@ -265,7 +263,7 @@ def _starts(task: Task, count: int) -> list[FloatArray]:
     from scipy.stats import qmc
 
     initial = task.initial
-    if count == 1 or task.data.t is not None or not task.exact:
+    if count == 1 or task.data.t is not None or task.data.signal == IMPEDANCE:
         return [initial]
     low = np.maximum(task.bounds[:, 0], initial / _SPREAD)
     high = np.minimum(task.bounds[:, 1], initial * _SPREAD)

@@ -20,6 +20,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.topology import driving_sources
+from fingerspice.numerics.differences import AT, STEP, derivative
 from fingerspice.results.outcome import SolveError
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.batch import batch
@@ -34,8 +35,6 @@ from fingerspice.studies.steady import steady_state
 if TYPE_CHECKING:
     from xarray import Dataset
 
-# Relative step of a difference, where derivatives are not exact: of networks.
-_STEP = 1e-4
 # Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's.
 _SLOPES = 1e-6
 # What a scene that cannot be run counts as, over the scale of the data.
@@ -73,7 +72,6 @@ class Task:
     # where the phase of an impedance is given, the phases (deg) after them
     target: FloatArray
     scale: FloatArray
-    exact: bool  # Whether derivatives are those of a series stack, and not differences
     watch: Callable[[], None] = lambda: None  # Called before every evaluation
 
     @property
@@ -99,36 +97,22 @@ class Task:
 
     def predict(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Predicted data (n,), and their derivatives by the logarithms of the parameters (n, n_parameter)."""
-        if self.exact:
-            return self._predicted(values, exact=True)
-        middle, _ = self._predicted(values, exact=False)
-        by = np.empty((middle.size, values.size))
-        for k in range(values.size):
-            pair = []
-            for sign in (-1.0, 1.0):
-                moved = values.copy()
-                moved[k] *= 1.0 + sign * _STEP
-                pair.append(self._predicted(moved, exact=False)[0])
-            by[:, k] = (pair[1] - pair[0]) / (2.0 * _STEP)
-        return middle, by
-
-    def _predicted(self, values: FloatArray, *, exact: bool) -> tuple[FloatArray, FloatArray]:
         data, how = self.data, {"rtol": self.rtol, "charge_law": self.charge_law, "charge": False}
         if data.t is not None:
-            paths = tuple(one.path for one in self.unknowns) if exact else ()
+            paths = tuple(one.path for one in self.unknowns)
             run = simulate(self.scene(values, 0), t_eval=data.t, sensitivities=paths, **how)  # type: ignore[arg-type]
             slopes = [getattr(run.sensitivities[path], data.signal) for path in paths]
-            return np.asarray(getattr(run, data.signal)), np.array(slopes).reshape(len(paths), -1).T * values[
-                : len(paths)
-            ]
+            return np.asarray(getattr(run, data.signal)), np.array(slopes).T * values
         if data.signal == IMPEDANCE:
-            return self._impedance(values), np.empty((self.target.size, 0))
-        if exact and self._in_lockstep:
+            moved = values * (1.0 + np.multiply.outer(STEP * np.array(AT), np.eye(values.size)))
+            by = derivative([np.array([self._impedance(one) for one in each]) for each in moved], STEP)
+            return self._impedance(values), by.T
+        if self._in_lockstep:
             return self._in_batches(values)
         name, found, by = data.name, np.empty(data.values.size), np.zeros((data.values.size, values.size))
         for row in range(data.values.size):
             circuit = self.scene(values, row)
-            felt = np.flatnonzero(self.members[:, row]) if exact else ()
+            felt = np.flatnonzero(self.members[:, row])
             paths = tuple(self.unknowns[k].path for k in felt)
             if self.average == "periodic":
                 one = steady_state(circuit, sensitivities=paths, points=4, **how)  # type: ignore[arg-type]

@@ -16,16 +16,14 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.loop import network_of
 from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.sensitivity import Sensitivity
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Figured, Figures, KeptFigures
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
-from fingerspice.solve.sensitivities import check_request, sensitivities_of
+from fingerspice.solve.sensitivities import check_request, period_of, sensitivities_of
 from fingerspice.solve.simulation import rtol_given, run_problem
-from fingerspice.waveforms.combinations import Sum
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,6 +49,8 @@ class SteadyState(Shown, Figured):
         Estimated error of the state, as its effect on the gap voltage and the force of the period.
     periods : float
         Number of periods integrated to find the state.
+    area : str or float
+        As in `simulate`.
     asked : tuple of str
         Parameters by which `sensitivities` are wanted.
     """
@@ -62,6 +62,7 @@ class SteadyState(Shown, Figured):
     memory: float
     error: ErrorEstimate
     periods: float
+    area: str | float = "coupled"
     asked: tuple[str, ...] = ()
 
     def _page(self) -> Page:
@@ -98,6 +99,16 @@ class SteadyState(Shown, Figured):
         """Derivatives of the period's signals and means, by the path of each parameter that was asked for."""
         return self.solution.sensitivities
 
+    def _run(self, circuit: Circuit, rtol: float) -> Solution:
+        """The run from the periodic state of another circuit, as long as the period of this one."""
+        one = self.problem
+        other = prepare(
+            circuit, t_stop=self.period, t_eval=None, charge_law=one.scene.charge_law, area=self.area,
+            start="uncharged", charge=False,
+        )  # fmt: skip
+        closed = close_period(dataclasses.replace(other, first=0.0, step=one.step), 0.5 * rtol)
+        return run_problem(closed.problem, rtol=rtol, start="periodic")
+
     @cached_property
     def solution(self) -> Solution:
         """The period's signals, integrated at the first access, which also gives the warnings.
@@ -107,12 +118,11 @@ class SteadyState(Shown, Figured):
         SolveError
             If the integration fails.
         """
-        tier = "coupled" if self.asked else "auto"
-        solution = run_problem(self.problem, rtol=self.rtol, tier=tier, start="periodic")
+        solution = run_problem(self.problem, rtol=self.rtol, start="periodic")
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
         if self.asked:
-            found = sensitivities_of(self.problem, solution, self.asked, "periodic", over_period=True)
+            found = sensitivities_of(self.problem, solution, self.asked, self._run, over_period=True)
             solution = dataclasses.replace(solution, sensitivities=found)
         for text in solution.warnings:
             if text not in self.problem.circuit.warnings:
@@ -162,8 +172,7 @@ def steady_state(
     rtol = rtol_given(rtol)
     points = whole_number("points", points, 1)
     circuit = overridden(circuit, sources, parameters)
-    waves = network_of(circuit).waveforms
-    period = (waves[0] if len(waves) == 1 else Sum(waves)).period
+    period = period_of(circuit)
     if period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
     problem = prepare(
@@ -174,5 +183,5 @@ def steady_state(
     closed = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)
     return SteadyState(
         closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.periods,
-        tuple(sensitivities),
+        area, tuple(sensitivities),
     )  # fmt: skip

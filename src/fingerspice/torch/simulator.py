@@ -1,4 +1,4 @@
-"""A circuit as a module of PyTorch: values from the package's own runs, derivatives from their tangents."""
+"""A circuit as a module of PyTorch: values from the package's own runs, derivatives from differences of runs."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from torch import Tensor
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.studies.batch import own_path
 from fingerspice.torch.requests import request, tensor_of
 from fingerspice.torch.scenes import MEANS, Scenes
 
 
 class Simulator(torch.nn.Module):
-    """A series stack whose parameters are those of a module, and whose runs have exact derivatives by them.
+    """A circuit whose parameters are those of a module, and whose runs have exact derivatives by them.
 
     Every parameter is a `torch.nn.Parameter` in double precision, in the netlist's unit, whose name is the path with
     ``_`` for its dots: ``Xgap.d`` is `Xgap_d`. Tensors of several values are many scenes; their shapes are broadcast.
@@ -28,7 +27,7 @@ class Simulator(torch.nn.Module):
     Parameters
     ----------
     circuit : Circuit
-        A series stack with a GAP whose area follows the voltage.
+        One with one GAP.
     parameters : sequence of str, or mapping of str to array_like
         Paths, as in `Circuit.replace`, of the circuit and its waveform; a mapping gives the values to start from, which
         are otherwise the circuit's. ``source.`` stands for the only source.
@@ -49,7 +48,7 @@ class Simulator(torch.nn.Module):
     Raises
     ------
     InputError
-        If the circuit is another network, or a path, output or time is unknown or missing.
+        If the circuit is another one, or a path, output or time is unknown or missing.
     """
 
     def __init__(
@@ -66,10 +65,9 @@ class Simulator(torch.nn.Module):
     ) -> None:
         super().__init__()
         require_circuit(circuit)
-        if not is_stack(circuit) or build_stack(circuit).contact is None:
-            raise InputError(
-                "the circuit is no series stack with a GAP; allowed: one with derivatives, which these are"
-            )
+        gaps = circuit.by_device("GAP")
+        if len(gaps) != 1:
+            raise InputError(f"the circuit has {len(gaps)} GAPs; allowed: one")
         self.circuit, self.logarithms = circuit, logarithms
         self._alone = isinstance(outputs, str)
         names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
