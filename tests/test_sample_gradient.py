@@ -12,6 +12,7 @@ from scipy.signal import butter, sosfilt
 import fingerspice as fs
 from fingerspice.base.errors import InputError
 from scenes import table1, table1_deck
+from test_network_recordings import floating
 
 RATE, COUNT = 48_000.0, 300
 T_STOP = (COUNT - 1) / RATE
@@ -77,6 +78,11 @@ def test_a_dispersive_skin(weights: np.ndarray) -> None:
     text = table1_deck().replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
     assert "DISPERSIVE" in text
     check(fs.parse_netlist(text), 100.0 + noise(6, 40.0), {"f_t": weights}, 0.5, 5e-7, rtol=1e-7)
+
+
+@pytest.mark.parametrize("volts", [80.0 + noise(1, 60.0), noise(1, 60.0)], ids=["above", "through"])
+def test_a_network(volts: np.ndarray, weights: np.ndarray) -> None:
+    check(floating(), volts, {"f_t": weights, "f_el_mean": 1.0}, 0.05, 1e-8, rtol=1e-8)
 
 
 def test_a_source_against_the_loop_a_late_recording_and_means_from_tstart() -> None:

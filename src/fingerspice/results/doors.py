@@ -72,8 +72,8 @@ class Doors(Shown):
         """Derivatives of a number that follows from this run by every sample of its source (docs/sensitivities.md).
 
         For ``J = sum((run.f_t - wanted) ** 2)`` that is ``run.sample_gradient(f_t=2.0 * (run.f_t - wanted))``. The run
-        is a series stack with a GAP whose area follows its voltage, under one recording: `Samples`, or a PWL on an even
-        grid. One sweep back through the run gives the derivatives by all samples (Cao, Li, Petzold and Serban 2003).
+        has one GAP whose area follows its voltage, under one recording: `Samples`, or a PWL on an even grid. One way
+        back through the run's steps gives the derivatives by all samples.
 
         Parameters
         ----------
@@ -91,7 +91,7 @@ class Doors(Shown):
         InputError
             For another circuit, source or run, or an unknown signal.
         SolveError
-            If the error stays above ten times the run's `rtol` of the largest derivative.
+            If the run cannot be followed sample by sample.
         """
         from fingerspice.solve.adjoint import sample_gradient
 

@@ -1,4 +1,9 @@
-"""Derivatives of a number that follows from a run by every sample of its source (`engine.adjoint`)."""
+"""Derivatives of a number that follows from a run by every sample of its source.
+
+The run is followed in lanes (`solve.laneblock`), by so many steps in each interval between samples. What an interval
+leads to is differentiated by what it starts from and by the source at its ends (`engine.laneslopes`); back from the end
+of the run, these derivatives are multiplied.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +15,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray, IntArray, real_numbers
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.engine.adjoint import new_room, sweep
-from fingerspice.engine.adjointsteps import Course, Wanted
-from fingerspice.engine.system import System
+from fingerspice.engine.laneslopes import AREAS, GAP, MORE, SQUARES, slopes_of, sum_back
 from fingerspice.numerics.differences import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.results.samplegradient import SampleGradient
 from fingerspice.results.solution import Solution
-from fingerspice.solve.initial import initial_state
+from fingerspice.solve.laneblock import Block
+from fingerspice.solve.laneform import LANES, LaneForm
+from fingerspice.solve.lanes import LEAST_MARGIN
+from fingerspice.solve.netforms import recording_of
+from fingerspice.solve.pieces import driving
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.scenes import scene_of
-from fingerspice.solve.simulation import asked, run_problem
-from fingerspice.solve.stackstate import model_of, to_stack
-from fingerspice.solve.track import prepare_system
+from fingerspice.solve.recordings import ready
+from fingerspice.solve.simulation import asked
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.samples import Samples
@@ -33,75 +38,15 @@ from fingerspice.waveforms.waveform import DC
 
 SIGNALS = ("u_gap", "area", "f_el", "f_t", "friction")
 MEANS = ("area_mean", "f_el_mean", "f_t_mean", "friction_mean")
-# Steps of a sample's length in each attempt; and the error wanted, relative to the largest derivative, over `rtol`.
-_ATTEMPTS, _ALLOWED = (2, 4, 8, 16), 10.0
-# Error of the finer steps at most, over their difference from the coarser ones, whose order is 4, or 2 where the
-# integrand jumps with the area's slope.
-_LEFT = 0.5
-# Error of the iteration in every step, over `rtol`.
-_SHARE = 1e-2
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """Steps of equal length between the samples of a recording, from the start of a run to its end."""
-
-    t: FloatArray  # (2 n + 1,): Start, middle and end of the n steps, s
-    # sample, share, width (n,): See `engine.adjoint.Course`
-    sample: IntArray
-    share: FloatArray
-    width: FloatArray
-
-    @property
-    def coarser(self) -> _Grid:
-        """Half as many steps."""
-        return _Grid(self.t[::2], self.sample[::2], self.share[::2], 2.0 * self.width[::2])
-
-    def place(self, t: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Steps that contain times (s), with their ends, and the fractions of them."""
-        ends = self.t[::2]
-        step = np.clip(np.searchsorted(ends, t, "left") - 1, 0, self.sample.size - 1)
-        return step, np.clip((t - ends[step]) / (ends[step + 1] - ends[step]), 0.0, 1.0)
-
-
-def _grid(wave: Samples, t0: float, t1: float, steps: int) -> _Grid:
-    first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
-    inner = wave.start + np.arange(first, last + 1) / wave.rate
-    slack = 1e-6 / wave.rate
-    edges = np.concatenate([[t0], inner[(inner > t0 + slack) & (inner < t1 - slack)], [t1]])
-    number = np.floor((0.5 * (edges[:-1] + edges[1:]) - wave.start) * wave.rate)
-    along = (number >= 0) & (number < wave.count - 1)
-    here = np.where(along, (edges[:-1] - wave.start) * wave.rate - number, 0.0)
-    length = np.where(along, np.diff(edges) * wave.rate, 0.0)
-    part = np.arange(2 * steps) / (2 * steps)
-    t = np.append((edges[:-1, None] + np.diff(edges)[:, None] * part).ravel(), t1)
-    share = (here[:, None] + length[:, None] * part[::2]).ravel()
-    sample = np.clip(number, 0, wave.count - 1).astype(np.int64)
-    return _Grid(t, np.repeat(sample, steps), share, np.repeat(length / steps, steps))
-
-
-def _course(system: System, run: Solution, problem: Problem, grid: _Grid) -> Course:
-    stack, model = problem.scene.stack, system.model
-    assert stack is not None
-    assert stack.gap is not None
-    assert run.u_gap is not None
-    u = np.asarray(float(stack.sign[stack.gap]) * run.u_gap)
-    q, dq = inverse_areas_with_slopes(u, model.curve)
-    s, rows = run.u_source, []
-    for i in np.flatnonzero(model.rate0 > 0.0):
-        cell = stack.state_order[i]
-        v = float(stack.sign[cell]) * run.u_layer[:, stack.layer_of(cell)]
-        rows.append((v - model.k[i] * s) / (model.area0 * q) if model.mobile else v)
-    h = np.diff(grid.t[::2])
-    x = np.ascontiguousarray(rows) if rows else np.zeros((0, u.size))
-    held = (u - model.k_gap * s) / q if model.mobile else np.zeros(0)
-    return Course(h, u, np.ascontiguousarray(s), held, x, q, dq * np.sign(u), grid.sample, grid.share, grid.width)
-
-
-def _coarser(c: Course, grid: _Grid) -> Course:
-    u, s, held, q, dq = (np.ascontiguousarray(row[::2]) for row in (c.u, c.s, c.held, c.q, c.dq))
-    x = np.ascontiguousarray(c.x[:, ::2])
-    return Course(np.diff(grid.t[::2]), u, s, held, x, q, dq, grid.sample, grid.share, grid.width)
+# Steps of an interval: of the first two numbers, or below this `rtol` of the second and third, and twice as many while
+# these differ; and the error wanted, relative to the largest derivative, over `rtol`.
+_STEPS, _COARSE, _ALLOWED = (1, 2, 4, 8, 16, 32, 64), 1e-7, 10.0
+# Distance of the differences, over the largest voltage.
+_APART = 1e-5
+# Intervals whose derivatives are held at once.
+_AT_ONCE = 1 << 13
+# Change of starts that is left, over the largest voltage; errors of the polynomials, over that asked for.
+_CLOSED, _SHARE = 1e-14, 1e-2
 
 
 @dataclass(frozen=True)
@@ -143,92 +88,207 @@ def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> _Weights:
     return _Weights(signals["u_gap"], force, signals["area"], mean, means["area_mean"])
 
 
-def _wanted(weights: _Weights, run: Solution, problem: Problem, system: System, grid: _Grid) -> Wanted:
-    stack = problem.scene.stack
-    assert stack is not None
-    assert stack.gap is not None
-    assert run.u_gap is not None
-    turn = float(stack.sign[stack.gap])
-    u = np.asarray(turn * run.u_gap)
-    q, dq = inverse_areas_with_slopes(u, system.model.curve)
-    dq = dq * np.sign(u)
-    by_u = turn * weights.u_gap - weights.area * dq / q**2
-    by_u += weights.f_el * system.stress * u * (2.0 - u * dq / q) / q
-    some = np.flatnonzero(by_u)
-    step, at = grid.place(run.t[some])
-    begin, fraction = grid.place(np.array([run.first]))
-    length = problem.t_stop - run.first
-    return Wanted(
-        weights.f_el_mean / length,
-        weights.area_mean / length,
-        (int(begin[0]), float(fraction[0])),
-        step,
-        at,
-        by_u[some],
-    )
+@dataclass(frozen=True)
+class _Run:
+    """A run between the samples of its source."""
+
+    problem: Problem
+    form: LaneForm
+    name: str  # Of the source
+    sign: float  # Of the source along the loop
+    wave: Samples  # Its own
+    t: FloatArray  # (n + 1,): Start and end of the run, samples between, and the start of the means, s
+    start: FloatArray  # (m,): Modes at the start
+    # (m,): Their derivatives by the source there
+    moved: FloatArray
+
+    @property
+    def turn(self) -> float:
+        """Sign of the gap voltage along the loop."""
+        stack = self.problem.scene.stack
+        return 1.0 if stack is None or stack.gap is None else float(stack.sign[stack.gap])
+
+    @property
+    def h(self) -> FloatArray:
+        """Lengths of the intervals (n,), or their common one (1,), s."""
+        h = np.diff(self.t)
+        return h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
+
+    @property
+    def place(self) -> tuple[IntArray, FloatArray]:
+        """Samples before the times `t`, and how far these are beyond, in samples, both (n + 1,)."""
+        at = np.clip((self.t - self.wave.start) * self.wave.rate, 0.0, self.wave.count - 1.0)
+        first = np.minimum(np.floor(at + 1e-6), self.wave.count - 2.0)
+        return first.astype(np.int64), np.maximum(at - first, 0.0)
 
 
 def _source_of(problem: Problem) -> tuple[str, float, Samples]:
-    """Name, sign along the loop and samples of the only source that is a recording."""
-    stack = problem.scene.stack
-    if stack is None or stack.contact is None or not problem.scene.coupled:
+    """Name, sign along the loop and samples of the only source that is a recording, beside constant ones."""
+    scene, stack = problem.scene, problem.scene.stack
+    if len(problem.network.fingers) != 1 or not scene.coupled:
         raise InputError(
-            "derivatives by samples are asked for, and the circuit is no series stack with a GAP whose area is "
-            "coupled; allowed: one"
+            "derivatives by samples are asked for, and the circuit has no single GAP whose area is coupled; allowed: "
+            "one"
         )
-    found = []
-    for element, sign in stack.sources:
-        wave = None if element.waveform is None else as_samples(element.waveform)
-        if wave is not None:
-            found.append((element.name, float(sign), wave))
-    if len(found) != 1:
+    if stack is None:
+        found = recording_of(problem)
+        known = [] if found is None else [(problem.network.sources[found[0]].name, 1.0, found[1])]
+    else:
+        waves = [
+            (e.name, float(sign), None if e.waveform is None else as_samples(e.waveform)) for e, sign in stack.sources
+        ]
+        known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
+    if len(known) != 1 or not isinstance(driving(problem), Samples):
         raise InputError(
-            f"derivatives by samples are asked for, and {len(found)} sources of the circuit are recordings; allowed: "
-            "one, such as fs.Samples, or a PWL on an even grid"
+            f"derivatives by samples are asked for, and {len(known)} sources of the circuit are recordings; allowed: "
+            "one, such as fs.Samples, or a PWL on an even grid, beside constant ones"
         )
-    return found[0]
+    return known[0]
 
 
-def _by_first_value(run: Solution, problem: Problem) -> FloatArray:
-    """Derivative of the state x at the start by the source's value there."""
-    scene, model = problem.scene, model_of(problem.scene)
-    if not problem.initial.s_before.any():
-        return np.zeros(model.gap.size)
+def _run_of(run: Solution) -> _Run:
+    def problem_of(by: float) -> Problem:
+        circuit = run.circuit if by == 0.0 else run.circuit.varied({name: Sum((wave, DC(sign * by)))})
+        return asked(
+            circuit, t_stop=run.t_stop, t_eval=None, charge_law=run.charge_law, area=run.area_mode, start=run.start,
+            charge=False, rtol=run.rtol,
+        )  # fmt: skip
+
+    problem = problem_of(0.0)
     name, sign, wave = _source_of(problem)
-    step, states = STEP * scene.u_peak, []
-    for at in AT:
-        other = run.circuit.replace({name: Sum((wave, DC(sign * at * step)))})
-        moved = scene_of(other, scene.charge_law, "coupled", problem.t_stop, 0.0)
-        inner = to_stack(moved, initial_state(other, moved, run.start))
-        states.append(inner.y[:-1])
-    return derivative(states, step)
+    form = ready(problem, max(_SHARE * run.rtol, 1e-13)) or ready(problem, run.rtol)
+    if form is None:
+        raise InputError(
+            "derivatives by samples are asked for, and this circuit is not followed sample by sample "
+            "(docs/recordings.md); allowed: a circuit that is"
+        )
+    t0, t1 = problem.t_start, problem.t_stop
+    first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
+    t, slack = wave.start + np.arange(first, last + 1) / wave.rate, 1e-6 / wave.rate
+    t = np.concatenate([[t0], t[(t > t0 + slack) & (t < t1 - slack)], [t1]])
+    if np.abs(t - run.first).min() > slack:
+        t = np.insert(t, np.searchsorted(t, run.first), run.first)
+    start, moved = form.start(problem)[0][: form.lanes.rates.size], np.zeros(form.lanes.rates.size)
+    if problem.initial.s_before.any():
+        step = STEP * problem.scene.u_peak
+        moved = derivative([form.start(problem_of(at * step))[0][: moved.size] for at in AT], step)
+    return _Run(problem, form, name, sign, wave, t, start, moved)
 
 
-def _swept(
-    run: Solution, problem: Problem, system: System, weights: _Weights, wave: Samples, steps: int
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Derivatives by the loop's samples, with so many steps of a sample's length and with half as many, 1/V."""
-    grid = _grid(wave, problem.t_start, problem.t_stop, steps)
-    dense = run_problem(problem, grid.t, run.rtol, tier="coupled", start=run.start, jumps="none")
-    if dense.failure is not None:
-        raise SolveError(dense.failure)
-    course, found = _course(system, dense, problem, grid), []
-    r = int(np.argmin(np.abs(np.log(system.q0) - 0.5 * np.log(course.q.min() * course.q.max()))))
-    for c, where in ((course, grid), (_coarser(course, grid.coarser), grid.coarser)):
-        wanted, out = _wanted(weights, run, problem, system, where), np.zeros(wave.count)
-        room = new_room(system.rates.shape[1], system.tap_k.size, np.bincount(wanted.step, minlength=1).max())
-        stuck = sweep(system, r, c, wanted, _SHARE * run.rtol, room, out)
-        if stuck >= 0:
-            cause = "the iteration for the derivatives by samples did not close"
-            at = float(where.t[2 * stuck])
+def _by_gap(weights: _Weights, run: Solution, one: _Run) -> FloatArray:
+    """Derivatives of the number by the gap voltage at the outputs, along the loop."""
+    ((_, contact),) = run.record.fingers
+    assert run.u_gap is not None
+    u = one.turn * run.u_gap
+    q, dq = inverse_areas_with_slopes(u, contact.curve(one.problem.scene.u_top))
+    dq = dq * np.sign(u)
+    by_u = one.turn * weights.u_gap - weights.area * dq / q**2
+    return np.asarray(by_u + weights.f_el * contact.stress(1.0) * u * (2.0 - u * dq / q) / q)
+
+
+class _Intervals:
+    """The intervals of a run between its times, with the modes at all of these."""
+
+    def __init__(self, one: _Run, rtol: float) -> None:
+        self.form, self.rtol, self.h, self.first = one.form, rtol, one.h, 0 if rtol >= _COARSE else 1
+        self.x, self.m = np.ascontiguousarray(one.problem.waveform.value(one.t)), one.form.lanes.rates.size
+        block, form, n = Block(one.form, self.x, self.h, True), one.form, one.t.size - 1
+        peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
+        solved = (
+            block.solve(one.start, _STEPS[self.first + 2], _CLOSED * peak)
+            and block.on_one_branch
+            and block.margin > LEAST_MARGIN
+        )
+        if not solved or float(np.abs(form.gap(block.xi)).max()) > form.u_top:
+            cause = "the run is not followed sample by sample, for its derivatives by samples"
+            at = float(one.t[0])
             raise SolveError(Failure(Status.STEP_UNDERFLOW, cause, "a higher sample rate takes shorter steps", at))
-        begun = float(room.reached @ system.project[r] @ _by_first_value(run, problem))
-        # The source at the start lies between two samples.
-        share = float(where.share[0])
-        out[where.sample[0]] += begun * (1.0 - share)
-        out[min(where.sample[0] + 1, wave.count - 1)] += begun * share
-        found.append(out)
-    return found[0], found[1]
+        self.z = block.kept[: self.m, :, :-1].reshape(self.m, -1)[:, :n]
+        sizes = np.append(np.abs(self.z).max(axis=1), np.abs(self.x).max())
+        self.delta = _APART * np.where(sizes > 0.0, sizes, peak)
+
+    def _slopes(self, at: IntArray, to: FloatArray, length: FloatArray, parts: int) -> FloatArray:
+        form, own, out = self.form, length.size > 1, np.empty((self.m + MORE, self.m + 2, at.size))
+        state, scratch = form.room(own)
+        weights = scratch if own else form.weights(length / parts)
+        still, z = form.weights(np.zeros(LANES if own else 1)), np.ascontiguousarray(self.z[:, at])
+        slopes_of(
+            form.marks(own), form.lanes, still, z, self.x[at], to, length, parts, self.delta, (state, weights), out
+        )  # fmt: skip
+        return out
+
+    def slopes(self, at: IntArray, to: FloatArray, length: FloatArray, rows: BoolArray) -> list[FloatArray]:
+        """Derivatives (`slopes_of`) from the starts of the intervals `at`, where the source goes to `to` in a `length`.
+
+        They come twice: as of the shortest steps, and extrapolated. `rows` says which of them are wanted.
+        """
+        if not length.any():
+            return 2 * [self._slopes(at, to, length, 1)]
+        m, many, first = self.m, length.size > 1, self.first
+        coarse, fine = (self._slopes(at, to, length, parts) for parts in _STEPS[first : first + 2])
+        # By the modes for what moves them, and by the source relative to the largest one.
+        moved = self.delta[:m, None] * np.abs(fine[:, :m])
+        scale = np.abs(fine[:, m:]).max(axis=(1, 2))[:, None] + np.zeros(m + 2)
+        scale[:, :m] = moved.max(axis=(1, 2))[:, None] / self.delta[:m]
+        wanted = rows[:, None, None] & (np.abs(fine - coarse) > _ALLOWED * self.rtol * scale[..., None])
+        for parts in _STEPS[first + 2 :]:
+            (still,) = np.nonzero(wanted.any(axis=(0, 1)))
+            if not still.size:
+                break
+            coarse[..., still] = fine[..., still]
+            fine[..., still] = self._slopes(at[still], to[still], length[still] if many else length, parts)
+            off = np.abs(fine[..., still] - coarse[..., still]) > _ALLOWED * self.rtol * scale[..., None]
+            wanted[..., still] = rows[:, None, None] & off
+        # Steps are of third order where the source is a line and the gap voltage has no zero.
+        return [fine, fine + (fine - coarse) / 7.0]
+
+
+def _outputs(by: _Intervals, one: _Run, run: Solution, weights: _Weights) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of the number by modes (2, m, n) and source (2, n + 1) at all times, by the outputs after each."""
+    n, m, t, x, by_u = by.x.size - 1, by.m, one.t, by.x, _by_gap(weights, run, one)
+    of_modes, of_source = np.zeros((2, m, n)), np.zeros((2, n + 1))
+    place = np.clip(np.searchsorted(t, run.t, "right") - 1, 0, n - 1)
+    share = (run.t - t[place]) / (t[place + 1] - t[place])
+    on = share < 1e-9
+    for which, between in ((on, False), (~on, True)):
+        for some in _parts_of(np.flatnonzero(which & (by_u != 0.0))):
+            at, part = place[some], share[some] if between else np.zeros(some.size)
+            to = x[at] + part * (x[at + 1] - x[at])
+            length = part * np.diff(t)[at] if between else np.zeros(1)
+            for row, found in enumerate(by.slopes(at, to, length, np.arange(m + MORE) == m + GAP)):
+                of_gap = by_u[some] * found[m + GAP]
+                for k in range(m):
+                    np.add.at(of_modes[row, k], at, of_gap[k])
+                np.add.at(of_source[row], at, of_gap[m] + (1.0 - part) * of_gap[m + 1])
+                np.add.at(of_source[row], at + 1, part * of_gap[m + 1])
+    return of_modes, of_source
+
+
+def _swept(one: _Run, run: Solution, weights: _Weights) -> FloatArray:
+    """Derivatives by the samples, with half the steps and with all, shape (2, n_sample)."""
+    by, t, ((_, contact),) = _Intervals(one, run.rtol), one.t, run.record.fingers
+    of_modes, of_source = _outputs(by, one, run, weights)
+    n, after, means = t.size - 1, np.zeros((2, by.m)), np.zeros((MORE, t.size - 1))
+    means[SQUARES], means[AREAS] = weights.f_el_mean * contact.stress(1.0), weights.area_mean
+    means *= (t[:-1] >= run.first - 1e-9 * (t[-1] - t[0])) / (t[-1] - run.first)
+    rows = np.append(np.ones(by.m, bool), means.any(axis=1))
+    for at in reversed(_parts_of(np.arange(n))):
+        a, b = at[0], at[-1] + 1
+        length = by.h[a:b] if by.h.size > 1 else by.h
+        for row, found in enumerate(by.slopes(at, by.x[at + 1], length, rows)):
+            own = np.ascontiguousarray(means[:, a:b]), np.ascontiguousarray(of_modes[row, :, a:b])
+            sum_back(found, *own, of_source[row, a : b + 1], after[row])
+    of_source[:, 0] += after @ one.moved
+    out, (first, beyond) = np.zeros((2, one.wave.count)), one.place
+    for row in range(2):
+        np.add.at(out[row], first, (1.0 - beyond) * of_source[row])
+        np.add.at(out[row], np.minimum(first + 1, one.wave.count - 1), beyond * of_source[row])
+    return out
+
+
+def _parts_of(numbers: IntArray) -> list[IntArray]:
+    """Rows of numbers, as many at once as memory is kept for."""
+    return [numbers[a : a + _AT_ONCE] for a in range(0, numbers.size, _AT_ONCE)]
 
 
 def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradient:
@@ -240,23 +300,15 @@ def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradien
         )
     if run.failure is not None:
         raise InputError("derivatives by samples are asked for, and the run failed; allowed: a run to its end")
-    problem = asked(
-        run.circuit, t_stop=run.t_stop, t_eval=None, charge_law=run.charge_law, area=run.area_mode, start=run.start,
-        charge=False, rtol=run.rtol,
-    )  # fmt: skip
-    name, sign, wave = _source_of(problem)
-    weights, system = _weights(run, of), prepare_system(problem.scene, run.rtol).system
-    for steps in _ATTEMPTS:
-        fine, coarse = _swept(run, problem, system, weights, wave, steps)
-        largest = float(np.abs(fine).max())
-        error = _LEFT * float(np.abs(fine - coarse).max()) + run.rtol * largest
-        if error <= _ALLOWED * run.rtol * largest:
-            break
-    else:
+    one, weights = _run_of(run), _weights(run, of)
+    coarse, fine = _swept(one, run, weights)
+    largest = float(np.abs(fine).max())
+    error = float(np.abs(fine - coarse).max()) + run.rtol * largest
+    if error > _ALLOWED * run.rtol * largest:
         warnings.warn(
             f"the derivatives by samples have an error of {error:.1e}, {error / largest:.0e} of the largest one; a "
             "higher sample rate makes it smaller",
             FingerspiceWarning,
             stacklevel=3,
         )
-    return SampleGradient(name, wave.rate, wave.start, sign * fine, error)
+    return SampleGradient(one.name, one.wave.rate, one.wave.start, one.sign * fine, error)

@@ -1,4 +1,4 @@
-"""The waveform of a drive as a module's parameter: its gradient by every sample comes from one sweep back."""
+"""The waveform of a drive as a module's parameter: its gradient by every sample comes from one way back."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ class _Driven:
 
 
 class Drive(torch.nn.Module):
-    """A series stack under a recording whose samples are the module's parameter `samples`, V.
+    """A circuit under a recording whose samples are the module's parameter `samples`, V.
 
     The gradient by all samples costs a few runs, however many samples there are (`Solution.sample_gradient`).
 
     Parameters
     ----------
     circuit : Circuit
-        A series stack with a GAP whose area follows the voltage.
+        One with one GAP.
     samples : array_like, shape (..., n)
         V; several rows are several drives.
     rate : float
@@ -76,7 +76,7 @@ class Drive(torch.nn.Module):
     Raises
     ------
     InputError
-        If the circuit is another network, or a source, output or time is unknown or missing.
+        If the circuit is another one, or a source, output or time is unknown or missing.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class Drive(torch.nn.Module):
 
 
 def _backward(ctx: Any, by_output: Tensor) -> tuple[None, Tensor]:
-    """Derivatives by the samples, from one sweep back through every run."""
+    """Derivatives by the samples, from one way back through every run."""
     scenes, out = ctx.driven.scenes, np.zeros((len(ctx.runs), ctx.shape[-1]))
     edges = np.cumsum([0, *scenes.sizes])
     for i, (run, row) in enumerate(zip(ctx.runs, by_output.reshape(len(ctx.runs), -1).numpy(), strict=True)):
