@@ -188,6 +188,13 @@ def weigh(c: Any, active: int, h: FloatArray, weights: FloatArray) -> None:
     weights[length] = h
 
 
+@jit_rows
+def _advanced(n: int, each: int, own: FloatArray, before: FloatArray, after: FloatArray, z: FloatArray) -> None:
+    """A mode at the end of a step by the weights of `_until`, which all share where `each` is 0."""
+    for i in range(n):
+        z[i] = own[0, i * each] * z[i] + own[1, i * each] * before[i] + own[2, i * each] * after[i]
+
+
 @jit
 def along(c: Any, h: FloatArray, x: FloatArray, first: IntArray, count: int, z: FloatArray) -> None:
     """Advance modes z (m, lanes) by `count` samples with the area at its reference.
@@ -197,15 +204,17 @@ def along(c: Any, h: FloatArray, x: FloatArray, first: IntArray, count: int, z: 
     lanes, each = first.size, 1 if h.size > 1 else 0
     wide = lanes if each else 1
     m, length, rows = np.empty((NODES + 2, wide)), np.full(wide, h[0]), np.empty((z.shape[0], 3, wide))
+    before, after = x[first], np.empty(lanes)
     for t in range(count):
         if each:
             for i in range(lanes):
                 length[i] = h[first[i] + t]
+        for i in range(lanes):
+            after[i] = x[first[i] + t + 1]
         for k in range(z.shape[0]):
             own = rows[k]
             if each or t == 0:
                 _moments(1, c.rates[k], length, m)
                 _until(wide, c.rates[k], c.gain[k], 1.0, length, m[0], m[1], own[0], own[1], own[2])
-            for i in range(lanes):
-                z[k, i] = own[0, i * each] * z[k, i] + own[1, i * each] * x[first[i] + t]
-                z[k, i] += own[2, i * each] * x[first[i] + t + 1]
+            _advanced(lanes, each, own, before, after, z[k])
+        before, after = after, before
