@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.batchgradients import gradient_coordinates, gradient_data, gradient_request, gradients_of
 from fingerspice.studies.batchladder import climb, in_lockstep
 from fingerspice.studies.batchscenes import lockstep_form
-from fingerspice.studies.batchsingle import SIGNALS_OF_BATCH, Single, run_single
+from fingerspice.studies.batchsingle import SIGNALS_OF_BATCH, each_alone, run_single
 from fingerspice.studies.batchtask import LOCKSTEP, STATUS_NAMES, Answers, Task, jobs_of
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.waveform import require
@@ -317,15 +318,7 @@ def _one_by_one(
         return
     by_period = (task.periods is not None and not task.periodic) or task.traced
     frequency = _frequencies(task.circuit, scenes) if by_period else np.ones(next(iter(scenes.values())).size)
-
-    def one(i: int) -> Single:
-        return run_single(task, {path: float(array[i]) for path, array in scenes.items()}, float(frequency[i]))
-
-    # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        singles = list(pool.map(one, rest.tolist()))
-    for i, single in zip(rest.tolist(), singles, strict=True):
+    for i, single in each_alone(task, scenes, frequency, rest, pool, partial(run_single, task), task.rtol):
         found.put_single(i, single.values, single.error, single.status)
         if single.message:
             found.messages[i] = single.message

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,30 +15,20 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
-from fingerspice.solve.simulation import RTOL_RANGE, simulate
+from fingerspice.solve.simulation import simulate
 from fingerspice.studies.batchdifferences import LEAST_RTOL, LIMIT, Gradients, Slopes, climb_gradients
 from fingerspice.studies.batchladder import FIGURES, in_lockstep
 from fingerspice.studies.batchscenes import lockstep_form
-from fingerspice.studies.batchsingle import OVER_PEAK, error_of
-from fingerspice.studies.batchtask import FAILED, ONE_BY_ONE, REFUSED, STATUS_NAMES, Answers, Task, jobs_of
+from fingerspice.studies.batchsingle import Single, each_alone, error_of
+from fingerspice.studies.batchtask import ONE_BY_ONE, REFUSED, STATUS_NAMES, Answers, Task, jobs_of
 from fingerspice.studies.steady import SteadyState, steady_state
 
 #: Outputs that have derivatives.
 MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean")
 # A relative change of a parameter by which it is seen whether the source's tone depends on it.
 _SEEN = 1e-3
-
-
-class _Single(NamedTuple):
-    """The derivatives of one scene by output, shape (n_parameter,), their error, its status, and a message if none."""
-
-    values: Mapping[str, FloatArray]
-    error: float
-    status: int
-    message: str
 
 
 def gradient_request(
@@ -122,15 +112,8 @@ def gradients_of(
     failed = found.status >= REFUSED
     slopes.status[failed], slopes.done[failed] = found.status[failed], True
     rest = np.flatnonzero(~slopes.done)
-
-    def one(i: int) -> _Single:
-        return _single(task, wanted, {path: float(array[i]) for path, array in every.items()}, float(frequency[i]))
-
-    # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        singles = list(pool.map(one, rest.tolist()))
-    for i, single in zip(rest.tolist(), singles, strict=True):
+    run = partial(_differentiated, task, wanted)
+    for i, single in each_alone(task, every, frequency, rest, pool, run, LIMIT * task.rtol):
         for name, value in single.values.items():
             slopes.values[name][i] = value
         slopes.error[i], slopes.status[i] = single.error, single.status
@@ -171,23 +154,7 @@ def _lockstep(
     return slopes, "what does not end after half periods, or does not meet its error in lockstep"
 
 
-def _single(task: Task, wanted: Gradients, changes: Mapping[str, float], frequency: float) -> _Single:
-    """The derivatives of one scene by those of its run; a refusal or failure is returned, not raised."""
-    try:
-        circuit, rtol = task.circuit.varied(changes), max(OVER_PEAK * task.rtol, RTOL_RANGE[0])
-        found = _differentiated(task, wanted, circuit, frequency, rtol)
-        if found.error > LIMIT * task.rtol and rtol > RTOL_RANGE[0]:
-            # As of the outputs: repeat with the rtol that the error asks for.
-            closer = max(0.5 * rtol * LIMIT * task.rtol / found.error, RTOL_RANGE[0])
-            found = _differentiated(task, wanted, circuit, frequency, closer)
-        return found
-    except InputError as error:
-        return _Single({}, math.nan, REFUSED, str(error))
-    except SolveError as error:
-        return _Single({}, math.nan, FAILED, str(error))
-
-
-def _differentiated(task: Task, wanted: Gradients, circuit: Circuit, frequency: float, rtol: float) -> _Single:
+def _differentiated(task: Task, wanted: Gradients, circuit: Circuit, frequency: float, rtol: float) -> Single:
     paths = tuple(dict.fromkeys(other for path in wanted.paths for other in wanted.together[path]))
     ran: Solution | SteadyState
     stop = task.t_stop if task.t_stop is not None else (task.periods or 1.0) / frequency
@@ -207,7 +174,7 @@ def _differentiated(task: Task, wanted: Gradients, circuit: Circuit, frequency: 
             by[wanted.paths.index(wanted.longer)] -= gained * stop / (stop - start)
         values[name] = np.array([x / circuit.parameters[p].value for x, p in zip(by, wanted.paths, strict=True)])
     # Their error, as that of a change by all of the parameter, is about ten times that of the run.
-    return _Single(values, LIMIT * error_of(ran), ONE_BY_ONE, "")
+    return Single(values, LIMIT * error_of(ran), ONE_BY_ONE, "")
 
 
 def gradient_data(slopes: Slopes) -> dict[str, Any]:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
@@ -23,7 +26,7 @@ OVER_PEAK = 0.1
 
 
 class Single(NamedTuple):
-    """The outputs of one scene, its stated error, its status, and the message if it has no outputs."""
+    """The outputs of one scene or their derivatives, the stated error, status, and the message if there are none."""
 
     values: Mapping[str, FloatArray]
     error: float
@@ -31,22 +34,39 @@ class Single(NamedTuple):
     message: str
 
 
-def run_single(task: Task, changes: Mapping[str, float], frequency: float) -> Single:
-    """Run one scene, whose periods are those of `frequency` (Hz); a refusal or failure is returned, not raised."""
-    try:
-        circuit, rtol = task.circuit.varied(changes), max(OVER_PEAK * task.rtol, RTOL_RANGE[0])
-        found = _run(task, circuit, frequency, rtol)
-        if found.error > task.rtol and rtol > RTOL_RANGE[0]:
-            # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
-            found = _run(task, circuit, frequency, max(0.5 * rtol * task.rtol / found.error, RTOL_RANGE[0]))
-        return found
-    except InputError as error:
-        return Single({}, math.nan, REFUSED, str(error))
-    except SolveError as error:
-        return Single({}, math.nan, FAILED, str(error))
+def each_alone(
+    task: Task, scenes: Mapping[str, FloatArray], frequency: FloatArray, which: NDArray[np.int64],
+    pool: ThreadPoolExecutor, run: Callable[[Circuit, float, float], Single], allowed: float,
+) -> Iterator[tuple[int, Single]]:  # fmt: skip
+    """What `run` finds of the scenes `which`, with an rtol that leads to an error that is `allowed`.
+
+    It takes the circuit, the frequency of its periods (Hz) and an rtol. A refusal or failure is an answer, not raised.
+    """
+
+    def one(i: int) -> Single:
+        try:
+            circuit = task.circuit.varied({path: float(array[i]) for path, array in scenes.items()})
+            rtol = max(OVER_PEAK * task.rtol, RTOL_RANGE[0])
+            found = run(circuit, float(frequency[i]), rtol)
+            if found.error > allowed and rtol > RTOL_RANGE[0]:
+                # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
+                closer = max(0.5 * rtol * allowed / found.error, RTOL_RANGE[0])
+                found = run(circuit, float(frequency[i]), closer)
+            return found
+        except InputError as error:
+            return Single({}, math.nan, REFUSED, str(error))
+        except SolveError as error:
+            return Single({}, math.nan, FAILED, str(error))
+
+    # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = list(pool.map(one, which.tolist()))
+    yield from zip(which.tolist(), found, strict=True)
 
 
-def _run(task: Task, circuit: Circuit, frequency: float, rtol: float) -> Single:
+def run_single(task: Task, circuit: Circuit, frequency: float, rtol: float) -> Single:
+    """The outputs of one scene."""
     ran: Solution | SteadyState
     if task.periodic:
         ran = steady_state(circuit, rtol=rtol, points=task.points, charge=False)

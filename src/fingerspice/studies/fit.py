@@ -31,7 +31,7 @@ _SPREAD, _FOLLOWED = 4.0, 3
 # choice takes a degree of freedom, and is made where so many are there; else errors are taken as equal.
 _CLEARLY, _CHOOSING = 2.0, 4
 # Error of the means by which starts are compared.
-_ROUGH = 1e-3
+_ROUGH = 1e-5
 
 
 def fit(
