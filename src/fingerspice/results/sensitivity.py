@@ -7,6 +7,10 @@ from dataclasses import dataclass
 from fingerspice.base.arrays import FloatArray
 from fingerspice.results.record import Sealed, sealed
 
+#: Signals and means that have derivatives.
+SIGNALS = ("u_gap", "area", "f_el", "f_t", "friction")
+MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean")
+
 
 @dataclass(frozen=True, repr=False)
 class Sensitivity(Sealed):

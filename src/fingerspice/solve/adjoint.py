@@ -22,6 +22,7 @@ from fingerspice.numerics.differences import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.results.samplegradient import SampleGradient
+from fingerspice.results.sensitivity import MEANS, SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.laneblock import Block
 from fingerspice.solve.laneform import LANES, LaneForm
@@ -36,8 +37,6 @@ from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import DC
 
-SIGNALS = ("u_gap", "area", "f_el", "f_t", "friction")
-MEANS = ("area_mean", "f_el_mean", "f_t_mean", "friction_mean")
 # Steps of an interval: of the first two numbers, or below this `rtol` of the second and third, and twice as many while
 # these differ; and the error wanted, relative to the largest derivative, over `rtol`.
 _STEPS, _COARSE, _ALLOWED = (1, 2, 4, 8, 16, 32, 64), 1e-7, 10.0

@@ -15,6 +15,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
+from fingerspice.results.sensitivity import MEANS
 from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate
@@ -25,8 +26,6 @@ from fingerspice.studies.batchsingle import Single, each_alone, error_of
 from fingerspice.studies.batchtask import ONE_BY_ONE, REFUSED, STATUS_NAMES, Answers, Task, jobs_of
 from fingerspice.studies.steady import SteadyState, steady_state
 
-#: Outputs that have derivatives.
-MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean")
 # A relative change of a parameter by which it is seen whether the source's tone depends on it.
 _SEEN = 1e-3
 

@@ -17,10 +17,11 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.outcome import SolveError
+from fingerspice.results.sensitivity import MEANS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate
 from fingerspice.torch.requests import request, tensor_of
-from fingerspice.torch.scenes import MEANS, Scenes
+from fingerspice.torch.scenes import Scenes
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 

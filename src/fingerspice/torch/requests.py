@@ -10,9 +10,10 @@ from torch import Tensor
 from fingerspice.base.arrays import positive_number, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.results.sensitivity import MEANS, SIGNALS
 from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.batch import LEAST_RTOL
-from fingerspice.torch.scenes import MEANS, SIGNALS, Scenes
+from fingerspice.torch.scenes import Scenes
 from fingerspice.waveforms.waveform import require
 
 

@@ -14,6 +14,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.outcome import SolveError
+from fingerspice.results.sensitivity import MEANS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.batch import batch
@@ -23,9 +24,6 @@ from fingerspice.studies.steady import SteadyState, steady_state
 
 if TYPE_CHECKING:
     from xarray import Dataset
-
-SIGNALS = ("u_gap", "area", "f_el", "f_t", "friction")
-MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean")
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from torch import Tensor
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.results.sensitivity import MEANS
 from fingerspice.studies.batch import own_path
 from fingerspice.torch.requests import request, tensor_of
-from fingerspice.torch.scenes import MEANS, Scenes
+from fingerspice.torch.scenes import Scenes
 
 
 class Simulator(torch.nn.Module):
