@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_within
+from fingerspice.base.compiled import jit_within_rows
 from fingerspice.engine.lanerows import (
     END_SLOPES,
     FADED,
@@ -19,7 +19,7 @@ from fingerspice.engine.lanerows import (
 )
 
 
-@jit_within
+@jit_within_rows
 def drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shares: bool, state: FloatArray) -> None:
     """Drives at node j, from xi there, but for N, and from what 1/A - q0 multiplies there.
 
@@ -69,7 +69,7 @@ def drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shar
             state[(at.g + j * drives + t) * lanes + i] = state[(x + 1) * lanes + i] * w
 
 
-@jit_within
+@jit_within_rows
 def _changes(marks: Any, c: Any, weights: FloatArray, node: int, state: FloatArray) -> None:
     """Change of N in a step at its rate at node 0 or the last one, into the first row of scratch.
 
@@ -98,7 +98,7 @@ def _changes(marks: Any, c: Any, weights: FloatArray, node: int, state: FloatArr
         state[x * lanes + i] *= -q / (d + state[(x + 2) * lanes + i] * q)
 
 
-@jit_within
+@jit_within_rows
 def smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
     """Put modes that fade within the first step of a sample where they soon are, on the new line of the source.
 
@@ -141,7 +141,7 @@ def smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
     return True
 
 
-@jit_within
+@jit_within_rows
 def bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """Add the modes' response to what the cubic through N lacks, whose slope at the end of the step is known."""
     lanes, m, leaks, at = len(marks.lanes), len(marks.modes), len(marks.leaks), places(marks)
@@ -158,7 +158,7 @@ def bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
             state[(SOURCES + k) * lanes + i] += weights[p * wide + i * each] * state[at.scratch * lanes + i]
 
 
-@jit_within
+@jit_within_rows
 def fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """Add what is left of what `smooth` has taken, and the modes' response to it by N and, as one, by the leaks."""
     lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
@@ -180,7 +180,7 @@ def fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
                 state[(SOURCES + k) * lanes + i] += pulse * fed + (decay * gone if k == f else 0.0)
 
 
-@jit_within
+@jit_within_rows
 def end_bent(marks: Any, c: Any, state: FloatArray) -> None:
     """The drives at the end of a step to node 0, from xi there, and on the tangents at the last node."""
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)

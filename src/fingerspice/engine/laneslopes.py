@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_within
+from fingerspice.base.compiled import jit, jit_within_rows
 from fingerspice.engine.lanerows import INNER_WEIGHT, NODES, OUTER_WEIGHT, SOURCES, places, polynomial_rows
 from fingerspice.engine.lanes import begin
 from fingerspice.engine.lanestep import step
@@ -17,7 +17,7 @@ from fingerspice.engine.laneweights import weigh
 GAP, SQUARES, AREAS, MORE = range(4)
 
 
-@jit_within
+@jit_within_rows
 def _gap_and_area(marks: Any, c: Any, node: int, state: FloatArray, u: FloatArray, q: FloatArray) -> None:
     """Gap voltage and 1/A - q0 at a node, of every lane."""
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)

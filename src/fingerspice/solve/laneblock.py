@@ -160,7 +160,9 @@ class Block:
     @property
     def _by_piece(self) -> FloatArray:
         """|xi| (V) at the samples of each piece, shape (LANES, count)."""
-        return np.pad(np.abs(self.xi[:-1]), (0, LANES * self.count - self.n)).reshape(LANES, self.count)
+        out = np.zeros(LANES * self.count)
+        out[: self.n] = np.abs(self.xi[:-1])
+        return out.reshape(LANES, self.count)
 
     @property
     def peaks(self) -> FloatArray:
@@ -177,18 +179,21 @@ class Block:
         """Follow a window of every piece by twice as many steps."""
         width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + self.form.bent))))
         lanes = np.arange(LANES)
-        off, at = np.zeros((len(self.kept), LANES, width + 1)), np.zeros(LANES, np.int64)
-        for place in self._windows(width):
+        off, z, at = np.empty(0), np.empty(0), lanes
+        for number, place in enumerate(self._windows(width)):
             first = np.maximum(place, 0)
             coarse = self.kept[:, lanes[:, None], first[:, None] + np.arange(width + 1)]
-            fine = np.zeros(coarse.shape)
+            fine = np.empty(coarse.shape)
             self._begin(coarse[: self.m, :, 0], self.first + first, fine)
             self._span(self.first + first, width, 2 * parts, -1.0, fine)
-            found = np.where((place >= 0)[:, None], fine - coarse, 0.0)
+            found = fine - coarse
+            found[:, place < 0] = 0.0
+            if number == 0:
+                off, z, at = found, coarse, first
+                continue
             worse = self._in_xi(found) > self._in_xi(off)
-            off[:, worse], at[worse] = found[:, worse], first[worse]
-        index = at[:, None] + np.arange(width + 1)
-        number = np.minimum(self.first[:, None] + index, self.n)
+            off[:, worse], z[:, worse], at[worse] = found[:, worse], coarse[:, worse], first[worse]
+        index = np.minimum((self.first + at)[:, None] + np.arange(width + 1), self.n)
         took = np.full(LANES, width * self.h[0])
         if self.own:
             took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
@@ -196,8 +201,7 @@ class Block:
         share, of_products = (
             np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
         )
-        z = self.kept[:, lanes[:, None], index]
-        return Window(z, off, self.x[number], self.xi[number], share, of_products)
+        return Window(z, off, self.x[index], self.xi[index], share, of_products)
 
     def _windows(self, width: int) -> list[IntArray]:
         """Where windows begin in each piece, -1 for none: where the source moves most, and at the start of a run.

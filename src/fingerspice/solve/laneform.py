@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial import chebyshev as series_of
 from numpy.polynomial.polynomial import polyder, polyval
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray, aligned
 from fingerspice.engine.lanereadout import polynomial_of
 from fingerspice.engine.lanerows import Lanes, Marks, Weighed, rows_of, weighed
 from fingerspice.engine.laneweights import weigh
@@ -20,7 +20,7 @@ from fingerspice.results.outcome import State
 from fingerspice.solve.problem import Problem
 
 # Number of lanes, whose rows fill the processor's vectors, and in which a recording goes as so many pieces.
-LANES = 32
+LANES = 64
 # Largest degree of the polynomial for 1/A.
 MOST_DEGREE = 28
 # Truncation error allowed for the polynomial of 1/A, relative to the error asked for or to this one, if that is less:
@@ -99,7 +99,9 @@ class LaneForm(ABC):
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
-        return np.zeros(rows_of(self.marks(own)).end * LANES), np.zeros((self.weighed.end, LANES if own else 1))
+        state, weights = aligned([(rows_of(self.marks(own)).end * LANES,), (self.weighed.end, LANES if own else 1)])
+        state[:], weights[:] = 0.0, 0.0
+        return state, weights
 
     def weights(self, h: FloatArray) -> FloatArray:
         """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
