@@ -59,6 +59,12 @@ def drives_under_mobile(marks: Any, c: Any, weights: FloatArray, j: int, before:
 
 
 @jit_within_rows
+def drives_under_mobile_at(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
+    """The same at a later node."""
+    drives_under_mobile(marks, c, weights, j, j - 1, state)
+
+
+@jit_within_rows
 def weaken_kinks(marks: Any, c: Any, state: FloatArray) -> None:
     """Scale what the rule misses of |xi|: u rises 1 / (1 -+ b) as much as xi with the area at 0 V on its two sides."""
     lanes, at = len(marks.lanes), places(marks)

@@ -9,6 +9,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.lanerows import polynomial_rows, rise_of
+from fingerspice.numerics.small import copy_to
 
 
 @jit_rows
@@ -123,7 +124,7 @@ def flow(
             break
         s, rate = x[at:], out[at:]
         if mobile:
-            xi[:size] = kept[m, i, :size]
+            copy_to(xi[:size], kept[m, i, :size])
             polynomial_of(c.slope, c.scale, c.shift, xi[:size], steep)
         else:
             _of_source_and_modes(size, c.k, s, c.shape, i, kept, xi)

@@ -42,6 +42,18 @@ class Marks(NamedTuple):
     own: tuple[int, ...]  # One entry if each lane has its own weights, or none
 
 
+class StackMarks(Marks):
+    """Of a stack under `local`."""
+
+
+class MobileMarks(Marks):
+    """Of a stack under `mobile`."""
+
+
+class NetworkMarks(Marks):
+    """Of a network."""
+
+
 class Lanes(NamedTuple):
     """Constants of a circuit in this form, with T drives, of which L are leaks."""
 

@@ -12,6 +12,7 @@ from fingerspice.engine.lanerows import INNER_WEIGHT, NODES, OUTER_WEIGHT, SOURC
 from fingerspice.engine.lanes import begin
 from fingerspice.engine.lanestep import step
 from fingerspice.engine.laneweights import weigh
+from fingerspice.numerics.small import copy_to
 
 # Rows of the derivatives behind those of the modes: gap voltage at the end, and the integrals of u^2 A and A.
 GAP, SQUARES, AREAS, MORE = range(4)
@@ -127,4 +128,4 @@ def sum_back(
                 now[p] = total + of_modes[p, k]
             else:
                 of_source[k + p - m] += total
-        after[:] = now
+        copy_to(after, now)

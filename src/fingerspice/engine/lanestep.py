@@ -23,9 +23,9 @@ from __future__ import annotations
 from typing import Any
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_rows, jit_within_rows
-from fingerspice.engine.lanebend import bend_end, drives_at, end_bent, fade, smooth
-from fingerspice.engine.lanemobile import drives_under_mobile, weaken_kinks
+from fingerspice.base.compiled import jit_by_kind, jit_rows, jit_within_rows
+from fingerspice.engine.lanebend import bent_drives_at, end_bent, smooth
+from fingerspice.engine.lanemobile import drives_under_mobile, drives_under_mobile_at, weaken_kinks
 from fingerspice.engine.lanerows import (
     INNER,
     INNER_WEIGHT,
@@ -34,9 +34,68 @@ from fingerspice.engine.lanerows import (
     QUICK,
     SOURCES,
     places,
+    polynomial_rows,
     project,
     weights_of,
 )
+
+
+@jit_within_rows
+def _drives_of_stack(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    x = at.scratch
+    for i in range(lanes):
+        state[x * lanes + i] = abs(state[(at.xi + j) * lanes + i]) * c.scale + c.shift
+    polynomial_rows(lanes, c.area, state[x * lanes :], state[(x + 1) * lanes :])
+    for t in range(leaks):
+        for i in range(lanes):
+            w = state[(at.w + leaks + t) * lanes + i]
+            state[(at.g + j * leaks + t) * lanes + i] = state[(x + 1) * lanes + i] * w
+
+
+@jit_within_rows
+def _begin_at_once(marks: Any, c: Any, weights: FloatArray, a: float, state: FloatArray) -> bool:
+    return False
+
+
+@jit_within_rows
+def _end_of_stack(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatArray) -> None:
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    _add_kinks(marks, c, weights, state)
+    project(marks, c, 1, at.xi, state)
+    for t in range(leaks):
+        for i in range(lanes):
+            state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * leaks + t) * lanes + i]
+            state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
+
+
+@jit_within_rows
+def _end_under_mobile(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatArray) -> None:
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    _add_kinks(marks, c, weights, state)
+    project(marks, c, 1, at.xi, state)
+    drives_under_mobile(marks, c, weights, 0, NODES - 1, state)
+    for t in range(leaks):
+        for i in range(lanes):
+            state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
+
+
+@jit_by_kind(StackMarks=_begin_at_once, MobileMarks=_begin_at_once, NetworkMarks=smooth)
+def _begin(marks: Any, c: Any, weights: FloatArray, a: float, state: FloatArray) -> bool:
+    """Prepare a step that begins at the part `a` of a sample; whether modes fade in it."""
+    raise NotImplementedError
+
+
+@jit_by_kind(StackMarks=_drives_of_stack, MobileMarks=drives_under_mobile_at, NetworkMarks=bent_drives_at)
+def _drives_at(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
+    """Drives at a later node from what is predicted there."""
+    raise NotImplementedError
+
+
+@jit_by_kind(StackMarks=_end_of_stack, MobileMarks=_end_under_mobile, NetworkMarks=end_bent)
+def _end(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatArray) -> None:
+    """From the modes at the end of a step, xi and the drives there, for the start of the next one."""
+    raise NotImplementedError
 
 
 @jit_rows
@@ -45,14 +104,13 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
 
     `weights` are those of the part's length.
     """
-    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives, bent = leaks + len(marks.bend), len(marks.bend) > len(marks.mobile)
+    lanes, at = len(marks.lanes), places(marks)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for i in range(lanes):
         before = state[2 * lanes + i]
         change = after[i] - before
         state[i], state[lanes + i] = before + a * change, before + b * change
-    fades = bent and a == 0.0 and smooth(marks, c, weights, state)
+    fades = _begin(marks, c, weights, a, state)
     # Numbers that the compiler knows: it then unrolls the sums in them.
     _at_node(marks, c, weights, 1, state)
     _at_node(marks, c, weights, 2, state)
@@ -61,23 +119,7 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
         state[(at.scratch + 1) * lanes + i] = weights[weights_of(marks).length * wide + i * each]
     _kinks(marks, c, state)
     _advance(marks, c, weights, state)
-    if bent:
-        bend_end(marks, c, weights, state)
-        if fades:
-            fade(marks, c, weights, state)
-    project(marks, c, 1, at.xi, state)
-    if bent:
-        end_bent(marks, c, state)
-    elif len(marks.mobile) > 0:
-        drives_under_mobile(marks, c, weights, 0, NODES - 1, state)
-    else:
-        for t in range(drives):
-            for i in range(lanes):
-                state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * drives + t) * lanes + i]
-    if not bent:
-        for t in range(leaks):
-            for i in range(lanes):
-                state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
+    _end(marks, c, weights, fades, state)
     if b == 1.0:
         for i in range(lanes):
             state[2 * lanes + i] = state[lanes + i]
@@ -85,12 +127,8 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
 
 @jit_within_rows
 def _at_node(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
-    """The drives at a later node."""
     _predict(marks, weights, j, state)
-    if len(marks.mobile) > 0:
-        drives_under_mobile(marks, c, weights, j, j - 1, state)
-    else:
-        drives_at(marks, c, weights, j, j - 1, True, state)
+    _drives_at(marks, c, weights, j, state)
 
 
 @jit_within_rows
@@ -117,7 +155,6 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     drives = leaks + len(marks.bend)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    bent = len(marks.bend) > len(marks.mobile)
     for k in range(len(marks.modes)):
         p = k * weights_of(marks).mode
         for i in range(lanes):
@@ -134,17 +171,23 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
             for n in range(NODES * drives):
                 z += weights[(p + NODES + 3 + n) * wide + i * each] * state[(at.g + n) * lanes + i]
             state[(SOURCES + k) * lanes + i] = z
-        if not bent:
-            quick = False
-            for i in range(lanes if len(marks.own) > 0 else 1):
-                quick = quick or c.rates[k] * state[(at.scratch + 1) * lanes + i] >= QUICK
-            if quick:
-                _add_kinks(marks, c, k, weights, state)
 
 
 @jit_within_rows
-def _add_kinks(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatArray) -> None:
-    """Add the response of mode k, if it decays fast, to what the cubics miss of the drives' kinks.
+def _add_kinks(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
+    """Add the response of modes that decay fast to what the cubics miss of the drives' kinks."""
+    lanes, at = len(marks.lanes), places(marks)
+    for k in range(len(marks.modes)):
+        quick = False
+        for i in range(lanes if len(marks.own) > 0 else 1):
+            quick = quick or c.rates[k] * state[(at.scratch + 1) * lanes + i] >= QUICK
+        if quick:
+            _add_kinks_to(marks, c, k, weights, state)
+
+
+@jit_within_rows
+def _add_kinks_to(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatArray) -> None:
+    """The same to mode k.
 
     These begin at th with a straight line and a square, to which the response is known.
     """

@@ -9,6 +9,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.lanerows import BASIS, FADED, INNER, NODES, QUICK, weighed
+from fingerspice.numerics.small import copy_to
 
 # Coefficients from x on of the quartic that is 0 at the nodes and has the slope 1 at the end of the step.
 _POWERS: list[float] = np.poly(np.array([0.0, *INNER, 1.0]))[3::-1].tolist()
@@ -182,21 +183,21 @@ def weigh(c: Any, active: int, h: FloatArray, weights: FloatArray) -> None:
             at = INNER[j - 1] if j < NODES - 1 else 1.0
             _moments(NODES if bent > 0 else j, rates[k] * at, h, m)
             _until(n, rates[k], c.gain[k], at, h, m[0], m[1], found[0], found[1], found[2])
-            own[NODES - 1 - j] = found[0]
+            copy_to(own[NODES - 1 - j], found[0])
             if k < active:
                 _drive(n, _LEAKS[j * (j - 1) // 2 :][:j], h, m, found[3:])
                 if bent > 0:
                     _drive(n, _BENDS[(j - 1) * (j + 2) // 2 :][: j + 1], h, m, found[3 + j :])
                 _gather(k, j, active, c.shape, c.taps, c.feed, found, at_nodes[j - 1])
         _late_times(n, rates[k], FADED if c.kappa > 0.0 else QUICK, h, own)
-        own[NODES + 1] = found[1]
-        own[NODES + 2] = found[2]
+        copy_to(own[NODES + 1 : NODES + 3], found[1:3])
         _drive(n, BASIS, h, m, found)
         _feed(c, k, found, own[NODES + 3 :])
         if bent > 0:
             _drive(n, _QUARTIC, h, m[1:], found)
-            own[mode - 1] = c.feed[k, leaks] * found[0]
-    weights[length] = h
+            for i in range(n):
+                own[mode - 1, i] = c.feed[k, leaks] * found[0, i]
+    copy_to(weights[length], h)
 
 
 @jit_rows

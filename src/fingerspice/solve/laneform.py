@@ -12,7 +12,16 @@ from numpy.polynomial.polynomial import polyder, polyval
 
 from fingerspice.base.arrays import BoolArray, FloatArray, aligned
 from fingerspice.engine.lanereadout import polynomial_of
-from fingerspice.engine.lanerows import Lanes, Marks, Weighed, rows_of, weighed
+from fingerspice.engine.lanerows import (
+    Lanes,
+    Marks,
+    MobileMarks,
+    NetworkMarks,
+    StackMarks,
+    Weighed,
+    rows_of,
+    weighed,
+)
 from fingerspice.engine.laneweights import weigh
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area_array
@@ -158,7 +167,8 @@ class LaneForm(ABC):
 
 @lru_cache(maxsize=64)
 def _marks(modes: int, active: int, leaks: int, bend: int, mobile: int, own: int) -> Marks:
-    return Marks(*((0,) * size for size in (modes, active, leaks, bend, mobile, LANES, own)))
+    kind = MobileMarks if mobile else NetworkMarks if bend else StackMarks
+    return kind(*((0,) * size for size in (modes, active, leaks, bend, mobile, LANES, own)))
 
 
 def slopes(area: FloatArray, scale: float) -> FloatArray:
