@@ -44,7 +44,7 @@ class _Steep:
 def _steep(form: LaneForm, block: Block, top: FloatArray) -> _Steep:
     c = form.lanes
     inverse = form.inverse_area(np.stack([np.zeros(LANES), top]))
-    force = (form.force(1.001 * top) - form.force(top)) / (1e-3 * top)
+    force = _slope_of_force(form, top)
     if not form.mobile:
         e = 1.0 / inverse - 1.0 / c.q0
         u, moved = (np.abs(x / (1.0 + c.kappa * e)).max(axis=0) for x in (1.0, e))
@@ -53,6 +53,11 @@ def _steep(form: LaneForm, block: Block, top: FloatArray) -> _Steep:
     steep = np.abs(form.slope(np.stack([np.zeros(LANES), top]))) * u
     source = float(np.abs(block.x).max())
     return _Steep(u, force * u, (source * steep / inverse**2).max(axis=0), steep.max(axis=0))
+
+
+def _slope_of_force(form: LaneForm, xi: FloatArray) -> FloatArray:
+    """By |xi|, N/V."""
+    return np.asarray((form.force(1.001 * xi) - form.force(xi)) / (1e-3 * xi))
 
 
 def _changes(form: LaneForm, shown: Shown, window: Window, xi: FloatArray) -> FloatArray:
@@ -84,20 +89,32 @@ def judge(block: Block, parts: int, peak: float, alike: FloatArray, chance: Floa
     own = window.off[: c.rates.size, :, -1]
     products = own[:, None] * own
     handed, lucky = block.hand_on(own * window.share, alike), block.hand_on(products * window.of_products, chance)
-    # At the end of a piece, with what it adds beyond its window.
-    alike_there = handed[:, :LANES] + own * (window.share - 1.0)
-    chance_there = lucky[..., :LANES] + products * (window.of_products - 1.0)
+    # What a piece adds beyond its window.
+    alike_more, chance_more = own * (window.share - 1.0), products * (window.of_products - 1.0)
 
-    def added(columns: FloatArray) -> FloatArray:
-        """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
-        by_chance = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there), 0.0))
-        more = np.maximum(by_chance, np.abs(columns @ alike_there) - LUCK * by_chance)
-        return np.asarray(more + np.abs(columns[:active]) @ block.left[:active] / OF_FORCE)
+    def added(columns: FloatArray, left: FloatArray | None = None) -> FloatArray:
+        """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them.
 
-    errors, over, top = np.zeros(4), added(c.shape), np.maximum(block.peaks, 1e-9 * peak + 1e-300)
+        `left` (m, LANES) is left of each mode of what a piece starts with.
+        """
+        left = np.ones(own.shape) if left is None else left
+        there = lucky[..., :LANES] * left[:, None] * left + chance_more
+        by_chance = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, there), 0.0))
+        there = np.abs(columns @ (handed[:, :LANES] * left + alike_more))
+        more = np.maximum(by_chance, there - LUCK * by_chance)
+        swept = (np.abs(columns) * block.left)[:active] / OF_FORCE
+        return np.asarray(more + swept @ left[:active])
+
+    least = 1e-9 * peak + 1e-300
+    errors, over, top = np.zeros(4), added(c.shape), np.maximum(block.peaks, least)
     steep, xi = _steep(form, block, top), window.xi + np.einsum("k,kij->ij", form.xi[1], window.off)
-    for i, of, by in ((0, form.gap, steep.u), (1, form.force, steep.force)):
-        errors[i] = (np.abs(of(xi) - of(window.xi)).max(axis=1) + by * over).max()
+    # An error that a fast mode brings into a piece changes the force as much as xi at the first sample allows.
+    decay = np.exp(-block.rates[:, None] * (block.h[block.first] if block.own else block.h))
+    first_xi = np.maximum(np.abs(block.xi[np.minimum(block.first, block.n)]) + over, least)
+    at_first = _slope_of_force(form, first_xi) * (steep.u if form.mobile else 1.0) * over
+    of_force = np.maximum(at_first, steep.force * added(c.shape, decay))
+    for i, of, more in ((0, form.gap, steep.u * over), (1, form.force, of_force)):
+        errors[i] = (np.abs(of(xi) - of(window.xi)).max(axis=1) + more).max()
     first = form.rows.k.size - form.flows
     for i, shown in ((2, form.nodes), (3, form.rows.behind(first))):
         seen = np.abs(_changes(form, shown, window, xi)).max(axis=-1, initial=0.0)
