@@ -85,8 +85,7 @@ def batch(
     threads : int, optional
         Number of threads; all processors by default. The result does not depend on it.
     device : str
-        ``"cuda"`` does lockstep on an NVIDIA graphics card, but for recordings and ``u_gap``. It was tested in a
-        simulator of a card and has not run on one yet.
+        ``"cuda"`` does lockstep on an NVIDIA graphics card, but for recordings and ``u_gap``.
 
     Returns
     -------
