@@ -55,7 +55,7 @@ class March(Stepping, NetworkIntegration):
         cells = self.form.c.size
         self.work = new_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
         scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
-        self.settling = Settling(problem, self.form.rates.copy(), self.pace.tol, scale)
+        self.settling = Settling(problem, self.form.rates.copy(), self.pace.tol, scale, leaps=False)
         if not repeat:
             self.settling.stop_looking()
 

@@ -57,7 +57,7 @@ class Stepping(Integration):
     out : ndarray, shape (width, n_out)
         Output rows as columns.
     repeated : int
-        Number of periods that were not integrated but repeat another.
+        Number of periods that were not integrated but repeat or extrapolate another.
     asked : float
         With this the stated error is compared after a few periods, where `try_out` was called. The tolerance was chosen
         before the peaks of the gaps were known; if it proves too large, the run ends there and not at its end before it
@@ -133,11 +133,14 @@ class Stepping(Integration):
     def stated(self, run: Run) -> None:
         """Write the stated errors and the margin into a run."""
 
+    def leap(self, sources: Sources) -> None:
+        """Extrapolate the following periods with one affine map, if its error allows it; a network does not."""
+
     def through(self, sources: Sources, t_end: float) -> Status:
         while True:
             code = self.march(sources, t_end, self.settling.looks)
             if code == loopstate.LOOKED_AT:
-                self._settle()
+                self._settle(sources)
             elif code == loopstate.EXCESSIVE:
                 if excess_of(self.stated_gaps(), self.problem.rounding) > self.asked:
                     return Status.ERROR_NOT_MET
@@ -146,11 +149,13 @@ class Stepping(Integration):
             if code == loopstate.DONE or self.t >= t_end:
                 return Status.SUCCESS
 
-    def _settle(self) -> None:
+    def _settle(self, sources: Sources) -> None:
         """Once the periodic state is reached, keep the next period and then repeat it to the end."""
         settling = self.settling
         if not settling.has_settled:
             self.keep(0)
+            if settling.may_leap:
+                self.leap(sources)
         elif not len(self.kept.times):
             self.keep(KEPT_STEPS)
         else:

@@ -159,7 +159,7 @@ class Track(Stepping):
         self.control[readout.MARGIN] = 1.0
         if model_of(scene).mobile and problem.initial.sign[0] != 0.0:
             self.control[readout.U_GAP], self.control[readout.SIGN] = start.u_gap, math.copysign(1.0, start.u_gap)
-        self.settling = Settling(problem, prepared.system.rates, tol, np.ones(n))
+        self.settling = Settling(problem, prepared.system.rates, tol, np.ones(n), leaps=True)
         if h_fixed > 0.0 or not repeat:
             self.settling.stop_looking()
 
@@ -191,8 +191,28 @@ class Track(Stepping):
             self.control[readout.U_BEFORE], _ = source(*_segment(sources, self.t, "left"))
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
 
+    def leap(self, sources: Sources) -> None:
+        from fingerspice.solve.approach import leap
+
+        leap(self, sources, self.settling)
+
     def _collected(self) -> tuple[float, float]:
         return float(self.control[readout.COLLECTED]), float(self.control[readout.SPREAD])
+
+    def land(self, base: Track, state: FloatArray, periods: int, off: float, owed: float) -> None:
+        """Take the result of the extrapolation by the period map over `periods` whole periods.
+
+        `base` is the integration of the last of them and `state` the state after it. `off` bounds the error of the map
+        as an error of the gap voltage (V), and `owed` as an error of the charge (C).
+        """
+        t, collected = self.t, self._collected()
+        self.y[:] = state
+        self.error, self.control = base.error, base.control
+        self.control[readout.T] = t + periods * self.settling.period
+        self.control[readout.BRANCH_START] -= self.settling.period
+        self.control[readout.ERROR_Q] += owed
+        self._pass(periods, periods - 1, off, collected)
+        self.repeated += periods
 
     def _pass(self, periods: int, alike: int, off: float, collected: tuple[float, float]) -> None:
         self.control[readout.BRANCH_START] += periods * self.settling.period
