@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -72,6 +73,26 @@ class Bar:
         if self._bar is not None:
             self._bar.stop()
             self._bar, Bar._standing = None, None
+
+
+@contextmanager
+def paced(what: str, first: float = 0.0) -> Iterator[Callable[..., None]]:
+    """A bar for work of which a share is done at first: it appears after one second, with the time left.
+
+    Gives a function of the share that is done by now, and of what says the pace by the seconds taken.
+    """
+    bar, begun = Bar(what), time.perf_counter()
+
+    def show(done: float, pace: Callable[[float], str] = lambda _: "") -> None:
+        took = time.perf_counter() - begun
+        if took > 1.0 and done > first and sys.stderr.isatty():
+            minutes, seconds = divmod(int((1.0 - done) * took / (done - first)), 60)
+            bar.show(done, f"{pace(took)} {minutes // 60:02}:{minutes % 60:02}:{seconds:02} left".strip())
+
+    try:
+        yield show
+    finally:
+        bar.stop()
 
 
 class Compiling:

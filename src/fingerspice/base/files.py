@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from fingerspice.base.errors import InputError
@@ -48,6 +49,22 @@ def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
     finally:
         _discard(temporary)
     return path
+
+
+def write_csv(path: str | Path, header: Iterable[str], rows: Iterable[Iterable[object]]) -> Path:
+    """Write a table as CSV; numbers have as many digits as it takes to read the same ones back.
+
+    Raises
+    ------
+    InputError
+        As `write_aside`.
+    """
+
+    def write(target: Path) -> None:
+        with target.open("w", newline="", encoding="utf-8") as stream:
+            csv.writer(stream, lineterminator="\n").writerows([header, *rows])
+
+    return write_aside(Path(path), write)
 
 
 def write_pieces(path: Path, data: memoryview) -> None:

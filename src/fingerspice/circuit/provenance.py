@@ -1,11 +1,13 @@
-"""Which named sets of parameters made a circuit, and which of their values still hold."""
+"""What a circuit is made of: its digests, the named sets of parameters that made it, and what still holds of them."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from typing import Any
 
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.waveforms.samples import Samples
 
 
 def remembering(circuit: Circuit, name: str, values: Mapping[str, Any]) -> Circuit:
@@ -29,3 +31,15 @@ def in_force(circuit: Circuit) -> dict[str, tuple[dict[str, Any], tuple[str, ...
         kept = {path: value for path, value in values.items() if now.get(path.lower(), value) == value}
         found[name] = kept, tuple(path for path in values if path not in kept)
     return found
+
+
+def digests(circuit: Circuit) -> tuple[str, str]:
+    """SHA-256 of a circuit's elements, initial voltages, law and step control, and of its sources' waveforms."""
+    elements, sources, tran = hashlib.sha256(), hashlib.sha256(), circuit.tran
+    for element in circuit.elements:
+        wave = element.waveform
+        elements.update(repr((element.name, element.device, element.nodes, dict(element.values))).encode())
+        sources.update(repr((element.name, wave.digest() if isinstance(wave, Samples) else wave)).encode())
+    more = circuit.charge_law, dict(circuit.initial), tran and (tran.max_step, tran.uic)
+    elements.update(repr(more).encode())
+    return elements.hexdigest(), sources.hexdigest()

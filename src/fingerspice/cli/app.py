@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -233,13 +232,14 @@ def ac(
         if area == "coupled":
             found = [*large_sweep(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)]
         results.open()
-        writes = [lambda: phasor_csv(found, data)]
-        if picture is not None:
-            from fingerspice.plots.drawing import save
+
+        def drawn() -> object:
             from fingerspice.plots.phasors import plot_phasor
 
-            writes.append(lambda: save(plot_phasor(found, circuit), picture, about=results.about))
+            return plot_phasor(found, circuit)
+
         answer.update(sweeps=[phasor_dict(r) for r in found] if as_json else None)
+        writes = [lambda: phasor_csv(found, data), *results.pictures(picture, drawn)]
         answer.give(lambda: phasor_tables(found, circuit), writes)
 
 
@@ -307,15 +307,10 @@ def compare(
         check_arguments(rtol)
         picture = None if no_plot else results.file("_compare.png")
         result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
-        writes: list[Callable[[], Path]] = []
         if picture is not None:
             results.open()
-            from fingerspice.plots.drawing import save
-            from fingerspice.studies.pictures import plot_comparison
-
-            writes.append(lambda: save(plot_comparison(result), picture, about=results.about))
         answer.update(method=result.solution.method, **result.to_dict())
-        answer.give(lambda: comparison_table(result), writes)
+        answer.give(lambda: comparison_table(result), results.pictures(picture, result.plot))
 
 
 for _command in (limits, designs.design, fits.fit, fits.fit_contact, sweeps.sweep):

@@ -43,7 +43,6 @@ def find_drive(
     table: Path, circuit: Circuit, results: Results, picture: bool, options: dict[str, Any]
 ) -> tuple[Any, Writes]:
     """The drive for the friction or force of a table, and the functions that write its files."""
-    from fingerspice.plots.drawing import save
     from fingerspice.studies.inverse import inverse_drive
     from fingerspice.studies.wanted import read_wanted
 
@@ -52,19 +51,16 @@ def find_drive(
     image = results.file("_design.png") if picture else None
     found = inverse_drive(circuit, duration=profile.duration, **{**options, kind: profile.wave})
     results.open()
-    writes: Writes = [
-        lambda: found.to_wav(files[0]), lambda: found.to_csv(files[1]), lambda: found.friction_to_csv(files[2])
+    return found, [
+        lambda: found.to_wav(files[0]), lambda: found.to_csv(files[1]), lambda: found.friction_to_csv(files[2]),
+        *results.pictures(image, found.plot),
     ]  # fmt: skip
-    if image is not None:
-        writes.append(lambda: save(found.plot(), image, about=results.about))
-    return found, writes
 
 
 def capability(
     circuit: Circuit, results: Results, picture: bool, limit: float | None, carrier: float | None
 ) -> tuple[Any, Writes]:
     """The map of the friction that the screen can produce, and the functions that write its files."""
-    from fingerspice.plots.drawing import save
     from fingerspice.studies.capability import capability as find
 
     if limit is None:
@@ -76,10 +72,7 @@ def capability(
     with progress("looking for the largest amplitudes") as update:
         found = find(circuit, limit, carrier=carrier, progress=update)
     results.open()
-    writes: Writes = [lambda: found.to_csv(table)]
-    if image is not None:
-        writes.append(lambda: save(found.plot(), image, about=results.about))
-    return found, writes
+    return found, [lambda: found.to_csv(table), *results.pictures(image, found.plot)]
 
 
 def design(

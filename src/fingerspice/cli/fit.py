@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -107,11 +106,6 @@ def fit_contact(
 
 def _give(answer: Answering, results: Results, found: Fit | ContactFit, file: Path, image: Path | None) -> None:
     """Write table and picture of a fit, and answer."""
-    from fingerspice.plots.drawing import save
-
     results.open()
-    writes: list[Callable[[], Path]] = [lambda: found.to_csv(file)]
-    if image is not None:
-        writes.append(lambda: save(found.plot(), image, about=results.about))
     answer.update(**found.to_dict())
-    answer.give(lambda: str(found), writes)
+    answer.give(lambda: str(found), [lambda: found.to_csv(file), *results.pictures(image, found.plot)])

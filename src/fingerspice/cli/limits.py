@@ -38,7 +38,7 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.studies.limits import fold_limits, grid_of, plot_limits
+    from fingerspice.studies.limits import fold_limits, grid_of
     from fingerspice.studies.reports import limits_csv, limits_text
 
     law = None if capability else "mobile"
@@ -62,10 +62,6 @@ def limits(
         with progress("looking for folds") as update:
             result = fold_limits(circuit, points=points, span=span, progress=update)
         results.open()
-        writes = [lambda: limits_csv(result, table)]
-        if picture is not None:
-            from fingerspice.plots.drawing import save
-
-            writes.append(lambda: save(plot_limits(result), picture, about=results.about))
+        writes = [lambda: limits_csv(result, table), *results.pictures(picture, result.plot)]
         answer.update(**result.to_dict())
         answer.give(lambda: limits_text(result), writes)

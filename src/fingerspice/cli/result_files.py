@@ -6,7 +6,7 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -92,6 +92,14 @@ class Results:
     def about(self) -> dict[str, str]:
         """Texts kept in a picture: the circuit, and the files that were made with the picture."""
         return {**self._own, "files": json.dumps(self.names)}
+
+    def pictures(self, path: Path | None, draw: Callable[[], Any]) -> list[Callable[[], Path]]:
+        """The function that draws and writes a picture; none without a path."""
+        if path is None:
+            return []
+        from fingerspice.plots.drawing import save
+
+        return [lambda: save(draw(), path, about=self.about)]
 
     def open(self) -> None:
         """When the default folder is created, put a .gitignore into it, to keep results out of version control."""
@@ -181,8 +189,4 @@ def _of_picture(file: Path) -> dict[str, str] | None:
     with Image.open(picture) as image:
         image.load()
         text: dict[str, Any] = dict(getattr(image, "text", {}))
-    data = file.with_suffix(".nc")
-    if not text.get("files") and file.suffix == ".png" and data.is_file():
-        # A picture of an earlier version has no list of files; the NetCDF file of the same name has the attributes.
-        return _of_data(data)
     return text if file.name in json.loads(text.get("files", "[]")) else None

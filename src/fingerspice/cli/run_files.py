@@ -26,14 +26,11 @@ def written(
     solution: Solution, data: Path, picture: Path | None, results: Results, schematic: Path | None
 ) -> list[Callable[[], Path]]:
     """Functions that write the files of a run: the data, then the picture and the schematic where they have a path."""
-    from fingerspice.plots.drawing import save
-
     if not solution.t.size:
         return []
     results.open()
     writes: list[Callable[[], Path]] = [partial(solution.to_csv if data.suffix == ".csv" else solution.to_netcdf, data)]
-    if picture is not None:
-        writes.append(lambda: save(_pictured(solution, results, schematic), picture, about=results.about))
+    writes += results.pictures(picture, lambda: _pictured(solution, results, schematic))
     if schematic is not None:
         # An SVG file knows no names of our own, and keeps all of them as one text.
         about = {"Description": json.dumps(results.about)}
@@ -97,9 +94,6 @@ class Touch:
     @property
     def writes(self) -> list[Callable[[], Path]]:
         """The function that writes the picture; empty if no picture is wanted."""
-        from fingerspice.plots.drawing import save
-
-        results, picture = self.results, self.picture
-        if results is None or picture is None or not self.fingers:
+        if self.results is None or not self.fingers:
             return []
-        return [lambda: save(self.fingers[0].plot(self.fingers[1:]), picture, about=results.about)]
+        return self.results.pictures(self.picture, lambda: self.fingers[0].plot(self.fingers[1:]))

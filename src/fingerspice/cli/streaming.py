@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import sys
 import time
 import warnings
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fingerspice import __version__
-from fingerspice.base.announcing import Bar
+from fingerspice.base.announcing import paced
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.cli.options import check_output, time_from_text
 from fingerspice.cli.result_files import Results
@@ -91,21 +89,12 @@ def _layers(circuit: Circuit) -> bool:
 def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[str]) -> dict[str, Any]:
     """All inputs that determine the bytes of a store, by which a later call recognises its own store."""
     from fingerspice.base.compiled import STAMP
-    from fingerspice.waveforms.samples import Samples
+    from fingerspice.circuit.provenance import digests
 
-    elements, sources = hashlib.sha256(), hashlib.sha256()
-    for element in circuit.elements:
-        wave = element.waveform
-        elements.update(repr((element.name, element.device, element.nodes, dict(element.values))).encode())
-        if isinstance(wave, Samples):
-            sources.update(repr((element.name, wave.digest())).encode())
-        else:
-            sources.update(repr((element.name, wave)).encode())
-    tran = circuit.tran
-    elements.update(repr((dict(circuit.initial), tran and (tran.max_step, tran.uic))).encode())
+    elements, sources = digests(circuit)
     o = run.outputs
     return {
-        "circuit": elements.hexdigest(), "source": sources.hexdigest(), "rtol": how["rtol"],
+        "circuit": elements, "source": sources, "rtol": how["rtol"],
         "charge_law": run.problem.scene.charge_law, "area": run.problem.scene.area_mode, "method": how["method"],
         "start": str(how["start"]), "chunk": run.count, "signals": names, "end": run.problem.t_stop,
         "output_times": [o.start, o.over, o.low, o.total],
@@ -118,7 +107,9 @@ def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None
     about = {key: text for key, text in results.about.items() if key != "files"}
     known: set[str] = set()
     writing: Future[None] | None = None
-    with ThreadPoolExecutor(1) as writer, _Pace(run) as pace:
+    start, stop = run.problem.t_start, run.problem.t_stop
+    first = float(run.outputs.times(run.done, run.done + 1)[0])
+    with ThreadPoolExecutor(1) as writer, paced("simulating", (first - start) / (stop - start)) as show:
         for number, solution in enumerate(run, store.done):
             for text in solution.warnings:
                 if text not in known:
@@ -127,29 +118,7 @@ def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None
             if writing is not None:
                 writing.result()
             writing = writer.submit(store.write, number, solution, names, about, run.mark())
-            pace.show(solution.t_stop)
+            reached = solution.t_stop
+            show((reached - start) / (stop - start), lambda s, t=reached: f"{(t - first) / s:,.3g} times real time,")
         if writing is not None:
             writing.result()
-
-
-class _Pace:
-    """A progress bar with the speed relative to real time, and the time left."""
-
-    def __init__(self, run: Stream) -> None:
-        self.bar, self.begun = Bar("simulating"), time.perf_counter()
-        self.start, self.stop = run.problem.t_start, run.problem.t_stop
-        self.first = float(run.outputs.times(run.done, run.done + 1)[0])
-
-    def __enter__(self) -> _Pace:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.stop()
-
-    def show(self, t: float) -> None:
-        """Show that the run has reached a time (s)."""
-        took, made = time.perf_counter() - self.begun, t - self.first
-        if took > 1.0 and made > 0.0 and sys.stderr.isatty():
-            left = time.strftime("%H:%M:%S", time.gmtime((self.stop - t) * took / made))
-            note = f"{made / took:,.3g} times real time, {left} left"
-            self.bar.show((t - self.start) / (self.stop - self.start), note)

@@ -7,7 +7,6 @@ import logging
 import math
 import os
 import sys
-import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from fingerspice.base.announcing import Bar
+from fingerspice.base.announcing import paced
 from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.cli.answers import OWN, blank
 from fingerspice.results.outcome import SolveError
@@ -205,17 +204,5 @@ def answer_usage(message: str) -> None:
 @contextmanager
 def progress(what: str = "simulating") -> Iterator[Callable[[float], None] | None]:
     """A progress bar on a terminal, which appears after one second."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    bar = Bar(what)
-    begin = time.perf_counter()
-
-    def update(done: float) -> None:
-        if time.perf_counter() - begin > 1.0:
-            bar.show(done)
-
-    try:
-        yield update
-    finally:
-        bar.stop()
+    with paced(what) as show:
+        yield show if sys.stderr.isatty() else None

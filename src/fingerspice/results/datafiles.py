@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import io
 import json
@@ -13,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base import files
 from fingerspice.base.arrays import BoolArray
-from fingerspice.base.files import write_aside, write_pieces
 from fingerspice.results.signals import SIGNALS
 from fingerspice.results.stored_circuit import stored_circuit
 from fingerspice.results.summary import Figures
@@ -37,14 +36,7 @@ def write_csv(solution: Solution, path: Path) -> Path:
     signals = solution.signals
     header = ["t [s]", *(f"{name} [{unit}]" for name, (_, unit, _) in signals.items())]
     table = np.column_stack([solution.t, *(value for value, _, _ in signals.values())])
-
-    def write(target: Path) -> None:
-        with target.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(header)
-            writer.writerows([repr(float(x)) for x in row] for row in table)
-
-    return write_aside(path, write)
+    return files.write_csv(path, header, table.tolist())
 
 
 def _kept(solution: Solution, jumps: str) -> BoolArray:
@@ -122,9 +114,9 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
                 group.dimensions["signal"] = 1 + len(solution.signals)
                 rows = [np.flatnonzero(~keep), *(x[~keep] for x, _, _ in solution.signals.values())]
                 group.create_variable("before", ("jump", "signal"), dtype=float, data=np.column_stack(rows))
-        write_pieces(target, content.getbuffer())
+        files.write_pieces(target, content.getbuffer())
 
-    return write_aside(path, write)
+    return files.write_aside(path, write)
 
 
 def _fill(file: Any, data: dict[str, Variable], coords: dict[str, Variable]) -> None:

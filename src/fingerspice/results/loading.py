@@ -170,10 +170,7 @@ def _text(value: Any) -> str:
 
 
 def _state(kept: dict[str, Any], law: str) -> State:
-    """The state reached; files of earlier versions store the source of a series stack as one number, `u_before`."""
     y, before, sign = (np.array(kept.get(k, d), float) for k, d in (("y", []), ("s_before", []), ("sign", [0.0])))
-    if "u_before" in kept:
-        before = np.array([kept["u_before"]], float)
     return State(float(kept["t"]), y, before, sign, law)
 
 

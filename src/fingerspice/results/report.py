@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from fingerspice.base.files import write_aside
+from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines, heading
@@ -182,15 +181,8 @@ def phasor_table(result: PhasorSolution, most: int = 40) -> Page:
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
     """Write sweeps as CSV, one after the other where there are several amplitudes."""
     units = {key: unit for key, unit, *_ in _columns(results[0])}
-
-    def write(target: Path) -> None:
-        with target.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            head = [f"{name} [{unit}]" for name, unit in units.items()]
-            writer.writerow(head)
-            for result in results:
-                data = phasor_dict(result) | {"amplitude": [result.amplitude] * result.frequency.size}
-                for row in zip(*(data[name] for name in units), strict=True):
-                    writer.writerow(map(repr, row))
-
-    return write_aside(path, write)
+    rows: list[tuple[object, ...]] = []
+    for result in results:
+        data = phasor_dict(result) | {"amplitude": [result.amplitude] * result.frequency.size}
+        rows += zip(*(data[name] for name in units), strict=True)
+    return write_csv(path, [f"{name} [{unit}]" for name, unit in units.items()], rows)

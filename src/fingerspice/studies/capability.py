@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, positive_number, positive_row, whole_number
 from fingerspice.base.errors import InputError
+from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import require_circuit
@@ -110,13 +111,9 @@ class Capability(Shown):
 
     def to_csv(self, path: str | Path) -> Path:
         """Write the map as CSV: one row for each frequency and mean."""
-        from fingerspice.studies.drive_files import write_columns
-
         mean, f = np.meshgrid(self.mean, self.frequency, indexing="ij")
-        return write_columns(
-            Path(path), ("frequency (Hz)", "mean friction (N)", "largest amplitude (N)"),
-            (f.ravel(), mean.ravel(), self.amplitude.ravel()),
-        )  # fmt: skip
+        header = "frequency (Hz)", "mean friction (N)", "largest amplitude (N)"
+        return write_csv(path, header, zip(f.ravel(), mean.ravel(), self.amplitude.ravel(), strict=True))
 
 
 def capability(

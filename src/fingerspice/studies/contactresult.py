@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,19 +11,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.files import write_aside
-from fingerspice.base.pages import Page, Shown
+from fingerspice.base.files import write_csv
+from fingerspice.base.pages import Page
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies.contactdata import Relation
 from fingerspice.studies.contacttask import FEWEST, ContactTask, pools_of
 from fingerspice.studies.fitestimates import (
     Estimate,
+    Estimates,
     Profile,
     correlation_of,
     covariance_of,
-    estimate_lines,
     estimate_of,
-    lmfit_report,
     misfit_note,
     notes_of,
 )
@@ -38,7 +36,7 @@ _NO_PART = 1e-9
 
 
 @dataclass(frozen=True, repr=False)
-class ContactFit(Shown):
+class ContactFit(Estimates):
     """A fit of a contact to data; `circuit` is ready to run.
 
     Attributes
@@ -108,13 +106,11 @@ class ContactFit(Shown):
         for one, misfit in zip(self.relations, self.misfits, strict=True):
             known = "sigma as given" if one.sigma is not None else "sigma estimated from the residuals"
             lines.append(f"{one.name}: {one.values.size} values, residual {100.0 * misfit:.3g} % rms; {known}")
-        own = estimate_lines(self.estimates, self.correlation, self.profiles, self.notes)
-        return Page([*lines, *own, "", f"in the deck: {self.gap} ... {self.line}"])
+        return Page([*lines, *self._lines(), "", f"in the deck: {self.gap} ... {self.line}"])
 
-    def report(self) -> str:
-        """Statistics, parameters and correlations in the layout of lmfit's ``fit_report``."""
-        count = self.freedom + len(self.estimates)
-        return lmfit_report(self.estimates, self.correlation, self.objective, count, self.evaluations)
+    @property
+    def _count(self) -> int:
+        return self.freedom + len(self.estimates)
 
     def plot(self) -> Figure:
         """Data and fit of every relation, with the residuals below."""
@@ -137,17 +133,10 @@ class ContactFit(Shown):
         """The fit as plain numbers and texts; `parameters` has a row for each."""
         return {
             "gap": self.gap,
-            "parameters": [vars(e) for e in self.estimates.values()],
-            "correlation": self.correlation.tolist(),
+            **self._plain(),
             "relations": [
                 {"kind": one.kind, "count": int(one.values.size), "misfit": misfit}
                 for one, misfit in zip(self.relations, self.misfits, strict=True)
-            ],
-            "objective": self.objective,
-            "notes": list(self.notes),
-            "profiles": [
-                {**vars(one), "values": one.values.tolist(), "objective": one.objective.tolist()}
-                for one in self.profiles.values()
             ],
         }
 
@@ -159,16 +148,13 @@ class ContactFit(Shown):
         InputError
             If the folder cannot be written.
         """
-
-        def write(target: Path) -> None:
-            with target.open("w", newline="", encoding="utf-8") as stream:
-                out = csv.writer(stream, lineterminator="\n")
-                out.writerow(("relation", "fn", "u_gap", "indentation", "measured", "fitted", "sigma"))
-                for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True):
-                    table = np.column_stack([one.fn, one.u_gap, one.indentation, one.values, fitted, sigma])
-                    out.writerows((one.kind, *(f"{x:.17g}" for x in row)) for row in table)
-
-        return write_aside(Path(path), write)
+        header = "relation", "fn", "u_gap", "indentation", "measured", "fitted", "sigma"
+        rows = [
+            (one.kind, *row)
+            for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True)
+            for row in np.column_stack([one.fn, one.u_gap, one.indentation, one.values, fitted, sigma])
+        ]
+        return write_csv(path, header, rows)
 
 
 # The condition that tells curves apart, by the one along the axis.

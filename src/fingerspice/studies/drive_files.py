@@ -106,13 +106,3 @@ def drive_wav(found: InverseDrive, path: Path, gain: float | None) -> Path:
             wavfile.write(stream, round(rate), data)
 
     return write_aside(path, write)
-
-
-def write_columns(path: Path, names: tuple[str, ...], columns: tuple[FloatArray, ...]) -> Path:
-    """Write columns as CSV under their names, with enough digits to read back the same doubles."""
-
-    def write(target: Path) -> None:
-        with target.open("w", newline="", encoding="utf-8") as stream:
-            np.savetxt(stream, np.column_stack(columns), "%.17g", ",", header=",".join(names), comments="")
-
-    return write_aside(path, write)

@@ -6,7 +6,6 @@ as periodic states of the transient. The measured points that the paper shows in
 
 from __future__ import annotations
 
-import csv
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning
-from fingerspice.base.files import write_aside
+from fingerspice.base.files import write_csv
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_resistivity
 from fingerspice.plots import drawing
@@ -84,14 +83,7 @@ class Table:
 
     def write(self, path: Path) -> Path:
         """Write the table as CSV with ten digits."""
-
-        def write(target: Path) -> None:
-            with target.open("w", newline="", encoding="utf-8") as stream:
-                writer = csv.writer(stream)
-                writer.writerow(self.header)
-                writer.writerows([f"{x:.10g}" for x in row] for row in zip(*self.columns, strict=True))
-
-        return write_aside(path, write)
+        return write_csv(path, self.header, ([f"{x:.10g}" for x in row] for row in zip(*self.columns, strict=True)))
 
 
 def make_figures(

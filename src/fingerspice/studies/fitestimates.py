@@ -6,11 +6,12 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.pages import Table
+from fingerspice.base.pages import Shown, Table
 
 # Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
 # the error of a parameter, in its logarithm, from which on nothing is known of it.
@@ -94,68 +95,91 @@ def estimate_of(
     return Estimate(path, unit, float(value), float(initial), value * error, value / far, value * far, at_bound)
 
 
-def estimate_lines(
-    estimates: Mapping[str, Estimate], correlation: FloatArray, profiles: Mapping[str, Profile], notes: Sequence[str]
-) -> list[str | Table]:
-    """Table of the parameters, correlations, profiles and notes, as a report has them."""
-    rows = [
-        (
-            e.path, f"{e.value:.6g}", f"{e.error:.2g}", f"{100.0 * e.error / e.value:.2g} %",
-            f"{e.low:.4g} to {e.high:.4g}", e.unit, f"{e.initial:.4g}", "at a bound" if e.at_bound else "",
-        )
-        for e in estimates.values()
-    ]  # fmt: skip
-    lines: list[str | Table] = [
-        "", Table(("parameter", "value", "error", "", "95 % interval", "unit", "started at", ""), rows)
-    ]  # fmt: skip
-    pairs = [
-        f"{a}, {b}: {correlation[i, j]:+.3f}"
-        for (i, a), (j, b) in itertools.combinations(enumerate(estimates), 2)
-        if abs(correlation[i, j]) > 0.1
-    ]
-    if pairs:
-        lines += ["", "correlations beyond 0.1: " + "; ".join(pairs)]
-    for one in profiles.values():
-        unit = estimates[one.path].unit
-        lines.append(f"profile of {one.path}: {one.low:.4g} to {one.high:.4g} {unit}, {one.shape}".replace(" ,", ","))
-    return [*lines, *(["", *notes] if notes else [])]
+class Estimates(Shown):
+    """What results of fits have in common, which are data classes with these fields."""
 
+    estimates: dict[str, Estimate]
+    correlation: FloatArray
+    objective: float
+    evaluations: int
+    notes: tuple[str, ...]
+    profiles: dict[str, Profile]
 
-def lmfit_report(
-    estimates: Mapping[str, Estimate], correlation: FloatArray, square: float, count: int, evaluations: int
-) -> str:
-    """The layout of lmfit's ``fit_report``, for programs and eyes that know it.
+    @property
+    def _count(self) -> int:
+        """Number of data."""
+        raise NotImplementedError
 
-    `square` is the sum of the squared residuals over sigma, `count` the number of data. As there, the criteria of
-    Akaike and Bayes are count log(square / count) + 2 k, and + k log(count), of k parameters.
-    """
-    k, freedom = len(estimates), count - len(estimates)
-    level = count * math.log(max(square, 1e-300) / count)
-    wide = max(map(len, estimates)) + 1
-    lines = [
-        "[[Fit Statistics]]",
-        "    # fitting method   = least_squares",
-        f"    # function evals   = {evaluations}",
-        f"    # data points      = {count}",
-        f"    # variables        = {k}",
-        f"    chi-square         = {square:.8g}",
-        f"    reduced chi-square = {square / freedom if freedom > 0 else math.inf:.8g}",
-        f"    Akaike info crit   = {level + 2.0 * k:.8g}",
-        f"    Bayesian info crit = {level + k * math.log(count):.8g}",
-        "[[Variables]]",
-    ]
-    for name, e in estimates.items():
-        share = 100.0 * e.error / e.value
-        lines.append(
-            f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} ({share:.2f}%) (init = {e.initial:.7g})"
-        )
-    pairs = [(i, j) for i, j in itertools.combinations(range(k), 2) if abs(correlation[i, j]) >= 0.1]
-    if pairs:
-        names = list(estimates)
-        lines.append("[[Correlations]] (unreported correlations are < 0.100)")
-        pairs.sort(key=lambda pair: -abs(correlation[pair]))
-        lines += [f"    C({names[i]}, {names[j]}) = {correlation[i, j]:+.4f}" for i, j in pairs]
-    return "\n".join(lines)
+    def _lines(self) -> list[str | Table]:
+        """Table of the parameters, correlations, profiles and notes, as a report has them."""
+        estimates, correlation = self.estimates, self.correlation
+        rows = [
+            (
+                e.path, f"{e.value:.6g}", f"{e.error:.2g}", f"{100.0 * e.error / e.value:.2g} %",
+                f"{e.low:.4g} to {e.high:.4g}", e.unit, f"{e.initial:.4g}", "at a bound" if e.at_bound else "",
+            )
+            for e in estimates.values()
+        ]  # fmt: skip
+        lines: list[str | Table] = [
+            "", Table(("parameter", "value", "error", "", "95 % interval", "unit", "started at", ""), rows)
+        ]  # fmt: skip
+        pairs = [
+            f"{a}, {b}: {correlation[i, j]:+.3f}"
+            for (i, a), (j, b) in itertools.combinations(enumerate(estimates), 2)
+            if abs(correlation[i, j]) > 0.1
+        ]
+        if pairs:
+            lines += ["", "correlations beyond 0.1: " + "; ".join(pairs)]
+        for one in self.profiles.values():
+            ends = f"{one.low:.4g} to {one.high:.4g} {estimates[one.path].unit}, {one.shape}"
+            lines.append(f"profile of {one.path}: {ends}".replace(" ,", ","))
+        return [*lines, *(["", *self.notes] if self.notes else [])]
+
+    def report(self) -> str:
+        """Statistics, parameters and correlations in the layout of lmfit's ``fit_report``.
+
+        As there, the criteria of Akaike and Bayes are n log(chi-square / n) + 2 k, and + k log(n), of n data and k
+        parameters.
+        """
+        estimates, correlation, square, count = self.estimates, self.correlation, self.objective, self._count
+        k, freedom = len(estimates), count - len(estimates)
+        level = count * math.log(max(square, 1e-300) / count)
+        wide = max(map(len, estimates)) + 1
+        lines = [
+            "[[Fit Statistics]]",
+            "    # fitting method   = least_squares",
+            f"    # function evals   = {self.evaluations}",
+            f"    # data points      = {count}",
+            f"    # variables        = {k}",
+            f"    chi-square         = {square:.8g}",
+            f"    reduced chi-square = {square / freedom if freedom > 0 else math.inf:.8g}",
+            f"    Akaike info crit   = {level + 2.0 * k:.8g}",
+            f"    Bayesian info crit = {level + k * math.log(count):.8g}",
+            "[[Variables]]",
+        ]
+        for name, e in estimates.items():
+            share = f"({100.0 * e.error / e.value:.2f}%) (init = {e.initial:.7g})"
+            lines.append(f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} {share}")
+        pairs = [(i, j) for i, j in itertools.combinations(range(k), 2) if abs(correlation[i, j]) >= 0.1]
+        if pairs:
+            names = list(estimates)
+            lines.append("[[Correlations]] (unreported correlations are < 0.100)")
+            pairs.sort(key=lambda pair: -abs(correlation[pair]))
+            lines += [f"    C({names[i]}, {names[j]}) = {correlation[i, j]:+.4f}" for i, j in pairs]
+        return "\n".join(lines)
+
+    def _plain(self) -> dict[str, Any]:
+        """Parameters, correlations, notes and profiles as plain numbers and texts."""
+        return {
+            "parameters": [vars(e) for e in self.estimates.values()],
+            "correlation": self.correlation.tolist(),
+            "objective": self.objective,
+            "notes": list(self.notes),
+            "profiles": [
+                {**vars(one), "values": one.values.tolist(), "objective": one.objective.tolist()}
+                for one in self.profiles.values()
+            ],
+        }
 
 
 def notes_of(

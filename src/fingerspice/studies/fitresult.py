@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,20 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.files import write_aside
-from fingerspice.base.pages import Page, Shown, Table
+from fingerspice.base.files import write_csv
+from fingerspice.base.pages import Page, Table
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import meaning_of
 from fingerspice.results.signals import SIGNALS
 from fingerspice.studies.fitdata import MEASURED, Data
 from fingerspice.studies.fitestimates import (
     Estimate,
+    Estimates,
     Profile,
     correlation_of,
     covariance_of,
-    estimate_lines,
     estimate_of,
-    lmfit_report,
     misfit_note,
     notes_of,
 )
@@ -48,7 +46,7 @@ class Fitted:
 
 
 @dataclass(frozen=True, repr=False)
-class Fit(Shown):
+class Fit(Estimates):
     """A fit of parameters to data; `circuit` is ready to run.
 
     Attributes
@@ -113,7 +111,7 @@ class Fit(Shown):
         ]
         if self.data.groups is not None:
             lines.append(f"groups by {self.data.groups.column}: {', '.join(self.data.groups.labels)}")
-        return Page([*lines, *estimate_lines(self.estimates, self.correlation, self.profiles, self.notes)])
+        return Page([*lines, *self._lines()])
 
     def _noise(self) -> str:
         if self.data.sigma is not None:
@@ -121,10 +119,9 @@ class Fit(Shown):
         equal = float(np.ptp(self.sigma)) <= 1e-9 * float(self.sigma.max())
         return f"sigma estimated from the residuals, {'equal for all' if equal else 'as equal shares of the values'}"
 
-    def report(self) -> str:
-        """Statistics, parameters and correlations in the layout of lmfit's ``fit_report``."""
-        count = self.data.values.size * (1 if self.data.phase is None else 2)
-        return lmfit_report(self.estimates, self.correlation, self.objective, count, self.evaluations)
+    @property
+    def _count(self) -> int:
+        return self.data.values.size * (1 if self.data.phase is None else 2)
 
     def plot(self) -> Figure:
         """Data and fit, with the residuals below."""
@@ -163,19 +160,12 @@ class Fit(Shown):
     def to_dict(self) -> dict[str, Any]:
         """The fit as plain numbers and texts; `parameters` has a row for each."""
         return {
-            "parameters": [vars(e) for e in self.estimates.values()],
-            "correlation": self.correlation.tolist(),
+            **self._plain(),
             "groups": list(self.circuits),
             "signal": self.data.signal,
             "count": int(self.data.values.size),
             "residual_rms": float(np.sqrt(np.mean(self.residual**2))),
-            "objective": self.objective,
             "objectives": list(self.objectives),
-            "notes": list(self.notes),
-            "profiles": [
-                {**vars(one), "values": one.values.tolist(), "objective": one.objective.tolist()}
-                for one in self.profiles.values()
-            ],
         }
 
     def to_csv(self, path: str | Path) -> Path:
@@ -187,19 +177,11 @@ class Fit(Shown):
             If the folder cannot be written.
         """
         data, groups = self.data, self.data.groups
-        columns = {"t": data.t} if data.t is not None else {}
+        columns: dict[str, Any] = {"t": data.t} if data.t is not None else {}
         columns |= {**data.conditions, data.signal: data.values, "fitted": self.predicted, "sigma": self.sigma}
-        texts = {name: [f"{x:.17g}" for x in values] for name, values in columns.items()}
         if groups is not None:
-            texts = {groups.column: [groups.labels[i] for i in groups.of], **texts}
-
-        def write(target: Path) -> None:
-            with target.open("w", newline="", encoding="utf-8") as stream:
-                out = csv.writer(stream, lineterminator="\n")
-                out.writerow(texts)
-                out.writerows(zip(*texts.values(), strict=True))
-
-        return write_aside(Path(path), write)
+            columns = {groups.column: [groups.labels[i] for i in groups.of], **columns}
+        return write_csv(path, columns, zip(*columns.values(), strict=True))
 
 
 def fit_result(

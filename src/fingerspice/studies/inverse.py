@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, positive_number, real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
@@ -161,19 +162,14 @@ class InverseDrive(Shown):
 
     def to_csv(self, path: str | Path) -> Path:
         """Write the drive as CSV: time (s) and voltage (V)."""
-        from fingerspice.studies.drive_files import write_columns
-
         t = np.arange(self.drive.values.size) / self.drive.rate
-        return write_columns(Path(path), ("time (s)", "drive (V)"), (t, self.drive.values))
+        return write_csv(path, ("time (s)", "drive (V)"), zip(t, self.drive.values, strict=True))
 
     def friction_to_csv(self, path: str | Path) -> Path:
         """Write wanted and predicted force and friction as CSV."""
-        from fingerspice.studies.drive_files import write_columns
-
         names = ("time (s)", "wanted force (N)", "force (N)", "wanted friction (N)", "friction (N)")
-        return write_columns(
-            Path(path), names, (self.times, self.wanted, self.force, self.wanted_friction, self.friction)
-        )
+        columns = self.times, self.wanted, self.force, self.wanted_friction, self.friction
+        return write_csv(path, names, zip(*columns, strict=True))
 
 
 def inverse_drive(

@@ -80,7 +80,24 @@ class FoldLimits(Shown):
 
     def plot(self) -> Picture:
         """Picture of the fold's voltage against every parameter, with a mark at the deck's own point."""
-        return plot_limits(self)
+        from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
+
+        figure, axes = new_figure(1, len(self.sweeps), height=3.2, sharey=True)
+        for ax, sweep in zip(axes, self.sweeps, strict=True):
+            factor, unit = engineering(sweep.own, sweep.unit)
+            x, own = factor * sweep.values, factor * sweep.own
+            ax.plot(x, sweep.voltages, color=BLUE, marker="o", markersize=3, label="fold of the mobile law")
+            ax.fill_between(x, sweep.voltages, 1e6, color=GREY, alpha=0.2, linewidth=0, label="no solution")
+            ax.plot([own], [self.peak], color=VERMILION, marker="D", linestyle="none", label="this deck")
+            ax.set_xscale("log")
+            ax.set_yscale("log")
+            dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
+        shown = np.concatenate([s.voltages[np.isfinite(s.voltages)] for s in self.sweeps] + [[self.peak]])
+        axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper left", ncols=3, fontsize=FONT - 0.5, frameon=False)
+        caption(figure, f"{heading(self.circuit)} · charge law mobile; the other parameters as in the deck")
+        return figure
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, SI units."""
@@ -248,25 +265,3 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
         middle = math.sqrt(low * high)
         low, high = (low, middle) if folds(middle) else (middle, high)
     return math.sqrt(low * high)
-
-
-def plot_limits(limits: FoldLimits) -> Picture:
-    """Picture of the fold's voltage against every parameter, with a mark at the deck's own point."""
-    from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
-
-    figure, axes = new_figure(1, len(limits.sweeps), height=3.2, sharey=True)
-    for ax, sweep in zip(axes, limits.sweeps, strict=True):
-        factor, unit = engineering(sweep.own, sweep.unit)
-        x, own = factor * sweep.values, factor * sweep.own
-        ax.plot(x, sweep.voltages, color=BLUE, marker="o", markersize=3, label="fold of the mobile law")
-        ax.fill_between(x, sweep.voltages, 1e6, color=GREY, alpha=0.2, linewidth=0, label="no solution")
-        ax.plot([own], [limits.peak], color=VERMILION, marker="D", linestyle="none", label="this deck")
-        ax.set_xscale("log")
-        ax.set_yscale("log")
-        dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
-    shown = np.concatenate([s.voltages[np.isfinite(s.voltages)] for s in limits.sweeps] + [[limits.peak]])
-    axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=3, fontsize=FONT - 0.5, frameon=False)
-    caption(figure, f"{heading(limits.circuit)} · charge law mobile; the other parameters as in the deck")
-    return figure

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fingerspice.base.files import write_aside
+from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines
@@ -116,13 +115,9 @@ def limits_text(limits: FoldLimits) -> Page:
 
 def limits_csv(limits: FoldLimits, path: Path) -> Path:
     """Write a map of the fold as CSV; a row without a fold has an empty voltage."""
-
-    def write(target: Path) -> None:
-        with target.open("w", newline="") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(["parameter", "value [SI]", "unit", "fold [V]"])
-            for sweep in limits.sweeps:
-                for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True):
-                    writer.writerow([sweep.name, repr(x), sweep.unit, repr(u) if math.isfinite(u) else ""])
-
-    return write_aside(path, write)
+    rows = [
+        (sweep.name, x, sweep.unit, u if math.isfinite(u) else "")
+        for sweep in limits.sweeps
+        for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
+    ]
+    return write_csv(path, ("parameter", "value [SI]", "unit", "fold [V]"), rows)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-import sys
 import time
 import warnings
 from collections import Counter, deque
@@ -22,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fingerspice import __version__
-from fingerspice.base.announcing import Bar
+from fingerspice.base.announcing import paced
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.heap import keep_freed_memory
@@ -149,40 +148,18 @@ def run_chunks(work: Work, shard: tuple[int, int], workers: int | None, client: 
     elif missing:
         answers = _here(work, missing)
     failures: list[str] = []
-    with _Pace(len(mine), len(mine) - len(missing)) as pace:
-        for done in answers:
-            failures += done.failures
-            pace.show(done.count)
+    scenes, found = 0, len(mine) - len(missing)
+    with paced("sweeping", found / len(mine)) as show:
+        for number, done in enumerate(answers, found + 1):
+            failures, scenes = failures + done.failures, scenes + done.count
+            show(number / len(mine), lambda s, count=scenes: f"{count / s:,.3g} scenes/s,")
     lacking = store.chunks - store.marked()
     if not lacking:
         store.tidy()
     return {
-        "chunks": len(mine), "chunks_found": len(mine) - len(missing), "chunks_missing": lacking,
+        "chunks": len(mine), "chunks_found": found, "chunks_missing": lacking,
         "seconds": time.perf_counter() - begun, "failures": failures[:MESSAGES],
     }  # fmt: skip
-
-
-class _Pace:
-    """A progress bar with the scenes a second, and the time left."""
-
-    def __init__(self, total: int, done: int) -> None:
-        self.bar, self.begun = Bar("sweeping"), time.perf_counter()
-        self.total, self.first, self.done, self.scenes = total, done, done, 0
-
-    def __enter__(self) -> _Pace:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.stop()
-
-    def show(self, count: int) -> None:
-        """Show that a chunk with this many scenes is done."""
-        self.done, self.scenes = self.done + 1, self.scenes + count
-        took = time.perf_counter() - self.begun
-        if took > 1.0 and sys.stderr.isatty():
-            seconds = (self.total - self.done) * took / (self.done - self.first)
-            left = f"{seconds // 3600:02.0f}:{seconds % 3600 // 60:02.0f}:{seconds % 60:02.0f}"
-            self.bar.show(self.done / self.total, f"{self.scenes / took:,.3g} scenes/s, {left} left")
 
 
 def _here(work: Work, missing: Sequence[int]) -> Iterator[Done]:

@@ -17,12 +17,12 @@ from fingerspice.base.arrays import whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import scenes_warnings
+from fingerspice.circuit.provenance import digests
 from fingerspice.studies.batch import batch, checked_scenes
 from fingerspice.studies.batchtask import LOCKSTEP, REFUSED
 from fingerspice.studies.sweepchunks import Work, programs, run_chunks, scheduled
 from fingerspice.studies.sweepplan import Plan
 from fingerspice.studies.sweepstore import MISSING, NAMES, STATUS, SweepStore, Variable, identity
-from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -126,13 +126,6 @@ def _check_values(circuit: Circuit, plan: Plan) -> None:
 def _identity(work: Work, options: Mapping[str, Any]) -> dict[str, Any]:
     """All inputs that determine the bytes of a store, by which a later call recognises its own store."""
     circuit, plan = work.circuit, work.plan
-    told = hashlib.sha256()
-    for element in circuit.elements:
-        wave = element.waveform
-        told.update(repr((element.name, element.device, element.nodes, dict(element.values))).encode())
-        told.update(repr(wave.digest() if isinstance(wave, Samples) else wave).encode())
-    tran = circuit.tran
-    told.update(repr((circuit.charge_law, dict(circuit.initial), tran)).encode())
     values: dict[str, Any] = {}
     for name, one in (plan.grid | plan.fixed).items():
         values[name] = hashlib.sha256(one.tobytes()).hexdigest() if one.size > 8 else one.tolist()
@@ -143,7 +136,8 @@ def _identity(work: Work, options: Mapping[str, Any]) -> dict[str, Any]:
         # Nine digits are the same on every machine.
         values[name] = [f"{x:.9g}" for x in law.ppf(_PROBES)]
     return {
-        "programs": work.programs, "circuit": told.hexdigest(), "list of parameters": list(values),
+        "programs": work.programs, "circuit": digests(circuit), "times": repr(circuit.tran),
+        "list of parameters": list(values),
         **{f"range of {name}": value for name, value in values.items()},
         **({"n": plan.n, "seed": plan.seed} if plan.drawn else {}),
         **_effective(options), "block": work.store.block,
