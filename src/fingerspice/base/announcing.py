@@ -15,7 +15,9 @@ _LOG = logging.getLogger("fingerspice")
 LONG = {
     ("engine.loop.march_on", "Stack"): "the steps of a series stack, about 35 s",
     ("engine.loop.march_on", "Mesh"): "the steps of a network, about 80 s",
-    ("engine.lanes.begin", "Marks"): "the steps of a recording, about 30 s",
+    ("engine.lanes.begin", "StackMarks"): "the steps of a recording, about 20 s",
+    ("engine.lanes.begin", "MobileMarks"): "the steps of a recording, about 20 s",
+    ("engine.lanes.begin", "NetworkMarks"): "the steps of a recording in a network, about 30 s",
     ("engine.shooting.close_period", "Stack"): "the periodic state, about 25 s",
     ("engine.collocation.advance", "Nodal"): "implicit steps, about 15 s",
     ("engine.lockmarch.march", ""): "scenes in lockstep, about 20 s",

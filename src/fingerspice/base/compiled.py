@@ -244,3 +244,5 @@ jit_fused = _cached(fastmath={"contract"}, noalias=True)
 jit_rows = _cached(fastmath={"contract", "reassoc"}, noalias=True)
 # Inlined by LLVM: a call with a tuple of arrays would cost as much as the work.
 jit_within = _cached(forceinline=True)
+# The same for what holds such loops: the caller's options do not reach what it inlines.
+jit_within_rows = _cached(forceinline=True, fastmath={"contract"})

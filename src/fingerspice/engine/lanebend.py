@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_within
+from fingerspice.base.compiled import jit_within_rows
 from fingerspice.engine.lanerows import (
     END_SLOPES,
     FADED,
@@ -19,57 +19,57 @@ from fingerspice.engine.lanerows import (
 )
 
 
-@jit_within
-def drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shares: bool, state: FloatArray) -> None:
+@jit_within_rows
+def _drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shares: bool, state: FloatArray) -> None:
     """Drives at node j, from xi there, but for N, and from what 1/A - q0 multiplies there.
 
-    In a network xi = X + B N(xi), where X is given, and B is the share of N at this node, or 0 if it has none. It is
-    solved on the tangent of N at node `before`, and once more on the one at the place that is found. Tangents have the
-    slope -q / d, d = q0 (q0 + q) - kappa q, where 1/A = q0 + q.
+    xi = X + B N(xi), where X is given, and B is the share of N at this node, or 0 if it has none. It is solved on the
+    tangent of N at node `before`, and once more on the one at the place that is found. Tangents have the slope -q / d,
+    d = q0 (q0 + q) - kappa q, where 1/A = q0 + q.
     """
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives, x = leaks + len(marks.bend), at.scratch
+    drives, x = leaks + 1, at.scratch
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     # The share of xi, and with steps of `one` those of what 1/A - q0 multiplies.
     one, on = weights_of(marks).one, 1.0 if shares else 0.0
     share_at = weights_of(marks).node + (j - 1) * (1 + leaks) * one + one - 1
-    if drives > leaks:
-        for i in range(lanes):
-            there, bend = state[(at.xi + before) * lanes + i], state[(at.g + before * drives + leaks) * lanes + i]
-            share, q = on * weights[share_at * wide + i * each], state[at.q * lanes + i]
-            without = state[(at.xi + j) * lanes + i]
-            d = c.q0 * (c.q0 + q) - c.kappa * q
-            state[(x + 2) * lanes + i] = without
-            state[(at.xi + j) * lanes + i] = there + d * ((without + share * bend - there) / (d + share * q))
     for i in range(lanes):
-        state[x * lanes + i] = abs(state[(at.xi + j) * lanes + i]) * c.scale + c.shift
+        there, bend = state[(at.xi + before) * lanes + i], state[(at.g + before * drives + leaks) * lanes + i]
+        share, q = on * weights[share_at * wide + i * each], state[at.q * lanes + i]
+        without = state[(at.xi + j) * lanes + i]
+        d = c.q0 * (c.q0 + q) - c.kappa * q
+        xi = there + d * ((without + share * bend - there) / (d + share * q))
+        state[(x + 2) * lanes + i], state[(at.xi + j) * lanes + i] = without, xi
+        state[x * lanes + i] = abs(xi) * c.scale + c.shift
     polynomial_rows(lanes, c.area, state[x * lanes :], state[(x + 1) * lanes :])
-    if drives > leaks:
-        polynomial_rows(lanes, c.slope, state[x * lanes :], state[(at.q + 1) * lanes :])
-        polynomial_rows(lanes, c.bend, state[x * lanes :], state[(x + 4) * lanes :])
-        for i in range(lanes):
-            xi, q = state[(at.xi + j) * lanes + i], state[(x + 1) * lanes + i]
-            share, bend = on * weights[share_at * wide + i * each], state[(x + 4) * lanes + i]
-            bend = bend if xi >= 0.0 else -bend
-            d = c.q0 * (c.q0 + q) - c.kappa * q
-            by = (state[(x + 2) * lanes + i] + share * bend - xi) / (d + share * q)
-            bend -= q * by
-            found = xi + d * by
-            q += state[(at.q + 1) * lanes + i] * (abs(found) - abs(xi))
-            state[(at.xi + j) * lanes + i] = found
-            state[(x + 1) * lanes + i] = q
-            state[at.q * lanes + i] = q
-            state[(at.g + j * drives + leaks) * lanes + i] = bend
-            for t in range(leaks):
-                more = c.bent[t] + on * weights[(share_at + (1 + t) * one) * wide + i * each]
-                state[(at.w + leaks + t) * lanes + i] += more * bend
-    for t in range(leaks):
-        for i in range(lanes):
+    polynomial_rows(lanes, c.slope, state[x * lanes :], state[(at.q + 1) * lanes :])
+    polynomial_rows(lanes, c.bend, state[x * lanes :], state[(x + 4) * lanes :])
+    for i in range(lanes):
+        xi, q = state[(at.xi + j) * lanes + i], state[(x + 1) * lanes + i]
+        share, bend = on * weights[share_at * wide + i * each], state[(x + 4) * lanes + i]
+        bend = bend if xi >= 0.0 else -bend
+        d = c.q0 * (c.q0 + q) - c.kappa * q
+        by = (state[(x + 2) * lanes + i] + share * bend - xi) / (d + share * q)
+        bend -= q * by
+        found = xi + d * by
+        q += state[(at.q + 1) * lanes + i] * (abs(found) - abs(xi))
+        state[(at.xi + j) * lanes + i] = found
+        state[at.q * lanes + i] = q
+        state[(at.g + j * drives + leaks) * lanes + i] = bend
+        for t in range(leaks):
             w = state[(at.w + leaks + t) * lanes + i]
-            state[(at.g + j * drives + t) * lanes + i] = state[(x + 1) * lanes + i] * w
+            w += (c.bent[t] + on * weights[(share_at + (1 + t) * one) * wide + i * each]) * bend
+            state[(at.w + leaks + t) * lanes + i] = w
+            state[(at.g + j * drives + t) * lanes + i] = q * w
 
 
-@jit_within
+@jit_within_rows
+def bent_drives_at(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
+    """The same at a later node, where N has its share."""
+    _drives_at(marks, c, weights, j, j - 1, True, state)
+
+
+@jit_within_rows
 def _changes(marks: Any, c: Any, weights: FloatArray, node: int, state: FloatArray) -> None:
     """Change of N in a step at its rate at node 0 or the last one, into the first row of scratch.
 
@@ -98,9 +98,9 @@ def _changes(marks: Any, c: Any, weights: FloatArray, node: int, state: FloatArr
         state[x * lanes + i] *= -q / (d + state[(x + 2) * lanes + i] * q)
 
 
-@jit_within
-def smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
-    """Put modes that fade within the first step of a sample where they soon are, on the new line of the source.
+@jit_within_rows
+def smooth(marks: Any, c: Any, weights: FloatArray, a: float, state: FloatArray) -> bool:
+    """Put modes that fade within a step where they soon are, on the new line of the source if it begins there (a = 0).
 
     What this changes of them and of the drives is kept in the rows from `gone` on. Whether there are such modes.
     """
@@ -109,7 +109,7 @@ def smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     fades, length = False, weights_of(marks).length
     for i in range(lanes if len(marks.own) > 0 else 1):
-        fades = fades or c.rates[c.fast] * weights[length * wide + i * each] > FADED
+        fades = fades or (a == 0.0 and c.rates[c.fast] * weights[length * wide + i * each] > FADED)
     if not fades:
         return False
     _changes(marks, c, weights, 0, state)
@@ -126,7 +126,7 @@ def smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
             state[(at.gone + k) * lanes + i] = z - soon
             state[(SOURCES + k) * lanes + i] = soon
     project(marks, c, 0, at.xi + last, state)
-    drives_at(marks, c, weights, last, 0, False, state)
+    _drives_at(marks, c, weights, last, 0, False, state)
     for i in range(lanes):
         state[at.xi * lanes + i] = state[(at.xi + last) * lanes + i]
         state[(at.q + 2) * lanes + i] = rise_of(c.q0, c.kappa, state[at.q * lanes + i])
@@ -141,8 +141,8 @@ def smooth(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> bool:
     return True
 
 
-@jit_within
-def bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
+@jit_within_rows
+def _bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """Add the modes' response to what the cubic through N lacks, whose slope at the end of the step is known."""
     lanes, m, leaks, at = len(marks.lanes), len(marks.modes), len(marks.leaks), places(marks)
     drives = leaks + 1
@@ -158,8 +158,8 @@ def bend_end(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
             state[(SOURCES + k) * lanes + i] += weights[p * wide + i * each] * state[at.scratch * lanes + i]
 
 
-@jit_within
-def fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
+@jit_within_rows
+def _fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """Add what is left of what `smooth` has taken, and the modes' response to it by N and, as one, by the leaks."""
     lanes, m, active, leaks = len(marks.lanes), len(marks.modes), len(marks.active), len(marks.leaks)
     at, rows = places(marks), weights_of(marks)
@@ -180,11 +180,18 @@ def fade(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
                 state[(SOURCES + k) * lanes + i] += pulse * fed + (decay * gone if k == f else 0.0)
 
 
-@jit_within
-def end_bent(marks: Any, c: Any, state: FloatArray) -> None:
-    """The drives at the end of a step to node 0, from xi there, and on the tangents at the last node."""
+@jit_within_rows
+def end_bent(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatArray) -> None:
+    """What N has beside the cubic, and fading modes; then the drives at the end of a step to node 0.
+
+    They follow from xi there, on the tangents at the last node.
+    """
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     drives, last = leaks + 1, NODES - 1
+    _bend_end(marks, c, weights, state)
+    if fades:
+        _fade(marks, c, weights, state)
+    project(marks, c, 1, at.xi, state)
     for i in range(lanes):
         xi, found, q = state[at.xi * lanes + i], state[(at.xi + last) * lanes + i], state[at.q * lanes + i]
         bend = state[(at.g + last * drives + leaks) * lanes + i]

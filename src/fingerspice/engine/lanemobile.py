@@ -10,11 +10,11 @@ from __future__ import annotations
 from typing import Any
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_within
+from fingerspice.base.compiled import jit_within_rows
 from fingerspice.engine.lanerows import INNER, places, polynomial_rows, weights_of
 
 
-@jit_within
+@jit_within_rows
 def drives_under_mobile(marks: Any, c: Any, weights: FloatArray, j: int, before: int, state: FloatArray) -> None:
     """Gap voltage and drives at node j, or for 0 at the end, from Y there, and from what multiplies 1/A - q0 there.
 
@@ -58,7 +58,13 @@ def drives_under_mobile(marks: Any, c: Any, weights: FloatArray, j: int, before:
             state[(at.g + j * (leaks + 1) + t) * lanes + i] = q * w
 
 
-@jit_within
+@jit_within_rows
+def drives_under_mobile_at(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
+    """The same at a later node."""
+    drives_under_mobile(marks, c, weights, j, j - 1, state)
+
+
+@jit_within_rows
 def weaken_kinks(marks: Any, c: Any, state: FloatArray) -> None:
     """Scale what the rule misses of |xi|: u rises 1 / (1 -+ b) as much as xi with the area at 0 V on its two sides."""
     lanes, at = len(marks.lanes), places(marks)

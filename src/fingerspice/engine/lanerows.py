@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_rows, jit_within
+from fingerspice.base.compiled import jit_rows, jit_within_rows
 
 # Inner nodes of Lobatto's rule with four nodes, and its weights in a step of length 1.
 INNER = (0.5 - 0.1 * 5.0**0.5, 0.5 + 0.1 * 5.0**0.5)
@@ -24,6 +24,8 @@ END_SLOPES = BASIS @ np.array([0.0, 1.0, 2.0, 3.0])
 SOURCES = 3
 # Time constants in a step from which on a mode is taken to follow the drives.
 FADED = 5.0
+# Time constants in a step from which on a mode's response to kinks is computed in closed form in a stack.
+QUICK = 0.25
 
 
 class Marks(NamedTuple):
@@ -38,6 +40,18 @@ class Marks(NamedTuple):
     mobile: tuple[int, ...]
     lanes: tuple[int, ...]
     own: tuple[int, ...]  # One entry if each lane has its own weights, or none
+
+
+class StackMarks(Marks):
+    """Of a stack under `local`."""
+
+
+class MobileMarks(Marks):
+    """Of a stack under `mobile`."""
+
+
+class NetworkMarks(Marks):
+    """Of a network."""
 
 
 class Lanes(NamedTuple):
@@ -91,21 +105,22 @@ def rows_of(marks: Any) -> Rows:
     g = xi + NODES
     w = g + NODES * drives
     scratch = w + 2 * leaks
-    q = scratch + 5 + NODES + drives
+    q = scratch + 5 + drives
     more = 3 if len(marks.mobile) > 0 else m + drives if drives > leaks else 0
     return Rows(xi, g, w, scratch, q, q + 3, q + 3, q + 4, q + 3 + more if more > 0 else q)
 
 
-places = jit_within(rows_of)
+places = jit_within_rows(rows_of)
 
 
 class Weighed(NamedTuple):
     """Rows of the weights of a step.
 
-    Each mode has its decay, those from the inner nodes to the end, its response to the source at both ends, and to each
-    drive at each node; in a network also to what N has beside the cubic, by its slope at the end. Behind the row of the
-    step's length, each later node has xi, and what 1/A - q0 multiplies in each leak: by the source at both ends, by the
-    active modes, and by each drive at each node but the last; in a network also by N at this node.
+    Each mode has its decay; the time for which what begins within the step acts at its end, as a cubic in where it
+    begins, unless the mode is quick; its response to the source at both ends, and to each drive at each node; in a
+    network also to what N has beside the cubic, by its slope at the end. Behind the row of the step's length, each
+    later node has xi, and what 1/A - q0 multiplies in each leak: by the source at both ends, by the active modes, and
+    by each drive at each node but the last; in a network also by N at this node.
     """
 
     mode: int  # Rows of a mode
@@ -118,21 +133,21 @@ class Weighed(NamedTuple):
 def weighed(modes: int, active: int, leaks: int, bend: int) -> Weighed:
     """The rows of the weights with so many modes, active modes, leaks, and 1 for a network."""
     drives = leaks + bend
-    mode, one = 5 + NODES * drives + bend, 2 + active + (NODES - 1) * drives + bend
+    mode, one = NODES + 3 + NODES * drives + bend, 2 + active + (NODES - 1) * drives + bend
     length = modes * mode
     return Weighed(mode, length, length + 1, one, length + 1 + (NODES - 1) * (1 + leaks) * one)
 
 
-@jit_within
+@jit_within_rows
 def weights_of(marks: Any) -> Weighed:
     """The same for the marks of compiled code."""
     return _weighed(len(marks.modes), len(marks.active), len(marks.leaks), len(marks.bend))
 
 
-_weighed = jit_within(weighed)
+_weighed = jit_within_rows(weighed)
 
 
-@jit_within
+@jit_within_rows
 def project(marks: Any, c: Any, place: int, to: int, state: FloatArray) -> None:
     """xi, into row `to`, and what 1/A - q0 multiplies but for N, from the modes and the source at one end."""
     lanes, active, leaks, at = len(marks.lanes), len(marks.active), len(marks.leaks), places(marks)
@@ -162,7 +177,7 @@ def polynomial_rows(n: int, powers: FloatArray, x: FloatArray, out: FloatArray) 
             out[i] = (((out[i] * x[i] + c3) * x[i] + c2) * x[i] + c1) * x[i] + c0
 
 
-@jit_within
+@jit_within_rows
 def rise_of(q0: float, kappa: float, q: float) -> float:
     """dN/dxi where 1/A = q0 + q: e / (1 + kappa e), e = A - 1/q0."""
     return -q / (q0 * (q0 + q) - kappa * q)

@@ -7,17 +7,18 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_within
+from fingerspice.base.compiled import jit, jit_within_rows
 from fingerspice.engine.lanerows import INNER_WEIGHT, NODES, OUTER_WEIGHT, SOURCES, places, polynomial_rows
 from fingerspice.engine.lanes import begin
 from fingerspice.engine.lanestep import step
 from fingerspice.engine.laneweights import weigh
+from fingerspice.numerics.small import copy_to
 
 # Rows of the derivatives behind those of the modes: gap voltage at the end, and the integrals of u^2 A and A.
 GAP, SQUARES, AREAS, MORE = range(4)
 
 
-@jit_within
+@jit_within_rows
 def _gap_and_area(marks: Any, c: Any, node: int, state: FloatArray, u: FloatArray, q: FloatArray) -> None:
     """Gap voltage and 1/A - q0 at a node, of every lane."""
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
@@ -127,4 +128,4 @@ def sum_back(
                 now[p] = total + of_modes[p, k]
             else:
                 of_source[k + p - m] += total
-        after[:] = now
+        copy_to(after, now)

@@ -23,24 +23,79 @@ from __future__ import annotations
 from typing import Any
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_rows, jit_within
-from fingerspice.engine.lanebend import bend_end, drives_at, end_bent, fade, smooth
-from fingerspice.engine.lanemobile import drives_under_mobile, weaken_kinks
+from fingerspice.base.compiled import jit_by_kind, jit_rows, jit_within_rows
+from fingerspice.engine.lanebend import bent_drives_at, end_bent, smooth
+from fingerspice.engine.lanemobile import drives_under_mobile, drives_under_mobile_at, weaken_kinks
 from fingerspice.engine.lanerows import (
-    BASIS,
-    FADED,
     INNER,
     INNER_WEIGHT,
     NODES,
     OUTER_WEIGHT,
+    QUICK,
     SOURCES,
     places,
+    polynomial_rows,
     project,
     weights_of,
 )
 
-# Time constants in a step from which on a mode's response to kinks is computed in closed form in a stack.
-QUICK = 0.25
+
+@jit_within_rows
+def _drives_of_stack(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    x = at.scratch
+    for i in range(lanes):
+        state[x * lanes + i] = abs(state[(at.xi + j) * lanes + i]) * c.scale + c.shift
+    polynomial_rows(lanes, c.area, state[x * lanes :], state[(x + 1) * lanes :])
+    for t in range(leaks):
+        for i in range(lanes):
+            w = state[(at.w + leaks + t) * lanes + i]
+            state[(at.g + j * leaks + t) * lanes + i] = state[(x + 1) * lanes + i] * w
+
+
+@jit_within_rows
+def _begin_at_once(marks: Any, c: Any, weights: FloatArray, a: float, state: FloatArray) -> bool:
+    return False
+
+
+@jit_within_rows
+def _end_of_stack(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatArray) -> None:
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    _add_kinks(marks, c, weights, state)
+    project(marks, c, 1, at.xi, state)
+    for t in range(leaks):
+        for i in range(lanes):
+            state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * leaks + t) * lanes + i]
+            state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
+
+
+@jit_within_rows
+def _end_under_mobile(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatArray) -> None:
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    _add_kinks(marks, c, weights, state)
+    project(marks, c, 1, at.xi, state)
+    drives_under_mobile(marks, c, weights, 0, NODES - 1, state)
+    for t in range(leaks):
+        for i in range(lanes):
+            state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
+
+
+@jit_by_kind(StackMarks=_begin_at_once, MobileMarks=_begin_at_once, NetworkMarks=smooth)
+def _begin(marks: Any, c: Any, weights: FloatArray, a: float, state: FloatArray) -> bool:
+    """Prepare a step that begins at the part `a` of a sample; whether modes fade in it."""
+    raise NotImplementedError
+
+
+@jit_by_kind(StackMarks=_drives_of_stack, MobileMarks=drives_under_mobile_at, NetworkMarks=bent_drives_at)
+def _drives_at(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
+    """Drives at a later node from what is predicted there."""
+    raise NotImplementedError
+
+
+@jit_by_kind(StackMarks=_end_of_stack, MobileMarks=_end_under_mobile, NetworkMarks=end_bent)
+def _end(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatArray) -> None:
+    """From the modes at the end of a step, xi and the drives there, for the start of the next one."""
+    raise NotImplementedError
 
 
 @jit_rows
@@ -49,47 +104,34 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
 
     `weights` are those of the part's length.
     """
-    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives, bent = leaks + len(marks.bend), len(marks.bend) > len(marks.mobile)
+    lanes, at = len(marks.lanes), places(marks)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for i in range(lanes):
         before = state[2 * lanes + i]
         change = after[i] - before
         state[i], state[lanes + i] = before + a * change, before + b * change
-    fades = bent and a == 0.0 and smooth(marks, c, weights, state)
-    for j in range(1, NODES):
-        _predict(marks, weights, j, state)
-        if len(marks.mobile) > 0:
-            drives_under_mobile(marks, c, weights, j, j - 1, state)
-        else:
-            drives_at(marks, c, weights, j, j - 1, True, state)
+    fades = _begin(marks, c, weights, a, state)
+    # Numbers that the compiler knows: it then unrolls the sums in them.
+    _at_node(marks, c, weights, 1, state)
+    _at_node(marks, c, weights, 2, state)
+    _at_node(marks, c, weights, 3, state)
     for i in range(lanes):
         state[(at.scratch + 1) * lanes + i] = weights[weights_of(marks).length * wide + i * each]
     _kinks(marks, c, state)
     _advance(marks, c, weights, state)
-    if bent:
-        bend_end(marks, c, weights, state)
-        if fades:
-            fade(marks, c, weights, state)
-    project(marks, c, 1, at.xi, state)
-    if bent:
-        end_bent(marks, c, state)
-    elif len(marks.mobile) > 0:
-        drives_under_mobile(marks, c, weights, 0, NODES - 1, state)
-    else:
-        for t in range(drives):
-            for i in range(lanes):
-                state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * drives + t) * lanes + i]
-    if not bent:
-        for t in range(leaks):
-            for i in range(lanes):
-                state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
+    _end(marks, c, weights, fades, state)
     if b == 1.0:
         for i in range(lanes):
             state[2 * lanes + i] = state[lanes + i]
 
 
-@jit_within
+@jit_within_rows
+def _at_node(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
+    _predict(marks, weights, j, state)
+    _drives_at(marks, c, weights, j, state)
+
+
+@jit_within_rows
 def _predict(marks: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
     """xi at node j, and what 1/A - q0 multiplies there, from the start of the step and the drives at earlier nodes."""
     lanes, active, leaks = len(marks.lanes), len(marks.active), len(marks.leaks)
@@ -102,55 +144,57 @@ def _predict(marks: Any, weights: FloatArray, j: int, state: FloatArray) -> None
             x = weights[first * wide + i * each] * state[i] + weights[(first + 1) * wide + i * each] * state[lanes + i]
             for k in range(active):
                 x += weights[(first + 2 + k) * wide + i * each] * state[(SOURCES + k) * lanes + i]
-            for n in range((NODES - 1) * (leaks + len(marks.bend))):
+            for n in range(j * (leaks + len(marks.bend))):
                 x += weights[(first + 2 + active + n) * wide + i * each] * state[(at.g + n) * lanes + i]
             state[to * lanes + i] = x
 
 
-@jit_within
+@jit_within_rows
 def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """The modes at the end of a step, from the drives at its nodes and what the rule misses of them."""
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives, late_at = leaks + len(marks.bend), at.scratch + 5
+    drives = leaks + len(marks.bend)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    bent = len(marks.bend) > len(marks.mobile)
-    limit = FADED if bent else QUICK
     for k in range(len(marks.modes)):
         p = k * weights_of(marks).mode
         for i in range(lanes):
-            # What begins at the kink decays to the end of the step, by the cubic through what begins at the nodes.
-            late = state[(late_at + NODES - 1) * lanes + i]
-            for j in range(NODES - 1):
-                late += weights[(p + j) * wide + i * each] * state[(late_at + j) * lanes + i]
-            late *= 1.0 if c.rates[k] * state[(at.scratch + 1) * lanes + i] < limit else 0.0
+            th, late = state[(at.scratch + 4) * lanes + i], weights[(p + NODES) * wide + i * each]
+            for j in range(NODES - 1, 0, -1):
+                late = late * th + weights[(p + j) * wide + i * each]
             z = (
                 weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
-                + weights[(p + 3) * wide + i * each] * state[i]
-                + weights[(p + 4) * wide + i * each] * state[lanes + i]
+                + weights[(p + NODES + 1) * wide + i * each] * state[i]
+                + weights[(p + NODES + 2) * wide + i * each] * state[lanes + i]
             )
             for t in range(drives):
-                z += c.feed[k, t] * late * state[(late_at + NODES + t) * lanes + i]
+                z += c.feed[k, t] * late * state[(at.scratch + 5 + t) * lanes + i]
             for n in range(NODES * drives):
-                z += weights[(p + 5 + n) * wide + i * each] * state[(at.g + n) * lanes + i]
+                z += weights[(p + NODES + 3 + n) * wide + i * each] * state[(at.g + n) * lanes + i]
             state[(SOURCES + k) * lanes + i] = z
-        if not bent:
-            quick = False
-            for i in range(lanes if len(marks.own) > 0 else 1):
-                quick = quick or c.rates[k] * state[(at.scratch + 1) * lanes + i] >= QUICK
-            if quick:
-                _add_kinks(marks, c, k, weights, state)
 
 
-@jit_within
-def _add_kinks(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatArray) -> None:
-    """Add the response of mode k, if it decays fast, to what the cubics miss of the drives' kinks.
+@jit_within_rows
+def _add_kinks(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
+    """Add the response of modes that decay fast to what the cubics miss of the drives' kinks."""
+    lanes, at = len(marks.lanes), places(marks)
+    for k in range(len(marks.modes)):
+        quick = False
+        for i in range(lanes if len(marks.own) > 0 else 1):
+            quick = quick or c.rates[k] * state[(at.scratch + 1) * lanes + i] >= QUICK
+        if quick:
+            _add_kinks_to(marks, c, k, weights, state)
+
+
+@jit_within_rows
+def _add_kinks_to(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatArray) -> None:
+    """The same to mode k.
 
     These begin at th with a straight line and a square, to which the response is known.
     """
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     drives = leaks + len(marks.bend)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    x, p = at.scratch, k * weights_of(marks).mode + 5 + drives
+    x, p = at.scratch, k * weights_of(marks).mode + NODES + 3 + drives
     for i in range(lanes):
         th, length = state[(x + 4) * lanes + i], state[(x + 1) * lanes + i]
         y, rest, a, b = max(c.rates[k] * length, QUICK), 1.0 - th, max(INNER[0] - th, 0.0), max(INNER[1] - th, 0.0)
@@ -174,7 +218,7 @@ def _add_kinks(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatArra
             state[(SOURCES + k) * lanes + i] += c.kinks[t] * size * more
 
 
-@jit_within
+@jit_within_rows
 def _kinks(marks: Any, c: Any, state: FloatArray) -> None:
     """What the rule misses of |xi| times 1 and t, in a step of length 1, and of the drives' kinks.
 
@@ -196,14 +240,11 @@ def _kinks(marks: Any, c: Any, state: FloatArray) -> None:
         k0 = 0.5 * (u0 * u0 + u1 * u1) * over - c0 - c1 - e0 - e1
         k1 = abs(d) * (om * om * om - th * th * th) / 3.0
         k1 += c0 * th - c1 * om - e0 * (INNER[0] - th) - e1 * (INNER[1] - th)
-        crossed, length = u0 * u1 < 0.0, state[(x + 1) * lanes + i]
+        crossed = u0 * u1 < 0.0
         state[x * lanes + i] = 2.0 * abs(d) if crossed else 0.0
         state[(x + 2) * lanes + i] = k0 if crossed else 0.0
         state[(x + 3) * lanes + i] = k1 if crossed else 0.0
         state[(x + 4) * lanes + i] = th if crossed else 0.0
-        for j in range(NODES):
-            share = BASIS[j, 0] + th * (BASIS[j, 1] + th * (BASIS[j, 2] + th * BASIS[j, 3]))
-            state[(x + 5 + j) * lanes + i] = length * share if crossed else 0.0
     if len(marks.mobile) > 0:
         weaken_kinks(marks, c, state)
     for t in range(drives):
@@ -212,4 +253,4 @@ def _kinks(marks: Any, c: Any, state: FloatArray) -> None:
         for i in range(lanes):
             k0, k1, th = state[(x + 2) * lanes + i], state[(x + 3) * lanes + i], state[(x + 4) * lanes + i]
             w0, w1 = state[first * lanes + i], state[second * lanes + i]
-            state[(x + 5 + NODES + t) * lanes + i] = c.kinks[t] * (k0 * w0 + (k0 * th + k1) * (w1 - w0))
+            state[(x + 5 + t) * lanes + i] = c.kinks[t] * (k0 * w0 + (k0 * th + k1) * (w1 - w0))

@@ -8,7 +8,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.lanerows import BASIS, INNER, NODES, weighed
+from fingerspice.engine.lanerows import BASIS, FADED, INNER, NODES, QUICK, weighed
 from fingerspice.numerics.small import copy_to
 
 # Coefficients from x on of the quartic that is 0 at the nodes and has the slope 1 at the end of the step.
@@ -107,6 +107,16 @@ def _until(
 
 
 @jit_rows
+def _late_times(n: int, rate: float, quick: float, h: FloatArray, own: FloatArray) -> None:
+    """The cubic in the place of a kink, through the decays from the nodes to the end, times h; 0 for quick modes."""
+    for i in range(n):
+        d0, d1, d2 = own[0, i], own[1, i], own[2, i]
+        length = h[i] if rate * h[i] < quick else 0.0
+        for p in range(NODES):
+            own[1 + p, i] = length * (d0 * BASIS[0, p] + d1 * BASIS[1, p] + d2 * BASIS[2, p] + BASIS[3, p])
+
+
+@jit_rows
 def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray) -> None:
     """Weights of drives by the coefficients of their polynomials, one row of `c` each, into rows of `out`."""
     for r in range(c.shape[0]):
@@ -179,9 +189,10 @@ def weigh(c: Any, active: int, h: FloatArray, weights: FloatArray) -> None:
                 if bent > 0:
                     _drive(n, _BENDS[(j - 1) * (j + 2) // 2 :][: j + 1], h, m, found[3 + j :])
                 _gather(k, j, active, c.shape, c.taps, c.feed, found, at_nodes[j - 1])
-        copy_to(own[3:5], found[1:3])
+        _late_times(n, rates[k], FADED if c.kappa > 0.0 else QUICK, h, own)
+        copy_to(own[NODES + 1 : NODES + 3], found[1:3])
         _drive(n, BASIS, h, m, found)
-        _feed(c, k, found, own[5:])
+        _feed(c, k, found, own[NODES + 3 :])
         if bent > 0:
             _drive(n, _QUARTIC, h, m[1:], found)
             for i in range(n):

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, aligned
 from fingerspice.base.compiled import jit
-from fingerspice.engine.lockscenes import CELL_ROWS, OMEGA, Block, Places, aligned, fill_block, put_result
+from fingerspice.engine.lockscenes import CELL_ROWS, OMEGA, Block, Places, fill_block, put_result
 from fingerspice.engine.lockstep import (
     N_STATE,
     N_WEIGHTS,

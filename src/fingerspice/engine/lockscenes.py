@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, aligned
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.lockmodes import Scratch, find_modes, find_rates, link, scratch_shapes
 from fingerspice.engine.lockstep import (
@@ -212,17 +211,6 @@ def block_shapes(rows: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
     size = n_constants(m_all, w_all, l_all, d_all - 1) * lanes
     modes = (m_all, lanes)
     return (size,), (m_all * lanes,), modes, modes, (rows * lanes,), (lanes,), (lanes,)
-
-
-def aligned(shapes: Iterable[tuple[int, ...]]) -> list[FloatArray]:
-    """Arrays that begin at multiples of 64 bytes, as a vector across two lines of the cache takes twice as long."""
-    whole = [(shape, math.prod(shape)) for shape in shapes]
-    raw = np.empty(8 + sum(size + 8 for _, size in whole))
-    at, out = -(raw.ctypes.data // raw.itemsize) % 8, []
-    for shape, size in whole:
-        out.append(raw[at : at + size].reshape(shape))
-        at += -(-size // 8) * 8
-    return out
 
 
 def new_block(rows: int, marks: Marks) -> Block:

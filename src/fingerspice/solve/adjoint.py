@@ -25,7 +25,7 @@ from fingerspice.results.samplegradient import SampleGradient
 from fingerspice.results.sensitivity import MEANS, SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.laneblock import Block
-from fingerspice.solve.laneform import LANES, LaneForm
+from fingerspice.solve.laneform import LaneForm
 from fingerspice.solve.lanes import LEAST_MARGIN
 from fingerspice.solve.netforms import recording_of
 from fingerspice.solve.pieces import driving
@@ -210,7 +210,7 @@ class _Intervals:
         form, own, out = self.form, length.size > 1, np.empty((self.m + MORE, self.m + 2, at.size))
         state, scratch = form.room(own)
         weights = scratch if own else form.weights(length / parts)
-        still, z = form.weights(np.zeros(LANES if own else 1)), np.ascontiguousarray(self.z[:, at])
+        still, z = form.weights(np.zeros(form.pieces if own else 1)), np.ascontiguousarray(self.z[:, at])
         slopes_of(
             form.marks(own), form.lanes, still, z, self.x[at], to, length, parts, self.delta, (state, weights), out
         )  # fmt: skip

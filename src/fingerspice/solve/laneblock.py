@@ -16,7 +16,7 @@ from fingerspice.engine.lanereadout import show
 from fingerspice.engine.lanerows import rows_of
 from fingerspice.engine.lanes import begin, span, within
 from fingerspice.engine.laneweights import along
-from fingerspice.solve.laneform import LANES, LaneForm
+from fingerspice.solve.laneform import LaneForm
 
 # A window over its piece, and the fewest samples in one.
 WINDOW, FEWEST = 1.0 / 16.0, 32
@@ -30,19 +30,19 @@ _STILL = 1e-9
 class Window:
     """What steps half as long change in a window of every piece."""
 
-    # z, off (rows, LANES, width + 1): States of the steps that are checked, and the differences; 0 in pieces that are
+    # z, off (rows, pieces, width + 1): States of the steps that are checked, and the differences; 0 in pieces that are
     # not checked
     z: FloatArray
     off: FloatArray
-    # source, xi (LANES, width + 1): V
+    # source, xi (pieces, width + 1): V
     source: FloatArray
     xi: FloatArray
-    share: FloatArray  # (m, LANES): What a piece adds over what its window does, if all errors are alike
-    of_products: FloatArray  # (m, m, LANES): The same of products of two errors, if they come by chance
+    share: FloatArray  # (m, pieces): What a piece adds over what its window does, if all errors are alike
+    of_products: FloatArray  # (m, m, pieces): The same of products of two errors, if they come by chance
 
 
 class Block:
-    """A row of samples, at once in `LANES` pieces.
+    """A row of samples, at once in as many pieces as the form goes in.
 
     Parameters
     ----------
@@ -56,39 +56,39 @@ class Block:
     """
 
     def __init__(self, form: LaneForm, x: FloatArray, h: FloatArray, starts_run: bool) -> None:
-        self.form, self.n, self.own = form, x.size - 1, h.size > 1
-        self.count = -(-self.n // LANES)
-        beyond = self.count * LANES - self.n
+        self.form, self.n, self.own, self.pieces = form, x.size - 1, h.size > 1, form.pieces
+        self.count = -(-self.n // self.pieces)
+        beyond = self.count * self.pieces - self.n
         # The source stays at its last value behind the end.
         self.x = np.concatenate([x, np.full(beyond, x[-1])]) if beyond else x
         self.h = np.concatenate([h, np.zeros(beyond)]) if self.own and beyond else h
-        self.first = self.count * np.arange(LANES)
+        self.first = self.count * np.arange(self.pieces)
         self.starts_run, self.marks, self.active = starts_run, form.marks(self.own), form.active
         self.rates = np.maximum(form.lanes.rates, _STILL)
         self.room, self.scratch = form.room(self.own)
-        self.still = form.weights(np.zeros(LANES if self.own else 1))
+        self.still = form.weights(np.zeros(self.pieces if self.own else 1))
         self.m = self.rates.size
         # States at the samples: the modes, and under `mobile` the gap voltage.
-        self.kept = np.zeros((self.m + int(form.mobile), LANES, self.count + 1))
+        self.kept = np.zeros((self.m + int(form.mobile), self.pieces, self.count + 1))
         self.left = np.zeros(self.rates.size)
 
     @cached_property
     def lengths(self) -> FloatArray:
         """Durations of the pieces, s."""
         if not self.own:
-            return np.full(LANES, self.count * self.h[0])
-        return np.asarray(self.h.reshape(LANES, self.count).sum(axis=1))
+            return np.full(self.pieces, self.count * self.h[0])
+        return np.asarray(self.h.reshape(self.pieces, self.count).sum(axis=1))
 
     @cached_property
     def handed(self) -> FloatArray:
         """What is left at the start of each piece of the modes at the start of the block and the ends of the pieces.
 
-        Shape (m, LANES, 1 + LANES).
+        Shape (m, pieces, 1 + pieces).
         """
         ends = np.concatenate([[0.0], np.cumsum(self.lengths)])
-        since = ends[:LANES, None] - ends[None, :]
+        since = ends[: self.pieces, None] - ends[None, :]
         left = np.exp(-self.rates[:, None, None] * np.maximum(since, 0.0))
-        return np.asarray(np.where(np.tri(LANES, 1 + LANES, dtype=bool), left, 0.0))
+        return np.asarray(np.where(np.tri(self.pieces, 1 + self.pieces, dtype=bool), left, 0.0))
 
     def _weights(self, parts: int) -> FloatArray:
         return self.scratch if self.own else self.form.weights(self.h / parts)
@@ -104,7 +104,7 @@ class Block:
         kept[: self.m, :, 0], kept[self.m :, :, 0] = starts, self._row(rows_of(self.marks).xi)
 
     def _row(self, number: int) -> FloatArray:
-        return self.room[number * LANES :][:LANES]
+        return self.room[number * self.pieces :][: self.pieces]
 
     @property
     def on_one_branch(self) -> bool:
@@ -121,11 +121,11 @@ class Block:
         # Least distances to the fold; the last sweep may stop before the end of the pieces.
         margins = [1.0]
         self.__dict__.pop("xi", None)
-        own = np.zeros((self.m, LANES))
+        own = np.zeros((self.m, self.pieces))
         along(form.lanes, self.h, self.x, self.first, self.count, own)
         starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[: self.m, None], own], axis=1))
         starts[active:] = 0.0
-        for sweep in range(LANES + 1):
+        for sweep in range(self.pieces + 1):
             self._begin(starts, self.first, self.kept)
             stops = self._span(self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
             self.sweeps += 1
@@ -159,8 +159,10 @@ class Block:
 
     @property
     def _by_piece(self) -> FloatArray:
-        """|xi| (V) at the samples of each piece, shape (LANES, count)."""
-        return np.pad(np.abs(self.xi[:-1]), (0, LANES * self.count - self.n)).reshape(LANES, self.count)
+        """|xi| (V) at the samples of each piece, shape (pieces, count)."""
+        out = np.zeros(self.pieces * self.count)
+        out[: self.n] = np.abs(self.xi[:-1])
+        return out.reshape(self.pieces, self.count)
 
     @property
     def peaks(self) -> FloatArray:
@@ -176,28 +178,30 @@ class Block:
     def check(self, parts: int) -> Window:
         """Follow a window of every piece by twice as many steps."""
         width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + self.form.bent))))
-        lanes = np.arange(LANES)
-        off, at = np.zeros((len(self.kept), LANES, width + 1)), np.zeros(LANES, np.int64)
-        for place in self._windows(width):
+        lanes = np.arange(self.pieces)
+        off, z, at = np.empty(0), np.empty(0), lanes
+        for number, place in enumerate(self._windows(width)):
             first = np.maximum(place, 0)
             coarse = self.kept[:, lanes[:, None], first[:, None] + np.arange(width + 1)]
-            fine = np.zeros(coarse.shape)
+            fine = np.empty(coarse.shape)
             self._begin(coarse[: self.m, :, 0], self.first + first, fine)
             self._span(self.first + first, width, 2 * parts, -1.0, fine)
-            found = np.where((place >= 0)[:, None], fine - coarse, 0.0)
+            found = fine - coarse
+            found[:, place < 0] = 0.0
+            if number == 0:
+                off, z, at = found, coarse, first
+                continue
             worse = self._in_xi(found) > self._in_xi(off)
-            off[:, worse], at[worse] = found[:, worse], first[worse]
-        index = at[:, None] + np.arange(width + 1)
-        number = np.minimum(self.first[:, None] + index, self.n)
-        took = np.full(LANES, width * self.h[0])
+            off[:, worse], z[:, worse], at[worse] = found[:, worse], coarse[:, worse], first[worse]
+        index = np.minimum((self.first + at)[:, None] + np.arange(width + 1), self.n)
+        took = np.full(self.pieces, width * self.h[0])
         if self.own:
             took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
         y, window = self.rates[:, None] * self.lengths, self.rates[:, None] * np.maximum(took, 1e-30)
         share, of_products = (
             np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
         )
-        z = self.kept[:, lanes[:, None], index]
-        return Window(z, off, self.x[number], self.xi[number], share, of_products)
+        return Window(z, off, self.x[index], self.xi[index], share, of_products)
 
     def _windows(self, width: int) -> list[IntArray]:
         """Where windows begin in each piece, -1 for none: where the source moves most, and at the start of a run.
@@ -205,7 +209,7 @@ class Block:
         With N as a drive, errors are large where |xi| is, too.
         """
         moves, whole = np.abs(np.diff(self.x)), self.count - self.count % width
-        most = moves.reshape(LANES, self.count)[:, :whole].reshape(LANES, -1, width).max(axis=-1)
+        most = moves.reshape(self.pieces, self.count)[:, :whole].reshape(self.pieces, -1, width).max(axis=-1)
         # Windows end before the last sample.
         most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
         place = np.where(most.max(axis=1) >= 0.0, width * np.argmax(most, axis=1), -1)
@@ -219,14 +223,14 @@ class Block:
         return [place, np.where(place >= 0, np.maximum(largest, 0), -1)]
 
     def _in_xi(self, off: FloatArray) -> FloatArray:
-        """Largest changes of xi (V) in each lane by changes of the modes (m, LANES, width + 1)."""
+        """Largest changes of xi (V) in each lane by changes of the modes (m, pieces, width + 1)."""
         return np.asarray(np.abs(np.einsum("k,kij->ij", self.form.xi[1], off)).max(axis=1))
 
     def hand_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
-        """Errors at the start of each piece, and at the end of the block, shape (*kinds, LANES + 1).
+        """Errors at the start of each piece, and at the end of the block, shape (*kinds, pieces + 1).
 
-        Pieces add `added` (*kinds, LANES), and `before` (*kinds,) is there at the start. Of one error for each mode, or
-        of the products of two.
+        Pieces add `added` (*kinds, pieces), and `before` (*kinds,) is there at the start. Of one error for each mode,
+        or of the products of two.
         """
         handed, lane = self.handed, (self.n - 1) // self.count
         left = np.exp(-self.rates * self.lengths[lane])
@@ -244,6 +248,6 @@ class Block:
             return x, z
         to, out, form = x + (self.x[number + 1] - x) * (since / length), np.empty_like(z), self.form
         parts *= BETWEEN if self.form.bent else 1
-        still, (room, _) = form.weights(np.zeros(LANES)), form.room(True)
+        still, (room, _) = form.weights(np.zeros(self.pieces)), form.room(True)
         within(form.marks(True), form.lanes, still, z, x, to, since, parts, room, out)
         return to, out

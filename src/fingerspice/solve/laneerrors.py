@@ -13,7 +13,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.solve.laneblock import Block, Window
-from fingerspice.solve.laneform import LANES, LaneForm, Shown
+from fingerspice.solve.laneform import LaneForm, Shown
 
 # Stated over seen errors, of voltages, of the force and of charges: as seen in recordings of tests/recording_errors.py.
 SAFETY, OF_FORCE, OF_CHARGE = 2.25, 1.75, 2.5
@@ -35,7 +35,7 @@ class Judged:
 class _Steep:
     """What an error of xi changes in each piece, at most: between 0 V and its peak."""
 
-    u: FloatArray  # (LANES,): Gap voltage, V/V
+    u: FloatArray  # (pieces,): Gap voltage, V/V
     force: FloatArray  # N/V
     moved: FloatArray  # What `Shown.bends` multiplies, m^2
     inverse: FloatArray  # 1/A, 1/m^2/V
@@ -43,20 +43,25 @@ class _Steep:
 
 def _steep(form: LaneForm, block: Block, top: FloatArray) -> _Steep:
     c = form.lanes
-    inverse = form.inverse_area(np.stack([np.zeros(LANES), top]))
-    force = (form.force(1.001 * top) - form.force(top)) / (1e-3 * top)
+    inverse = form.inverse_area(np.stack([np.zeros(top.size), top]))
+    force = _slope_of_force(form, top)
     if not form.mobile:
         e = 1.0 / inverse - 1.0 / c.q0
         u, moved = (np.abs(x / (1.0 + c.kappa * e)).max(axis=0) for x in (1.0, e))
-        return _Steep(u, force, moved, np.zeros(LANES))
+        return _Steep(u, force, moved, np.zeros(top.size))
     u = inverse.max(axis=0) / c.q0 / block.margin
-    steep = np.abs(form.slope(np.stack([np.zeros(LANES), top]))) * u
+    steep = np.abs(form.slope(np.stack([np.zeros(top.size), top]))) * u
     source = float(np.abs(block.x).max())
     return _Steep(u, force * u, (source * steep / inverse**2).max(axis=0), steep.max(axis=0))
 
 
+def _slope_of_force(form: LaneForm, xi: FloatArray) -> FloatArray:
+    """By |xi|, N/V."""
+    return np.asarray((form.force(1.001 * xi) - form.force(xi)) / (1e-3 * xi))
+
+
 def _changes(form: LaneForm, shown: Shown, window: Window, xi: FloatArray) -> FloatArray:
-    """Changes of quantities in windows (C, LANES, width + 1), where xi goes to other values."""
+    """Changes of quantities in windows (C, pieces, width + 1), where xi goes to other values."""
     m = form.lanes.rates.size
     found = np.einsum("ck,kij->cij", shown.columns, window.off[:m])
     if shown.by_area.any():
@@ -84,20 +89,32 @@ def judge(block: Block, parts: int, peak: float, alike: FloatArray, chance: Floa
     own = window.off[: c.rates.size, :, -1]
     products = own[:, None] * own
     handed, lucky = block.hand_on(own * window.share, alike), block.hand_on(products * window.of_products, chance)
-    # At the end of a piece, with what it adds beyond its window.
-    alike_there = handed[:, :LANES] + own * (window.share - 1.0)
-    chance_there = lucky[..., :LANES] + products * (window.of_products - 1.0)
+    # What a piece adds beyond its window.
+    alike_more, chance_more = own * (window.share - 1.0), products * (window.of_products - 1.0)
 
-    def added(columns: FloatArray) -> FloatArray:
-        """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them."""
-        by_chance = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, chance_there), 0.0))
-        more = np.maximum(by_chance, np.abs(columns @ alike_there) - LUCK * by_chance)
-        return np.asarray(more + np.abs(columns[:active]) @ block.left[:active] / OF_FORCE)
+    def added(columns: FloatArray, left: FloatArray | None = None) -> FloatArray:
+        """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them.
 
-    errors, over, top = np.zeros(4), added(c.shape), np.maximum(block.peaks, 1e-9 * peak + 1e-300)
+        `left` (m, pieces) is left of each mode of what a piece starts with.
+        """
+        left = np.ones(own.shape) if left is None else left
+        there = lucky[..., :-1] * left[:, None] * left + chance_more
+        by_chance = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, there), 0.0))
+        there = np.abs(columns @ (handed[:, :-1] * left + alike_more))
+        more = np.maximum(by_chance, there - LUCK * by_chance)
+        swept = (np.abs(columns) * block.left)[:active] / OF_FORCE
+        return np.asarray(more + swept @ left[:active])
+
+    least = 1e-9 * peak + 1e-300
+    errors, over, top = np.zeros(4), added(c.shape), np.maximum(block.peaks, least)
     steep, xi = _steep(form, block, top), window.xi + np.einsum("k,kij->ij", form.xi[1], window.off)
-    for i, of, by in ((0, form.gap, steep.u), (1, form.force, steep.force)):
-        errors[i] = (np.abs(of(xi) - of(window.xi)).max(axis=1) + by * over).max()
+    # An error that a fast mode brings into a piece changes the force as much as xi at the first sample allows.
+    decay = np.exp(-block.rates[:, None] * (block.h[block.first] if block.own else block.h))
+    first_xi = np.maximum(np.abs(block.xi[np.minimum(block.first, block.n)]) + over, least)
+    at_first = _slope_of_force(form, first_xi) * (steep.u if form.mobile else 1.0) * over
+    of_force = np.maximum(at_first, steep.force * added(c.shape, decay))
+    for i, of, more in ((0, form.gap, steep.u * over), (1, form.force, of_force)):
+        errors[i] = (np.abs(of(xi) - of(window.xi)).max(axis=1) + more).max()
     first = form.rows.k.size - form.flows
     for i, shown in ((2, form.nodes), (3, form.rows.behind(first))):
         seen = np.abs(_changes(form, shown, window, xi)).max(axis=-1, initial=0.0)
@@ -109,4 +126,4 @@ def judge(block: Block, parts: int, peak: float, alike: FloatArray, chance: Floa
             errors[i] = max(errors[i], (row + more).max())
     alone = np.abs(np.einsum("k,kij->ij", c.shape, window.off[: c.rates.size])).max()
     alone += np.abs(c.shape @ (own * (window.share - 1.0))).max()
-    return Judged(errors, float(alone), handed[:, LANES], lucky[..., LANES])
+    return Judged(errors, float(alone), handed[:, -1], lucky[..., -1])

@@ -10,17 +10,27 @@ import numpy as np
 from numpy.polynomial import chebyshev as series_of
 from numpy.polynomial.polynomial import polyder, polyval
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray, aligned
 from fingerspice.engine.lanereadout import polynomial_of
-from fingerspice.engine.lanerows import Lanes, Marks, Weighed, rows_of, weighed
+from fingerspice.engine.lanerows import (
+    Lanes,
+    Marks,
+    MobileMarks,
+    NetworkMarks,
+    StackMarks,
+    Weighed,
+    rows_of,
+    weighed,
+)
 from fingerspice.engine.laneweights import weigh
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area_array
 from fingerspice.results.outcome import State
 from fingerspice.solve.problem import Problem
 
-# Number of lanes, whose rows fill the processor's vectors, and in which a recording goes as so many pieces.
-LANES = 32
+# Number of lanes, each with a piece of a recording: of a stack, and of a network, whose rows would not all fit into the
+# processor's nearest memory.
+OF_STACK, OF_NETWORK = 64, 32
 # Largest degree of the polynomial for 1/A.
 MOST_DEGREE = 28
 # Truncation error allowed for the polynomial of 1/A, relative to the error asked for or to this one, if that is less:
@@ -83,7 +93,8 @@ class LaneForm(ABC):
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
         leaks = self.lanes.tap_s.size
         return _marks(
-            self.lanes.rates.size, self.active, leaks, self.lanes.feed.shape[1] - leaks, int(self.mobile), int(own)
+            self.lanes.rates.size, self.active, leaks, self.lanes.feed.shape[1] - leaks, int(self.mobile), self.pieces,
+            int(own),
         )  # fmt: skip
 
     @property
@@ -97,9 +108,18 @@ class LaneForm(ABC):
         modes, leaks = self.lanes.rates.size, self.lanes.tap_s.size
         return weighed(modes, self.active, leaks, self.lanes.feed.shape[1] - leaks)
 
+    @property
+    def pieces(self) -> int:
+        """Number of lanes."""
+        return OF_NETWORK if self.bent else OF_STACK
+
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
-        return np.zeros(rows_of(self.marks(own)).end * LANES), np.zeros((self.weighed.end, LANES if own else 1))
+        state, weights = aligned(
+            [(rows_of(self.marks(own)).end * self.pieces,), (self.weighed.end, self.pieces if own else 1)]
+        )
+        state[:], weights[:] = 0.0, 0.0
+        return state, weights
 
     def weights(self, h: FloatArray) -> FloatArray:
         """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
@@ -155,8 +175,9 @@ class LaneForm(ABC):
 
 
 @lru_cache(maxsize=64)
-def _marks(modes: int, active: int, leaks: int, bend: int, mobile: int, own: int) -> Marks:
-    return Marks(*((0,) * size for size in (modes, active, leaks, bend, mobile, LANES, own)))
+def _marks(modes: int, active: int, leaks: int, bend: int, mobile: int, pieces: int, own: int) -> Marks:
+    kind = MobileMarks if mobile else NetworkMarks if bend else StackMarks
+    return kind(*((0,) * size for size in (modes, active, leaks, bend, mobile, pieces, own)))
 
 
 def slopes(area: FloatArray, scale: float) -> FloatArray:

@@ -15,7 +15,7 @@ from fingerspice.engine.lanerows import NODES
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.laneblock import Block
 from fingerspice.solve.laneerrors import OF_CHARGE, OF_FORCE, SAFETY, Judged, judge
-from fingerspice.solve.laneform import LANES, LaneForm
+from fingerspice.solve.laneform import LaneForm
 from fingerspice.solve.pieces import Piece, driving, spacing_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run, excess_of
@@ -132,8 +132,8 @@ class LaneMarch:
     def _growing(self, piece: Piece, values: FloatArray) -> tuple[Piece, FloatArray]:
         """A piece on one line of the source, with steps that grow from a part of the shortest time constant on."""
         span = piece.stop - piece.start
-        shortest = min(EARLY / float(self.form.lanes.rates.max()), span / (LANES * GROWN))
-        share = np.append(0.0, np.geomspace(shortest / span, 1.0, LANES * GROWN))
+        shortest = min(EARLY / float(self.form.lanes.rates.max()), span / (self.form.pieces * GROWN))
+        share = np.append(0.0, np.geomspace(shortest / span, 1.0, self.form.pieces * GROWN))
         share[-1] = 1.0
         line = values[0] + share * (values[-1] - values[0])
         return replace(piece, times=piece.start + share * span), line
