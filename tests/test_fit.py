@@ -367,7 +367,7 @@ def test_the_command_fits_the_fingers_of_the_example(command: Command, tmp_path:
     assert {path: row["low"] < true[path] < row["high"] for path, row in rows.items()} == dict.fromkeys(true, True)
     lines = (tmp_path / "fingerpad_fit.csv").read_text().splitlines()
     assert lines[0].startswith("finger,Vdrive.amplitude")
-    assert lines[1].startswith("left,100,20,")
+    assert lines[1].startswith("left,100.0,20.0,")
 
 
 @pytest.mark.parametrize(

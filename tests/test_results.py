@@ -115,11 +115,3 @@ def test_reports_pictures_and_files_say_what_was_changed(command: Command) -> No
         assert report["title"] == "Fingerpad"
         assert report["overrides"]["Xgap.d"] == "5u"
         assert report["overrides"]["Vdrive"].startswith("Square(")
-
-
-def test_a_picture_from_before_is_known_by_the_data_beside_it(command: Command) -> None:
-    assert command("run", "pad.cir").code == 0
-    Image.open("out/pad.png").save("out/pad.png")
-    assert command("run", "pad.cir").code == 0
-    Image.open("out/pad.png").save("out/pad.png")
-    assert command("run", "pad.cir", "--set", "Xgap.d=5u").code == 2

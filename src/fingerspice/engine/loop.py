@@ -31,7 +31,7 @@ from fingerspice.engine.meshstep import attempt_mesh, beyond_mesh, complete_mesh
 from fingerspice.engine.pace import Pace, accept, allowed_factor, rung, shorten
 from fingerspice.engine.readout import ACCEPTED, REJECTED, H, T, note
 from fingerspice.engine.repeat import SAME_TIME
-from fingerspice.engine.settling import ACCEPTABLE, NEXT, TRIAL, Looks, look, next_stop, take_result
+from fingerspice.engine.settling import ACCEPTABLE, NEXT, TRIAL, Looks, look, next_stop
 from fingerspice.engine.stackend import complete_stack, end_stack, worst_of_stack
 from fingerspice.engine.stackstep import (
     Stack,
@@ -105,7 +105,6 @@ def march_on(circuit: Circuit, pace: Pace, state: LoopState, looks: Looks, t_end
     Returns with EXCESSIVE where a trial of the error fails, and with LOOKED_AT where a look has found something.
     """
     circuit, state, looks = borrow(circuit), borrow(state), borrow(looks)
-    take_result(looks)
     while True:
         stop = next_stop(looks, edges(circuit), t_end)
         code = march(circuit, pace, state, stop)

@@ -103,15 +103,11 @@ def is_wanted(s: LoopState, t_new: float) -> bool:
 
 
 @jit_within
-def write_step(
-    s: LoopState, t: float, mark: float, values: FloatArray, coefficients: FloatArray, work: FloatArray
-) -> None:
+def write_step(s: LoopState, t: float, values: FloatArray, coefficients: FloatArray, work: FloatArray) -> None:
     """Record a finished step that began at t (s), keep it for repetition, and write its outputs.
 
     Parameters
     ----------
-    mark : float
-        What the step ends with: `repeat.AT_ZERO`, `repeat.AT_EDGE`, or 0.
     values, coefficients : ndarray, shape (n_column, ROWS)
         The columns at the rows of the step; takes their Chebyshev coefficients.
     work : ndarray, shape (2, WRITTEN_AT_ONCE)
@@ -131,7 +127,7 @@ def write_step(
     place = counters[KEPT]
     counters[KEPT] += 1
     if place < kept_times.shape[0]:
-        kept_times[place, 0], kept_times[place, 1], kept_times[place, 2], kept_times[place, 3] = t, h, t_new, mark
+        kept_times[place, 0], kept_times[place, 1], kept_times[place, 2] = t, h, t_new
         copy_to(s.kept.series[place], coefficients[: s.outputs.columns.shape[0]])
     if has_outputs:
         counters[OUTPUT] += write_outputs(

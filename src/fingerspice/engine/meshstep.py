@@ -252,7 +252,7 @@ def _write(c: Mesh, pace: Pace, s: LoopState, t: float) -> None:
     write_columns(
         form.shape.shape[0], first_z, pace.charge, form.shape, form.follow, work.modes[netform.W], work.s, s.y, values
     )  # fmt: skip
-    write_step(s, t, 0.0, values, work.coefficients, work.outputs)
+    write_step(s, t, values, work.coefficients, work.outputs)
 
 
 @jit_within

@@ -1,4 +1,4 @@
-"""Outputs of many periods from the polynomials of one: equal periods, or periods related by an affine map.
+"""Outputs of many equal periods from the polynomials of one.
 
 A billion periods take half a minute. They are written by compiled calls of some milliseconds, between which Python can
 react to Ctrl-C; each call hands its state to the next, so that no result depends on where the calls are divided.
@@ -23,7 +23,6 @@ from fingerspice.numerics.small import copy_to
 # Relative distance within which two times count as equal: a few units in the last place. So much the end of a step,
 # shifted by whole periods, may miss an output time.
 SAME_TIME = 8e-16
-AT_ZERO, AT_EDGE = 1.0, 2.0
 # Number of steps in one compiled call.
 AT_ONCE = 1_000_000
 
@@ -31,15 +30,13 @@ AT_ONCE = 1_000_000
 class Kept(NamedTuple):
     """Steps kept for repetition."""
 
-    # (n_step, 4): Start, length and reached end of each step, s; and whether it ends at a zero of the gap voltage, an
-    # edge of the source, or anywhere (AT_ZERO, AT_EDGE, 0)
-    times: FloatArray
+    times: FloatArray  # (n_step, 3): Start, length and reached end of each step, s
     series: FloatArray  # (n_step, n_column, ROWS): Chebyshev coefficients of the output columns over the whole length
 
 
 def new_kept(steps: int, columns: int) -> Kept:
     """Room for so many steps."""
-    return Kept(np.zeros((steps, 4)), np.zeros((steps, columns, ROWS)))
+    return Kept(np.zeros((steps, 3)), np.zeros((steps, columns, ROWS)))
 
 
 class _Walk(NamedTuple):
@@ -101,7 +98,7 @@ def _repeat(
     t_out, out = outputs.t, outputs.columns
     held, as_powers = borrow(walk.held), borrow(walk.as_powers)
     if begin == 1:
-        _make_powers(series, np.zeros((0, 0, 0, 0)), as_powers)
+        _make_powers(series, as_powers)
     work = np.zeros((2, WRITTEN_AT_ONCE))
     for k in range(begin, end):
         shift = k * period
@@ -129,11 +126,10 @@ def _repeat(
 
 
 @jit
-def _make_powers(series: FloatArray, by: FloatArray, made: NDArray[np.bool_]) -> None:
+def _make_powers(series: FloatArray, made: NDArray[np.bool_]) -> None:
     """Turn Chebyshev coefficients (n_step, n_column, ROWS) into those of 1, x, x^2, ..., which halve the work.
 
-    This is done for steps where the powers are as exact, which `made` (n_step,) marks; the derivatives `by` (n, n_step,
-    n_column, ROWS) of these steps are turned as well.
+    This is done for steps where the powers are as exact, which `made` (n_step,) marks.
     """
     room = np.zeros(NODES)
     for i in range(made.size):
@@ -145,128 +141,3 @@ def _make_powers(series: FloatArray, by: FloatArray, made: NDArray[np.bool_]) ->
         for c in range(series.shape[1]):
             to_powers(series[i, c, :NODES], room)
             copy_to(series[i, c, :NODES], room)
-            for m in range(by.shape[0]):
-                to_powers(by[m, i, c, :NODES], room)
-                copy_to(by[m, i, c, :NODES], room)
-
-
-class PeriodMap(NamedTuple):
-    """Affine map from the start of a period to its steps and its end, made at a period from live voltages `x`."""
-
-    # (n_step + 1,): Where the steps begin and end in the first period, if that starts from `x` without charge, s
-    marks: FloatArray
-    marks_by: FloatArray  # (n_step + 1, n): Its derivative by the live voltages at the start, s/V
-    series: FloatArray  # (n_step, n_column, ROWS): Chebyshev coefficients of that period's outputs, each over its step
-    by: FloatArray  # (n, n_step, n_column, ROWS): Their derivative
-    slope: FloatArray  # (n + 1, n): That of live voltages and charge at the end
-    x: FloatArray  # (n,): V
-    end: FloatArray  # (n + 1,): Live voltages (V) and charge (C) where the period from `x` ends
-
-
-def approach(
-    one: PeriodMap, state: FloatArray, shown: int, still: float, period: float, periods: int, first: int,
-    outputs: Outputs,
-) -> int:  # fmt: skip
-    """Write the outputs of periods that follow one another by an affine map.
-
-    Parameters
-    ----------
-    one : PeriodMap
-        Its `series` and `by` are used up.
-    state : ndarray, shape (n + 1,)
-        Live voltages (V) and charge (C) where the first period starts, and on return where the last one ends.
-    shown : int
-        Columns that are voltages; after them come charge and current, if wanted.
-    still : float
-        Largest change of a period's start for which the period before provides the outputs, V.
-    period : float
-        s.
-    periods : int
-        How many there are.
-    first, outputs
-        As `readout.write_outputs`.
-
-    Returns
-    -------
-    int
-        The first output that is left.
-    """
-    walk = _new_walk(one.series.shape[0])
-    formed = _Formed(
-        np.full(one.x.size, np.inf), np.zeros(one.marks.size), np.zeros_like(one.series), np.ones(1, np.bool_)
-    )  # fmt: skip
-    for begin, stop in _calls(periods, one.series.shape[0]):
-        first = _approach(one, state, shown, still, period, begin, stop, walk, formed, first, outputs)
-    return first
-
-
-class _Formed(NamedTuple):
-    """The period that was formed last; it serves until the start has changed too much."""
-
-    at: FloatArray  # (n,): Difference of its start from `x`, V
-    stops: FloatArray  # (n_step + 1,): Its marks, s
-    series: FloatArray  # (n_step, n_column, ROWS)
-    stale: NDArray[np.bool_]  # (1,): Whether `stops` and `series` still belong to an earlier start than `at`
-
-
-@jit
-def _approach(
-    one: PeriodMap, state: FloatArray, shown: int, still: float, period: float, begin: int, stop: int, walk: _Walk,
-    formed: _Formed, first: int, outputs: Outputs,
-) -> int:  # fmt: skip
-    """As `approach`, of the periods from `begin` to before `stop`."""
-    marks, series, by, slope, x, end, t_out = one.marks, one.series, one.by, one.slope, one.x, one.end, outputs.t
-    n = x.size
-    work = np.zeros((2, WRITTEN_AT_ONCE))
-    held, stops, made = walk.held, formed.stops, formed.series
-    if begin == 0:
-        _make_powers(series, by, walk.as_powers)
-    delta = np.zeros(n)
-    for k in range(begin, stop):
-        shift = k * period
-        moved = 0.0
-        for m in range(n):
-            delta[m] = state[m] - x[m]
-            moved = max(moved, abs(delta[m] - formed.at[m]))
-        # Also in periods without outputs, so that no output depends on which others are asked for.
-        if moved > still:
-            copy_to(formed.at, delta)
-            formed.stale[0] = True
-        close = marks[-1] + shift
-        if first < t_out.size and t_out[first] <= close + SAME_TIME * abs(close):
-            if formed.stale[0]:
-                _form(marks, one.marks_by, series, by, formed.at, stops, made)
-                formed.stale[0] = False
-            for i in range(series.shape[0]):
-                since, until = stops[i] + shift, stops[i + 1] + shift
-                if series.shape[1] > shown:
-                    made[i, shown, 0] += state[n]
-                held[i] = write_outputs(
-                    since, until - since, 1.0, until, SAME_TIME * abs(until), walk.as_powers[i], made[i], work, first,
-                    held[i], outputs,
-                )  # fmt: skip
-                first += held[i]
-                if series.shape[1] > shown:
-                    made[i, shown, 0] -= state[n]
-        for j in range(n + 1):
-            state[j] = end[j] + (state[n] if j == n else 0.0)
-        for m in range(n):
-            for j in range(n + 1):
-                state[j] += slope[j, m] * delta[m]
-    return first
-
-
-@jit
-def _form(
-    marks: FloatArray, marks_by: FloatArray, series: FloatArray, by: FloatArray, delta: FloatArray, stops: FloatArray,
-    formed: FloatArray,
-) -> None:  # fmt: skip
-    """Marks and series of the period whose start differs by `delta` (V), see `approach`, into `stops` and `formed`."""
-    copy_to(stops, marks)
-    copy_to(formed, series)
-    for m in range(delta.size):
-        stops += marks_by[:, m] * delta[m]
-        for i in range(series.shape[0]):
-            for c in range(series.shape[1]):
-                for d in range(ROWS):
-                    formed[i, c, d] += by[m, i, c, d] * delta[m]

@@ -58,7 +58,6 @@ from fingerspice.engine.readout import (
     error_at,
     layers,
 )
-from fingerspice.engine.repeat import AT_EDGE, AT_ZERO
 from fingerspice.engine.stackstep import Stack, flip, source_voltage
 from fingerspice.engine.work import DQ, SOURCE, X_GAP, Q, U
 from fingerspice.engine.zeros import farthest_off, zero
@@ -101,7 +100,7 @@ def complete_stack(c: Stack, pace: Pace, s: LoopState) -> int:
 @jit_within
 def _write(c: Stack, pace: Pace, s: LoopState, t: float) -> None:
     """Charge of a step that began at t (s), and its outputs."""
-    system, work, step, place, level = c.system, c.work, s.step, s.place, s.place[LEVEL]
+    system, work, step, level = c.system, c.work, s.step, s.place[LEVEL]
     model, shown, values = system.model, system.shown[level], work.values
     n_shown = shown.shape[0]
     if pace.charge:
@@ -112,8 +111,7 @@ def _write(c: Stack, pace: Pace, s: LoopState, t: float) -> None:
     if not is_wanted(s, step[T_NEW]):
         return
     layers(model.mobile, model.area0, system.k_shown, shown, work.w, work.r[SOURCE], work.r[Q], values)
-    mark = AT_ZERO if place[CROSSED] >= 0 else (AT_EDGE if step[T_NEW] == step[STOP] else 0.0)
-    write_step(s, t, mark, values, work.coefficients, work.outputs)
+    write_step(s, t, values, work.coefficients, work.outputs)
 
 
 @jit_within

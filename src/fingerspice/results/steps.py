@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.readout import RECORDED, Steps, new_steps
-from fingerspice.engine.repeat import PeriodMap
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS
 from fingerspice.results.measures import Panels, Read
 from fingerspice.results.record import Record
@@ -21,13 +19,9 @@ from fingerspice.waveforms.sampling import same_time
 CAPACITY, _AT_ONCE = 512, 16_384
 #: Largest number of values kept of a run's steps (64 MB); figures of a longer run are computed from its outputs.
 MOST_NUMBERS = 8_000_000
-#: Largest number of different periods in an extrapolation (`Leap`).
-_MOST_PERIODS = 20_000
 #: Sets of places between the steps whose record is kept, and the most places of one.
 _KNOWN, _MOST_KNOWN = 8, 4096
 _NODES = POINTS[:NODES]
-#: Matrix from Chebyshev coefficients to values at the nodes.
-_FROM_SERIES = chebyshev.chebvander(2.0 * _NODES - 1.0, NODES - 1).T
 
 
 @dataclass(frozen=True)
@@ -45,40 +39,6 @@ class Block:
     period: float = 0.0
 
 
-@dataclass(frozen=True)
-class Leap:
-    """Periods that follow one another by the affine map `one`, from live voltages `start` (V); see `engine.repeat`."""
-
-    one: PeriodMap
-    start: FloatArray
-    still: float
-    period: float
-    periods: int
-
-    def blocks(self) -> list[Block] | None:
-        """The periods one by one until they no longer change; None where too many of them differ."""
-        n = self.one.x.size
-        out: list[Block] = []
-        delta = self.start[:n] - self.one.x
-        last = None
-        for k in range(self.periods):
-            if last is not None and float(np.abs(delta - last).max(initial=0.0)) <= self.still:
-                moved = self._block(last, k * self.period)
-                out.append(Block(moved.times, moved.values, self.periods - k, moved.shift, self.period))
-                return out
-            if k >= _MOST_PERIODS:
-                return None
-            out.append(self._block(delta, k * self.period))
-            last, delta = delta, self.one.end[:n] - self.one.x + self.one.slope[:n] @ delta
-        return out
-
-    def _block(self, delta: FloatArray, shift: float) -> Block:
-        marks = self.one.marks + self.one.marks_by @ delta
-        series = self.one.series + np.tensordot(delta, self.one.by, 1)
-        times = np.column_stack([marks[:-1], np.diff(marks), marks[1:], np.ones(marks.size - 1)])
-        return Block(times, series[:, :, :NODES] @ _FROM_SERIES, 1, shift, self.period)
-
-
 @dataclass
 class Recorder:
     """Collects the steps of one integration after each call of its compiled loop."""
@@ -86,7 +46,7 @@ class Recorder:
     columns: int
     capacity: int = CAPACITY
     room: Steps = field(init=False)
-    parts: list[Block | Leap] = field(default_factory=list)
+    parts: list[Block] = field(default_factory=list)
     numbers: int = 0
     full: bool = False
 
@@ -110,9 +70,8 @@ class Recorder:
 
     def repeat(self, since: int, periods: int, period: float) -> None:
         """Let the blocks from number `since` on also represent the `periods` periods that follow them."""
-        for part in self.parts[since:]:
-            if isinstance(part, Block) and periods > 0:
-                self.parts.append(Block(part.times, part.values, periods, period, period))
+        if periods > 0:
+            self.parts += [Block(b.times, b.values, periods, period, period) for b in self.parts[since:]]
 
     def finish(self, first: float, stop: float, make: Callable[..., Record]) -> Recorded | None:
         """The recorded run from `first` to `stop` (s); None where nothing, or too much, was recorded."""
@@ -123,30 +82,24 @@ class Recorder:
 class Recorded:
     """Recorded steps; `make` builds a record from times, a mask of left-hand values, and states as columns."""
 
-    parts: tuple[Block | Leap, ...]
+    parts: tuple[Block, ...]
     first: float
     stop: float
     make: Callable[[FloatArray, BoolArray, FloatArray], Record]
 
-    def run(self, readers: Mapping[str, Read], since: float, until: float) -> Stretches | None:
-        """The steps as one array; None where they are too many."""
+    def run(self, readers: Mapping[str, Read], since: float, until: float) -> Stretches:
+        """The steps as one array."""
         return self._stretches
 
     @cached_property
-    def _stretches(self) -> Stretches | None:
-        blocks: list[Block] = []
-        for part in self.parts:
-            made = part.blocks() if isinstance(part, Leap) else [part]
-            if made is None:
-                return None
-            blocks += made
-        return Stretches(blocks, self.make)
+    def _stretches(self) -> Stretches:
+        return Stretches(self.parts, self.make)
 
 
 class Stretches:
     """Steps of a run, with its signals at any fraction of each step."""
 
-    def __init__(self, blocks: list[Block], make: Callable[[FloatArray, BoolArray, FloatArray], Record]) -> None:
+    def __init__(self, blocks: Sequence[Block], make: Callable[[FloatArray, BoolArray, FloatArray], Record]) -> None:
         sizes = [len(b.times) for b in blocks]
         self._make = make
         self._known: dict[tuple[bytes, bytes], tuple[FloatArray, Record]] = {}

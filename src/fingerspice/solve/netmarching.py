@@ -55,7 +55,7 @@ class March(Stepping, NetworkIntegration):
         cells = self.form.c.size
         self.work = new_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
         scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
-        self.settling = Settling(problem, self.form.rates.copy(), self.pace.tol, scale, leaps=False)
+        self.settling = Settling(problem, self.form.rates.copy(), self.pace.tol, scale)
         if not repeat:
             self.settling.stop_looking()
 
@@ -80,17 +80,16 @@ class March(Stepping, NetworkIntegration):
     def _collected(self) -> FloatArray:
         return self.collected.copy()
 
-    def _pass(self, periods: int, alike: int, off: float, collected: FloatArray) -> None:
+    def _pass(self, periods: int, off: float, owed: float, collected: FloatArray) -> None:
         self.branch[:, 0] += periods * self.settling.period
         met = self.met
         met[:, netassess.ERROR_U] += off
         steepest = 2.0 * met[:, netassess.PEAK_F] / np.maximum(met[:, netassess.PEAK_U], 1e-300)
         met[:, netassess.ERROR_F] += off * steepest
-        # The charge error of the repeated period recurs in each of the `alike` periods that repeat it.
         missed, spread = self.collected - collected
-        self.collected[0] += alike * missed
+        self.collected[0] += periods * missed
         held = float(self.problem.network.capacitance(self.problem.scene.area0).sum())
-        self.control[readout.ERROR_Q] += alike * float((np.abs(missed) + np.sqrt(spread)).max()) + held * off
+        self.control[readout.ERROR_Q] += periods * float((np.abs(missed) + np.sqrt(spread)).max()) + held * owed
 
     def _failed(self, code: int, sources: Sources) -> Status:
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()

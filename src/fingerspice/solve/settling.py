@@ -18,19 +18,12 @@ FEWEST_PERIODS = 6.0
 TRIAL_PERIODS = 2.0
 # Remaining change allowed over all later periods, as a fraction of the error allowed in a step.
 _SHARE = 1.0 / 3.0
-# Distance to the periodic state below which the map of a period is first tried as a linear one, in units of
-# sqrt(allowed error * peak): its defect is of second order. A rejected extrapolation reduces the distance.
-_NEAR = 10.0
-# Smallest perturbation for the map's derivative, relative to that distance; with a smaller one, round-off dominates
-# the difference of two periods.
-_PROBE = 0.1
 
 
 class Settling:
     """Compares the states after whole periods until later periods no longer change them.
 
-    The compiled loop does so (`engine.settling`); this class begins it, reads what it finds, and tells it what came of
-    that.
+    The compiled loop does so (`engine.settling`); this class begins it and reads what it finds.
 
     Parameters
     ----------
@@ -41,8 +34,6 @@ class Settling:
         Error of the gap voltage allowed in a step, V.
     scale : ndarray, shape (n,)
         Converts the first n entries of the integration's state to volts.
-    leaps : bool
-        Whether the periods before the periodic state may be extrapolated.
 
     Attributes
     ----------
@@ -52,7 +43,7 @@ class Settling:
         Period of the source, s; remaining change allowed, V.
     """
 
-    def __init__(self, problem: Problem, rates: FloatArray, tol: float, scale: FloatArray, leaps: bool) -> None:
+    def __init__(self, problem: Problem, rates: FloatArray, tol: float, scale: FloatArray) -> None:
         self.period = problem.waveform.period or math.inf
         self.allowed = _SHARE * tol
         start = max(problem.t_start, problem.waveform.settled)
@@ -60,12 +51,10 @@ class Settling:
         values = np.zeros(looks.N_VALUES)
         self.looks = Looks(values, np.zeros(scale.size), scale)
         values[looks.START], values[looks.STOP], values[looks.PERIOD] = start, problem.t_stop, self.period
-        values[looks.ALLOWED], values[looks.NEAREST], values[looks.MODES] = self.allowed, _NEAR, live.size
+        values[looks.ALLOWED], values[looks.HAS_CHARGE], values[looks.LOOKED] = self.allowed, problem.charge, -1.0
         # A mode with rate 0 keeps its charge for ever, so that it does not limit the time to the periodic state.
         values[looks.RATE] = looks.RATE_SHARE * float(live.min()) if live.size else math.inf
-        values[looks.HAS_CHARGE], values[looks.LEAPS] = problem.charge, leaps
-        values[looks.LOOKED] = -1.0
-        values[looks.NEAR] = values[looks.DISTANCE] = values[looks.REMAINING] = values[looks.TRIAL] = math.inf
+        values[looks.DISTANCE] = values[looks.REMAINING] = values[looks.TRIAL] = math.inf
         self._periods = (problem.t_stop - start) / self.period * (1.0 + 1e-12)
         values[looks.NEXT] = start if self._periods >= FEWEST_PERIODS else math.inf
 
@@ -75,6 +64,11 @@ class Settling:
         if self._periods >= 1.0 + 10.0 * TRIAL_PERIODS:
             values[looks.TRIAL] = values[looks.START] + TRIAL_PERIODS * self.period
             values[looks.ACCEPTABLE] = acceptable
+
+    def refine(self, share: float) -> None:
+        """Go on with this share of the error allowed, as the voltages have settled, and not the charge."""
+        self.allowed *= share
+        self.looks.values[looks.ALLOWED], self.looks.values[looks.FINE] = self.allowed, 1.0
 
     def stop_looking(self) -> None:
         """Integrate to the end without further looks."""
@@ -86,31 +80,11 @@ class Settling:
         return bool(self.looks.values[looks.HAS_SETTLED])
 
     @property
-    def may_leap(self) -> bool:
-        """Whether the state is near enough to the periodic one for extrapolation, and enough periods remain."""
-        return bool(self.looks.values[looks.MAY_LEAP])
-
-    @property
     def left(self) -> int:
         """Whole periods from the last look to the end of the run."""
         return int(self.looks.values[looks.LEFT])
 
     @property
-    def remaining(self) -> float:
-        """Bound of the change of the gap voltage after the last look, V, enlarged by its effect on the charge."""
-        return float(self.looks.values[looks.REMAINING])
-
-    @property
-    def probe(self) -> float:
-        """Perturbation of a state voltage for the finite differences of the period map, V."""
-        values = self.looks.values
-        return float(max(values[looks.DISTANCE], _PROBE * values[looks.NEAR]))
-
-    def leapt(self, periods: int, x: FloatArray) -> None:
-        """Record an accepted extrapolation over `periods` periods from the last look to the state x (n,)."""
-        self.looks.values[looks.LEAPT] = periods
-        self.looks.before[:] = x
-
-    def stumbled(self, excess: float) -> None:
-        """Record a rejected extrapolation, whose error was `excess` times the allowed one."""
-        self.looks.values[looks.EXCESS] = excess
+    def remaining(self) -> tuple[float, float]:
+        """Bound of the change of the gap voltage after the last look, V; then enlarged by its effect on the charge."""
+        return float(self.looks.values[looks.DISTANCE]), float(self.looks.values[looks.REMAINING])

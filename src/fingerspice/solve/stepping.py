@@ -32,6 +32,9 @@ SAFETY = 2.5
 LOCAL_SHARE = 0.15
 # Smallest error of a step above round-off, relative to the voltage scale.
 FINEST = 4e-15
+# Error allowed in a step, relative to the one before, once the voltages have settled and a period is to be repeated so
+# often that the errors of its charge add up.
+FINER = 0.01
 # Longest step, relative to the source's shortest time scale: the collocation nodes must not alias the source.
 LONGEST_STEP = 0.6
 # Most steps of a period that is kept for repetition: 1 MB.
@@ -57,7 +60,7 @@ class Stepping(Integration):
     out : ndarray, shape (width, n_out)
         Output rows as columns.
     repeated : int
-        Number of periods that were not integrated but repeat or extrapolate another.
+        Number of periods that were not integrated but repeat another.
     asked : float
         With this the stated error is compared after a few periods, where `try_out` was called. The tolerance was chosen
         before the peaks of the gaps were known; if it proves too large, the run ends there and not at its end before it
@@ -118,11 +121,11 @@ class Stepping(Integration):
         """Accumulated error of the charge so far."""
 
     @abstractmethod
-    def _pass(self, periods: int, alike: int, off: float, collected: Any) -> None:
-        """Advance the error by `periods` whole periods, of which `alike` repeat the charge error of the integrated one.
+    def _pass(self, periods: int, off: float, owed: float, collected: Any) -> None:
+        """Advance the error by `periods` whole periods, each of which repeats the charge error of the integrated one.
 
-        `off` (V) is the error of the voltages of these periods, and `collected` the accumulated error of the charge
-        before the integrated period.
+        `off` (V) is the error of the voltages of these periods, `owed` (V) that of the charge over the capacitance, and
+        `collected` the accumulated error of the charge before the integrated period.
         """
 
     @abstractmethod
@@ -133,14 +136,11 @@ class Stepping(Integration):
     def stated(self, run: Run) -> None:
         """Write the stated errors and the margin into a run."""
 
-    def leap(self, sources: Sources) -> None:
-        """Extrapolate the following periods with one affine map, if its error allows it; a network does not."""
-
     def through(self, sources: Sources, t_end: float) -> Status:
         while True:
             code = self.march(sources, t_end, self.settling.looks)
             if code == loopstate.LOOKED_AT:
-                self._settle(sources)
+                self._settle()
             elif code == loopstate.EXCESSIVE:
                 if excess_of(self.stated_gaps(), self.problem.rounding) > self.asked:
                     return Status.ERROR_NOT_MET
@@ -149,13 +149,16 @@ class Stepping(Integration):
             if code == loopstate.DONE or self.t >= t_end:
                 return Status.SUCCESS
 
-    def _settle(self, sources: Sources) -> None:
+    def _settle(self) -> None:
         """Once the periodic state is reached, keep the next period and then repeat it to the end."""
         settling = self.settling
         if not settling.has_settled:
             self.keep(0)
-            if settling.may_leap:
-                self.leap(sources)
+            if settling.remaining[0] <= settling.allowed:
+                tol, finest = self.pace.tol, FINEST * float(self.stated_gaps()[:, 0].max(initial=0.0))
+                share = min(1.0, max(FINER, finest / tol))
+                settling.refine(share)
+                self.pace = self.pace._replace(tol=share * tol)
         elif not len(self.kept.times):
             self.keep(KEPT_STEPS)
         else:
@@ -196,7 +199,7 @@ class Stepping(Integration):
         self.recorder.drain(self.counters)
         self.recorder.repeat(self.kept_from, periods, period)
         self.control[readout.T] += periods * period
-        self._pass(periods, periods, settling.remaining, collected)
+        self._pass(periods, *settling.remaining, collected)
         self.repeated += periods
 
     def charge_error(self, spread: float) -> float:

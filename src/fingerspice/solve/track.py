@@ -159,7 +159,7 @@ class Track(Stepping):
         self.control[readout.MARGIN] = 1.0
         if model_of(scene).mobile and problem.initial.sign[0] != 0.0:
             self.control[readout.U_GAP], self.control[readout.SIGN] = start.u_gap, math.copysign(1.0, start.u_gap)
-        self.settling = Settling(problem, prepared.system.rates, tol, np.ones(n), leaps=True)
+        self.settling = Settling(problem, prepared.system.rates, tol, np.ones(n))
         if h_fixed > 0.0 or not repeat:
             self.settling.stop_looking()
 
@@ -191,30 +191,10 @@ class Track(Stepping):
             self.control[readout.U_BEFORE], _ = source(*_segment(sources, self.t, "left"))
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
 
-    def leap(self, sources: Sources) -> None:
-        from fingerspice.solve.approach import leap
-
-        leap(self, sources, self.settling)
-
     def _collected(self) -> tuple[float, float]:
         return float(self.control[readout.COLLECTED]), float(self.control[readout.SPREAD])
 
-    def land(self, base: Track, state: FloatArray, periods: int, off: float, owed: float) -> None:
-        """Take the result of the extrapolation by the period map over `periods` whole periods.
-
-        `base` is the integration of the last of them and `state` the state after it. `off` bounds the error of the map
-        as an error of the gap voltage (V), and `owed` as an error of the charge (C).
-        """
-        t, collected = self.t, self._collected()
-        self.y[:] = state
-        self.error, self.control = base.error, base.control
-        self.control[readout.T] = t + periods * self.settling.period
-        self.control[readout.BRANCH_START] -= self.settling.period
-        self.control[readout.ERROR_Q] += owed
-        self._pass(periods, periods - 1, off, collected)
-        self.repeated += periods
-
-    def _pass(self, periods: int, alike: int, off: float, collected: tuple[float, float]) -> None:
+    def _pass(self, periods: int, off: float, owed: float, collected: tuple[float, float]) -> None:
         self.control[readout.BRANCH_START] += periods * self.settling.period
         self.control[readout.ERROR_U] += off
         self.control[readout.ERROR_V] += off
@@ -222,12 +202,11 @@ class Track(Stepping):
             steepest = 2.0 * self.control[readout.PEAK_F] / self.control[readout.PEAK_U]
             self.control[readout.ERROR_F] += off * steepest
         if self.pace.charge:
-            # The charge error of the integrated period recurs in each of the `alike` periods that repeat it.
             missed = self.control[readout.COLLECTED] - collected[0]
-            self.control[readout.COLLECTED] += alike * missed
+            self.control[readout.COLLECTED] += periods * missed
             self.control[readout.ERROR_Q] += (
-                alike * (abs(missed) + np.sqrt(self.control[readout.SPREAD] - collected[1]))
-                + self.capacitance * off
+                periods * (abs(missed) + np.sqrt(self.control[readout.SPREAD] - collected[1]))
+                + self.capacitance * owed
             )  # fmt: skip
 
     def state(self) -> State:
