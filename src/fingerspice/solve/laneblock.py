@@ -60,7 +60,8 @@ class Block:
         self.count = -(-self.n // self.pieces)
         beyond = self.count * self.pieces - self.n
         # The source stays at its last value behind the end.
-        self.x = np.concatenate([x, np.full(beyond, x[-1])]) if beyond else x
+        self.x = form.scratch("x", x.size + beyond)
+        self.x[: x.size], self.x[x.size :] = x, x[-1]
         self.h = np.concatenate([h, np.zeros(beyond)]) if self.own and beyond else h
         self.first = self.count * np.arange(self.pieces)
         self.starts_run, self.marks, self.active = starts_run, form.marks(self.own), form.active
@@ -69,7 +70,7 @@ class Block:
         self.still = form.weights(np.zeros(self.pieces if self.own else 1))
         self.m = self.rates.size
         # States at the samples: the modes, and under `mobile` the gap voltage.
-        self.kept = np.zeros((self.m + int(form.mobile), self.pieces, self.count + 1))
+        self.kept = form.scratch("kept", self.m + int(form.mobile), self.pieces, self.count + 1)
         self.left = np.zeros(self.rates.size)
 
     @cached_property
@@ -121,6 +122,7 @@ class Block:
         # Least distances to the fold; the last sweep may stop before the end of the pieces.
         margins = [1.0]
         self.__dict__.pop("xi", None)
+        self.__dict__.pop("peaks", None)
         own = np.zeros((self.m, self.pieces))
         along(form.lanes, self.h, self.x, self.first, self.count, own)
         starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[: self.m, None], own], axis=1))
@@ -153,18 +155,19 @@ class Block:
     @cached_property
     def xi(self) -> FloatArray:
         """xi (V) at the samples, shape (n + 1,), after `solve`."""
-        (k, columns), out = self.form.xi, np.empty(self.n + 1)
+        (k, columns), out = self.form.xi, self.form.scratch("xi", self.n + 1)
         show(k, columns, self.x, self.first, self.count, self.n + 1, self.kept, out)
         return out
 
     @property
     def _by_piece(self) -> FloatArray:
         """|xi| (V) at the samples of each piece, shape (pieces, count)."""
-        out = np.zeros(self.pieces * self.count)
-        out[: self.n] = np.abs(self.xi[:-1])
-        return out.reshape(self.pieces, self.count)
+        out = self.form.scratch("sizes", self.pieces, self.count)
+        np.abs(self.xi[:-1], out=out.reshape(-1)[: self.n])
+        out.reshape(-1)[self.n :] = 0.0
+        return out
 
-    @property
+    @cached_property
     def peaks(self) -> FloatArray:
         """Largest |xi| (V) at the samples of each piece, and at the next one."""
         own = self._by_piece.max(axis=1)
@@ -208,7 +211,8 @@ class Block:
 
         With N as a drive, errors are large where |xi| is, too.
         """
-        moves, whole = np.abs(np.diff(self.x)), self.count - self.count % width
+        moves, whole = self.form.scratch("moves", self.pieces * self.count), self.count - self.count % width
+        np.abs(np.subtract(self.x[1:], self.x[:-1], out=moves), out=moves)
         most = moves.reshape(self.pieces, self.count)[:, :whole].reshape(self.pieces, -1, width).max(axis=-1)
         # Windows end before the last sample.
         most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0

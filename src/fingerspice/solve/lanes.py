@@ -19,6 +19,7 @@ from fingerspice.solve.laneform import LaneForm
 from fingerspice.solve.pieces import Piece, driving, spacing_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run, excess_of
+from fingerspice.waveforms.sampling import on_grid
 
 # Steps of a sample, by level.
 PARTS = (1, 2, 4, 8, 16, 32, 64)
@@ -33,6 +34,9 @@ GROWN, EARLY = 8, 0.05
 # Relative change of a voltage over that of the area which causes it, at most, under `local`: what scales with the area
 # divides the voltage with what does not.
 DIVIDED = 0.5
+# How fine steps must be is found on so many samples at the start of a run, below these relative errors: in a stack, and
+# in a network. For larger ones steps of a sample mostly do.
+FIRST, AT_ONCE = 1 << 14, (3e-7, 3e-6)
 # Least distance to the fold that is followed.
 LEAST_MARGIN = 0.2
 # What leaks by the error of the polynomial of 1/A over what is stored, times that error: as seen in offset recordings.
@@ -96,28 +100,31 @@ class LaneMarch:
         if piece.grows:
             piece, values = self._growing(piece, values)
         h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
-        block = Block(self.form, values, h, self.steps == 0)
         starts_at = self.form.after(self.z, float(values[0]))
-        while True:
-            parts, excess = PARTS[self.level], math.inf
-            # Another sweep over short pieces costs little.
-            left = max(OF_STARTS * min(block.count / SHORT, 1.0) * self.rtol, LEAST_CHANGE)
-            solved = block.solve(self.z, parts, left * self.scale)
-            self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
-            if solved:
-                peak = float(np.abs(block.xi).max())
-                if not (self.form.gap(np.array(peak)) <= self.form.u_top and self._on_branch(block, starts_at, peak)):
-                    return Outcome.LOST
-                seen = judge(block, parts, max(peak, self.peak), self.alike, self.chance)
-                excess = self._excess(seen, max(peak, self.peak), LEAST_AT_START if piece.grows else LEAST_PEAK)
-            if excess <= 1.0:
-                break
-            self.refused += parts * block.n
-            if self.level + 1 == len(PARTS):
-                return Outcome.NOT_MET
-            divides = FINER[1] if self.form.bent else FINER[0]
-            finer = math.ceil(math.log(excess) / math.log(divides)) if excess < math.inf else 1
-            self.level = min(self.level + max(1, finer), len(PARTS) - 1)
+        divides, at_once = FINER[self.form.bent], AT_ONCE[self.form.bent]
+        tries = self.steps == 0 and self.rtol < at_once and values.size > 4 * FIRST
+        for size in (FIRST, values.size - 1)[0 if tries else 1 :]:
+            block = Block(self.form, values[: size + 1], h[:size], self.steps == 0)
+            while True:
+                parts, excess = PARTS[self.level], math.inf
+                # Another sweep over short pieces costs little.
+                left = max(OF_STARTS * min(block.count / SHORT, 1.0) * self.rtol, LEAST_CHANGE)
+                solved = block.solve(self.z, parts, left * self.scale)
+                self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
+                if solved:
+                    peak = float(block.peaks.max())
+                    within = self.form.gap(np.array(peak)) <= self.form.u_top
+                    if not (within and self._on_branch(block, starts_at, peak)):
+                        return Outcome.LOST
+                    seen = judge(block, parts, max(peak, self.peak), self.alike, self.chance)
+                    excess = self._excess(seen, max(peak, self.peak), LEAST_AT_START if piece.grows else LEAST_PEAK)
+                if excess <= 1.0:
+                    break
+                self.refused += parts * block.n
+                if self.level + 1 == len(PARTS):
+                    return Outcome.NOT_MET
+                finer = math.ceil(math.log(excess) / math.log(divides)) if excess < math.inf else 1
+                self.level = min(self.level + max(1, finer), len(PARTS) - 1)
         self.peak, self.errors = max(peak, self.peak), np.maximum(seen.errors, self.errors)
         self.alike, self.chance, self.margin = seen.alike, seen.chance, min(self.margin, block.margin)
         self.steps += parts * block.n
@@ -165,11 +172,13 @@ class LaneMarch:
             return
         t, self.outputs, rows = t_out[first:last], last, out[:, first:last]
         times = piece.times
-        samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
-        if t.size == n and np.abs(t - samples).max() <= slack:
+        if t.size == n and (
+            on_grid(t, piece.start, piece.spacing, slack) if times is None else np.abs(t - times[:-1]).max() <= slack
+        ):
             slope = np.diff(block.x[: n + 1]) / block.h[:n] if self.form.flows else block.x
             self._show(block.x, slope, block.first, block.kept, rows)
             return
+        samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
         number = np.clip(np.searchsorted(samples, t + slack, side="right") - 1, 0, n - 1)
         length = np.broadcast_to(block.h[:n], n)[number]
         since = t - samples[number]

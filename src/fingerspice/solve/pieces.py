@@ -16,7 +16,7 @@ from fingerspice.waveforms.recorded import MOST_PER_POINT, as_samples
 from fingerspice.waveforms.samples import Samples
 
 # Fewest samples for which this method pays, and the samples of a piece; pieces begin at multiples of that number.
-LEAST_SAMPLES, PIECE = 64, 1 << 16
+LEAST_SAMPLES, PIECE = 64, 1 << 18
 # Fewest points of a PWL at uneven times for which its own steps pay, whose loop has to be compiled once.
 LEAST_POINTS = 1000
 # Longest step on a line between two points, over their median distance.
@@ -53,8 +53,7 @@ class Piece:
         assert isinstance(wave, Samples)
         if self.first == self.last:
             return wave.value([self.start, self.start + self.spacing])
-        # Compiled code is compiled for arrays that may be written, and recordings are read-only.
-        return np.require(wave.between(self.first, self.last + 1), requirements="W")
+        return wave.between(self.first, self.last + 1)
 
 
 def driving(problem: Problem) -> Samples | PWL | None:
