@@ -60,18 +60,18 @@ def _slope_of_force(form: LaneForm, xi: FloatArray) -> FloatArray:
     return np.asarray((form.force(1.001 * xi) - form.force(xi)) / (1e-3 * xi))
 
 
-def _changes(form: LaneForm, shown: Shown, window: Window, xi: FloatArray) -> FloatArray:
-    """Changes of quantities in windows (C, pieces, width + 1), where xi goes to other values."""
+def _changes(form: LaneForm, shown: Shown, window: Window, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Largest changes of quantities in windows, where xi goes to other values, and sums of the modes: (C, pieces)."""
     m = form.lanes.rates.size
-    found = np.einsum("ck,kij->cij", shown.columns, window.off[:m])
+    found, whole = np.einsum("ck,kij->cij", shown.columns, window.off[:m]), np.zeros((shown.k.size, 1, 1))
     if shown.by_area.any():
+        whole = np.einsum("ck,kij->cij", shown.columns, window.z[:m])
         inverse, other = form.inverse_area(window.xi), form.inverse_area(xi)
-        whole = np.einsum("ck,kij->cij", shown.columns[shown.by_area], window.z[:m])
-        found[shown.by_area] = other * found[shown.by_area] + (other - inverse) * whole
+        found = np.where(shown.by_area[:, None, None], other * found + (other - inverse) * whole, found)
     if shown.bends.any():
         moved = form.moved(xi, window.source) - form.moved(window.xi, window.source)
         found += shown.bends[:, None, None] * moved
-    return np.asarray(found)
+    return np.abs(found).max(axis=-1, initial=0.0), np.abs(whole).max(axis=-1, initial=0.0)
 
 
 def judge(block: Block, parts: int, peak: float, alike: FloatArray, chance: FloatArray) -> Judged:
@@ -92,38 +92,36 @@ def judge(block: Block, parts: int, peak: float, alike: FloatArray, chance: Floa
     # What a piece adds beyond its window.
     alike_more, chance_more = own * (window.share - 1.0), products * (window.of_products - 1.0)
 
-    def added(columns: FloatArray, left: FloatArray | None = None) -> FloatArray:
-        """Of a sum of the modes: by chance, or by errors that are alike where chance does not explain them.
+    def added(columns: FloatArray, left: FloatArray) -> FloatArray:
+        """Of sums of the modes (C, m): by chance, or by errors that are alike where chance does not explain them.
 
         `left` (m, pieces) is left of each mode of what a piece starts with.
         """
-        left = np.ones(own.shape) if left is None else left
         there = lucky[..., :-1] * left[:, None] * left + chance_more
-        by_chance = np.sqrt(np.maximum(np.einsum("k,l,kli->i", columns, columns, there), 0.0))
+        by_chance = np.sqrt(np.maximum(np.einsum("ck,cl,kli->ci", columns, columns, there), 0.0))
         there = np.abs(columns @ (handed[:, :-1] * left + alike_more))
-        more = np.maximum(by_chance, there - LUCK * by_chance)
-        swept = (np.abs(columns) * block.left)[:active] / OF_FORCE
-        return np.asarray(more + swept @ left[:active])
+        swept = np.abs(columns[:, :active]) * (block.left[:active] / OF_FORCE)
+        return np.asarray(np.maximum(by_chance, there - LUCK * by_chance) + swept @ left[:active])
 
     least = 1e-9 * peak + 1e-300
-    errors, over, top = np.zeros(4), added(c.shape), np.maximum(block.peaks, least)
+    errors, charges = np.zeros(4), form.rows.behind(form.rows.k.size - form.flows)
+    over, *others = added(np.vstack([c.shape, form.nodes.columns, charges.columns]), np.ones(own.shape))
+    top = np.maximum(block.peaks, least)
     steep, xi = _steep(form, block, top), window.xi + np.einsum("k,kij->ij", form.xi[1], window.off)
     # An error that a fast mode brings into a piece changes the force as much as xi at the first sample allows.
     decay = np.exp(-block.rates[:, None] * (block.h[block.first] if block.own else block.h))
     first_xi = np.maximum(np.abs(block.xi[np.minimum(block.first, block.n)]) + over, least)
     at_first = _slope_of_force(form, first_xi) * (steep.u if form.mobile else 1.0) * over
-    of_force = np.maximum(at_first, steep.force * added(c.shape, decay))
+    of_force = np.maximum(at_first, steep.force * added(c.shape[None], decay * np.ones(own.shape))[0])
     for i, of, more in ((0, form.gap, steep.u * over), (1, form.force, of_force)):
         errors[i] = (np.abs(of(xi) - of(window.xi)).max(axis=1) + more).max()
-    first = form.rows.k.size - form.flows
-    for i, shown in ((2, form.nodes), (3, form.rows.behind(first))):
-        seen = np.abs(_changes(form, shown, window, xi)).max(axis=-1, initial=0.0)
-        for row, columns, bend, by_area in zip(seen, shown.columns, shown.bends, shown.by_area, strict=True):
-            more = added(columns) + abs(bend) * steep.moved * over
-            if by_area:
-                whole = np.abs(np.einsum("k,kij->ij", columns, window.z[: c.rates.size])).max(axis=1)
-                more = added(columns) * steep.u * c.q0 + whole * steep.inverse * over
-            errors[i] = max(errors[i], (row + more).max())
+    for i, shown in ((2, form.nodes), (3, charges)):
+        found, whole = _changes(form, shown, window, xi)
+        more = np.reshape(others[: shown.k.size], (-1, own.shape[1]))
+        more = np.where(shown.by_area[:, None], more * steep.u * c.q0 + whole * steep.inverse * over, more)
+        more = more + np.abs(shown.bends)[:, None] * steep.moved * over
+        errors[i] = (found + more).max(initial=0.0)
+        others = others[shown.k.size :]
     alone = np.abs(np.einsum("k,kij->ij", c.shape, window.off[: c.rates.size])).max()
     alone += np.abs(c.shape @ (own * (window.share - 1.0))).max()
     return Judged(errors, float(alone), handed[:, -1], lucky[..., -1])
