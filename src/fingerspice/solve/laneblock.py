@@ -6,6 +6,8 @@ each sweep they are corrected by what the modes decay by in a piece, until xi no
 
 from __future__ import annotations
 
+import math
+import threading
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,6 +26,22 @@ WINDOW, FEWEST = 1.0 / 16.0, 32
 BETWEEN = 4
 # The rate that stands for 0, 1/s.
 _STILL = 1e-9
+
+
+class _OfThread(threading.local):
+    """Arrays of the present thread, which its next block overwrites: memory that is new to a process costs time."""
+
+    def __init__(self) -> None:
+        self.arrays: dict[str, FloatArray] = {}
+
+    def get(self, name: str, *shape: int) -> FloatArray:
+        size = math.prod(shape)
+        if name not in self.arrays or self.arrays[name].size < size:
+            self.arrays[name] = np.empty(size)
+        return self.arrays[name][:size].reshape(shape)
+
+
+_SCRATCH = _OfThread()
 
 
 @dataclass(frozen=True)
@@ -60,7 +78,7 @@ class Block:
         self.count = -(-self.n // self.pieces)
         beyond = self.count * self.pieces - self.n
         # The source stays at its last value behind the end.
-        self.x = form.scratch("x", x.size + beyond)
+        self.x = _SCRATCH.get("x", x.size + beyond)
         self.x[: x.size], self.x[x.size :] = x, x[-1]
         self.h = np.concatenate([h, np.zeros(beyond)]) if self.own and beyond else h
         self.first = self.count * np.arange(self.pieces)
@@ -70,7 +88,7 @@ class Block:
         self.still = form.weights(np.zeros(self.pieces if self.own else 1))
         self.m = self.rates.size
         # States at the samples: the modes, and under `mobile` the gap voltage.
-        self.kept = form.scratch("kept", self.m + int(form.mobile), self.pieces, self.count + 1)
+        self.kept = _SCRATCH.get("kept", self.m + int(form.mobile), self.pieces, self.count + 1)
         self.left = np.zeros(self.rates.size)
 
     @cached_property
@@ -155,14 +173,14 @@ class Block:
     @cached_property
     def xi(self) -> FloatArray:
         """xi (V) at the samples, shape (n + 1,), after `solve`."""
-        (k, columns), out = self.form.xi, self.form.scratch("xi", self.n + 1)
+        (k, columns), out = self.form.xi, _SCRATCH.get("xi", self.n + 1)
         show(k, columns, self.x, self.first, self.count, self.n + 1, self.kept, out)
         return out
 
     @property
     def _by_piece(self) -> FloatArray:
         """|xi| (V) at the samples of each piece, shape (pieces, count)."""
-        out = self.form.scratch("sizes", self.pieces, self.count)
+        out = _SCRATCH.get("sizes", self.pieces, self.count)
         np.abs(self.xi[:-1], out=out.reshape(-1)[: self.n])
         out.reshape(-1)[self.n :] = 0.0
         return out
@@ -211,7 +229,7 @@ class Block:
 
         With N as a drive, errors are large where |xi| is, too.
         """
-        moves, whole = self.form.scratch("moves", self.pieces * self.count), self.count - self.count % width
+        moves, whole = _SCRATCH.get("moves", self.pieces * self.count), self.count - self.count % width
         np.abs(np.subtract(self.x[1:], self.x[:-1], out=moves), out=moves)
         most = moves.reshape(self.pieces, self.count)[:, :whole].reshape(self.pieces, -1, width).max(axis=-1)
         # Windows end before the last sample.

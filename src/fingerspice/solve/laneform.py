@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import chebyshev as series_of
@@ -113,17 +112,6 @@ class LaneForm(ABC):
     def pieces(self) -> int:
         """Number of lanes."""
         return OF_NETWORK if self.bent else OF_STACK
-
-    @cached_property
-    def _arrays(self) -> dict[str, FloatArray]:
-        return {}
-
-    def scratch(self, name: str, *shape: int) -> FloatArray:
-        """An array that the next one of this name overwrites: memory that is new to a process costs time."""
-        size = math.prod(shape)
-        if name not in self._arrays or self._arrays[name].size < size:
-            self._arrays[name] = np.empty(size)
-        return self._arrays[name][:size].reshape(shape)
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
