@@ -146,7 +146,7 @@ with compiling.around():
 sweep.stop()
 """
 LINES = [
-    "fingerspice: note: compiling the steps of a series stack, about 35 s, only once: later runs find it on the disk",
+    "fingerspice: note: compiling the steps of a series stack, about 30 s, only once: later runs find it on the disk",
     "fingerspice: note: compiling the steps of a network, about 80 s, only once: later runs find it on the disk",
 ]
 

@@ -13,8 +13,8 @@ _LOG = logging.getLogger("fingerspice")
 #: What takes the compiler more than ten seconds, by function and class of its first argument: what it is, and the time
 #: on one core of an x86-64 server of 2026.
 LONG = {
-    ("engine.loop.march_on", "Stack"): "the steps of a series stack, about 35 s",
-    ("engine.loop.march_on", "Mesh"): "the steps of a network, about 80 s",
+    ("engine.loop.march_on", "Stack"): "the steps of a series stack, about 30 s",
+    ("engine.loop.march_on", "Mesh"): "the steps of a network, about 60 s",
     ("engine.lanes.begin", "StackMarks"): "the steps of a recording, about 20 s",
     ("engine.lanes.begin", "MobileMarks"): "the steps of a recording, about 20 s",
     ("engine.lanes.begin", "NetworkMarks"): "the steps of a recording in a network, about 30 s",
