@@ -36,11 +36,11 @@ COMMANDS = {
 # The command, with what ends it just where it would hurt: PLACE is patched to strike when called for the N-th time.
 STRUCK = """
 import os, pathlib, sys
-from fingerspice.results import datafiles
+from fingerspice.base import files
 from fingerspice.__main__ import main
 place, count, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 sys.argv[1:4] = []
-owner = datafiles if place == "write_pieces" else pathlib.Path
+owner = files if place == "write_pieces" else pathlib.Path
 calls, original = [], getattr(owner, place)
 def strike(self, *arguments):
     calls.append(1)
@@ -169,7 +169,7 @@ def test_while_a_file_is_written_too(
 def test_ctrl_c_is_heard_in_the_middle_of_a_long_run(tmp_path: Path) -> None:
     deck = (Path(__file__).parents[1] / "circuits" / "two_fingers.cir").read_text()
     (tmp_path / "long.cir").write_text(deck)
-    code = "import fingerspice as fs; fs.simulate(fs.read_netlist('long.cir'), t_stop=100.0, t_eval=[1.0])"
+    code = "import fingerspice as fs; fs.simulate(fs.read_netlist('long.cir'), t_stop=100.0, method='exponential')"
     entry = [sys.executable, "-c", f"import fingerspice.__main__ as m, sys\nsys.argv[1:] = []\n{SOLVING.format(code)}"]
     process = start(tmp_path, entry=entry)
     minded(process)

@@ -297,7 +297,7 @@ def test_a_file_is_whole_or_as_it_was_when_the_disk_is_full(
 
         return write_aside(path, half)
 
-    monkeypatch.setattr("fingerspice.results.datafiles.write_aside", full)
+    monkeypatch.setattr("fingerspice.base.files.write_aside", full)
     with pytest.raises(fs.InputError, match=r"cannot write .*run\.dat: No space left on device"):
         getattr(square, write)(path)
     assert [p.name for p in tmp_path.iterdir()] == (["run.dat"] if there else [])

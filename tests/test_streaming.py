@@ -164,8 +164,8 @@ def test_a_stream_goes_on_from_a_mark() -> None:
 
 def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
     circuit, most = fs.parse_netlist(table1_deck()), []
-    # The first two make what later runs through the same circuit use again.
-    for seconds in (25, 75, 25, 75):
+    # The first makes what later runs through the same circuit use again.
+    for seconds in (75, 75, 150):
         path = wav(tmp_path / f"{seconds}.wav", 48_000 * seconds)
         tracemalloc.start()
         samples = fs.Samples.from_wav(path, 150.0, at_once=False)
@@ -173,7 +173,7 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
             assert chunk.f_el is not None
         most.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert most[3] < 1.1 * most[2] + 1e6
+    assert most[2] < 1.1 * most[1] + 1e6
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
 from fingerspice.solve.settling import Settling
+from fingerspice.waveforms.sampling import same_time
 
 # Ratio of stated to estimated error: the largest error of a step may lie beside the points at which it is estimated,
 # and contributions of opposite sign may cancel at these points.
@@ -198,7 +199,9 @@ class Stepping(Integration):
         self.y[-n_s:] += periods * drift
         self.recorder.drain(self.counters)
         self.recorder.repeat(self.kept_from, periods, period)
-        self.control[readout.T] += periods * period
+        # The end of a period may be the end of the run but for the rounding of both.
+        reached, stop = self.t + periods * period, self.problem.t_stop
+        self.control[readout.T] = stop if abs(stop - reached) <= same_time(stop) else reached
         self._pass(periods, *settling.remaining, collected)
         self.repeated += periods
 
