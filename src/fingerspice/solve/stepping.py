@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import loopstate, readout
+from fingerspice.engine import loopstate, readout, settling
 from fingerspice.engine import repeat as repetition
 from fingerspice.engine.loopstate import LoopState
 from fingerspice.engine.network import Sources
@@ -22,7 +22,7 @@ from fingerspice.results.record import bare_record
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
-from fingerspice.solve.settling import Settling
+from fingerspice.solve.settling import try_out
 
 # Ratio of stated to estimated error: the largest error of a step may lie beside the points at which it is estimated,
 # and contributions of opposite sign may cancel at these points.
@@ -54,7 +54,7 @@ class Stepping(Integration):
     Attributes
     ----------
     pace : Pace
-    settling : Settling
+    looks : Looks
     control : ndarray
         State of the compiled loop, with the indices of `engine.readout`.
     out : ndarray, shape (width, n_out)
@@ -67,7 +67,7 @@ class Stepping(Integration):
         is repeated.
     """
 
-    settling: Settling
+    looks: Looks
     control: FloatArray
     error: FloatArray
     asked = math.inf
@@ -83,7 +83,7 @@ class Stepping(Integration):
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.step, self.place = np.zeros(loopstate.N_STEP), np.zeros(loopstate.N_PLACE, np.int64)
         self.out = np.empty((width, t_out.size))
-        self.repeated = 0
+        self.period, self.repeated = problem.waveform.period or math.inf, 0
         self.recorder = Recorder(shown)
         self.keep(0)
 
@@ -106,7 +106,7 @@ class Stepping(Integration):
     def try_out(self, asked: float) -> None:
         """Compare the stated error with `asked` after a few periods, if many are left."""
         self.asked = asked
-        self.settling.try_out(asked / SAFETY)
+        try_out(self.looks.values, asked / SAFETY)
 
     @abstractmethod
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
@@ -138,7 +138,7 @@ class Stepping(Integration):
 
     def through(self, sources: Sources, t_end: float) -> Status:
         while True:
-            code = self.march(sources, t_end, self.settling.looks)
+            code = self.march(sources, t_end, self.looks)
             if code == loopstate.LOOKED_AT:
                 self._settle()
             elif code == loopstate.EXCESSIVE:
@@ -151,13 +151,13 @@ class Stepping(Integration):
 
     def _settle(self) -> None:
         """Once the periodic state is reached, keep the next period and then repeat it to the end."""
-        settling = self.settling
-        if not settling.has_settled:
+        found = self.looks.values
+        if found[settling.HAS_SETTLED] == 0.0:
             self.keep(0)
-            if settling.remaining[0] <= settling.allowed:
+            if found[settling.DISTANCE] <= found[settling.ALLOWED]:
                 tol, finest = self.pace.tol, FINEST * float(self.stated_gaps()[:, 0].max(initial=0.0))
                 share = min(1.0, max(FINER, finest / tol))
-                settling.refine(share)
+                found[settling.ALLOWED], found[settling.FINE] = share * found[settling.ALLOWED], 1.0
                 self.pace = self.pace._replace(tol=share * tol)
         elif not len(self.kept.times):
             self.keep(KEPT_STEPS)
@@ -166,7 +166,7 @@ class Stepping(Integration):
             if self.keeps_all:
                 self._repeat()
             self.keep(0)
-            settling.stop_looking()
+            found[settling.NEXT] = math.inf
 
     def keep(self, steps: int) -> None:
         """Keep the steps from now on, at most `steps` of them."""
@@ -184,8 +184,8 @@ class Stepping(Integration):
 
     def _repeat(self) -> None:
         """Repeat the kept period in place of all whole periods that follow."""
-        settling, n_s = self.settling, self.s_before.size
-        periods, period = settling.left, settling.period
+        found, n_s, period = self.looks.values, self.s_before.size, self.period
+        periods = int(found[settling.LEFT])
         charge, collected = self.before
         drift = self.y[-n_s:] - charge
         drifts = np.zeros(len(self.out))
@@ -199,7 +199,7 @@ class Stepping(Integration):
         self.recorder.drain(self.counters)
         self.recorder.repeat(self.kept_from, periods, period)
         self.control[readout.T] += periods * period
-        self._pass(periods, *settling.remaining, collected)
+        self._pass(periods, float(found[settling.DISTANCE]), float(found[settling.REMAINING]), collected)
         self.repeated += periods
 
     def charge_error(self, spread: float) -> float:
