@@ -162,11 +162,6 @@ class Track(Stepping):
         self.looks = looks_of(problem, prepared.system.rates, tol, np.ones(n), repeat and h_fixed == 0.0)
 
     @property
-    def shown(self) -> int:
-        """Number of voltages among the columns of the outputs."""
-        return int(self.problem.scene.shown.turn.size)
-
-    @property
     def capacitance(self) -> float:
         """Capacitance of the layer through which the charge is computed, at the area at 0 V, F."""
         model = self.prepared.system.model
