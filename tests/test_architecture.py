@@ -19,10 +19,10 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 400
 # Lines of all files together and of each package: as many as there are, rounded up. They are only ever lowered; what
 # moves from one package to another takes its lines along.
-ALL_LINES = 50_490
+ALL_LINES = 50_440
 PACKAGE_LINES = {
     "base": 1_210, "circuit": 3_034, "cli": 2_391, "engine": 10_050, "explorer": 1_920, "netlist": 3_260,
-    "numerics": 1_355, "physics": 515, "plots": 1_730, "results": 3_320, "sets": 510, "solve": 8_058, "studies": 9_284,
+    "numerics": 1_355, "physics": 515, "plots": 1_730, "results": 3_312, "sets": 510, "solve": 8_020, "studies": 9_284,
     "torch": 575, "waveforms": 3_120,
 }  # fmt: skip
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.results.steps import Recorder
-from fingerspice.solve import stepping
+from fingerspice.results import steps
 from scenes import deck, table1
 
 AREA = 34.9715871843e-6
@@ -107,7 +105,7 @@ def test_where_the_recorded_steps_fill_their_arrays_changes_nothing(name: str, m
     stop = 0.02 if name in ("amplifier", "two_fingers") else 0.1
     plain = fs.simulate(circuit, t_stop=stop, rtol=1e-6, charge=False)
     for capacity in (1, 7):
-        monkeypatch.setattr(stepping, "Recorder", partial(Recorder, capacity=capacity))
+        monkeypatch.setattr(steps, "CAPACITY", capacity)
         run = fs.simulate(circuit, t_stop=stop, rtol=1e-6, charge=False)
         assert run.stats["steps"] == plain.stats["steps"]
         np.testing.assert_array_equal(run.u_gap, plain.u_gap)

@@ -44,29 +44,24 @@ class Recorder:
     """Collects the steps of one integration after each call of its compiled loop."""
 
     columns: int
-    capacity: int = CAPACITY
     room: Steps = field(init=False)
     parts: list[Block] = field(default_factory=list)
     numbers: int = 0
     full: bool = False
 
     def __post_init__(self) -> None:
-        self.room = new_steps(min(self.capacity, 1 + _AT_ONCE // max(self.columns, 1)), self.columns)
+        self.room = new_steps(min(CAPACITY, 1 + _AT_ONCE // max(self.columns, 1)), self.columns)
 
-    def drain(self, counters: IntArray) -> Block | None:
-        """Collect the steps that the loop has recorded, as a block; None where there are none, or too many."""
+    def drain(self, counters: IntArray) -> None:
+        """Collect the steps that the loop has recorded, as a block; none of them where there are too many."""
         count = int(counters[RECORDED])
         counters[RECORDED] = 0
         self.numbers += count * self.columns * NODES
         self.full = self.full or self.numbers > MOST_NUMBERS
         if self.full:
             self.parts.clear()
-            return None
-        if count == 0:
-            return None
-        block = Block(self.room.times[:count].copy(), self.room.values[:count].copy())
-        self.parts.append(block)
-        return block
+        elif count > 0:
+            self.parts.append(Block(self.room.times[:count].copy(), self.room.values[:count].copy()))
 
     def repeat(self, since: int, periods: int, period: float) -> None:
         """Let the blocks from number `since` on also represent the `periods` periods that follow them."""

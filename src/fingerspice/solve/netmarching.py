@@ -18,7 +18,7 @@ from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.references import known_references
 from fingerspice.solve.runs import NetworkIntegration, Run
-from fingerspice.solve.settling import Settling
+from fingerspice.solve.settling import looks_of
 from fingerspice.solve.sources import held as held_at
 from fingerspice.solve.stepping import SAFETY, Stepping
 
@@ -55,9 +55,7 @@ class March(Stepping, NetworkIntegration):
         cells = self.form.c.size
         self.work = new_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
         scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
-        self.settling = Settling(problem, self.form.rates.copy(), self.pace.tol, scale)
-        if not repeat:
-            self.settling.stop_looking()
+        self.looks = looks_of(problem, self.form.rates.copy(), self.pace.tol, scale, repeat)
 
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
@@ -81,7 +79,7 @@ class March(Stepping, NetworkIntegration):
         return self.collected.copy()
 
     def _pass(self, periods: int, off: float, owed: float, collected: FloatArray) -> None:
-        self.branch[:, 0] += periods * self.settling.period
+        self.branch[:, 0] += periods * self.period
         met = self.met
         met[:, netassess.ERROR_U] += off
         steepest = 2.0 * met[:, netassess.PEAK_F] / np.maximum(met[:, netassess.PEAK_U], 1e-300)

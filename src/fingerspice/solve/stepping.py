@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import loopstate, readout
+from fingerspice.engine import loopstate, readout, settling
 from fingerspice.engine import repeat as repetition
 from fingerspice.engine.loopstate import LoopState
 from fingerspice.engine.network import Sources
@@ -22,7 +22,7 @@ from fingerspice.results.record import bare_record
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
-from fingerspice.solve.settling import Settling
+from fingerspice.solve.settling import try_out
 from fingerspice.waveforms.sampling import same_time
 
 # Ratio of stated to estimated error: the largest error of a step may lie beside the points at which it is estimated,
@@ -55,7 +55,7 @@ class Stepping(Integration):
     Attributes
     ----------
     pace : Pace
-    settling : Settling
+    looks : Looks
     control : ndarray
         State of the compiled loop, with the indices of `engine.readout`.
     out : ndarray, shape (width, n_out)
@@ -68,7 +68,7 @@ class Stepping(Integration):
         is repeated.
     """
 
-    settling: Settling
+    looks: Looks
     control: FloatArray
     error: FloatArray
     asked = math.inf
@@ -84,7 +84,7 @@ class Stepping(Integration):
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.step, self.place = np.zeros(loopstate.N_STEP), np.zeros(loopstate.N_PLACE, np.int64)
         self.out = np.empty((width, t_out.size))
-        self.repeated = 0
+        self.period, self.repeated = problem.waveform.period or math.inf, 0
         self.recorder = Recorder(shown)
         self.keep(0)
 
@@ -107,7 +107,7 @@ class Stepping(Integration):
     def try_out(self, asked: float) -> None:
         """Compare the stated error with `asked` after a few periods, if many are left."""
         self.asked = asked
-        self.settling.try_out(asked / SAFETY)
+        try_out(self.looks.values, asked / SAFETY)
 
     @abstractmethod
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
@@ -139,7 +139,7 @@ class Stepping(Integration):
 
     def through(self, sources: Sources, t_end: float) -> Status:
         while True:
-            code = self.march(sources, t_end, self.settling.looks)
+            code = self.march(sources, t_end, self.looks)
             if code == loopstate.LOOKED_AT:
                 self._settle()
             elif code == loopstate.EXCESSIVE:
@@ -152,13 +152,13 @@ class Stepping(Integration):
 
     def _settle(self) -> None:
         """Once the periodic state is reached, keep the next period and then repeat it to the end."""
-        settling = self.settling
-        if not settling.has_settled:
+        found = self.looks.values
+        if found[settling.HAS_SETTLED] == 0.0:
             self.keep(0)
-            if settling.remaining[0] <= settling.allowed:
+            if found[settling.DISTANCE] <= found[settling.ALLOWED]:
                 tol, finest = self.pace.tol, FINEST * float(self.stated_gaps()[:, 0].max(initial=0.0))
                 share = min(1.0, max(FINER, finest / tol))
-                settling.refine(share)
+                found[settling.ALLOWED], found[settling.FINE] = share * found[settling.ALLOWED], 1.0
                 self.pace = self.pace._replace(tol=share * tol)
         elif not len(self.kept.times):
             self.keep(KEPT_STEPS)
@@ -167,7 +167,7 @@ class Stepping(Integration):
             if self.keeps_all:
                 self._repeat()
             self.keep(0)
-            settling.stop_looking()
+            found[settling.NEXT] = math.inf
 
     def keep(self, steps: int) -> None:
         """Keep the steps from now on, at most `steps` of them."""
@@ -185,8 +185,8 @@ class Stepping(Integration):
 
     def _repeat(self) -> None:
         """Repeat the kept period in place of all whole periods that follow."""
-        settling, n_s = self.settling, self.s_before.size
-        periods, period = settling.left, settling.period
+        found, n_s, period = self.looks.values, self.s_before.size, self.period
+        periods = int(found[settling.LEFT])
         charge, collected = self.before
         drift = self.y[-n_s:] - charge
         drifts = np.zeros(len(self.out))
@@ -202,7 +202,7 @@ class Stepping(Integration):
         # The end of a period may be the end of the run but for the rounding of both.
         reached, stop = self.t + periods * period, self.problem.t_stop
         self.control[readout.T] = stop if abs(stop - reached) <= same_time(stop) else reached
-        self._pass(periods, *settling.remaining, collected)
+        self._pass(periods, float(found[settling.DISTANCE]), float(found[settling.REMAINING]), collected)
         self.repeated += periods
 
     def charge_error(self, spread: float) -> float:

@@ -31,7 +31,7 @@ from fingerspice.results.steps import Recorded
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run, kept_with
 from fingerspice.solve.scenes import Scene
-from fingerspice.solve.settling import Settling
+from fingerspice.solve.settling import looks_of
 from fingerspice.solve.sources import segment_index
 from fingerspice.solve.stackstate import (
     StackState,
@@ -159,14 +159,7 @@ class Track(Stepping):
         self.control[readout.MARGIN] = 1.0
         if model_of(scene).mobile and problem.initial.sign[0] != 0.0:
             self.control[readout.U_GAP], self.control[readout.SIGN] = start.u_gap, math.copysign(1.0, start.u_gap)
-        self.settling = Settling(problem, prepared.system.rates, tol, np.ones(n))
-        if h_fixed > 0.0 or not repeat:
-            self.settling.stop_looking()
-
-    @property
-    def shown(self) -> int:
-        """Number of voltages among the columns of the outputs."""
-        return int(self.problem.scene.shown.turn.size)
+        self.looks = looks_of(problem, prepared.system.rates, tol, np.ones(n), repeat and h_fixed == 0.0)
 
     @property
     def capacitance(self) -> float:
@@ -195,7 +188,7 @@ class Track(Stepping):
         return float(self.control[readout.COLLECTED]), float(self.control[readout.SPREAD])
 
     def _pass(self, periods: int, off: float, owed: float, collected: tuple[float, float]) -> None:
-        self.control[readout.BRANCH_START] += periods * self.settling.period
+        self.control[readout.BRANCH_START] += periods * self.period
         self.control[readout.ERROR_U] += off
         self.control[readout.ERROR_V] += off
         if self.control[readout.PEAK_U] > 0.0:
