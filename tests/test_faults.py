@@ -169,7 +169,9 @@ def test_while_a_file_is_written_too(
 def test_ctrl_c_is_heard_in_the_middle_of_a_long_run(tmp_path: Path) -> None:
     deck = (Path(__file__).parents[1] / "circuits" / "two_fingers.cir").read_text()
     (tmp_path / "long.cir").write_text(deck)
-    code = "import fingerspice as fs; fs.simulate(fs.read_netlist('long.cir'), t_stop=100.0, method='exponential')"
+    # Every period is stepped.
+    how = "t_stop=100.0, t_eval=[1.0], method='exponential'"
+    code = f"import fingerspice as fs; fs.simulate(fs.read_netlist('long.cir'), {how})"
     entry = [sys.executable, "-c", f"import fingerspice.__main__ as m, sys\nsys.argv[1:] = []\n{SOLVING.format(code)}"]
     process = start(tmp_path, entry=entry)
     minded(process)
