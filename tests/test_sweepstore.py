@@ -250,6 +250,11 @@ def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(
     assert tree(path) == whole
 
 
+def test_a_shard_without_chunks_does_nothing(circuit: fs.Circuit, tmp_path: Path) -> None:
+    found = fs.sweep(circuit, {"Xgap.d": [3e-6, 4e-6]}, store=tmp_path / "s.zarr", shard=(3, 3), **HOW)
+    assert (found.attrs["chunks"], found.attrs["chunks_found"], found.attrs["chunks_missing"]) == (0, 0, 1)
+
+
 def test_shards_by_separate_processes_make_the_whole(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, script: list[str]
 ) -> None:

@@ -62,7 +62,9 @@ def write_csv(path: str | Path, header: Iterable[str], rows: Iterable[Iterable[o
 
     def write(target: Path) -> None:
         with target.open("w", newline="", encoding="utf-8") as stream:
-            csv.writer(stream, lineterminator="\n").writerows([header, *rows])
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(header)
+            writer.writerows(rows)
 
     return write_aside(Path(path), write)
 

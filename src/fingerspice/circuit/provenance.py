@@ -34,12 +34,11 @@ def in_force(circuit: Circuit) -> dict[str, tuple[dict[str, Any], tuple[str, ...
 
 
 def digests(circuit: Circuit) -> tuple[str, str]:
-    """SHA-256 of a circuit's elements, initial voltages, law and step control, and of its sources' waveforms."""
+    """SHA-256 of a circuit's elements, initial voltages and step control, and of its sources' waveforms."""
     elements, sources, tran = hashlib.sha256(), hashlib.sha256(), circuit.tran
     for element in circuit.elements:
         wave = element.waveform
         elements.update(repr((element.name, element.device, element.nodes, dict(element.values))).encode())
         sources.update(repr((element.name, wave.digest() if isinstance(wave, Samples) else wave)).encode())
-    more = circuit.charge_law, dict(circuit.initial), tran and (tran.max_step, tran.uic)
-    elements.update(repr(more).encode())
+    elements.update(repr((dict(circuit.initial), tran and (tran.max_step, tran.uic))).encode())
     return elements.hexdigest(), sources.hexdigest()

@@ -15,7 +15,7 @@ from fingerspice.engine.repeat import SAME_TIME
 
 # The coupling may make the slowest mode slower than with the area frozen; this fraction of its rate is a safe bound.
 RATE_SHARE = 0.5
-# Most looks with finer steps until the charge counts as settled with the voltages: what is then left of it is stated.
+# Looks with finer steps after which the charge counts as settled with the voltages: what is left of it is stated.
 _FINE_LOOKS = 3
 # Entries of `Looks.values`. Times (s): next look; first comparison of the stated error with the one asked for; start,
 # period and end of the run under the periodic source.
@@ -80,7 +80,7 @@ def look(looks: Looks, s: LoopState) -> bool:
     moved *= s.control[MAGNIFIED]
     v[DISTANCE] = v[REMAINING] = math.inf
     # Periods in which the slowest mode of the frozen circuit decays to 1/e.
-    memory = RATE_SHARE / (v[RATE] * v[PERIOD]) if v[RATE] > 0.0 else 1.0
+    memory = RATE_SHARE / (v[RATE] * v[PERIOD])
     wait = 1.0
     if v[LOOKED] >= 0.0:
         passed = v[COUNT] - v[LOOKED]

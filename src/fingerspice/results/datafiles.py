@@ -36,7 +36,7 @@ def write_csv(solution: Solution, path: Path) -> Path:
     signals = solution.signals
     header = ["t [s]", *(f"{name} [{unit}]" for name, (_, unit, _) in signals.items())]
     table = np.column_stack([solution.t, *(value for value, _, _ in signals.values())])
-    return files.write_csv(path, header, table.tolist())
+    return files.write_csv(path, header, (row.tolist() for row in table))
 
 
 def _kept(solution: Solution, jumps: str) -> BoolArray:

@@ -154,12 +154,11 @@ class Stepping(Integration):
         """Once the periodic state is reached, keep the next period and then repeat it to the end."""
         found = self.looks.values
         if found[settling.HAS_SETTLED] == 0.0:
-            self.keep(0)
-            if found[settling.DISTANCE] <= found[settling.ALLOWED]:
-                tol, finest = self.pace.tol, FINEST * float(self.stated_gaps()[:, 0].max(initial=0.0))
-                share = min(1.0, max(FINER, finest / tol))
-                found[settling.ALLOWED], found[settling.FINE] = share * found[settling.ALLOWED], 1.0
-                self.pace = self.pace._replace(tol=share * tol)
+            # The voltages have, and the charge has not.
+            tol, finest = self.pace.tol, FINEST * float(self.stated_gaps()[:, 0].max(initial=0.0))
+            share = min(1.0, max(FINER, finest / tol))
+            found[settling.ALLOWED], found[settling.FINE] = share * found[settling.ALLOWED], 1.0
+            self.pace = self.pace._replace(tol=share * tol)
         elif not len(self.kept.times):
             self.keep(KEPT_STEPS)
         else:

@@ -148,11 +148,11 @@ def run_chunks(work: Work, shard: tuple[int, int], workers: int | None, client: 
     elif missing:
         answers = _here(work, missing)
     failures: list[str] = []
-    scenes, found = 0, len(mine) - len(missing)
-    with paced("sweeping", found / len(mine)) as show:
+    scenes, found, whole = 0, len(mine) - len(missing), max(len(mine), 1)
+    with paced("sweeping", found / whole) as show:
         for number, done in enumerate(answers, found + 1):
             failures, scenes = failures + done.failures, scenes + done.count
-            show(number / len(mine), lambda s, count=scenes: f"{count / s:,.3g} scenes/s,")
+            show(number / whole, lambda s, count=scenes: f"{count / s:,.3g} scenes/s,")
     lacking = store.chunks - store.marked()
     if not lacking:
         store.tidy()

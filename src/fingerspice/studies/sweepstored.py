@@ -136,8 +136,8 @@ def _identity(work: Work, options: Mapping[str, Any]) -> dict[str, Any]:
         # Nine digits are the same on every machine.
         values[name] = [f"{x:.9g}" for x in law.ppf(_PROBES)]
     return {
-        "programs": work.programs, "circuit": digests(circuit), "times": repr(circuit.tran),
-        "list of parameters": list(values),
+        "programs": work.programs, "circuit": digests(circuit), "law of the deck": circuit.charge_law,
+        "times": repr(circuit.tran), "list of parameters": list(values),
         **{f"range of {name}": value for name, value in values.items()},
         **({"n": plan.n, "seed": plan.seed} if plan.drawn else {}),
         **_effective(options), "block": work.store.block,
