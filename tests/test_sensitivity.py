@@ -19,6 +19,7 @@ CIRCUITS = Path(__file__).parents[1] / "circuits"
 STEP = 2e-4
 T_STOP = 0.03
 WEIGHTS = {-2: 1.0, -1: -8.0, 1: 8.0, 2: -1.0}
+FINER = {-3: -1.0, -2: 9.0, -1: -45.0, 1: 45.0, 2: -9.0, 3: 1.0}
 # Paths of Table 1's circuit by the paper's name of the value.
 PAPER = {
     "Xgap.d": "d_a_um", "Xgap.eps_r": "eps_r_a", "Xgap.r": "R_a_ohm", "Xgap.fn": "F_N_N", "Xgap.mu": "mu0",
@@ -89,7 +90,7 @@ def test_every_parameter_of_a_sine(law: str) -> None:
 @pytest.mark.parametrize("law", ["local", "mobile"])
 def test_a_square_whose_jumps_have_two_values(table_1: fs.Circuit, law: str) -> None:
     source = {"amplitude": 200.0, "frequency": 100.0}
-    check_by_hand(("Xgap.d", "Xgap.r", "Xskin.d", "Vdrive.amplitude"), source, law, 0.02, 2e-9)
+    check_by_hand(("Xgap.d", "Xgap.r", "Xskin.d", "Vdrive.amplitude"), source, law, 0.02, 1e-9)
     circuit = table_1.replace({"Vdrive": fs.Square(200, 100)})
     run = fs.simulate(circuit, t_stop=T_STOP, rtol=1e-8, sensitivities=("Vdrive.amplitude",), charge_law=law)
     jump = int(np.flatnonzero(np.diff(run.t) == 0.0)[0])
@@ -113,15 +114,17 @@ def test_networks_have_them(law: str, tau: float) -> None:
     own, h = {"Ramp.value": 47e3, "Cbody.value": 150e-12, "Vdrive.amplitude": 60.0}, 3e-3
     for path in paths:
         value, around = own[path], {}
-        for k in WEIGHTS:
+        for k in FINER:
             now = own | {path: value * (1.0 + k * h)}
             reference = Floating(5000.0, now["Ramp.value"], now["Cbody.value"], law == "mobile", tau)
             tone = Tone(120.0, now["Vdrive.amplitude"], 5000.0)
             around[k] = reference.response(tone, list(t), rtol=1e-13)
         for name in ("u_gap", "area"):
-            expected = sum(weight * around[k][name] for k, weight in WEIGHTS.items()) / (12.0 * h)
+            expected = sum(weight * around[k][name] for k, weight in FINER.items()) / (60.0 * h)
             found = getattr(run.sensitivities[path], name) * value
-            assert np.abs(found - expected).max() <= 2e-9 * np.abs(getattr(run, name)).max(), (path, name)
+            # With a delay the reference itself knows the area no better: it moves by so much with its tolerance.
+            tol = 2e-9 if tau > 0.0 and name == "area" else 1e-9
+            assert np.abs(found - expected).max() <= tol * np.abs(getattr(run, name)).max(), (path, name)
 
 
 def difference(circuit: fs.Circuit, path: str, step: float = STEP, **how: Any) -> dict[str, np.ndarray | float]:
