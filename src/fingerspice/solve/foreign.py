@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.engine import collocation
-from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_signs, gap_voltage, rates
+from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_signs, rates
 from fingerspice.engine.radau import NFEV
 from fingerspice.results.outcome import Status
 from fingerspice.results.record import Record
@@ -36,83 +36,56 @@ REFERENCE, FIRST, ATTEMPTS = 0.03, 0.1, 6
 
 
 class _FailedError(Exception):
-    """A library's integrator gave up at time `t` (s, from the start of the piece)."""
-
-    def __init__(self, t: float, text: str) -> None:
-        self.t = t
-        self.text = text
-        super().__init__(text)
+    """A library's integrator gave up."""
 
 
 @jit
 def _rate(
-    net: Net, room: Room, sources: Sources, index: IntArray, base: float, t: float, y: FloatArray, sign: FloatArray,
-    chooses: bool,
+    net: Net, room: Room, sources: Sources, index: IntArray, base: float, t: float, y: FloatArray, sign: FloatArray
 ) -> FloatArray:  # fmt: skip
-    """y' at t (s) after `base`, NaN past a fold; with `chooses`, the branches of the areas follow from the voltages."""
+    """y' at t (s) after `base`, NaN past a fold; the branches of the areas follow from the voltages."""
     at_sources(sources, index, base, t, room.s, room.ds)
-    if chooses:
-        choose_signs(net, room, False, y, sign)
+    choose_signs(net, room, False, y, sign)
     out = np.empty(y.size)
     if not rates(net, room, False, y, sign, out):
         out[:] = np.nan
     return out
 
 
-@jit
-def _gap(
-    net: Net, room: Room, sources: Sources, index: IntArray, base: float, t: float, y: FloatArray, area: int
-) -> float:  # fmt: skip
-    """Gap voltage (V) on which an area depends, at t (s) after `base`."""
-    at_sources(sources, index, base, t, room.s, room.ds)
-    return gap_voltage(net, room, area, y)
-
-
 @dataclass
 class _Piece:
-    """A smooth part of a run for a library to integrate: `length` seconds from state `y`, with outputs at `times`.
-
-    `rate` is y'(t, y). `gaps` are the gap voltages times the signs of their branches; the piece ends where one becomes
-    0 V, because the area has a kink there.
-    """
+    """A smooth part of a run: y'(t, y) = rate from the state `y`, at `times` (s, ascending) from 0 to its end."""
 
     rate: Callable[[float, FloatArray], FloatArray]
-    gaps: Sequence[Callable[[float, FloatArray], float]]
-    length: float
-    y: FloatArray
     times: FloatArray
+    y: FloatArray
     tol: float
     scale: FloatArray
     tau: float
 
 
-# Result of a library: time reached (s) and state there, states at the output times reached, number of evaluations.
-_Result = tuple[float, FloatArray, FloatArray, int]
+# Result of a library: states at the times, and the number of evaluations.
+_Result = tuple[FloatArray, int]
 
 
 def _scipy_piece(piece: _Piece, name: str) -> _Result:
     from scipy.integrate import solve_ivp
 
-    for gap in piece.gaps:
-        gap.terminal, gap.direction = True, -1.0  # type: ignore[attr-defined]
     # Warning filters belong to the whole process: change them in one thread at a time, for scipy's warnings only.
     with _QUIET, warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"scipy\.")
         try:
             result = solve_ivp(
-                piece.rate, (0.0, piece.length), piece.y, method=name, dense_output=True, events=piece.gaps or None,
+                piece.rate, (0.0, piece.times[-1]), piece.y, method=name, t_eval=piece.times,
                 rtol=max(piece.tol, 3e-14), atol=piece.tol * piece.scale,
             )  # fmt: skip
         except ValueError as error:
             # Past a fold y' is NaN, and scipy's implicit methods refuse to factor a matrix with NaN.
-            raise _FailedError(0.0, f"scipy: {error}") from None
-    end = result.y[:, -1]
+            raise _FailedError(f"scipy: {error}") from None
     # LSODA reports success even if the state is NaN.
-    if result.status < 0 or not np.all(np.isfinite(end)):
-        raise _FailedError(float(result.t[-1]), str(result.message))
-    t_end = float(result.t[-1]) if result.status == 1 else piece.length
-    times = piece.times[piece.times <= t_end]
-    return t_end, end, result.sol(times).T if times.size else np.empty((0, end.size)), int(result.nfev)
+    if result.status < 0 or not np.all(np.isfinite(result.y[:, -1])):
+        raise _FailedError(str(result.message))
+    return result.y.T, int(result.nfev)
 
 
 def _torch_piece(piece: _Piece, name: str) -> _Result:
@@ -126,28 +99,27 @@ def _torch_piece(piece: _Piece, name: str) -> _Result:
         # torchdiffeq takes one atol for all entries, so each entry is integrated in units of its scale.
         rate = piece.rate(float(t), y.numpy() * piece.scale) / piece.scale
         # Past a fold y' is NaN, which would make torchdiffeq's step length NaN; it rejects the step if y' is huge.
-        return torch.from_numpy(np.where(np.isfinite(rate), rate, 1e9 / piece.length))
+        return torch.from_numpy(np.where(np.isfinite(rate), rate, 1e9 / length))
 
-    times = np.unique(np.concatenate([[0.0], piece.times, [piece.length]]))
-    options = {}
+    length, options = float(piece.times[-1]), {}
     if name in _TORCH_FIXED:
         # A fixed step h from the tolerance, with the error model (h / tau)^order.
-        longest = min(piece.tau, piece.length / 4.0)
+        longest = min(piece.tau, length / 4.0)
         options = {"step_size": float(min(longest, 2.0 * longest * piece.tol ** (1.0 / _TORCH_FIXED[name])))}
     try:
         with torch.no_grad():
             y = odeint(
-                slope, torch.from_numpy(piece.y / piece.scale), torch.from_numpy(times), method=name,
+                slope, torch.from_numpy(piece.y / piece.scale), torch.from_numpy(piece.times), method=name,
                 rtol=max(piece.tol, 3e-14), atol=piece.tol, options=options,
             ).numpy() * piece.scale  # fmt: skip
     except AssertionError as error:
         text = str(error)
         if "underflow in dt" in text:
             text = "torchdiffeq's step underflowed: its methods are explicit, and this scene may be too stiff for them"
-        raise _FailedError(0.0, text) from None
+        raise _FailedError(text) from None
     if not np.all(np.isfinite(y[-1])):
-        raise _FailedError(0.0, "torchdiffeq returned NaN")
-    return piece.length, y[-1], y[np.searchsorted(times, piece.times)], counts[0]
+        raise _FailedError("torchdiffeq returned NaN")
+    return y, counts[0]
 
 
 class Foreign(Collocation):
@@ -158,7 +130,7 @@ class Foreign(Collocation):
         left: BoolArray,
     ) -> None:  # fmt: skip
         super().__init__(problem, radau_scheme(STAGES), tol, u_scale, t_out, left)
-        self.library, self.name, self.detail = library, name, ""
+        self.by, self.name, self.detail = _torch_piece if library == "torchdiffeq" else _scipy_piece, name, ""
         # Without a request for charge its scale is infinite, which libraries cannot take: 1 C is as good as infinite.
         self.scale = np.where(np.isfinite(self.scale), self.scale, 1.0)
         fastest = float(problem.scene.rates.max(initial=0.0))
@@ -166,61 +138,46 @@ class Foreign(Collocation):
 
     def through(self, sources: Sources, t_end: float) -> Status:
         edges = np.unique(sources.edges)
-        stuck = 0
         for stop in np.append(edges[(edges > self.t) & (edges < t_end)], t_end):
             after = values_at(sources, self.t)
             jumps = np.abs(after - self.s_before) > collocation.ROUNDING * np.maximum(abs(after), abs(self.s_before))
             if np.any(jumps) and not self.jump(after):
                 return self.stuck()
-            while self.t < stop:
-                before = self.t
-                try:
-                    self._piece(sources, float(stop))
-                except _FailedError as error:
-                    self.detail = error.text
-                    return Status.METHOD_FAILED
-                # Give up if every branch has changed sign without progress: on either side of 0 V the area's branch
-                # leads back to 0 V at once.
-                stuck = stuck + 1 if self.t == before else 0
-                if stuck > 2 * self.sign.size:
-                    return self.stuck()
+            try:
+                self._piece(sources, float(stop))
+            except _FailedError as error:
+                self.detail = str(error)
+                return Status.METHOD_FAILED
         return Status.SUCCESS
 
     def _piece(self, sources: Sources, stop: float) -> None:
-        """Integrate to the next zero of a gap voltage, at most to `stop` (s)."""
-        net, room, base, sign, n_s = self.net, self.room, self.t, self.sign, self.s_before.size
-        first = sources.first
+        """Integrate to `stop` (s)."""
+        net, room, base, n_s, first = self.net, self.room, self.t, self.s_before.size, sources.first
         index = np.array([
             np.searchsorted(sources.edges[first[i] : first[i + 1]], base, side="right") - 1 for i in range(n_s)
         ])  # fmt: skip
-        torch = self.library == "torchdiffeq"
 
         def rate(t: float, y: FloatArray) -> FloatArray:
-            found: FloatArray = _rate(net, room, sources, index, base, t, np.ascontiguousarray(y), sign, torch)
+            found: FloatArray = _rate(net, room, sources, index, base, t, np.ascontiguousarray(y), self.sign)
             return found
 
-        _rate(net, room, sources, index, base, 0.0, self.y, sign, bool(np.any(sign == 0.0)))
-        follows = [int(i) for i in np.flatnonzero(net.gap >= 0)]
-        gaps = [lambda t, y, i=i, s=float(sign[i]): s * _gap(net, room, sources, index, base, t, y, i) for i in follows]
         done = int(self.counters[collocation.OUTPUT])
         inside = (self.t_out < stop) | ((self.t_out == stop) & self.left)
         times = self.t_out[done : int(np.count_nonzero(inside))] - base
-        piece = _Piece(rate, gaps, stop - base, self.y.copy(), times, self.tol, self.scale, self.tau)
-        t, y, states, used = (_torch_piece if torch else _scipy_piece)(piece, self.name)
-        for row, since, state in zip(self.rows[done:], times, states, strict=False):
+        every = np.unique(np.concatenate([[0.0], times, [stop - base]]))
+        states, used = self.by(_Piece(rate, every, self.y.copy(), self.tol, self.scale, self.tau), self.name)
+        for row, since, state in zip(self.rows[done:], times, states[np.searchsorted(every, times)], strict=False):
             row[: state.size] = state
             if self.problem.charge:
                 row[state.size :] = rate(float(since), state)[-n_s:]
-        self.counters[collocation.OUTPUT] += len(states)
+        self.counters[collocation.OUTPUT] += len(times)
         self.counters[NFEV] += used
         self.counters[collocation.ACCEPTED] += 1
-        at = [_gap(net, room, sources, index, base, t, y, i) for i in follows]
-        if t < piece.length:
-            met = follows[int(np.argmin([sign[i] * u for i, u in zip(follows, at, strict=True)]))]
-            sign[met] = -sign[met]
-        at_sources(sources, index, base, t, self.s_before, room.ds)
-        self.y[:] = y
-        self.control[collocation.BASE] = stop if t == piece.length else base + t
+        self.y[:] = states[-1]
+        # The last call leaves the branches as they are at the end.
+        rate(stop - base, self.y)
+        self.s_before[:] = room.s
+        self.control[collocation.BASE] = stop
 
 
 def solve_foreign(
