@@ -1,7 +1,7 @@
 """Sensitivities of a run by parameters: fourth-order differences of runs with a much smaller error than its own.
 
-At an `rtol` of 1e-10 the gap voltages of networks are differentiated to 1e-9 of their peaks, for a change of a parameter
-by all of itself, and all signals to 2e-9 (tests/test_sensitivity.py).
+At an `rtol` of 1e-10 the gap voltages of networks are differentiated to 1e-9 of their peaks, for a change of a
+parameter by all of itself, and all signals to 2e-9 (tests/test_sensitivity.py).
 """
 
 from __future__ import annotations
