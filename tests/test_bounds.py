@@ -11,8 +11,8 @@ import pytest
 
 import fingerspice as fs
 from deck_edits import edited
-from fingerspice.engine import repeat
-from fingerspice.solve.times import MOST_BYTES
+from fingerspice.engine import loopstate
+from fingerspice.solve.problem import MOST_BYTES
 from fingerspice.waveforms import bounds
 from processes import ended, start
 from scenes import table1
@@ -137,9 +137,9 @@ def test_no_result_depends_on_where_a_walk_over_periods_is_cut(
     calls: list[int] = []
     whole = fs.simulate(circuit, t_eval=t, t_stop=3.0, rtol=1e-6)
     assert whole.stats["repeated"] > 1000
-    cut = repeat._calls
-    monkeypatch.setattr(repeat, "AT_ONCE", 100)
-    monkeypatch.setattr(repeat, "_calls", lambda *a: calls.append(1) or cut(*a))
+    cut = loopstate._calls
+    monkeypatch.setattr(loopstate, "AT_ONCE", 100)
+    monkeypatch.setattr(loopstate, "_calls", lambda *a: calls.append(1) or cut(*a))
     again = fs.simulate(circuit, t_eval=t, t_stop=3.0, rtol=1e-6)
     assert calls
     for name, (values, _, _) in whole.signals.items():

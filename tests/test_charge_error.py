@@ -11,7 +11,7 @@ import pytest
 from numpy.polynomial import Polynomial
 from scipy.optimize import brentq
 
-from fingerspice.engine import charge, netcharge, netform, readout, work
+from fingerspice.engine import charge, netcharge, netform, readout, rows
 from fingerspice.engine.model import Model
 from fingerspice.engine.netform import Form
 from fingerspice.engine.readout import N_PLACES
@@ -140,9 +140,9 @@ def engine_account(
     u, _, area = step.at(POINTS, 0.0)
     w = np.array([m(POINTS) for m in step.modes])
     places = np.array([e(POINTS[PLACES]) for e in step.errors])
-    r = np.zeros((work.N_FLAT, ROWS))
-    r[work.SOURCE], r[work.U], r[work.Q] = step.source(POINTS), u, 1.0 / area
-    r[work.DQ], r[work.X_GAP] = -slope_at(u) / area**2, step.gap @ w
+    r = np.zeros((rows.N_FLAT, ROWS))
+    r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
+    r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
     control = np.zeros(readout.N_CONTROL)
     control[readout.COLLECTED] = collected
     control[readout.LAST_Q] = 0.0 if last_area is None else 1.0 / last_area
@@ -203,9 +203,9 @@ def test_what_a_stack_s_polynomials_miss_between_nodes_does_not_leak(law: str) -
     w[:, FIRST:] += missed
     places = np.zeros((2, N_PLACES))
     places[:, 1 : N_PLACES - 1] = missed
-    r = np.zeros((work.N_FLAT, ROWS))
-    r[work.SOURCE], r[work.U], r[work.Q] = step.source(POINTS), u, 1.0 / area
-    r[work.DQ], r[work.X_GAP] = -slope_at(u) / area**2, step.gap @ w
+    r = np.zeros((rows.N_FLAT, ROWS))
+    r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
+    r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
     control = np.zeros(readout.N_CONTROL)
     charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, 0.0, control)
     leaked = size * H * 3e-7 * np.abs(step.slow).sum()
@@ -307,7 +307,7 @@ def engine_charge(
     control, collected = np.zeros(readout.N_CONTROL), np.array([[before], [0.0]])
     form = form_of(step)
     work = netform.new_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
-    work.places[:], work.off[:, : len(places)] = places, missed
+    rows.places[:], rows.off[:, : len(places)] = places, missed
     netcharge.charge_error(
         form, work, H, step.lost[None, :], step.g, theta, np.ascontiguousarray(u), areas, z, collected, control
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.engine import netassess, nodes, work
+from fingerspice.engine import netassess, rows, stackend
 from fingerspice.engine.readout import N_PLACES
 from fingerspice.numerics.lobatto import END, FIRST, MISS, POINTS, ROWS
 
@@ -63,15 +63,15 @@ def test_a_stack_s_nodes_are_off_by_what_modes_area_and_source_are(mobile: bool)
 
     source = 100.0 + 10.0 * POINTS
     u, q, _ = voltages(source, w)
-    r = np.zeros((work.N_FLAT, ROWS))
-    r[work.SOURCE], r[work.U], r[work.Q], r[work.DQ], r[work.X_GAP] = source, u, q, slope, gap @ w
+    r = np.zeros((rows.N_FLAT, ROWS))
+    r[rows.SOURCE], r[rows.U], r[rows.Q], r[rows.DQ], r[rows.X_GAP] = source, u, q, slope, gap @ w
     at = np.array(PLACES)
     want = (voltages(source[at], w[:, at] + places)[2] - voltages(source[at], w[:, at] - places)[2]) / 2.0
-    found = nodes.node_error(mobile, area0, node, k_node, gap, w, r, places)
+    found = stackend.node_error(mobile, area0, node, k_node, gap, w, r, places)
     assert found == pytest.approx(np.abs(want).max(), rel=1e-5, abs=0.0)
     # What a polynomial through the source's values misses is an error of the nodes too.
-    r[work.SOURCE, FIRST:] += MISS
-    alone = nodes.node_error(False, area0, node, k_node, gap, w, r, 0.0 * places)
+    r[rows.SOURCE, FIRST:] += MISS
+    alone = stackend.node_error(False, area0, node, k_node, gap, w, r, 0.0 * places)
     assert alone == pytest.approx(np.abs(k_node).max() * np.abs(MISS).max(), rel=1e-9, abs=0.0)
 
 

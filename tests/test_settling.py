@@ -9,7 +9,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.solve import settling
+from fingerspice.solve import stepping
 from scenes import table1, table1_deck
 
 # A square's edges reach beyond the band of the dispersive skin's data.
@@ -187,7 +187,7 @@ def test_what_a_repeated_period_is_off_is_in_every_stated_error(
 ) -> None:
     # Taken for settled while it still moves hundreds of times more than a step may be off, and the coating's charge
     # takes its time: what is left to move is then all the error there is.
-    monkeypatch.setattr(settling, "_SHARE", 1e2)
+    monkeypatch.setattr(stepping, "_SHARE", 1e2)
     f, stop = 1000.0, 0.06
     circuit = fs.parse_netlist(table1_deck(f"SIN(60 120 {f!r})", coat={"r": "10meg"}, extra=beside))
     t = np.linspace(0.0, stop, 4001)[:-1]

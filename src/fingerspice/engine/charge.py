@@ -11,8 +11,8 @@ from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.exponential import between
 from fingerspice.engine.model import Model
 from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, N_PLACES, PEAK_Q, SPREAD, row_of
+from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.engine.system import System
-from fingerspice.engine.work import DQ, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POINTS
 
 # The interpolation error of a rate changes its sign at every node, so that its integral is at most this fraction of its

@@ -9,9 +9,8 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.rows import evaluate, moved
+from fingerspice.engine.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, Work, evaluate, moved
 from fingerspice.engine.system import System
-from fingerspice.engine.work import DQ, GUESS, SOURCE, X_GAP, Q, U, Work
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 
 # Step lengths whose tables are kept; fewer where there are many modes, each of which takes 2 kB for a step length.

@@ -15,8 +15,8 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine.model import Model, branch_area
+from fingerspice.engine.rows import DQ, SOURCE, X_GAP, Q, U, Work
 from fingerspice.engine.system import System
-from fingerspice.engine.work import DQ, SOURCE, X_GAP, Q, U, Work
 from fingerspice.numerics.lobatto import END, NODES, POINTS
 
 # Loop gain of the feedback through the area over a step: up to the first value the feedback is neglected, and up to the

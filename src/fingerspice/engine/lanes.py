@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.compiled import jit
-from fingerspice.engine.lanerows import SOURCES, Marks, places
+from fingerspice.base.compiled import jit, jit_within_rows
+from fingerspice.engine.lanerows import INNER_WEIGHT, NODES, OUTER_WEIGHT, SOURCES, Marks, places, polynomial_rows
 from fingerspice.engine.lanestep import step
 from fingerspice.engine.laneweights import weigh
+from fingerspice.numerics.small import copy_to
 
 # Samples that are read and written at once.
 TILE = 16
@@ -138,3 +139,120 @@ def within(
         for i in range(min(lanes, h.size - first)):
             for k in range(out.shape[0]):
                 out[k, first + i] = state[(SOURCES + k) * lanes + i]
+
+
+# Rows of the derivatives behind those of the modes: gap voltage at the end, and the integrals of u^2 A and A.
+GAP, SQUARES, AREAS, MORE = range(4)
+
+
+@jit_within_rows
+def _gap_and_area(marks: Any, c: Any, node: int, state: FloatArray, u: FloatArray, q: FloatArray) -> None:
+    """Gap voltage and 1/A - q0 at a node, of every lane."""
+    lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
+    drives = leaks + len(marks.bend)
+    for i in range(lanes):
+        u[i] = abs(state[(at.xi + node) * lanes + i]) * c.scale + c.shift
+    polynomial_rows(lanes, c.area, u, q)
+    for i in range(lanes):
+        u[i] = state[(at.xi + node) * lanes + i]
+        if len(marks.bend) > len(marks.mobile):
+            u[i] -= c.kappa * state[(at.g + node * drives + leaks) * lanes + i]
+
+
+@jit
+def slopes_of(
+    marks: Any, c: Any, still: FloatArray, z: FloatArray, x: FloatArray, to: FloatArray, h: FloatArray, parts: int,
+    delta: FloatArray, room: tuple[FloatArray, FloatArray], out: FloatArray,
+) -> None:  # fmt: skip
+    """Central differences of what intervals lead to, each in `parts` steps.
+
+    Parameters
+    ----------
+    still : ndarray
+        As in `begin`.
+    z, x, to : ndarray, shape (m, n), (n,) and (n,)
+        Modes at the start of each interval, and the source at its start and end, V.
+    h : ndarray, shape (n,) or (1,)
+        Lengths of the intervals, or of all of them, s.
+    delta : ndarray, shape (m + 1,)
+        Distances to either side, of each mode and of the source.
+    room : tuple of ndarray
+        State and weights of the lanes, the latter of one step where all intervals share them.
+    out : ndarray, shape (m + MORE, m + 2, n)
+        Takes the derivatives of the modes at the end and of the rows named above, by the modes at the start and the
+        source at start and end.
+    """
+    lanes, m = len(marks.lanes), len(marks.modes)
+    state, weights = room
+    n, flat = x.size, weights.reshape(-1)
+    modes, before, after, length = np.empty((m, lanes)), np.empty(lanes), np.empty(lanes), np.empty(lanes)
+    found, u, q = np.empty((m + MORE, lanes)), np.empty(lanes), np.empty(lanes)
+    for first in range(0, n, lanes):
+        for i in range(lanes):
+            length[i] = h[min(first + i, n - 1) if len(marks.own) > 0 else 0] / parts
+        if len(marks.own) > 0:
+            weigh(c, len(marks.active), length, weights)
+        for p in range(m + 2):
+            for sign in (1.0, -1.0):
+                move = sign * delta[min(p, m)]
+                for i in range(lanes):
+                    j = min(first + i, n - 1)
+                    before[i], after[i] = x[j] + (move if p == m else 0.0), to[j] + (move if p == m + 1 else 0.0)
+                    for k in range(m):
+                        modes[k, i] = z[k, j] + (move if p == k else 0.0)
+                begin(marks, c, still, modes, before, state)
+                found[:] = 0.0
+                for part in range(parts):
+                    for node in range(NODES):
+                        if node == 1:
+                            step(marks, c, flat, state, after, part / parts, (part + 1) / parts)
+                        # After a step its end is node 0 of the next one.
+                        _gap_and_area(marks, c, node % (NODES - 1), state, u, q)
+                        by = OUTER_WEIGHT if node % (NODES - 1) == 0 else INNER_WEIGHT
+                        for i in range(lanes):
+                            area = by * length[i] / (c.q0 + q[i])
+                            found[m + SQUARES, i] += u[i] * u[i] * area
+                            found[m + AREAS, i] += area
+                for i in range(lanes):
+                    found[m + GAP, i] = u[i]
+                    for k in range(m):
+                        found[k, i] = state[(SOURCES + k) * lanes + i]
+                share = 0.5 / move
+                for i in range(min(lanes, n - first)):
+                    for row in range(m + MORE):
+                        before_it = 0.0 if sign > 0.0 else out[row, p, first + i]
+                        out[row, p, first + i] = before_it + share * found[row, i]
+
+
+@jit
+def sum_back(
+    slopes: FloatArray, of_integrals: FloatArray, of_modes: FloatArray, of_source: FloatArray, after: FloatArray
+) -> None:
+    """Derivatives of a number by the source at all nodes, and by the modes at the first one.
+
+    Parameters
+    ----------
+    slopes : ndarray, shape (m + MORE, m + 2, n)
+        See `slopes_of`.
+    of_integrals : ndarray, shape (MORE, n)
+        Derivatives of the number by the rows behind the modes.
+    of_modes : ndarray, shape (m, n)
+        Its own derivatives by the modes at the nodes.
+    of_source : ndarray, shape (n + 1,)
+        Those by the source there, to which all that follows is added.
+    after : ndarray, shape (m,)
+        Derivatives by the modes at the last node; then by those at the first one.
+    """
+    m, now = after.size, np.empty(after.size)
+    for k in range(slopes.shape[2] - 1, -1, -1):
+        for p in range(m + 2):
+            total = 0.0
+            for row in range(m):
+                total += slopes[row, p, k] * after[row]
+            for row in range(MORE):
+                total += slopes[m + row, p, k] * of_integrals[row, k]
+            if p < m:
+                now[p] = total + of_modes[p, k]
+            else:
+                of_source[k + p - m] += total
+        copy_to(after, now)

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.card import card_compiler, for_card
 from fingerspice.engine.lockmarch import How, Source, march_block, stepping_shapes
-from fingerspice.engine.lockmodes import scratch_shapes
-from fingerspice.engine.lockscenes import Places, block_shapes
+from fingerspice.engine.lockscenes import Places, block_shapes, scratch_shapes
 from fingerspice.engine.lockstep import Marks, marks_of
 
 Lengths = tuple[int, int, int, int, int]

@@ -46,6 +46,7 @@ from fingerspice.engine.netassess import (
     account,
     account_nodes,
     assess,
+    carry,
     charged,
     first_zero,
     store,
@@ -53,7 +54,6 @@ from fingerspice.engine.netassess import (
     write_columns,
 )
 from fingerspice.engine.netcharge import charge_error
-from fingerspice.engine.netgrowth import carry
 from fingerspice.engine.netrows import clear, combine, follow_sources
 from fingerspice.engine.netstep import ramp_rows, solve_step, source_rows, step_charges
 from fingerspice.engine.network import at_sources

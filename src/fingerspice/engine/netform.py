@@ -20,7 +20,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.coupling import Coupling, new_coupling
 from fingerspice.engine.readout import N_CONTROL, N_PLACES, WRITTEN_AT_ONCE
-from fingerspice.engine.work import N_FLAT
+from fingerspice.engine.rows import N_FLAT
 from fingerspice.numerics.lobatto import NODES, ROWS
 
 # Blocks of the modes' rows.

@@ -7,7 +7,7 @@ import math
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine import netform, rows
-from fingerspice.engine import work as stack_work
+from fingerspice.engine import rows as stack_work
 from fingerspice.engine.currents import cell_currents
 from fingerspice.engine.exponential import Tables, distance, mix, plain, respond
 from fingerspice.engine.netassess import moved

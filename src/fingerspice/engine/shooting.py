@@ -7,7 +7,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.loop import march
-from fingerspice.engine.loopstate import DONE, N_PLACE, N_STEP, LoopState
+from fingerspice.engine.loopstate import DONE, N_PLACE, N_STEP, Kept, LoopState
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.readout import (
     BRANCH_LENGTH,
@@ -25,7 +25,6 @@ from fingerspice.engine.readout import (
     Steps,
     T,
 )  # fmt: skip
-from fingerspice.engine.repeat import Kept
 from fingerspice.engine.stackstep import Stack
 from fingerspice.engine.system import System
 from fingerspice.numerics.lobatto import NODES, ROWS

@@ -65,10 +65,9 @@ from fingerspice.engine.readout import (
     H,
     T,
 )
-from fingerspice.engine.rows import largest_size, source_rows
+from fingerspice.engine.rows import DQ, GUESS, X_GAP, U, Work, largest_size, source_rows
 from fingerspice.engine.segment import Segment, segment_at, source
 from fingerspice.engine.system import System
-from fingerspice.engine.work import DQ, GUESS, X_GAP, U, Work
 from fingerspice.engine.zeros import dip, first_wrong
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 

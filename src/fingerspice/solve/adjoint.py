@@ -1,7 +1,7 @@
 """Derivatives of a number that follows from a run by every sample of its source.
 
 The run is followed in lanes (`solve.laneblock`), by so many steps in each interval between samples. What an interval
-leads to is differentiated by what it starts from and by the source at its ends (`engine.laneslopes`); back from the end
+leads to is differentiated by what it starts from and by the source at its ends (`engine.lanes`); back from the end
 of the run, these derivatives are multiplied.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.engine.laneslopes import AREAS, GAP, MORE, SQUARES, slopes_of, sum_back
+from fingerspice.engine.lanes import AREAS, GAP, MORE, SQUARES, slopes_of, sum_back
 from fingerspice.numerics.differences import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status

@@ -7,8 +7,7 @@ import itertools
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.solve.problem import Problem
-from fingerspice.solve.times import check_length, check_outputs
+from fingerspice.solve.problem import Problem, check_length, check_outputs
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import misses, same_time
 from fingerspice.waveforms.waveform import DC, Waveform

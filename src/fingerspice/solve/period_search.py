@@ -18,12 +18,12 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.network import network_modes
 from fingerspice.engine import netassess, readout
 from fingerspice.results.outcome import SolveError, Status
-from fingerspice.solve.diagnosis import period_failure
 from fingerspice.solve.marching import GUESS
 from fingerspice.solve.netmarching import March
 from fingerspice.solve.nodal import pass_through
 from fingerspice.solve.period import CHARGING, Found, Period, Stopped
 from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import period_failure
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY
 
 # Tolerance of the early passes: relative to the last Newton step, and at most, relative to the voltage scale.

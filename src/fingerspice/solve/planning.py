@@ -15,8 +15,8 @@ from fingerspice.physics.contact import inverse_area_range
 from fingerspice.results.plan import Plan
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import kept_with
-from fingerspice.solve.settling import FEWEST_PERIODS
 from fingerspice.solve.sources import shortest_event
+from fingerspice.solve.stepping import FEWEST_PERIODS
 
 # Number of plans cached with a scene.
 MOST_PLANS = 16

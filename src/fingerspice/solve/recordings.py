@@ -15,13 +15,12 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.results.record import Record
-from fingerspice.solve.laneform import LaneForm
+from fingerspice.solve.laneform import LaneForm, rounded_peak, stack
 from fingerspice.solve.lanes import LaneMarch, Outcome
 from fingerspice.solve.netforms import finger
 from fingerspice.solve.pieces import Piece, pieces_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, closed_form, kept_with
-from fingerspice.solve.stackform import rounded_peak, stack
 
 # Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
 # and add up, a later piece cannot make up for errors of the earlier ones.

@@ -23,16 +23,14 @@ from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.cautions import run_warnings
 from fingerspice.solve.closed_form import solve_algebraic, solve_linear
-from fingerspice.solve.diagnosis import ROUGH, run_failure
 from fingerspice.solve.marching import solve as solve_exponential
 from fingerspice.solve.nodal import solve_coupled
 from fingerspice.solve.outputs import asked_for, at_breakpoints
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.planning import make_plan
-from fingerspice.solve.problem import Problem, prepare
-from fingerspice.solve.runs import Progress, Run
+from fingerspice.solve.problem import Problem, prepare, to_ends
+from fingerspice.solve.runs import ROUGH, Progress, Run, run_failure
 from fingerspice.solve.sensitivities import check_request, sensitivities_of
-from fingerspice.solve.times import to_ends
 from fingerspice.waveforms.waveform import DOUBLE, require
 
 RTOL_RANGE = (1e-13, 0.1)

@@ -10,8 +10,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.network import Sources, at_sources
-from fingerspice.solve.problem import Problem
-from fingerspice.solve.times import check_length
+from fingerspice.solve.problem import Problem, check_length
 from fingerspice.waveforms.refining import WIDEST
 from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, is_sampled, source_table
 from fingerspice.waveforms.waveform import Waveform

@@ -10,20 +10,64 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import loopstate, readout, settling
-from fingerspice.engine import repeat as repetition
+from fingerspice.engine import loop, loopstate, readout
+from fingerspice.engine.loop import Looks
 from fingerspice.engine.loopstate import LoopState
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.readout import Outputs
-from fingerspice.engine.settling import Looks
 from fingerspice.results.outcome import Status
 from fingerspice.results.record import bare_record
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
-from fingerspice.solve.settling import try_out
 from fingerspice.waveforms.sampling import same_time
+
+# Runs of fewer periods are integrated throughout, because nothing would be saved.
+FEWEST_PERIODS = 6.0
+# Number of the source's periods after which a run's error is first compared with its peaks, where ten times as many
+# are left.
+TRIAL_PERIODS = 2.0
+# Remaining change allowed over all later periods, as a fraction of the error allowed in a step.
+_SHARE = 1.0 / 3.0
+
+
+def looks_of(problem: Problem, rates: FloatArray, tol: float, scale: FloatArray, repeat: bool) -> Looks:
+    """The looks of a run, none where it is not to `repeat` a period.
+
+    Parameters
+    ----------
+    problem : Problem
+    rates : ndarray
+        Rates of the modes with the area frozen, 1/s.
+    tol : float
+        Error of the gap voltage allowed in a step, V.
+    scale : ndarray, shape (n,)
+        Converts the first n entries of the integration's state to volts.
+    repeat : bool
+    """
+    period, start = problem.waveform.period or math.inf, max(problem.t_start, problem.waveform.settled)
+    live, values = rates[rates > 0.0], np.zeros(loop.N_VALUES)
+    values[loop.START], values[loop.STOP], values[loop.PERIOD] = start, problem.t_stop, period
+    values[loop.ALLOWED], values[loop.HAS_CHARGE], values[loop.LOOKED] = _SHARE * tol, problem.charge, -1.0
+    # A mode with rate 0 keeps its charge for ever, so that it does not limit the time to the periodic state.
+    values[loop.RATE] = loop.RATE_SHARE * float(live.min()) if live.size else math.inf
+    values[loop.DISTANCE] = values[loop.REMAINING] = values[loop.TRIAL] = math.inf
+    values[loop.NEXT] = start if repeat and periods_of(values) >= FEWEST_PERIODS else math.inf
+    return Looks(values, np.zeros(scale.size), scale)
+
+
+def periods_of(values: FloatArray) -> float:
+    """Number of periods of a run, from the values of its looks."""
+    return float((values[loop.STOP] - values[loop.START]) / values[loop.PERIOD] * (1.0 + 1e-12))
+
+
+def try_out(values: FloatArray, acceptable: float) -> None:
+    """Compare the ratio of estimated error to peak with the `acceptable` one after a few periods."""
+    if periods_of(values) >= 1.0 + 10.0 * TRIAL_PERIODS:
+        values[loop.TRIAL] = values[loop.START] + TRIAL_PERIODS * values[loop.PERIOD]
+        values[loop.ACCEPTABLE] = acceptable
+
 
 # Ratio of stated to estimated error: the largest error of a step may lie beside the points at which it is estimated,
 # and contributions of opposite sign may cancel at these points.
@@ -153,11 +197,11 @@ class Stepping(Integration):
     def _settle(self) -> None:
         """Once the periodic state is reached, keep the next period and then repeat it to the end."""
         found = self.looks.values
-        if found[settling.HAS_SETTLED] == 0.0:
+        if found[loop.HAS_SETTLED] == 0.0:
             # The voltages have, and the charge has not.
             tol, finest = self.pace.tol, FINEST * float(self.stated_gaps()[:, 0].max(initial=0.0))
             share = min(1.0, max(FINER, finest / tol))
-            found[settling.ALLOWED], found[settling.FINE] = share * found[settling.ALLOWED], 1.0
+            found[loop.ALLOWED], found[loop.FINE] = share * found[loop.ALLOWED], 1.0
             self.pace = self.pace._replace(tol=share * tol)
         elif not len(self.kept.times):
             self.keep(KEPT_STEPS)
@@ -166,11 +210,11 @@ class Stepping(Integration):
             if self.keeps_all:
                 self._repeat()
             self.keep(0)
-            found[settling.NEXT] = math.inf
+            found[loop.NEXT] = math.inf
 
     def keep(self, steps: int) -> None:
         """Keep the steps from now on, at most `steps` of them."""
-        self.kept = repetition.new_kept(steps, len(self.out))
+        self.kept = loopstate.new_kept(steps, len(self.out))
         if steps:
             self.counters[readout.KEPT] = 0
             self.recorder.drain(self.counters)
@@ -185,13 +229,13 @@ class Stepping(Integration):
     def _repeat(self) -> None:
         """Repeat the kept period in place of all whole periods that follow."""
         found, n_s, period = self.looks.values, self.s_before.size, self.period
-        periods = int(found[settling.LEFT])
+        periods = int(found[loop.LEFT])
         charge, collected = self.before
         drift = self.y[-n_s:] - charge
         drifts = np.zeros(len(self.out))
         if self.problem.charge:
             drifts[-2 * n_s : -n_s] = drift
-        self.counters[readout.OUTPUT] = repetition.repeat(
+        self.counters[readout.OUTPUT] = loopstate.repeat(
             self.kept, int(self.counters[readout.KEPT]), period, periods, drifts, int(self.counters[readout.OUTPUT]),
             self.outputs,
         )  # fmt: skip
@@ -201,7 +245,7 @@ class Stepping(Integration):
         # The end of a period may be the end of the run but for the rounding of both.
         reached, stop = self.t + periods * period, self.problem.t_stop
         self.control[readout.T] = stop if abs(stop - reached) <= same_time(stop) else reached
-        self._pass(periods, float(found[settling.DISTANCE]), float(found[settling.REMAINING]), collected)
+        self._pass(periods, float(found[loop.DISTANCE]), float(found[loop.REMAINING]), collected)
         self.repeated += periods
 
     def charge_error(self, spread: float) -> float:

@@ -19,9 +19,8 @@ from fingerspice.results.outcome import SolveError, Status
 from fingerspice.results.plan import Plan
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
-from fingerspice.solve.problem import Problem
+from fingerspice.solve.problem import Problem, check_length, check_outputs
 from fingerspice.solve.simulation import asked, check_method, planned, rtol_given, solution_of
-from fingerspice.solve.times import check_length, check_outputs
 from fingerspice.solve.windows import BySamples, ByWindows, Mark, Outputs, outputs_of, within
 from fingerspice.waveforms.waveform import require
 
