@@ -79,7 +79,7 @@ LENT = {
     "results.doors.Doors.plot": "plots.traces",
     "results.doors.Doors.explore": "explorer.server",
     "results.doors.Doors.sample_gradient": "solve.adjoint",
-    "results.spectrum.Spectrum.plot": "plots.spectra",
+    "results.spectrum.Spectrum.plot": "plots.traces",
     "results.phasor_solution.PhasorSolution.plot": "plots.phasors",
 }
 THIRD_PARTY = {

@@ -10,8 +10,7 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 
-from fingerspice.base.borrowing import borrow
-from fingerspice.base.compiled import jit, jit_by_kind
+from fingerspice.base.compiled import borrow, jit, jit_by_kind
 
 
 class Inner(NamedTuple):

@@ -129,7 +129,7 @@ PRIVATE = """
 import sys
 import numpy as np
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.base.borrowing import borrow
+from fingerspice.base.compiled import borrow
 
 @jit_within
 def inner(x):

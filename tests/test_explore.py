@@ -32,10 +32,9 @@ from fingerspice.circuit.describe import MEANINGS
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.examples import EXAMPLES
 from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS
-from fingerspice.explorer.scene import scene
+from fingerspice.explorer.scene import as_deck, as_python, means, scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
-from fingerspice.explorer.sharing import as_deck, as_python, means
-from fingerspice.explorer.waveforms import WAVEFORMS
+from fingerspice.explorer.sliders import WAVEFORMS
 
 ROOT = Path(__file__).parents[1]
 SINE = EXAMPLES[0].deck

@@ -14,7 +14,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.explorer.examples import EXAMPLES
-from fingerspice.explorer.static import static_page
+from fingerspice.explorer.gallery import static_page
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")
 CHROMIUM = shutil.which("chromium")

@@ -20,9 +20,8 @@ from fingerspice.explorer.changed import applied, before, unsaid
 from fingerspice.explorer.encoding import framed
 from fingerspice.explorer.examples import EXAMPLES
 from fingerspice.explorer.request import asked_by
-from fingerspice.explorer.scene import scene
-from fingerspice.explorer.sharing import as_python
-from fingerspice.explorer.waveforms import read_source, text_of
+from fingerspice.explorer.scene import as_python, scene
+from fingerspice.explorer.sliders import read_source, text_of
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 DECKS = {example.name: example.deck for example in EXAMPLES}

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 import fingerspice as fs
 from fingerspice.base.errors import InputError, Where
+from fingerspice.netlist.arithmetic import FUNCTIONS
 from fingerspice.netlist.expressions import evaluate
-from fingerspice.netlist.functions import FUNCTIONS
 from ngspice_tools import call_ngspice
 
 HERE = Where("deck.cir", 3, 10)

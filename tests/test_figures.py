@@ -12,7 +12,7 @@ from PIL import Image
 import fingerspice as fs
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies import figures
-from fingerspice.studies.table1 import TABLE1_DECK, table1_circuit
+from fingerspice.studies.figures import TABLE1_DECK, table1_circuit
 from scenes import table1
 
 F = ("10Hz", "100Hz", "1000Hz", "10000Hz")

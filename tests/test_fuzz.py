@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 
 import fuzz
 from fingerspice.base.errors import InputError, Where
+from fingerspice.netlist.arithmetic import FUNCTIONS
 from fingerspice.netlist.expressions import evaluate
-from fingerspice.netlist.functions import FUNCTIONS
 from fingerspice.netlist.lexer import group, lex, logical_lines, split_lines
 
 HERE = Where("deck.cir", 1)

@@ -18,7 +18,7 @@ from fingerspice.circuit import topology
 from fingerspice.netlist import flatten, reader
 from fingerspice.netlist.deck import LONGEST_TITLE, Number, parse_deck
 from fingerspice.netlist.expressions import evaluate
-from fingerspice.netlist.spelling import nearest
+from fingerspice.netlist.slips import nearest
 
 MANY = 20_000
 

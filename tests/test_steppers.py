@@ -12,7 +12,7 @@ import fingerspice as fs
 from analytic import sine_segments, transient
 from fingerspice.engine.network import rates
 from fingerspice.engine.radau import dense_polynomial, dense_state, guess, linearise, step
-from fingerspice.numerics.radau_tableau import Tableau, radau
+from fingerspice.numerics.lobatto import Tableau, radau
 from fingerspice.solve.nodal import STAGES, STAGES_BESIDE, Collocation, radau_scheme
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.sources import Tables, joined, values_at

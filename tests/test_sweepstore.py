@@ -23,7 +23,7 @@ from scipy import stats
 
 import fingerspice as fs
 from commands import Command, tree
-from fingerspice.studies import sweepchunks, sweepstored
+from fingerspice.studies import sweepchunks, sweepstore
 from fingerspice.studies.sweepplan import make_plan
 from fingerspice.studies.sweepstore import SweepStore
 from processes import ended, no_room, start
@@ -50,7 +50,7 @@ def circuit() -> fs.Circuit:
 
 @pytest.fixture(autouse=True)
 def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sweepstored, "CHUNK", 64)
+    monkeypatch.setattr(sweepstore, "CHUNK", 64)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def whole(circuit: fs.Circuit, tmp_path_factory: pytest.TempPathFactory) -> dict
     """The store that one call makes, file by file."""
     path = tmp_path_factory.mktemp("whole") / "whole.zarr"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweepstored, "CHUNK", 64)
+        patch.setattr(sweepstore, "CHUNK", 64)
         found = fs.sweep(circuit, PARAMETERS, store=path, **HOW)
     assert (found.attrs["chunks"], found.attrs["chunks_found"], found.attrs["chunks_missing"]) == (192, 0, 0)
     return tree(path)
@@ -210,10 +210,10 @@ SCRIPT = """
 import sys
 import fingerspice as fs
 import test_sweepstore as here
-from fingerspice.studies import sweepstored
+from fingerspice.studies import sweepstore
 
 if __name__ == "__main__":
-    sweepstored.CHUNK = 64
+    sweepstore.CHUNK = 64
     circuit = fs.read_netlist(here.CIRCUITS / "fingerpad.cir")
     asked = {"store": sys.argv[1], "shard": (int(sys.argv[2]), int(sys.argv[3]))}
     fs.sweep(circuit, here.PARAMETERS, **asked, **({"workers": 2} if len(sys.argv) > 4 else {}), **here.HOW)
@@ -289,7 +289,7 @@ def test_dask_workers_that_are_killed_20_times_cost_nothing(
         assert found.attrs["chunks_missing"] == 0
         assert tree(path) == whole
         # What a worker refuses is told as it is.
-        monkeypatch.setattr(sweepstored, "programs", lambda: "fingerspice 0.0")
+        monkeypatch.setattr(sweepstore, "programs", lambda: "fingerspice 0.0")
         with pytest.raises(fs.InputError, match="a worker has fingerspice"):
             fs.sweep(circuit, PARAMETERS, store=tmp_path / "o.zarr", scheduler=cluster.scheduler_address, **HOW)
 

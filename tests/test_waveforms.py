@@ -13,7 +13,7 @@ from scipy.integrate import quad
 
 import fingerspice as fs
 from fingerspice.engine.segment import Segment, source
-from fingerspice.waveforms import combinations, periodic, ramps, repeated, sampling, transients
+from fingerspice.waveforms import combinations, periodic, ramps, repeated, sampling
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.sampling import source_table
@@ -57,7 +57,7 @@ def table_values(case: Case, t0: float, t1: float, t: np.ndarray) -> tuple[np.nd
 def test_every_waveform_class_is_in_the_registry() -> None:
     named = {type(c.waveform) for c in CASES}
     abstract = (fs.Waveform, ramps.Ramps)
-    for module in (combinations, periodic, ramps, repeated, sampling, transients, waveforms):
+    for module in (combinations, periodic, ramps, repeated, sampling, waveforms):
         for name, item in vars(module).items():
             if isinstance(item, type) and issubclass(item, fs.Waveform) and not name.startswith("_"):
                 assert item in named or item in abstract, f"{name} has no case"

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from fingerspice.netlist.netlist import parse_netlist as parse_netlist
     from fingerspice.netlist.netlist import read_netlist as read_netlist
     from fingerspice.results.loading import load as load
+    from fingerspice.results.outcome import Plan as Plan
     from fingerspice.results.outcome import SolveError as SolveError
     from fingerspice.results.outcome import Status as Status
-    from fingerspice.results.plan import Plan as Plan
     from fingerspice.results.solution import Solution as Solution
-    from fingerspice.sets.citation import Citation as Citation
+    from fingerspice.sets.parameters import Citation as Citation
     from fingerspice.sets.parameters import ParameterSet as ParameterSet
     from fingerspice.sets.parameters import parameters as parameters
     from fingerspice.solve.simulation import plan as plan
@@ -53,9 +53,9 @@ if TYPE_CHECKING:
     from fingerspice.studies.fitting import fit_material as fit_material
     from fingerspice.studies.inverse import InverseDrive as InverseDrive
     from fingerspice.studies.inverse import inverse_drive as inverse_drive
-    from fingerspice.studies.largesignal import large_signal as large_signal
     from fingerspice.studies.limits import FoldLimits as FoldLimits
     from fingerspice.studies.limits import fold_limits as fold_limits
+    from fingerspice.studies.phasors import large_signal as large_signal
     from fingerspice.studies.phasors import phasor as phasor
     from fingerspice.studies.populations import sobol as sobol
     from fingerspice.studies.populations import sweep as sweep
@@ -64,6 +64,8 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.combinations import AM as AM
     from fingerspice.waveforms.combinations import Product as Product
     from fingerspice.waveforms.combinations import Sum as Sum
+    from fingerspice.waveforms.periodic import Chirp as Chirp
+    from fingerspice.waveforms.periodic import Exp as Exp
     from fingerspice.waveforms.periodic import Pulse as Pulse
     from fingerspice.waveforms.periodic import Sawtooth as Sawtooth
     from fingerspice.waveforms.periodic import Square as Square
@@ -73,8 +75,6 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.repeated import Repeat as Repeat
     from fingerspice.waveforms.samples import Samples as Samples
     from fingerspice.waveforms.sampling import Function as Function
-    from fingerspice.waveforms.transients import Chirp as Chirp
-    from fingerspice.waveforms.transients import Exp as Exp
     from fingerspice.waveforms.waveform import DC as DC
     from fingerspice.waveforms.waveform import Sine as Sine
     from fingerspice.waveforms.waveform import Waveform as Waveform
@@ -82,11 +82,10 @@ if TYPE_CHECKING:
 _HOMES = {
     "circuit.circuit": ("Circuit",),
     "netlist.netlist": ("parse_netlist", "read_netlist"),
-    "waveforms.periodic": ("Pulse", "Sawtooth", "Square", "Triangle"),
+    "waveforms.periodic": ("Chirp", "Exp", "Pulse", "Sawtooth", "Square", "Triangle"),
     "waveforms.ramps": ("PWL",),
     "waveforms.samples": ("Samples",),
     "waveforms.repeated": ("Burst", "Repeat"),
-    "waveforms.transients": ("Chirp", "Exp"),
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Product", "Sum"),
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
@@ -103,17 +102,14 @@ _HOMES = {
     "studies.fitresult": ("Fit",),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.inverse": ("InverseDrive", "inverse_drive"),
-    "studies.largesignal": ("large_signal",),
+    "studies.phasors": ("large_signal", "phasor"),
     "studies.limits": ("FoldLimits", "fold_limits"),
     "studies.populations": ("sobol", "sweep"),
     "results.loading": ("load",),
-    "studies.phasors": ("phasor",),
-    "results.plan": ("Plan",),
-    "sets.citation": ("Citation",),
-    "sets.parameters": ("ParameterSet", "parameters"),
+    "results.outcome": ("Plan", "SolveError", "Status"),
+    "sets.parameters": ("Citation", "ParameterSet", "parameters"),
     "solve.simulation": ("plan", "simulate"),
     "solve.streaming": ("stream",),
-    "results.outcome": ("SolveError", "Status"),
     "results.solution": ("Solution",),
     "studies.steady": ("SteadyState", "steady_state"),
 }

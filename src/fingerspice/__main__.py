@@ -6,8 +6,7 @@ import os
 import signal
 from types import FrameType
 
-from fingerspice.base.files import discard_unfinished
-from fingerspice.base.streams import mend_streams
+from fingerspice.base.files import discard_unfinished, mend_streams
 
 _STOPS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 

@@ -14,13 +14,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from numba import njit
-from numba.core import config
+from numba import njit, types
+from numba.core import cgutils, config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Flags, compile_extra
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.typing.templates import make_concrete_template
+from numba.core.datamodel import models
+from numba.core.datamodel.registry import register_default
+from numba.core.typing.templates import AttributeTemplate, make_concrete_template
+from numba.extending import infer_getattr, intrinsic, lower_getattr_generic
+from numba.np.arrayobj import make_array
 
 from fingerspice.base.announcing import Compiling
 from fingerspice.base.errors import InputError
@@ -32,7 +36,6 @@ SHARED_FOLDERS = ("engine", "numerics", "physics")
 _OWN = Path(__file__).resolve()
 _SOURCES = [
     _OWN,
-    _OWN.with_name("borrowing.py"),
     *sorted(p for name in SHARED_FOLDERS for p in (_PACKAGE / name).rglob("*.py")),
 ]
 #: Hash of the compiled code's sources. By content, so that a package that is copied, or packed into an image, keeps its
@@ -246,3 +249,91 @@ jit_rows = _cached(fastmath={"contract", "reassoc"}, noalias=True)
 jit_within = _cached(forceinline=True)
 # The same for what holds such loops: the caller's options do not reach what it inlines.
 jit_within_rows = _cached(forceinline=True, fastmath={"contract"})
+
+
+Lent = TypeVar("Lent")
+# numba has no types for what its extensions are made of.
+_Type: Any = types.Type
+_Template: Any = AttributeTemplate
+_lower_getattr: Any = lower_getattr_generic
+
+
+class Borrowed(_Type):  # type: ignore[misc]
+    """Type of the address of a named tuple `of` some type; its attributes are read as those of the tuple."""
+
+    def __init__(self, of: Any) -> None:
+        self.of = of
+        # The tuple's own name lists all types in it, and would be part of the name of every function.
+        digest = hashlib.sha256(str(of).encode()).hexdigest()[:12]
+        super().__init__(name=f"{of.instance_class.__name__}_{digest}")
+
+    @property
+    def key(self) -> Any:
+        return self.of
+
+    @property
+    def instance_class(self) -> type:
+        """Class of the tuple."""
+        return cast(type, self.of.instance_class)
+
+
+@register_default(Borrowed)
+class _BorrowedModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, borrowed: Borrowed) -> None:
+        address = manager.lookup(borrowed.of).get_value_type().as_pointer()
+        cast(Any, super()).__init__(manager, borrowed, address)
+
+
+def _lent(context: Any, builder: Any, kind: Any, item: Any) -> Any:
+    """The value without reference counts: of an array, or of all arrays in a tuple."""
+    if isinstance(kind, types.Array):
+        view = cast(Any, make_array)(kind)(context, builder, item)
+        null: Any = cgutils.get_null_value
+        view.meminfo, view.parent = null(view.meminfo.type), null(view.parent.type)
+        return view._getvalue()
+    if isinstance(kind, types.BaseTuple):
+        for i, part in enumerate(cast(Any, kind).types):
+            item = builder.insert_value(item, _lent(context, builder, part, builder.extract_value(item, i)), i)
+    return item
+
+
+@infer_getattr
+class _BorrowedAttribute(_Template):  # type: ignore[misc]
+    key = Borrowed
+
+    def generic_resolve(self, borrowed: Any, name: str) -> Any:
+        if name not in borrowed.of.fields:
+            return None
+        kind = borrowed.of.types[borrowed.of.fields.index(name)]
+        return Borrowed(kind) if isinstance(kind, types.BaseNamedTuple) else kind
+
+
+@_lower_getattr(Borrowed)  # type: ignore[untyped-decorator]
+def _read(context: Any, builder: Any, borrowed: Any, address: Any, name: str) -> Any:
+    place = borrowed.of.fields.index(name)
+    kind, field = borrowed.of.types[place], cast(Any, cgutils.gep_inbounds)(builder, address, 0, place)
+    # A tuple inside the tuple is borrowed, too.
+    return field if isinstance(kind, types.BaseNamedTuple) else _lent(context, builder, kind, builder.load(field))
+
+
+@intrinsic
+def _borrow(typing: Any, value: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        kind, item = signature.args[0], values[0]
+        if isinstance(kind, Borrowed):
+            return item
+        item = _lent(context, builder, kind, item)
+        if isinstance(kind, types.BaseNamedTuple):
+            return cast(Any, cgutils.alloca_once_value)(builder, item)
+        return item
+
+    kind = Borrowed(value) if isinstance(value, types.BaseNamedTuple) else value
+    return kind(value), generate
+
+
+#: The same array or named tuple, for use within the function that calls this, and within those that it calls.
+#:
+#: An array is without a reference count, which would cost an atomic operation for each view of it. A named tuple is its
+#: address. The argument must outlive the result: borrow only arguments of a function, never arrays that it allocates,
+#: because these are freed after their last use by name.
+borrow: Callable[[Lent], Lent] = cast(Any, _borrow)

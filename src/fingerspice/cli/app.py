@@ -14,7 +14,7 @@ from fingerspice.cli import answers, options
 from fingerspice.cli import design as designs
 from fingerspice.cli import fit as fits
 from fingerspice.cli import sweep as sweeps
-from fingerspice.cli.arguments import (
+from fingerspice.cli.answers import (
     AsJson,
     ChargeLaw,
     Chunk,
@@ -41,11 +41,31 @@ from fingerspice.cli.figures import figures
 from fingerspice.cli.limits import limits
 from fingerspice.cli.options import area_from_text, check_output, read_circuit
 from fingerspice.cli.result_files import Results
-from fingerspice.cli.run_files import Touch, large_sweep, written
-from fingerspice.cli.sets import sets
-from fingerspice.cli.streaming import run_streamed
+from fingerspice.cli.run_files import Touch, large_sweep, run_streamed, written
 from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
 from fingerspice.results.outcome import SolveError
+
+
+def sets(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="A set; without it all are listed.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the named sets of parameters, or show the values of one with their ranges and sources.
+
+    Examples:
+
+      fingerspice sets
+
+      fingerspice sets moist
+    """
+    from fingerspice.sets.parameters import parameters
+
+    with Answering("sets", as_json) as answer:
+        found = parameters() if name is None else parameters(name)
+        shown = parameters().values() if name is None else [parameters(name)]
+        answer.update(parameter_sets=[one.to_dict() for one in shown])
+        answer.give(lambda: str(found))
+
 
 app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},

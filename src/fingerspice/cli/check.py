@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fingerspice.cli.arguments import AsJson
+from fingerspice.cli.answers import AsJson
 from fingerspice.cli.terminal import Answering
 
 
@@ -21,7 +21,7 @@ def check(
 
       fingerspice check out/long.zarr
     """
-    from fingerspice.results.stores import check_store
+    from fingerspice.results.datafiles import check_store
 
     with Answering("check", as_json) as answer:
         chunks = check_store(store)

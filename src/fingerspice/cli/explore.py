@@ -11,7 +11,7 @@ import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.cli import answers
-from fingerspice.cli.arguments import AsJson, Coating, Drive, Finger, Set
+from fingerspice.cli.answers import AsJson, Coating, Drive, Finger, Set
 from fingerspice.cli.options import check_output, read_circuit
 from fingerspice.cli.terminal import Answering
 
@@ -85,7 +85,7 @@ def _circuit(
 def _write(answer: Answering, circuit: Circuit | None, deck: Path | None, output: Path) -> None:
     """Write the page of a circuit, or of the examples, as one file."""
     from fingerspice.base.files import write_aside
-    from fingerspice.explorer.static import static_page
+    from fingerspice.explorer.gallery import static_page
 
     check_output(output, deck)
     page = static_page(circuit)

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from fingerspice.base.errors import InputError
-from fingerspice.cli.arguments import AsJson, Out
+from fingerspice.cli.answers import AsJson, Out
 from fingerspice.cli.options import check_output
 from fingerspice.cli.result_files import FOLDER
 from fingerspice.cli.terminal import Answering, progress

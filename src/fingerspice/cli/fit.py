@@ -9,7 +9,7 @@ import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.cli import answers
-from fingerspice.cli.arguments import AsJson, ChargeLaw, Deck, Name, NoPlot, Out, Overwrite, Set
+from fingerspice.cli.answers import AsJson, ChargeLaw, Deck, Name, NoPlot, Out, Overwrite, Set
 from fingerspice.cli.options import read_circuit
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import Answering

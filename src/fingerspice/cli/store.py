@@ -16,9 +16,8 @@ import numpy as np
 
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import UNFINISHED, settle_on_disk, write_aside, write_durably
-from fingerspice.results.datafiles import Variable, variables
+from fingerspice.results.datafiles import CHECKSUM, SIGNATURE, Variable, fault, signature, variables, zarr_library
 from fingerspice.results.solution import Solution
-from fingerspice.results.stores import CHECKSUM, SIGNATURE, fault, signature, zarr_library
 
 #: Attributes of the group: identity of the run, number of finished chunks, state to continue from, and results so far.
 RUN, DONE, MARK, SO_FAR = "run", "chunks_done", "goes_on", "so_far"

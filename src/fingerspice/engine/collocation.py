@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.borrowing import borrow
-from fingerspice.base.compiled import jit
+from fingerspice.base.compiled import borrow, jit
 from fingerspice.engine.network import (
     at_sources,
     choose_signs,

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.borrowing import borrow
-from fingerspice.base.compiled import jit, jit_by_kind, jit_within
+from fingerspice.base.compiled import borrow, jit, jit_by_kind, jit_within
 from fingerspice.engine.loopstate import (
     CONVERGED,
     DONE,

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.borrowing import borrow
-from fingerspice.base.compiled import jit, jit_within
+from fingerspice.base.compiled import borrow, jit, jit_within
 from fingerspice.engine.readout import (
     KEPT,
     OUTPUT,

@@ -21,7 +21,7 @@ FARTHEST = 2.0
 
 
 class Scheme(NamedTuple):
-    """Radau IIA as numbers (see `fingerspice.numerics.radau_tableau.Tableau`), with its matrix diagonalised."""
+    """Radau IIA as numbers (see `fingerspice.numerics.lobatto.Tableau`), with its matrix diagonalised."""
 
     # a, c, e, dense: The tableau's; `e` (s,) gives the highest Legendre coefficient of the increment
     a: FloatArray

@@ -9,11 +9,10 @@ from typing import Any
 
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.provenance import in_force, remembering
+from fingerspice.circuit.describe import in_force, remembering
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.explorer.request import Request, circuits_of, request_of
-from fingerspice.explorer.sliders import value_text
-from fingerspice.explorer.waveforms import read_source, text_of
+from fingerspice.explorer.sliders import read_source, text_of, value_text
 from fingerspice.sets.parameters import ParameterSet, parameters
 from fingerspice.waveforms.waveform import Waveform
 

@@ -19,7 +19,7 @@ from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.explorer.recordings import Recording, recording_of
-from fingerspice.explorer.waveforms import gain_of, read_source
+from fingerspice.explorer.sliders import gain_of, read_source
 from fingerspice.netlist.netlist import parse_netlist
 from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.results.solution import Solution

@@ -26,7 +26,7 @@ from fingerspice.explorer.encoding import as_json, framed
 from fingerspice.explorer.examples import EXAMPLES
 from fingerspice.explorer.request import asked_by
 from fingerspice.explorer.scene import begun
-from fingerspice.explorer.waveforms import menu
+from fingerspice.explorer.sliders import menu
 from fingerspice.results.solution import Solution
 
 ADDRESS = "127.0.0.1"
@@ -213,11 +213,11 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
 
 def _handed_on(what: str, given: Any, own: Circuit | None) -> dict[str, Any]:
     """What the page hands on; the studies that it takes are loaded only now, so that the first picture comes sooner."""
-    from fingerspice.explorer import sharing
+    from fingerspice.explorer import scene
 
     if what == "means":
-        return sharing.means(given, own)
-    return {"ok": True, "text": (sharing.as_deck if what == "deck" else sharing.as_python)(given, own)}
+        return scene.means(given, own)
+    return {"ok": True, "text": (scene.as_deck if what == "deck" else scene.as_python)(given, own)}
 
 
 #: What the page asks for most, whose answer comes in two parts; and all else that it asks for.

@@ -9,8 +9,7 @@ from typing import Literal
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
 from fingerspice.netlist.deck import Directive, Number, Token, parse_deck
-from fingerspice.netlist.slips import is_unit
-from fingerspice.netlist.spelling import nearest
+from fingerspice.netlist.slips import is_unit, nearest
 from fingerspice.waveforms.bounds import check_range
 
 #: Number of outputs of a run whose .tran has no TSTEP.

@@ -14,8 +14,8 @@ from fingerspice.circuit.values import is_resistance, mega_note, unit_trap, unus
 from fingerspice.netlist.deck import Call, Number, Statement, Token
 from fingerspice.netlist.directives import start_volts
 from fingerspice.netlist.scope import Value
+from fingerspice.netlist.slips import nearest
 from fingerspice.netlist.sources import Context, Source, read_source
-from fingerspice.netlist.spelling import nearest
 
 #: LTspice's parasitics, which become elements: ``rser`` in series at the first node, all others in parallel.
 _PARASITICS = {"V": ("rser", "cpar"), "C": ("rser", "rpar", "cpar")}

@@ -21,9 +21,18 @@ from typing import TypeAlias
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import suspicious_mega
-from fingerspice.netlist.arithmetic import Lexeme, check_order, lexemes_of, number_of, to_python
-from fingerspice.netlist.functions import CONSTANTS, FUNCTIONS, Problem, power
-from fingerspice.netlist.spelling import nearest
+from fingerspice.netlist.arithmetic import (
+    CONSTANTS,
+    FUNCTIONS,
+    Lexeme,
+    Problem,
+    check_order,
+    lexemes_of,
+    number_of,
+    power,
+    to_python,
+)
+from fingerspice.netlist.slips import nearest
 
 #: Largest number of characters of an expression.
 MAX_LENGTH = 2000

@@ -12,7 +12,7 @@ from pathlib import Path, PurePath
 from fingerspice.base.errors import InputError, Where
 from fingerspice.netlist.lexer import split_lines
 from fingerspice.netlist.library import LIBRARIES, library_text
-from fingerspice.netlist.spelling import closest, nearest
+from fingerspice.netlist.slips import closest, nearest
 
 MAX_BYTES = 64 * 2**20
 #: Largest total size of the files that a deck's sources name, bytes.

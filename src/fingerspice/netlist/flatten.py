@@ -9,8 +9,7 @@ from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.lexer import Group, Lexeme, Line, group, lex
 from fingerspice.netlist.reader import DIRECTIVES, Subcircuit
 from fingerspice.netlist.scope import Bare, Call, Number, Scope, Token, Value
-from fingerspice.netlist.slips import stray_word
-from fingerspice.netlist.spelling import nearest
+from fingerspice.netlist.slips import nearest, stray_word
 
 #: Limits of subcircuit calls: total number of expanded lines and characters, nesting, and characters of a flat name.
 MAX_EXPANDED = 100_000

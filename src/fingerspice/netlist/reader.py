@@ -13,8 +13,7 @@ from fingerspice.circuit.devices import layer_devices
 from fingerspice.netlist.files import MAX_BYTES, NATIVE_LIBRARIES, inside, library_changed, read_text
 from fingerspice.netlist.lexer import Group, Lexeme, Line, group, lex, logical_lines, split_lines
 from fingerspice.netlist.scope import Formula, param_formulas
-from fingerspice.netlist.slips import ELSEWHERE, decimal_comma, greek_mu
-from fingerspice.netlist.spelling import nearest
+from fingerspice.netlist.slips import ELSEWHERE, decimal_comma, greek_mu, nearest
 
 #: Limits of a netlist with its included files: a word takes up to 500 bytes of memory, and a line 200.
 MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000

@@ -10,8 +10,8 @@ from typing import Literal, TypeAlias
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number, suspicious_mega
+from fingerspice.netlist.arithmetic import CONSTANTS, RESERVED
 from fingerspice.netlist.expressions import Expression, compile_expression
-from fingerspice.netlist.functions import CONSTANTS, RESERVED
 from fingerspice.netlist.lexer import Group, Lexeme, Line
 
 _NUMERIC = re.compile(r"[+-]|\.?[0-9]")

@@ -9,8 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.borrowing import borrow
-from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.base.compiled import borrow, jit, jit_rows
 
 
 def nodes(n: int, lo: float, hi: float) -> FloatArray:

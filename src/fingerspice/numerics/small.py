@@ -5,6 +5,8 @@ LAPACK through numba would cost a fifth of a second at start-up to load, for mat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
@@ -102,3 +104,16 @@ def diagonalise(matrix: FloatArray, vectors: FloatArray) -> None:
                     vectors[k, q] = s * a + c * b
         if not rotated:
             return
+
+
+AT = (-2.0, -1.0, 1.0, 2.0)
+"""Where a function is evaluated, in steps."""
+STEP = 3e-4
+"""Step relative to the argument, or to its scale, at which truncation and rounding are both about 1e-12."""
+_WEIGHTS = (1.0 / 12.0, -8.0 / 12.0, 8.0 / 12.0, -1.0 / 12.0)
+
+
+def derivative(values: Sequence[FloatArray | float], step: float) -> FloatArray:
+    """Derivative from the values at `AT` times a step."""
+    total = sum(weight * np.asarray(one, float) for weight, one in zip(_WEIGHTS, values, strict=True))
+    return np.asarray(total / step)

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
 
-    from fingerspice.results.samplegradient import SampleGradient
+    from fingerspice.results.sensitivity import SampleGradient
     from fingerspice.results.solution import Solution
-    from fingerspice.sets.citation import Citation
+    from fingerspice.sets.parameters import Citation
 
 
 class Doors(Shown):
@@ -105,6 +105,6 @@ class Doors(Shown):
         Citation
             ``print`` shows the text and the BibTeX, which is also in `Citation.bibtex`.
         """
-        from fingerspice.sets.citation import cite
+        from fingerspice.sets.parameters import cite
 
         return cite(self.circuit, self.method)  # type: ignore[attr-defined]

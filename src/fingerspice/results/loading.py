@@ -16,11 +16,10 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.physics.contact import Contact
 from fingerspice.results.datafiles import FORMAT, GROUP
-from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, State, Status
-from fingerspice.results.plan import Plan
+from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, State, Status
+from fingerspice.results.signals import StoredRecord, StoredRun
 from fingerspice.results.solution import Solution
 from fingerspice.results.stored_circuit import made_again
-from fingerspice.results.stored_record import StoredRecord, StoredRun
 from fingerspice.waveforms.waveform import Fundamental
 
 

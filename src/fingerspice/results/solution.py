@@ -25,12 +25,11 @@ if TYPE_CHECKING:
     import xarray
 
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.plan import Plan
-    from fingerspice.results.refined import ClosedForm
+    from fingerspice.results.outcome import Plan
     from fingerspice.results.sensitivity import Sensitivity
+    from fingerspice.results.signals import StoredRun
     from fingerspice.results.spectrum import Spectrum
-    from fingerspice.results.steps import Recorded
-    from fingerspice.results.stored_record import StoredRun
+    from fingerspice.results.steps import ClosedForm, Recorded
     from fingerspice.waveforms.waveform import Fundamental
 
 

@@ -114,7 +114,7 @@ class Spectrum(Sealed, Shown):
         matplotlib.figure.Figure
             ``savefig("x.pdf")`` saves it, ``show()`` shows it.
         """
-        from fingerspice.plots.spectra import plot_spectrum
+        from fingerspice.plots.traces import plot_spectrum
 
         return plot_spectrum(self)
 

@@ -14,7 +14,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran, check
 from fingerspice.circuit.loop import network_of
-from fingerspice.waveforms import combinations, periodic, ramps, repeated, samples, transients
+from fingerspice.waveforms import combinations, periodic, ramps, repeated, samples
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
 from fingerspice.waveforms.waveform import Waveform, blank_terms
@@ -24,7 +24,7 @@ MOST_NUMBERS = 8_000_000
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
-        waveforms.DC, waveforms.Sine, transients.Chirp, transients.Exp, ramps.PWL, periodic.Pulse, periodic.Square,
+        waveforms.DC, waveforms.Sine, periodic.Chirp, periodic.Exp, ramps.PWL, periodic.Pulse, periodic.Square,
         periodic.Triangle, periodic.Sawtooth, combinations.Sum, combinations.Product, combinations.AM,
         repeated.Burst, repeated.Repeat, samples.Samples,
     )

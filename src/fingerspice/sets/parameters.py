@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -13,9 +15,69 @@ from typing import Any, overload
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import Circuit
-from fingerspice.sets.applying import changes_by
-from fingerspice.sets.reading import KINDS, Reference, SetValue, keys_in, references, tables, values_of
+from fingerspice.circuit.arguments import require_circuit
+from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.describe import in_force, remembering
+from fingerspice.circuit.topology import driving_sources
+from fingerspice.sets.reading import ELEMENTS, KINDS, Reference, SetValue, keys_in, references, tables, values_of
+from fingerspice.waveforms.combinations import AM
+from fingerspice.waveforms.periodic import Square
+from fingerspice.waveforms.waveform import Sine, Waveform
+
+#: Waveforms of drives, by the name that a set gives.
+WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM}
+
+
+def changes_by(
+    name: str, values: Mapping[str, SetValue], waveform: str | None, circuit: Circuit, to: str | None
+) -> Circuit:
+    """The circuit with the values of the set of that name, as `ParameterSet.apply` describes it."""
+    require_circuit(circuit)
+    changes: dict[str, float | Waveform] = {}
+    for kind in dict.fromkeys(value.element for value in values.values()):
+        own = [value for value in values.values() if value.element == kind]
+        needed = not all(value.optional for value in own)
+        elements = _elements(name, kind, circuit, to, needed)
+        if kind == "source":
+            assert waveform is not None
+            changes[elements[0].name] = WAVEFORMS[waveform](**{value.parameter: value.value for value in own})
+            continue
+        changes |= {
+            f"{element.name}.{value.parameter}": value.value
+            for element in elements
+            for value in own
+            if value.parameter in element.values
+        }
+    return remembering(circuit.replace(changes), name, changes)
+
+
+def _elements(name: str, kind: str, circuit: Circuit, to: str | None, needed: bool) -> list[Element]:
+    """The elements that a set's values for a kind of element go to.
+
+    Raises
+    ------
+    InputError
+        If there is none and one is needed, or if it is not clear which is meant.
+    """
+    devices = ELEMENTS[kind]
+    known = driving_sources(circuit) if kind == "source" else list(circuit.elements)
+    known = [e for e in known if e.device in devices]
+    found = [e for e in known if to is None or f"{e.name}.".lower().startswith(f"{to}.".lower())]
+    what = {"source": "driving V source"}.get(kind, " or ".join(devices))
+    if not found and needed:
+        inside = "the circuit" if to is None else f"{to!r} of the circuit"
+        there = f"its {', '.join(e.name for e in known)}" if known else f"a circuit with a {what}"
+        raise InputError(f"the set {name!r} has values for a {what}, which {inside} lacks; allowed: {there}")
+    # A finger has one layer of each kind on its area; two would be two parts of the screen, of which one is meant.
+    at = Counter("" if kind == "source" else e.nodes[2] for e in found)
+    if any(count > 1 for count in at.values()):
+        names = ", ".join(e.name for e in found)
+        raise InputError(
+            f"the set {name!r} has values for one {what}, and the circuit has {names}; allowed: one of these names "
+            f"(to={found[0].name!r}, or {found[0].name}={name} on the command line)"
+        )
+    return found
+
 
 #: Units that take a prefix in tables.
 _PREFIXED = ("m", "ohm", "V", "Hz", "N")
@@ -201,3 +263,84 @@ def quantity(value: float, unit: str) -> str:
     """A value with its unit, with a prefix where the unit takes one."""
     plain = unit not in _PREFIXED or value == 0.0 or not math.isfinite(value)
     return f"{value:g} {unit}".rstrip() if plain else format_si(value, unit)
+
+
+#: The paper whose model is simulated.
+MODEL = "Forsbach2021"
+#: Programs that integrated the run, by the part of the method's name before the colon.
+_METHODS = {"scipy": "SciPy", "torchdiffeq": "torchdiffeq"}
+
+
+@dataclass(frozen=True, repr=False)
+class Citation(Shown):
+    """What to cite for a run.
+
+    Attributes
+    ----------
+    statements : tuple of str
+        What was used, one sentence or more each, with keys of references in brackets.
+    references : tuple of Reference
+        The works named in the statements, and those from which the values of the sets come.
+    """
+
+    statements: tuple[str, ...]
+    references: tuple[Reference, ...]
+
+    @property
+    def bibtex(self) -> str:
+        """The references as BibTeX entries, in UTF-8."""
+        return "\n\n".join(reference.bibtex() for reference in self.references)
+
+    def _page(self) -> Page:
+        cited = [f"[{r.key}] {r.text()}" for r in self.references]
+        return Page([*self.statements, "", *cited, "", self.bibtex])
+
+
+def cite(circuit: Circuit, method: str) -> Citation:
+    """What to cite for a run of a circuit by a method."""
+    from fingerspice import __version__
+
+    known = references()
+    program = dataclasses.replace(known["fingerspice"], where={"note": f"version {__version__}"})
+    found: dict[str, Reference] = {MODEL: known[MODEL], program.key: program}
+    said = [f"The model is that of [{MODEL}], simulated with fingerspice {__version__} [{program.key}]."]
+    for name, (kept, changed) in in_force(circuit).items():
+        one = parameters(name)
+        given = {path: _given(one, circuit, path) for path in kept}
+        said.append(_sentence(one, given, changed))
+        # The works behind the values that were used; those that only say how far a value may vary are not cited.
+        texts = [one.claims, *(value.source for values in given.values() for value in values)] if kept else []
+        found |= {key: known[key] for text in texts for key in keys_in(text)}
+    if not circuit.sets:
+        said.append("No set of parameters was applied.")
+    said.append(
+        f"All other values are those of the deck “{circuit.title}” and of changes made to it; cite their sources, "
+        "which the program does not know."
+    )
+    key = _METHODS.get(method.partition(":")[0])
+    if key is not None:
+        said.append(f"The method {method} is that of [{key}].")
+        found[key] = known[key]
+    return Citation(tuple(said), tuple(found.values()))
+
+
+def _sentence(one: ParameterSet, given: dict[str, list[SetValue]], changed: tuple[str, ...]) -> str:
+    """What a set gave to the circuit, what of it is assumed, and what was changed since."""
+    if not given:
+        return f"All values of the set {one.name} were changed since it was applied."
+    said = [f"The set {one.name} ({one.title}) gave {', '.join(given)}"]
+    assumed = [path for path, values in given.items() if any(value.assumed for value in values)]
+    said += [f"assumed, not published: {', '.join(assumed)}"] if assumed else []
+    said += [f"changed since: {', '.join(changed)}"] if changed else []
+    return f"{'; '.join(said)}."
+
+
+def _given(one: ParameterSet, circuit: Circuit, path: str) -> list[SetValue]:
+    """The values of a set that a path of the circuit got: one, or those of a waveform."""
+    name, _, parameter = path.rpartition(".")
+    devices = {e.name: e.device for e in circuit.elements}
+    if path in devices or not name:
+        return [value for value in one.values.values() if value.element == "source"]
+    fitting = [value for value in one.values.values() if value.parameter == parameter]
+    # Where the elements are unknown, any value of the set with this parameter may be meant.
+    return [value for value in fitting if name not in devices or devices[name] in ELEMENTS[value.element]]

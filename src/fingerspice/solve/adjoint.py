@@ -18,11 +18,10 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.engine.lanes import AREAS, GAP, MORE, SQUARES, slopes_of, sum_back
-from fingerspice.numerics.differences import AT, STEP, derivative
+from fingerspice.numerics.small import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status
-from fingerspice.results.samplegradient import SampleGradient
-from fingerspice.results.sensitivity import MEANS, SIGNALS
+from fingerspice.results.sensitivity import MEANS, SIGNALS, SampleGradient
 from fingerspice.results.solution import Solution
 from fingerspice.solve.laneblock import Block
 from fingerspice.solve.laneform import LaneForm

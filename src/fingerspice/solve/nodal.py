@@ -17,7 +17,7 @@ from fingerspice.engine.collocation import Passage, advance
 from fingerspice.engine.network import Sources, new_room
 from fingerspice.engine.radau import Nodal, Scheme, new_work
 from fingerspice.engine.readout import TRIED
-from fingerspice.numerics.radau_tableau import radau
+from fingerspice.numerics.lobatto import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
 from fingerspice.results.record import Record

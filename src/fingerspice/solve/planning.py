@@ -12,7 +12,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.base.units import format_si
 from fingerspice.engine.model import Model
 from fingerspice.physics.contact import inverse_area_range
-from fingerspice.results.plan import Plan
+from fingerspice.results.outcome import Plan
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import kept_with
 from fingerspice.solve.sources import shortest_event

@@ -16,7 +16,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
-from fingerspice.numerics.differences import AT, derivative
+from fingerspice.numerics.small import AT, derivative
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.results.sensitivity import MEANS, SIGNALS, Sensitivity
 from fingerspice.results.solution import Solution

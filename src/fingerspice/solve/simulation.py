@@ -17,8 +17,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import Parameters, Sources, area_given, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import circuit_warnings
-from fingerspice.results.outcome import SolveError, Status
-from fingerspice.results.plan import Plan
+from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.cautions import run_warnings

@@ -15,8 +15,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, positive_number, whole_number
 from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.results.outcome import SolveError, Status
-from fingerspice.results.plan import Plan
+from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem, check_length, check_outputs

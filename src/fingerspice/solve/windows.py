@@ -10,8 +10,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.network import Network
-from fingerspice.results.outcome import State, Status
-from fingerspice.results.plan import Plan
+from fingerspice.results.outcome import Plan, State, Status
 from fingerspice.results.record import Record
 from fingerspice.solve.lanes import LaneMarch, Outcome
 from fingerspice.solve.outputs import at_breakpoints

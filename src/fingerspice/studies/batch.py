@@ -26,8 +26,16 @@ from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.batchgradients import gradient_coordinates, gradient_data, gradient_request, gradients_of
 from fingerspice.studies.batchladder import climb, in_lockstep
 from fingerspice.studies.batchscenes import lockstep_form
-from fingerspice.studies.batchsingle import SIGNALS_OF_BATCH, each_alone, run_single
-from fingerspice.studies.batchtask import LOCKSTEP, STATUS_NAMES, Answers, Task, jobs_of
+from fingerspice.studies.batchtask import (
+    LOCKSTEP,
+    SIGNALS_OF_BATCH,
+    STATUS_NAMES,
+    Answers,
+    Task,
+    each_alone,
+    jobs_of,
+    run_single,
+)
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.waveform import require
 

@@ -20,9 +20,8 @@ from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import heading
 from fingerspice.solve.runs import Progress
-from fingerspice.studies.drive_shapes import rise
 from fingerspice.studies.inverse import LEAD, Task
-from fingerspice.studies.inversion import Finger, Inverter, Limits, inverter_of, the_finger
+from fingerspice.studies.inversion import Finger, Inverter, Limits, inverter_of, rise, the_finger
 from fingerspice.studies.wanted import ForceCurve, Profile
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require

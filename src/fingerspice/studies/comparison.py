@@ -71,7 +71,7 @@ class Comparison(Shown):
 
     def plot(self) -> Picture:
         """Picture of one period of the transient and of the phasor, with the figures of both."""
-        from fingerspice.studies.pictures import plot_comparison
+        from fingerspice.studies.reports import plot_comparison
 
         return plot_comparison(self)
 

@@ -13,9 +13,8 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.studies.contactdata import Given, Relation, relations_of
+from fingerspice.studies.contactdata import ContactTask, Given, Relation, relations_of, solved
 from fingerspice.studies.contactresult import ContactFit, contact_result
-from fingerspice.studies.contacttask import ContactTask, solved
 from fingerspice.studies.fit import bounds_of, profiled, refuse_twice
 from fingerspice.studies.fitprofile import profile_of
 from fingerspice.studies.fittask import REFUSED

@@ -14,8 +14,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.studies.contactdata import Relation
-from fingerspice.studies.contacttask import FEWEST, ContactTask, pools_of
+from fingerspice.studies.contactdata import FEWEST, ContactTask, Relation, pools_of
 from fingerspice.studies.fitestimates import (
     Estimate,
     Estimates,

@@ -17,10 +17,9 @@ from fingerspice.netlist.library import LIBRARIES, library_text
 from fingerspice.physics.contact import Contact
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged
-from fingerspice.waveforms.periodic import Pulse
+from fingerspice.waveforms.periodic import Exp, Pulse
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.transients import Exp
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
 EDGE = 1e-9

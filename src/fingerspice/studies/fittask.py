@@ -20,7 +20,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.numerics.differences import AT, STEP, derivative
+from fingerspice.numerics.small import AT, STEP, derivative
 from fingerspice.results.outcome import SolveError
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.batch import batch

@@ -143,7 +143,7 @@ class MaterialFit(Shown):
 
     def plot(self) -> Figure:
         """Resistivity and permittivity of the data and of the ladder, and the misfit, against frequency."""
-        from fingerspice.studies.pictures import plot_material
+        from fingerspice.studies.reports import plot_material
 
         return plot_material(self)
 

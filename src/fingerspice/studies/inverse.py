@@ -18,8 +18,7 @@ from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.solve.simulation import simulate
-from fingerspice.studies.drive_shapes import means, rise
-from fingerspice.studies.inversion import Finger, Inverter, Limits, inverter_of, the_finger
+from fingerspice.studies.inversion import Finger, Inverter, Limits, inverter_of, means, rise, the_finger
 from fingerspice.studies.wanted import ForceCurve, Profile, Wanted, as_profile, check_forces, force_of_friction
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require

@@ -15,8 +15,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies.batch import batch
 from fingerspice.studies.batchtask import REFUSED
-from fingerspice.studies.sweepplan import BITS, Plan, make_plan
-from fingerspice.studies.sweepsets import with_sets
+from fingerspice.studies.sweepplan import BITS, Plan, make_plan, with_sets
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -90,7 +89,7 @@ def sweep(
     """
     circuit, parameters = with_sets(circuit, parameters)
     if store is not None:
-        from fingerspice.studies.sweepstored import stored
+        from fingerspice.studies.sweepstore import stored
 
         plan = make_plan(circuit, parameters, n, seed, MOST_STORED_SAMPLES)
         return stored(circuit, plan, options, Path(store), workers, scheduler, shard)

@@ -1,23 +1,134 @@
-"""Pages and tables of the studies: periodic states, comparisons, folds and fitted materials."""
+"""Pictures of comparisons and of fitted materials."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines
+from fingerspice.physics.materials import EPS0
+from fingerspice.plots import drawing, lines
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.report import summary_table
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from fingerspice.plots.picture import Picture
     from fingerspice.studies.comparison import Comparison
     from fingerspice.studies.fitting import MaterialFit
     from fingerspice.studies.limits import FoldLimits
     from fingerspice.studies.steady import SteadyState
+
+
+def plot_comparison(comparison: Comparison) -> Picture:
+    """One period of the transient and of the phasor solution in one picture, with a table of their figures.
+
+    Parameters
+    ----------
+    comparison : Comparison
+
+    Returns
+    -------
+    Picture
+    """
+    figure, axes = drawing.new_figure(3, height=5.6, height_ratios=[1.3, 1.3, 0.75])
+    solution, p = comparison.solution, comparison.phasor
+    runs = [lines.Drawn(solution, "")]
+    start, stop = float(solution.t[0]), float(solution.t[-1])
+    source_phase = solution.fundamental.phase if solution.fundamental else 0.0
+    turns = 2.0 * np.pi * comparison.frequency * solution.t + source_phase
+    of_gaps = [p.of_gap(i) for i in range(len(comparison.gaps))]
+    waves = [np.sin(turns + np.radians(one["phase_deg"])) for one in of_gaps]
+    voltages = [one["amplitude"] * wave for one, wave in zip(of_gaps, waves, strict=True)]
+    forces = [2.0 * one["f_el_mean"] * wave**2 for one, wave in zip(of_gaps, waves, strict=True)]
+    for ax, keys, curves in zip(axes, (["u_source", "u_gap"], ["f_el"]), (voltages, forces), strict=False):
+        quantity, traces = lines.QUANTITIES[keys[-1]], lines.traces_of(runs, keys)
+        factor, unit = lines.scale_of(quantity, traces, start, stop)
+        for trace in traces:
+            lines.draw_line(ax, trace, factor, start, stop, runs)
+        t = lines.time_unit(runs)[0] * solution.t
+        style: dict[str, Any] = {"color": drawing.BLACK, "linestyle": drawing.DASHES[3], "linewidth": 1.5}
+        for trace, curve in zip(traces[-len(curves) :], curves, strict=True):
+            ax.plot(t, factor * curve, label=f"{trace.label}, phasor", **style)
+        lines.finish_panel(ax, quantity, unit, [factor * trace.x for trace in traces])
+    lines.time_axis(axes[:2], runs, start, stop)
+    _table(axes[2], comparison)
+    drawing.caption(figure, f"{lines.about(solution)} · periodic state; the phasor is of the fundamental alone")
+    figure.align_ylabels(axes[:2])
+    return figure
+
+
+def _table(ax: Axes, comparison: Comparison) -> None:
+    names = {
+        "amplitude": "Gap voltage at the fundamental",
+        "phase_deg": "Its lead over the source",
+        "f_el_mean": "Mean electroadhesive force",
+        "area_mean": "Mean ridge area",
+    }
+    text = "|phasor|transient,\nmean area|transient,\ncoupled|coupled −\nphasor|of it, ripple\nof the area"
+    head = text.split("|")
+    split = [row[0].partition(":") for row in comparison.rows()]
+    labels = [f"{names[name]} {gap}".rstrip() for name, _, gap in split]
+    cells = [
+        [
+            f"{label} [{row[1].replace('deg', '°').replace('^2', '²')}]",
+            *(f"{x:.5g}".replace("-", "−") for x in row[2:5]),
+            *(f"{x:+.2g}".replace("-", "−") for x in row[5:]),
+        ]
+        for label, row in zip(labels, comparison.rows(), strict=True)
+    ]
+    ax.axis("off")
+    widths = [0.36, *[0.128] * 5]
+    table = ax.table([head, *cells], cellLoc="right", loc="center", edges="horizontal", colWidths=widths)
+    table.auto_set_font_size(False)
+    table.set_fontsize(drawing.FONT - 0.5)
+    for (row, column), cell in table.get_celld().items():
+        cell.set_edgecolor("#BBBBBB")
+        cell.set_linewidth(0.6)
+        if row == 0:
+            cell.set_height(1.7 * cell.get_height())
+        if column == 0:
+            cell.get_text().set_horizontalalignment("left")
+            cell.PAD = 0.0
+
+
+def plot_material(fit: MaterialFit) -> Picture:
+    """Resistivity and permittivity as measured and as fitted, and the misfit of the admittivity, against frequency."""
+    figure, axes = drawing.new_figure(1, 3, height=2.7)
+    f = np.geomspace(fit.frequency[0], fit.frequency[-1], 400)
+    measured = 1.0 / fit.data.real, fit.data.imag / (2.0 * np.pi * fit.frequency * EPS0)
+    fitted = fit.ladder.resistivity(f), fit.ladder.permittivity(f)
+    labels = "Resistivity [Ω m]", "Relative permittivity"
+    for ax, points, line, label in zip(axes[:2], measured, fitted, labels, strict=True):
+        ax.loglog(fit.frequency, points, color=drawing.GREY, marker="o", markersize=2.5, linestyle="none", label="data")
+        ax.loglog(f, line, color=drawing.BLUE, linewidth=1.4, label=f"ladder of {len(fit.ladder.poles)} poles")
+        drawing.dress(ax, label, "Frequency [Hz]")
+    limit = fit.kramers_kronig
+    axes[2].semilogx(fit.frequency, 100.0 * fit.misfit, color=drawing.BLUE, linewidth=1.4, label="ladder")
+    axes[2].semilogx(
+        limit.frequency,
+        100.0 * limit.misfit,
+        color=drawing.VERMILION,
+        linewidth=1.0,
+        linestyle="--",
+        label="any material",
+    )
+    drawing.dress(axes[2], "Misfit [%]", "Frequency [Hz]")
+    for ax in (axes[0], axes[2]):
+        ax.legend(fontsize=drawing.FONT - 0.5, frameon=False)
+    drawing.caption(
+        figure,
+        f"misfit {100.0 * fit.rms:.2g} % rms; no causal and passive material is nearer than "
+        f"{100.0 * limit.rms:.2g} % rms",
+    )
+    return figure
 
 
 def steady_page(state: SteadyState) -> Page:

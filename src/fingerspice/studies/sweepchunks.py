@@ -24,15 +24,16 @@ from fingerspice import __version__
 from fingerspice.base.announcing import paced
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.heap import keep_freed_memory
+from fingerspice.base.files import keep_freed_memory
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies import sweepplan
 from fingerspice.studies.batch import MESSAGES, batch
 from fingerspice.studies.sweepplan import Plan
-from fingerspice.studies.sweepstore import SweepStore
 
 if TYPE_CHECKING:
     from xarray import Dataset
+
+    from fingerspice.studies.sweepstore import SweepStore
 
 # Chunks that a process has at once: it computes one while another one is waiting for the disk.
 AT_ONCE = 2

@@ -20,8 +20,7 @@ from fingerspice.results.outcome import SolveError
 from fingerspice.results.sensitivity import MEANS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate
-from fingerspice.torch.requests import request, tensor_of
-from fingerspice.torch.scenes import Scenes
+from fingerspice.torch.scenes import Scenes, request, tensor_of
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 

@@ -15,8 +15,7 @@ from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.sensitivity import MEANS
 from fingerspice.studies.batch import own_path
-from fingerspice.torch.requests import request, tensor_of
-from fingerspice.torch.scenes import Scenes
+from fingerspice.torch.scenes import Scenes, request, tensor_of
 
 
 class Simulator(torch.nn.Module):
