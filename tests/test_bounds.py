@@ -13,7 +13,7 @@ import fingerspice as fs
 from deck_edits import edited
 from fingerspice.engine import loopstate
 from fingerspice.solve.problem import MOST_BYTES
-from fingerspice.waveforms import combinations
+from fingerspice.waveforms import bounds
 from processes import ended, start
 from scenes import table1
 
@@ -86,8 +86,8 @@ def test_values_do_not_depend_on_the_windows_they_are_looked_up_in(
     rng = np.random.default_rng(7)
     t = np.concatenate([rng.uniform(-0.01, 0.5, 300), wave.breakpoints(0.0, 0.5)]).reshape(-1, 1)
     whole = [wave.value(t, side) for side in ("left", "right")]
-    monkeypatch.setattr(combinations, "_WINDOW", 7)
-    assert len(list(combinations.in_windows(t.ravel(), wave.breakpoint_rate()))) > 20
+    monkeypatch.setattr(bounds, "_WINDOW", 7)
+    assert len(list(bounds.in_windows(t.ravel(), wave.breakpoint_rate()))) > 20
     for expected, side in zip(whole, ("left", "right"), strict=True):
         np.testing.assert_array_equal(wave.value(t, side), expected)
 

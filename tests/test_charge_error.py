@@ -307,7 +307,7 @@ def engine_charge(
     control, collected = np.zeros(readout.N_CONTROL), np.array([[before], [0.0]])
     form = form_of(step)
     work = netform.new_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
-    rows.places[:], rows.off[:, : len(places)] = places, missed
+    work.places[:], work.off[:, : len(places)] = places, missed
     netcharge.charge_error(
         form, work, H, step.lost[None, :], step.g, theta, np.ascontiguousarray(u), areas, z, collected, control
     )

@@ -15,7 +15,7 @@ import fingerspice as fs
 from commands import Command
 from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import Tran
-from fingerspice.netlist.library import LIBRARIES, library_text
+from fingerspice.netlist.files import LIBRARIES, library_text
 from fingerspice.netlist.slips import ELSEWHERE, decimal_comma
 from ngspice_tools import call_ngspice, run_ngspice, with_max_step
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.netlist.library import LIBRARIES, library_text
+from fingerspice.netlist.files import LIBRARIES, library_text
 from ngspice_tools import CIRCUITS, call_ngspice, run_ngspice
 from scenes import deck, table1
 

@@ -10,7 +10,7 @@ from scipy.integrate import simpson
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.numerics.extremes import largest
+from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import NODES, POINTS
 from fingerspice.results import measures, steps
 from scenes import deck, table1, table1_deck

@@ -22,7 +22,7 @@ import fingerspice as fs
 import recording_errors
 from commands import Command, tree
 from fingerspice.cli.store import Store
-from fingerspice.solve import pieces, windows
+from fingerspice.solve import pieces, recordings
 from fingerspice.waveforms import samples
 from processes import ended, no_room, start
 from scenes import table1_deck
@@ -122,7 +122,7 @@ def test_a_quiet_beginning_is_followed_to_its_own_scale() -> None:
 
 @pytest.mark.parametrize("name", ["two_fingers", "amplifier", "fingerpad_square", "texture_recording"])
 def test_any_circuit_is_streamed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(windows, "WINDOW", 400)
+    monkeypatch.setattr(recordings, "WINDOW", 400)
     circuit = fs.read_netlist(Path(__file__).parents[1] / "circuits" / f"{name}.cir")
     how = {"rtol": 1e-6, "t_stop": 0.03}
     one, other = (list(fs.stream(circuit, count=count, **how)) for count in (251, 10**6))

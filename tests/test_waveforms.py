@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 import fingerspice as fs
-from fingerspice.engine.segment import Segment, source
-from fingerspice.waveforms import combinations, periodic, ramps, repeated, sampling
+from fingerspice.engine.zeros import Segment, source
+from fingerspice.waveforms import combinations, periodic, ramps, sampling
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.sampling import source_table
@@ -57,7 +57,7 @@ def table_values(case: Case, t0: float, t1: float, t: np.ndarray) -> tuple[np.nd
 def test_every_waveform_class_is_in_the_registry() -> None:
     named = {type(c.waveform) for c in CASES}
     abstract = (fs.Waveform, ramps.Ramps)
-    for module in (combinations, periodic, ramps, repeated, sampling, waveforms):
+    for module in (combinations, periodic, ramps, sampling, waveforms):
         for name, item in vars(module).items():
             if isinstance(item, type) and issubclass(item, fs.Waveform) and not name.startswith("_"):
                 assert item in named or item in abstract, f"{name} has no case"

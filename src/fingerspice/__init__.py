@@ -62,7 +62,9 @@ if TYPE_CHECKING:
     from fingerspice.studies.steady import SteadyState as SteadyState
     from fingerspice.studies.steady import steady_state as steady_state
     from fingerspice.waveforms.combinations import AM as AM
+    from fingerspice.waveforms.combinations import Burst as Burst
     from fingerspice.waveforms.combinations import Product as Product
+    from fingerspice.waveforms.combinations import Repeat as Repeat
     from fingerspice.waveforms.combinations import Sum as Sum
     from fingerspice.waveforms.periodic import Chirp as Chirp
     from fingerspice.waveforms.periodic import Exp as Exp
@@ -71,8 +73,6 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.periodic import Square as Square
     from fingerspice.waveforms.periodic import Triangle as Triangle
     from fingerspice.waveforms.ramps import PWL as PWL
-    from fingerspice.waveforms.repeated import Burst as Burst
-    from fingerspice.waveforms.repeated import Repeat as Repeat
     from fingerspice.waveforms.samples import Samples as Samples
     from fingerspice.waveforms.sampling import Function as Function
     from fingerspice.waveforms.waveform import DC as DC
@@ -85,9 +85,8 @@ _HOMES = {
     "waveforms.periodic": ("Chirp", "Exp", "Pulse", "Sawtooth", "Square", "Triangle"),
     "waveforms.ramps": ("PWL",),
     "waveforms.samples": ("Samples",),
-    "waveforms.repeated": ("Burst", "Repeat"),
     "waveforms.sampling": ("Function",),
-    "waveforms.combinations": ("AM", "Product", "Sum"),
+    "waveforms.combinations": ("AM", "Burst", "Product", "Repeat", "Sum"),
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
     "studies.batch": ("batch",),
     "studies.capability": ("Capability", "capability"),

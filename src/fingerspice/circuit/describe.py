@@ -11,9 +11,8 @@ from typing import Any
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.waveforms.combinations import Product, Sum
+from fingerspice.waveforms.combinations import Burst, Product, Repeat, Sum
 from fingerspice.waveforms.ramps import PWL
-from fingerspice.waveforms.repeated import Burst, Repeat
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DC, Waveform

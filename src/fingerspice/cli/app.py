@@ -229,7 +229,7 @@ def ac(
     from fingerspice.results.report import phasor_csv, phasor_dict, phasor_tables
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.phasors import phasor
-    from fingerspice.studies.sweeps import sweep_frequencies
+    from fingerspice.studies.populations import sweep_frequencies
 
     how = "steady_state" if area == "coupled" else "phasor"
     with Answering("ac", as_json, charge_law=charge_law, method=how, rtol=rtol, area=area, skin=skin) as answer:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from fingerspice.base.arrays import FloatArray
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.cli.store import Store
-    from fingerspice.results.phasor_solution import PhasorSolution
+    from fingerspice.results.loading import PhasorSolution
     from fingerspice.results.solution import Solution
     from fingerspice.solve.streaming import Stream
     from fingerspice.studies.feel import Feel

@@ -22,8 +22,8 @@ from fingerspice.base.errors import InputError, printable
 from fingerspice.base.pages import in_notebook
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.explorer import changed
-from fingerspice.explorer.encoding import as_json, framed
 from fingerspice.explorer.examples import EXAMPLES
+from fingerspice.explorer.recordings import as_json, framed
 from fingerspice.explorer.request import asked_by
 from fingerspice.explorer.scene import begun
 from fingerspice.explorer.sliders import menu

@@ -7,12 +7,27 @@ import sys
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from encodings import cp1252
+from functools import cache
 from pathlib import Path, PurePath
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.netlist.lexer import split_lines
-from fingerspice.netlist.library import LIBRARIES, library_text
 from fingerspice.netlist.slips import closest, nearest
+
+LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
+
+
+@cache
+def library_text(law: str) -> str:
+    """Text of a charge law's library, from the installed package or the source tree."""
+    name = LIBRARIES[law]
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "lib", package.parents[1] / "circuits"):
+        path = folder / name
+        if path.is_file():
+            return path.read_text(encoding="utf-8")
+    raise InputError(f"{name} is missing from this installation; reinstall fingerspice")
+
 
 MAX_BYTES = 64 * 2**20
 #: Largest total size of the files that a deck's sources name, bytes.

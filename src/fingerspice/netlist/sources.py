@@ -12,11 +12,10 @@ from fingerspice.circuit.circuit import SmallSignal
 from fingerspice.netlist.deck import Call, Number, Token
 from fingerspice.netlist.files import SourceFiles
 from fingerspice.netlist.slips import is_unit, nearest
-from fingerspice.waveforms.combinations import AM
+from fingerspice.waveforms.combinations import AM, Burst, Repeat
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.periodic import Chirp, Exp, Pulse, Sawtooth, Square, Triangle
 from fingerspice.waveforms.ramps import PWL
-from fingerspice.waveforms.repeated import Burst, Repeat
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 

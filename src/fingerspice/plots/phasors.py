@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.plots.picture import Picture
-    from fingerspice.results.phasor_solution import PhasorSolution
+    from fingerspice.plots.drawing import Picture
+    from fingerspice.results.loading import PhasorSolution
 
 
 def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from fingerspice.base.arrays import FloatArray
-    from fingerspice.plots.picture import Picture
+    from fingerspice.plots.drawing import Picture
     from fingerspice.results.solution import Solution
     from fingerspice.results.spectrum import Spectrum
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.numerics.extremes import largest
+from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS
 
 #: From the record of a run to one of its signals, shape (n_t,).

@@ -14,7 +14,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran, check
 from fingerspice.circuit.loop import network_of
-from fingerspice.waveforms import combinations, periodic, ramps, repeated, samples
+from fingerspice.waveforms import combinations, periodic, ramps, samples
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
 from fingerspice.waveforms.waveform import Waveform, blank_terms
@@ -26,7 +26,7 @@ _WAVEFORMS = {
     for kind in (
         waveforms.DC, waveforms.Sine, periodic.Chirp, periodic.Exp, ramps.PWL, periodic.Pulse, periodic.Square,
         periodic.Triangle, periodic.Sawtooth, combinations.Sum, combinations.Product, combinations.AM,
-        repeated.Burst, repeated.Repeat, samples.Samples,
+        combinations.Burst, combinations.Repeat, samples.Samples,
     )
 }  # fmt: skip
 _PLAIN = ("title", "charge_law", "work", "warnings", "unused", "overrides", "initial")

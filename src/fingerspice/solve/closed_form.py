@@ -11,15 +11,15 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.network import Modes, Network
-from fingerspice.engine.algebraic import follow, source_at
+from fingerspice.engine.currents import follow, source_at
 from fingerspice.engine.network import at_sources
 from fingerspice.numerics import hold, linear
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
+from fingerspice.solve.initial import StackState, from_stack, from_written, model_of, row_width
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run, closed_form, gap_signals, kept_with
 from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index
-from fingerspice.solve.stackstate import StackState, from_stack, from_written, model_of, row_width
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import on_grid, same_time
 

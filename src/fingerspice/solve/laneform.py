@@ -31,9 +31,9 @@ from fingerspice.engine.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area_array
 from fingerspice.results.outcome import State
+from fingerspice.solve.initial import StackState, from_stack
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK
-from fingerspice.solve.stackstate import StackState, from_stack
 from fingerspice.solve.track import as_recorded, on_branch, system_of
 
 # Number of lanes, each with a piece of a recording: of a stack, and of a network, whose rows would not all fit into the

@@ -17,11 +17,11 @@ from fingerspice.engine.pace import Pace
 from fingerspice.engine.stackstep import Stack
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import ErrorEstimate, SolveError, State, Status
+from fingerspice.solve.initial import StackState, from_stack, model_of
 from fingerspice.solve.period import CHARGING, Found, Period, Stopped, first_period
 from fingerspice.solve.period_search import Search
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import period_failure
-from fingerspice.solve.stackstate import StackState, from_stack, model_of
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, LONGEST_STEP, SAFETY
 from fingerspice.solve.track import prepare_system
 from fingerspice.waveforms.sampling import SourceTable, source_table

@@ -16,9 +16,8 @@ from fingerspice.circuit.network import Network
 from fingerspice.circuit.notices import time_slip
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
-from fingerspice.solve.initial import initial_state
+from fingerspice.solve.initial import StackState, initial_state, to_stack
 from fingerspice.solve.scenes import Scene, scene_of
-from fingerspice.solve.stackstate import StackState, to_stack
 from fingerspice.waveforms.sampling import on_breakpoint, same_time
 from fingerspice.waveforms.waveform import Waveform, require
 

@@ -19,8 +19,8 @@ from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem, check_length, check_outputs
+from fingerspice.solve.recordings import BySamples, ByWindows, Mark, Outputs, outputs_of, within
 from fingerspice.solve.simulation import asked, check_method, planned, rtol_given, solution_of
-from fingerspice.solve.windows import BySamples, ByWindows, Mark, Outputs, outputs_of, within
 from fingerspice.waveforms.waveform import require
 
 # Default length of a chunk, s.

@@ -20,19 +20,15 @@ from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import end_row
 from fingerspice.engine.rows import Work, new_work
-from fingerspice.engine.segment import Segment, source
 from fingerspice.engine.stackstep import Stack
 from fingerspice.engine.system import LEVEL_RATIO, System, area_error, area_missed, area_range, build_system
+from fingerspice.engine.zeros import Segment, source
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record, sided
 from fingerspice.results.steps import Recorded
-from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Run, kept_with
-from fingerspice.solve.scenes import Scene
-from fingerspice.solve.sources import segment_index
-from fingerspice.solve.stackstate import (
+from fingerspice.solve.initial import (
     StackState,
     as_marched,
     from_stack,
@@ -40,6 +36,10 @@ from fingerspice.solve.stackstate import (
     model_of,
     row_width,
 )
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import Run, kept_with
+from fingerspice.solve.scenes import Scene
+from fingerspice.solve.sources import segment_index
 from fingerspice.solve.stepping import SAFETY, OutOfRangeError, Stepping, looks_of
 
 # Number of modal systems cached with a scene: one for each thread and decade of tolerances, of up to 1 MB each.

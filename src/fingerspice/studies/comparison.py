@@ -13,14 +13,14 @@ from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.response import linear_scene
-from fingerspice.results.phasor_solution import PhasorSolution
+from fingerspice.results.loading import PhasorSolution
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Value
 from fingerspice.studies.phasors import phasor
 from fingerspice.studies.steady import steady_state
 
 if TYPE_CHECKING:
-    from fingerspice.plots.picture import Picture
+    from fingerspice.plots.drawing import Picture
 
 
 @dataclass(frozen=True)

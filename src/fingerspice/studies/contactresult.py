@@ -113,7 +113,7 @@ class ContactFit(Estimates):
 
     def plot(self) -> Figure:
         """Data and fit of every relation, with the residuals below."""
-        from fingerspice.plots.fits import Curve, Panel, plot_panels
+        from fingerspice.plots.populations import Curve, Panel, plot_panels
 
         panels = []
         for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True):

@@ -30,7 +30,7 @@ from fingerspice.waveforms.waveform import require
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from fingerspice.plots.picture import Picture
+    from fingerspice.plots.drawing import Picture
     from fingerspice.results.solution import Solution
     from fingerspice.results.spectrum import Spectrum
 

@@ -125,7 +125,7 @@ class Fit(Estimates):
 
     def plot(self) -> Figure:
         """Data and fit, with the residuals below."""
-        from fingerspice.plots.fits import Curve, plot_fit
+        from fingerspice.plots.populations import Curve, plot_fit
 
         data, circuit = self.data, self.circuit
         signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal

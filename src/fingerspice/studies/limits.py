@@ -24,7 +24,7 @@ from fingerspice.waveforms.combinations import Product
 from fingerspice.waveforms.waveform import Waveform, as_waveform, require
 
 if TYPE_CHECKING:
-    from fingerspice.plots.picture import Picture
+    from fingerspice.plots.drawing import Picture
 
 
 # Range of voltages that is searched, V; relative accuracy of the voltage at the fold; relative error of each run.

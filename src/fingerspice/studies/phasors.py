@@ -17,11 +17,11 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.network import build_network
 from fingerspice.circuit.response import LinearScene, areas_at_rest, linear_scene, with_skin_held
 from fingerspice.circuit.usual import beyond_fingers
+from fingerspice.results.loading import PhasorSolution
 from fingerspice.results.measures import weigh_outputs
-from fingerspice.results.phasor_solution import PhasorSolution
 from fingerspice.solve.runs import Progress
+from fingerspice.studies.populations import Drive, sweep_drive, sweep_notes
 from fingerspice.studies.steady import steady_state
-from fingerspice.studies.sweeps import Drive, sweep_drive, sweep_notes
 from fingerspice.waveforms.waveform import Fundamental, Sine, Waveform, require
 
 
