@@ -12,7 +12,7 @@ import pytest
 FAULTS = """
 import resource, sys
 import numpy as np
-from fingerspice.base.files import keep_freed_memory
+from fingerspice.base.arrays import keep_freed_memory
 if "keep" in sys.argv:
     keep_freed_memory()
 for _ in range(3):

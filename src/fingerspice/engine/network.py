@@ -20,7 +20,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
-from fingerspice.engine.zeros import Segment, source
+from fingerspice.engine.segment import Segment, source
 from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
 

@@ -22,7 +22,7 @@ from fingerspice.engine.readout import (
     H,
     T,
 )
-from fingerspice.engine.zeros import Segment, source
+from fingerspice.engine.segment import Segment, source
 from fingerspice.numerics.lobatto import NODES
 
 # Ratio of neighbouring step lengths of the ladder, as a power of two: small enough to waste little, large enough for

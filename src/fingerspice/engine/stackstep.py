@@ -66,8 +66,9 @@ from fingerspice.engine.readout import (
     T,
 )
 from fingerspice.engine.rows import DQ, GUESS, X_GAP, U, Work, largest_size, source_rows
+from fingerspice.engine.segment import Segment, segment_at, source
 from fingerspice.engine.system import System
-from fingerspice.engine.zeros import Segment, dip, first_wrong, segment_at, source
+from fingerspice.engine.zeros import dip, first_wrong
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 
 # A gap voltage below this fraction of the one at the next node counts as 0.

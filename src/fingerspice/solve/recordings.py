@@ -21,9 +21,8 @@ from fingerspice.results.record import Record
 from fingerspice.solve.laneform import LaneForm, rounded_peak, stack
 from fingerspice.solve.lanes import LaneMarch, Outcome
 from fingerspice.solve.netforms import finger
-from fingerspice.solve.outputs import at_breakpoints
 from fingerspice.solve.pieces import Piece, pieces_of
-from fingerspice.solve.problem import Problem
+from fingerspice.solve.problem import Problem, at_breakpoints
 from fingerspice.solve.runs import Progress, Run, closed_form, kept_with
 from fingerspice.solve.simulation import integrated, own_rtol, state_error
 from fingerspice.waveforms.samples import Samples

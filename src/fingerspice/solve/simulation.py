@@ -23,10 +23,9 @@ from fingerspice.results.solution import Solution
 from fingerspice.solve.closed_form import solve_algebraic, solve_linear
 from fingerspice.solve.marching import solve as solve_exponential
 from fingerspice.solve.nodal import solve_coupled
-from fingerspice.solve.outputs import asked_for, at_breakpoints
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.planning import make_plan, run_warnings
-from fingerspice.solve.problem import Problem, prepare, to_ends
+from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare, to_ends
 from fingerspice.solve.runs import ROUGH, Progress, Run, run_failure
 from fingerspice.solve.sensitivities import check_request, sensitivities_of
 from fingerspice.waveforms.waveform import DOUBLE, require

@@ -20,9 +20,9 @@ from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import end_row
 from fingerspice.engine.rows import Work, new_work
+from fingerspice.engine.segment import Segment, source
 from fingerspice.engine.stackstep import Stack
 from fingerspice.engine.system import LEVEL_RATIO, System, area_error, area_missed, area_range, build_system
-from fingerspice.engine.zeros import Segment, source
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import State, Status

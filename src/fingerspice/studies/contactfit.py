@@ -16,8 +16,7 @@ from fingerspice.circuit.devices import DEVICES
 from fingerspice.studies.contactdata import ContactTask, Given, Relation, relations_of, solved
 from fingerspice.studies.contactresult import ContactFit, contact_result
 from fingerspice.studies.fit import bounds_of, profiled, refuse_twice
-from fingerspice.studies.fitprofile import profile_of
-from fingerspice.studies.fittask import REFUSED
+from fingerspice.studies.fittask import REFUSED, profile_of
 from fingerspice.waveforms.waveform import require
 
 PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")

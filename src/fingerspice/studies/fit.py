@@ -20,9 +20,8 @@ from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.batch import batch
 from fingerspice.studies.fitdata import IMPEDANCE, Data, data_of
 from fingerspice.studies.fitgroups import Unknown, group_column, unknowns_of
-from fingerspice.studies.fitprofile import limit_of, profile_of
 from fingerspice.studies.fitresult import Fit, Fitted, fit_result
-from fingerspice.studies.fittask import FARTHEST, REFUSED, Task, evaluations_shown, followed
+from fingerspice.studies.fittask import FARTHEST, REFUSED, Task, evaluations_shown, followed, limit_of, profile_of
 from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.

@@ -22,9 +22,8 @@ import numpy as np
 
 from fingerspice import __version__
 from fingerspice.base.announcing import paced
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, keep_freed_memory
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.files import keep_freed_memory
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies import sweepplan
 from fingerspice.studies.batch import MESSAGES, batch
