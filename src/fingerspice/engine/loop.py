@@ -14,19 +14,12 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import borrow, jit, jit_by_kind, jit_within
 from fingerspice.engine.loopstate import (
-    CONVERGED,
     DONE,
     EXCESSIVE,
-    FRESH,
     GO_ON,
-    LENGTH,
     LOOKED_AT,
     RETRY,
     SAME_TIME,
-    STEP_ERROR,
-    TRIES,
-    TRUSTED,
-    WANTED,
     LoopState,
 )  # fmt: skip
 from fingerspice.engine.mesh import Mesh, begin_mesh, edges_of_mesh, start_mesh, worst_of_mesh
@@ -234,7 +227,7 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
     """
     # Arrays without a reference count: it would cost an atomic operation at every access to a tuple.
     circuit, state = borrow(circuit), borrow(state)
-    state.place[TRUSTED] = 1
+    state.step[0].trusted = 1
     start(circuit, state)
     while True:
         code = begin(circuit, pace, state, t_end)
@@ -250,30 +243,30 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
 @jit_within
 def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
     """Solve a step with ever shorter lengths until its error is small enough, and choose the next step's length."""
-    step, place, control, counters = state.step, state.place, state.control, state.counters
-    step[WANTED], place[TRIES] = control[H], 1
+    step, control, counters = state.step[0], state.control, state.counters
+    step.wanted, step.tries = control[H], 1
     while True:
         code = attempt(circuit, pace, state)
         if code == RETRY:
             continue
         if code != GO_ON:
             return code
-        h, error, converged = step[LENGTH], step[STEP_ERROR], place[CONVERGED] > 0
+        h, error, converged = step.length, step.step_error, step.converged > 0
         note(state.tried, counters[ACCEPTED] + counters[REJECTED], control[T], h, error / pace.tol)
         if converged and not pace.controlled:
             return GO_ON
         factor = allowed_factor(error, pace.tol)
         if error <= pace.tol:
-            accept(h, step[WANTED], factor, place[TRIES], place[FRESH], place[TRUSTED] > 0, control)
-            place[FRESH] = -1
+            accept(h, step.wanted, factor, step.tries, step.fresh, step.trusted > 0, control)
+            step.fresh = -1
             return GO_ON
-        place[TRIES] += 1
+        step.tries += 1
         counters[REJECTED] += 1
         code = refuse(circuit, state)
         if code != GO_ON:
             return code
         reach = beyond(circuit, pace, state)
         if reach < 2.0:
-            step[LENGTH] = rung(h * min(0.9, reach))
+            step.length = rung(h * min(0.9, reach))
         else:
-            step[LENGTH] = step[WANTED] = shorten(h, factor, control)
+            step.length = step.wanted = shorten(h, factor, control)

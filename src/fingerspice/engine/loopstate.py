@@ -1,13 +1,13 @@
 """What the loop of exponential steps and its two kinds of circuits share: the run in progress and the step at hand.
 
-The step at hand is in arrays, because its parts are functions of their own, and because a run may pause between two
+The step at hand is a record, because its parts are functions of their own, and because a run may pause between two
 steps and continue in a later call.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,27 +163,46 @@ DONE, NO_STEP, OUT_OF_RANGE, TOO_MANY, PAUSED, REFERENCE, EXCESSIVE, LOOKED_AT =
 # Codes of the parts of a step, beside these: go on with the next part; start again with this step; try another length.
 GO_ON, AGAIN, RETRY = -1, -2, -3
 
-# Entries of `LoopState.step`: length being tried, that wanted before a boundary or a zero cut it short, and that to
-# which the exponential tables in use belong, s; fraction of the length that counts, and the time then reached, s; error
-# of the step, which controls its length, and of the whole run, V; largest ratio of a move of the gap voltage to the
-# move of a state voltage.
-LENGTH, WANTED, TABLED, THETA, T_NEW, STEP_ERROR, RUN_ERROR, GROWN = range(8)
-# The source's segment at hand and the time since its start, the end of the step's range, and the time since which
-# evaluations are counted, s; fraction of the step at which the gap voltage dips off its branch, or 0.
-START, EDGE, SINCE, STOP, BEGUN, BELOW = range(8, 14)
-N_STEP = 14
-# Entries of `LoopState.place`: whether the run is paused; number of the segment, the reference area, and the tables;
-# entry of `control` for the length of a first step after an edge or a zero, -1 for other steps; lengths tried; branches
-# left in a row without a step; whether the iteration converged, and did at the last length that was rejected; first
-# node off its branch, or 0; the area whose gap voltage ends the step by a zero, or -1.
-IS_PAUSED, INDEX, LEVEL, SLOT, FRESH, TRIES, FLIPS, CONVERGED, TRUSTED, WRONG, CROSSED = range(11)
-# Evaluations at the last edge of the source; most steps; in this call, number of iterations without convergence, of
-# steps accepted before it, and of those at which it pauses.
-EVALUATED, MOST, UNCONVERGED, ACCEPTED_BEFORE, PAUSE_AT = range(11, 16)
-# Of a network: whether the call has begun; is within a jump of the sources; at an edge; whether no voltage follows a
-# source at once; whether the areas are coupled; and whether no mode counts as stiff.
-HAS_BEGUN, IN_JUMP, AT_EDGE, SMOOTH, SEVERAL, WHOLE = range(16, 22)
-N_PLACE = 22
+STEP = np.dtype([
+    ("length", float),  # s: being tried
+    ("wanted", float),  # s: before a boundary or a zero cut it short
+    ("tabled", float),  # s: to which the exponential tables in use belong
+    ("theta", float),  # Fraction of the length that counts
+    ("t_new", float),  # s: reached at that fraction
+    ("step_error", float),  # V: of the step, which controls its length
+    ("run_error", float),  # V: of the whole run
+    ("grown", float),  # Largest ratio of a move of the gap voltage to the move of a state voltage
+    ("start", float),  # s: of the source's segment at hand
+    ("edge", float),  # s: its end
+    ("since", float),  # s: time since its start
+    ("stop", float),  # s: end of the step's range
+    ("begun", float),  # s: since which evaluations are counted
+    ("below", float),  # Fraction of the step at which the gap voltage dips off its branch, or 0
+    ("is_paused", np.int64),
+    ("index", np.int64),  # Of the source's segment
+    ("level", np.int64),  # Of the reference area
+    ("slot", np.int64),  # Of the tables
+    ("fresh", np.int64),  # Entry of `control` for the length of a first step after an edge or a zero; -1 for others
+    ("tries", np.int64),  # Lengths tried
+    ("flips", np.int64),  # Branches left in a row without a step
+    ("converged", np.int64),  # Whether the iteration has
+    ("trusted", np.int64),  # Whether it has at the last length that was rejected
+    ("wrong", np.int64),  # First node off its branch, or 0
+    ("crossed", np.int64),  # The area whose gap voltage ends the step by a zero, or -1
+    ("evaluated", np.int64),  # Rows, at the last edge of the source
+    ("most", np.int64),  # Steps allowed
+    ("unconverged", np.int64),  # Iterations of this call
+    ("accepted_before", np.int64),  # Steps, before this call
+    ("pause_at", np.int64),  # So many accepted steps
+    # Of a network
+    ("has_begun", np.int64),  # Whether the call has
+    ("in_jump", np.int64),  # Whether it is within a jump of the sources
+    ("at_edge", np.int64),
+    ("smooth", np.int64),  # Whether no voltage follows a source at once
+    ("several", np.int64),  # Whether the areas are coupled
+    ("whole", np.int64),  # Whether no mode counts as stiff
+])  # fmt: skip
+"""The step at hand."""
 
 
 class LoopState(NamedTuple):
@@ -195,9 +214,7 @@ class LoopState(NamedTuple):
     # control, counters: Bookkeeping, see `engine.readout`
     control: FloatArray
     counters: IntArray
-    # step, place (N_STEP,): The step at hand; its entries are named above
-    step: FloatArray
-    place: IntArray
+    step: NDArray[Any]  # (1,): A record of type `STEP`
     outputs: Outputs
     # Takes the first steps, for repeated periods, until it is full; `counters` tells how many steps there were
     kept: Kept
@@ -213,10 +230,10 @@ def may_shorten(s: LoopState, since: float) -> bool:
 
     The rounding of its length is relative to the time `since` (s).
     """
-    if s.step[LENGTH] <= 1e-13 * max(since, 1e-3 * (s.step[STOP] - s.control[T])):
+    if s.step[0].length <= 1e-13 * max(since, 1e-3 * (s.step[0].stop - s.control[T])):
         return False
     s.counters[REJECTED] += 1
-    s.control[H], s.place[FLIPS] = 0.25 * s.step[LENGTH], 0
+    s.control[H], s.step[0].flips = 0.25 * s.step[0].length, 0
     return True
 
 
@@ -243,7 +260,7 @@ def write_step(s: LoopState, t: float, values: FloatArray, coefficients: FloatAr
         Scratch.
     """
     counters, kept_times = s.counters, s.kept.times
-    h, theta, t_new = s.step[LENGTH], s.step[THETA], s.step[T_NEW]
+    h, theta, t_new = s.step[0].length, s.step[0].theta, s.step[0].t_new
     if s.steps.times.shape[0] > 0:
         record(s.steps.times, s.steps.values, counters[RECORDED], t, h, t_new, theta, values)
         counters[RECORDED] += 1

@@ -11,29 +11,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine import netform
 from fingerspice.engine.exponential import Tables
-from fingerspice.engine.loopstate import (
-    ACCEPTED_BEFORE,
-    AT_EDGE,
-    DONE,
-    FLIPS,
-    FRESH,
-    GO_ON,
-    HAS_BEGUN,
-    IN_JUMP,
-    IS_PAUSED,
-    LENGTH,
-    MOST,
-    PAUSE_AT,
-    PAUSED,
-    REFERENCE,
-    SEVERAL,
-    SMOOTH,
-    STOP,
-    TABLED,
-    TOO_MANY,
-    UNCONVERGED,
-    LoopState,
-)
+from fingerspice.engine.loopstate import DONE, GO_ON, PAUSED, REFERENCE, TOO_MANY, LoopState
 from fingerspice.engine.netassess import ERROR_F, ERROR_U, PEAK_F, PEAK_U, load
 from fingerspice.engine.netform import Form, Leaks, Work
 from fingerspice.engine.network import Sources, at_sources
@@ -174,7 +152,7 @@ def worst_of_mesh(c: Mesh, s: LoopState) -> float:
 def leaks_of(c: Mesh, s: LoopState) -> Leaks:
     """What leaks at present: nothing within a jump of the sources."""
     form, none = c.form, c.work.jump.leaks
-    if s.place[IN_JUMP] > 0:
+    if s.step[0].in_jump > 0:
         return Leaks(none.rates, none.gain, none.g, none.pace, none.lost, none.lost_s)
     return Leaks(form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s)
 
@@ -182,27 +160,27 @@ def leaks_of(c: Mesh, s: LoopState) -> Leaks:
 @jit_within
 def branch_of(c: Mesh, s: LoopState) -> FloatArray:
     """Where the areas' branches began: in time, or within a jump."""
-    return c.work.jump.branch if s.place[IN_JUMP] > 0 else c.branch
+    return c.work.jump.branch if s.step[0].in_jump > 0 else c.branch
 
 
 @jit_within
 def start_mesh(c: Mesh, s: LoopState) -> None:
     """Begin a call of the loop, or go on after a pause, which changes nothing."""
-    form, work, place, counters = c.form, c.work, s.place, s.counters
+    form, work, step, counters = c.form, c.work, s.step[0], s.counters
     n = form.shape.shape[0]
-    place[PAUSE_AT] = counters[ACCEPTED] + 1 + _AT_ONCE // form.rates.size
+    step.pause_at = counters[ACCEPTED] + 1 + _AT_ONCE // form.rates.size
     # Other runs may have used the tables since the last call.
-    s.step[TABLED] = 0.0
-    if place[IS_PAUSED] > 0:
-        place[IS_PAUSED] = 0
+    s.step[0].tabled = 0.0
+    if step.is_paused > 0:
+        step.is_paused = 0
         return
-    place[FLIPS], place[FRESH] = 0, -1
-    place[IN_JUMP], place[HAS_BEGUN], place[UNCONVERGED] = 0, 0, 0
-    place[ACCEPTED_BEFORE] = counters[ACCEPTED]
-    place[SEVERAL] = 0
+    step.flips, step.fresh = 0, -1
+    step.in_jump, step.has_begun, step.unconverged = 0, 0, 0
+    step.accepted_before = counters[ACCEPTED]
+    step.several = 0
     for b in range(1, form.home.size):
-        place[SEVERAL] |= int(form.home[b] != form.home[0])
-    place[SMOOTH] = int(
+        step.several |= int(form.home[b] != form.home[0])
+    step.smooth = int(
         _all_zero(form.tap_s) and _all_zero(form.stored_s) and _all_zero(form.follow) and _all_zero(form.gap_s)
     )
     for i in range(work.segment.size):
@@ -225,59 +203,59 @@ def _all_zero(x: FloatArray) -> bool:
 @jit_within
 def begin_mesh(c: Mesh, pace: Pace, s: LoopState, t_end: float) -> int:
     """Where the next step starts: at an edge of a source, within a jump, or later; and its length."""
-    form, work, step, place, control, counters = c.form, c.work, s.step, s.place, s.control, s.counters
-    if place[IN_JUMP] > 0 and control[T] >= 1.0:
+    form, work, step, control, counters = c.form, c.work, s.step[0], s.control, s.counters
+    if step.in_jump > 0 and control[T] >= 1.0:
         _leave_jump(c, s)
-    if counters[ACCEPTED] + counters[REJECTED] > place[MOST]:
+    if counters[ACCEPTED] + counters[REJECTED] > step.most:
         return TOO_MANY
-    step[STOP], place[AT_EDGE] = 1.0, 0
-    if place[IN_JUMP] > 0:
+    step.stop, step.at_edge = 1.0, 0
+    if step.in_jump > 0:
         copy_to(work.now, c.s_before)
     else:
-        if place[HAS_BEGUN] > 0 and control[T] >= t_end:
+        if step.has_begun > 0 and control[T] >= t_end:
             return DONE
-        if counters[ACCEPTED] >= place[PAUSE_AT] or counters[RECORDED] >= s.steps.times.shape[0] > 0:
-            place[IS_PAUSED] = 1
+        if counters[ACCEPTED] >= step.pause_at or counters[RECORDED] >= s.steps.times.shape[0] > 0:
+            step.is_paused = 1
             return PAUSED
         _look_at_sources(c, s, t_end)
-        if place[IN_JUMP] == 0 and control[T] >= t_end:
+        if step.in_jump == 0 and control[T] >= t_end:
             return DONE
     t = control[T]
-    if place[AT_EDGE] > 0:
+    if step.at_edge > 0:
         # Step lengths after a jump are often those after the previous jump.
         control[H], control[TOO_LONG], control[ALLOWED] = control[H_AFTER_EDGE], 0.0, 0.0
-        place[FRESH] = H_AFTER_EDGE
+        step.fresh = H_AFTER_EDGE
     load(form.inverse, form.follow, s.y, work.now, work.w0)
     _choose_branches(c, s, t)
-    if place[IN_JUMP] == 0 and far_from(form, work.here) and not _take_reference(c, s):
+    if step.in_jump == 0 and far_from(form, work.here) and not _take_reference(c, s):
         return REFERENCE
     rates = leaks_of(c, s).rates
-    longest = Pace(pace.tol, 1.0, True, pace.charge) if place[IN_JUMP] > 0 else pace
-    is_series = c.sources.series.shape[1] > 0 and place[IN_JUMP] == 0
+    longest = Pace(pace.tol, 1.0, True, pace.charge) if step.in_jump > 0 else pace
+    is_series = c.sources.series.shape[1] > 0 and step.in_jump == 0
     # If all rates are zero, the time constant is infinite.
-    step[LENGTH] = choose_step(longest, 1.0 / rates.max(), True, is_series, t, step[STOP] - t, control)
+    step.length = choose_step(longest, 1.0 / rates.max(), True, is_series, t, step.stop - t, control)
     return GO_ON
 
 
 @jit_within
 def _look_at_sources(c: Mesh, s: LoopState, t_end: float) -> None:
     """The sources' segments and values at the present time, and the next edge; a jump of any of them is entered."""
-    work, place, sources, before, t = c.work, s.place, c.sources, c.s_before, s.control[T]
+    work, step, sources, before, t = c.work, s.step[0], c.sources, c.s_before, s.control[T]
     segment, now, stop = work.segment, work.now, t_end
     for i in range(now.size):
         while sources.edges[sources.first[i] + segment[i] + 1] <= t:
             segment[i] += 1
-        place[AT_EDGE] |= int(sources.edges[sources.first[i] + segment[i]] == t)
+        step.at_edge |= int(sources.edges[sources.first[i] + segment[i]] == t)
         stop = min(stop, sources.edges[sources.first[i] + segment[i] + 1])
-    s.step[STOP] = stop
+    s.step[0].stop = stop
     at_sources(sources, segment, t, 0.0, now, work.slopes_now)
     # The time at which a call starts may differ from an edge by rounding.
-    least = _ROUNDING if place[AT_EDGE] > 0 else (math.inf if place[HAS_BEGUN] > 0 else _UNNOTICED)
-    place[HAS_BEGUN] = 1
+    least = _ROUNDING if step.at_edge > 0 else (math.inf if step.has_begun > 0 else _UNNOTICED)
+    step.has_begun = 1
     jumps = False
     for i in range(now.size):
         jumps |= abs(now[i] - before[i]) > least * max(abs(now[i]), abs(before[i]))
-    if jumps and place[SMOOTH] > 0:
+    if jumps and step.smooth > 0:
         copy_to(before, now)
     elif jumps:
         _enter_jump(c, s)
@@ -286,8 +264,8 @@ def _look_at_sources(c: Mesh, s: LoopState, t_end: float) -> None:
 @jit_within
 def _enter_jump(c: Mesh, s: LoopState) -> None:
     """Go on in the fraction of a jump from the sources' values before it to those now."""
-    jump, place, control = c.work.jump, s.place, s.control
-    place[IN_JUMP], place[AT_EDGE] = 1, 0
+    jump, step, control = c.work.jump, s.step[0], s.control
+    step.in_jump, step.at_edge = 1, 0
     copy_to(jump.control, control)
     copy_to(jump.sign, c.sign)
     copy_to(jump.before, c.s_before)
@@ -295,7 +273,7 @@ def _enter_jump(c: Mesh, s: LoopState) -> None:
     jump.branch[:] = 0.0
     control[:] = 0.0
     control[ERROR_Q], control[MAGNIFIED] = jump.control[ERROR_Q], jump.control[MAGNIFIED]
-    s.step[TABLED], s.step[STOP] = 0.0, 1.0
+    s.step[0].tabled, s.step[0].stop = 0.0, 1.0
     copy_to(c.work.now, jump.before)
 
 
@@ -308,7 +286,7 @@ def _leave_jump(c: Mesh, s: LoopState) -> None:
     for a in range(c.sign.size):
         if c.sign[a] != jump.sign[a]:
             c.branch[a, 0], c.branch[a, 1] = s.control[T], math.inf
-    s.step[TABLED] = 0.0
+    s.step[0].tabled = 0.0
 
 
 @jit_within
@@ -317,14 +295,14 @@ def resume_time(c: Mesh, s: LoopState) -> None:
     jump, control = c.work.jump, s.control
     jump.control[ERROR_Q], jump.control[MAGNIFIED] = control[ERROR_Q], control[MAGNIFIED]
     copy_to(control, jump.control)
-    s.place[IN_JUMP] = 0
+    s.step[0].in_jump = 0
 
 
 @jit_within
 def _choose_branches(c: Mesh, s: LoopState, t: float) -> None:
     """The areas at the start of a step and, where it is not known yet, the branch of each; the next zero to expect."""
     form, work, control, sign = c.form, c.work, s.control, c.sign
-    branch, in_jump, w0, now = branch_of(c, s), s.place[IN_JUMP] > 0, c.work.w0, c.work.now
+    branch, in_jump, w0, now = branch_of(c, s), s.step[0].in_jump > 0, c.work.w0, c.work.now
     ahead = math.inf
     control[BRANCH_START], control[BRANCH_LENGTH] = t, math.inf
     for a in range(sign.size):
@@ -358,7 +336,7 @@ def _take_reference(c: Mesh, s: LoopState) -> bool:
     if found < 0:
         return False
     go_over(c.references, found, form, s.error)
-    work.at[0], s.step[TABLED] = found, 0.0
+    work.at[0], s.step[0].tabled = found, 0.0
     copy_to(work.size[: form.shape.shape[0]], form.size)
     start_at(form.area0, work.areas[netform.AREA])
     load(form.inverse, form.follow, s.y, work.now, work.w0)

@@ -12,35 +12,7 @@ from fingerspice.engine import netform
 from fingerspice.engine.coupling import take_coupling
 from fingerspice.engine.currents import Moving, answer_mobile
 from fingerspice.engine.exponential import make_tables, weigh
-from fingerspice.engine.loopstate import (
-    ACCEPTED_BEFORE,
-    AGAIN,
-    CONVERGED,
-    CROSSED,
-    FLIPS,
-    FRESH,
-    GO_ON,
-    GROWN,
-    IN_JUMP,
-    LENGTH,
-    NO_STEP,
-    RETRY,
-    SEVERAL,
-    SLOT,
-    SMOOTH,
-    STEP_ERROR,
-    STOP,
-    T_NEW,
-    TABLED,
-    THETA,
-    TRUSTED,
-    UNCONVERGED,
-    WHOLE,
-    LoopState,
-    is_wanted,
-    may_shorten,
-    write_step,
-)
+from fingerspice.engine.loopstate import AGAIN, GO_ON, NO_STEP, RETRY, LoopState, is_wanted, may_shorten, write_step
 from fingerspice.engine.mesh import Mesh, branch_of, leaks_of, resume_time
 from fingerspice.engine.netassess import (
     account,
@@ -87,9 +59,9 @@ _UNCONVERGED, _UNCONVERGED_SHARE = 40, 0.2
 def _take_coupling(c: Mesh, s: LoopState) -> None:
     """The coupling of the areas for steps of the length to be tried."""
     form, work, leaks = c.form, c.work, leaks_of(c, s)
-    which = 2 * work.at[0] + int(s.place[IN_JUMP] > 0)
+    which = 2 * work.at[0] + int(s.step[0].in_jump > 0)
     take_coupling(
-        work.own, which, s.step[LENGTH], leaks.rates, form.feed, form.tap, form.tap_s, form.c, leaks.g, form.home,
+        work.own, which, s.step[0].length, leaks.rates, form.feed, form.tap, form.tap_s, form.c, leaks.g, form.home,
         form.cell,
     )  # fmt: skip
 
@@ -97,58 +69,58 @@ def _take_coupling(c: Mesh, s: LoopState) -> None:
 @jit_within
 def attempt_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
-    form, work, step, place, tables, tol = c.form, c.work, s.step, s.place, c.tables, pace.tol
+    form, work, step, tables, tol = c.form, c.work, s.step[0], c.tables, pace.tol
     leaks, branch, t, in_jump, several = (
-        leaks_of(c, s), branch_of(c, s), s.control[T], s.place[IN_JUMP] > 0, s.place[SEVERAL] > 0
+        leaks_of(c, s), branch_of(c, s), s.control[T], s.step[0].in_jump > 0, s.step[0].several > 0
     )  # fmt: skip
-    h = step[LENGTH]
-    if h != step[TABLED]:
-        place[SLOT] = make_tables(
+    h = step.length
+    if h != step.tabled:
+        step.slot = make_tables(
             leaks.rates, -1 if in_jump else work.at[0], h, tables.h, tables.level, tables.used, tables.decay,
             tables.phi, tables.miss,
         )  # fmt: skip
-        step[TABLED] = h
+        step.tabled = h
         _take_coupling(c, s)
-        place[WHOLE] = int(work.own.key[1] == 0)
-        weigh(leaks.rates, work.size, tables.decay[place[SLOT]], h, work.weight)
+        step.whole = int(work.own.key[1] == 0)
+        weigh(leaks.rates, work.size, tables.decay[step.slot], h, work.weight)
     if in_jump:
         ramp_rows(t, h, work.jump.before, work.jump.after, work.s, work.ds)
     else:
-        slopes = pace.charge or place[SMOOTH] == 0
+        slopes = pace.charge or step.smooth == 0
         source_rows(c.sources, work.segment, t, h, slopes, work.r, work.s, work.ds)
     follow_sources(form, work, leaks.gain)
     passes, closed, answer = solve_step(
-        form, work, leaks, tables, place[SLOT], several, h, c.sign, 0.3 * tol
+        form, work, leaks, tables, step.slot, several, h, c.sign, 0.3 * tol
     )  # fmt: skip
     s.counters[NFEV] += passes * NODES
-    place[CONVERGED], step[STEP_ERROR], step[GROWN] = int(closed), math.inf, 1.0
+    step.converged, step.step_error, step.grown = int(closed), math.inf, 1.0
     # An iteration that has not converged says nothing about the sign of the gap voltage.
     if not closed:
         return GO_ON
     u = work.areas[netform.U]
-    if place[FLIPS] <= c.sign.size and turn_at_start(form.cell, u, c.sign, tol, t, branch):
-        place[FLIPS] += 1
+    if step.flips <= c.sign.size and turn_at_start(form.cell, u, c.sign, tol, t, branch):
+        step.flips += 1
         return RETRY
     if form.mobile:
-        step[GROWN] = 1.0 / work.room[3].min()
-    carry(form, work, leaks, tables, place[SLOT], several, h, s.error, c.sign, answer)
-    error = assess(form, work, leaks, tables, place[SLOT], h, s.error, step[GROWN])
-    step[STEP_ERROR] = max(error, charged(form.cell, u, work.areas[netform.AREA])) if pace.charge else error
+        step.grown = 1.0 / work.room[3].min()
+    carry(form, work, leaks, tables, step.slot, several, h, s.error, c.sign, answer)
+    error = assess(form, work, leaks, tables, step.slot, h, s.error, step.grown)
+    step.step_error = max(error, charged(form.cell, u, work.areas[netform.AREA])) if pace.charge else error
     return GO_ON
 
 
 @jit_within
 def refuse_mesh(c: Mesh, s: LoopState) -> int:
     """Why no shorter step would do after one that was rejected; GO_ON if one may."""
-    step, place, t = s.step, s.place, s.control[T]
-    place[UNCONVERGED] += int(place[CONVERGED] == 0)
+    step, t = s.step[0], s.control[T]
+    step.unconverged += int(step.converged == 0)
     # The error of a shorter step says nothing about the length at which the iteration converges.
-    place[TRUSTED] = place[CONVERGED]
-    accepted = s.counters[ACCEPTED] - place[ACCEPTED_BEFORE]
-    stuck = place[UNCONVERGED] > _UNCONVERGED + _UNCONVERGED_SHARE * accepted
+    step.trusted = step.converged
+    accepted = s.counters[ACCEPTED] - step.accepted_before
+    stuck = step.unconverged > _UNCONVERGED + _UNCONVERGED_SHARE * accepted
     # A step of this length is rounding of the time: if it is rejected, there is a singularity.
-    lost = step[LENGTH] <= 1e-13 * max(abs(t), 1e-3 * (step[STOP] - t))
-    return NO_STEP if stuck or lost or (place[WHOLE] > 0 and 1.0 / step[GROWN] < _NEAR_FOLD) else GO_ON
+    lost = step.length <= 1e-13 * max(abs(t), 1e-3 * (step.stop - t))
+    return NO_STEP if stuck or lost or (step.whole > 0 and 1.0 / step.grown < _NEAR_FOLD) else GO_ON
 
 
 @jit_within
@@ -169,42 +141,42 @@ def beyond_mesh(c: Mesh, pace: Pace, s: LoopState) -> float:
 @jit_within
 def complete_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
     """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
-    work, step, place, control, t = c.work, s.step, s.place, s.control, s.control[T]
-    h, stop = step[LENGTH], step[STOP]
-    step[T_NEW], step[THETA], place[CROSSED] = t + h, 1.0, -1
-    if step[T_NEW] >= stop or stop - step[T_NEW] <= 1e-12 * h:
-        step[T_NEW], step[THETA] = stop, min(1.0, (stop - t) / h)
-    u, turned_enough = work.areas[netform.U], place[FLIPS] > c.sign.size
-    place[CROSSED], step[THETA], step[T_NEW] = first_zero(
-        c.form.cell, u, c.sign, pace.tol, t, h, step[THETA], step[T_NEW], turned_enough, work.room[0]
+    work, step, control, t = c.work, s.step[0], s.control, s.control[T]
+    h, stop = step.length, step.stop
+    step.t_new, step.theta, step.crossed = t + h, 1.0, -1
+    if step.t_new >= stop or stop - step.t_new <= 1e-12 * h:
+        step.t_new, step.theta = stop, min(1.0, (stop - t) / h)
+    u, turned_enough = work.areas[netform.U], step.flips > c.sign.size
+    step.crossed, step.theta, step.t_new = first_zero(
+        c.form.cell, u, c.sign, pace.tol, t, h, step.theta, step.t_new, turned_enough, work.room[0]
     )  # fmt: skip
-    a = place[CROSSED]
-    if a >= 0 and step[T_NEW] <= t:
+    a = step.crossed
+    if a >= 0 and step.t_new <= t:
         branch = branch_of(c, s)
         c.sign[a], branch[a, 0], branch[a, 1] = -c.sign[a], t, math.inf
-        place[FLIPS] += 1
+        step.flips += 1
         return AGAIN
     if turned_enough:
         off = 0.0
         for b in range(c.sign.size):
             if c.form.cell[b] >= 0:
-                off = max(off, farthest_off(u[b], c.sign[b], step[THETA]))
+                off = max(off, farthest_off(u[b], c.sign[b], step.theta))
         if off > pace.tol and may_shorten(s, t):
             return AGAIN
-    if c.form.mobile and place[WHOLE] == 0:
-        step[GROWN] = _magnified_whole(c, s)
+    if c.form.mobile and step.whole == 0:
+        step.grown = _magnified_whole(c, s)
         _take_coupling(c, s)
-    if not 0.0 < step[GROWN] < math.inf:
+    if not 0.0 < step.grown < math.inf:
         return NO_STEP
-    control[MAGNIFIED] = max(control[MAGNIFIED], step[GROWN])
-    place[FLIPS] = 0
-    basis_at(step[THETA], work.basis)
+    control[MAGNIFIED] = max(control[MAGNIFIED], step.grown)
+    step.flips = 0
+    basis_at(step.theta, work.basis)
     _write(c, pace, s, t)
     _account(c, s)
     _move(c, s)
     if a >= 0:
         _cross(c, s, a)
-    control[T] = step[T_NEW]
+    control[T] = step.t_new
     s.counters[ACCEPTED] += 1
     return GO_ON
 
@@ -217,7 +189,7 @@ def _magnified_whole(c: Mesh, s: LoopState) -> float:
     """
     form, work = c.form, c.work
     own, areas, spare = work.own, work.areas, work.spare_cells
-    which = 2 * work.at[0] + int(s.place[IN_JUMP] > 0)
+    which = 2 * work.at[0] + int(s.step[0].in_jump > 0)
     take_coupling(own, which, 0.0, form.rates, form.feed, form.tap, form.tap_s, form.c, form.g, form.home, form.cell)
     clear(spare[netform.CHI])
     clear(spare[netform.ETA])
@@ -228,7 +200,7 @@ def _magnified_whole(c: Mesh, s: LoopState) -> float:
         spare[netform.ETA], spare[netform.RHO], work.spare_areas[netform.KNOWN], spare[netform.SHARE],
     )  # fmt: skip
     answer_mobile(
-        s.place[SEVERAL] > 0, own, form.home, form.first, form.cell, rows, work.mixed, work.matrix, work.room[3]
+        s.step[0].several > 0, own, form.home, form.first, form.cell, rows, work.mixed, work.matrix, work.room[3]
     )  # fmt: skip
     least: float = work.room[3, :NODES].min()
     return 1.0 / least
@@ -237,17 +209,17 @@ def _magnified_whole(c: Mesh, s: LoopState) -> float:
 @jit_within
 def _write(c: Mesh, pace: Pace, s: LoopState, t: float) -> None:
     """Charges of a step that began at t (s or, in a jump, a fraction), and its outputs."""
-    form, work, step, values = c.form, c.work, s.step, c.work.values
+    form, work, step, values = c.form, c.work, s.step[0], c.work.values
     leaks, first_z, n_y = leaks_of(c, s), s.y.size - c.s_before.size, s.y.size
     if pace.charge:
-        step_charges(form, work, leaks, step[LENGTH], c.integral, c.sign, values[first_z:n_y], values[n_y:])
+        step_charges(form, work, leaks, step.length, c.integral, c.sign, values[first_z:n_y], values[n_y:])
         charge_error(
-            form, work, step[LENGTH], leaks.lost, leaks.g, step[THETA], work.cells[netform.CELL_U], work.areas,
+            form, work, step.length, leaks.lost, leaks.g, step.theta, work.cells[netform.CELL_U], work.areas,
             values[first_z:], c.collected, s.control,
         )  # fmt: skip
     for e in range(c.s_before.size):
         work.gained[e] = at(values[first_z + e], work.basis) if pace.charge else 0.0
-    if s.place[IN_JUMP] > 0 or not is_wanted(s, step[T_NEW]):
+    if s.step[0].in_jump > 0 or not is_wanted(s, step.t_new):
         return
     write_columns(
         form.shape.shape[0], first_z, pace.charge, form.shape, form.follow, work.modes[netform.W], work.s, s.y, values
@@ -262,7 +234,7 @@ def _account(c: Mesh, s: LoopState) -> None:
     for a in range(c.sign.size):
         if form.stress[a] > 0.0:
             account(
-                areas[netform.U, a], areas[netform.AREA, a], form.stress[a], s.step[THETA], work.run[a], work.places,
+                areas[netform.U, a], areas[netform.AREA, a], form.stress[a], s.step[0].theta, work.run[a], work.places,
                 form.slow[a], c.peaks[a],
             )  # fmt: skip
     account_nodes(form.node, form.node_s, work.places, work.off, c.peaks[c.sign.size])
@@ -271,7 +243,7 @@ def _account(c: Mesh, s: LoopState) -> None:
 @jit_within
 def _move(c: Mesh, s: LoopState) -> None:
     """State and error at the end of a step, or where it is cut short."""
-    form, work, theta, t_new = c.form, c.work, s.step[THETA], s.step[T_NEW]
+    form, work, theta, t_new = c.form, c.work, s.step[0].theta, s.step[0].t_new
     w, w0, before, after = work.modes[netform.W], work.w0, work.jump.before, work.jump.after
     for k in range(w0.size):
         w0[k] = at(w[k], work.basis)
@@ -280,7 +252,7 @@ def _move(c: Mesh, s: LoopState) -> None:
     else:
         for k in range(w0.size):
             s.error[k] = work.places[k, N_PLACES - 1]
-    if s.place[IN_JUMP] > 0:
+    if s.step[0].in_jump > 0:
         for e in range(before.size):
             c.s_before[e] = before[e] + t_new * (after[e] - before[e])
     else:
@@ -291,18 +263,18 @@ def _move(c: Mesh, s: LoopState) -> None:
 @jit_within
 def _cross(c: Mesh, s: LoopState, a: int) -> None:
     """Change the branch of area a at a zero of its gap voltage, which ends a step."""
-    control, branch, t_new = s.control, branch_of(c, s), s.step[T_NEW]
+    control, branch, t_new = s.control, branch_of(c, s), s.step[0].t_new
     c.sign[a] = -c.sign[a]
     branch[a, 0], branch[a, 1] = t_new, t_new - branch[a, 0]
     s.counters[ZEROS] += 1
     # The area has a kink here, which excites the fast modes again.
     if control[H_AFTER_ZERO] > 0.0:
         control[H], control[ALLOWED] = control[H_AFTER_ZERO], 0.0
-    s.place[FRESH] = H_AFTER_ZERO
+    s.step[0].fresh = H_AFTER_ZERO
 
 
 @jit_within
 def end_mesh(c: Mesh, s: LoopState) -> None:
     """End a call of the loop: if it stopped within a jump, the time is that of the jump."""
-    if s.place[IN_JUMP] > 0:
+    if s.step[0].in_jump > 0:
         resume_time(c, s)

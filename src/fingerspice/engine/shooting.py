@@ -7,7 +7,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.loop import march
-from fingerspice.engine.loopstate import DONE, N_PLACE, N_STEP, Kept, LoopState
+from fingerspice.engine.loopstate import DONE, STEP, Kept, LoopState
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.readout import (
     BRANCH_LENGTH,
@@ -60,7 +60,7 @@ def _map(
             y[i] += system.live[0, i, k] * w[k]
     count = np.zeros(N_COUNTERS, np.int64)
     state = LoopState(
-        y, np.zeros(n + 1), control, count, np.zeros(N_STEP), np.zeros(N_PLACE, np.int64),
+        y, np.zeros(n + 1), control, count, np.zeros(1, STEP),
         Outputs(np.zeros(0), np.zeros(0, np.bool_), np.zeros((n, 0))), Kept(np.zeros((0, 4)), np.zeros((0, n, ROWS))),
         Steps(np.zeros((0, 4)), np.zeros((0, n, NODES))), np.zeros((TRIED, 4)),
     )  # fmt: skip

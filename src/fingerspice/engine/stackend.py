@@ -10,23 +10,9 @@ from fingerspice.engine.charge import charge_step
 from fingerspice.engine.exponential import between
 from fingerspice.engine.loopstate import (
     AGAIN,
-    BELOW,
-    CROSSED,
-    FLIPS,
-    FRESH,
     GO_ON,
-    GROWN,
-    LENGTH,
-    LEVEL,
     NO_STEP,
     OUT_OF_RANGE,
-    RUN_ERROR,
-    SINCE,
-    START,
-    STOP,
-    T_NEW,
-    THETA,
-    WRONG,
     LoopState,
     is_wanted,
     may_shorten,
@@ -132,32 +118,32 @@ def _linear_error(node: FloatArray, k_node: FloatArray, source: FloatArray, plac
 @jit_within
 def complete_stack(c: Stack, pace: Pace, s: LoopState) -> int:
     """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
-    step, place, control, t = s.step, s.place, s.control, s.control[T]
-    h, since, length = step[LENGTH], step[SINCE], step[STOP] - step[START]
+    step, control, t = s.step[0], s.control, s.control[T]
+    h, since, length = step.length, step.since, step.stop - step.start
     reached = since + h
-    step[THETA], place[CROSSED] = 1.0, -1
+    step.theta, step.crossed = 1.0, -1
     if reached >= length or length - reached <= 1e-12 * h:
         reached = length
-        step[THETA] = min(1.0, (length - since) / h)
-    if place[WRONG] > 0 or step[BELOW] > 0.0:
-        crossing = zero(c.work.r[U], control[SIGN], place[WRONG], step[BELOW], c.work.coefficients[0])
+        step.theta = min(1.0, (length - since) / h)
+    if step.wrong > 0 or step.below > 0.0:
+        crossing = zero(c.work.r[U], control[SIGN], step.wrong, step.below, c.work.coefficients[0])
         if since + crossing * h <= since:
-            if place[FLIPS] < 2:
+            if step.flips < 2:
                 return flip(s)
-            if farthest_off(c.work.r[U], control[SIGN], step[THETA]) > pace.tol and may_shorten(s, since):
+            if farthest_off(c.work.r[U], control[SIGN], step.theta) > pace.tol and may_shorten(s, since):
                 return AGAIN
-        elif since + crossing * h <= reached and crossing <= step[THETA]:
-            step[THETA], reached, place[CROSSED] = crossing, since + crossing * h, 0
-    place[FLIPS] = 0
-    step[T_NEW] = step[STOP] if reached == length else step[START] + reached
+        elif since + crossing * h <= reached and crossing <= step.theta:
+            step.theta, reached, step.crossed = crossing, since + crossing * h, 0
+    step.flips = 0
+    step.t_new = step.stop if reached == length else step.start + reached
     _write(c, pace, s, t)
     _account(c, s)
     _move(c, pace.charge, s)
-    if place[CROSSED] >= 0 and not _cross(c, s):
+    if step.crossed >= 0 and not _cross(c, s):
         return NO_STEP
-    control[T], step[SINCE] = step[T_NEW], reached
-    if control[T] >= step[STOP]:
-        control[U_BEFORE] = source_voltage(c, s, control[T] - step[START])
+    control[T], step.since = step.t_new, reached
+    if control[T] >= step.stop:
+        control[U_BEFORE] = source_voltage(c, s, control[T] - step.start)
     s.counters[ACCEPTED] += 1
     return OUT_OF_RANGE if control[PEAK_U] > c.system.u_top else GO_ON
 
@@ -165,15 +151,15 @@ def complete_stack(c: Stack, pace: Pace, s: LoopState) -> int:
 @jit_within
 def _write(c: Stack, pace: Pace, s: LoopState, t: float) -> None:
     """Charge of a step that began at t (s), and its outputs."""
-    system, work, step, level = c.system, c.work, s.step, s.place[LEVEL]
+    system, work, step, level = c.system, c.work, s.step[0], s.step[0].level
     model, shown, values = system.model, system.shown[level], work.values
     n_shown = shown.shape[0]
     if pace.charge:
         charge_step(
-            system, work, level, c.integral, step[LENGTH], s.y[work.w0.size], step[THETA], s.control, values[n_shown],
+            system, work, level, c.integral, step.length, s.y[work.w0.size], step.theta, s.control, values[n_shown],
             values[n_shown + 1],
         )  # fmt: skip
-    if not is_wanted(s, step[T_NEW]):
+    if not is_wanted(s, step.t_new):
         return
     layers(model.mobile, model.area0, system.k_shown, shown, work.w, work.r[SOURCE], work.r[Q], values)
     write_step(s, t, values, work.coefficients, work.outputs)
@@ -182,12 +168,12 @@ def _write(c: Stack, pace: Pace, s: LoopState, t: float) -> None:
 @jit_within
 def _account(c: Stack, s: LoopState) -> None:
     """Peaks of a step, and the errors of the run in it."""
-    system, work, step, control, level = c.system, c.work, s.step, s.control, s.place[LEVEL]
+    system, work, step, control, level = c.system, c.work, s.step[0], s.control, s.step[0].level
     model, r = system.model, c.work.r
-    control[MAGNIFIED] = max(control[MAGNIFIED], step[GROWN])
+    control[MAGNIFIED] = max(control[MAGNIFIED], step.grown)
     account(
-        model.mobile and model.coupled, model.area0, system.stress, r[U], r[Q], r[X_GAP], r[DQ], step[THETA],
-        step[RUN_ERROR], control,
+        model.mobile and model.coupled, model.area0, system.stress, r[U], r[Q], r[X_GAP], r[DQ], step.theta,
+        step.run_error, control,
     )  # fmt: skip
     v_error = node_error(
         model.mobile, model.area0, system.node[level], system.k_node, system.gap[level], work.w, r, work.places
@@ -198,7 +184,7 @@ def _account(c: Stack, s: LoopState) -> None:
 @jit_within
 def _move(c: Stack, charge: bool, s: LoopState) -> None:
     """State and error at the end of a step, or where it is cut short."""
-    system, work, control, theta, y = c.system, c.work, s.control, s.step[THETA], s.y
+    system, work, control, theta, y = c.system, c.work, s.control, s.step[0].theta, s.y
     n, r, w, w0, places, basis, error = work.w0.size, work.r, work.w, work.w0, work.places, work.basis, s.error
     n_shown = system.shown.shape[1]
     if theta < 1.0:
@@ -208,14 +194,14 @@ def _move(c: Stack, charge: bool, s: LoopState) -> None:
         error_at(places, theta, error)
         if charge:
             y[n], control[LAST_Q] = at(work.values[n_shown], basis), at(r[Q], basis)
-        control[U_GAP] = 0.0 if s.place[CROSSED] >= 0 else at(r[U], basis)
+        control[U_GAP] = 0.0 if s.step[0].crossed >= 0 else at(r[U], basis)
     else:
         for k in range(n):
             w0[k], error[k] = w[k, END], places[k, N_PLACES - 1]
         if charge:
             y[n], control[LAST_Q] = work.values[n_shown, END], r[Q, END]
         control[U_GAP] = r[U, END]
-    live = system.live[s.place[LEVEL]]
+    live = system.live[s.step[0].level]
     for i in range(n):
         y[i] = 0.0
         for k in range(n):
@@ -225,7 +211,7 @@ def _move(c: Stack, charge: bool, s: LoopState) -> None:
 @jit_within
 def _cross(c: Stack, s: LoopState) -> bool:
     """Change the branch at a zero of the gap voltage, which ends a step; False at a fold there."""
-    step, control, model, t_new = s.step, s.control, c.system.model, s.step[T_NEW]
+    step, control, model, t_new = s.step[0], s.control, c.system.model, s.step[0].t_new
     control[SIGN] = -control[SIGN]
     control[BRANCH_LENGTH] = t_new - control[BRANCH_START]
     control[BRANCH_START] = t_new
@@ -236,14 +222,14 @@ def _cross(c: Stack, s: LoopState) -> bool:
         control[MARGIN] = 0.0
         return False
     # The area has a kink here, which excites fast modes again: the first step is chosen as after other zeros.
-    if step[BELOW] > 0.0:
+    if step.below > 0.0:
         # The gap voltage returns to 0 V soon.
-        control[H] = 2.0 * (step[BELOW] - step[THETA]) * step[LENGTH]
+        control[H] = 2.0 * (step.below - step.theta) * step.length
         control[ALLOWED] = 0.0
     elif control[H_AFTER_ZERO] > 0.0:
         control[H] = control[H_AFTER_ZERO]
         control[ALLOWED] = 0.0
-    s.place[FRESH] = H_AFTER_ZERO
+    s.step[0].fresh = H_AFTER_ZERO
     return True
 
 

@@ -12,39 +12,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_within
 from fingerspice.engine.exponential import Tables, assess, converge, make_tables, weigh
 from fingerspice.engine.growth import SLIGHT, carry, loop_gain
-from fingerspice.engine.loopstate import (
-    AGAIN,
-    BEGUN,
-    BELOW,
-    CONVERGED,
-    DONE,
-    EDGE,
-    EVALUATED,
-    FLIPS,
-    FRESH,
-    GO_ON,
-    GROWN,
-    INDEX,
-    IS_PAUSED,
-    LENGTH,
-    LEVEL,
-    MOST,
-    NO_STEP,
-    OUT_OF_RANGE,
-    PAUSED,
-    RETRY,
-    RUN_ERROR,
-    SINCE,
-    SLOT,
-    START,
-    STEP_ERROR,
-    STOP,
-    TABLED,
-    TOO_MANY,
-    WANTED,
-    WRONG,
-    LoopState,
-)
+from fingerspice.engine.loopstate import AGAIN, DONE, GO_ON, NO_STEP, OUT_OF_RANGE, PAUSED, RETRY, TOO_MANY, LoopState
 from fingerspice.engine.model import branch_area, turns_at_zero
 from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
 from fingerspice.engine.readout import (
@@ -102,51 +70,51 @@ def edges_of_stack(c: Stack) -> FloatArray:
 @jit_within
 def start_stack(c: Stack, s: LoopState) -> None:
     """Begin a call of the loop: find the segment of the source, unless the run was paused."""
-    step, place, control, counters = s.step, s.place, s.control, s.counters
+    step, control, counters = s.step[0], s.control, s.counters
     # Other runs may have used the tables since the last call.
-    step[TABLED], place[LEVEL], place[FLIPS] = 0.0, -1, 0
-    if place[IS_PAUSED] > 0:
-        place[IS_PAUSED] = 0
+    step.tabled, step.level, step.flips = 0.0, -1, 0
+    if step.is_paused > 0:
+        step.is_paused = 0
         return
-    place[INDEX] = segment_at(c.edges, control[T]) - 1 if c.edges[0] < control[T] else -1
+    step.index = segment_at(c.edges, control[T]) - 1 if c.edges[0] < control[T] else -1
     # The segment is entered at the first step, as its edge is not before the present time.
-    step[START], step[EDGE], step[SINCE], step[BEGUN] = 0.0, control[T], 0.0, control[T]
-    place[FRESH], place[EVALUATED] = -1, counters[NFEV]
-    place[MOST] = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
+    step.start, step.edge, step.since, step.begun = 0.0, control[T], 0.0, control[T]
+    step.fresh, step.evaluated = -1, counters[NFEV]
+    step.most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
 
 
 @jit_within
 def begin_stack(c: Stack, pace: Pace, s: LoopState, t_end: float) -> int:
     """Where the next step starts: after a jump of the source, from the modes of the reference area; and its length."""
-    step, place, control, counters = s.step, s.place, s.control, s.counters
+    step, control, counters = s.step[0], s.control, s.counters
     model, t = c.system.model, control[T]
     if not t < t_end:
         return DONE
     if counters[RECORDED] >= s.steps.times.shape[0] > 0:
-        place[IS_PAUSED] = 1
+        step.is_paused = 1
         return PAUSED
-    evaluated = counters[NFEV] - place[EVALUATED]
-    if counters[ACCEPTED] + counters[REJECTED] > place[MOST]:
+    evaluated = counters[NFEV] - step.evaluated
+    if counters[ACCEPTED] + counters[REJECTED] > step.most:
         return TOO_MANY
     if evaluated > NODES * FIRST_PASSES:
-        longest = (t - step[BEGUN]) / pace.h_max
+        longest = (t - step.begun) / pace.h_max
         if evaluated > NODES * (FIRST_PASSES + MOST_PASSES * longest):
             return TOO_MANY
-    while t >= step[EDGE]:
-        place[INDEX] += 1
-        step[START], step[EDGE] = c.edges[place[INDEX]], c.edges[place[INDEX] + 1]
-        if step[EDGE] > t and not _enter_segment(c, pace, s):
+    while t >= step.edge:
+        step.index += 1
+        step.start, step.edge = c.edges[step.index], c.edges[step.index + 1]
+        if step.edge > t and not _enter_segment(c, pace, s):
             return NO_STEP
-    step[STOP] = min(step[EDGE], t_end)
+    step.stop = min(step.edge, t_end)
     _take_level(c, s)
-    project, w0 = c.system.project[place[LEVEL]], c.work.w0
+    project, w0 = c.system.project[step.level], c.work.w0
     for k in range(w0.size):
         w0[k] = 0.0
         for i in range(w0.size):
             w0[k] += project[k, i] * s.y[i]
-    length = step[STOP] - step[START]
-    step[LENGTH] = choose_step(
-        pace, model.tau, model.coupled, c.series[place[INDEX]].size > 0, t, length - step[SINCE], control
+    length = step.stop - step.start
+    step.length = choose_step(
+        pace, model.tau, model.coupled, c.series[step.index].size > 0, t, length - step.since, control
     )  # fmt: skip
     return GO_ON
 
@@ -154,11 +122,11 @@ def begin_stack(c: Stack, pace: Pace, s: LoopState, t_end: float) -> int:
 @jit_within
 def _enter_segment(c: Stack, pace: Pace, s: LoopState) -> bool:
     """Take the jump of the source at the start of a segment; False if it meets a fold."""
-    step, place, control, model = s.step, s.place, s.control, c.system.model
+    step, control, model = s.step[0], s.control, c.system.model
     # Time is counted from the edge: a transient after it may be faster than the rounding of t.
-    step[SINCE] = control[T] - step[START]
-    step[BEGUN], place[EVALUATED] = control[T], s.counters[NFEV]
-    u_source = source_voltage(c, s, step[SINCE])
+    step.since = control[T] - step.start
+    step.begun, step.evaluated = control[T], s.counters[NFEV]
+    u_source = source_voltage(c, s, step.since)
     if model.mobile or pace.charge:
         if not enter(model, pace.charge, u_source, s.y, control):
             return False
@@ -169,72 +137,72 @@ def _enter_segment(c: Stack, pace: Pace, s: LoopState) -> bool:
         take_branch(1.0 if control[U_GAP] >= 0.0 or not model.coupled else -1.0, control)
     # Try the step that was right after the edge before: similar jumps often need similar steps.
     control[H], control[TOO_LONG], control[ALLOWED] = control[H_AFTER_EDGE], 0.0, 0.0
-    place[FRESH] = H_AFTER_EDGE
+    step.fresh = H_AFTER_EDGE
     return True
 
 
 @jit_within
 def source_voltage(c: Stack, s: LoopState, tau: float) -> float:
     """Source voltage (V) `tau` s into the segment at hand."""
-    index, start = s.place[INDEX], s.step[START]
-    u, _ = source(Segment(start, s.step[EDGE] - start, c.terms[index], c.series[index]), tau)
+    index, start = s.step[0].index, s.step[0].start
+    u, _ = source(Segment(start, s.step[0].edge - start, c.terms[index], c.series[index]), tau)
     return u
 
 
 @jit_within
 def _take_level(c: Stack, s: LoopState) -> None:
     """Go over to the reference area nearest to the present area; the error of the modes goes along."""
-    system, place, error = c.system, s.place, s.error
+    system, step, error = c.system, s.step[0], s.error
     n, now = system.model.gap.size, 0
     if system.q0.size > 1:
         q, _ = branch_area(system.model, s.control[SIGN], s.control[U_GAP])
         now = nearest_level(system.q0, q)
-    if now == place[LEVEL]:
+    if now == step.level:
         return
     if error[n] != now:
         change_level(system.live, system.project, int(error[n]), now, error)
         error[n] = now
-    place[LEVEL], s.step[TABLED] = now, 0.0
+    step.level, s.step[0].tabled = now, 0.0
 
 
 @jit_within
 def attempt_stack(c: Stack, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
-    system, work, step, place, control, counters = c.system, c.work, s.step, s.place, s.control, s.counters
-    model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.place[LEVEL], s.control[SIGN]
-    h, u_rows = step[LENGTH], work.r[U]
-    if h != step[TABLED]:
+    system, work, step, control, counters = c.system, c.work, s.step[0], s.control, s.counters
+    model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.step[0].level, s.control[SIGN]
+    h, u_rows = step.length, work.r[U]
+    if h != step.tabled:
         tables = c.tables
-        place[SLOT] = make_tables(
+        step.slot = make_tables(
             system.rates[level], level, h, tables.h, tables.level, tables.used, tables.decay, tables.phi, tables.miss
         )  # fmt: skip
-        step[TABLED] = h
-        weigh(system.rates[level], system.gap[level], tables.decay[place[SLOT]], h, work.weight)
-    segment = c.terms[place[INDEX]], c.series[place[INDEX]]
-    source_rows(segment[0], segment[1], step[EDGE] - step[START], step[SINCE], h, pace.charge, r)
+        step.tabled = h
+        weigh(system.rates[level], system.gap[level], tables.decay[step.slot], h, work.weight)
+    segment = c.terms[step.index], c.series[step.index]
+    source_rows(segment[0], segment[1], step.edge - step.start, step.since, h, pace.charge, r)
     if model.mobile:
         for i in range(ROWS):
             r[GUESS, i] = control[U_GAP]
-    passes, closed = converge(system, c.tables, work, place[SLOT], level, sign, 0.3 * tol)
+    passes, closed = converge(system, c.tables, work, step.slot, level, sign, 0.3 * tol)
     counters[NFEV] += passes * NODES
-    place[WRONG] = first_wrong(u_rows, sign, tol) if model.coupled else 0
+    step.wrong = first_wrong(u_rows, sign, tol) if model.coupled else 0
     # Node 1 may be off its branch only because the iteration did not converge: also require a start near 0 V.
     at_zero = sign * u_rows[0] <= _AT_ZERO * min(abs(u_rows[1]), system.u_top)
-    if place[WRONG] == 1 and place[FLIPS] < 2 and at_zero:
+    if step.wrong == 1 and step.flips < 2 and at_zero:
         # The step starts at a zero, and the gap voltage leaves it to the other side: change the branch.
         if turns_at_zero(model, r[X_GAP, 0], -sign):
             control[MARGIN] = 0.0
             return NO_STEP
         return flip(s)
-    step[BELOW] = dip(u_rows, sign, tol, place[WRONG], work.coefficients[0]) if model.coupled and closed else 0.0
-    if 0.0 < step[BELOW] < POINTS[1] and at_zero:
+    step.below = dip(u_rows, sign, tol, step.wrong, work.coefficients[0]) if model.coupled and closed else 0.0
+    if 0.0 < step.below < POINTS[1] and at_zero:
         # The gap voltage starts at a zero and soon returns to it: a shorter step resolves this.
         counters[REJECTED] += 1
-        step[LENGTH] = rung(2.0 * step[BELOW] * h)
-        step[WANTED] = control[H] = step[LENGTH]
-        place[FLIPS] = 0
+        step.length = rung(2.0 * step.below * h)
+        step.wanted = control[H] = step.length
+        step.flips = 0
         return RETRY
-    place[CONVERGED], step[STEP_ERROR] = int(closed), math.inf
+    step.converged, step.step_error = int(closed), math.inf
     if closed:
         _assess(c, s)
     return GO_ON
@@ -244,34 +212,34 @@ def attempt_stack(c: Stack, pace: Pace, s: LoopState) -> int:
 def flip(s: LoopState) -> int:
     """Change the branch of the area, and start again."""
     s.control[SIGN] = -s.control[SIGN]
-    s.place[FLIPS] += 1
+    s.step[0].flips += 1
     return AGAIN
 
 
 @jit_within
 def _assess(c: Stack, s: LoopState) -> None:
     """Errors of a converged step, and of the run so far."""
-    system, work, step, level, slot = c.system, c.work, s.step, s.place[LEVEL], s.place[SLOT]
+    system, work, step, level, slot = c.system, c.work, s.step[0], s.step[0].level, s.step[0].slot
     decay = c.tables.decay[slot]
     for k in range(work.w0.size):
         for p in range(N_PLACES - 1):
             work.carried[k, p] = decay[k, NODES + p if p < N_PLACES - 2 else END] * s.error[k]
     grown = loop_gain(system, work, level)
     if grown > SLIGHT:
-        carry(system, work, level, decay, step[LENGTH], s.control[SIGN], grown, s.error)
-    step[STEP_ERROR], step[RUN_ERROR], step[GROWN] = assess(system, c.tables, work, slot, level, s.error)
+        carry(system, work, level, decay, step.length, s.control[SIGN], grown, s.error)
+    step.step_error, step.run_error, step.grown = assess(system, c.tables, work, slot, level, s.error)
 
 
 @jit_within
 def refuse_stack(c: Stack, s: LoopState) -> int:
     """Why no shorter step would do after one that was rejected; GO_ON if one may."""
-    system, step, r = c.system, s.step, c.work.r
+    system, step, r = c.system, s.step[0], c.work.r
     model = system.model
     # A step rejected beyond the end of the area's polynomial: shorter ones would creep up to the kink there.
     if model.coupled and abs(s.control[U_GAP]) > 0.9 * system.u_top and largest_size(r[U]) > system.u_top:
         return OUT_OF_RANGE
     # A step of the size of the time's rounding is rejected: the solution has a singularity here.
-    if step[LENGTH] <= 1e-15 * step[SINCE] + 1e-25 * (step[EDGE] - step[START]):
+    if step.length <= 1e-15 * step.since + 1e-25 * (step.edge - step.start):
         return NO_STEP
     if model.mobile and 1.0 - model.area0 * r[X_GAP, 0] * r[DQ, 0] < _NEAR_FOLD:
         return NO_STEP
@@ -284,5 +252,5 @@ def beyond_stack(c: Stack, pace: Pace, s: LoopState) -> float:
 
     There the branch of the area has no meaning, and the error says nothing.
     """
-    wrong, u = s.place[WRONG], c.work.r[U]
+    wrong, u = s.step[0].wrong, c.work.r[U]
     return 1.1 * POINTS[wrong] if wrong > 1 and s.control[SIGN] * u[END] < c.system.lo else 2.0

@@ -15,6 +15,7 @@ import numpy as np
 
 from fingerspice.base.errors import FingerspiceWarning
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.explorer import examples
 from fingerspice.explorer.recordings import as_json
 from fingerspice.explorer.request import circuits_of, request_of, times_of
 from fingerspice.explorer.scene import scene

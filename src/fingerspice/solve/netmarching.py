@@ -257,7 +257,7 @@ class March(Stepping, NetworkIntegration):
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
         more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
-        self.place[loopstate.MOST] = taken + int(more)
+        self.step[0]["most"] = taken + int(more)
         while True:
             known = self.references
             mesh = Mesh(

@@ -126,7 +126,7 @@ class Stepping(Integration):
         longest = h_fixed or min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
         self.pace = Pace(tol, longest, h_fixed == 0.0, problem.charge)
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
-        self.step, self.place = np.zeros(loopstate.N_STEP), np.zeros(loopstate.N_PLACE, np.int64)
+        self.step = np.zeros(1, loopstate.STEP)
         self.out = np.empty((width, t_out.size))
         self.period, self.repeated = problem.waveform.period or math.inf, 0
         self.recorder = Recorder(shown)
@@ -139,7 +139,7 @@ class Stepping(Integration):
     def loop_state(self) -> LoopState:
         """The integration as the compiled loop takes and updates it."""
         return LoopState(
-            self.y, self.error, self.control, self.counters, self.step, self.place, self.outputs, self.kept,
+            self.y, self.error, self.control, self.counters, self.step, self.outputs, self.kept,
             self.recorder.room, self.tried,
         )  # fmt: skip
 
