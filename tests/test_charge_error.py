@@ -143,9 +143,9 @@ def engine_account(
     r = np.zeros((rows.N_FLAT, ROWS))
     r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
     r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
-    control = np.zeros(readout.N_CONTROL)
-    control[readout.COLLECTED] = collected
-    control[readout.LAST_Q] = 0.0 if last_area is None else 1.0 / last_area
+    control = np.zeros(1, readout.CONTROL)[0]
+    control["collected"] = collected
+    control["last_q"] = 0.0 if last_area is None else 1.0 / last_area
     charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, kept, control)
     return control
 
@@ -164,19 +164,19 @@ def test_what_a_step_of_a_stack_leaves_in_the_charge_is_its_derivative_by_the_vo
     stays = total - (held - held[0])
     spread = np.cumsum(np.abs(np.diff(stays, prepend=0.0)))
     scale = max(np.abs(stays).max(), np.abs(held).max())
-    assert control[readout.COLLECTED] == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
+    assert control["collected"] == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
     # Since the start of the run, where nothing was off.
     # What the trapezoids miss is a share of all that was added up, whatever is left of it.
     want = np.max(np.abs(held + stays))
-    assert control[readout.ERROR_Q] == pytest.approx(want, rel=0.0, abs=2.0 * ROUGH * (want + spread[-1]))
+    assert control["error_q"] == pytest.approx(want, rel=0.0, abs=2.0 * ROUGH * (want + spread[-1]))
     # What was collected before adds to it with its sign.
     for before in (3.0 * scale, -3.0 * scale):
         want = np.max(np.abs(held + stays + before))
         rough = 2.0 * ROUGH * (want + spread[-1])
-        assert engine_account(step, before)[readout.ERROR_Q] == pytest.approx(want, rel=0.0, abs=rough)
+        assert engine_account(step, before)["error_q"] == pytest.approx(want, rel=0.0, abs=rough)
     # What stays with a sign that is not known is as likely to add as to take away.
-    both = engine_account(step, kept=3.0 * scale)[readout.ERROR_Q]
-    assert both == pytest.approx(np.hypot(control[readout.ERROR_Q], 3.0 * scale), rel=1e-12, abs=0.0)
+    both = engine_account(step, kept=3.0 * scale)["error_q"]
+    assert both == pytest.approx(np.hypot(control["error_q"], 3.0 * scale), rel=1e-12, abs=0.0)
 
 
 def test_both_ends_of_a_jump_s_move_are_off_in_its_charge() -> None:
@@ -184,7 +184,7 @@ def test_both_ends_of_a_jump_s_move_are_off_in_its_charge() -> None:
     step = stack(np.random.default_rng(8), "local", "stores")
     area = float(step.at(np.array([0.0]), 0.0)[2][0])
     before = 1.1 * area
-    added = engine_account(step, last_area=before)[readout.COLLECTED] - engine_account(step)[readout.COLLECTED]
+    added = engine_account(step, last_area=before)["collected"] - engine_account(step)["collected"]
     # From u1 to u2 the charge is the integral of A du / (k S): moved by d, (A(u2) - A(u1)) d / (k S).
     moved = float(step.gap @ [e(0.0) for e in step.errors])
     assert added == pytest.approx((area - before) * moved / (step.k_gap * step.s), rel=1e-9, abs=0.0)
@@ -206,10 +206,10 @@ def test_what_a_stack_s_polynomials_miss_between_nodes_does_not_leak(law: str) -
     r = np.zeros((rows.N_FLAT, ROWS))
     r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
     r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
-    control = np.zeros(readout.N_CONTROL)
+    control = np.zeros(1, readout.CONTROL)[0]
     charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, 0.0, control)
     leaked = size * H * 3e-7 * np.abs(step.slow).sum()
-    assert abs(control[readout.COLLECTED]) <= 1e-6 * leaked
+    assert abs(control["collected"]) <= 1e-6 * leaked
 
 
 # A network --------------------------------------------------------------------------------------------------
@@ -304,7 +304,7 @@ def engine_charge(
     areas[netform.AREA], areas[netform.MORE] = area, area - A0
     areas[netform.SLOPE] = 0.0 if step.slow else slope_at(u[0])
     z = np.array([[step.charge(x, 0.0) for x in POINTS]])
-    control, collected = np.zeros(readout.N_CONTROL), np.array([[before], [0.0]])
+    control, collected = np.zeros(1, readout.CONTROL)[0], np.array([[before], [0.0]])
     form = form_of(step)
     work = netform.new_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
     work.places[:], work.off[:, : len(places)] = places, missed
@@ -349,7 +349,7 @@ def test_what_a_step_of_a_network_leaves_in_the_charge_is_its_derivative_by_the_
         assert collected[0] - before == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
         want = np.max(np.abs(held + stays + before))
         rough = 2.0 * ROUGH * (want + spread[-1])
-        assert control[readout.ERROR_Q] == pytest.approx(want, rel=0.0, abs=rough)
+        assert control["error_q"] == pytest.approx(want, rel=0.0, abs=rough)
 
 
 @every_law
@@ -364,7 +364,7 @@ def test_what_polynomials_miss_between_nodes_is_stored_but_stays_only_where_a_st
     assert whole[0] == 0.0
     # The areas' own polynomials are exact here to rounding.
     assert np.sqrt(whole[1]) <= 1e-9 * stored
-    assert control[readout.ERROR_Q] >= 0.99 * stored
+    assert control["error_q"] >= 0.99 * stored
     cut, _ = engine_charge(step, places, missed, theta=0.6)
     leak = size * max(abs(step.leak_by(x, m)) for x, m in zip(POINTS[FIRST:], MISS, strict=True))
     # The largest integral of the node polynomial from the start of the step on, over its own largest value.

@@ -10,7 +10,11 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.exponential import between
 from fingerspice.engine.model import Model
-from fingerspice.engine.readout import COLLECTED, ERROR_Q, LAST_Q, N_PLACES, PEAK_Q, SPREAD, row_of
+from fingerspice.engine.readout import (
+    N_PLACES,
+    Control,
+    row_of,
+)
 from fingerspice.engine.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.engine.system import System
 from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POINTS
@@ -27,7 +31,7 @@ _DERIVATIVE_BETWEEN = np.ascontiguousarray(BETWEEN.T @ DERIVATIVE)
 @jit_within
 def charge_step(
     system: System, work: Work, level: int, integral: FloatArray, h: float, z0: float, theta: float,
-    control: FloatArray, z: FloatArray, current: FloatArray,
+    control: Control, z: FloatArray, current: FloatArray,
 ) -> None:  # fmt: skip
     """Charge z (C) and current (A) at the nodes of a step of length h (s) that starts with the charge z0.
 
@@ -73,7 +77,7 @@ def charge_step(
     _integrate(integral, h, z0, z)
     for j in range(NODES):
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
-        control[PEAK_Q] = max(control[PEAK_Q], abs(z[j]))
+        control.peak_q = max(control.peak_q, abs(z[j]))
     kept = missed if theta < 1.0 else kept
     _account(model, gap, slow_share, w, r, h, work.places, theta, missed, kept, control)
 
@@ -111,7 +115,7 @@ def _integrate(integral: FloatArray, h: float, z0: float, z: FloatArray) -> None
 @jit
 def _account(
     model: Model, gap: FloatArray, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, places: FloatArray,
-    theta: float, missed: float, kept: float, control: FloatArray,
+    theta: float, missed: float, kept: float, control: Control,
 ) -> None:  # fmt: skip
     """Update the largest error of the charge, over the part of a step that counts, from the signed error of the modes.
 
@@ -128,7 +132,7 @@ def _account(
     last_area, last_voltage, last_gap, last_error, last_gap_error = 0.0, 0.0, 0.0, 0.0, 0.0
     last_theta = 0.0
     added = 0.0
-    control[SPREAD] += kept * kept
+    control.spread += kept * kept
     brief, brief_gap = np.zeros(N_PLACES), np.zeros(N_PLACES)
     for k in range(n):
         first, second, third = between(w[k])
@@ -160,9 +164,9 @@ def _account(
             v *= scale
         voltage = slow[n] * r[SOURCE, row] + v
         if p == 0:
-            if not model.mobile and control[LAST_Q] > 0.0:
+            if not model.mobile and control.last_q > 0.0:
                 # A jump's charge is an integral of A over the gap voltage; the error of the latter shifts both limits.
-                added += (area - 1.0 / control[LAST_Q]) * lasting_gap / (model.k_gap * model.s)
+                added += (area - 1.0 / control.last_q) * lasting_gap / (model.k_gap * model.s)
         else:
             reached = min(POINTS[row], theta)
             part = (reached - last_theta) / (POINTS[row] - last_theta)
@@ -178,12 +182,12 @@ def _account(
             if reached < POINTS[row]:
                 break
             last_theta = reached
-        known = now + control[COLLECTED] + added
+        known = now + control.collected + added
         # The signs of `missed` and of the shares in SPREAD are not known: add squares.
-        control[ERROR_Q] = max(control[ERROR_Q], math.sqrt(known * known + missed * missed + control[SPREAD]))
+        control.error_q = max(control.error_q, math.sqrt(known * known + missed * missed + control.spread))
         last_area, last_voltage, last_gap = area, voltage, r[U, row]
         last_error, last_gap_error = lasting, lasting_gap
-    control[COLLECTED] += added
+    control.collected += added
 
 
 @jit

@@ -24,8 +24,12 @@ from fingerspice.engine.loopstate import (
 )  # fmt: skip
 from fingerspice.engine.mesh import Mesh, begin_mesh, edges_of_mesh, start_mesh, worst_of_mesh
 from fingerspice.engine.meshstep import attempt_mesh, beyond_mesh, complete_mesh, end_mesh, refuse_mesh
-from fingerspice.engine.pace import Pace, accept, allowed_factor, rung, shorten
-from fingerspice.engine.readout import ACCEPTED, MAGNIFIED, REJECTED, H, T, note
+from fingerspice.engine.pace import NOT_FRESH, Pace, accept, allowed_factor, rung, shorten
+from fingerspice.engine.readout import (
+    ACCEPTED,
+    REJECTED,
+    note,
+)
 from fingerspice.engine.stackend import complete_stack, end_stack, worst_of_stack
 from fingerspice.engine.stackstep import (
     Stack,
@@ -101,7 +105,7 @@ def look(looks: Looks, s: LoopState) -> bool:
         now = looks.scale[k] * s.y[k]
         moved = max(moved, abs(now - before[k]))
         before[k] = now
-    moved *= s.control[MAGNIFIED]
+    moved *= s.control[0].magnified
     v[DISTANCE] = v[REMAINING] = math.inf
     # Periods in which the slowest mode of the frozen circuit decays to 1/e.
     memory = RATE_SHARE / (v[RATE] * v[PERIOD])
@@ -201,7 +205,7 @@ def march_on(circuit: Circuit, pace: Pace, state: LoopState, looks: Looks, t_end
                 return EXCESSIVE
         if stop >= looks.values[NEXT] - slack and look(looks, state):
             return LOOKED_AT
-        if state.control[T] >= t_end:
+        if state.control[0].t >= t_end:
             return DONE
 
 
@@ -243,8 +247,8 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
 @jit_within
 def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
     """Solve a step with ever shorter lengths until its error is small enough, and choose the next step's length."""
-    step, control, counters = state.step[0], state.control, state.counters
-    step.wanted, step.tries = control[H], 1
+    step, control, counters = state.step[0], state.control[0], state.counters
+    step.wanted, step.tries = control.h, 1
     while True:
         code = attempt(circuit, pace, state)
         if code == RETRY:
@@ -252,13 +256,13 @@ def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
         if code != GO_ON:
             return code
         h, error, converged = step.length, step.step_error, step.converged > 0
-        note(state.tried, counters[ACCEPTED] + counters[REJECTED], control[T], h, error / pace.tol)
+        note(state.tried, counters[ACCEPTED] + counters[REJECTED], control.t, h, error / pace.tol)
         if converged and not pace.controlled:
             return GO_ON
         factor = allowed_factor(error, pace.tol)
         if error <= pace.tol:
             accept(h, step.wanted, factor, step.tries, step.fresh, step.trusted > 0, control)
-            step.fresh = -1
+            step.fresh = NOT_FRESH
             return GO_ON
         step.tries += 1
         counters[REJECTED] += 1

@@ -20,10 +20,9 @@ from fingerspice.engine.readout import (
     RECORDED,
     REJECTED,
     WRITTEN_AT_ONCE,
-    H,
+    Control,
     Outputs,
     Steps,
-    T,
     record,
     series_of,
     write_outputs,
@@ -182,7 +181,7 @@ STEP = np.dtype([
     ("index", np.int64),  # Of the source's segment
     ("level", np.int64),  # Of the reference area
     ("slot", np.int64),  # Of the tables
-    ("fresh", np.int64),  # Entry of `control` for the length of a first step after an edge or a zero; -1 for others
+    ("fresh", np.int64),  # Whether it is the first after an edge or a zero
     ("tries", np.int64),  # Lengths tried
     ("flips", np.int64),  # Branches left in a row without a step
     ("converged", np.int64),  # Whether the iteration has
@@ -212,7 +211,7 @@ class LoopState(NamedTuple):
     # Estimated error of the modes, signed; of a stack, then the number of the reference area that they belong to
     error: FloatArray
     # control, counters: Bookkeeping, see `engine.readout`
-    control: FloatArray
+    control: Control
     counters: IntArray
     step: NDArray[Any]  # (1,): A record of type `STEP`
     outputs: Outputs
@@ -230,10 +229,10 @@ def may_shorten(s: LoopState, since: float) -> bool:
 
     The rounding of its length is relative to the time `since` (s).
     """
-    if s.step[0].length <= 1e-13 * max(since, 1e-3 * (s.step[0].stop - s.control[T])):
+    if s.step[0].length <= 1e-13 * max(since, 1e-3 * (s.step[0].stop - s.control[0].t)):
         return False
     s.counters[REJECTED] += 1
-    s.control[H], s.step[0].flips = 0.25 * s.step[0].length, 0
+    s.control[0].h, s.step[0].flips = 0.25 * s.step[0].length, 0
     return True
 
 

@@ -15,20 +15,11 @@ from fingerspice.engine.loopstate import DONE, GO_ON, PAUSED, REFERENCE, TOO_MAN
 from fingerspice.engine.netassess import ERROR_F, ERROR_U, PEAK_F, PEAK_U, load
 from fingerspice.engine.netform import Form, Leaks, Work
 from fingerspice.engine.network import Sources, at_sources
-from fingerspice.engine.pace import Pace, choose_step
+from fingerspice.engine.pace import AFTER_EDGE, NOT_FRESH, Pace, choose_step
 from fingerspice.engine.readout import (
     ACCEPTED,
-    ALLOWED,
-    BRANCH_LENGTH,
-    BRANCH_START,
-    ERROR_Q,
-    H_AFTER_EDGE,
-    MAGNIFIED,
     RECORDED,
     REJECTED,
-    TOO_LONG,
-    H,
-    T,
 )
 from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
@@ -174,7 +165,7 @@ def start_mesh(c: Mesh, s: LoopState) -> None:
     if step.is_paused > 0:
         step.is_paused = 0
         return
-    step.flips, step.fresh = 0, -1
+    step.flips, step.fresh = 0, NOT_FRESH
     step.in_jump, step.has_begun, step.unconverged = 0, 0, 0
     step.accepted_before = counters[ACCEPTED]
     step.several = 0
@@ -203,8 +194,8 @@ def _all_zero(x: FloatArray) -> bool:
 @jit_within
 def begin_mesh(c: Mesh, pace: Pace, s: LoopState, t_end: float) -> int:
     """Where the next step starts: at an edge of a source, within a jump, or later; and its length."""
-    form, work, step, control, counters = c.form, c.work, s.step[0], s.control, s.counters
-    if step.in_jump > 0 and control[T] >= 1.0:
+    form, work, step, control, counters = c.form, c.work, s.step[0], s.control[0], s.counters
+    if step.in_jump > 0 and control.t >= 1.0:
         _leave_jump(c, s)
     if counters[ACCEPTED] + counters[REJECTED] > step.most:
         return TOO_MANY
@@ -212,19 +203,19 @@ def begin_mesh(c: Mesh, pace: Pace, s: LoopState, t_end: float) -> int:
     if step.in_jump > 0:
         copy_to(work.now, c.s_before)
     else:
-        if step.has_begun > 0 and control[T] >= t_end:
+        if step.has_begun > 0 and control.t >= t_end:
             return DONE
         if counters[ACCEPTED] >= step.pause_at or counters[RECORDED] >= s.steps.times.shape[0] > 0:
             step.is_paused = 1
             return PAUSED
         _look_at_sources(c, s, t_end)
-        if step.in_jump == 0 and control[T] >= t_end:
+        if step.in_jump == 0 and control.t >= t_end:
             return DONE
-    t = control[T]
+    t = control.t
     if step.at_edge > 0:
         # Step lengths after a jump are often those after the previous jump.
-        control[H], control[TOO_LONG], control[ALLOWED] = control[H_AFTER_EDGE], 0.0, 0.0
-        step.fresh = H_AFTER_EDGE
+        control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
+        step.fresh = AFTER_EDGE
     load(form.inverse, form.follow, s.y, work.now, work.w0)
     _choose_branches(c, s, t)
     if step.in_jump == 0 and far_from(form, work.here) and not _take_reference(c, s):
@@ -240,7 +231,7 @@ def begin_mesh(c: Mesh, pace: Pace, s: LoopState, t_end: float) -> int:
 @jit_within
 def _look_at_sources(c: Mesh, s: LoopState, t_end: float) -> None:
     """The sources' segments and values at the present time, and the next edge; a jump of any of them is entered."""
-    work, step, sources, before, t = c.work, s.step[0], c.sources, c.s_before, s.control[T]
+    work, step, sources, before, t = c.work, s.step[0], c.sources, c.s_before, s.control[0].t
     segment, now, stop = work.segment, work.now, t_end
     for i in range(now.size):
         while sources.edges[sources.first[i] + segment[i] + 1] <= t:
@@ -264,15 +255,15 @@ def _look_at_sources(c: Mesh, s: LoopState, t_end: float) -> None:
 @jit_within
 def _enter_jump(c: Mesh, s: LoopState) -> None:
     """Go on in the fraction of a jump from the sources' values before it to those now."""
-    jump, step, control = c.work.jump, s.step[0], s.control
+    jump, step, control = c.work.jump, s.step[0], s.control[0]
     step.in_jump, step.at_edge = 1, 0
-    copy_to(jump.control, control)
+    jump.control[0] = s.control[0]
     copy_to(jump.sign, c.sign)
     copy_to(jump.before, c.s_before)
     copy_to(jump.after, c.work.now)
     jump.branch[:] = 0.0
-    control[:] = 0.0
-    control[ERROR_Q], control[MAGNIFIED] = jump.control[ERROR_Q], jump.control[MAGNIFIED]
+    s.control[0] = jump.control[1]
+    control.error_q, control.magnified = jump.control[0].error_q, jump.control[0].magnified
     s.step[0].tabled, s.step[0].stop = 0.0, 1.0
     copy_to(c.work.now, jump.before)
 
@@ -285,26 +276,26 @@ def _leave_jump(c: Mesh, s: LoopState) -> None:
     copy_to(c.s_before, jump.after)
     for a in range(c.sign.size):
         if c.sign[a] != jump.sign[a]:
-            c.branch[a, 0], c.branch[a, 1] = s.control[T], math.inf
+            c.branch[a, 0], c.branch[a, 1] = s.control[0].t, math.inf
     s.step[0].tabled = 0.0
 
 
 @jit_within
 def resume_time(c: Mesh, s: LoopState) -> None:
     """Take the bookkeeping of before a jump, with the errors that the jump has added."""
-    jump, control = c.work.jump, s.control
-    jump.control[ERROR_Q], jump.control[MAGNIFIED] = control[ERROR_Q], control[MAGNIFIED]
-    copy_to(control, jump.control)
+    jump, control = c.work.jump, s.control[0]
+    jump.control[0].error_q, jump.control[0].magnified = control.error_q, control.magnified
+    s.control[0] = jump.control[0]
     s.step[0].in_jump = 0
 
 
 @jit_within
 def _choose_branches(c: Mesh, s: LoopState, t: float) -> None:
     """The areas at the start of a step and, where it is not known yet, the branch of each; the next zero to expect."""
-    form, work, control, sign = c.form, c.work, s.control, c.sign
+    form, work, control, sign = c.form, c.work, s.control[0], c.sign
     branch, in_jump, w0, now = branch_of(c, s), s.step[0].in_jump > 0, c.work.w0, c.work.now
     ahead = math.inf
-    control[BRANCH_START], control[BRANCH_LENGTH] = t, math.inf
+    control.branch_start, control.branch_length = t, math.inf
     for a in range(sign.size):
         if form.cell[a] < 0:
             sign[a] = 1.0
@@ -325,7 +316,7 @@ def _choose_branches(c: Mesh, s: LoopState, t: float) -> None:
         end = branch[a, 0] + _BEYOND * branch[a, 1] - t
         if 0.0 < end < ahead:
             ahead = end
-            control[BRANCH_START], control[BRANCH_LENGTH] = branch[a, 0], branch[a, 1]
+            control.branch_start, control.branch_length = branch[a, 0], branch[a, 1]
 
 
 @jit_within

@@ -29,17 +29,12 @@ from fingerspice.engine.netcharge import charge_error
 from fingerspice.engine.netrows import clear, combine, follow_sources
 from fingerspice.engine.netstep import ramp_rows, solve_step, source_rows, step_charges
 from fingerspice.engine.network import at_sources
-from fingerspice.engine.pace import Pace
+from fingerspice.engine.pace import AFTER_ZERO, Pace
 from fingerspice.engine.readout import (
     ACCEPTED,
-    ALLOWED,
-    H_AFTER_ZERO,
-    MAGNIFIED,
     N_PLACES,
     NFEV,
     ZEROS,
-    H,
-    T,
     at,
     basis_at,
     error_at,
@@ -71,7 +66,7 @@ def attempt_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
     form, work, step, tables, tol = c.form, c.work, s.step[0], c.tables, pace.tol
     leaks, branch, t, in_jump, several = (
-        leaks_of(c, s), branch_of(c, s), s.control[T], s.step[0].in_jump > 0, s.step[0].several > 0
+        leaks_of(c, s), branch_of(c, s), s.control[0].t, s.step[0].in_jump > 0, s.step[0].several > 0
     )  # fmt: skip
     h = step.length
     if h != step.tabled:
@@ -112,7 +107,7 @@ def attempt_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
 @jit_within
 def refuse_mesh(c: Mesh, s: LoopState) -> int:
     """Why no shorter step would do after one that was rejected; GO_ON if one may."""
-    step, t = s.step[0], s.control[T]
+    step, t = s.step[0], s.control[0].t
     step.unconverged += int(step.converged == 0)
     # The error of a shorter step says nothing about the length at which the iteration converges.
     step.trusted = step.converged
@@ -141,7 +136,7 @@ def beyond_mesh(c: Mesh, pace: Pace, s: LoopState) -> float:
 @jit_within
 def complete_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
     """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
-    work, step, control, t = c.work, s.step[0], s.control, s.control[T]
+    work, step, control, t = c.work, s.step[0], s.control[0], s.control[0].t
     h, stop = step.length, step.stop
     step.t_new, step.theta, step.crossed = t + h, 1.0, -1
     if step.t_new >= stop or stop - step.t_new <= 1e-12 * h:
@@ -168,7 +163,7 @@ def complete_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
         _take_coupling(c, s)
     if not 0.0 < step.grown < math.inf:
         return NO_STEP
-    control[MAGNIFIED] = max(control[MAGNIFIED], step.grown)
+    control.magnified = max(control.magnified, step.grown)
     step.flips = 0
     basis_at(step.theta, work.basis)
     _write(c, pace, s, t)
@@ -176,7 +171,7 @@ def complete_mesh(c: Mesh, pace: Pace, s: LoopState) -> int:
     _move(c, s)
     if a >= 0:
         _cross(c, s, a)
-    control[T] = step.t_new
+    control.t = step.t_new
     s.counters[ACCEPTED] += 1
     return GO_ON
 
@@ -215,7 +210,7 @@ def _write(c: Mesh, pace: Pace, s: LoopState, t: float) -> None:
         step_charges(form, work, leaks, step.length, c.integral, c.sign, values[first_z:n_y], values[n_y:])
         charge_error(
             form, work, step.length, leaks.lost, leaks.g, step.theta, work.cells[netform.CELL_U], work.areas,
-            values[first_z:], c.collected, s.control,
+            values[first_z:], c.collected, s.control[0],
         )  # fmt: skip
     for e in range(c.s_before.size):
         work.gained[e] = at(values[first_z + e], work.basis) if pace.charge else 0.0
@@ -263,14 +258,14 @@ def _move(c: Mesh, s: LoopState) -> None:
 @jit_within
 def _cross(c: Mesh, s: LoopState, a: int) -> None:
     """Change the branch of area a at a zero of its gap voltage, which ends a step."""
-    control, branch, t_new = s.control, branch_of(c, s), s.step[0].t_new
+    control, branch, t_new = s.control[0], branch_of(c, s), s.step[0].t_new
     c.sign[a] = -c.sign[a]
     branch[a, 0], branch[a, 1] = t_new, t_new - branch[a, 0]
     s.counters[ZEROS] += 1
     # The area has a kink here, which excites the fast modes again.
-    if control[H_AFTER_ZERO] > 0.0:
-        control[H], control[ALLOWED] = control[H_AFTER_ZERO], 0.0
-    s.step[0].fresh = H_AFTER_ZERO
+    if control.h_after_zero > 0.0:
+        control.h, control.allowed = control.h_after_zero, 0.0
+    s.step[0].fresh = AFTER_ZERO
 
 
 @jit_within

@@ -11,7 +11,11 @@ from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.charge import LOBE
 from fingerspice.engine.exponential import between
 from fingerspice.engine.netform import AREA, CELL_U, MORE, SLOPE, D, Form, J, Leaks, W, Work
-from fingerspice.engine.readout import ERROR_Q, N_PLACES, row_of
+from fingerspice.engine.readout import (
+    N_PLACES,
+    Control,
+    row_of,
+)
 from fingerspice.numerics.lobatto import DERIVATIVE, NODES, POINTS, ROWS
 
 # Largest integral within a step of a function that changes its sign at every node, as the node polynomial does, over
@@ -95,7 +99,7 @@ def charge_rows(
 @jit
 def charge_error(
     form: Form, work: Work, h: float, lost: FloatArray, g: FloatArray, theta: float, u: FloatArray, areas: FloatArray,
-    z: FloatArray, collected: FloatArray, control: FloatArray,
+    z: FloatArray, collected: FloatArray, control: Control,
 ) -> None:  # fmt: skip
     """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
 
@@ -158,7 +162,7 @@ def charge_error(
             now = _held(form, source, p, lasting, cell_slips[0], u, areas[MORE])
             known = now + collected[0, source] + added
             error = math.sqrt(known * known + off_briefly[p] * off_briefly[p] + collected[1, source])
-            control[ERROR_Q] = max(control[ERROR_Q], error)
+            control.error_q = max(control.error_q, error)
             if last_theta > theta:
                 break
         collected[0, source] += added

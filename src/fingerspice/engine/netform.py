@@ -13,13 +13,14 @@ jump, and nothing leaks: all rates are zero.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.coupling import Coupling, new_coupling
-from fingerspice.engine.readout import N_CONTROL, N_PLACES, WRITTEN_AT_ONCE
+from fingerspice.engine.readout import CONTROL, N_PLACES, WRITTEN_AT_ONCE
 from fingerspice.engine.rows import N_FLAT
 from fingerspice.numerics.lobatto import NODES, ROWS
 
@@ -136,8 +137,8 @@ class Jump(NamedTuple):
     # before, after (n_s,): Values of the sources before and after it, V or A
     before: FloatArray
     after: FloatArray
-    # control, sign: Bookkeeping and branches of the areas before the jump
-    control: FloatArray
+    # control (2,), sign: Bookkeeping before the jump and at its start, and branches of the areas before it
+    control: NDArray[Any]
     sign: FloatArray
     branch: FloatArray  # (n_area, 2): As `Mesh.branch`, by the fraction of the jump
     leaks: Leaks  # Zeros
@@ -193,7 +194,7 @@ def _new_jump(n: int, modes: int, cells: int, areas: int, sources: int) -> Jump:
         np.zeros((sources, sources)),
     )  # fmt: skip
     return Jump(
-        np.zeros(sources), np.zeros(sources), np.zeros(N_CONTROL), np.zeros(areas), np.zeros((areas, 2)), leaks
+        np.zeros(sources), np.zeros(sources), np.zeros(2, CONTROL), np.zeros(areas), np.zeros((areas, 2)), leaks
     )  # fmt: skip
 
 

@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp, write_row_at
 from fingerspice.engine.readout import (
-    ALLOWED,
-    BRANCH_LENGTH,
-    BRANCH_START,
-    ERROR_Q,
-    SIGN,
-    TOO_LONG,
-    U_BEFORE,
-    U_GAP,
-    H,
-    T,
+    Control,
 )
 from fingerspice.engine.segment import Segment, source
 from fingerspice.numerics.lobatto import NODES
@@ -37,6 +29,8 @@ _REFUTED = 1.5
 # Largest ratio of the first step after an edge or a zero to the first step after the previous one; the smaller value
 # holds if that step was found by rejections.
 _MOST_FRESH, _TRIED_FRESH = 2.0, 1.1
+# Whether a step is the first after an edge or a zero.
+NOT_FRESH, AFTER_EDGE, AFTER_ZERO = range(3)
 
 
 class Pace(NamedTuple):
@@ -62,63 +56,65 @@ def nearest_level(q0: FloatArray, q: float) -> int:
 
 
 @jit
-def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: FloatArray) -> bool:
+def enter(model: Model, charge: bool, u_source: float, y: FloatArray, control: Control) -> bool:
     """Take a jump of the source at this time, if there is one, and the branch after it; False if it meets a fold."""
     x_gap = dot(model.gap, y)
-    if not model.mobile and u_source != control[U_BEFORE] and charge:
-        moved, error = jump_charge(model, x_gap, control[U_BEFORE], u_source)
+    if not model.mobile and u_source != control.u_before and charge:
+        moved, error = jump_charge(model, x_gap, control.u_before, u_source)
         y[-1] += moved
-        control[ERROR_Q] += error
+        control.error_q += error
     k_u = model.k_gap * u_source
-    if model.mobile and control[SIGN] != 0.0:
-        u = ramp(model, k_u, x_gap, control[U_GAP])
-        sign = control[SIGN] if u == 0.0 else math.copysign(1.0, u)
+    if model.mobile and control.sign != 0.0:
+        u = ramp(model, k_u, x_gap, control.u_gap)
+        sign = control.sign if u == 0.0 else math.copysign(1.0, u)
     else:
         sign = choose_branch(model, u_source, y)
         u = gap_voltage(model, k_u, x_gap, sign, k_u)
     if u != u:
         return False
     take_branch(sign if model.coupled else 1.0, control)
-    control[U_GAP] = u
+    control.u_gap = u
     return True
 
 
 @jit
 def end_row(
-    model: Model, segment: Segment, tau: float, charge: bool, y: FloatArray, control: FloatArray, row: FloatArray
+    model: Model, segment: Segment, tau: float, charge: bool, y: FloatArray, controls: NDArray[Any], row: FloatArray
 ) -> None:
     """Output row (see `model.write_row`) `tau` s into a segment, at 0 after the jump of the source that may begin it.
 
-    The jump's charge is added to `y`, its branch goes into `control`; the row is NaN where the jump passes a fold.
+    The jump's charge is added to `y`, its branch goes into `controls` (1,); the row is NaN where the jump passes a
+    fold.
     """
+    control = controls[0]
     u_source, du_source = source(segment, tau)
     if tau == 0.0 and not enter(model, charge, u_source, y, control):
         u_source = math.nan
-    u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), control[SIGN], control[U_GAP])
-    write_row_at(model, u_source, du_source, y, control[SIGN], u, row)
+    u = gap_voltage(model, model.k_gap * u_source, dot(model.gap, y), control.sign, control.u_gap)
+    write_row_at(model, u_source, du_source, y, control.sign, u, row)
 
 
 @jit
-def take_branch(sign: float, control: FloatArray) -> None:
+def take_branch(sign: float, control: Control) -> None:
     """Take the branch of a sign; a new branch starts here, and its length is not known yet."""
-    if sign != control[SIGN]:
-        control[BRANCH_START] = control[T]
-        control[BRANCH_LENGTH] = math.inf
-    control[SIGN] = sign
+    if sign != control.sign:
+        control.branch_start = control.t
+        control.branch_length = math.inf
+    control.sign = sign
 
 
 @jit
 def choose_step(
-    pace: Pace, tau: float, coupled: bool, is_series: bool, t: float, remaining: float, control: FloatArray
+    pace: Pace, tau: float, coupled: bool, is_series: bool, t: float, remaining: float, control: Control
 ) -> float:
     """Length of the next step, s: one of the ladder, or exactly to the end of a segment that cannot be continued."""
     if not pace.controlled:
         return pace.h_max
-    h = control[H]
+    h = control.h
     if h == 0.0:
         h = 4.0 * tau
     h = min(h, pace.h_max)
-    ahead = control[BRANCH_START] + _BEYOND * control[BRANCH_LENGTH] - t
+    ahead = control.branch_start + _BEYOND * control.branch_length - t
     target = remaining
     if coupled and 0.0 < ahead < remaining:
         target = ahead
@@ -142,7 +138,7 @@ def allowed_factor(error: float, tol: float) -> float:
 
 
 @jit
-def accept(h: float, wanted: float, factor: float, tries: int, fresh: int, closed: bool, control: FloatArray) -> None:
+def accept(h: float, wanted: float, factor: float, tries: int, fresh: int, closed: bool, control: Control) -> None:
     """Choose the length after that of a step within its error.
 
     Parameters
@@ -154,7 +150,7 @@ def accept(h: float, wanted: float, factor: float, tries: int, fresh: int, close
     tries : int
         Lengths that were tried.
     fresh : int
-        Entry of `control` for the length of a first step after an edge or a zero; -1 for other steps.
+        Whether it is the first after an edge or a zero (NOT_FRESH and so on).
     closed : bool
         False if the last rejected length was one at which the iteration did not converge: the error of a shorter step
         says nothing about that.
@@ -163,25 +159,29 @@ def accept(h: float, wanted: float, factor: float, tries: int, fresh: int, close
     """
     # A step cut short by a boundary says little about the next one. After a jump the decays die away one by one, and
     # the length allowed grows from step to step as it did.
-    growth = h * factor / control[ALLOWED] if control[ALLOWED] > 0.0 else 1.0
-    control[ALLOWED] = h * factor
+    growth = h * factor / control.allowed if control.allowed > 0.0 else 1.0
+    control.allowed = h * factor
     proposed = h * min(_MOST_GROWTH, max(0.5, factor * min(max(growth, 1.0), _MOST_TREND)))
     proposed = max(proposed, wanted if h < wanted else 0.0)
-    if closed and h * factor > _REFUTED * control[TOO_LONG]:
-        control[TOO_LONG] = 0.0
-    if control[TOO_LONG] > 0.0:
-        proposed = min(proposed, 0.93 * control[TOO_LONG])
-        control[TOO_LONG] *= growth if growth > 1.5 else 1.03
-    if fresh >= 0 and h >= wanted:
-        control[fresh] = h * min(_MOST_FRESH if tries == 1 else _TRIED_FRESH, factor)
-    control[H] = proposed
+    if closed and h * factor > _REFUTED * control.too_long:
+        control.too_long = 0.0
+    if control.too_long > 0.0:
+        proposed = min(proposed, 0.93 * control.too_long)
+        control.too_long *= growth if growth > 1.5 else 1.03
+    if fresh != NOT_FRESH and h >= wanted:
+        first = h * min(_MOST_FRESH if tries == 1 else _TRIED_FRESH, factor)
+        if fresh == AFTER_EDGE:
+            control.h_after_edge = first
+        else:
+            control.h_after_zero = first
+    control.h = proposed
 
 
 @jit
-def shorten(h: float, factor: float, control: FloatArray) -> float:
+def shorten(h: float, factor: float, control: Control) -> float:
     """The length to try after a rejected one, which is remembered."""
-    control[TOO_LONG] = h
-    control[ALLOWED] = 0.0
+    control.too_long = h
+    control.allowed = 0.0
     shorter: float = rung(h * min(0.9, max(0.25, factor)))
     return shorter
 

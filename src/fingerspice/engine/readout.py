@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,30 +11,33 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
 
-# Entries of `control`.
-T, H, SIGN, U_BEFORE, U_GAP = 0, 1, 2, 3, 4
-BRANCH_START, BRANCH_LENGTH, PEAK_U, PEAK_F, ERROR_U, ERROR_F = 5, 6, 7, 8, 9, 10
-# A step length that was rejected recently, s.
-TOO_LONG = 11
-# The first step taken after an edge of the source, s.
-H_AFTER_EDGE = 12
-# Largest change of the gap voltage for a change of 1 V of a state voltage.
-MAGNIFIED = 13
-# Error of the charge: the largest so far (C), the sum with known signs (C), and the sum of squares of the others (C^2).
-ERROR_Q, COLLECTED, SPREAD = 14, 15, 16
-# 1/A where the last step ended, 1/m^2.
-LAST_Q = 17
-# Length that the last step's error would have allowed, s; 0 if it says nothing about the next step.
-ALLOWED = 18
-# The first step taken after a zero of the gap voltage, s; 0 before the first.
-H_AFTER_ZERO = 19
-# Smallest distance to the fold so far.
-MARGIN = 20
-# Largest charge so far, C.
-PEAK_Q = 21
-# Largest error of a node's voltage, V.
-ERROR_V = 22
-N_CONTROL = 23
+CONTROL = np.dtype([
+    ("t", float),  # s
+    ("h", float),  # s: length of the next step
+    ("sign", float),  # Of the gap voltage, on the branch of the area
+    ("u_before", float),  # V: source before `t`
+    ("u_gap", float),  # V
+    ("branch_start", float),  # s
+    ("branch_length", float),  # s: of the branch before; infinite before the first
+    ("peak_u", float),  # V
+    ("peak_f", float),  # N
+    ("error_u", float),  # V
+    ("error_f", float),  # N
+    ("too_long", float),  # s: a length that was rejected recently
+    ("h_after_edge", float),  # s: the first step taken after an edge of the source
+    ("magnified", float),  # Largest change of the gap voltage for a change of 1 V of a state voltage
+    ("error_q", float),  # C: largest error of the charge so far
+    ("collected", float),  # C: sum of the charge's errors with known signs
+    ("spread", float),  # C^2: sum of the squares of its other errors
+    ("last_q", float),  # 1/m^2: 1/A where the last step ended
+    ("allowed", float),  # s: length that the last step's error would have allowed; 0 if it says nothing about the next
+    ("h_after_zero", float),  # s: the first step taken after a zero of the gap voltage; 0 before the first
+    ("margin", float),  # Smallest distance to the fold so far
+    ("peak_q", float),  # C
+    ("error_v", float),  # V: largest error of a node's voltage
+])  # fmt: skip
+"""Bookkeeping of a run."""
+Control = Any  # A record of type `CONTROL`
 # Entries of `counters`: rows evaluated, steps accepted and rejected, zeros, outputs written, steps kept, recorded.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT, RECORDED = 0, 1, 2, 3, 4, 5, 6
 N_COUNTERS = 7
@@ -270,17 +273,17 @@ def write_outputs(
 @jit_rows
 def account(
     mobile: bool, area0: float, stress: float, u: FloatArray, q: FloatArray, x_gap: FloatArray, dq: FloatArray,
-    theta: float, run_error: float, control: FloatArray,
+    theta: float, run_error: float, control: Control,
 ) -> None:  # fmt: skip
     """Peaks of gap voltage and force, their largest errors and the distance to the fold in the part that counts."""
     if mobile:
-        margin = control[MARGIN]
+        margin = control.margin
         for j in range(NODES):
             if POINTS[j] <= theta:
                 margin = min(margin, 1.0 - area0 * x_gap[j] * dq[j])
-        control[MARGIN] = margin
-    peak_u = control[PEAK_U]
-    peak_f = control[PEAK_F]
+        control.margin = margin
+    peak_u = control.peak_u
+    peak_f = control.peak_f
     steepest = 0.0
     for j in range(NODES):
         if POINTS[j] <= theta:
@@ -290,7 +293,7 @@ def account(
             peak_f = max(peak_f, pressure * size)
             # F ~ u^2 A: an error du changes F by at most 2 F du / u, because the area falls with |u|.
             steepest = max(steepest, 2.0 * pressure)
-    control[PEAK_U] = peak_u
-    control[PEAK_F] = peak_f
-    control[ERROR_U] = max(control[ERROR_U], run_error)
-    control[ERROR_F] = max(control[ERROR_F], run_error * steepest)
+    control.peak_u = peak_u
+    control.peak_f = peak_f
+    control.error_u = max(control.error_u, run_error)
+    control.error_f = max(control.error_f, run_error * steepest)

@@ -10,20 +10,12 @@ from fingerspice.engine.loop import march
 from fingerspice.engine.loopstate import DONE, STEP, Kept, LoopState
 from fingerspice.engine.pace import Pace
 from fingerspice.engine.readout import (
-    BRANCH_LENGTH,
-    ERROR_F,
-    ERROR_U,
-    H_AFTER_EDGE,
-    N_CONTROL,
+    CONTROL,
     N_COUNTERS,
     NFEV,
-    PEAK_F,
-    PEAK_U,
     TRIED,
-    U_BEFORE,
     Outputs,
     Steps,
-    T,
 )  # fmt: skip
 from fingerspice.engine.stackstep import Stack
 from fingerspice.engine.system import System
@@ -49,18 +41,19 @@ def _map(
 ) -> int:  # fmt: skip
     """Integrate modes w over the table; `end` receives them at its end, times `turned`, `figures` peaks and errors."""
     n, system, edges = w.size, stack.system, stack.edges
-    control = np.zeros(N_CONTROL)
-    control[T] = edges[0]
-    control[U_BEFORE] = u_before
-    control[BRANCH_LENGTH] = np.inf
-    control[H_AFTER_EDGE] = figures[5]
+    controls = np.zeros(1, CONTROL)
+    control = controls[0]
+    control.t = edges[0]
+    control.u_before = u_before
+    control.branch_length = np.inf
+    control.h_after_edge = figures[5]
     y = np.zeros(n + 1)
     for i in range(n):
         for k in range(n):
             y[i] += system.live[0, i, k] * w[k]
     count = np.zeros(N_COUNTERS, np.int64)
     state = LoopState(
-        y, np.zeros(n + 1), control, count, np.zeros(1, STEP),
+        y, np.zeros(n + 1), controls, count, np.zeros(1, STEP),
         Outputs(np.zeros(0), np.zeros(0, np.bool_), np.zeros((n, 0))), Kept(np.zeros((0, 4)), np.zeros((0, n, ROWS))),
         Steps(np.zeros((0, 4)), np.zeros((0, n, NODES))), np.zeros((TRIED, 4)),
     )  # fmt: skip
@@ -69,11 +62,11 @@ def _map(
         end[k] = 0.0
         for i in range(n):
             end[k] += turned * system.project[0, k, i] * y[i]
-    figures[0] = control[PEAK_U]
-    figures[1] = control[PEAK_F]
-    figures[2] = control[ERROR_U]
-    figures[3] = control[ERROR_F]
-    figures[5] = control[H_AFTER_EDGE]
+    figures[0] = control.peak_u
+    figures[1] = control.peak_f
+    figures[2] = control.error_u
+    figures[3] = control.error_f
+    figures[5] = control.h_after_edge
     counters[NFEV] += count[NFEV]
     counters[1] += 1
     return code

@@ -19,28 +19,11 @@ from fingerspice.engine.loopstate import (
     write_step,
 )
 from fingerspice.engine.model import dot, turns_at_zero
-from fingerspice.engine.pace import Pace
+from fingerspice.engine.pace import AFTER_ZERO, Pace
 from fingerspice.engine.readout import (
     ACCEPTED,
-    ALLOWED,
-    BRANCH_LENGTH,
-    BRANCH_START,
-    ERROR_F,
-    ERROR_U,
-    ERROR_V,
-    H_AFTER_ZERO,
-    LAST_Q,
-    MAGNIFIED,
-    MARGIN,
     N_PLACES,
-    PEAK_F,
-    PEAK_U,
-    SIGN,
-    U_BEFORE,
-    U_GAP,
     ZEROS,
-    H,
-    T,
     account,
     at,
     basis_at,
@@ -118,7 +101,7 @@ def _linear_error(node: FloatArray, k_node: FloatArray, source: FloatArray, plac
 @jit_within
 def complete_stack(c: Stack, pace: Pace, s: LoopState) -> int:
     """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
-    step, control, t = s.step[0], s.control, s.control[T]
+    step, control, t = s.step[0], s.control[0], s.control[0].t
     h, since, length = step.length, step.since, step.stop - step.start
     reached = since + h
     step.theta, step.crossed = 1.0, -1
@@ -126,11 +109,11 @@ def complete_stack(c: Stack, pace: Pace, s: LoopState) -> int:
         reached = length
         step.theta = min(1.0, (length - since) / h)
     if step.wrong > 0 or step.below > 0.0:
-        crossing = zero(c.work.r[U], control[SIGN], step.wrong, step.below, c.work.coefficients[0])
+        crossing = zero(c.work.r[U], control.sign, step.wrong, step.below, c.work.coefficients[0])
         if since + crossing * h <= since:
             if step.flips < 2:
                 return flip(s)
-            if farthest_off(c.work.r[U], control[SIGN], step.theta) > pace.tol and may_shorten(s, since):
+            if farthest_off(c.work.r[U], control.sign, step.theta) > pace.tol and may_shorten(s, since):
                 return AGAIN
         elif since + crossing * h <= reached and crossing <= step.theta:
             step.theta, reached, step.crossed = crossing, since + crossing * h, 0
@@ -141,11 +124,11 @@ def complete_stack(c: Stack, pace: Pace, s: LoopState) -> int:
     _move(c, pace.charge, s)
     if step.crossed >= 0 and not _cross(c, s):
         return NO_STEP
-    control[T], step.since = step.t_new, reached
-    if control[T] >= step.stop:
-        control[U_BEFORE] = source_voltage(c, s, control[T] - step.start)
+    control.t, step.since = step.t_new, reached
+    if control.t >= step.stop:
+        control.u_before = source_voltage(c, s, control.t - step.start)
     s.counters[ACCEPTED] += 1
-    return OUT_OF_RANGE if control[PEAK_U] > c.system.u_top else GO_ON
+    return OUT_OF_RANGE if control.peak_u > c.system.u_top else GO_ON
 
 
 @jit_within
@@ -156,7 +139,7 @@ def _write(c: Stack, pace: Pace, s: LoopState, t: float) -> None:
     n_shown = shown.shape[0]
     if pace.charge:
         charge_step(
-            system, work, level, c.integral, step.length, s.y[work.w0.size], step.theta, s.control, values[n_shown],
+            system, work, level, c.integral, step.length, s.y[work.w0.size], step.theta, s.control[0], values[n_shown],
             values[n_shown + 1],
         )  # fmt: skip
     if not is_wanted(s, step.t_new):
@@ -168,9 +151,9 @@ def _write(c: Stack, pace: Pace, s: LoopState, t: float) -> None:
 @jit_within
 def _account(c: Stack, s: LoopState) -> None:
     """Peaks of a step, and the errors of the run in it."""
-    system, work, step, control, level = c.system, c.work, s.step[0], s.control, s.step[0].level
+    system, work, step, control, level = c.system, c.work, s.step[0], s.control[0], s.step[0].level
     model, r = system.model, c.work.r
-    control[MAGNIFIED] = max(control[MAGNIFIED], step.grown)
+    control.magnified = max(control.magnified, step.grown)
     account(
         model.mobile and model.coupled, model.area0, system.stress, r[U], r[Q], r[X_GAP], r[DQ], step.theta,
         step.run_error, control,
@@ -178,13 +161,13 @@ def _account(c: Stack, s: LoopState) -> None:
     v_error = node_error(
         model.mobile, model.area0, system.node[level], system.k_node, system.gap[level], work.w, r, work.places
     )  # fmt: skip
-    control[ERROR_V] = max(control[ERROR_V], v_error)
+    control.error_v = max(control.error_v, v_error)
 
 
 @jit_within
 def _move(c: Stack, charge: bool, s: LoopState) -> None:
     """State and error at the end of a step, or where it is cut short."""
-    system, work, control, theta, y = c.system, c.work, s.control, s.step[0].theta, s.y
+    system, work, control, theta, y = c.system, c.work, s.control[0], s.step[0].theta, s.y
     n, r, w, w0, places, basis, error = work.w0.size, work.r, work.w, work.w0, work.places, work.basis, s.error
     n_shown = system.shown.shape[1]
     if theta < 1.0:
@@ -193,14 +176,14 @@ def _move(c: Stack, charge: bool, s: LoopState) -> None:
             w0[k] = at(w[k], basis)
         error_at(places, theta, error)
         if charge:
-            y[n], control[LAST_Q] = at(work.values[n_shown], basis), at(r[Q], basis)
-        control[U_GAP] = 0.0 if s.step[0].crossed >= 0 else at(r[U], basis)
+            y[n], control.last_q = at(work.values[n_shown], basis), at(r[Q], basis)
+        control.u_gap = 0.0 if s.step[0].crossed >= 0 else at(r[U], basis)
     else:
         for k in range(n):
             w0[k], error[k] = w[k, END], places[k, N_PLACES - 1]
         if charge:
-            y[n], control[LAST_Q] = work.values[n_shown, END], r[Q, END]
-        control[U_GAP] = r[U, END]
+            y[n], control.last_q = work.values[n_shown, END], r[Q, END]
+        control.u_gap = r[U, END]
     live = system.live[s.step[0].level]
     for i in range(n):
         y[i] = 0.0
@@ -211,25 +194,25 @@ def _move(c: Stack, charge: bool, s: LoopState) -> None:
 @jit_within
 def _cross(c: Stack, s: LoopState) -> bool:
     """Change the branch at a zero of the gap voltage, which ends a step; False at a fold there."""
-    step, control, model, t_new = s.step[0], s.control, c.system.model, s.step[0].t_new
-    control[SIGN] = -control[SIGN]
-    control[BRANCH_LENGTH] = t_new - control[BRANCH_START]
-    control[BRANCH_START] = t_new
+    step, control, model, t_new = s.step[0], s.control[0], c.system.model, s.step[0].t_new
+    control.sign = -control.sign
+    control.branch_length = t_new - control.branch_start
+    control.branch_start = t_new
     s.counters[ZEROS] += 1
-    if turns_at_zero(model, dot(model.gap, s.y), control[SIGN]):
-        control[T] = t_new
-        control[SIGN] = -control[SIGN]
-        control[MARGIN] = 0.0
+    if turns_at_zero(model, dot(model.gap, s.y), control.sign):
+        control.t = t_new
+        control.sign = -control.sign
+        control.margin = 0.0
         return False
     # The area has a kink here, which excites fast modes again: the first step is chosen as after other zeros.
     if step.below > 0.0:
         # The gap voltage returns to 0 V soon.
-        control[H] = 2.0 * (step.below - step.theta) * step.length
-        control[ALLOWED] = 0.0
-    elif control[H_AFTER_ZERO] > 0.0:
-        control[H] = control[H_AFTER_ZERO]
-        control[ALLOWED] = 0.0
-    s.step[0].fresh = H_AFTER_ZERO
+        control.h = 2.0 * (step.below - step.theta) * step.length
+        control.allowed = 0.0
+    elif control.h_after_zero > 0.0:
+        control.h = control.h_after_zero
+        control.allowed = 0.0
+    s.step[0].fresh = AFTER_ZERO
     return True
 
 
@@ -241,7 +224,7 @@ def end_stack(c: Stack, s: LoopState) -> None:
 @jit_within
 def worst_of_stack(c: Stack, s: LoopState) -> float:
     """Largest ratio of the estimated error to the peak so far, of the gap's voltage and force."""
-    control = s.control
-    of_voltage = control[ERROR_U] / control[PEAK_U] if control[PEAK_U] > 0.0 else 0.0
-    of_force = control[ERROR_F] / control[PEAK_F] if control[PEAK_F] > 0.0 else 0.0
+    control = s.control[0]
+    of_voltage = control.error_u / control.peak_u if control.peak_u > 0.0 else 0.0
+    of_force = control.error_f / control.peak_f if control.peak_f > 0.0 else 0.0
     return max(of_voltage, of_force)

@@ -14,24 +14,26 @@ from fingerspice.engine.exponential import Tables, assess, converge, make_tables
 from fingerspice.engine.growth import SLIGHT, carry, loop_gain
 from fingerspice.engine.loopstate import AGAIN, DONE, GO_ON, NO_STEP, OUT_OF_RANGE, PAUSED, RETRY, TOO_MANY, LoopState
 from fingerspice.engine.model import branch_area, turns_at_zero
-from fingerspice.engine.pace import Pace, change_level, choose_step, enter, nearest_level, rung, take_branch
+from fingerspice.engine.pace import (
+    AFTER_EDGE,
+    NOT_FRESH,
+    Pace,
+    change_level,
+    choose_step,
+    enter,
+    nearest_level,
+    rung,
+    take_branch,
+)
 from fingerspice.engine.readout import (
     ACCEPTED,
-    ALLOWED,
     FIRST_PASSES,
-    H_AFTER_EDGE,
-    MARGIN,
     MOST_PASSES,
     MOST_STEPS,
     N_PLACES,
     NFEV,
     RECORDED,
     REJECTED,
-    SIGN,
-    TOO_LONG,
-    U_GAP,
-    H,
-    T,
 )
 from fingerspice.engine.rows import DQ, GUESS, X_GAP, U, Work, largest_size, source_rows
 from fingerspice.engine.segment import Segment, segment_at, source
@@ -70,24 +72,24 @@ def edges_of_stack(c: Stack) -> FloatArray:
 @jit_within
 def start_stack(c: Stack, s: LoopState) -> None:
     """Begin a call of the loop: find the segment of the source, unless the run was paused."""
-    step, control, counters = s.step[0], s.control, s.counters
+    step, control, counters = s.step[0], s.control[0], s.counters
     # Other runs may have used the tables since the last call.
     step.tabled, step.level, step.flips = 0.0, -1, 0
     if step.is_paused > 0:
         step.is_paused = 0
         return
-    step.index = segment_at(c.edges, control[T]) - 1 if c.edges[0] < control[T] else -1
+    step.index = segment_at(c.edges, control.t) - 1 if c.edges[0] < control.t else -1
     # The segment is entered at the first step, as its edge is not before the present time.
-    step.start, step.edge, step.since, step.begun = 0.0, control[T], 0.0, control[T]
-    step.fresh, step.evaluated = -1, counters[NFEV]
+    step.start, step.edge, step.since, step.begun = 0.0, control.t, 0.0, control.t
+    step.fresh, step.evaluated = NOT_FRESH, counters[NFEV]
     step.most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
 
 
 @jit_within
 def begin_stack(c: Stack, pace: Pace, s: LoopState, t_end: float) -> int:
     """Where the next step starts: after a jump of the source, from the modes of the reference area; and its length."""
-    step, control, counters = s.step[0], s.control, s.counters
-    model, t = c.system.model, control[T]
+    step, control, counters = s.step[0], s.control[0], s.counters
+    model, t = c.system.model, control.t
     if not t < t_end:
         return DONE
     if counters[RECORDED] >= s.steps.times.shape[0] > 0:
@@ -122,22 +124,22 @@ def begin_stack(c: Stack, pace: Pace, s: LoopState, t_end: float) -> int:
 @jit_within
 def _enter_segment(c: Stack, pace: Pace, s: LoopState) -> bool:
     """Take the jump of the source at the start of a segment; False if it meets a fold."""
-    step, control, model = s.step[0], s.control, c.system.model
+    step, control, model = s.step[0], s.control[0], c.system.model
     # Time is counted from the edge: a transient after it may be faster than the rounding of t.
-    step.since = control[T] - step.start
-    step.begun, step.evaluated = control[T], s.counters[NFEV]
+    step.since = control.t - step.start
+    step.begun, step.evaluated = control.t, s.counters[NFEV]
     u_source = source_voltage(c, s, step.since)
     if model.mobile or pace.charge:
         if not enter(model, pace.charge, u_source, s.y, control):
             return False
     else:
-        control[U_GAP] = model.k_gap * u_source
+        control.u_gap = model.k_gap * u_source
         for i in range(model.gap.size):
-            control[U_GAP] += model.gap[i] * s.y[i]
-        take_branch(1.0 if control[U_GAP] >= 0.0 or not model.coupled else -1.0, control)
+            control.u_gap += model.gap[i] * s.y[i]
+        take_branch(1.0 if control.u_gap >= 0.0 or not model.coupled else -1.0, control)
     # Try the step that was right after the edge before: similar jumps often need similar steps.
-    control[H], control[TOO_LONG], control[ALLOWED] = control[H_AFTER_EDGE], 0.0, 0.0
-    step.fresh = H_AFTER_EDGE
+    control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
+    step.fresh = AFTER_EDGE
     return True
 
 
@@ -155,7 +157,7 @@ def _take_level(c: Stack, s: LoopState) -> None:
     system, step, error = c.system, s.step[0], s.error
     n, now = system.model.gap.size, 0
     if system.q0.size > 1:
-        q, _ = branch_area(system.model, s.control[SIGN], s.control[U_GAP])
+        q, _ = branch_area(system.model, s.control[0].sign, s.control[0].u_gap)
         now = nearest_level(system.q0, q)
     if now == step.level:
         return
@@ -168,8 +170,8 @@ def _take_level(c: Stack, s: LoopState) -> None:
 @jit_within
 def attempt_stack(c: Stack, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
-    system, work, step, control, counters = c.system, c.work, s.step[0], s.control, s.counters
-    model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.step[0].level, s.control[SIGN]
+    system, work, step, control, counters = c.system, c.work, s.step[0], s.control[0], s.counters
+    model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.step[0].level, s.control[0].sign
     h, u_rows = step.length, work.r[U]
     if h != step.tabled:
         tables = c.tables
@@ -182,7 +184,7 @@ def attempt_stack(c: Stack, pace: Pace, s: LoopState) -> int:
     source_rows(segment[0], segment[1], step.edge - step.start, step.since, h, pace.charge, r)
     if model.mobile:
         for i in range(ROWS):
-            r[GUESS, i] = control[U_GAP]
+            r[GUESS, i] = control.u_gap
     passes, closed = converge(system, c.tables, work, step.slot, level, sign, 0.3 * tol)
     counters[NFEV] += passes * NODES
     step.wrong = first_wrong(u_rows, sign, tol) if model.coupled else 0
@@ -191,7 +193,7 @@ def attempt_stack(c: Stack, pace: Pace, s: LoopState) -> int:
     if step.wrong == 1 and step.flips < 2 and at_zero:
         # The step starts at a zero, and the gap voltage leaves it to the other side: change the branch.
         if turns_at_zero(model, r[X_GAP, 0], -sign):
-            control[MARGIN] = 0.0
+            control.margin = 0.0
             return NO_STEP
         return flip(s)
     step.below = dip(u_rows, sign, tol, step.wrong, work.coefficients[0]) if model.coupled and closed else 0.0
@@ -199,7 +201,7 @@ def attempt_stack(c: Stack, pace: Pace, s: LoopState) -> int:
         # The gap voltage starts at a zero and soon returns to it: a shorter step resolves this.
         counters[REJECTED] += 1
         step.length = rung(2.0 * step.below * h)
-        step.wanted = control[H] = step.length
+        step.wanted = control.h = step.length
         step.flips = 0
         return RETRY
     step.converged, step.step_error = int(closed), math.inf
@@ -211,7 +213,7 @@ def attempt_stack(c: Stack, pace: Pace, s: LoopState) -> int:
 @jit_within
 def flip(s: LoopState) -> int:
     """Change the branch of the area, and start again."""
-    s.control[SIGN] = -s.control[SIGN]
+    s.control[0].sign = -s.control[0].sign
     s.step[0].flips += 1
     return AGAIN
 
@@ -226,7 +228,7 @@ def _assess(c: Stack, s: LoopState) -> None:
             work.carried[k, p] = decay[k, NODES + p if p < N_PLACES - 2 else END] * s.error[k]
     grown = loop_gain(system, work, level)
     if grown > SLIGHT:
-        carry(system, work, level, decay, step.length, s.control[SIGN], grown, s.error)
+        carry(system, work, level, decay, step.length, s.control[0].sign, grown, s.error)
     step.step_error, step.run_error, step.grown = assess(system, c.tables, work, slot, level, s.error)
 
 
@@ -236,7 +238,7 @@ def refuse_stack(c: Stack, s: LoopState) -> int:
     system, step, r = c.system, s.step[0], c.work.r
     model = system.model
     # A step rejected beyond the end of the area's polynomial: shorter ones would creep up to the kink there.
-    if model.coupled and abs(s.control[U_GAP]) > 0.9 * system.u_top and largest_size(r[U]) > system.u_top:
+    if model.coupled and abs(s.control[0].u_gap) > 0.9 * system.u_top and largest_size(r[U]) > system.u_top:
         return OUT_OF_RANGE
     # A step of the size of the time's rounding is rejected: the solution has a singularity here.
     if step.length <= 1e-15 * step.since + 1e-25 * (step.edge - step.start):
@@ -253,4 +255,4 @@ def beyond_stack(c: Stack, pace: Pace, s: LoopState) -> float:
     There the branch of the area has no meaning, and the error says nothing.
     """
     wrong, u = s.step[0].wrong, c.work.r[U]
-    return 1.1 * POINTS[wrong] if wrong > 1 and s.control[SIGN] * u[END] < c.system.lo else 2.0
+    return 1.1 * POINTS[wrong] if wrong > 1 and s.control[0].sign * u[END] < c.system.lo else 2.0

@@ -235,12 +235,10 @@ class March(Stepping, NetworkIntegration):
         scene, size = problem.scene, problem.initial.y.size
         n_s, n_area = len(scene.waveforms), scene.net.gap.size
         self.u_scale, self.decade = u_scale, int(np.floor(np.log10(rtol)))
-        self.control = np.zeros(readout.N_CONTROL)
-        self.control[readout.T] = problem.t_start
-        self.control[readout.MAGNIFIED] = 1.0
         self.collected = np.zeros((2, n_s))
         width = size + n_s if problem.charge else size
         super().__init__(problem, tol * u_scale, t_out, left, size - n_s, width)
+        self.control["magnified"] = 1.0
         self.rows = self.out.T
         self.error = np.zeros(self.n + self.n_slow)
         self.met = np.zeros((n_area + 1, 4))
@@ -284,7 +282,7 @@ class March(Stepping, NetworkIntegration):
         missed, spread = self.collected - collected
         self.collected[0] += periods * missed
         held = float(self.problem.network.capacitance(self.problem.scene.area0).sum())
-        self.control[readout.ERROR_Q] += periods * float((np.abs(missed) + np.sqrt(spread)).max()) + held * owed
+        self.control["error_q"] += periods * float((np.abs(missed) + np.sqrt(spread)).max()) + held * owed
 
     def _failed(self, code: int, sources: Sources) -> Status:
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
@@ -324,7 +322,7 @@ class March(Stepping, NetworkIntegration):
         scene = self.problem.scene
         run.gaps = self.stated_gaps()
         run.node_error = float(self._stated()[-1, netassess.ERROR_U])
-        run.margin = 1.0 / float(self.control[readout.MAGNIFIED])
+        run.margin = 1.0 / float(self.control["magnified"])
         if self.problem.charge:
             steps = 1.0 + float(self.counters[readout.ACCEPTED])
             largest = self.u_scale + float(self.met[:, netassess.PEAK_U].max(initial=0.0))

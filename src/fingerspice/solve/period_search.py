@@ -16,7 +16,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.network import network_modes
-from fingerspice.engine import netassess, readout
+from fingerspice.engine import netassess
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.solve.marching import GUESS
 from fingerspice.solve.netmarching import March
@@ -148,7 +148,7 @@ class Search:
         if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
             return None
         error = np.append(one.form.shape @ one.error[:n], one.error[n:])
-        magnified = max(1.0, float(one.control[readout.MAGNIFIED]))
+        magnified = max(1.0, float(one.control["magnified"]))
         return one.y, one.s_before, error, _Pass(none, none, one.met.copy(), magnified, one.references.magnified)
 
     def _collocated(self, problem: Problem, tol: float) -> _Made:

@@ -242,9 +242,10 @@ def _source_warnings(problem: Problem) -> Iterator[str]:
 
 def _off_warning(problem: Problem, run: Run) -> Iterator[str]:
     """A warning about sources that are 0 in the whole run, unless a charge of the start drives it."""
+    if run.status is not Status.SUCCESS or not problem.waveforms or run.gaps[:, 0].any():
+        return
     currents = problem.waveforms[problem.network.n_voltage :]
-    peaks = (problem.scene.u_peak, *(wave.peak(problem.t_start, problem.t_stop) for wave in currents))
-    if run.status is Status.SUCCESS and problem.waveforms and not (any(peaks) or run.gaps[:, 0].any()):
+    if not any((problem.scene.u_peak, *(wave.peak(problem.t_start, problem.t_stop) for wave in currents))):
         small = ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None)
         if small:
             yield (

@@ -100,8 +100,8 @@ class Stepping(Integration):
     ----------
     pace : Pace
     looks : Looks
-    control : ndarray
-        State of the compiled loop, with the indices of `engine.readout`.
+    control : record
+        Bookkeeping of the compiled loop, of type `engine.readout.CONTROL`.
     out : ndarray, shape (width, n_out)
         Output rows as columns.
     repeated : int
@@ -113,7 +113,6 @@ class Stepping(Integration):
     """
 
     looks: Looks
-    control: FloatArray
     error: FloatArray
     asked = math.inf
 
@@ -121,6 +120,9 @@ class Stepping(Integration):
         self, problem: Problem, tol: float, t_out: FloatArray, left: BoolArray, shown: int, width: int,
         h_fixed: float = 0.0,
     ) -> None:  # fmt: skip
+        self.controls = np.zeros(1, readout.CONTROL)
+        self.control = self.controls[0]
+        self.control["t"] = problem.t_start
         super().__init__(problem, t_out, left)
         span = problem.t_stop - problem.t_start
         longest = h_fixed or min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
@@ -134,12 +136,12 @@ class Stepping(Integration):
 
     @property
     def t(self) -> float:
-        return float(self.control[readout.T])
+        return float(self.control["t"])
 
     def loop_state(self) -> LoopState:
         """The integration as the compiled loop takes and updates it."""
         return LoopState(
-            self.y, self.error, self.control, self.counters, self.step, self.outputs, self.kept,
+            self.y, self.error, self.controls, self.counters, self.step, self.outputs, self.kept,
             self.recorder.room, self.tried,
         )  # fmt: skip
 
@@ -244,7 +246,7 @@ class Stepping(Integration):
         self.recorder.repeat(self.kept_from, periods, period)
         # The end of a period may be the end of the run but for the rounding of both.
         reached, stop = self.t + periods * period, self.problem.t_stop
-        self.control[readout.T] = stop if abs(stop - reached) <= same_time(stop) else reached
+        self.control["t"] = stop if abs(stop - reached) <= same_time(stop) else reached
         self._pass(periods, float(found[loop.DISTANCE]), float(found[loop.REMAINING]), collected)
         self.repeated += periods
 
@@ -256,7 +258,7 @@ class Stepping(Integration):
         period = self.problem.waveform.period
         passed = self.t - self.problem.t_start
         alike = passed / period - self.repeated if period else 0.0
-        known = float(self.control[readout.ERROR_Q])
+        known = float(self.control["error_q"])
         return SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
 
     def recorded(self) -> Recorded | None:

@@ -147,17 +147,15 @@ class Track(Stepping):
     ) -> None:  # fmt: skip
         scene, start = problem.scene, problem.inner
         self.prepared, self.start, n = prepared, start, start.y.size - 1
-        self.control = np.zeros(readout.N_CONTROL)
         shown = scene.shown.turn.size
         super().__init__(problem, tol, t_out, left, shown, shown + 2 if problem.charge else shown, h_fixed)
         self.y = start.y.copy()
         self.error = np.zeros(n + 1)
-        self.control[readout.T] = problem.t_start
-        self.control[readout.U_BEFORE] = start.u_before
-        self.control[readout.BRANCH_LENGTH] = np.inf
-        self.control[readout.MARGIN] = 1.0
+        self.control["u_before"] = start.u_before
+        self.control["branch_length"] = np.inf
+        self.control["margin"] = 1.0
         if model_of(scene).mobile and problem.initial.sign[0] != 0.0:
-            self.control[readout.U_GAP], self.control[readout.SIGN] = start.u_gap, math.copysign(1.0, start.u_gap)
+            self.control["u_gap"], self.control["sign"] = start.u_gap, math.copysign(1.0, start.u_gap)
         self.looks = looks_of(problem, prepared.system.rates, tol, np.ones(n), repeat and h_fixed == 0.0)
 
     @property
@@ -180,24 +178,24 @@ class Track(Stepping):
             raise OutOfRangeError(self.prepared.system.u_top)
         if self.t > sources.edges[0]:
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
-            self.control[readout.U_BEFORE], _ = source(*_segment(sources, self.t, "left"))
+            self.control["u_before"], _ = source(*_segment(sources, self.t, "left"))
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
 
     def _collected(self) -> tuple[float, float]:
-        return float(self.control[readout.COLLECTED]), float(self.control[readout.SPREAD])
+        return float(self.control["collected"]), float(self.control["spread"])
 
     def _pass(self, periods: int, off: float, owed: float, collected: tuple[float, float]) -> None:
-        self.control[readout.BRANCH_START] += periods * self.period
-        self.control[readout.ERROR_U] += off
-        self.control[readout.ERROR_V] += off
-        if self.control[readout.PEAK_U] > 0.0:
-            steepest = 2.0 * self.control[readout.PEAK_F] / self.control[readout.PEAK_U]
-            self.control[readout.ERROR_F] += off * steepest
+        self.control["branch_start"] += periods * self.period
+        self.control["error_u"] += off
+        self.control["error_v"] += off
+        if self.control["peak_u"] > 0.0:
+            steepest = 2.0 * self.control["peak_f"] / self.control["peak_u"]
+            self.control["error_f"] += off * steepest
         if self.pace.charge:
-            missed = self.control[readout.COLLECTED] - collected[0]
-            self.control[readout.COLLECTED] += periods * missed
-            self.control[readout.ERROR_Q] += (
-                periods * (abs(missed) + np.sqrt(self.control[readout.SPREAD] - collected[1]))
+            missed = self.control["collected"] - collected[0]
+            self.control["collected"] += periods * missed
+            self.control["error_q"] += (
+                periods * (abs(missed) + np.sqrt(self.control["spread"] - collected[1]))
                 + self.capacitance * owed
             )  # fmt: skip
 
@@ -207,8 +205,8 @@ class Track(Stepping):
     def inner_state(self) -> StackState:
         """The state reached in the engine's form."""
         c = self.control
-        sign, u_gap = float(c[readout.SIGN]), float(c[readout.U_GAP])
-        state = StackState(self.t, self.y.copy(), float(c[readout.U_BEFORE]), u_gap, self.start.offset)
+        sign, u_gap = float(c["sign"]), float(c["u_gap"])
+        state = StackState(self.t, self.y.copy(), float(c["u_before"]), u_gap, self.start.offset)
         return on_branch(self.prepared.system.model, state, sign)
 
     def written(self) -> FloatArray:
@@ -224,7 +222,7 @@ class Track(Stepping):
         segment, tau = _segment(after or sources, self.problem.t_stop, "right")
         model = self.prepared.system.model
         # `end_row` applies a jump at the end to these copies, so that the final state remains the left-hand one.
-        end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.control.copy(), row)
+        end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.controls.copy(), row)
         self.out[:, first:] = as_marched(self.problem.scene, row[None, :])[0, : len(self.out), None]
         self.counters[readout.OUTPUT] = self.t_out.size
 
@@ -234,9 +232,9 @@ class Track(Stepping):
         segment, tau = _segment(sources, self.t, side)
         row = np.empty(row_width(self.problem.scene))
         u, du = source(segment, tau)
-        found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c[readout.SIGN], c[readout.U_GAP])
+        found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c["sign"], c["u_gap"])
         # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
-        write_row_at(model, u, du, self.y, c[readout.SIGN], found if found == found else c[readout.U_GAP], row)
+        write_row_at(model, u, du, self.y, c["sign"], found if found == found else c["u_gap"], row)
         return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
 
     def recorded(self) -> Recorded | None:
@@ -247,31 +245,31 @@ class Track(Stepping):
 
     def stated_gaps(self) -> FloatArray:
         control, model = self.control, model_of(self.problem.scene)
-        peak_u, peak_f = float(control[readout.PEAK_U]), float(control[readout.PEAK_F])
+        peak_u, peak_f = float(control["peak_u"]), float(control["peak_f"])
         # Round-off adds to the truncation error.
         floor = 4e-16 * (peak_u + model.k_gap * self.problem.scene.u_size)
-        u_error = SAFETY * float(control[readout.ERROR_U]) + floor
-        f_error = SAFETY * float(control[readout.ERROR_F]) + 2.0 * floor / (peak_u or 1.0) * peak_f
+        u_error = SAFETY * float(control["error_u"]) + floor
+        f_error = SAFETY * float(control["error_f"]) + 2.0 * floor / (peak_u or 1.0) * peak_f
         return np.array([[peak_u, peak_f, u_error, f_error]])
 
     def stated(self, run: Run) -> None:
-        run.gaps, run.margin = self.stated_gaps(), float(self.control[readout.MARGIN])
-        floor = 4e-16 * (float(self.control[readout.PEAK_U]) + self.problem.scene.u_size)
-        run.node_error = SAFETY * float(self.control[readout.ERROR_V]) + floor
+        run.gaps, run.margin = self.stated_gaps(), float(self.control["margin"])
+        floor = 4e-16 * (float(self.control["peak_u"]) + self.problem.scene.u_size)
+        run.node_error = SAFETY * float(self.control["error_v"]) + floor
         if self.problem.charge:
-            run.charge_error = self._charge_error(float(self.control[readout.PEAK_U]))
+            run.charge_error = self._charge_error(float(self.control["peak_u"]))
 
     def _charge_error(self, peak_u: float) -> float:
         """Estimated error of the charge, C; every step adds the round-off of the charge that a layer holds."""
         held = self.capacitance * (self.problem.scene.u_size + peak_u)
         steps = 1.0 + float(self.counters[readout.ACCEPTED])
         # The relative error of the area's polynomial is also a relative error of all charge moved.
-        moved = held + float(self.control[readout.PEAK_Q])
+        moved = held + float(self.control["peak_q"])
         missed = self.prepared.area_error * moved if self.prepared.system.model.coupled else 0.0
         # The factor comes from a stack whose layers all leak fast: compared with a reference, the errors of gap voltage
         # and charge were 1.5 times the estimates, because they peak between the points of the estimate; and from scene
         # 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
-        return CHARGE_SAFETY * self.charge_error(float(self.control[readout.SPREAD])) + 4e-16 * held * steps + missed
+        return CHARGE_SAFETY * self.charge_error(float(self.control["spread"])) + 4e-16 * held * steps + missed
 
 
 def on_branch(model: Model, state: StackState, sign: float) -> StackState:
