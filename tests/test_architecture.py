@@ -37,7 +37,7 @@ MANY_PARAMETERS = {
     "cli.app.plan",
     "cli.app.compare",
     "cli.explore.explore",
-    "cli.limits.limits",
+    "cli.design.limits",
     "cli.design.design",
     "cli.fit.fit",
     "cli.sweep.sweep",

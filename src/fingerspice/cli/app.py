@@ -38,7 +38,7 @@ from fingerspice.cli.answers import (
 from fingerspice.cli.check import check
 from fingerspice.cli.explore import explore
 from fingerspice.cli.figures import figures
-from fingerspice.cli.limits import limits
+from fingerspice.cli.design import limits
 from fingerspice.cli.options import area_from_text, check_output, read_circuit
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.run_files import Touch, large_sweep, run_streamed, written
