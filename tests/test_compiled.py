@@ -66,7 +66,7 @@ def test_a_change_reaches_code_that_is_cached_elsewhere(tmp_path):
     # `source` calls `chebyshev.evaluate`, which stands in another file.
     code = (
         "import numpy as np\n"
-        "from fingerspice.engine.segment import Segment, source\n"
+        "from fingerspice.engine.network import Segment, source\n"
         "print(repr(source(Segment(0.0, 1.0, np.zeros((1, 6)), np.array([3.0, 0.0])), 0.5)[0]))"
     )
     cache = tmp_path / "cache"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import fingerspice as fs
 from fingerspice.base.arrays import FloatArray
-from fingerspice.engine.segment import Segment, source
+from fingerspice.engine.network import Segment, source
 from fingerspice.solve.sources import LOOKS
 from fingerspice.waveforms.sampling import SourceTable, on_grid, source_table
 from scenes import table1, table1_deck

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 import fingerspice as fs
-from fingerspice.engine.segment import Segment, source
+from fingerspice.engine.network import Segment, source
 from fingerspice.waveforms import combinations, periodic, ramps, sampling
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.recorded import as_samples

@@ -53,9 +53,9 @@ if TYPE_CHECKING:
     from fingerspice.studies.fitting import fit_material as fit_material
     from fingerspice.studies.inverse import InverseDrive as InverseDrive
     from fingerspice.studies.inverse import inverse_drive as inverse_drive
+    from fingerspice.studies.largesignal import large_signal as large_signal
     from fingerspice.studies.limits import FoldLimits as FoldLimits
     from fingerspice.studies.limits import fold_limits as fold_limits
-    from fingerspice.studies.phasors import large_signal as large_signal
     from fingerspice.studies.phasors import phasor as phasor
     from fingerspice.studies.populations import sobol as sobol
     from fingerspice.studies.populations import sweep as sweep
@@ -101,7 +101,8 @@ _HOMES = {
     "studies.fitresult": ("Fit",),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.inverse": ("InverseDrive", "inverse_drive"),
-    "studies.phasors": ("large_signal", "phasor"),
+    "studies.largesignal": ("large_signal",),
+    "studies.phasors": ("phasor",),
     "studies.limits": ("FoldLimits", "fold_limits"),
     "studies.populations": ("sobol", "sweep"),
     "results.loading": ("load",),

@@ -36,9 +36,9 @@ from fingerspice.cli.answers import (
     Streamed,
 )  # fmt: skip
 from fingerspice.cli.check import check
+from fingerspice.cli.design import limits
 from fingerspice.cli.explore import explore
 from fingerspice.cli.figures import figures
-from fingerspice.cli.design import limits
 from fingerspice.cli.options import area_from_text, check_output, read_circuit
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.run_files import Touch, large_sweep, run_streamed, written
@@ -229,7 +229,7 @@ def ac(
     from fingerspice.results.report import phasor_csv, phasor_dict, phasor_tables
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.phasors import phasor
-    from fingerspice.studies.populations import sweep_frequencies
+    from fingerspice.studies.sweeps import sweep_frequencies
 
     how = "steady_state" if area == "coupled" else "phasor"
     with Answering("ac", as_json, charge_law=charge_law, method=how, rtol=rtol, area=area, skin=skin) as answer:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from fingerspice.base.arrays import FloatArray
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.cli.store import Store
-    from fingerspice.results.loading import PhasorSolution
+    from fingerspice.results.phasor_solution import PhasorSolution
     from fingerspice.results.solution import Solution
     from fingerspice.solve.streaming import Stream
     from fingerspice.studies.feel import Feel
@@ -59,7 +59,7 @@ def large_sweep(
     circuit: Circuit, frequencies: FloatArray, amplitude: list[float] | None, **how: Any
 ) -> tuple[PhasorSolution, ...]:
     """The sweep with ``--area coupled``: the periodic state at every frequency (Hz) and amplitude (V)."""
-    from fingerspice.studies.phasors import large_signal
+    from fingerspice.studies.largesignal import large_signal
 
     with progress("sweeping") as update:
         return large_signal(circuit, frequencies, amplitude, progress=update, **how)

@@ -11,7 +11,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.coupling import Coupling
 from fingerspice.engine.model import Model, choose_branch, dot, jump_charge, write_row
-from fingerspice.engine.segment import Segment, source
+from fingerspice.engine.network import Segment, source
 from fingerspice.numerics.lobatto import ROWS
 
 # Gauss-Seidel sweeps over the areas in each evaluation of the currents.

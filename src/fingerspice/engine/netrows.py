@@ -6,27 +6,10 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.engine import netform
 from fingerspice.engine.coupling import STIFF
 from fingerspice.engine.currents import Moving, answer_alone, answer_mobile, answer_together
-from fingerspice.engine.netform import (
-    AREA,
-    CHI,
-    CHI_S,
-    ETA,
-    ETA_S,
-    KNOWN,
-    LIN,
-    MORE,
-    RATE,
-    RHO,
-    SHARE,
-    SLOPE,
-    U_S,
-    Form,
-    Leaks,
-    U,
-    Work,
-)
+from fingerspice.engine.netform import Form, Leaks, Work
 from fingerspice.engine.rows import polynomial_rows
 from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, ROWS
 from fingerspice.physics.contact import inverse_area
@@ -169,13 +152,13 @@ def evaluate(
     `d` receives the derivatives of stiff modes. `cells` and `areas` are blocks of rows, whose parts that follow the
     sources are given. False beyond a fold; under `mobile`, `least` (ROWS,) receives the distance to it.
     """
-    coupling, lin, rates, pace = work.own, work.modes[LIN], leaks.rates, leaks.pace
+    coupling, lin, rates, pace = work.own, work.modes[netform.LIN], leaks.rates, leaks.pace
     mobile = form.mobile
     n = form.gap.shape[1]
     stiff = coupling.key[1] > 0
-    u, eta, chi, rho = areas[U], cells[ETA], cells[CHI], cells[RHO]
-    area, slope, rate, more = areas[AREA], areas[SLOPE], areas[RATE], areas[MORE]
-    combine_from(form.gap, w, areas[U_S], u)
+    u, eta, chi, rho = areas[netform.U], cells[netform.ETA], cells[netform.CHI], cells[netform.RHO]
+    area, slope, rate, more = areas[netform.AREA], areas[netform.SLOPE], areas[netform.RATE], areas[netform.MORE]
+    combine_from(form.gap, w, areas[netform.U_S], u)
     clear(pull)
     if stiff:
         mode_rates(h, rates, w, lin, pull, True, d)
@@ -191,12 +174,12 @@ def evaluate(
                     mobile, h, rates[k], pace[a], form.unit[a], w[k], lin[k], d[k], pull[k], area[a], slope[a], rate[a]
                 )  # fmt: skip
             _subtract(area[a], form.area0[a], more[a])
-    combine_from(coupling.from_modes, w, cells[ETA_S], eta)
+    combine_from(coupling.from_modes, w, cells[netform.ETA_S], eta)
     if stiff:
         combine(coupling.from_stiff, d[:n], eta)
     if mobile:
-        combine_from(coupling.held, w, cells[CHI_S], chi)
-        rows = Moving(u, more, slope, rate, chi, eta, rho, areas[KNOWN], cells[SHARE])
+        combine_from(coupling.held, w, cells[netform.CHI_S], chi)
+        rows = Moving(u, more, slope, rate, chi, eta, rho, areas[netform.KNOWN], cells[netform.SHARE])
         answer_mobile(
             several, coupling, form.home, form.first, form.cell, rows, work.mixed, work.matrix, least
         )  # fmt: skip
@@ -205,7 +188,7 @@ def evaluate(
             if not least[i] > 0.0:
                 return False
     elif several:
-        answer_together(form.home, coupling.answer, coupling.cross, more, cells[SHARE], eta, rho)
+        answer_together(form.home, coupling.answer, coupling.cross, more, cells[netform.SHARE], eta, rho)
     else:
         answer_alone(form.home, coupling.answer, more, eta, rho)
     combine(coupling.feed, rho, pull[:n])
@@ -215,15 +198,15 @@ def evaluate(
 @jit_within
 def follow_sources(form: Form, work: Work, gain: FloatArray) -> None:
     """The parts of a step's rows that depend on the sources alone; see `evaluate`."""
-    coupling, s, ds, lin, cells, areas = work.own, work.s, work.ds, work.modes[LIN], work.cells, work.areas
+    coupling, s, ds, lin, cells, areas = work.own, work.s, work.ds, work.modes[netform.LIN], work.cells, work.areas
     n = form.gap.shape[1]
     clear(lin)
     combine(gain, s, lin)
-    clear(cells[ETA_S])
-    combine(coupling.from_rates, lin[:n], cells[ETA_S])
-    combine(coupling.from_slopes, ds, cells[ETA_S])
-    combine(coupling.from_sources, s, cells[ETA_S])
-    clear(cells[CHI_S])
-    combine(coupling.from_slopes, s, cells[CHI_S])
-    clear(areas[U_S])
-    combine(form.gap_s, s, areas[U_S])
+    clear(cells[netform.ETA_S])
+    combine(coupling.from_rates, lin[:n], cells[netform.ETA_S])
+    combine(coupling.from_slopes, ds, cells[netform.ETA_S])
+    combine(coupling.from_sources, s, cells[netform.ETA_S])
+    clear(cells[netform.CHI_S])
+    combine(coupling.from_slopes, s, cells[netform.CHI_S])
+    clear(areas[netform.U_S])
+    combine(form.gap_s, s, areas[netform.U_S])

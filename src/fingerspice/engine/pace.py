@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp, write_row_at
+from fingerspice.engine.network import Segment, source
 from fingerspice.engine.readout import (
     Control,
 )
-from fingerspice.engine.segment import Segment, source
 from fingerspice.numerics.lobatto import NODES
 
 # Ratio of neighbouring step lengths of the ladder, as a power of two: small enough to waste little, large enough for

@@ -14,6 +14,7 @@ from fingerspice.engine.exponential import Tables, assess, converge, make_tables
 from fingerspice.engine.growth import SLIGHT, carry, loop_gain
 from fingerspice.engine.loopstate import AGAIN, DONE, GO_ON, NO_STEP, OUT_OF_RANGE, PAUSED, RETRY, TOO_MANY, LoopState
 from fingerspice.engine.model import branch_area, turns_at_zero
+from fingerspice.engine.network import Segment, segment_at, source
 from fingerspice.engine.pace import (
     AFTER_EDGE,
     NOT_FRESH,
@@ -36,7 +37,6 @@ from fingerspice.engine.readout import (
     REJECTED,
 )
 from fingerspice.engine.rows import DQ, GUESS, X_GAP, U, Work, largest_size, source_rows
-from fingerspice.engine.segment import Segment, segment_at, source
 from fingerspice.engine.system import System
 from fingerspice.engine.zeros import dip, first_wrong
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS

@@ -25,7 +25,7 @@ from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.export import export_netlist
-from fingerspice.studies.phasors import large_signal
+from fingerspice.studies.largesignal import large_signal
 from fingerspice.waveforms.waveform import Sine
 
 #: Traces of each kind, and harmonics.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.plots.drawing import Picture
-    from fingerspice.results.loading import PhasorSolution
+    from fingerspice.results.phasor_solution import PhasorSolution
 
 
 def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:

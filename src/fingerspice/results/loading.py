@@ -6,15 +6,13 @@ import dataclasses
 import json
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fingerspice.base.arrays import ComplexArray, FloatArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.physics.contact import Contact
 from fingerspice.results.datafiles import FORMAT, GROUP
@@ -22,10 +20,10 @@ from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, S
 from fingerspice.results.signals import StoredRecord, StoredRun
 from fingerspice.results.solution import Solution
 from fingerspice.results.stored_circuit import made_again
-from fingerspice.waveforms.waveform import Fundamental, require
+from fingerspice.waveforms.waveform import Fundamental
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 def load(path: str | Path) -> Solution:
@@ -197,73 +195,3 @@ def _circuit(file: Any, run: dict[str, Any]) -> Circuit:
         return Circuit(
             _text(file.attrs["title"]), (), text=_text(file.attrs["deck"]), overrides=dict(run["overrides"]), sets=sets
         )
-
-
-@dataclass(frozen=True, repr=False)
-class PhasorSolution(Shown):
-    """Phasors against frequency; arrays of shape (n_frequency,).
-
-    Attributes
-    ----------
-    frequency : ndarray
-        Hz.
-    gain : ndarray of complex
-        Ratio of gap voltage to source, with the modulus of Eq. 11 and the angle of Eq. 13 (V/A for a current source).
-    layer_gain : ndarray of complex, shape (n_frequency, n_layer)
-        The same ratio for every layer.
-    u_gap : ndarray of complex
-        Complex amplitude of the gap voltage, V; NaN for a source without fundamental or AC.
-    area : ndarray
-        Ridge contact area, m^2.
-    f_el_mean : ndarray
-        Mean electroadhesive force, N.
-    amplitude : float
-        Source amplitude, V (A for a current source).
-    layers : tuple of str
-    phase : float
-        Phase of the source, rad.
-    drive : str
-        Where amplitude and phase come from, in words.
-    notes : tuple of str
-        Remarks on how the sweep was made.
-    warnings : tuple of str
-        Warnings of extrapolation and of implausible results.
-    circuit : Circuit or None
-        The circuit of the sweep.
-    impedance : ndarray of complex or None
-        Voltage of the source over its current, ohm; None for a large-signal sweep or several sources.
-    nodes : tuple of str
-        Nodes of a circuit without GAP, for which figures of a gap are NaN; empty with a GAP.
-    v_nodes : ndarray of complex or None, shape (n_frequency, n_node)
-        Their complex amplitudes, V.
-    """
-
-    frequency: FloatArray
-    gain: ComplexArray
-    layer_gain: ComplexArray
-    u_gap: ComplexArray
-    area: FloatArray
-    f_el_mean: FloatArray
-    amplitude: float
-    layers: tuple[str, ...]
-    phase: float = 0.0
-    drive: str = ""
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    circuit: Circuit | None = None
-    impedance: ComplexArray | None = None
-    nodes: tuple[str, ...] = ()
-    v_nodes: ComplexArray | None = None
-
-    def _page(self) -> Page:
-        from fingerspice.results.report import phasor_table
-
-        return phasor_table(self, most=20)
-
-    def plot(self) -> Figure:
-        """Gain, phase, mean force and area, or without GAP the node voltages, against frequency."""
-        from fingerspice.plots.phasors import plot_phasor
-
-        require(self.circuit is not None, "circuit", self.circuit, "a sweep that phasor or large_signal made")
-        assert self.circuit is not None
-        return plot_phasor((self,), self.circuit)

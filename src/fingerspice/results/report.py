@@ -16,8 +16,8 @@ from fingerspice.circuit.describe import head_lines, heading
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.loading import PhasorSolution
     from fingerspice.results.outcome import Plan
+    from fingerspice.results.phasor_solution import PhasorSolution
     from fingerspice.results.solution import Solution
 
 

@@ -19,7 +19,7 @@ from scipy.integrate import OdeSolution, solve_ivp
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.model import branch_area, dot, ramp, voltage_by_time, write_row_at
-from fingerspice.engine.segment import Segment, source
+from fingerspice.engine.network import Segment, source
 from fingerspice.results.outcome import Failure, SolveError, Status, last_tried
 from fingerspice.solve.initial import StackState, from_stack, from_written, model_of, row_width, to_stack
 from fingerspice.solve.marching import solve as solve_marching

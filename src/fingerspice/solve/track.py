@@ -17,10 +17,9 @@ from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import forget, new_tables
 from fingerspice.engine.loop import Looks
 from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
-from fingerspice.engine.network import Sources
+from fingerspice.engine.network import Segment, Sources, source
 from fingerspice.engine.pace import end_row
 from fingerspice.engine.rows import Work, new_work
-from fingerspice.engine.segment import Segment, source
 from fingerspice.engine.stackstep import Stack
 from fingerspice.engine.system import LEVEL_RATIO, System, area_error, area_missed, area_range, build_system
 from fingerspice.numerics.lobatto import integral_table

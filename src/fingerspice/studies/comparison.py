@@ -13,7 +13,7 @@ from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.response import linear_scene
-from fingerspice.results.loading import PhasorSolution
+from fingerspice.results.phasor_solution import PhasorSolution
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Value
 from fingerspice.studies.phasors import phasor
