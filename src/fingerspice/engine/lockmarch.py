@@ -10,21 +10,9 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, aligned
 from fingerspice.base.compiled import jit
+from fingerspice.engine import lockstep
 from fingerspice.engine.lockscenes import CELL_ROWS, OMEGA, Block, Places, fill_block, put_result
-from fingerspice.engine.lockstep import (
-    N_STATE,
-    N_WEIGHTS,
-    PEAK,
-    SHAPE,
-    START_TIMES,
-    VALUE,
-    Marks,
-    Weights,
-    Z,
-    area_row,
-    n_state,
-    run,
-)  # fmt: skip
+from fingerspice.engine.lockstep import Marks, Weights, area_row, n_state, run
 from fingerspice.engine.lockweights import weigh
 
 # Most periods in the search for the periodic state.
@@ -59,7 +47,7 @@ class Stepping(NamedTuple):
 def stepping_shapes(pieces: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
     """Shapes of the arrays of a `Stepping`, for weights of so many pieces (4 without jumps)."""
     m_all, _, l_all, _, count, lanes = (len(mark) for mark in marks)
-    row, modes = N_WEIGHTS * m_all * lanes, (m_all * lanes,)
+    row, modes = lockstep.N_WEIGHTS * m_all * lanes, (m_all * lanes,)
     sums = (count * lanes,)
     return (
         (row,),
@@ -92,13 +80,13 @@ def _closed(
     for i in range(lanes):
         off = 0.0
         for m in range(m_all):
-            change = (s[(Z * m_all + m) * lanes + i] - start[m * lanes + i]) * back[m * lanes + i]
-            off += abs(c[(SHAPE + m) * lanes + i] * change)
-        closing[i] = off / (s[(N_STATE * m_all + PEAK) * lanes + i] + 1e-300)
+            change = (s[(lockstep.Z * m_all + m) * lanes + i] - start[m * lanes + i]) * back[m * lanes + i]
+            off += abs(c[(lockstep.SHAPE + m) * lanes + i] * change)
+        closing[i] = off / (s[(lockstep.N_STATE * m_all + lockstep.PEAK) * lanes + i] + 1e-300)
         if closing[i] > tol:
             done = False
             for m in range(m_all):
-                change = s[(Z * m_all + m) * lanes + i] - start[m * lanes + i]
+                change = s[(lockstep.Z * m_all + m) * lanes + i] - start[m * lanes + i]
                 start[m * lanes + i] += change * back[m * lanes + i]
     return done
 
@@ -117,8 +105,8 @@ def _settled(i: int, c: FloatArray, stepping: Stepping, steps: int, traced: bool
     off, held = 0.0, area_row(m_all, len(marks[1]), len(marks[2])) + len(marks[3]) - 1
     for m in range(m_all):
         at = m * lanes + i
-        off += abs(c[(SHAPE + m) * lanes + i] * (s[Z * m_all * lanes + at] - before[at]) * back[at])
-    peak = s[(N_STATE * m_all + PEAK) * lanes + i]
+        off += abs(c[(lockstep.SHAPE + m) * lanes + i] * (s[lockstep.Z * m_all * lanes + at] - before[at]) * back[at])
+    peak = s[(lockstep.N_STATE * m_all + lockstep.PEAK) * lanes + i]
     of_force = off * peak / (last[i] / steps * c[held * lanes + i] + 1e-300)
     return float(max(of_force, off / (peak + 1e-300)) if traced else of_force)
 
@@ -136,14 +124,14 @@ def _from_rest(
     halves, steps, jumping = how
     s, last, before, closing, settled = stepping[2], stepping[3], stepping[4], stepping[6], stepping[7]
     m_all, count, lanes = len(marks[0]), len(marks[4]), len(marks[5])
-    sums = (N_STATE * m_all + VALUE + count) * lanes
+    sums = (lockstep.N_STATE * m_all + lockstep.VALUE + count) * lanes
     for i in range(lanes):
         closing[i] = math.inf
     done, left = 0, lanes
     while left > 0:
         upto = done + 2 - halves % 2 if done == 0 else done + 2
         for i in range(before.size):
-            before[i] = s[Z * m_all * lanes + i]
+            before[i] = s[lockstep.Z * m_all * lanes + i]
         for i in range(last.size):
             last[i] = -s[sums + i] if done > 0 else 0.0
         run(c, g, s, wave, (done, upto, steps, jumping), trace, marks)
@@ -183,7 +171,7 @@ def march_block(
     # Unpacked by position, as a compiler for graphics cards may know plain tuples only.
     c, start, rates, drive, t, top, tails, _ = block
     still, moving, s, _, _, back, closing, length, moments = stepping
-    sums, omega = (N_STATE * m_all + VALUE + count) * lanes, (CELL_ROWS * (m_all + 1) + OMEGA) * lanes
+    sums, omega = (lockstep.N_STATE * m_all + lockstep.VALUE + count) * lanes, (CELL_ROWS * (m_all + 1) + OMEGA) * lanes
     fill_block(table, pending, first, places, curves, (source[0], jumping, covered), block, marks)
     for i in range(lanes):
         period = 2.0 * math.pi / t[omega + i]
@@ -198,7 +186,7 @@ def march_block(
             continue
         steps = half // 2 if w == 0 else half
         # All pieces together are 2^pieces - 1 times the first, which has steps / pieces of the shortest steps.
-        shorter = pieces / (2.0**pieces - 1.0) if jumping else START_TIMES[1]
+        shorter = pieces / (2.0**pieces - 1.0) if jumping else lockstep.START_TIMES[1]
         for i in range(lanes):
             length[i] = math.pi / t[omega + i] / steps * shorter
         weigh(length, rates, drive, g, moments, marks)

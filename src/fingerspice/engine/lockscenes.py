@@ -10,16 +10,8 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, aligned
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lockstep import (
-    N_STATE,
-    PEAK,
-    SCALE,
-    SHAPE,
-    VALUE,
-    Marks,
-    area_row,
-    n_constants,
-)  # fmt: skip
+from fingerspice.engine import lockstep
+from fingerspice.engine.lockstep import Marks, area_row, n_constants
 from fingerspice.numerics.modes import write_modes
 
 # A mode's rate nearer than this (relative) to the rate of a cell, a pole of the characteristic equation, has too few
@@ -136,11 +128,11 @@ def link(
 ) -> None:  # fmt: skip
     """Constants by which the modes have to do with gap and leaks."""
     m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
-    of_z = SHAPE + m_all + w_all + l_all * w_all
+    of_z = lockstep.SHAPE + m_all + w_all + l_all * w_all
     of_leak = of_z + l_all * m_all
     for i in range(lanes):
         for m in range(m_all):
-            c[(SHAPE + m) * lanes + i] = shape[(gap * m_all + m) * lanes + i]
+            c[(lockstep.SHAPE + m) * lanes + i] = shape[(gap * m_all + m) * lanes + i]
             for n in range(l_all):
                 c[(of_z + n * m_all + m) * lanes + i] = shape[(leaks[n] * m_all + m) * lanes + i]
                 c[(of_leak + m * l_all + n) * lanes + i] = (
@@ -245,7 +237,7 @@ def _respond(
     A tone's response in a mode is gain (rate - i omega) / (rate^2 + omega^2) of it.
     """
     m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
-    others, of_u = CELL_ROWS * (m_all + 1), SHAPE + m_all
+    others, of_u = CELL_ROWS * (m_all + 1), lockstep.SHAPE + m_all
     of_w = of_u + w_all
     of_z = of_w + l_all * w_all
     for i in range(lanes):
@@ -264,8 +256,8 @@ def _respond(
                 size = gain[m * lanes + i] / (rate * rate + omega * omega)
                 along, across = size * (rate * sine + omega * cosine), size * (rate * cosine - omega * sine)
                 start[m * lanes + i] -= across
-                u_sine += c[(SHAPE + m) * lanes + i] * along
-                u_cosine += c[(SHAPE + m) * lanes + i] * across
+                u_sine += c[(lockstep.SHAPE + m) * lanes + i] * along
+                u_cosine += c[(lockstep.SHAPE + m) * lanes + i] * across
                 for n in range(l_all):
                     c[(of_w + n * w_all + 2 * tone) * lanes + i] += c[(of_z + n * m_all + m) * lanes + i] * along
                     c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] += c[(of_z + n * m_all + m) * lanes + i] * across
@@ -280,7 +272,7 @@ def _drive(
 ) -> None:  # fmt: skip
     """Constants of a source of constant pieces or straight lines: the cells' voltages at once, and the modes' drive."""
     m_all, l_all, lanes = len(marks[0]), len(marks[2]), len(marks[5])
-    of_u, row = SHAPE + m_all, CELL_ROWS * (m_all + 1) + N_OTHERS
+    of_u, row = lockstep.SHAPE + m_all, CELL_ROWS * (m_all + 1) + N_OTHERS
     for i in range(lanes):
         amplitude = t[row * lanes + i]
         c[of_u * lanes + i] = k[gap * lanes + i] * amplitude
@@ -301,17 +293,17 @@ def put_result(
     `lengths` are the number of periods that the last period stands for beside itself; that of half periods of the run;
     and of the steps in each.
     """
-    own, count, lanes = N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
+    own, count, lanes = lockstep.N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
     ahead, halves, steps = lengths
     if first + i >= out.shape[1]:
         return
     for j in range(count):
-        total = s[(own + VALUE + count + j) * lanes + i]
+        total = s[(own + lockstep.VALUE + count + j) * lanes + i]
         if ahead > 0:
             total += ahead * last[j * lanes + i]
         out[j, first + i] = total / (halves * steps)
         out[count + j, first + i] = last[j * lanes + i] / (2 * steps)
-    out[2 * count, first + i] = s[(own + PEAK) * lanes + i]
+    out[2 * count, first + i] = s[(own + lockstep.PEAK) * lanes + i]
     out[2 * count + 1, first + i] = closing
 
 
@@ -375,7 +367,7 @@ def fill_block(
         _inverse_areas(curves[1][j], top, b, curves[0], near, values[j * lanes : (j + 1) * lanes], marks)
     _polynomials(curves[2], values, area, c, marks)
     for i in range(lanes):
-        c[SCALE * lanes + i] = 2.0 / top[i]
+        c[lockstep.SCALE * lanes + i] = 2.0 / top[i]
         # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
         # These fall to about a third from one to the next; the last one alone may be small by chance.
         tail = max(abs(c[area * lanes + i]), 2.0 / 3.0 * abs(c[(area + 1) * lanes + i])) / 2.0 ** (d_all - 1)

@@ -15,6 +15,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
+from fingerspice.numerics.small import AT, derivative
 from fingerspice.physics.contact import Contact, ridge_area
 from fingerspice.studies.fitdata import SIGMA, number_columns, unit_factor
 from fingerspice.studies.fitresult import Fitted
@@ -201,13 +202,9 @@ class ContactTask:
                 # Of values that no user has written.
                 warnings.simplefilter("ignore", FingerspiceWarning)
                 middle = self._misses(values)
-                for k in range(values.size):
-                    at = []
-                    for step in (-2.0, -1.0, 1.0, 2.0):
-                        moved = values.copy()
-                        moved[k] *= np.exp(step * _STEP)
-                        at.append(self._misses(moved))
-                    by[:, k] = (at[0] - 8.0 * at[1] + 8.0 * at[2] - at[3]) / (12.0 * _STEP)
+                for k, one in enumerate(np.eye(values.size)):
+                    moved = [values * np.exp(at * _STEP * one) for at in AT]
+                    by[:, k] = derivative([self._misses(each) for each in moved], _STEP)
         except InputError:
             return np.full(size, REFUSED), np.zeros((size, values.size))
         return middle, by
