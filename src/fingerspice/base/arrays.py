@@ -1,4 +1,4 @@
-"""Types of numpy arrays, named once for the whole package; the numbers that a user gives; and several arrays in one."""
+"""Types of numpy arrays, the numbers that a user gives, several arrays in one, and memory that a process keeps."""
 
 from __future__ import annotations
 

@@ -1,8 +1,12 @@
-"""The compiler's decorator, with a cache on disk that no change of the sources outlives.
+"""The compiler's decorator, with a cache on disk that no change of the sources outlives; and borrowed tuples of arrays.
 
 numba keys its cache by the one file a function stands in, while the compiled code holds every function it calls: after
 a change of one file it would go on running the old code of the others. So the key holds a stamp of all files that
 compiled code may call: those of the folders below, as compiled functions elsewhere are private to their own file.
+
+numba passes a tuple by its parts. A hundred arrays are a thousand numbers, which every call would copy, and which every
+function compiled for such a call would take apart and put together again. A borrowed tuple stands in memory, and
+functions are given its address.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files that are complete or absent: written under a temporary name, then renamed."""
+"""Files that are complete or absent (written aside, then renamed), and standard streams that can always be written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A circuit in words: its elements, its sources, and the changes made after its deck was read."""
+"""A circuit in words: its elements, its sources, the changes made after its deck was read; and its digests."""
 
 from __future__ import annotations
 

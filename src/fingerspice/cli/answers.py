@@ -1,4 +1,4 @@
-"""The answers of `--json`: each command has the same keys for every circuit and every outcome (docs/json.md)."""
+"""Arguments that commands share, and the answers of `--json`, with the same keys for every outcome (docs/json.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of the command `run`: data, picture and the picture of ``--feel``; and the large-signal sweep of `ac`."""
+"""Files of `run`: data, pictures and the store of ``--stream``; and the large-signal sweep of `ac`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Currents that the areas of a network add at all rows of a step, by its coupling (see `engine.coupling`)."""
+"""Currents that a network's areas add at all rows of a step (`engine.coupling`); outputs of a stack without leaks."""
 
 from __future__ import annotations
 

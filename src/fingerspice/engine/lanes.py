@@ -1,4 +1,4 @@
-"""Spans of samples in lanes (`engine.lanestep`)."""
+"""Spans of samples in lanes (`engine.lanestep`), and the derivatives of their steps, summed back through a run."""
 
 from __future__ import annotations
 

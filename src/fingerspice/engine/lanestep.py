@@ -6,7 +6,9 @@ step:
     z' = -rates z + gain s + feed g,   xi = k s + shape z,   g_t = (1/A - q0) (tap_s s + taps z + bent N)_t
 
 In a stack xi is the gap voltage u, and 1/A a polynomial in |u|; under `mobile` u follows from xi and the part of it
-that the modes have (`engine.lanestep`). In a network N, the integral of A - 1/q0 over u, is one more drive, behind
+that the modes have: with 1/A = q0 + q it is u = X + B q(u), X = k s + shape z, B = (X - k s) / q0, and the last drive
+is g = A - 1/q0 times s. Where X has a share S of it, X = Y + S g, that is u = Y + C q(u) with
+C = (Y - (k + S / q0) s) / q0. In a network N, the integral of A - 1/q0 over u, is one more drive, behind
 the leaks: u + kappa N = xi, and both 1/A and N are polynomials in |xi| (`solve.netforms`).
 
 The drives g are taken at Lobatto's four nodes. There the state is predicted with polynomials through the leaks at the

@@ -1,7 +1,8 @@
-"""What the loop of exponential steps and its two kinds of circuits share: the run in progress and the step at hand.
+"""What the loop of exponential steps and its circuits share: the run, the step at hand, and periods that repeat one.
 
 The step at hand is a record, because its parts are functions of their own, and because a run may pause between two
-steps and continue in a later call.
+steps and continue in a later call. A billion periods take half a minute to write: compiled calls of some milliseconds,
+each of which hands its state to the next, let Python react to Ctrl-C, and no result depends on where they are divided.
 """
 
 from __future__ import annotations

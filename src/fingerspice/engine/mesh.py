@@ -1,4 +1,4 @@
-"""A network as the loop of exponential steps takes it, and where its steps start: edges and jumps of the sources."""
+"""A network as the loop of exponential steps takes it: edges, jumps, and the reference that fits its areas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Error and peaks of a finished step of a network; `exponential.assess` and `readout` do the same for a stack."""
+"""Error and peaks of a finished step of a network; `exponential.assess` and `readout` do the same for a stack.
+
+How the error of the run is carried through a step is found by differences (`engine.growth` has the equations): the
+currents that the areas cause are evaluated once more at modes shifted by the error, and the response to their change is
+iterated a few times.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evaluations of a stack's step at all its rows at once: the source, the area and the nonlinear term."""
+"""Evaluations of a stack's step at all its rows at once: the source, the area, the nonlinear term; and their arrays."""
 
 from __future__ import annotations
 

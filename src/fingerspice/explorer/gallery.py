@@ -1,4 +1,4 @@
-"""A gallery: pictures of decks and of the explorer's example scenes."""
+"""A gallery: pictures of decks and of the explorer's scenes; and its page as one file without a server."""
 
 from __future__ import annotations
 

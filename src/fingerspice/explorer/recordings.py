@@ -1,4 +1,4 @@
-"""Recordings and tables that are dropped on the page: their numbers come with each request, as the page has them."""
+"""What the page sends and gets: recordings dropped on it, whose numbers come with each request; answers as JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One scene of the explorer: from what the page asks for to traces, figures and sentences, without any state."""
+"""One scene of the explorer, without any state: traces, figures, sentences, and its text as a deck or as Python."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sliders: every parameter of every element, with a range in which moving it makes sense."""
+"""Sliders: every parameter of every element, with a range in which it makes sense; and the menu of waveforms."""
 
 from __future__ import annotations
 

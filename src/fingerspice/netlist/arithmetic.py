@@ -1,6 +1,7 @@
-"""Translation of a netlist's arithmetic to Python text: lexemes, a check of their order and nesting, the translation.
+"""A netlist's arithmetic: its functions, which mean the same as in ngspice's `.param`, and its text in Python.
 
-The check finds every syntax error, so that Python's parser only gets correct text of limited nesting.
+A check of order and nesting of the lexemes finds every syntax error, so that Python's parser only gets correct text of
+limited nesting.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Access to the files of a netlist: their text, the folder they may be in, and the libraries of native devices."""
+"""Files of a netlist: their text, the folder they may be in, and the libraries of native devices as shipped."""
 
 from __future__ import annotations
 

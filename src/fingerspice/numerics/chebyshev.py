@@ -1,4 +1,4 @@
-"""Chebyshev interpolation of smooth functions on an interval, and its compiled evaluation."""
+"""Chebyshev interpolation on an interval, its compiled evaluation, and the largest values of polynomials."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Collocation at Gauss-Lobatto points against an exact exponential: nodes, bases and tables, compiled.
+"""Collocation at Gauss-Lobatto points against an exact exponential: nodes, bases and tables, compiled; and Radau IIA of
+any number of stages (Hairer and Wanner, Solving Ordinary Differential Equations II, 1996, IV.5).
 
 On a step of length h a mode w' = -rate w + g(t) has, with g interpolated at the nodes, the exact solution
 

@@ -1,4 +1,4 @@
-"""Dense algebra on matrices of a few rows, and copies of arrays, compiled.
+"""Dense algebra on matrices of a few rows, and copies of arrays, compiled; and central differences.
 
 LAPACK through numba would cost a fifth of a second at start-up to load, for matrices of ten rows.
 """

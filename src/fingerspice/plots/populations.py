@@ -1,4 +1,4 @@
-"""Pictures of sweeps: percentile bands along a grid or a histogram, and the parameters behind the variance."""
+"""Pictures of sweeps (percentile bands or a histogram, and what is behind the variance) and of fits."""
 
 from __future__ import annotations
 

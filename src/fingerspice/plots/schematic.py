@@ -1,4 +1,7 @@
-"""The schematic of a circuit: its layers as a ladder, each a resistor beside a capacitor, with names and values."""
+"""The schematic of a circuit: its layers as a ladder, each a resistor beside a capacitor, with names and values.
+
+Symbols are strokes: points in inches around the symbol's centre, the first node above.
+"""
 
 from __future__ import annotations
 

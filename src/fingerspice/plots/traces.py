@@ -1,4 +1,4 @@
-"""Pictures of signals against time: for one run or several, in a window, or as envelopes of many oscillations."""
+"""Pictures of signals against time, of runs together, in a window or as envelopes; and of spectra."""
 
 from __future__ import annotations
 

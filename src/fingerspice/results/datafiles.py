@@ -1,4 +1,4 @@
-"""Zarr stores on the disk: the library that reads them, and the checksums of their chunks.
+"""Files of results: NetCDF, and Zarr stores with the checksums of their chunks.
 
 A chunk's file is its bytes and their CRC-32C, as Zarr's codec of that name has it, so that every program that reads a
 store through Zarr refuses a chunk whose bytes have changed.

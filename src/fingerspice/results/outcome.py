@@ -1,4 +1,4 @@
-"""How a run ended: its status or failure, its stated error, and the state from which another run may start."""
+"""The model chosen for a run, and how it ended: status or failure, stated error, and the state to go on from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the signals of a run change with a parameter of its circuit."""
+"""How the signals of a run change with a parameter of its circuit, and a number with the samples of its source."""
 
 from __future__ import annotations
 

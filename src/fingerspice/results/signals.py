@@ -1,4 +1,4 @@
-"""The signals of a run by name: the signals of its record, and further ones computed from them for each gap."""
+"""Signals of a run by name: those of its record, or of a file, and further ones computed from them for each gap."""
 
 from __future__ import annotations
 

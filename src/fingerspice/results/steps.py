@@ -1,4 +1,4 @@
-"""A run between its outputs: the recorded steps, and the number of equal periods that each represents."""
+"""A run between its outputs: recorded steps with the periods that each stands for, or panels refined until they fit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The named sets: looking them up, showing them, and applying them to a circuit."""
+"""The named sets: looking them up, showing them, applying them to a circuit, and what to cite for a run."""
 
 from __future__ import annotations
 

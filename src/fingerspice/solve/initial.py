@@ -1,4 +1,9 @@
-"""The initial state of a run, from the deck's ``uic`` and ``.ic``, the operating point, or an earlier solution."""
+"""The initial state of a run, from the deck's ``uic`` and ``.ic``, the operating point, or an earlier solution; and the
+form that a state has in a stack's own equations.
+
+The live voltages along the loop are k U + v. The stack's own state x is v under `local`, and v A / A_0 under `mobile`
+(see `engine.model`). The charge delivered by the source is z under `local`, and z + A U / S - offset under `mobile`.
+"""
 
 from __future__ import annotations
 

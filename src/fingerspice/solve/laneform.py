@@ -1,4 +1,4 @@
-"""A circuit with one finger, prepared for steps in lanes (`engine.lanestep`)."""
+"""A circuit with one finger prepared for lanes (`engine.lanestep`): what it has to give, and the form of a stack."""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Recordings of one finger, block by block in lanes (`solve.laneblock`), with stated errors (`solve.lanes`)."""
+"""Recordings of one finger, block by block in lanes (`solve.laneblock`), with stated errors.
+
+A window of each piece, where the source moves most, is followed by steps half as long. The difference is the error of
+the window; a piece adds as much more as it is longer, and hands it on to the pieces after it, as the modes decay: once
+as if all errors were alike, and once as if they came by chance.
+"""
 
 from __future__ import annotations
 

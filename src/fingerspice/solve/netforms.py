@@ -1,4 +1,20 @@
-"""One finger in a network prepared for recordings: `solve.netforms` in the form of `engine.lanestep`."""
+"""One finger in a network, in the form of `engine.lanestep`, so that a recording needs one step a sample there, too.
+
+In modes at a reference area A0 a network is v' = -rates v + gain s + feed j, u = tap v + tap_s s, where each cell whose
+area moves carries a current beside that at A0 (see `engine.netrows`). Under the local law, and with e = A - A0, it is
+e (c u' + g u). If all these cells are in series they carry one current. Then every c u' + g u equals that of the gap,
+less the difference of the fixed leaks over A. With G the fixed leaks, and q = 1/A,
+
+    j_b = c_gap N' + A0 (q - q0) (G_b u_b - G_gap u_gap),    N(u_gap) = integral of e over the gap voltage from 0 V.
+
+N' is absorbed by the state: w = v - f c_gap N, f the sum of feed over these cells, has
+
+    w' = -rates w + gain s - rates f c_gap N + sum over b of feed_b A0 (q - q0) (G_b u_b - G_gap u_gap),
+
+without the slope of any voltage, so that w is continuous where the source jumps. The gap voltage follows from
+xi = gap w + gap_s s by u_gap + kappa N(u_gap) = xi, kappa = -(gap f) c_gap, whose left side rises with u_gap. The
+charge that a source has delivered is one more mode, of rate zero, and a sum of these quantities.
+"""
 
 from __future__ import annotations
 

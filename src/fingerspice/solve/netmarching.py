@@ -1,4 +1,7 @@
-"""One integration of a network by exponential steps: as `engine.loop` takes it."""
+"""One integration of a network by exponential steps, as `engine.loop` takes it; its modes at reference areas.
+
+A run whose areas change by much goes from one reference to another, so that the areas stay near those of the modes.
+"""
 
 from __future__ import annotations
 

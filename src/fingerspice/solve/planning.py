@@ -1,4 +1,4 @@
-"""Choice of the model for a scene: the lightest tier whose error is below the error asked for, and the reasons."""
+"""Choice of the lightest model whose error is below that asked for, with reasons; warnings about a run's limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run prepared for integration: its scene, start and end, output spacing and initial state."""
+"""A run prepared for integration: scene, start, end, initial state, and the times of its outputs."""
 
 from __future__ import annotations
 

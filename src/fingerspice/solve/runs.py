@@ -1,4 +1,4 @@
-"""The common part of all integrators: the loop over windows, the end of a run, and its result with stated errors."""
+"""What integrators share: the loop over windows, the end of a run, stated errors, and what to say of a failure."""
 
 from __future__ import annotations
 

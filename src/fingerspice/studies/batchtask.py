@@ -1,4 +1,4 @@
-"""The request of a batch (`Task`), and its results (`Answers`)."""
+"""The request of a batch (`Task`), its results (`Answers`), and scenes that run by themselves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measured areas and friction forces of a finger, from arrays or tables, for the fit of a contact."""
+"""Measured areas and friction forces of a finger, and what a contact's parameters predict of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is fitted: predictions and residuals with their derivatives, and the least squares from one start."""
+"""What is fitted: predictions, residuals, the least squares from one start, and profiles of the likelihood."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Source voltage for a wanted gap voltage: exact for a stack, from the linear response for another network."""
+"""Source voltage for a wanted gap voltage; the rise of a drive, and means of its force."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of comparisons and of fitted materials."""
+"""Pages of studies, and pictures of comparisons and of fitted materials."""
 
 from __future__ import annotations
 

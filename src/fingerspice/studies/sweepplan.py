@@ -1,4 +1,4 @@
-"""What a sweep runs: parameters that make a grid, parameters that are drawn, and the draws."""
+"""What a sweep runs: parameters that make a grid, parameters that are drawn, the draws, and named sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sweep on the disk: a Zarr store whose chunks any number of processes write, in any order.
+"""A sweep on the disk: a Zarr store whose chunks, which the sweep alone determines, any number of processes write.
 
 A chunk is a block of scenes, one file of every array. The file of ``status`` is written last, when the others have
 reached the disk, and so marks the chunk as done.

@@ -1,4 +1,4 @@
-"""Scenes of one circuit as arrays: what a run answers, and its derivatives by parameters. No tensors here."""
+"""Scenes of one circuit as arrays, what the modules are asked for, and a drive's samples as a parameter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sums and products of waveforms, and the amplitude-modulated carrier."""
+"""Sums and products of waveforms, the amplitude-modulated carrier, and stretches that are used once or repeated."""
 
 from __future__ import annotations
 

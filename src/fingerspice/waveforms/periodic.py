@@ -1,4 +1,4 @@
-"""Periodic waveforms made of straight pieces: square, triangle, sawtooth, and SPICE's pulses."""
+"""Waveforms of straight pieces: square, triangle, sawtooth, pulses; the chirp and the exponential pulse."""
 
 from __future__ import annotations
 

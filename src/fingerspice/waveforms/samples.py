@@ -1,4 +1,4 @@
-"""Samples at a constant rate: in memory, or in a WAV file whose parts are read when they are needed."""
+"""Samples at a constant rate, in memory or in a WAV file read by parts, and at a whole multiple of their rate."""
 
 from __future__ import annotations
 
