@@ -80,7 +80,7 @@ LENT = {
     "results.doors.Doors.explore": "explorer.server",
     "results.doors.Doors.sample_gradient": "solve.adjoint",
     "results.spectrum.Spectrum.plot": "plots.traces",
-    "results.phasor_solution.PhasorSolution.plot": "plots.phasors",
+    "results.phasor_solution.PhasorSolution.plot": "plots.traces",
 }
 THIRD_PARTY = {
     "numerics": {"numpy", "numba"},

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 import fingerspice as fs
-from fingerspice.plots import drawing, phasors, traces
+from fingerspice.plots import drawing, traces
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies import reports
 from fingerspice.studies.comparison import compare
@@ -154,7 +154,7 @@ def test_a_sweep_shows_gain_phase_force_and_area() -> None:
     circuit = table1()
     with pytest.warns(fs.FingerspiceWarning, match="the sweep goes down to 1 Hz"):
         result = fs.phasor(circuit, np.geomspace(1.0, 1e4, 21))
-    figure = phasors.plot_phasor((result,), circuit)
+    figure = traces.plot_phasor((result,), circuit)
     assert len(labels(figure)) == 4
     assert all(ax.get_xscale() == "log" for ax in figure.axes)
     for ax, values in zip(
@@ -168,14 +168,14 @@ def test_a_sweep_shows_gain_phase_force_and_area() -> None:
 
 def test_within_the_skin_data_nothing_is_shaded() -> None:
     circuit = table1()
-    figure = phasors.plot_phasor((fs.phasor(circuit, np.geomspace(10.0, 1e5, 9)),), circuit)
+    figure = traces.plot_phasor((fs.phasor(circuit, np.geomspace(10.0, 1e5, 9)),), circuit)
     assert "outside" not in small_print(figure)
     assert not any(ax.patches for ax in figure.axes)
 
 
 def test_a_single_frequency_and_a_source_without_fundamental_are_drawn_too(tmp_path: Path) -> None:
     circuit = table1().replace({"Vdrive": fs.DC(100.0)})
-    figure = phasors.plot_phasor((fs.phasor(circuit, 100.0, area="frozen"),), circuit)
+    figure = traces.plot_phasor((fs.phasor(circuit, 100.0, area="frozen"),), circuit)
     assert figure.axes[2].texts[0].get_text() == "the source has no fundamental"
     drawing.save(figure, tmp_path / "x.png")
 

@@ -254,7 +254,7 @@ def ac(
         results.open()
 
         def drawn() -> object:
-            from fingerspice.plots.phasors import plot_phasor
+            from fingerspice.plots.traces import plot_phasor
 
             return plot_phasor(found, circuit)
 

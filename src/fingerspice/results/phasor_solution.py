@@ -77,7 +77,7 @@ class PhasorSolution(Shown):
 
     def plot(self) -> Figure:
         """Gain, phase, mean force and area, or without GAP the node voltages, against frequency."""
-        from fingerspice.plots.phasors import plot_phasor
+        from fingerspice.plots.traces import plot_phasor
 
         require(self.circuit is not None, "circuit", self.circuit, "a sweep that phasor or large_signal made")
         assert self.circuit is not None

@@ -14,9 +14,8 @@ from functools import cached_property
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.engine.lanereadout import show
 from fingerspice.engine.lanerows import rows_of
-from fingerspice.engine.lanes import begin, span, within
+from fingerspice.engine.lanes import begin, show, span, within
 from fingerspice.engine.laneweights import along
 from fingerspice.solve.laneform import LaneForm
 

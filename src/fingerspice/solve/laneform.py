@@ -14,7 +14,6 @@ from numpy.polynomial.polynomial import polyder, polyval
 
 from fingerspice.base.arrays import BoolArray, FloatArray, aligned
 from fingerspice.circuit.statespace import Stack
-from fingerspice.engine.lanereadout import polynomial_of
 from fingerspice.engine.lanerows import (
     Lanes,
     Marks,
@@ -25,6 +24,7 @@ from fingerspice.engine.lanerows import (
     rows_of,
     weighed,
 )
+from fingerspice.engine.lanes import polynomial_of
 from fingerspice.engine.laneweights import weigh
 from fingerspice.engine.model import dot, ramp
 from fingerspice.engine.system import System

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.engine.lanereadout import flow, show
 from fingerspice.engine.lanerows import NODES
+from fingerspice.engine.lanes import flow, show
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.laneblock import Block, Window
 from fingerspice.solve.laneform import LaneForm, Shown
