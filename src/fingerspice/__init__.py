@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from fingerspice.studies.capability import capability as capability
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
+    from fingerspice.studies.comparison import large_signal as large_signal
     from fingerspice.studies.contactfit import fit_contact as fit_contact
     from fingerspice.studies.contactresult import ContactFit as ContactFit
     from fingerspice.studies.export import export_netlist as export_netlist
@@ -53,7 +54,6 @@ if TYPE_CHECKING:
     from fingerspice.studies.fitting import fit_material as fit_material
     from fingerspice.studies.inverse import InverseDrive as InverseDrive
     from fingerspice.studies.inverse import inverse_drive as inverse_drive
-    from fingerspice.studies.largesignal import large_signal as large_signal
     from fingerspice.studies.limits import FoldLimits as FoldLimits
     from fingerspice.studies.limits import fold_limits as fold_limits
     from fingerspice.studies.phasors import phasor as phasor
@@ -90,7 +90,7 @@ _HOMES = {
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
     "studies.batch": ("batch",),
     "studies.capability": ("Capability", "capability"),
-    "studies.comparison": ("Comparison", "compare"),
+    "studies.comparison": ("Comparison", "compare", "large_signal"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "explorer.server": ("Explorer", "explore"),
     "studies.contactfit": ("fit_contact",),
@@ -101,7 +101,6 @@ _HOMES = {
     "studies.fitresult": ("Fit",),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.inverse": ("InverseDrive", "inverse_drive"),
-    "studies.largesignal": ("large_signal",),
     "studies.phasors": ("phasor",),
     "studies.limits": ("FoldLimits", "fold_limits"),
     "studies.populations": ("sobol", "sweep"),

@@ -59,7 +59,7 @@ def large_sweep(
     circuit: Circuit, frequencies: FloatArray, amplitude: list[float] | None, **how: Any
 ) -> tuple[PhasorSolution, ...]:
     """The sweep with ``--area coupled``: the periodic state at every frequency (Hz) and amplitude (V)."""
-    from fingerspice.studies.largesignal import large_signal
+    from fingerspice.studies.comparison import large_signal
 
     with progress("sweeping") as update:
         return large_signal(circuit, frequencies, amplitude, progress=update, **how)

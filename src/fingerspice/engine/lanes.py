@@ -1,4 +1,4 @@
-"""Spans of samples in lanes (`engine.lanestep`), and the derivatives of their steps, summed back through a run."""
+"""Spans of samples in lanes (`engine.lanestep`), what is read from them, and derivatives summed back through a run."""
 
 from __future__ import annotations
 

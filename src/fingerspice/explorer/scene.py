@@ -24,8 +24,8 @@ from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate
+from fingerspice.studies.comparison import large_signal
 from fingerspice.studies.export import export_netlist
-from fingerspice.studies.largesignal import large_signal
 from fingerspice.waveforms.waveform import Sine
 
 #: Traces of each kind, and harmonics.

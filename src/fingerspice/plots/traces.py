@@ -1,4 +1,4 @@
-"""Pictures of signals against time, of runs together, in a window or as envelopes; and of spectra."""
+"""Pictures of signals against time (runs together, in a window, as envelopes), of spectra and of phasors."""
 
 from __future__ import annotations
 

@@ -18,8 +18,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.batch import batch
-from fingerspice.studies.fitdata import IMPEDANCE, Data, data_of
-from fingerspice.studies.fitgroups import Unknown, group_column, unknowns_of
+from fingerspice.studies.fitdata import IMPEDANCE, Data, Unknown, data_of, group_column, unknowns_of
 from fingerspice.studies.fitresult import Fit, Fitted, fit_result
 from fingerspice.studies.fittask import FARTHEST, REFUSED, Task, evaluations_shown, followed, limit_of, profile_of
 from fingerspice.waveforms.waveform import require

@@ -16,7 +16,7 @@ from fingerspice.base.pages import Page, Table
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import meaning_of
 from fingerspice.results.signals import SIGNALS
-from fingerspice.studies.fitdata import MEASURED, Data
+from fingerspice.studies.fitdata import MEASURED, Data, Unknown, fitted_circuits
 from fingerspice.studies.fitestimates import (
     Estimate,
     Estimates,
@@ -27,7 +27,6 @@ from fingerspice.studies.fitestimates import (
     misfit_note,
     notes_of,
 )
-from fingerspice.studies.fitgroups import Unknown, fitted_circuits
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -27,9 +27,8 @@ from fingerspice.solve.simulation import simulate
 from fingerspice.studies.batch import batch
 from fingerspice.studies.batchgradients import in_lockstep_by
 from fingerspice.studies.batchtask import REFUSED as BATCH_REFUSED
-from fingerspice.studies.fitdata import IMPEDANCE, Data
+from fingerspice.studies.fitdata import IMPEDANCE, Data, Unknown, members_of
 from fingerspice.studies.fitestimates import Profile
-from fingerspice.studies.fitgroups import Unknown, members_of
 from fingerspice.studies.fitresult import Fitted
 from fingerspice.studies.phasors import phasor
 from fingerspice.studies.steady import steady_state
