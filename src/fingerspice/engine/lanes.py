@@ -9,16 +9,8 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within_rows
-from fingerspice.engine.lanerows import (
-    INNER_WEIGHT,
-    NODES,
-    OUTER_WEIGHT,
-    SOURCES,
-    Marks,
-    places,
-    polynomial_rows,
-    rise_of,
-)
+from fingerspice.engine import lanerows
+from fingerspice.engine.lanerows import Marks, places, polynomial_rows, rise_of
 from fingerspice.engine.lanestep import step
 from fingerspice.engine.laneweights import weigh
 from fingerspice.numerics.small import copy_to
@@ -38,7 +30,7 @@ def begin(marks: Marks, c: Any, still: FloatArray, starts: FloatArray, source: F
     for i in range(lanes):
         state[2 * lanes + i] = source[i]
         for k in range(m):
-            state[(SOURCES + k) * lanes + i] = starts[k, i]
+            state[(lanerows.SOURCES + k) * lanes + i] = starts[k, i]
     step(marks, c, still.reshape(-1), state, source, 0.0, 1.0)
     if len(marks.mobile) > 0:
         # On the way to the gap voltage the distance to the fold tells nothing.
@@ -94,22 +86,22 @@ def span(
             for p in range(parts):
                 step(marks, c, flat, state, after[k * lanes :], p / parts, (p + 1) / parts)
             for i in range(rows * lanes):
-                found[k * rows * lanes + i] = state[SOURCES * lanes + i]
+                found[k * rows * lanes + i] = state[lanerows.SOURCES * lanes + i]
         off = 0.0
         for i in range(lanes):
             change = 0.0
             for k in range(active):
-                change += abs(c.shape[k] * (state[(SOURCES + k) * lanes + i] - kept[k, i, done + size]))
+                change += abs(c.shape[k] * (state[(lanerows.SOURCES + k) * lanes + i] - kept[k, i, done + size]))
             off = max(off, change) if change == change else math.inf
         stops = off <= tol
         if stops:
             for k in range(active):
                 left[k] = 0.0
                 for i in range(lanes):
-                    left[k] = max(left[k], abs(state[(SOURCES + k) * lanes + i] - kept[k, i, done + size]))
+                    left[k] = max(left[k], abs(state[(lanerows.SOURCES + k) * lanes + i] - kept[k, i, done + size]))
             for k in range(active, m):
                 for i in range(lanes):
-                    shift = state[(SOURCES + k) * lanes + i] - kept[k, i, done + size]
+                    shift = state[(lanerows.SOURCES + k) * lanes + i] - kept[k, i, done + size]
                     for j in range(done + size + 1, count + 1):
                         kept[k, i, j] += shift
         for row in range(rows):
@@ -147,7 +139,7 @@ def within(
             step(marks, c, weights.reshape(-1), state, after, p / parts, (p + 1) / parts)
         for i in range(min(lanes, h.size - first)):
             for k in range(out.shape[0]):
-                out[k, first + i] = state[(SOURCES + k) * lanes + i]
+                out[k, first + i] = state[(lanerows.SOURCES + k) * lanes + i]
 
 
 # Rows of the derivatives behind those of the modes: gap voltage at the end, and the integrals of u^2 A and A.
@@ -212,12 +204,12 @@ def slopes_of(
                 begin(marks, c, still, modes, before, state)
                 found[:] = 0.0
                 for part in range(parts):
-                    for node in range(NODES):
+                    for node in range(lanerows.NODES):
                         if node == 1:
                             step(marks, c, flat, state, after, part / parts, (part + 1) / parts)
                         # After a step its end is node 0 of the next one.
-                        _gap_and_area(marks, c, node % (NODES - 1), state, u, q)
-                        by = OUTER_WEIGHT if node % (NODES - 1) == 0 else INNER_WEIGHT
+                        _gap_and_area(marks, c, node % (lanerows.NODES - 1), state, u, q)
+                        by = lanerows.OUTER_WEIGHT if node % (lanerows.NODES - 1) == 0 else lanerows.INNER_WEIGHT
                         for i in range(lanes):
                             area = by * length[i] / (c.q0 + q[i])
                             found[m + SQUARES, i] += u[i] * u[i] * area
@@ -225,7 +217,7 @@ def slopes_of(
                 for i in range(lanes):
                     found[m + GAP, i] = u[i]
                     for k in range(m):
-                        found[k, i] = state[(SOURCES + k) * lanes + i]
+                        found[k, i] = state[(lanerows.SOURCES + k) * lanes + i]
                 share = 0.5 / move
                 for i in range(min(lanes, n - first)):
                     for row in range(m + MORE):
