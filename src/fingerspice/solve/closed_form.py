@@ -11,7 +11,7 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.network import Modes, Network
-from fingerspice.engine.currents import follow, source_at
+from fingerspice.engine.model import follow, source_at
 from fingerspice.engine.network import at_sources
 from fingerspice.numerics import hold, linear
 from fingerspice.results.outcome import State, Status
