@@ -217,31 +217,15 @@ class LaneMarch:
             piece, values = self._growing(piece, values)
         h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
         starts_at = self.form.after(self.z, float(values[0]))
-        divides, at_once = FINER[self.form.bent], AT_ONCE[self.form.bent]
-        tries = self.steps == 0 and self.rtol < at_once and values.size > 4 * FIRST
+        tries = self.steps == 0 and self.rtol < AT_ONCE[self.form.bent] and values.size > 4 * FIRST
         for size in (FIRST, values.size - 1)[0 if tries else 1 :]:
             block = Block(self.form, values[: size + 1], h[:size], self.steps == 0)
-            while True:
-                parts, excess = PARTS[self.level], math.inf
-                # Another sweep over short pieces costs little.
-                left = max(OF_STARTS * min(block.count / SHORT, 1.0) * self.rtol, LEAST_CHANGE)
-                solved = block.solve(self.z, parts, left * self.scale)
-                self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
-                if solved:
-                    peak = float(block.peaks.max())
-                    within = self.form.gap(np.array(peak)) <= self.form.u_top
-                    if not (within and self._on_branch(block, starts_at, peak)):
-                        return Outcome.LOST
-                    seen = judge(block, parts, max(peak, self.peak), self.alike, self.chance)
-                    excess = self._excess(seen, max(peak, self.peak), LEAST_AT_START if piece.grows else LEAST_PEAK)
-                if excess <= 1.0:
-                    break
-                self.refused += parts * block.n
-                if self.level + 1 == len(PARTS):
-                    return Outcome.NOT_MET
-                finer = math.ceil(math.log(excess) / math.log(divides)) if excess < math.inf else 1
-                self.level = min(self.level + max(1, finer), len(PARTS) - 1)
-        self.peak, self.errors = max(peak, self.peak), np.maximum(seen.errors, self.errors)
+            outcome, seen, excess = self._climb(block, starts_at, LEAST_AT_START if piece.grows else LEAST_PEAK)
+            if outcome is not Outcome.MET:
+                return outcome
+        assert seen is not None
+        parts, self.peak = PARTS[self.level], max(float(block.peaks.max()), self.peak)
+        self.errors = np.maximum(seen.errors, self.errors)
         self.alike, self.chance, self.margin = seen.alike, seen.chance, min(self.margin, block.margin)
         self.steps += parts * block.n
         self._write(piece, block, parts, t_out, out)
@@ -251,6 +235,30 @@ class LaneMarch:
         elif excess < COARSER and self.level > 0:
             self.level -= 1
         return Outcome.MET
+
+    def _climb(self, block: Block, starts_at: float, share: float) -> tuple[Outcome, Judged | None, float]:
+        """Solve a block, with ever more steps a sample until its error is met; its errors and their excess."""
+        seen: Judged | None = None
+        while True:
+            parts, excess = PARTS[self.level], math.inf
+            # Another sweep over short pieces costs little.
+            left = max(OF_STARTS * min(block.count / SHORT, 1.0) * self.rtol, LEAST_CHANGE)
+            solved = block.solve(self.z, parts, left * self.scale)
+            self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
+            if solved:
+                peak = float(block.peaks.max())
+                within = self.form.gap(np.array(peak)) <= self.form.u_top
+                if not (within and self._on_branch(block, starts_at, peak)):
+                    return Outcome.LOST, seen, excess
+                seen = judge(block, parts, max(peak, self.peak), self.alike, self.chance)
+                excess = self._excess(seen, max(peak, self.peak), share)
+            if excess <= 1.0:
+                return Outcome.MET, seen, excess
+            self.refused += parts * block.n
+            if self.level + 1 == len(PARTS):
+                return Outcome.NOT_MET, seen, excess
+            finer = math.ceil(math.log(excess) / math.log(FINER[self.form.bent])) if excess < math.inf else 1
+            self.level = min(self.level + max(1, finer), len(PARTS) - 1)
 
     def _growing(self, piece: Piece, values: FloatArray) -> tuple[Piece, FloatArray]:
         """A piece on one line of the source, with steps that grow from a part of the shortest time constant on."""
