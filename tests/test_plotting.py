@@ -246,7 +246,7 @@ def test_thinning_keeps_every_extreme_and_both_ends() -> None:
 def test_pictures_need_no_pyplot_and_their_module_no_matplotlib() -> None:
     code = (
         "import sys, numpy, fingerspice as fs\n"
-        "from fingerspice.plots import drawing, lines, phasors, traces\n"
+        "from fingerspice.plots import drawing, lines, traces\n"
         "from fingerspice.studies import figures\n"
         "assert not any(m.startswith('matplotlib') for m in sys.modules)\n"
         "drawing.new_figure(1)\n"

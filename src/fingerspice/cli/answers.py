@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from fingerspice.results.outcome import Plan
     from fingerspice.results.solution import Solution
 
-
 Answer = dict[str, Any]
 #: Keys of every answer.
 COMMON = (

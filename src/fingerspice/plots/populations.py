@@ -10,12 +10,11 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.plots import drawing
-from fingerspice.plots.drawing import Picture
+from fingerspice.plots.picture import Picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import Dataset
-
 
 # Ratio of the largest to the smallest abscissa from which on the axis is logarithmic.
 _WIDE = 20.0

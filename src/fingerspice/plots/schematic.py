@@ -20,12 +20,11 @@ from fingerspice.base.files import write_aside
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import waveform_text
 from fingerspice.plots import drawing
-from fingerspice.plots.drawing import Picture
+from fingerspice.plots.picture import Picture
 from fingerspice.plots.placement import GROUND, Place, Placement, place
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
 
 Stroke = Sequence[tuple[float, float]]
 #: Half the height of a part, and half the distance of a resistor from the capacitor beside it.

@@ -23,11 +23,10 @@ if TYPE_CHECKING:
 
     from fingerspice.base.arrays import FloatArray
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.plots.drawing import Picture
+    from fingerspice.plots.picture import Picture
     from fingerspice.results.phasor_solution import PhasorSolution
     from fingerspice.results.solution import Solution
     from fingerspice.results.spectrum import Spectrum
-
 
 #: Up to MOST_DRAWN oscillations are drawn as lines. More are drawn as an envelope, with an enlargement of the last
 #: ZOOMED oscillations whose swing is at least the fraction _LOUD of the largest swing.

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from fingerspice.results.solution import Solution
 
-
 #: Name of the checksum, in the identity of a store; key of the checksum of a store's attributes among them.
 CHECKSUM, SIGNATURE = "crc32c", "checksum"
 _SIZE = 4

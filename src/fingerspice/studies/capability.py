@@ -27,7 +27,7 @@ from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
-    from fingerspice.plots.drawing import Picture
+    from fingerspice.plots.picture import Picture
 
 # Samples per period of the modulation and of the carrier, and the lowest sample rate, Hz.
 _PER_PERIOD, _PER_CARRIER, _LEAST_RATE = 64, 32, 8000.0

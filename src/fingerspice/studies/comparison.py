@@ -30,7 +30,7 @@ from fingerspice.studies.sweeps import Drive, sweep_drive, sweep_notes
 from fingerspice.waveforms.waveform import Sine, Waveform
 
 if TYPE_CHECKING:
-    from fingerspice.plots.drawing import Picture
+    from fingerspice.plots.picture import Picture
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from fingerspice.plots import drawing
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
-    from fingerspice.plots.drawing import Picture
+    from fingerspice.plots.picture import Picture
     from fingerspice.studies.inverse import InverseDrive
 
 _FULL = 2.0**31

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
     from fingerspice.results.spectrum import Spectrum
 
-
 #: Upper edge of a third-octave band, relative to its middle (one band's middle is 1 kHz); fewest bins in a band.
 _EDGE, _FEWEST = 2.0 ** (1.0 / 6.0), 2
 #: Lines weaker than this fraction of the strongest acceleration are round-off, and are left out.

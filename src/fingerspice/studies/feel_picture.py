@@ -11,7 +11,7 @@ from fingerspice.plots import drawing
 from fingerspice.plots.traces import stems
 
 if TYPE_CHECKING:
-    from fingerspice.plots.drawing import Picture
+    from fingerspice.plots.picture import Picture
     from fingerspice.studies.feel import Feel
 
 _MARKERS = "osD^vP"

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 TABLE1_DECK = """\
 Fingerpad on a 3M-coated touchscreen, Table 1
 Vdrive  drive 0          SIN(0 200 100)

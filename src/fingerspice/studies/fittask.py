@@ -36,7 +36,6 @@ from fingerspice.studies.steady import steady_state
 if TYPE_CHECKING:
     from xarray import Dataset
 
-
 # Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's.
 _SLOPES = 1e-6
 # What a scene that cannot be run counts as, over the scale of the data.

@@ -24,7 +24,7 @@ from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
-    from fingerspice.plots.drawing import Picture
+    from fingerspice.plots.picture import Picture
 
 BoolArray = NDArray[np.bool_]
 

@@ -24,8 +24,7 @@ from fingerspice.waveforms.combinations import Product
 from fingerspice.waveforms.waveform import Waveform, as_waveform, require
 
 if TYPE_CHECKING:
-    from fingerspice.plots.drawing import Picture
-
+    from fingerspice.plots.picture import Picture
 
 # Range of voltages that is searched, V; relative accuracy of the voltage at the fold; relative error of each run.
 LOWEST, HIGHEST = 1e-3, 1e5

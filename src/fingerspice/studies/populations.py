@@ -21,7 +21,6 @@ from fingerspice.waveforms.waveform import require
 if TYPE_CHECKING:
     from xarray import Dataset
 
-
 # Largest number of scenes of a sweep, whose figures are kept in memory (some 100 bytes each), of a population, and of a
 # population in a store.
 MOST_SCENES, MOST_SAMPLES, MOST_STORED_SAMPLES = 1 << 26, 1 << 20, 1 << BITS

@@ -20,7 +20,7 @@ from fingerspice.results.report import summary_table
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from fingerspice.plots.drawing import Picture
+    from fingerspice.plots.picture import Picture
     from fingerspice.studies.comparison import Comparison
     from fingerspice.studies.fitting import MaterialFit
     from fingerspice.studies.limits import FoldLimits

@@ -37,7 +37,6 @@ from fingerspice.waveforms.waveform import require
 if TYPE_CHECKING:
     from xarray import Dataset
 
-
 #: The array that marks chunks as done, and its value where a scene has not been run.
 STATUS, MISSING = "status", len(STATUS_NAMES)
 #: Attribute of a coordinate that counts named sets of parameters: their names.
