@@ -44,7 +44,7 @@ def test_run_writes_data_and_picture_and_prints_a_table_that_names_the_gap_volta
 ) -> None:
     result = command("run", "pad.cir", "--out", "new/folder")
     assert result.code == 0
-    assert result.err == ""
+    assert not result.lines
     table = result.out.splitlines()
     assert table[0] == "Fingerpad"
     expected = fs.simulate(fs.read_netlist("pad.cir"))
@@ -147,7 +147,7 @@ def test_a_skin_at_another_frequency_than_the_source_is_warned_about_once(comman
         "fingerspice: warning: Xskin takes its data at f = 200 Hz, the source's fundamental is 100 Hz"
     )
     assert line.endswith("Xskin.f=100 would match")
-    assert command(name, "pad.cir", "--no-plot", "--name", "matched").err == ""
+    assert not command(name, "pad.cir", "--no-plot", "--name", "matched").lines
 
 
 def test_a_voltage_that_air_does_not_bear_is_warned_about_once(command: Command) -> None:
@@ -171,7 +171,7 @@ def test_values_on_the_command_line_have_the_traps_of_the_deck(command: Command)
     first, *rest = command(*words, "--area", "35").lines
     assert first.startswith("fingerspice: warning: --area 35 is in m^2, 3.5e+07 mm^2")
     assert rest[-1].startswith("fingerspice: warning: the contact area reaches 35 m^2, over 0.001 m^2 (10 cm^2,")
-    assert command(*words, "--area", "35u").err == ""
+    assert not command(*words, "--area", "35u").lines
 
 
 # ac, compare, export, figures
