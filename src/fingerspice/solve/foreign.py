@@ -10,6 +10,7 @@ import threading
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -64,11 +65,8 @@ class _Piece:
     tau: float
 
 
-# Result of a library: states at the times, and the number of evaluations.
-_Result = tuple[FloatArray, int]
-
-
-def _scipy_piece(piece: _Piece, name: str) -> _Result:
+def _scipy_piece(piece: _Piece, name: str) -> tuple[FloatArray, int]:
+    """States at the times, and the number of evaluations."""
     from scipy.integrate import solve_ivp
 
     # Warning filters belong to the whole process: change them in one thread at a time, for scipy's warnings only.
@@ -88,7 +86,7 @@ def _scipy_piece(piece: _Piece, name: str) -> _Result:
     return result.y.T, int(result.nfev)
 
 
-def _torch_piece(piece: _Piece, name: str) -> _Result:
+def _torch_piece(piece: _Piece, name: str) -> tuple[FloatArray, int]:
     import torch
     from torchdiffeq import odeint
 
@@ -113,10 +111,8 @@ def _torch_piece(piece: _Piece, name: str) -> _Result:
                 rtol=max(piece.tol, 3e-14), atol=piece.tol, options=options,
             ).numpy() * piece.scale  # fmt: skip
     except AssertionError as error:
-        text = str(error)
-        if "underflow in dt" in text:
-            text = "torchdiffeq's step underflowed: its methods are explicit, and this scene may be too stiff for them"
-        raise _FailedError(text) from None
+        short = "torchdiffeq's step underflowed: its methods are explicit, and this scene may be too stiff for them"
+        raise _FailedError(short if "underflow in dt" in str(error) else str(error)) from None
     if not np.all(np.isfinite(y[-1])):
         raise _FailedError("torchdiffeq returned NaN")
     return y, counts[0]
@@ -133,8 +129,7 @@ class Foreign(Collocation):
         self.by, self.name, self.detail = _torch_piece if library == "torchdiffeq" else _scipy_piece, name, ""
         # Without a request for charge its scale is infinite, which libraries cannot take: 1 C is as good as infinite.
         self.scale = np.where(np.isfinite(self.scale), self.scale, 1.0)
-        fastest = float(problem.scene.rates.max(initial=0.0))
-        self.tau = 1.0 / fastest if fastest > 0.0 else np.inf
+        self.tau = 1.0 / max(float(problem.scene.rates.max(initial=0.0)), 1e-300)
 
     def through(self, sources: Sources, t_end: float) -> Status:
         edges = np.unique(sources.edges)
@@ -158,8 +153,7 @@ class Foreign(Collocation):
         ])  # fmt: skip
 
         def rate(t: float, y: FloatArray) -> FloatArray:
-            found: FloatArray = _rate(net, room, sources, index, base, t, np.ascontiguousarray(y), self.sign)
-            return found
+            return np.asarray(_rate(net, room, sources, index, base, t, np.ascontiguousarray(y), self.sign))
 
         done = int(self.counters[collocation.OUTPUT])
         inside = (self.t_out < stop) | ((self.t_out == stop) & self.left)
@@ -196,11 +190,8 @@ def solve_foreign(
     if name not in known:
         allowed = ", ".join(f"{library}:{m}" for m in known)
         raise InputError(f"unknown method '{method}'; allowed: {allowed}")
-    if library == "torchdiffeq":
-        try:
-            import torchdiffeq  # noqa: F401
-        except ImportError:
-            raise InputError(f"method '{method}' needs torchdiffeq; pip install 'fingerspice[torch]'") from None
+    if library == "torchdiffeq" and find_spec("torchdiffeq") is None:
+        raise InputError(f"method '{method}' needs torchdiffeq; pip install 'fingerspice[torch]'")
     reference = solve_coupled(problem, max(REFERENCE * rtol, 1e-13), t_out, left)
     ours = list(gap_signals(reference.record(problem)))
     u_scale = float(reference.gaps[:, 0].max(initial=0.0)) or 1.0

@@ -77,6 +77,10 @@ def radau_scheme(stages: int) -> Scheme:
     )  # fmt: skip
 
 
+# Least area that the scale of the charge counts with, over that at 0 V.
+LEAST_SHARE = 1e-6
+
+
 class Collocation(NetworkIntegration):
     """One integration in progress; see `engine.collocation.advance`."""
 
@@ -88,7 +92,12 @@ class Collocation(NetworkIntegration):
         self.progress: Progress | None = None
         self.rows = np.full((t_out.size, self.width), np.nan)
         n_s = self.s_before.size
-        stored = u_scale * float(np.abs(problem.network.capacitance(problem.scene.area0)).sum()) or u_scale
+        least = problem.scene.area0.copy()
+        for i, contact in enumerate(problem.network.contacts):
+            if contact is not None and self.net.gap[i] >= 0:
+                # Where voltage presses an area away, its charge moves at voltages that are a small part of the peak.
+                least[i] = min(least[i], max(float(contact.area(u_scale)), LEAST_SHARE * least[i]))
+        stored = u_scale * float(np.abs(problem.network.capacitance(least)).sum()) or u_scale
         # With an infinite scale the error of the charge does not control the steps, unless charge was asked for.
         charge = stored if problem.charge else np.inf
         self.scale = np.concatenate([np.full(self.n, u_scale), np.ones(self.n_slow), np.full(n_s, charge)])
