@@ -53,6 +53,8 @@ MENDED = {
     (0, 1204): "refused: fold",
     (1, 45): "refused: fold",
     (4, 124): "right",  # A jump to an area of 4.5e-13 m^2 past no fold.
+    (21, 2759): "right",
+    (33, 1501): "refused: fold",
     (21, 2546): "right",  # Radau's scale of the charge was that of an area that a volt presses away.
     # The reference's own: a current behind 6 milliohm, and a peak close after a late edge.
     (0, 1839): "right",

@@ -77,8 +77,8 @@ def radau_scheme(stages: int) -> Scheme:
     )  # fmt: skip
 
 
-# Least area that the scale of the charge counts with, over that at 0 V.
-LEAST_SHARE = 1e-6
+# Least area that the scale of the charge counts with, over that at 0 V: with less, rounding may ask for minutes.
+LEAST_SHARE = 1e-3
 
 
 class Collocation(NetworkIntegration):
