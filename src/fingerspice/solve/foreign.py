@@ -190,7 +190,7 @@ def solve_foreign(
     if name not in known:
         allowed = ", ".join(f"{library}:{m}" for m in known)
         raise InputError(f"unknown method '{method}'; allowed: {allowed}")
-    if library == "torchdiffeq" and find_spec("torchdiffeq") is None:
+    if library == "torchdiffeq" and not all(map(find_spec, ("torch", "torchdiffeq"))):
         raise InputError(f"method '{method}' needs torchdiffeq; pip install 'fingerspice[torch]'")
     reference = solve_coupled(problem, max(REFERENCE * rtol, 1e-13), t_out, left)
     ours = list(gap_signals(reference.record(problem)))
