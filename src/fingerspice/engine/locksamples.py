@@ -1,8 +1,8 @@
 """Many series stacks at once under one recording, in lockstep; see `engine.lockstep` for lanes, rows and constants.
 
 The recording is a straight line between two samples, to which the response of the modes is exact. Its slope jumps at
-every sample, which leaves no order to a multistep method. So each step takes the exponential Simpson rule of
-`engine.relaxation`, with one evaluation of the nonlinear term in its middle and one at its end: both are predicted,
+every sample, which leaves no order to a multistep method. So each step takes Simpson's rule of
+exponential quadrature, with one evaluation of the nonlinear term in its middle and one at its end: both are predicted,
 evaluated, and the end is corrected. Where the gap voltage changes its sign within a step, what Simpson's rule misses of
 the kink of 1/A is added in closed form, for a voltage that is a straight line in the step.
 """
