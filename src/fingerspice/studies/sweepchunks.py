@@ -1,20 +1,17 @@
-"""A sweep chunk by chunk, into a store: by this process, by processes of its own, or by the workers of a scheduler."""
+"""A sweep chunk by chunk, into a store: by this process, or by the workers of a Dask scheduler, here or elsewhere."""
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
+import logging
 import time
 import warnings
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass
 from functools import partial
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
-from multiprocessing.reduction import ForkingPickler
+from multiprocessing import parent_process
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -38,8 +35,8 @@ if TYPE_CHECKING:
 AT_ONCE = 2
 _FREE = nullcontext()
 _WRITING = Lock()
-# Workers that may be lost with one chunk, and one after another while no chunk is finished.
-TRIES, MOST_LOST = 3, 20
+# How often the scheduler may give up one chunk, and chunks one after another: each time it has lost several workers.
+TRIES, MOST_LOST = 2, 20
 # Chunks that a scheduler is given at once, and how long it may take to answer, s.
 AHEAD, PATIENCE = 4096, 5.0
 
@@ -121,10 +118,8 @@ def _by_its_number(told: str, work: Work, part: tuple[slice, ...]) -> str:
     return f"scene {np.ravel_multi_index(whole, work.plan.sizes) if whole else 0}: {message}"
 
 
-def run_chunks(work: Work, shard: tuple[int, int], workers: int | None, client: Any) -> dict[str, Any]:
-    """Run the chunks of a shard that are not yet done.
-
-    They are run in this process, in `workers` processes, or by the workers of a `client` of Dask.
+def run_chunks(work: Work, shard: tuple[int, int], client: Any) -> dict[str, Any]:
+    """Run the chunks of a shard that are not yet done, in this process or by the workers of a `client` of Dask.
 
     Returns
     -------
@@ -143,8 +138,6 @@ def run_chunks(work: Work, shard: tuple[int, int], workers: int | None, client: 
     answers: Iterator[Done] = iter(())
     if missing and client is not None:
         answers = _by_scheduler(work, missing, client)
-    elif missing and workers is not None:
-        answers = _by_processes(work, missing, min(workers, len(missing)))
     elif missing:
         answers = _here(work, missing)
     failures: list[str] = []
@@ -170,148 +163,43 @@ def _here(work: Work, missing: Sequence[int]) -> Iterator[Done]:
         yield from pool.map(partial(run_chunk, work, computing=Lock()), missing)
 
 
-@dataclass
-class _Worker:
-    """A process, the pipe to it, the chunks that it has, and whether it has told that it is there."""
-
-    process: BaseProcess
-    pipe: Connection
-    has: set[int] = field(default_factory=set)
-    ready: bool = False
-
-
-def _by_processes(work: Work, missing: Sequence[int], count: int) -> Iterator[Done]:
-    """Chunks by processes of this machine; the chunk of a process that is lost goes to another one."""
-    try:
-        sent = bytes(ForkingPickler.dumps(work))
-    except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"the sweep cannot be sent to other processes: {error}") from None
-    todo, left, lost = deque(missing), len(missing), Counter[int | None]()
-    crew = {worker.pipe: worker for worker in (_hired(sent) for _ in range(count))}
-    try:
-        while left:
-            for pipe in wait(list(crew)):
-                assert isinstance(pipe, Connection)
-                worker = crew[pipe]
-                try:
-                    answer = pipe.recv()
-                except (EOFError, OSError):
-                    del crew[pipe]
-                    lost.update({None, *worker.has})
-                    _mourn(worker, lost)
-                    todo.extend(worker.has)
-                    new = _hired(sent)
-                    crew[new.pipe] = new
-                    continue
-                if isinstance(answer, Exception):
-                    raise answer
-                worker.ready = True
-                if answer is not None:
-                    worker.has.remove(answer.index)
-                # A chunk that a worker was lost with is run alone, so that it alone is blamed.
-                while todo and len(worker.has) < (1 if lost.keys() & {todo[0], *worker.has} else AT_ONCE):
-                    worker.has.add(todo[0])
-                    # A process that is lost meanwhile is found by its closed pipe.
-                    with suppress(OSError):
-                        pipe.send(todo.popleft())
-                if answer is not None:
-                    lost[None], left = 0, left - 1
-                    yield answer
-    finally:
-        for worker in crew.values():
-            worker.process.terminate()
-            worker.pipe.close()
-        for worker in crew.values():
-            worker.process.join()
-
-
-def _hired(sent: bytes) -> _Worker:
-    """A new process, to which the sweep is sent."""
-    context = multiprocessing.get_context("spawn")
-    own, other = context.Pipe()
-    process = context.Process(target=_serve, args=(other,), daemon=True)
-    process.start()
-    other.close()
-    with suppress(OSError):
-        own.send_bytes(sent)
-    return _Worker(process, own)
-
-
-def _mourn(worker: _Worker, lost: Counter[int | None]) -> None:
-    """Refuse to go on where workers cannot start, or too many were lost in a row or with one chunk."""
-    worker.pipe.close()
-    worker.process.join()
-    code = worker.process.exitcode
-    if not worker.ready and code is not None and code > 0:
-        raise InputError(
-            f"a worker ended with code {code} before it began; in a script, allowed: workers under "
-            "if __name__ == '__main__'"
-        )
-    _give_up(lost, f", the last with code {code}")
-
-
-def _give_up(lost: Counter[int | None], last: str) -> None:
-    """Refuse to go on where too many workers were lost with one chunk, or in a row (counted under None)."""
-    for index, count in lost.items():
-        if count >= (MOST_LOST if index is None else TRIES):
-            how = "one after another" if index is None else f"with chunk {index} of the sweep"
-            raise InputError(
-                f"{count} workers were lost {how}{last}; allowed: fewer workers, if the memory is too small for these; "
-                "what is written stays, and the same command goes on from there"
-            )
-
-
-def _serve(pipe: Connection) -> None:
-    """A worker: runs the chunks that it is told to until the pipe is closed."""
-    # Ctrl-C is for the process that has started this one.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    warnings.simplefilter("ignore")
-    sending, computing = Lock(), Lock()
-
-    def tell(answer: Done | Exception | None) -> None:
-        with sending, suppress(OSError):
-            pipe.send(answer)
-
-    def run(index: int) -> None:
-        try:
-            tell(run_chunk(work, index, computing))
-        except Exception as error:
-            tell(error)
-
-    with suppress(EOFError, OSError), ThreadPoolExecutor(AT_ONCE) as pool:
-        work: Work = pipe.recv()
-        tell(None)
-        while True:
-            pool.submit(run, pipe.recv())
-
-
 @contextmanager
-def scheduled(address: str | None) -> Iterator[Any]:
-    """The client of a Dask scheduler; None without an address.
+def at_work(workers: int | None, scheduler: str | None) -> Iterator[Any]:
+    """A client of the `workers` that run the chunks on this machine, or of those of a scheduler; None for neither.
 
     Raises
     ------
     InputError
-        If Dask is not installed, or nothing answers at this address.
+        If Dask is not installed, no worker can start, or nothing answers at the scheduler's address.
     """
-    if address is None:
+    if workers is None and scheduler is None:
         yield None
         return
     try:
         import distributed
     except ImportError:
         raise InputError(
-            "scheduler takes the package distributed, which is not installed; allowed: pip install "
-            "'fingerspice[cluster]'"
+            f"{'scheduler' if workers is None else 'workers'} takes the package distributed, which is not installed; "
+            "allowed: pip install 'fingerspice[cluster]'"
         ) from None
-    try:
-        client = distributed.Client(address, timeout=PATIENCE, set_as_default=False)
-    except (OSError, ValueError, ImportError, RuntimeError) as error:
-        raise InputError(
-            f"no scheduler answers at {address} ({type(error).__name__}); allowed: the address that `dask scheduler` "
-            "tells, such as tcp://10.0.0.1:8786"
-        ) from None
-    with client:
+    with ExitStack() as held:
+        try:
+            if workers is not None:
+                scheduler = held.enter_context(
+                    distributed.LocalCluster(
+                        n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0",
+                        silence_logs=logging.CRITICAL,
+                    )
+                ).scheduler_address  # fmt: skip
+            client = held.enter_context(distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False))
+        except (OSError, ValueError, ImportError, RuntimeError) as error:
+            raise InputError(
+                f"no scheduler answers at {scheduler} ({type(error).__name__}); allowed: the address that "
+                "`dask scheduler` tells, such as tcp://10.0.0.1:8786"
+                if workers is None
+                else f"the workers did not start ({type(error).__name__}); in a script, allowed: workers under "
+                "if __name__ == '__main__'"
+            ) from None
         yield client
 
 
@@ -323,9 +211,12 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
     held = client.submit(_same, work, pure=False)
     todo, lost = deque(missing), Counter[int | None]()
     running: dict[Any, int] = {}
+    given_up: list[int] = []
+    last: Exception | None = None
     waiting = as_completed(loop=client.loop)
     while todo or running:
-        while todo and len(running) < AHEAD:
+        # A chunk that workers were lost with is run alone, so that it alone is blamed.
+        while todo and len(running) < (1 if lost.keys() & {todo[0], *running.values()} else AHEAD):
             index = todo.popleft()
             future = client.submit(_run_and_write_aside, held, index, pure=False)
             running[future] = index
@@ -340,8 +231,10 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
             # The scheduler gives a chunk up that several workers were lost with; and an answer that is lost with its
             # worker does not come before the chunk has been run again.
             lost.update((None, index) if isinstance(error, KilledWorker) else (None,))
-            _give_up(lost, f": {error}")
-            todo.append(index)
+            if lost[None] == MOST_LOST:
+                raise _lost("one chunk after another", MOST_LOST, error) from None
+            (given_up if lost[index] == TRIES else todo).append(index)
+            last = error
         except Exception as error:
             raise InputError(
                 f"the sweep at the scheduler ended with {type(error).__name__}: {error}; what is written stays, and "
@@ -350,6 +243,15 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
         else:
             lost[None] = 0
             yield answer
+    if given_up:
+        raise _lost(f"chunk {given_up[0]} of the sweep", TRIES, last)
+
+
+def _lost(chunk: str, count: int, last: Exception | None) -> InputError:
+    return InputError(
+        f"the workers of {chunk} were lost, {count} times: {last}; allowed: fewer workers, if the memory is too small "
+        "for these; what is written stays, and the same command goes on from there"
+    )
 
 
 def _same(work: Work) -> Work:
@@ -359,6 +261,9 @@ def _same(work: Work) -> Work:
 def _run_and_write_aside(work: Work, index: int) -> Done:
     """A task of Dask: its worker computes the next chunk while this one is written."""
     keep_freed_memory()
+    if parent_process() is not None:
+        # A process of Dask's own, whose terminal may be the user's, who has been warned before the first chunk.
+        warnings.simplefilter("ignore", FingerspiceWarning)
     return run_chunk(work, index, writing=_aside())
 
 

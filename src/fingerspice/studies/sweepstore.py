@@ -30,7 +30,7 @@ from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.results.datafiles import CHECKSUM, checksum, fault, zarr_library
 from fingerspice.studies.batch import batch, checked_scenes
 from fingerspice.studies.batchtask import LOCKSTEP, REFUSED, STATUS_NAMES
-from fingerspice.studies.sweepchunks import Work, programs, run_chunks, scheduled
+from fingerspice.studies.sweepchunks import Work, at_work, programs, run_chunks
 from fingerspice.studies.sweepplan import Plan
 from fingerspice.waveforms.waveform import require
 
@@ -275,9 +275,9 @@ def stored(
         name: (values, {NAMES: list(plan.tables[name].names)} if name in plan.tables else {"units": plan.units[name]})
         for name, values in plan.grid.items()
     }
-    with scheduled(scheduler) as client:
+    with at_work(None if workers is None else min(workers, work.store.chunks), scheduler) as client:
         work.store.open(_identity(work, options), about, grid)
-        told = run_chunks(work, shard, workers, client)
+        told = run_chunks(work, shard, client)
     found = work.store.dataset()
     found.attrs |= told
     return found
