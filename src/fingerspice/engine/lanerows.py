@@ -13,13 +13,17 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within_rows
 
-# Inner nodes of Lobatto's rule with four nodes, and its weights in a step of length 1.
+# Lobatto's rules with three nodes (Simpson's) and with four, in a step of length 1: their nodes, weights, and the
+# coefficients of the Lagrange polynomials through the nodes, one row each. The first rule's fourth node has no use.
 INNER = (0.5 - 0.1 * 5.0**0.5, 0.5 + 0.1 * 5.0**0.5)
-OUTER_WEIGHT, INNER_WEIGHT = 1.0 / 12.0, 5.0 / 12.0
+PLACES = np.array([[0.0, 0.5, 1.0, 2.0], [0.0, *INNER, 1.0]])
+WEIGHTS = np.array([[1.0, 4.0, 1.0, 0.0], [0.5, 2.5, 2.5, 0.5]]) / 6.0
+# The longer rule's, which networks always take.
 NODES = 4
-# Coefficients of the Lagrange polynomials through the nodes, and their slopes at the end of the step.
-BASIS = np.ascontiguousarray(np.linalg.inv(np.vander((0.0, *INNER, 1.0), increasing=True)).T)
-END_SLOPES = BASIS @ np.array([0.0, 1.0, 2.0, 3.0])
+BASIS = np.stack([
+    np.pad(np.linalg.inv(np.vander(PLACES[n - 3, :n], increasing=True)).T, (0, NODES - n)) for n in (3, NODES)
+])  # fmt: skip
+END_SLOPES = BASIS[1] @ np.array([0.0, 1.0, 2.0, 3.0])
 # Rows of the lanes' state before those of the modes: the source at both ends of a part, and at the last sample.
 SOURCES = 3
 # Time constants in a step from which on a mode is taken to follow the drives.
@@ -33,6 +37,7 @@ class Marks(NamedTuple):
 
     modes: tuple[int, ...]  # All of them
     active: tuple[int, ...]  # Those that are not passive
+    inner: tuple[int, ...]  # Nodes within a step
     leaks: tuple[int, ...]  # Drives but N
     # bend, mobile: One entry if there is a drive beside the leaks (N in a network, or A - 1/q0 times the source under
     # `mobile`), and under `mobile`; or none
@@ -102,8 +107,8 @@ def rows_of(marks: Any) -> Rows:
     """The order of the state's rows: the source's and the modes', then these."""
     m, leaks, drives = len(marks.modes), len(marks.leaks), len(marks.leaks) + len(marks.bend)
     xi = SOURCES + m
-    g = xi + NODES
-    w = g + NODES * drives
+    g = xi + len(marks.inner) + 2
+    w = g + (len(marks.inner) + 2) * drives
     scratch = w + 2 * leaks
     q = scratch + 5 + drives
     more = 3 if len(marks.mobile) > 0 else m + drives if drives > leaks else 0
@@ -130,18 +135,18 @@ class Weighed(NamedTuple):
     end: int
 
 
-def weighed(modes: int, active: int, leaks: int, bend: int) -> Weighed:
-    """The rows of the weights with so many modes, active modes, leaks, and 1 for a network."""
-    drives = leaks + bend
-    mode, one = NODES + 3 + NODES * drives + bend, 2 + active + (NODES - 1) * drives + bend
+def weighed(modes: int, active: int, inner: int, leaks: int, bend: int) -> Weighed:
+    """The rows of the weights with so many modes, active modes, nodes within a step, leaks, and 1 for a network."""
+    drives, nodes = leaks + bend, inner + 2
+    mode, one = nodes + 3 + nodes * drives + bend, 2 + active + (nodes - 1) * drives + bend
     length = modes * mode
-    return Weighed(mode, length, length + 1, one, length + 1 + (NODES - 1) * (1 + leaks) * one)
+    return Weighed(mode, length, length + 1, one, length + 1 + (nodes - 1) * (1 + leaks) * one)
 
 
 @jit_within_rows
 def weights_of(marks: Any) -> Weighed:
     """The same for the marks of compiled code."""
-    return _weighed(len(marks.modes), len(marks.active), len(marks.leaks), len(marks.bend))
+    return _weighed(len(marks.modes), len(marks.active), len(marks.inner), len(marks.leaks), len(marks.bend))
 
 
 _weighed = jit_within_rows(weighed)

@@ -82,7 +82,7 @@ def span(
             if len(marks.own) > 0:
                 for i in range(lanes):
                     length[i] = h[first[i] + done + k] / parts
-                weigh(c, active, length, weights)
+                weigh(c, active, len(marks.inner), length, weights)
             for p in range(parts):
                 step(marks, c, flat, state, after[k * lanes :], p / parts, (p + 1) / parts)
             for i in range(rows * lanes):
@@ -134,7 +134,7 @@ def within(
             for k in range(m):
                 modes[k, i] = starts[k, j]
         begin(marks, c, still, modes, before, state)
-        weigh(c, len(marks.active), length, weights)
+        weigh(c, len(marks.active), len(marks.inner), length, weights)
         for p in range(parts):
             step(marks, c, weights.reshape(-1), state, after, p / parts, (p + 1) / parts)
         for i in range(min(lanes, h.size - first)):
@@ -183,7 +183,7 @@ def slopes_of(
         Takes the derivatives of the modes at the end and of the rows named above, by the modes at the start and the
         source at start and end.
     """
-    lanes, m = len(marks.lanes), len(marks.modes)
+    lanes, m, last = len(marks.lanes), len(marks.modes), len(marks.inner) + 1
     state, weights = room
     n, flat = x.size, weights.reshape(-1)
     modes, before, after, length = np.empty((m, lanes)), np.empty(lanes), np.empty(lanes), np.empty(lanes)
@@ -192,7 +192,7 @@ def slopes_of(
         for i in range(lanes):
             length[i] = h[min(first + i, n - 1) if len(marks.own) > 0 else 0] / parts
         if len(marks.own) > 0:
-            weigh(c, len(marks.active), length, weights)
+            weigh(c, len(marks.active), len(marks.inner), length, weights)
         for p in range(m + 2):
             for sign in (1.0, -1.0):
                 move = sign * delta[min(p, m)]
@@ -204,12 +204,12 @@ def slopes_of(
                 begin(marks, c, still, modes, before, state)
                 found[:] = 0.0
                 for part in range(parts):
-                    for node in range(lanerows.NODES):
+                    for node in range(last + 1):
                         if node == 1:
                             step(marks, c, flat, state, after, part / parts, (part + 1) / parts)
                         # After a step its end is node 0 of the next one.
-                        _gap_and_area(marks, c, node % (lanerows.NODES - 1), state, u, q)
-                        by = lanerows.OUTER_WEIGHT if node % (lanerows.NODES - 1) == 0 else lanerows.INNER_WEIGHT
+                        _gap_and_area(marks, c, node % last, state, u, q)
+                        by = lanerows.WEIGHTS[last - 2, node]
                         for i in range(lanes):
                             area = by * length[i] / (c.q0 + q[i])
                             found[m + SQUARES, i] += u[i] * u[i] * area

@@ -11,13 +11,13 @@ is g = A - 1/q0 times s. Where X has a share S of it, X = Y + S g, that is u = Y
 C = (Y - (k + S / q0) s) / q0. In a network N, the integral of A - 1/q0 over u, is one more drive, behind
 the leaks: u + kappa N = xi, and both 1/A and N are polynomials in |xi| (`solve.netforms`).
 
-The drives g are taken at Lobatto's four nodes. There the state is predicted with polynomials through the leaks at the
-nodes before, and through N at these and the node itself, which is an equation for xi. The modes' response to the source
-and to the cubic through the drives is exact. Where xi crosses 0 V, g has a kink, of which the integral and the first
-moment that the rule misses are known on the straight line of xi, and are added. In a network the slope of N at the end
-of the step is known, too, and makes the cubic a quartic; modes that decay within a small part of a sample begin where
-they soon are, and what they leave on the way decays beside them. The last modes may be passive: nothing depends on
-them, such as a charge.
+The drives g are taken at the nodes of Lobatto's rule with four of them, or of Simpson's for larger errors. There the
+state is predicted with polynomials through the leaks at the nodes before, and through N at these and the node itself,
+which is an equation for xi. The modes' response to the source and to the polynomial through the drives is exact. Where
+xi crosses 0 V, g has a kink, of which the integral and the first moment that the rule misses are known on the straight
+line of xi, and are added. In a network the slope of N at the end of the step is known, too, and makes the cubic a
+quartic; modes that decay within a small part of a sample begin where they soon are, and what they leave on the way
+decays beside them. The last modes may be passive: nothing depends on them, such as a charge.
 """
 
 from __future__ import annotations
@@ -28,12 +28,10 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_by_kind, jit_rows, jit_within_rows
 from fingerspice.engine.lanebend import bent_drives_at, end_bent, smooth
 from fingerspice.engine.lanerows import (
-    INNER,
-    INNER_WEIGHT,
-    NODES,
-    OUTER_WEIGHT,
+    PLACES,
     QUICK,
     SOURCES,
+    WEIGHTS,
     places,
     polynomial_rows,
     project,
@@ -51,7 +49,7 @@ def drives_under_mobile(marks: Any, c: Any, weights: FloatArray, j: int, before:
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     x, over, flat, one = at.scratch, 1.0 / c.q0, at.flat + (0 if j == 0 else 1), weights_of(marks).one
     # At the end X is known.
-    on, until = 1.0 if j > 0 else 0.0, INNER[0] if j == 1 else INNER[1] if j == 2 else 1.0
+    on, until = 1.0 if j > 0 else 0.0, PLACES[len(marks.inner) - 1, j] if j > 0 else 1.0
     share_at = weights_of(marks).node + (max(j, 1) - 1) * (1 + leaks) * one + one - 1
     for i in range(lanes):
         source = state[i] + until * (state[lanes + i] - state[i])
@@ -128,7 +126,7 @@ def _end_of_stack(marks: Any, c: Any, weights: FloatArray, fades: bool, state: F
     project(marks, c, 1, at.xi, state)
     for t in range(leaks):
         for i in range(lanes):
-            state[(at.g + t) * lanes + i] = state[(at.g + (NODES - 1) * leaks + t) * lanes + i]
+            state[(at.g + t) * lanes + i] = state[(at.g + (len(marks.inner) + 1) * leaks + t) * lanes + i]
             state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
 
 
@@ -137,7 +135,7 @@ def _end_under_mobile(marks: Any, c: Any, weights: FloatArray, fades: bool, stat
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     _add_kinks(marks, c, weights, state)
     project(marks, c, 1, at.xi, state)
-    drives_under_mobile(marks, c, weights, 0, NODES - 1, state)
+    drives_under_mobile(marks, c, weights, 0, len(marks.inner) + 1, state)
     for t in range(leaks):
         for i in range(lanes):
             state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
@@ -177,7 +175,8 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
     # Numbers that the compiler knows: it then unrolls the sums in them.
     _at_node(marks, c, weights, 1, state)
     _at_node(marks, c, weights, 2, state)
-    _at_node(marks, c, weights, 3, state)
+    if len(marks.inner) > 1:
+        _at_node(marks, c, weights, 3, state)
     for i in range(lanes):
         state[(at.scratch + 1) * lanes + i] = weights[weights_of(marks).length * wide + i * each]
     _kinks(marks, c, state)
@@ -216,23 +215,23 @@ def _predict(marks: Any, weights: FloatArray, j: int, state: FloatArray) -> None
 def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
     """The modes at the end of a step, from the drives at its nodes and what the rule misses of them."""
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives = leaks + len(marks.bend)
+    drives, nodes = leaks + len(marks.bend), len(marks.inner) + 2
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     for k in range(len(marks.modes)):
         p = k * weights_of(marks).mode
         for i in range(lanes):
-            th, late = state[(at.scratch + 4) * lanes + i], weights[(p + NODES) * wide + i * each]
-            for j in range(NODES - 1, 0, -1):
+            th, late = state[(at.scratch + 4) * lanes + i], weights[(p + nodes) * wide + i * each]
+            for j in range(nodes - 1, 0, -1):
                 late = late * th + weights[(p + j) * wide + i * each]
             z = (
                 weights[p * wide + i * each] * state[(SOURCES + k) * lanes + i]
-                + weights[(p + NODES + 1) * wide + i * each] * state[i]
-                + weights[(p + NODES + 2) * wide + i * each] * state[lanes + i]
+                + weights[(p + nodes + 1) * wide + i * each] * state[i]
+                + weights[(p + nodes + 2) * wide + i * each] * state[lanes + i]
             )
             for t in range(drives):
                 z += c.feed[k, t] * late * state[(at.scratch + 5 + t) * lanes + i]
-            for n in range(NODES * drives):
-                z += weights[(p + NODES + 3 + n) * wide + i * each] * state[(at.g + n) * lanes + i]
+            for n in range(nodes * drives):
+                z += weights[(p + nodes + 3 + n) * wide + i * each] * state[(at.g + n) * lanes + i]
             state[(SOURCES + k) * lanes + i] = z
 
 
@@ -255,12 +254,12 @@ def _add_kinks_to(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatA
     These begin at th with a straight line and a square, to which the response is known.
     """
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
-    drives = leaks + len(marks.bend)
+    drives, inner = leaks + len(marks.bend), len(marks.inner)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
-    x, p = at.scratch, k * weights_of(marks).mode + NODES + 3 + drives
+    x, p = at.scratch, k * weights_of(marks).mode + inner + 5
     for i in range(lanes):
         th, length = state[(x + 4) * lanes + i], state[(x + 1) * lanes + i]
-        y, rest, a, b = max(c.rates[k] * length, QUICK), 1.0 - th, max(INNER[0] - th, 0.0), max(INNER[1] - th, 0.0)
+        y, rest = max(c.rates[k] * length, QUICK), 1.0 - th
         size = state[x * lanes + i] if c.rates[k] * length >= QUICK else 0.0
         # The decay from th on, as the 64th power of a series.
         v = min(y * rest, 40.0) / 64.0
@@ -275,9 +274,9 @@ def _add_kinks_to(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatA
             rise -= w
             w += th * rise
             more = c.feed[k, t] * length * (w * straight + rise * square)
-            more -= weights[(p + t) * wide + i * each] * a * (w + rise * a)
-            more -= weights[(p + drives + t) * wide + i * each] * b * (w + rise * b)
-            more -= weights[(p + 2 * drives + t) * wide + i * each] * rest * (w + rise * rest)
+            for j in range(1, inner + 2):
+                since = max(PLACES[inner - 1, j] - th, 0.0)
+                more -= weights[(p + j * drives + t) * wide + i * each] * since * (w + rise * since)
             state[(SOURCES + k) * lanes + i] += c.kinks[t] * size * more
 
 
@@ -286,23 +285,24 @@ def _kinks(marks: Any, c: Any, state: FloatArray) -> None:
     """What the rule misses of |xi| times 1 and t, in a step of length 1, and of the drives' kinks.
 
     On the straight line of xi from u0 to u1, which is 0 at th: int |u| = (u0^2 + u1^2) / (2 |u1 - u0|) and
-    int |u| (t - th) = |u1 - u0| ((1 - th)^3 - th^3) / 3, less Lobatto's sums of both.
+    int |u| (t - th) = |u1 - u0| ((1 - th)^3 - th^3) / 3, less the rule's sums of both.
     """
     lanes, leaks, drives = len(marks.lanes), len(marks.leaks), len(marks.leaks) + len(marks.bend)
     at = places(marks)
-    x = at.scratch
-    begins, ends = (at.flat, at.flat + 1) if len(marks.mobile) > 0 else (at.xi, at.xi + NODES - 1)
+    x, inner, rule = at.scratch, len(marks.inner), len(marks.inner) - 1
+    begins, ends = (at.flat, at.flat + 1) if len(marks.mobile) > 0 else (at.xi, at.xi + inner + 1)
     for i in range(lanes):
         u0, u1 = state[begins * lanes + i], state[ends * lanes + i]
         d = u1 - u0
         over = 1.0 / (abs(d) + 1e-300)
         th = abs(u0) * over
         om = 1.0 - th
-        c0, c1 = OUTER_WEIGHT * abs(u0), OUTER_WEIGHT * abs(u1)
-        e0, e1 = INNER_WEIGHT * abs(u0 + INNER[0] * d), INNER_WEIGHT * abs(u0 + INNER[1] * d)
-        k0 = 0.5 * (u0 * u0 + u1 * u1) * over - c0 - c1 - e0 - e1
+        k0 = 0.5 * (u0 * u0 + u1 * u1) * over
         k1 = abs(d) * (om * om * om - th * th * th) / 3.0
-        k1 += c0 * th - c1 * om - e0 * (INNER[0] - th) - e1 * (INNER[1] - th)
+        for j in range(inner + 2):
+            share = WEIGHTS[rule, j] * abs(u0 + PLACES[rule, j] * d)
+            k0 -= share
+            k1 -= share * (PLACES[rule, j] - th)
         crossed = u0 * u1 < 0.0
         state[x * lanes + i] = 2.0 * abs(d) if crossed else 0.0
         state[(x + 2) * lanes + i] = k0 if crossed else 0.0
@@ -311,7 +311,7 @@ def _kinks(marks: Any, c: Any, state: FloatArray) -> None:
     if len(marks.mobile) > 0:
         weaken_kinks(marks, c, state)
     for t in range(drives):
-        first, second = (0, 1) if len(marks.mobile) > 0 else (at.xi, at.xi + NODES - 1)
+        first, second = (0, 1) if len(marks.mobile) > 0 else (at.xi, at.xi + inner + 1)
         first, second = (at.w + t, at.w + leaks + t) if t < leaks else (first, second)
         for i in range(lanes):
             k0, k1, th = state[(x + 2) * lanes + i], state[(x + 3) * lanes + i], state[(x + 4) * lanes + i]

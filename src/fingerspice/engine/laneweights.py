@@ -8,7 +8,7 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.lanerows import BASIS, FADED, INNER, NODES, QUICK, weighed
+from fingerspice.engine.lanerows import BASIS, FADED, INNER, NODES, PLACES, QUICK, weighed
 from fingerspice.numerics.small import copy_to
 
 # Coefficients from x on of the quartic that is 0 at the nodes and has the slope 1 at the end of the step.
@@ -22,15 +22,17 @@ def _through(nodes: tuple[float, ...], until: float) -> FloatArray:
     return np.pad(until * found, ((0, 0), (0, NODES - len(nodes))))
 
 
-_PLACES = (0.0, *INNER, 1.0)
-# At each later node weights of the leaks, which are known at the nodes before, and of N.
+# At each later node weights by rule: of the leaks, which are known at the nodes before, and of the last drive.
 _LEAKS, _BENDS = (
-    np.ascontiguousarray(np.vstack([_through(_PLACES[: j + more], _PLACES[j]) for j in range(1, NODES)]))
+    np.stack([
+        np.vstack([_through(tuple(places[: j + more]), float(places[j])) for j in range(1, NODES)])
+        for places in PLACES
+    ])
     for more in (0, 1)
-)
-# The first prediction misses the slope of the leaks. The second one is given the opposite error, so that both cancel at
-# the end of the step, whose method is then of third order.
-_LEAKS[1:3, 0] += np.array([-0.5, 0.5]) * INNER[0]
+)  # fmt: skip
+# The first prediction misses the slope of the leaks. With four nodes the second one is given the opposite error, so
+# that both cancel at the end of the step, whose method is then of third order.
+_LEAKS[1, 1:3, 0] += np.array([-0.5, 0.5]) * INNER[0]
 _weighed = jit_within(weighed)
 # Largest rate times length for which moments follow from the highest one, and that from its series.
 _EARLY = 1.0
@@ -107,13 +109,14 @@ def _until(
 
 
 @jit_rows
-def _late_times(n: int, rate: float, quick: float, h: FloatArray, own: FloatArray) -> None:
-    """The cubic in the place of a kink, through the decays from the nodes to the end, times h; 0 for quick modes."""
+def _late_times(n: int, inner: int, rate: float, quick: float, h: FloatArray, own: FloatArray) -> None:
+    """What multiplies powers of a kink's place: the polynomial through the decays to the end, times h; 0 if quick."""
+    basis = BASIS[inner - 1]
     for i in range(n):
-        d0, d1, d2 = own[0, i], own[1, i], own[2, i]
+        d0, d1, d2 = own[0, i], own[1, i], own[2, i] if inner > 1 else 1.0
         length = h[i] if rate * h[i] < quick else 0.0
-        for p in range(NODES):
-            own[1 + p, i] = length * (d0 * BASIS[0, p] + d1 * BASIS[1, p] + d2 * BASIS[2, p] + BASIS[3, p])
+        for p in range(inner + 2):
+            own[1 + p, i] = length * (d0 * basis[0, p] + d1 * basis[1, p] + d2 * basis[2, p] + basis[3, p])
 
 
 @jit_rows
@@ -127,14 +130,14 @@ def _drive(n: int, c: FloatArray, h: FloatArray, m: FloatArray, out: FloatArray)
 
 @jit_rows
 def _gather(
-    k: int, j: int, active: int, shape: FloatArray, taps: FloatArray, feed: FloatArray, found: FloatArray,
+    k: int, j: int, active: int, inner: int, shape: FloatArray, taps: FloatArray, feed: FloatArray, found: FloatArray,
     weights: FloatArray,
 ) -> None:  # fmt: skip
     """Add what mode k does to the quantities at node j, by its weights there.
 
     `found` has the decay, the weights of the source, of the leaks at the nodes before, and of N at these and itself.
     """
-    n, leaks, drives = found.shape[1], taps.shape[0], feed.shape[1]
+    n, leaks, drives, last = found.shape[1], taps.shape[0], feed.shape[1], inner + 1
     for p in range(1 + leaks):
         by = shape[k] if p == 0 else taps[p - 1, k]
         for i in range(n):
@@ -147,7 +150,7 @@ def _gather(
                 for i in range(n):
                     weights[p, row, i] += share * found[3 + node, i]
         for node in range((j + 1) * (drives - leaks)):
-            share, row = by * feed[k, leaks], 2 + active + (node * drives + leaks if node < j else 3 * drives)
+            share, row = by * feed[k, leaks], 2 + active + (node * drives + leaks if node < j else last * drives)
             for i in range(n):
                 weights[p, row, i] += share * found[3 + j + node, i]
 
@@ -156,43 +159,43 @@ def _gather(
 def _feed(c: Any, k: int, found: FloatArray, own: FloatArray) -> None:
     """Weights of each drive at each node in mode k, from those of the nodes."""
     drives = c.feed.shape[1]
-    for j in range(NODES):
+    for j in range(found.shape[0]):
         for t in range(drives):
             for i in range(found.shape[1]):
                 own[j * drives + t, i] = c.feed[k, t] * found[j, i]
 
 
 @jit
-def weigh(c: Any, active: int, h: FloatArray, weights: FloatArray) -> None:
+def weigh(c: Any, active: int, inner: int, h: FloatArray, weights: FloatArray) -> None:
     """Weights of steps of the lengths h (n,), into the rows (n,) of `weights` (`engine.lanerows.Weighed`)."""
     rates, n, m, count, leaks = c.rates, h.size, np.zeros((NODES + 2, h.size)), c.rates.size, c.tap_s.size
     drives, found = c.feed.shape[1], np.empty((3 + 2 * NODES, h.size))
-    bent = drives - leaks
-    mode, length, first, one, _ = _weighed(count, active, leaks, bent)
-    at_nodes = weights[first:].reshape((NODES - 1, 1 + leaks, one, n))
+    bent, nodes, places = drives - leaks, inner + 2, PLACES[inner - 1]
+    mode, length, first, one, _ = _weighed(count, active, inner, leaks, bent)
+    at_nodes = weights[first:].reshape((nodes - 1, 1 + leaks, one, n))
     at_nodes[:] = 0.0
-    for j in range(1, NODES):
-        at = INNER[j - 1] if j < NODES - 1 else 1.0
+    for j in range(1, nodes):
+        at = places[j]
         for p in range(1 + leaks):
             by = c.k if p == 0 else c.tap_s[p - 1]
             at_nodes[j - 1, p, 0] = by * (1.0 - at)
             at_nodes[j - 1, p, 1] = by * at
     for k in range(count):
         own = weights[k * mode :]
-        for j in range(1, NODES):
-            at = INNER[j - 1] if j < NODES - 1 else 1.0
+        for j in range(1, nodes):
+            at = places[j]
             _moments(NODES if bent > 0 else j, rates[k] * at, h, m)
             _until(n, rates[k], c.gain[k], at, h, m[0], m[1], found[0], found[1], found[2])
-            copy_to(own[NODES - 1 - j], found[0])
+            copy_to(own[nodes - 1 - j], found[0])
             if k < active:
-                _drive(n, _LEAKS[j * (j - 1) // 2 :][:j], h, m, found[3:])
+                _drive(n, _LEAKS[inner - 1][j * (j - 1) // 2 :][:j], h, m, found[3:])
                 if bent > 0:
-                    _drive(n, _BENDS[(j - 1) * (j + 2) // 2 :][: j + 1], h, m, found[3 + j :])
-                _gather(k, j, active, c.shape, c.taps, c.feed, found, at_nodes[j - 1])
-        _late_times(n, rates[k], FADED if c.kappa > 0.0 else QUICK, h, own)
-        copy_to(own[NODES + 1 : NODES + 3], found[1:3])
-        _drive(n, BASIS, h, m, found)
-        _feed(c, k, found, own[NODES + 3 :])
+                    _drive(n, _BENDS[inner - 1][(j - 1) * (j + 2) // 2 :][: j + 1], h, m, found[3 + j :])
+                _gather(k, j, active, inner, c.shape, c.taps, c.feed, found, at_nodes[j - 1])
+        _late_times(n, inner, rates[k], FADED if c.kappa > 0.0 else QUICK, h, own)
+        copy_to(own[nodes + 1 : nodes + 3], found[1:3])
+        _drive(n, BASIS[inner - 1][:nodes], h, m, found)
+        _feed(c, k, found[:nodes], own[nodes + 3 :])
         if bent > 0:
             _drive(n, _QUARTIC, h, m[1:], found)
             for i in range(n):

@@ -39,6 +39,8 @@ from fingerspice.solve.track import as_recorded, on_branch, system_of
 # Number of lanes, each with a piece of a recording: of a stack, and of a network, whose rows would not all fit into the
 # processor's nearest memory.
 OF_STACK, OF_NETWORK = 64, 32
+# Relative error from which on steps in a stack have Simpson's nodes, and need two evaluations in the place of three.
+BY_SIMPSON = 1e-5
 # Largest degree of the polynomial for 1/A.
 MOST_DEGREE = 28
 # Truncation error allowed for the polynomial of 1/A, relative to the error asked for or to this one, if that is less:
@@ -69,6 +71,7 @@ class LaneForm(ABC):
 
     lanes: Lanes
     active: int  # Number of modes that are not passive
+    inner: int  # Number of nodes within a step
     mobile: bool  # Charge law
     rows: Shown  # What is recorded: voltages, and the charges
     nodes: Shown
@@ -101,8 +104,8 @@ class LaneForm(ABC):
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
         leaks = self.lanes.tap_s.size
         return _marks(
-            self.lanes.rates.size, self.active, leaks, self.lanes.feed.shape[1] - leaks, int(self.mobile), self.pieces,
-            int(own),
+            self.lanes.rates.size, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks, int(self.mobile),
+            self.pieces, int(own),
         )  # fmt: skip
 
     @property
@@ -114,7 +117,7 @@ class LaneForm(ABC):
     def weighed(self) -> Weighed:
         """Rows of the weights."""
         modes, leaks = self.lanes.rates.size, self.lanes.tap_s.size
-        return weighed(modes, self.active, leaks, self.lanes.feed.shape[1] - leaks)
+        return weighed(modes, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks)
 
     @property
     def pieces(self) -> int:
@@ -132,7 +135,7 @@ class LaneForm(ABC):
     def weights(self, h: FloatArray) -> FloatArray:
         """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
         out = np.empty((self.weighed.end, h.size))
-        weigh(self.lanes, self.active, h, out)
+        weigh(self.lanes, self.active, self.inner, h, out)
         return out
 
     def _polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
@@ -183,9 +186,11 @@ class LaneForm(ABC):
 
 
 @lru_cache(maxsize=64)
-def _marks(modes: int, active: int, leaks: int, bend: int, mobile: int, pieces: int, own: int) -> Marks:
+def _marks(
+    modes: int, active: int, inner: int, leaks: int, bend: int, mobile: int, pieces: int, own: int
+) -> Marks:  # fmt: skip
     kind = MobileMarks if mobile else NetworkMarks if bend else StackMarks
-    return kind(*((0,) * size for size in (modes, active, leaks, bend, mobile, pieces, own)))
+    return kind(*((0,) * size for size in (modes, active, inner, leaks, bend, mobile, pieces, own)))
 
 
 def slopes(area: FloatArray, scale: float) -> FloatArray:
@@ -329,7 +334,7 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
     )  # fmt: skip
     voltages = np.arange(k.size) < system.k_shown.size
     return StackForm(
-        lanes, n, model.mobile, Shown(columns, k, moves, voltages & model.mobile),
+        lanes, n, 1 if rtol >= BY_SIMPSON else 2, model.mobile, Shown(columns, k, moves, voltages & model.mobile),
         Shown(nodes, system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile)),
         int(problem.charge), system.stress, float(model.k_gap), system.u_top, missed, missed_bend,
         float(model.slow[-3]) * area0, system,

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.engine.lanerows import NODES
 from fingerspice.engine.lanes import flow, show
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.laneblock import Block, Window
@@ -244,7 +243,7 @@ class LaneMarch:
             # Another sweep over short pieces costs little.
             left = max(OF_STARTS * min(block.count / SHORT, 1.0) * self.rtol, LEAST_CHANGE)
             solved = block.solve(self.z, parts, left * self.scale)
-            self.evaluated += (NODES - 1) * parts * block.n * block.sweeps
+            self.evaluated += (self.form.inner + 1) * parts * block.n * block.sweeps
             if solved:
                 peak = float(block.peaks.max())
                 within = self.form.gap(np.array(peak)) <= self.form.u_top

@@ -311,7 +311,7 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
     still, moved = np.zeros(len(modal.nodes)), modal.nodes[:, :n] @ reduced.absorbed
     nodes = Shown(modal.nodes, still, moved, still > 0.0)
     return NetworkForm(
-        lanes, n, False, Shown(modal.columns, modal.k, modal.bends, np.zeros(modal.k.size, bool)), nodes, m - n,
+        lanes, n, 2, False, Shown(modal.columns, modal.k, modal.bends, np.zeros(modal.k.size, bool)), nodes, m - n,
         float(contact.stress(1.0)), share, scene.u_top, missed, missed_bend,
         float(problem.network.capacitance(reduced.area0).sum()), reduced,
     )  # fmt: skip
