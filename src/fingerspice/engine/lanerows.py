@@ -20,7 +20,7 @@ PLACES = np.array([[0.0, 0.5, 1.0, 2.0], [0.0, *INNER, 1.0]])
 WEIGHTS = np.array([[1.0, 4.0, 1.0, 0.0], [0.5, 2.5, 2.5, 0.5]]) / 6.0
 # The longer rule's, which networks always take.
 NODES = 4
-BASIS = np.stack([
+BASIS = np.ascontiguousarray([
     np.pad(np.linalg.inv(np.vander(PLACES[n - 3, :n], increasing=True)).T, (0, NODES - n)) for n in (3, NODES)
 ])  # fmt: skip
 END_SLOPES = BASIS[1] @ np.array([0.0, 1.0, 2.0, 3.0])
@@ -162,9 +162,8 @@ def project(marks: Any, c: Any, place: int, to: int, state: FloatArray) -> None:
         for k in range(active):
             xi += c.shape[k] * state[(SOURCES + k) * lanes + i]
         state[to * lanes + i] = xi
-    for t in range(leaks):
-        for i in range(lanes):
-            w = c.tap_s[t] * state[place * lanes + i]
+        for t in range(leaks):
+            w = c.tap_s[t] * source
             for k in range(active):
                 w += c.taps[t, k] * state[(SOURCES + k) * lanes + i]
             state[(at.w + leaks + t) * lanes + i] = w

@@ -16,7 +16,7 @@ from fingerspice.engine.laneweights import weigh
 from fingerspice.numerics.small import copy_to
 
 # Samples that are read and written at once.
-TILE = 16
+TILE = 8
 
 
 @jit

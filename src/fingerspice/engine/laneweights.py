@@ -24,7 +24,7 @@ def _through(nodes: tuple[float, ...], until: float) -> FloatArray:
 
 # At each later node weights by rule: of the leaks, which are known at the nodes before, and of the last drive.
 _LEAKS, _BENDS = (
-    np.stack([
+    np.ascontiguousarray([
         np.vstack([_through(tuple(places[: j + more]), float(places[j])) for j in range(1, NODES)])
         for places in PLACES
     ])

@@ -24,7 +24,7 @@ from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.results.sensitivity import MEANS, SIGNALS, SampleGradient
 from fingerspice.results.solution import Solution
 from fingerspice.solve.laneblock import Block
-from fingerspice.solve.laneform import LaneForm
+from fingerspice.solve.laneform import PIECES, LaneForm
 from fingerspice.solve.lanes import LEAST_MARGIN
 from fingerspice.solve.netforms import recording_of
 from fingerspice.solve.pieces import driving
@@ -209,7 +209,7 @@ class _Intervals:
         form, own, out = self.form, length.size > 1, np.empty((self.m + MORE, self.m + 2, at.size))
         state, scratch = form.room(own)
         weights = scratch if own else form.weights(length / parts)
-        still, z = form.weights(np.zeros(form.pieces if own else 1)), np.ascontiguousarray(self.z[:, at])
+        still, z = form.weights(np.zeros(PIECES if own else 1)), np.ascontiguousarray(self.z[:, at])
         slopes_of(
             form.marks(own), form.lanes, still, z, self.x[at], to, length, parts, self.delta, (state, weights), out
         )  # fmt: skip

@@ -17,7 +17,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.lanerows import rows_of
 from fingerspice.engine.lanes import begin, show, span, within
 from fingerspice.engine.laneweights import along
-from fingerspice.solve.laneform import LaneForm
+from fingerspice.solve.laneform import PIECES, LaneForm
 
 # A window over its piece, and the fewest samples in one.
 WINDOW, FEWEST = 1.0 / 16.0, 32
@@ -73,7 +73,7 @@ class Block:
     """
 
     def __init__(self, form: LaneForm, x: FloatArray, h: FloatArray, starts_run: bool) -> None:
-        self.form, self.n, self.own, self.pieces = form, x.size - 1, h.size > 1, form.pieces
+        self.form, self.n, self.own, self.pieces = form, x.size - 1, h.size > 1, PIECES
         self.count = -(-self.n // self.pieces)
         beyond = self.count * self.pieces - self.n
         # The source stays at its last value behind the end.

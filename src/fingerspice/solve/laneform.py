@@ -36,9 +36,8 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK
 from fingerspice.solve.track import as_recorded, on_branch, system_of
 
-# Number of lanes, each with a piece of a recording: of a stack, and of a network, whose rows would not all fit into the
-# processor's nearest memory.
-OF_STACK, OF_NETWORK = 64, 32
+# Number of lanes, each with a piece of a recording.
+PIECES = 64
 # Relative error from which on steps in a stack have Simpson's nodes, and need two evaluations in the place of three.
 BY_SIMPSON = 1e-5
 # Largest degree of the polynomial for 1/A.
@@ -105,7 +104,7 @@ class LaneForm(ABC):
         leaks = self.lanes.tap_s.size
         return _marks(
             self.lanes.rates.size, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks, int(self.mobile),
-            self.pieces, int(own),
+            PIECES, int(own),
         )  # fmt: skip
 
     @property
@@ -119,16 +118,9 @@ class LaneForm(ABC):
         modes, leaks = self.lanes.rates.size, self.lanes.tap_s.size
         return weighed(modes, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks)
 
-    @property
-    def pieces(self) -> int:
-        """Number of lanes."""
-        return OF_NETWORK if self.bent else OF_STACK
-
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
         """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
-        state, weights = aligned(
-            [(rows_of(self.marks(own)).end * self.pieces,), (self.weighed.end, self.pieces if own else 1)]
-        )
+        state, weights = aligned([(rows_of(self.marks(own)).end * PIECES,), (self.weighed.end, PIECES if own else 1)])
         state[:], weights[:] = 0.0, 0.0
         return state, weights
 

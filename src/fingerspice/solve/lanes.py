@@ -18,7 +18,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.lanes import flow, show
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.laneblock import Block, Window
-from fingerspice.solve.laneform import LaneForm, Shown
+from fingerspice.solve.laneform import PIECES, LaneForm, Shown
 from fingerspice.solve.pieces import Piece, driving, spacing_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Run, excess_of
@@ -262,8 +262,8 @@ class LaneMarch:
     def _growing(self, piece: Piece, values: FloatArray) -> tuple[Piece, FloatArray]:
         """A piece on one line of the source, with steps that grow from a part of the shortest time constant on."""
         span = piece.stop - piece.start
-        shortest = min(EARLY / float(self.form.lanes.rates.max()), span / (self.form.pieces * GROWN))
-        share = np.append(0.0, np.geomspace(shortest / span, 1.0, self.form.pieces * GROWN))
+        shortest = min(EARLY / float(self.form.lanes.rates.max()), span / (PIECES * GROWN))
+        share = np.append(0.0, np.geomspace(shortest / span, 1.0, PIECES * GROWN))
         share[-1] = 1.0
         line = values[0] + share * (values[-1] - values[0])
         return replace(piece, times=piece.start + share * span), line

@@ -58,8 +58,8 @@ def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: Fl
 def to_ends(t: FloatArray, t_start: float, t_stop: float) -> None:
     """Set times (s, ascending) that pass an end of the run by rounding to that end, in place."""
     slack = same_time(t_stop)
-    t[(t < t_start) & (t >= t_start - slack)] = t_start
-    t[(t > t_stop) & (t <= t_stop + slack)] = t_stop
+    t[slice(*t.searchsorted([t_start - slack, t_start]))] = t_start
+    t[slice(*t.searchsorted([t_stop, t_stop + slack], "right"))] = t_stop
 
 
 # Most signals that one element adds to the outputs: a GAP adds most, with its two nodes and its area.
