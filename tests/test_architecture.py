@@ -19,10 +19,10 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 400
 # Lines of all files together and of each package: as many as there are, rounded up. They are only ever lowered; what
 # moves from one package to another takes its lines along.
-ALL_LINES = 49_494
+ALL_LINES = 49_396
 PACKAGE_LINES = {
     "base": 1_190, "circuit": 3_025, "cli": 2_348, "engine": 9_765, "explorer": 1_876, "netlist": 3_246,
-    "numerics": 1_320, "physics": 514, "plots": 1_682, "results": 3_263, "sets": 485, "solve": 7_827, "studies": 9_157,
+    "numerics": 1_320, "physics": 514, "plots": 1_682, "results": 3_263, "sets": 485, "solve": 7_824, "studies": 9_062,
     "torch": 536, "waveforms": 3_085,
 }  # fmt: skip
 

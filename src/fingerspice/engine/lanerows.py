@@ -18,11 +18,9 @@ from fingerspice.base.compiled import jit_rows, jit_within_rows
 INNER = (0.5 - 0.1 * 5.0**0.5, 0.5 + 0.1 * 5.0**0.5)
 PLACES = np.array([[0.0, 0.5, 1.0, 2.0], [0.0, *INNER, 1.0]])
 WEIGHTS = np.array([[1.0, 4.0, 1.0, 0.0], [0.5, 2.5, 2.5, 0.5]]) / 6.0
-# The longer rule's, which networks always take.
-NODES = 4
-BASIS = np.ascontiguousarray([
-    np.pad(np.linalg.inv(np.vander(PLACES[n - 3, :n], increasing=True)).T, (0, NODES - n)) for n in (3, NODES)
-])  # fmt: skip
+# Networks always take the longer one.
+NODES, _POWERS = 4, (np.vander(PLACES[n - 3, :n], increasing=True) for n in (3, 4))
+BASIS = np.ascontiguousarray([np.pad(np.linalg.inv(x).T, (0, NODES - len(x))) for x in _POWERS])
 END_SLOPES = BASIS[1] @ np.array([0.0, 1.0, 2.0, 3.0])
 # Rows of the lanes' state before those of the modes: the source at both ends of a part, and at the last sample.
 SOURCES = 3

@@ -38,7 +38,7 @@ from fingerspice.engine.lanerows import (
     weights_of,
 )
 
-# Divisions take so much longer than products, and the compiler makes no products of them.
+# The compiler makes no products of divisions.
 THIRD, SIXTH = 1.0 / 3.0, 1.0 / 6.0
 
 
@@ -90,18 +90,6 @@ def drives_under_mobile(marks: Any, c: Any, weights: FloatArray, j: int, before:
 def drives_under_mobile_at(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
     """The same at a later node."""
     drives_under_mobile(marks, c, weights, j, j - 1, state)
-
-
-@jit_within_rows
-def weaken_kinks(marks: Any, c: Any, state: FloatArray) -> None:
-    """Scale what the rule misses of |xi|: u rises 1 / (1 -+ b) as much as xi with the area at 0 V on its two sides."""
-    lanes, at = len(marks.lanes), places(marks)
-    for i in range(lanes):
-        b = c.steep * state[(at.q + 2) * lanes + i]
-        by = 1.0 / (1.0 - b * b)
-        state[at.scratch * lanes + i] *= by
-        state[(at.scratch + 2) * lanes + i] *= by
-        state[(at.scratch + 3) * lanes + i] *= by
 
 
 @jit_within_rows
@@ -310,8 +298,13 @@ def _kinks(marks: Any, c: Any, state: FloatArray) -> None:
         state[(x + 2) * lanes + i] = k0 if crossed else 0.0
         state[(x + 3) * lanes + i] = k1 if crossed else 0.0
         state[(x + 4) * lanes + i] = th if crossed else 0.0
-    if len(marks.mobile) > 0:
-        weaken_kinks(marks, c, state)
+    # u rises 1 / (1 -+ b) as much as xi with the area at 0 V, on its two sides.
+    for i in range(lanes if len(marks.mobile) > 0 else 0):
+        b = c.steep * state[(at.q + 2) * lanes + i]
+        by = 1.0 / (1.0 - b * b)
+        state[x * lanes + i] *= by
+        state[(x + 2) * lanes + i] *= by
+        state[(x + 3) * lanes + i] *= by
     for i in range(lanes):
         k0, k1, th = state[(x + 2) * lanes + i], state[(x + 3) * lanes + i], state[(x + 4) * lanes + i]
         for t in range(drives):

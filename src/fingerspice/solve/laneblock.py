@@ -221,9 +221,9 @@ class Block:
         share, of_products = (
             np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
         )
-        # Nothing of passive modes decays: other windows add less than the one where the source moves most.
-        share[self.active :] = self.busy[0]
-        of_products[self.active :, self.active :] = self.busy[1]
+        if not self.form.bent:
+            # Nothing of passive modes decays: other windows add less than the one where the source moves most.
+            share[self.active :], of_products[self.active :, self.active :] = self.busy
         return Window(z, off, self.x[index], self.xi[index], share, of_products)
 
     def _windows(self, width: int) -> list[IntArray]:
@@ -237,10 +237,9 @@ class Block:
         # Windows end before the last sample.
         most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
         place = np.where(most.max(axis=1) >= 0.0, width * np.argmax(most, axis=1), -1)
+        # Windows of a piece, each by how much the source moves in it: the errors of kinks grow with its square.
         squares = (np.maximum(most, 0.0) / np.maximum(most.max(axis=1, keepdims=True), 1e-300)) ** 2
-        self.busy = np.maximum(
-            (self.count / (width * most.shape[1])) * np.stack([squares, squares**2]).sum(axis=-1), 1.0
-        )
+        self.busy = np.maximum(self.count / (width * most.shape[1]) * np.stack([squares, squares**2]).sum(axis=-1), 1.0)
         if self.starts_run:
             place[0] = 0
         if not self.form.bent:

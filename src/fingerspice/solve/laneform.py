@@ -101,11 +101,9 @@ class LaneForm(ABC):
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
-        leaks = self.lanes.tap_s.size
-        return _marks(
-            self.lanes.rates.size, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks, int(self.mobile),
-            PIECES, int(own),
-        )  # fmt: skip
+        leaks, kind = self.lanes.tap_s.size, MobileMarks if self.mobile else NetworkMarks if self.bent else StackMarks
+        more = self.lanes.feed.shape[1] - leaks, int(self.mobile), PIECES, int(own)
+        return _marks(kind, self.lanes.rates.size, self.active, self.inner, leaks, *more)
 
     @property
     def bent(self) -> bool:
@@ -178,11 +176,8 @@ class LaneForm(ABC):
 
 
 @lru_cache(maxsize=64)
-def _marks(
-    modes: int, active: int, inner: int, leaks: int, bend: int, mobile: int, pieces: int, own: int
-) -> Marks:  # fmt: skip
-    kind = MobileMarks if mobile else NetworkMarks if bend else StackMarks
-    return kind(*((0,) * size for size in (modes, active, inner, leaks, bend, mobile, pieces, own)))
+def _marks(kind: type[Marks], *sizes: int) -> Marks:
+    return kind(*((0,) * size for size in sizes))
 
 
 def slopes(area: FloatArray, scale: float) -> FloatArray:

@@ -145,7 +145,7 @@ OF_STARTS, LEAST_CHANGE, SHORT = 0.01, 1e-14, 1024
 # stack, and in a network.
 COARSER, FINER = 1.0 / 60.0, (8.0, 12.0)
 # Steps of a piece that grows in each lane, and the first one over the shortest time constant.
-GROWN, EARLY = 8, 0.05
+GROWN, EARLY = 4, 0.05
 # Relative change of a voltage over that of the area which causes it, at most, under `local`: what scales with the area
 # divides the voltage with what does not.
 DIVIDED = 0.5
