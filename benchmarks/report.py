@@ -2,8 +2,9 @@
 
 Run: python benchmarks/report.py [--results FILE] [--page FILE] [--waits FILE]. From work_precision.json come
 results/work_precision.md (every contestant), the pictures results/work_precision.png and work_precision_networks.png,
-and the tables between the `speed` markers of docs/speed.md; from run_times.json, baseline.json and recordings.json in
-the same folder comes the table between the markers of docs/proof.md.
+and the tables between the `speed` markers of docs/speed.md; those between its `recordings` markers from
+recordings.json; from run_times.json, baseline.json and recordings.json in the same folder comes the table between the
+markers of docs/proof.md.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from work_pictures import COSTS, OURS, picture
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "work_precision.json"
 WAITS, PAGE = (HERE.parent / "docs" / name for name in ("proof.md", "speed.md"))
-BEGIN, END = "<!-- speed:begin -->", "<!-- speed:end -->"
+BEGIN, END = "<!-- {}:begin -->", "<!-- {}:end -->"
 TARGETS = (1e-3, 1e-6, 1e-10)
 NGSPICE_TARGET = 1e-4
 STEPPED = "fingerspice, every period"
@@ -289,7 +290,65 @@ def details(results: Report) -> str:
     return "\n".join(lines)
 
 
-def put_into(text: str, path: Path) -> None:
+def recordings_text(recorded: Report) -> str:
+    """The tables of recordings on the page on speed."""
+    skins, bands = ("SKIN", "SKIN_DISPERSIVE"), (1_000.0, 8_000.0, 20_000.0)
+
+    def cell(found: Report, unit: str = "sample") -> str:
+        error = found["error"]
+        small = "unstable" if error is None or not error < 1.0 else f"{error:.0e}".replace("e-0", "e-")
+        return f"{number(found[f'ns_per_{unit}'])} ({small})"
+
+    def rows(names: list[str], every: list[Report], same: tuple[str, ...]) -> list[list[str]]:
+        kinds = list(dict.fromkeys(tuple(p[key] for key in same) for p in every))
+        return [
+            [
+                name,
+                *(cell(p) for kind in kinds for p in every if p["row"] == name and tuple(p[k] for k in same) == kind),
+            ]
+            for name in names
+        ]
+
+    order = {(skin, band): i for i, (skin, band) in enumerate((s, b) for s in skins for b in bands)}
+    points = [{**p, "row": p["contestant"].replace("0.0001", "1e-4").replace("e-0", "e-")} for p in recorded["points"] if "0.001" not in p["contestant"]]
+    points.sort(key=lambda p: order[p["skin"], p["band_Hz"]])
+    names = sorted(dict.fromkeys(p["row"] for p in points), key=lambda name: ("fingerspice" not in name, "," in name))
+    head = ["", *(f"{'dispersive, ' if s != 'SKIN' and b == bands[0] else ''}to {b / 1e3:g} kHz" for s, b in order)]
+    around = [
+        {**p, "row": f"{p['rtol']:g}" if p["method"] == "auto" else f"{p['rtol']:g}, `{p['method']}`"}
+        for p in recorded["networks"]
+    ]
+    decks = list(dict.fromkeys(p["deck"] for p in around))
+    uneven = [
+        " to ".join(number(ns) for ns in (min(found), max(found)))
+        for found in (
+            [p["ns_per_point"] for p in recorded["uneven"] if (p["skin"], p["method"]) == how]
+            for how in ((skin, method) for skin in skins for method in ("auto", "exponential"))
+        )
+    ]
+    lengths = ", ".join(f"{p['seconds']:g}" for p in recorded["lengths"])
+    took = ", ".join(number(p["ns_per_sample"]) for p in recorded["lengths"])
+    return "\n".join([
+        *wrapped(
+            f"Nanoseconds a sample, on commit {recorded['machine']['commit']}, {recorded['seconds']:g} s, by `python "
+            "benchmarks/recordings.py` ([`recordings.json`](../benchmarks/results/recordings.json))."
+        ),
+        "", *markdown([head, *rows(names, points, ("skin", "band_Hz"))]), "",
+        *wrapped('Networks with one finger, beside the engine that steps every circuit (`method="exponential"`):'), "",
+        *markdown([
+            ["", *(f"`{deck}`, to {b / 1e3:g} kHz" for deck in decks for b in bands[:2])],
+            *rows(list(dict.fromkeys(p["row"] for p in around)), around, ("deck", "band_Hz")),
+        ]), "",
+        *wrapped(
+            f"A PWL whose points lie up to a third of a sample beside these takes {uneven[0]} ns a point at 1e-4 and "
+            f"1e-6, where the ordinary steps take {uneven[1]}; with the dispersive skin {uneven[2]} and {uneven[3]}. "
+            f"Recordings up to 8 kHz of {lengths} s take {took} ns a sample at 1e-6. Where the area is given, a sample "
+            f"takes {recorded['area_given']['ratio']:.1f} times that of scipy's `lfilter`."
+        ),
+    ])  # fmt: skip
+
+
+def put_into(text: str, path: Path, name: str = "speed") -> None:
     """Put the text between the markers of a page.
 
     Raises
@@ -298,11 +357,11 @@ def put_into(text: str, path: Path) -> None:
         If the page has no markers.
     """
     page = path.read_text(encoding="utf-8")
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
+    before, begin, rest = page.partition(BEGIN.format(name))
+    _, end, after = rest.partition(END.format(name))
     if not begin or not end:
-        raise ValueError(f"{path} has no lines {BEGIN} and {END}")
-    path.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
+        raise ValueError(f"{path} has no lines {BEGIN.format(name)} and {END.format(name)}")
+    path.write_text(f"{before}{begin}\n{text}\n{end}{after}", encoding="utf-8")
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -324,6 +383,8 @@ def main(arguments: list[str] | None = None) -> None:
         path = options.results.with_name(f"{options.results.stem}_networks.png")
         picture(results, [networks[::2], networks[1::2]], path)
     put_into(page_text(results), options.page)
+    recorded = json.loads((options.results.parent / "recordings.json").read_text(encoding="utf-8"))
+    put_into(recordings_text(recorded), options.page, "recordings")
     put_into(waits(options.results.parent), options.waits)
 
 

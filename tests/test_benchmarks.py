@@ -145,12 +145,14 @@ def test_the_report_needs_nothing_but_the_results(work_precision, tmp_path):
     for name in ("run_times", "baseline", "throughput", "recordings"):
         (tmp_path / f"{name}.json").write_text((FOLDER / "results" / f"{name}.json").read_text())
     for written in (page, waits):
-        written.write_text(f"before\n{report.BEGIN}\nstale\n{report.END}\nafter\n")
+        marks = [mark.format(part) for part in ("speed", "recordings") for mark in (report.BEGIN, report.END)]
+        written.write_text("before\n{}\nstale\n{}\n{}\nstale\n{}\nafter\n".format(*marks))
     report.main(["--results", str(path), "--page", str(page), "--waits", str(waits)])
     for text in (page.read_text(), waits.read_text()):
         assert text.startswith("before\n")
         assert text.endswith("\nafter\n")
-        assert "stale" not in text
+    assert "stale" not in page.read_text()
+    assert "| numba loop | " in page.read_text()
     assert "| best peer over ours, times | 15 / 15 / 15 |" in page.read_text()
     assert "| best peer over ours, times | 15 / 15 / 15 | 15 / 15 / 15 |" in page.read_text()
     assert "9 of 18 points" in " ".join(page.read_text().split())

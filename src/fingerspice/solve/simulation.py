@@ -138,14 +138,13 @@ def asked(
     circuit: Circuit, *, t_stop: float | None, t_eval: FloatArray | None, start: str | Solution, rtol: float,
     area: str | float, **how: Any,
 ) -> Problem:  # fmt: skip
-    """The problem that a call of `simulate` asks for, its arguments checked.
+    """The problem that a call of `simulate` asks for, with arguments as `check_arguments` leaves them.
 
     Raises
     ------
     InputError
         For a request that cannot be run.
     """
-    check_arguments(rtol, area=area, start=start)
     t_stop = None if t_stop is None else real_number("t_stop", t_stop, "a number in s")
     if isinstance(start, Solution) and start.stored is not None:
         raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")

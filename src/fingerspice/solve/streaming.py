@@ -20,7 +20,7 @@ from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem, check_length, check_outputs
 from fingerspice.solve.recordings import BySamples, ByWindows, Mark, Outputs, outputs_of, within
-from fingerspice.solve.simulation import asked, check_method, planned, rtol_given, solution_of
+from fingerspice.solve.simulation import asked, check_arguments, planned, solution_of
 from fingerspice.waveforms.waveform import require
 
 # Default length of a chunk, s.
@@ -197,8 +197,7 @@ def stream(
     SolveError
         While iterating, where the run fails; its `solution` holds the outputs after the last chunk.
     """
-    check_method(method)
-    rtol = rtol_given(rtol)
+    rtol = check_arguments(rtol, method, area, start)
     chunk = None if chunk is None else positive_number("chunk", chunk, "s")
     step = None if step is None else positive_number("step", step, "s")
     if count is not None:
