@@ -310,7 +310,11 @@ def recordings_text(recorded: Report) -> str:
         ]
 
     order = {(skin, band): i for i, (skin, band) in enumerate((s, b) for s in skins for b in bands)}
-    points = [{**p, "row": p["contestant"].replace("0.0001", "1e-4").replace("e-0", "e-")} for p in recorded["points"] if "0.001" not in p["contestant"]]
+    points = [
+        {**p, "row": p["contestant"].replace("0.0001", "1e-4").replace("e-0", "e-")}
+        for p in recorded["points"]
+        if "0.001" not in p["contestant"]
+    ]
     points.sort(key=lambda p: order[p["skin"], p["band_Hz"]])
     names = sorted(dict.fromkeys(p["row"] for p in points), key=lambda name: ("fingerspice" not in name, "," in name))
     head = ["", *(f"{'dispersive, ' if s != 'SKIN' and b == bands[0] else ''}to {b / 1e3:g} kHz" for s, b in order)]

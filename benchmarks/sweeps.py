@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import logging
 import platform
 import random
 import resource
@@ -19,7 +18,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +47,8 @@ periods = 5
 def measured(n: int, repeats: int, folder: Path) -> list[dict[str, Any]]:
     """Seconds of a sweep in memory and into a store, and bytes on the disk.
 
-    All ways take turns, so that other work on the machine disturbs them alike. Processes take time to start, and so do
-    Dask's workers: they have a second sweep of four times as many scenes, and its further scenes cost the difference.
+    All ways take turns, so that other work on the machine disturbs them alike. Processes (Dask's workers) take time to
+    start: they have a second sweep of four times as many scenes, and its further scenes cost the difference.
     """
     store = folder / "own.zarr"
     ways: dict[str, tuple[int, Callable[[int], Any]]] = {
@@ -61,9 +59,6 @@ def measured(n: int, repeats: int, folder: Path) -> list[dict[str, Any]]:
         "store, 2 processes": (n, lambda n: _swept(n, workers=2, store=store)),
         "store, 2 processes, more": (4 * n, lambda n: _swept(n, workers=2, store=store)),
     }
-    if find_spec("distributed"):
-        ways["store, 2 workers of Dask"] = (n, lambda n: _by_dask(n, store))
-        ways["store, 2 workers of Dask, more"] = (4 * n, lambda n: _by_dask(n, store))
     _swept(n)
     times: dict[str, list[tuple[float, float]]] = {who: [] for who in ways}
     rows = []
@@ -86,16 +81,6 @@ def measured(n: int, repeats: int, folder: Path) -> list[dict[str, Any]]:
 
 def _swept(n: int, **how: Any) -> Any:
     return fs.sweep(fs.read_netlist(DECK), PARAMETERS, n=n, outputs=("f_el_mean",), periods=5, **how)
-
-
-def _by_dask(n: int, store: Path) -> Any:
-    """The sweep by two workers of Dask, which start and end with it."""
-    import distributed
-
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.CRITICAL
-    ) as cluster:
-        return _swept(n, scheduler=cluster.scheduler_address, store=store)
 
 
 def _processor_seconds() -> float:
