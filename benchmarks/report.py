@@ -319,7 +319,7 @@ def recordings_text(recorded: Report) -> str:
     names = sorted(dict.fromkeys(p["row"] for p in points), key=lambda name: ("fingerspice" not in name, "," in name))
     head = ["", *(f"{'dispersive, ' if s != 'SKIN' and b == bands[0] else ''}to {b / 1e3:g} kHz" for s, b in order)]
     around = [
-        {**p, "row": f"{p['rtol']:g}" if p["method"] == "auto" else f"{p['rtol']:g}, `{p['method']}`"}
+        {**p, "row": {1e-4: "1e-4", 1e-6: "1e-6"}[p["rtol"]] + (f", `{p['method']}`" if p["method"] != "auto" else "")}
         for p in recorded["networks"]
     ]
     decks = list(dict.fromkeys(p["deck"] for p in around))
