@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,12 +185,33 @@ class Floating:
             scale[5] *= 1e-5
         # A stage that is refused may have been far out.
         with np.errstate(all="ignore"):
-            run = solve_ivp(rates, (0.0, times[-1]), y0, "DOP853", times, rtol=rtol, atol=scale)
-        assert run.success, run.message
-        states = [unpack(y) for y in run.y.T]
+            found = self._pieces(rates, y0, np.asarray(times), gap, {"rtol": rtol, "atol": scale})
+        states = [unpack(y) for y in found.T]
         return {
             "u_gap": np.array([v[gap] for v, _ in states]),
             "area": np.array([a for _, a in states]),
-            "charge": run.y[4],
-            "state": np.array([[*v, y[3], *y[5:]] for (v, _), y in zip(states, run.y.T, strict=True)]).T,
+            "charge": found[4],
+            "state": np.array([[*v, y[3], *y[5:]] for (v, _), y in zip(states, found.T, strict=True)]).T,
         }
+
+    def _pieces(
+        self, rates: Callable[[float, FloatArray], FloatArray], y: FloatArray, times: FloatArray, gap: int, how: Any
+    ) -> FloatArray:
+        """States at the times; where the area is slow, no step passes over 0 V, where what it follows has a kink."""
+        found, begin = [], 0.0
+        while True:
+            side = float(np.sign(rates(begin, y)[gap] if found or y[gap] == 0.0 else y[gap]))
+
+            def at_zero(t: float, y: FloatArray, begin: float = begin, side: float = side) -> float:
+                return float(y[gap]) if t > begin + 1e-9 else side
+
+            at_zero.terminal = True  # type: ignore[attr-defined]
+            left = times[times > begin] if found else times
+            run = solve_ivp(
+                rates, (begin, times[-1]), y, "DOP853", left, events=at_zero if self.tau > 0.0 else None, **how
+            )
+            assert run.success, run.message
+            found.append(run.y)
+            if run.status == 0:
+                return np.concatenate(found, axis=1)
+            begin, y = float(run.t_events[0][0]), run.y_events[0][0]
