@@ -197,21 +197,19 @@ class Floating:
     def _pieces(
         self, rates: Callable[[float, FloatArray], FloatArray], y: FloatArray, times: FloatArray, gap: int, how: Any
     ) -> FloatArray:
-        """States at the times; where the area is slow, no step passes over 0 V, where what it follows has a kink."""
-        found, begin = [], 0.0
+        """States at the times; from an uncharged start with a slow area no step passes over the kinks at 0 V."""
+        found, begin, stops = [], 0.0, self.tau > 0.0 and y[gap] == 0.0
         while True:
-            side = float(np.sign(rates(begin, y)[gap] if found or y[gap] == 0.0 else y[gap]))
+            side = float(np.sign(rates(begin, y)[gap]))
 
             def at_zero(t: float, y: FloatArray, begin: float = begin, side: float = side) -> float:
                 return float(y[gap]) if t > begin + 1e-9 else side
 
             at_zero.terminal = True  # type: ignore[attr-defined]
             left = times[times > begin] if found else times
-            run = solve_ivp(
-                rates, (begin, times[-1]), y, "DOP853", left, events=at_zero if self.tau > 0.0 else None, **how
-            )
+            run = solve_ivp(rates, (begin, times[-1]), y, "DOP853", left, events=at_zero if stops else None, **how)
             assert run.success, run.message
-            found.append(run.y)
+            found.append(run.y.reshape(y.size, -1))
             if run.status == 0:
                 return np.concatenate(found, axis=1)
             begin, y = float(run.t_events[0][0]), run.y_events[0][0]

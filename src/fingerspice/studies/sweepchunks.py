@@ -211,8 +211,7 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
     held = client.submit(_same, work, pure=False)
     todo, lost = deque(missing), Counter[int | None]()
     running: dict[Any, int] = {}
-    given_up: list[int] = []
-    last: Exception | None = None
+    given_up: dict[int, Exception] = {}
     waiting = as_completed(loop=client.loop)
     while todo or running:
         # A chunk that workers were lost with is run alone, so that it alone is blamed.
@@ -233,24 +232,25 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[D
             lost.update((None, index) if isinstance(error, KilledWorker) else (None,))
             if lost[None] == MOST_LOST:
                 raise _lost("one chunk after another", MOST_LOST, error) from None
-            (given_up if lost[index] == TRIES else todo).append(index)
-            last = error
+            given_up[index] = error
+            if lost[index] < TRIES:
+                todo.append(index)
         except Exception as error:
             raise InputError(
                 f"the sweep at the scheduler ended with {type(error).__name__}: {error}; what is written stays, and "
                 "the same command goes on from there"
             ) from None
         else:
-            lost[None] = 0
+            lost[None], _ = 0, given_up.pop(index, None)
             yield answer
-    if given_up:
-        raise _lost(f"chunk {given_up[0]} of the sweep", TRIES, last)
+    for index, reason in given_up.items():
+        raise _lost(f"chunk {index} of the sweep", TRIES, reason)
 
 
-def _lost(chunk: str, count: int, last: Exception | None) -> InputError:
+def _lost(chunk: str, count: int, reason: Exception) -> InputError:
     return InputError(
-        f"the workers of {chunk} were lost, {count} times: {last}; allowed: fewer workers, if the memory is too small "
-        "for these; what is written stays, and the same command goes on from there"
+        f"the workers of {chunk} were lost, {count} times: {reason}; allowed: fewer workers, if the memory is too "
+        "small for these; what is written stays, and the same command goes on from there"
     )
 
 
