@@ -31,8 +31,7 @@ import fuzz_inputs as make
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.netlist import expressions
 from fingerspice.netlist.deck import LONGEST_TITLE
-from fingerspice.netlist.directives import sweep_from_text
-from fingerspice.netlist.netlist import source_from_text
+from fingerspice.netlist.netlist import source_from_text, sweep_from_text
 from fingerspice.netlist.reader import MAX_WARNINGS
 from fingerspice.studies.fitting import fit_material
 from fingerspice.studies.materialdata import read_table

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.netlist import flatten
-from fingerspice.netlist.deck import Call, Deck, Number, Statement, Token, parse_deck, read_deck
+from fingerspice.netlist.deck import Deck, parse_deck, read_deck
+from fingerspice.netlist.words import Call, Number, Statement, Token
 
 PAPER = """Fingerpad on a 3M-coated touchscreen, Table 1
 .include fingerspice.lib
@@ -61,8 +62,8 @@ def test_the_paper_deck_is_read_as_written() -> None:
     assert [value(number) for number in gap.params.values()] == [float(x) for x in expected.values()]
     assert skin.nodes == ("skin", "0", "area")
     assert skin.node_names == ("skin", "gnd", "AREA")
-    assert read.tran is not None
-    assert [a.text if isinstance(a, Token) else value(a) for a in read.tran.args] == [1e-5, 0.05, "uic"]
+    (tran,) = read.named(".tran")
+    assert [a.text if isinstance(a, Token) else value(a) for a in tran.args] == [1e-5, 0.05, "uic"]
     assert read.includes == ("fingerspice.lib",)
     assert read.unused == ()
     assert read.warnings == ()
@@ -72,7 +73,7 @@ def test_the_paper_deck_is_read_as_written() -> None:
 def test_places_are_physical_lines_and_columns_also_on_continuations() -> None:
     gap = parse_deck(PAPER).statements[2]
     assert gap.where == Where("<netlist>", 5, 1)
-    assert gap.param_where["m_exp"] == Where("<netlist>", 6, 3)
+    assert gap.params["m_exp"].key == Where("<netlist>", 6, 3)
     assert gap.params["c2"].where == Where("<netlist>", 6, 36)
     error = refusal("R1 a 0 {2", "* between", "", "  + +thik}", ".param thick=1")
     assert error.where == Where("<netlist>", 5, 6)
@@ -97,7 +98,7 @@ def test_brackets_and_commas_are_separators_and_calls_are_kept() -> None:
     for text in ("V1 a 0 SIN(0 200 {f})", "V1 (a 0) SIN ( 0, 200, 'f' )"):
         (call,) = only(text, ".param f=100").body
         assert isinstance(call, Call)
-        assert (call.name, [value(a) for a in call.args]) == ("SIN", [0.0, 200.0, 100.0])
+        assert (call.text, [value(a) for a in call.args]) == ("SIN", [0.0, 200.0, 100.0])
     bare = only("V1 a 0 SIN 0 200 100").body
     assert isinstance(bare[0], Token)
     assert [value(x) for x in bare[1:]] == [0.0, 200.0, 100.0]
@@ -110,7 +111,7 @@ def test_calls_hold_their_own_parameters() -> None:
     assert isinstance(call, Call)
     assert value(call.params["r"]) == 0.0
     assert call.params["file"] == Token("x.csv", Where("<netlist>", 2, 30))
-    assert call.param_where["r"] == Where("<netlist>", 2, 21)
+    assert call.params["r"].key == Where("<netlist>", 2, 21)
 
 
 def test_numbers_keep_what_was_written() -> None:
@@ -182,7 +183,7 @@ def test_subcircuits_are_flattened_with_their_parameters_and_nodes() -> None:
     assert value(layer.params["d"]) == pytest.approx(3e-6)
     assert value(middle.body[0]) == pytest.approx(6e-6)
     assert value(first.body[0]) == pytest.approx(12e-6)
-    assert list(read.ic[0].params) == ["v(xf.mid)"]
+    assert list(read.named(".ic")[0].params) == ["v(xf.mid)"]
 
 
 def test_a_native_device_wins_over_a_definition_of_its_name() -> None:
@@ -198,11 +199,10 @@ def test_directives_without_effect_are_listed_once() -> None:
 
 def test_directives_carry_words_pairs_and_their_text() -> None:
     read = deck(".IC V(Area) = 34.97 v(b)={1+1}", ".option reltol=1e-4 dialect=ngspice noacct", ".ac dec 10 1 1meg")
-    assert {key: value(x) for key, x in read.ic[0].params.items()} == {"v(area)": 34.97, "v(b)": 2.0}
-    assert read.options[0].name == ".options"
-    assert read.options[0].params["dialect"] == Token("ngspice", Where("<netlist>", 3, 29))
-    assert read.ac is not None
-    assert read.ac.text == ".ac dec 10 1 1meg"
+    assert {key: value(x) for key, x in read.named(".ic")[0].params.items()} == {"v(area)": 34.97, "v(b)": 2.0}
+    (options,), (ac,) = read.named(".options"), read.named(".ac")
+    assert options.params["dialect"] == Token("ngspice", Where("<netlist>", 3, 29))
+    assert ac.text == ".ac dec 10 1 1meg"
 
 
 @pytest.mark.parametrize(

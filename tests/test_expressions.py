@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 import fingerspice as fs
 from fingerspice.base.errors import InputError, Where
-from fingerspice.netlist.arithmetic import FUNCTIONS
-from fingerspice.netlist.expressions import evaluate
+from fingerspice.netlist.expressions import FUNCTIONS, evaluate
 from ngspice_tools import call_ngspice
 
 HERE = Where("deck.cir", 3, 10)
@@ -70,6 +69,7 @@ def test_arithmetic_means_what_ngspice_means(text: str, value: float) -> None:
         ("2^3*2^2", 32.0),
         ("1<2 && 2<3 || 0", 1.0),
         ("atan2(1, 1)", math.pi / 4),
+        ("-(-(-(-(1))))", 1.0),
         ("1+" * 900 + "1", 901.0),
         ("(" * 25 + "-1" + ")" * 25, -1.0),
     ],

@@ -21,8 +21,7 @@ from hypothesis import strategies as st
 
 import fuzz
 from fingerspice.base.errors import InputError, Where
-from fingerspice.netlist.arithmetic import FUNCTIONS
-from fingerspice.netlist.expressions import evaluate
+from fingerspice.netlist.expressions import FUNCTIONS, evaluate
 from fingerspice.netlist.lexer import group, lex, logical_lines, split_lines
 
 HERE = Where("deck.cir", 1)
@@ -137,7 +136,7 @@ def test_memory_that_is_kept_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_reading_the_same_again_keeps_nothing() -> None:
     def blocks_after() -> int:
         fuzz.run(400, seed="again")
-        fuzz.expressions._compile.cache_clear()
+        fuzz.expressions.compiled.cache_clear()
         fuzz.gc.collect()
         return sys.getallocatedblocks()
 
@@ -188,11 +187,11 @@ def test_the_pieces_of_any_text_have_places_in_it(text: str) -> None:
     with contextlib.suppress(InputError):
         for line in logical_lines(split_lines(text), "deck.cir"):
             lexemes = lex(line)
-            group(line, lexemes, probes=True)
+            group(lexemes, probes=True)
             for lexeme in lexemes:
-                where = line.where(lexeme.position)
+                where = lexeme.where
                 written = split_lines(text)[where.line - 1][where.column - 1 :]
-                assert line.written(lexeme)[:1] == written[:1]
+                assert lexeme.written[:1] == written[:1]
 
 
 def test_the_fuzzer_runs_from_the_command_line() -> None:

@@ -16,9 +16,10 @@ import fuzz
 from fingerspice.base.errors import LONGEST_MESSAGE, FingerspiceWarning, InputError, Where
 from fingerspice.circuit import topology
 from fingerspice.netlist import flatten, reader
-from fingerspice.netlist.deck import LONGEST_TITLE, Number, parse_deck
+from fingerspice.netlist.deck import LONGEST_TITLE, parse_deck
 from fingerspice.netlist.expressions import evaluate
 from fingerspice.netlist.slips import nearest
+from fingerspice.netlist.words import Number
 
 MANY = 20_000
 

@@ -239,7 +239,7 @@ def _check_output(file: Path, deck: Path | None) -> None:
 def sweep(text: str | None, circuit: Circuit) -> AcSweep:
     """The sweep given by ``--sweep``, else the deck's, and else a sweep over the band of the skin's data."""
     from fingerspice.circuit.circuit import AcSweep
-    from fingerspice.netlist.directives import sweep_from_text
+    from fingerspice.netlist.netlist import sweep_from_text
 
     if text is None:
         return circuit.ac or AcSweep("dec", 20, 10.0, 1e5)

@@ -13,23 +13,12 @@ from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import layer_devices
-from fingerspice.netlist.files import MAX_BYTES, NATIVE_LIBRARIES, is_stream, read_stream, read_text
-from fingerspice.netlist.flatten import Directive, Flattener, Statement, directive_of
-from fingerspice.netlist.reader import DIRECTIVES, Reader, Subcircuit
-from fingerspice.netlist.scope import Call, Number, Scope, Token
+from fingerspice.netlist.files import MAX_BYTES, is_stream, read_stream, read_text
+from fingerspice.netlist.flatten import Flattener
+from fingerspice.netlist.reader import DIRECTIVES, Reader
+from fingerspice.netlist.scope import Scope
 from fingerspice.netlist.slips import with_comma
-
-__all__ = [
-    "NATIVE_LIBRARIES",
-    "Call",
-    "Deck",
-    "Directive",
-    "Number",
-    "Statement",
-    "Token",
-    "parse_deck",
-    "read_deck",
-]
+from fingerspice.netlist.words import Directive, Statement
 
 #: Largest number of characters of a title that are shown; the middle of a longer title is left out.
 LONGEST_TITLE = 200
@@ -46,12 +35,7 @@ class Deck:
 
     title: str  # The first line in printable characters (see `errors.printable`); `text` has the line as written
     statements: tuple[Statement, ...]  # Elements in the order of the file, subcircuit calls expanded
-    # tran, ac: The analyses; each may be given once
-    tran: Directive | None
-    ac: Directive | None
-    # ic, options: Start values, as in `Flattener.starts`, and options, in the order of the file
-    ic: tuple[Directive, ...]
-    options: tuple[Directive, ...]
+    directives: tuple[Directive, ...]  # Those with values, as in `Flattener.directives`
     # Names, without folder, of the included libraries of native devices, whose files are not read
     includes: tuple[str, ...]
     files: tuple[Path, ...]  # The other included files, which were read
@@ -61,20 +45,15 @@ class Deck:
     text: str  # The netlist as read
     path: Path | None  # Path of the file; None for a text
 
+    def named(self, name: str) -> list[Directive]:
+        """The directives of that name."""
+        return [directive for directive in self.directives if directive.name == name]
+
 
 def read_deck(path: str | Path) -> Deck:
-    """Read a netlist file.
+    """Read a netlist file, which may include files from its own folder only.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file. It may include files from its own folder only. Standard input (``-``), a device or a pipe is a deck
-        called ``stdin`` in the working directory.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read (missing, a folder, empty, too large, not text) or has an error.
+    Standard input (``-``), a device or a pipe is a deck called ``stdin`` in the working directory.
     """
     if is_stream(Path(path)):
         return parse_deck(read_stream(Path(path)), Path("stdin"))
@@ -82,19 +61,9 @@ def read_deck(path: str | Path) -> Deck:
 
 
 def parse_deck(text: str, path: Path | None = None) -> Deck:
-    """Read a netlist.
+    """Read a netlist, whose first line is the title.
 
-    Parameters
-    ----------
-    text : str
-        The whole netlist; its first line is the title.
-    path : Path, optional
-        Path of the file with this text; without it only the libraries of native devices can be included.
-
-    Raises
-    ------
-    InputError
-        If the text has an error; the message gives its place and the allowed alternatives.
+    `path` is that of the file with this text; without it only the libraries of native devices can be included.
     """
     file = str(path) if path is not None else "<netlist>"
     if not text.strip("\ufeff \t\r\n"):
@@ -111,28 +80,22 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
         reader.warn(problem, Where(file, 1))
     try:
         reader.read_deck(lines)
-        return _assemble(reader, title, text, path)
+        scope = Scope()
+        for definition in reader.root.params:
+            scope.define(definition)
+        scope.solve()
+        flattener = Flattener()
+        flattener.run(reader.root, scope)
     except InputError as error:
         raise with_comma(error, reader.warnings) from None
-
-
-def _assemble(reader: Reader, title: str, text: str, path: Path | None) -> Deck:
-    """Evaluate parameters, then statements, then directives."""
-    scope = Scope()
-    for formula in reader.root.params:
-        scope.define(formula)
-    scope.solve()
-    flattener = Flattener()
-    flattener.run(reader.root, scope)
-    directives = [directive_of(*analysis, scope) for analysis in reader.analyses]
-    _warn_uncalled(reader, reader.root)
+    for defined in reader.root.inner.values():
+        # In a library it is usual that some subcircuits are never called.
+        if defined.where.file == file and not (defined.called or defined.skipped):
+            reader.warn(f"subcircuit '{defined.name}' is never called, and its body was not read", defined.where)
     return Deck(
         title=title,
         statements=tuple(flattener.statements),
-        tran=_only(directives, ".tran"),
-        ac=_only(directives, ".ac"),
-        ic=tuple(flattener.starts),
-        options=tuple(d for d in directives if d.name == ".options"),
+        directives=tuple(flattener.directives),
         includes=tuple(reader.libraries),
         files=tuple(reader.files),
         unused=tuple(reader.unused),
@@ -141,21 +104,6 @@ def _assemble(reader: Reader, title: str, text: str, path: Path | None) -> Deck:
         text=text,
         path=path,
     )
-
-
-def _only(directives: list[Directive], name: str) -> Directive | None:
-    found = [directive for directive in directives if directive.name == name]
-    if len(found) > 1:
-        raise InputError(f"{name} is given twice, first at {found[0].where}", found[1].where)
-    return found[0] if found else None
-
-
-def _warn_uncalled(reader: Reader, root: Subcircuit) -> None:
-    """Warn about subcircuits that the deck itself defines and never calls; in a library that is usual."""
-    for defined in root.inner.values():
-        where = defined.line.where(defined.line.start) if defined.line is not None else None
-        if where is not None and where.file == reader.file and not (defined.called or defined.skipped):
-            reader.warn(f"subcircuit '{defined.name}' is never called, and its body was not read", where)
 
 
 def _reads_like_a_statement(title: str) -> bool:

@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping
 from typing import Literal
 
-from fingerspice.base.errors import InputError, Where
+from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
-from fingerspice.netlist.deck import Directive, Number, Token, parse_deck
 from fingerspice.netlist.slips import is_unit, nearest
+from fingerspice.netlist.words import Call, Directive, Number, Token
 from fingerspice.waveforms.bounds import check_range
 
 #: Number of outputs of a run whose .tran has no TSTEP.
@@ -35,19 +35,13 @@ _LTSPICE_OPTIONS = frozenset(
 
 def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]:
     """The numbers and the other words of a directive's line."""
-    numbers: list[Number] = []
-    words: list[str] = []
     for arg in directive.args:
-        if isinstance(arg, Number):
-            numbers.append(arg)
-        elif isinstance(arg, Token):
-            words.append(arg.text.lower())
-        else:
-            raise InputError(f"{directive.name}: {arg.name!r} is not understood; allowed: {usage}", arg.where)
-    if directive.params:
-        key = next(iter(directive.params))
-        raise InputError(f"{directive.name} takes no {key!r}; allowed: {usage}", directive.param_where[key])
-    return numbers, words
+        if isinstance(arg, Call):
+            raise InputError(f"{directive.name}: {arg.text!r} is not understood; allowed: {usage}", arg.where)
+    for key, value in directive.params.items():
+        raise InputError(f"{directive.name} takes no {key!r}; allowed: {usage}", value.key)
+    numbers = [arg for arg in directive.args if isinstance(arg, Number)]
+    return numbers, [arg.text.lower() for arg in directive.args if isinstance(arg, Token)]
 
 
 def read_tran(directive: Directive, notes: list[str]) -> Tran:
@@ -69,13 +63,14 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
     for what, number in (("TSTOP", stop), ("TMAX", longest)):
         _require(number is None or 1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 s")
     if step is None or step.value == 0.0:
-        every = longest.value if longest else stop.value / LTSPICE_OUTPUTS
-        step = Number(every, f"{every:g}", directive.where) if longest is None else longest
-        if longest is None:
-            notes.append(
-                f"{directive.where}: {directive.text.strip()!r} has no TSTEP, which LTspice does not need: "
-                f"{LTSPICE_OUTPUTS:,} outputs, one every {every:g} s"
-            )
+        step = longest
+    if step is None:
+        every = stop.value / LTSPICE_OUTPUTS
+        step = Number(every, f"{every:g}", directive.where)
+        notes.append(
+            f"{directive.where}: {directive.text.strip()!r} has no TSTEP, which LTspice does not need: "
+            f"{LTSPICE_OUTPUTS:,} outputs, one every {every:g} s"
+        )
     _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
     _require(1e-30 <= step.value <= 1e30, "TSTEP", step, "1e-30 to 1e30 s")
     _require(step.value <= stop.value, "TSTEP", step, f"at most TSTOP = {stop.text} (the output step comes first)")
@@ -109,7 +104,7 @@ def read_ac(directive: Directive) -> AcSweep:
     return AcSweep(scale, int(n.value), low.value, high.value)
 
 
-def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...]) -> dict[str, float]:
+def read_initial(directives: list[Directive], elements: tuple[Element, ...]) -> dict[str, float]:
     """``.ic v(node)=value``: start values by canonical node, in V, or in mm^2 of an area node."""
     usage = "allowed: .ic v(node)=value"
     nodes = {node: None for e in elements for node in e.nodes}  # an ordered set
@@ -119,7 +114,7 @@ def read_initial(directives: tuple[Directive, ...], elements: tuple[Element, ...
         if directive.args:
             raise InputError(f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
         for key, value in directive.params.items():
-            place = directive.param_where[key]
+            place = value.key
             if not (key.startswith("v(") and key.endswith(")")):
                 raise InputError(f".ic {key!r} is not understood; {usage}", place)
             if not isinstance(value, Number):
@@ -163,21 +158,17 @@ def unused_starts(initial: Mapping[str, float], elements: tuple[Element, ...], u
     return (*out, *(f"IC= of {e.name}" for e in elements if e.initial is not None and not uic))
 
 
-def read_options(directives: tuple[Directive, ...]) -> tuple[str, tuple[str, ...]]:
+def read_options(directives: list[Directive]) -> tuple[str, tuple[str, ...]]:
     """The reading of Eq. 7 that ``work`` selects, and the names of ngspice's and LTspice's options, without effect."""
     work, unused = None, []
     for directive in directives:
-        names: list[tuple[str, Number | Token | None, Where]] = [
-            (key, value, directive.param_where[key]) for key, value in directive.params.items()
-        ]
+        names = [(key, value.text.lower(), value.key) for key, value in directive.params.items()]
         for arg in directive.args:
             if not isinstance(arg, Token):
-                text = arg.text if isinstance(arg, Number) else arg.name
-                raise InputError(f".options {text!r} is not understood; allowed: .options name=value", arg.where)
-            names.append((arg.text.lower(), None, arg.where))
-        for key, value, place in names:
+                raise InputError(f".options {arg.text!r} is not understood; allowed: .options name=value", arg.where)
+            names.append((arg.text.lower(), "", arg.where))
+        for key, text, place in names:
             if key == "work":
-                text = value.text.lower() if value is not None else ""
                 if text not in WORK_READINGS:
                     raise InputError(f".options work is {text!r}; allowed: {' or '.join(WORK_READINGS)}", place)
                 if work not in (None, text):
@@ -190,20 +181,3 @@ def read_options(directives: tuple[Directive, ...]) -> tuple[str, tuple[str, ...
                 known = f"work={'|'.join(WORK_READINGS)}, and those of ngspice and LTspice, which have no effect here"
                 raise InputError(f"unknown option {key!r}{hint}; allowed: {known}", place)
     return work or "gap", tuple(dict.fromkeys(unused))
-
-
-def sweep_from_text(text: str) -> AcSweep:
-    """A sweep from text such as ``dec 10 10 100k``.
-
-    Raises
-    ------
-    InputError
-        If the text is not a sweep.
-    """
-    try:
-        deck = parse_deck(f"sweep\n.ac {text}\n")
-        if deck.ac is None:
-            raise InputError("not a sweep")
-        return read_ac(deck.ac)
-    except InputError as error:
-        raise InputError(f"{text!r}: {error.message}") from None

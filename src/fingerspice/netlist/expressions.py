@@ -1,9 +1,6 @@
-"""Evaluation of netlist arithmetic such as `{2*d + 1u}`, by a whitelist of `ast` nodes, never by `eval`.
+"""Arithmetic of netlists such as `{2*d + 1u}`: compiled once, and evaluated with the values of parameters.
 
-There are three steps. `arithmetic` divides the text into SPICE numbers, names and operators, and checks their order and
-nesting, which finds every syntax error. Python's own parser then builds a tree. This module evaluates the tree, which
-may contain only the kinds of nodes in the tables below.
-
+From loose to tight an expression has `a ? b : c`, `||`, `&&`, comparisons, `+ -`, `* /`, signs, and `^` or `**`.
 Functions have the same meaning as in ngspice's `.param`; `log` is the natural logarithm. An expression that ngspice and
 mathematics read differently (`2^3^2`, a negative base) is refused. ngspice 39 does not know `pi`, `e`, `atan2` and
 `hypot`.
@@ -11,195 +8,277 @@ mathematics read differently (`2^3^2`, a negative base) is refused. ngspice 39 d
 
 from __future__ import annotations
 
-import ast
 import math
 import operator
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import TypeAlias
+from functools import lru_cache, partial
+from typing import NamedTuple, TypeAlias
 
 from fingerspice.base.errors import InputError, Where
-from fingerspice.base.units import suspicious_mega
-from fingerspice.netlist.arithmetic import (
-    CONSTANTS,
-    FUNCTIONS,
-    Lexeme,
-    Problem,
-    check_order,
-    lexemes_of,
-    number_of,
-    power,
-    to_python,
-)
+from fingerspice.base.units import parse_number, spice_text, suspicious_mega
 from fingerspice.netlist.slips import nearest
 
-#: Largest number of characters of an expression.
-MAX_LENGTH = 2000
+#: Limits: characters of an expression, nested brackets, `?` in an expression, and signs in a row.
+MAX_LENGTH, MAX_DEPTH, MAX_QUESTIONS, MAX_SIGNS = 2000, 25, 25, 3
 
-_BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Pow: power,
+CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
+#: Function from the values of parameters, whose names are in lower case, to the value of a part of an expression.
+Term: TypeAlias = Callable[[Mapping[str, float]], float]
+
+
+class Problem(Exception):
+    """An error in an expression, with the position of the character at fault."""
+
+    def __init__(self, message: str, position: int = 0) -> None:
+        self.message = message
+        self.position = position
+
+
+def _power(base: float, exponent: float) -> float:
+    """`base ^ exponent`; a negative base needs an even exponent, as ngspice takes the base's absolute value."""
+    if base < 0.0 and not (exponent % 2.0 == 0.0):
+        raise Problem(
+            f"({base:g})^({exponent:g}) has a negative base, whose absolute value ngspice takes: "
+            "write pow(x, y) or abs(x)^y"
+        )
+    return math.pow(base, exponent)
+
+
+def _pwr(base: float, exponent: float) -> float:
+    if base < 0.0:
+        raise Problem("pwr of a negative base differs between simulators: write pow(x, y) or pow(abs(x), y)")
+    return math.pow(base, exponent)
+
+
+_AS_IN_MATH = "sqrt exp log10 sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh floor ceil"
+#: From a name to the function, and its number of arguments.
+FUNCTIONS: Mapping[str, tuple[Callable[..., float], int]] = {
+    **{name: (getattr(math, name), 1) for name in _AS_IN_MATH.split()},
+    "ln": (math.log, 1),
+    "log": (math.log, 1),
+    "arctan": (math.atan, 1),
+    "abs": (abs, 1),
+    "sqr": (lambda x: x * x, 1),
+    "sgn": (lambda x: (x > 0.0) - (x < 0.0), 1),
+    "int": (math.trunc, 1),
+    "nint": (round, 1),
+    "min": (min, 2),
+    "max": (max, 2),
+    "pow": (math.pow, 2),
+    "pwr": (_pwr, 2),
+    "atan2": (math.atan2, 2),
+    "hypot": (math.hypot, 2),
+    "ternary_fcn": (lambda condition, yes, no: yes if condition else no, 3),
 }
-_COMPARE: Mapping[type[ast.cmpop], Callable[[float, float], bool]] = {
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
-    ast.Eq: operator.eq,
-    ast.NotEq: operator.ne,
-}
-#: The place of an expression in its file: the place of its first character or, for an expression over several lines, a
-#: function from a character's position to its place.
-Place: TypeAlias = Where | Callable[[int], Where]
+#: Names of functions in ngspice 39, where a parameter of such a name is not read: `{max + 1}` is 1.
+RESERVED = frozenset((*FUNCTIONS, "agauss", "aunif", "gauss", "limit", "unif"))
+
+_COMPARISONS = {
+    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq, "!=": operator.ne,
+}  # fmt: skip
+#: Operators between two values, from loose to tight. `||` and `&&` have the function of all their values' truths.
+_LEVELS: tuple[Mapping[str, Callable[..., float]], ...] = (
+    {"||": any},
+    {"&&": all},
+    _COMPARISONS,
+    {"+": operator.add, "-": operator.sub},
+    {"*": operator.mul, "/": operator.truediv},
+)
+_POWERS = ("^", "**")
+#: After these a minus stands before one value of several.
+_OPERATORS = frozenset(("?", ":", *_POWERS, *(sign for level in _LEVELS for sign in level)))
+
+_LEX = re.compile(
+    r"(?P<space>\s+)"
+    r"|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[\w.]*)"
+    r"|(?P<name>[A-Za-z_]\w*)"
+    r"|(?P<op>\*\*|&&|\|\||[<>=!]=|[-+*/^<>(),?:])"
+)
 
 
-@dataclass(frozen=True, slots=True)
-class Expression:
-    """A checked expression."""
-
+class _Piece(NamedTuple):
+    kind: str  # number, name, call, op or end
     text: str
-    names: tuple[str, ...]  # The names in the expression, constants included, in lower case, each once
-    positions: Mapping[str, int]  # Position of the first use of each name
-    # mega, mega_position: The first number written with a capital M, or an empty text, and its position
-    mega: str
-    mega_position: int
-    tree: ast.expr
-    value: float | None  # Value of an expression that is a single number; None for all others
-
-    def evaluate(self, names: Mapping[str, float], where: Place) -> float:
-        """Value of the expression, given the values of names (lower case); `where` is its place, for messages."""
-        if self.value is not None:
-            return self.value
-        try:
-            return _finite(self, names)
-        except Problem as problem:
-            raise InputError(problem.message, _at(where, problem.position)) from None
+    position: int
 
 
-def evaluate(text: str, names: Mapping[str, float], where: Where) -> float:
-    """Value of an expression without its braces or quotes.
-
-    Parameters
-    ----------
-    text : str
-        Arithmetic with + - * / ** ^, comparisons, && ||, `a ? b : c`, SPICE numbers, functions and names.
-    names : Mapping[str, float]
-        Values of the names; matched without case.
-    where : Where
-        The place of the first character, for messages.
-
-    Raises
-    ------
-    InputError
-        If the text is not arithmetic, a name or function is unknown, or the result is not finite.
-    """
-    lower = {name.lower(): value for name, value in names.items()}
-    return compile_expression(text, where).evaluate(lower, where)
-
-
-def compile_expression(text: str, where: Place) -> Expression:
-    """Check an expression, so that it can be evaluated many times.
-
-    Raises
-    ------
-    InputError
-        If the text is not arithmetic.
-    """
-    try:
-        return _compile(text)
-    except Problem as problem:
-        raise InputError(problem.message, _at(where, problem.position)) from None
+def _pieces(text: str) -> list[_Piece]:
+    """Numbers, names, names before a bracket (calls), operators, and at last the end."""
+    pieces: list[_Piece] = []
+    position = questions = 0
+    while position < len(text):
+        match = _LEX.match(text, position)
+        if match is None:
+            hint = ": a comparison is ==" if text[position] == "=" else ""
+            raise Problem(f"{text[position]!r} does not belong in arithmetic{hint}", position)
+        kind, found = match.lastgroup or "", match.group()
+        questions += found == "?"
+        if questions > MAX_QUESTIONS:
+            raise Problem(f"more than {MAX_QUESTIONS} '?' in one expression", position)
+        if found == "(" and pieces and pieces[-1].kind == "name":
+            pieces[-1] = pieces[-1]._replace(kind="call")
+        if kind != "space":
+            pieces.append(_Piece(kind, found, position))
+        position = match.end()
+    return [*pieces, _Piece("end", "", len(text))]
 
 
-def _at(where: Place, position: int) -> Where:
-    if callable(where):
-        return where(position)
-    return Where(where.file, where.line, where.column + position)
+class _Parser:
+    """Recursive descent, only as deep as the brackets are nested: chains such as `a + b - c` are loops."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.pieces = _pieces(text)
+        self.names: dict[str, int] = {}
+        self._at = 0
+        self._brackets: list[tuple[_Piece, bool]] = []  # open, each with whether it encloses a function's arguments
+
+    def whole(self) -> Term:
+        """The whole text as one expression."""
+        term = self._condition()
+        self._refuse_going_on()
+        return term
+
+    def _take(self, *texts: str) -> _Piece | None:
+        """The next piece if it is one of these."""
+        piece = self.pieces[self._at]
+        if piece.text not in texts:
+            return None
+        self._at += 1
+        return piece
+
+    def _refuse_going_on(self) -> None:
+        """Refuse what cannot follow a complete value."""
+        kind, text, position = self.pieces[self._at]
+        if kind == "end":
+            if self._brackets:
+                raise Problem("'(' is never closed", self._brackets[-1][0].position)
+        elif text == ")":
+            if not self._brackets:
+                raise Problem("')' without an opening '('", position)
+        elif text == ":":
+            raise Problem("':' without its '?' (a ? b : c)", position)
+        elif text != ",":
+            raise Problem(f"an operator is missing before '{text}'", position)
+        elif not (self._brackets and self._brackets[-1][1]):
+            raise Problem("',' outside the arguments of a function", position)
+
+    def _condition(self) -> Term:
+        """`a ? b : c`; conditions after `:` group to the right."""
+        test = self._chain(0)
+        asked = self._take("?")
+        if asked is None:
+            return test
+        yes = self._chain(0)
+        nested = self._take("?")
+        if nested is not None:  # ngspice 39 takes 5 as 1?0?5:6:7
+            raise Problem("a condition between '?' and ':' has two readings: use brackets", nested.position)
+        if self._take(":") is None:
+            self._refuse_going_on()
+            raise Problem("'?' without its ':' (a ? b : c)", asked.position)
+        no = self._condition()
+        return lambda names: yes(names) if test(names) != 0.0 else no(names)
+
+    def _chain(self, level: int) -> Term:
+        """Values joined by the operators of a level; `a<b<c` is refused, which is ambiguous."""
+        if level == len(_LEVELS):
+            return self._signed()
+        operators = _LEVELS[level]
+        first, rest = self._chain(level + 1), list[tuple[Callable[..., float], Term]]()
+        while (found := self._take(*operators)) is not None:
+            if rest and operators is _COMPARISONS:
+                raise Problem(f"a second '{found.text}' in a row has two readings: use brackets", found.position)
+            rest.append((operators[found.text], self._chain(level + 1)))
+        if not rest:
+            return first
+        if operators is _LEVELS[0] or operators is _LEVELS[1]:
+            decide = rest[0][0]
+            terms = [first, *(term for _, term in rest)]
+            return lambda names: float(decide(term(names) != 0.0 for term in terms))
+        return partial(_folded, first, rest)
+
+    def _signed(self, of_power: bool = False) -> Term:
+        """A value behind its signs.
+
+        ngspice moves a minus after an operator to the next number in the text, wherever that stands, so that `2*-(3)+4`
+        is 2 there, and applies it before a power, so that `2*-3^2` is 18: such a minus is refused.
+        """
+        begin, negative = self._at, False
+        while (sign := self._take("+", "-")) is not None:
+            negative ^= sign.text == "-"
+            if self._at - begin > MAX_SIGNS:
+                raise Problem(f"more than {MAX_SIGNS} signs in a row", sign.position)
+        end = self._at
+        value = self._raised(of_power)
+        for index in range(max(begin, 1), end):
+            before, sign, number, after = self.pieces[index - 1 : index + 3]
+            moved = number.kind != "number" or (after.text in _POWERS and before.text not in _POWERS)
+            if sign.text == "-" and before.text in _OPERATORS and moved:
+                problem = "a '-' after an operator has two readings here: use brackets, as in 2*(-x)"
+                raise Problem(problem, sign.position)
+        return (lambda names: -value(names)) if negative else value
+
+    def _raised(self, of_power: bool) -> Term:
+        """`a^b`; `a^b^c` is refused, which ngspice groups to the left and mathematics to the right."""
+        base = self._value()
+        found = self._take(*_POWERS)
+        if found is None:
+            return base
+        if of_power:
+            raise Problem("a second '^' in a row has two readings: use brackets", found.position)
+        return partial(_folded, base, [(_power, self._signed(of_power=True))])
+
+    def _value(self) -> Term:
+        """A number, a name, or what is in brackets."""
+        piece = self.pieces[self._at]
+        kind, text, position = piece
+        if text == "(":
+            return self._in_brackets(False)[0]
+        if kind == "op":
+            raise Problem(f"a value is missing before '{text}'", position)
+        if kind == "end":
+            self._refuse_going_on()
+            raise Problem("a value is missing at the end" if self._at else "the expression is empty", position)
+        self._at += 1
+        name = text.lower()
+        if kind == "number":
+            number = _number_of(piece)
+            return lambda names: number
+        if kind == "name":
+            self.names.setdefault(name, position)
+            return partial(_looked_up, piece)
+        if name not in FUNCTIONS:
+            hint = nearest(text, FUNCTIONS) or f"; functions are {' '.join(FUNCTIONS)}"
+            raise Problem(f"'{text}' is not a function{hint}", position)
+        return partial(_called, name, self._in_brackets(True), self.text)
+
+    def _in_brackets(self, of_call: bool) -> list[Term]:
+        """The expressions in brackets: one, or a function's arguments."""
+        opening = self.pieces[self._at]
+        self._brackets.append((opening, of_call))
+        if len(self._brackets) > MAX_DEPTH:
+            raise Problem(f"brackets nested deeper than {MAX_DEPTH}", opening.position)
+        terms: list[Term] = []
+        while self.pieces[self._at].text != ")" or not terms:
+            self._at += 1  # the opening bracket, or a comma
+            terms.append(self._condition())
+            self._refuse_going_on()
+        self._at += 1
+        self._brackets.pop()
+        return terms
 
 
-@lru_cache(maxsize=8192)
-def _compile(text: str) -> Expression:
-    if len(text) > MAX_LENGTH:
-        raise Problem(f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
-    lexemes = lexemes_of(text)
-    check_order(lexemes, len(text))
-    positions: dict[str, int] = {}
-    for lexeme in lexemes:
-        if lexeme.kind == "name":
-            positions.setdefault(lexeme.text.lower(), lexeme.position)
-    nothing = Lexeme("", "", 0)
-    mega = next((x for x in lexemes if x.kind == "number" and suspicious_mega(x.text)), nothing)
-    if len(lexemes) == 1 and lexemes[0].kind == "number":
-        value = number_of(lexemes[0])
-        return Expression(text, (), {}, mega.text, mega.position, ast.Constant(value), value)
-    python = to_python(lexemes, {name: number for number, name in enumerate(positions)})
-    try:
-        tree = ast.parse(python, mode="eval").body
-    except (SyntaxError, RecursionError, MemoryError) as error:  # never expected, as the checks above find all errors
-        raise Problem(f"'{text}' is not arithmetic ({type(error).__name__})") from None
-    return Expression(text, tuple(positions), positions, mega.text, mega.position, tree, None)
-
-
-def _finite(expression: Expression, names: Mapping[str, float]) -> float:
-    """Value of an expression; refuses a value that is not a finite number."""
-    try:
-        value = float(_walk(expression.tree, names, expression))
-    except RecursionError:  # never expected, because of the limits of nesting
-        raise Problem(f"'{expression.text}' is nested too deeply") from None
-    except ZeroDivisionError:
-        raise Problem(f"'{expression.text}' divides by zero") from None
-    except OverflowError:
-        raise Problem(f"'{expression.text}' is too large for a number (1.8e308)") from None
-    except ValueError:
-        raise Problem(f"'{expression.text}' leaves the domain of one of its functions") from None
-    if not math.isfinite(value):
-        raise Problem(f"'{expression.text}' gives {value:g}, not a finite number")
+def _folded(first: Term, rest: list[tuple[Callable[..., float], Term]], names: Mapping[str, float]) -> float:
+    """Value of a chain, from left to right."""
+    value = first(names)
+    for function, term in rest:
+        value = float(function(value, term(names)))
     return value
 
 
-def _walk(node: ast.expr, names: Mapping[str, float], expression: Expression) -> float:
-    """Value of one node of an allowed kind; the recursion is only as deep as the nesting of brackets."""
-    if isinstance(node, ast.Constant) and type(node.value) is float:
-        return node.value
-    if isinstance(node, ast.Name):
-        return _look_up(expression.names[int(node.id[1:])], names, expression)
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
-        value = _walk(node.operand, names, expression)
-        return -value if isinstance(node.op, ast.USub) else value
-    if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
-        return _walk_chain(node, names, expression)
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-        return _call(node, names, expression)
-    if isinstance(node, ast.Compare) and len(node.ops) == 1:
-        left, right = _walk(node.left, names, expression), _walk(node.comparators[0], names, expression)
-        return float(_COMPARE[type(node.ops[0])](left, right))
-    if isinstance(node, ast.BoolOp):
-        truths = (_walk(value, names, expression) != 0.0 for value in node.values)
-        return float(all(truths) if isinstance(node.op, ast.And) else any(truths))
-    if isinstance(node, ast.IfExp):
-        chosen = node.body if _walk(node.test, names, expression) != 0.0 else node.orelse
-        return _walk(chosen, names, expression)
-    raise Problem(f"'{expression.text}' is not arithmetic")
-
-
-def _walk_chain(node: ast.BinOp, names: Mapping[str, float], expression: Expression) -> float:
-    """Value of a chain `a + b - c ...` by a loop, because its tree is as deep as the chain is long."""
-    spine: list[ast.BinOp] = []
-    left: ast.expr = node
-    while isinstance(left, ast.BinOp):
-        spine.append(left)
-        left = left.left
-    value = _walk(left, names, expression)
-    for step in reversed(spine):
-        value = _BINARY[type(step.op)](value, _walk(step.right, names, expression))
-    return value
-
-
-def _look_up(name: str, names: Mapping[str, float], expression: Expression) -> float:
+def _looked_up(piece: _Piece, names: Mapping[str, float]) -> float:
+    name = piece.text.lower()
     if name in names:
         return names[name]
     if name in CONSTANTS:
@@ -207,17 +286,84 @@ def _look_up(name: str, names: Mapping[str, float], expression: Expression) -> f
     hint = f": the function is written {name}(...)" if name in FUNCTIONS else nearest(name, [*CONSTANTS, *names])
     if name == "time":
         hint = ": a function of time is SIN, PULSE or PWL, or given in Python, sources={'V1': f}"
-    position = expression.positions[name]
-    written = expression.text[position : position + len(name)]
-    raise Problem(f"parameter '{written}' is not defined{hint}", position)
+    raise Problem(f"parameter '{piece.text}' is not defined{hint}", piece.position)
 
 
-def _call(node: ast.Call, names: Mapping[str, float], expression: Expression) -> float:
-    name = node.func.id[2:] if isinstance(node.func, ast.Name) else ""
+def _called(name: str, arguments: list[Term], text: str, names: Mapping[str, float]) -> float:
     function, wanted = FUNCTIONS[name]
-    given = len(node.args)
+    given = len(arguments)
     if given != wanted:
         more = f"; write {name}({name}(a, b), c), as ngspice 39 leaves some out" if given > 2 == wanted else ""
         plural = "" if wanted == 1 else "s"
-        raise Problem(f"{name} takes {wanted} argument{plural}, {given} given: {expression.text}{more}")
-    return float(function(*(_walk(argument, names, expression) for argument in node.args)))
+        raise Problem(f"{name} takes {wanted} argument{plural}, {given} given: {text}{more}")
+    return float(function(*(argument(names) for argument in arguments)))
+
+
+def _number_of(piece: _Piece) -> float:
+    """Value of a number; refuses mil, which ngspice's arithmetic takes for milli."""
+    try:
+        value = parse_number(piece.text)
+    except ValueError as error:
+        raise Problem(str(error), piece.position) from None
+    if piece.text.lower().lstrip("0123456789.e+-").startswith("mil"):
+        problem = f"'{piece.text}' differs between simulators, ngspice 39 reads milli here: write {spice_text(value)}"
+        raise Problem(problem, piece.position)
+    return value
+
+
+_FAILURES: Mapping[type[Exception], str] = {
+    ZeroDivisionError: "divides by zero",
+    OverflowError: "is too large for a number (1.8e308)",
+    ValueError: "leaves the domain of one of its functions",
+}
+
+
+class Expression(NamedTuple):
+    """A compiled expression."""
+
+    text: str
+    names: Mapping[str, int]  # Names in lower case, constants included, and the position of each one's first use
+    mega: tuple[str, int] | None  # The first number written with a capital M, and its position
+    term: Term
+
+    def evaluate(self, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
+        """Value of the expression, given the values of names (lower case); a value that is not finite is refused."""
+        position = 0
+        try:
+            value = float(self.term(names))
+            if math.isfinite(value):
+                return value
+            message = f"'{self.text}' gives {value:g}, not a finite number"
+        except Problem as problem:
+            message, position = problem.message, problem.position
+        except (ZeroDivisionError, OverflowError, ValueError) as error:
+            message = f"'{self.text}' {_FAILURES[type(error)]}"
+        raise InputError(message, place(position))
+
+
+def compile_expression(text: str, place: Callable[[int], Where]) -> Expression:
+    """Check an expression, without its braces or quotes; `place` gives the place of one of its characters."""
+    try:
+        return compiled(text)
+    except Problem as problem:
+        raise InputError(problem.message, place(problem.position)) from None
+
+
+@lru_cache(maxsize=8192)
+def compiled(text: str) -> Expression:
+    """The expression of a text; raises `Problem` if it is not arithmetic."""
+    if len(text) > MAX_LENGTH:
+        raise Problem(f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
+    parser = _Parser(text)
+    term = parser.whole()
+    mega = next(((p.text, p.position) for p in parser.pieces if p.kind == "number" and suspicious_mega(p.text)), None)
+    return Expression(text, parser.names, mega, term)
+
+
+def evaluate(text: str, names: Mapping[str, float], where: Where) -> float:
+    """Value of an expression, whose names are matched without case; `where` is the place of its first character."""
+
+    def place(position: int) -> Where:
+        return Where(where.file, where.line, where.column + position)
+
+    return compile_expression(text, place).evaluate({name.lower(): value for name, value in names.items()}, place)

@@ -14,7 +14,12 @@ from fingerspice.base.errors import InputError, Where
 from fingerspice.netlist.lexer import split_lines
 from fingerspice.netlist.slips import closest, nearest
 
+#: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
 LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
+NATIVE_LIBRARIES = tuple(LIBRARIES.values())
+
+#: Largest size of a file, and of all the files that a deck's sources name, bytes.
+MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30
 
 
 @cache
@@ -29,48 +34,31 @@ def library_text(law: str) -> str:
     raise InputError(f"{name} is missing from this installation; reinstall fingerspice")
 
 
-MAX_BYTES = 64 * 2**20
-#: Largest total size of the files that a deck's sources name, bytes.
-MAX_SOURCE_BYTES = 2**30
-
-#: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
-NATIVE_LIBRARIES = tuple(LIBRARIES.values())
-
-
 def read_text(path: Path, shown: str, where: Where | None = None, root: Path | None = None) -> str:
-    """Text of a netlist or table.
+    """Text of a netlist or table in UTF-8, Latin-1, or UTF-16 with a mark.
 
-    Parameters
-    ----------
-    path : Path
-    shown : str
-        The path as the user wrote it.
-    where : Where, optional
-        Place of the line that names the file.
-    root : Path, optional
-        Folder outside of which no file's name may appear in a message.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, not an ordinary file, too large, or not text in UTF-8, Latin-1 or UTF-16 with a mark.
+    `shown` is the path as the user wrote it at the place `where`; files outside the folder `root` are not proposed.
     """
     try:
         if path.is_dir():
-            raise InputError(f"'{shown}' is a folder, not a file", where)
-        if not path.exists():
-            raise InputError(f"'{shown}' does not exist{_similar_file(path, shown, root)}", where)
-        if not path.is_file():
-            raise InputError(f"'{shown}' is not an ordinary file", where)
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"'{shown}' is larger than {MAX_BYTES >> 20} MiB", where)
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:  # InputError is a ValueError
-        if isinstance(error, InputError):
-            raise
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise InputError(f"'{shown}' cannot be read: {reason}", where) from None
-    return _decoded(data, shown, where)
+            problem = "is a folder, not a file"
+        elif not path.exists():
+            problem = f"does not exist{_similar_file(path, shown, root)}"
+        elif not path.is_file():
+            problem = "is not an ordinary file"
+        elif path.stat().st_size > MAX_BYTES:
+            problem = f"is larger than {MAX_BYTES >> 20} MiB"
+        else:
+            return _decoded(path.read_bytes(), shown, where)
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        problem = f"cannot be read: {_reason(error)}"
+    raise InputError(f"'{shown}' {problem}", where)
+
+
+def _reason(error: Exception) -> str:
+    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
 def is_stream(path: Path) -> bool:
@@ -82,18 +70,12 @@ def is_stream(path: Path) -> bool:
 
 
 def read_stream(path: Path) -> str:
-    """Text of a deck from standard input, a device or a pipe.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, is too large, or is no text.
-    """
+    """Text of a deck from standard input, a device or a pipe."""
     try:
         with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)
     except OSError as error:
-        raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from None
+        raise InputError(f"'{path}' cannot be read: {_reason(error)}") from None
     if len(data) > MAX_BYTES:
         raise InputError(f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
     return _decoded(data, str(path), None)
@@ -128,20 +110,12 @@ class SourceFiles:
     size: int = 0  # Total size of the files named so far, bytes; a file counts each time that it is named
 
     def find(self, name: str, where: Where) -> Path:
-        """Path of a file named at the place `where`.
-
-        Raises
-        ------
-        InputError
-            If the file is outside the folder, its name is no file's, or the files are too large in all; the message has
-            the place.
-        """
+        """Path of a file named at the place `where`; one outside the folder is refused, and too much in all."""
         try:
             path = Path(name).expanduser() if self.anywhere else self._below(name, where)
             size = path.stat().st_size if path.is_file() else None
         except (OSError, RuntimeError) as error:  # a name that is too long, or the folder of an unknown user
-            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-            raise InputError(f"'{name}' cannot be read: {reason}", where) from None
+            raise InputError(f"'{name}' cannot be read: {_reason(error)}", where) from None
         if size is not None:
             self.size += size
             if self.size > MAX_SOURCE_BYTES:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.lexer import Group, Lexeme, Line, group, lex
-from fingerspice.netlist.reader import DIRECTIVES, Subcircuit
-from fingerspice.netlist.scope import Bare, Call, Number, Scope, Token, Value
+from fingerspice.netlist.reader import DIRECTIVES, DirectiveLine, Subcircuit
+from fingerspice.netlist.scope import Bare, Scope
 from fingerspice.netlist.slips import nearest, stray_word
+from fingerspice.netlist.words import Directive, Number, Statement, Value
 
 #: Limits of subcircuit calls: total number of expanded lines and characters, nesting, and characters of a flat name.
 MAX_EXPANDED = 100_000
@@ -17,57 +19,37 @@ MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 MAX_NAME = 400
 
-_VALUED = {"R": "resistor", "C": "capacitor", "V": "voltage source", "I": "current source"}
+
+class Kind(NamedTuple):
+    """What is read of the elements with a letter, besides X, which has two nodes."""
+
+    what: str
+    # Kind of text that is evaluated without braces: a word of a resistor or capacitor names a parameter, those of a
+    # source are keywords (DC, SIN)
+    bare: Bare = "nothing"
+    value: tuple[str, ...] = ()  # Other names of the value
+    beside: tuple[str, ...] = ()  # LTspice's parasitics, which become elements: rser in series, all others in parallel
+    data: tuple[str, ...] = ()  # Data of a part that LTspice and Qucs-S write and no calculation uses
+
+
+KINDS = {
+    "R": Kind("resistor", "name", ("r", "resistance"), (), ("tol", "pwr", "tc1", "tc2")),
+    "C": Kind("capacitor", "name", ("c", "capacitance"), ("rser", "rpar", "cpar"),
+              ("tol", "v", "irms", "mfg", "pn", "type", "tc1", "tc2")),
+    "V": Kind("voltage source", beside=("rser", "cpar")),
+    "I": Kind("current source"),
+}  # fmt: skip
 _ELSEWHERE = {
     "A": "an XSPICE model",
     "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
     "D": "a diode",
-    "E": "a controlled source",
-    "F": "a controlled source",
-    "G": "a controlled source",
-    "H": "a controlled source",
-    "J": "a transistor",
     "K": "a coupled inductor",
     "L": "an inductor",
-    "M": "a transistor",
-    "O": "a transmission line",
-    "Q": "a transistor",
-    "S": "a switch",
-    "T": "a transmission line",
-    "U": "a transmission line",
-    "W": "a switch",
-    "Y": "a transmission line",
-    "Z": "a transistor",
+    **dict.fromkeys("EFGH", "a controlled source"),
+    **dict.fromkeys("JMQZ", "a transistor"),
+    **dict.fromkeys("OTUY", "a transmission line"),
+    **dict.fromkeys("SW", "a switch"),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Statement:
-    """One element of the flat circuit."""
-
-    name: str  # Name as written, with the names of the enclosing calls in front: ``Xfinger.Xgap``
-    letter: str  # R, C, V, I, or X for a native device
-    # Nodes in lower case, ground as ``0``; a node inside a subcircuit has the names of the enclosing calls in front
-    nodes: tuple[str, ...]
-    node_names: tuple[str, ...]  # The same nodes as written
-    device: str | None  # A native device's name in upper case
-    body: tuple[Number | Token | Call, ...]  # The words after the nodes; empty for an X
-    params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
-    param_where: dict[str, Where]  # Places of the keys
-    where: Where  # Place of the name
-
-
-@dataclass(frozen=True, slots=True)
-class Directive:
-    """A line such as `.tran 10u 50m uic`."""
-
-    name: str  # Name in lower case, with its dot
-    args: tuple[Number | Token | Call, ...]  # Words of the line, numbers evaluated
-    # Values of `key=value` pairs by key in lower case; `.ic v(area)=1` has the key ``v(area)``
-    params: dict[str, Value]
-    param_where: dict[str, Where]  # Places of the keys
-    where: Where  # Place of the dot
-    text: str  # The line as written, continuations joined
 
 
 @dataclass(slots=True)
@@ -88,47 +70,34 @@ class _Instance:
             return "0", name
         return self.ports.get(lower) or (f"{self.prefix}{lower}".lower(), f"{self.prefix}{name}")
 
+    def nodes(self, words: list[Lexeme]) -> list[tuple[str, str]]:
+        """Canonical and written names of nodes."""
+        for word in words:
+            if word.kind != "word":
+                raise InputError(f"{word.written} stands where a node's name belongs", word.where)
+        return [self.node(word.text) for word in words]
+
     def find(self, name: str) -> tuple[Subcircuit, _Instance] | None:
         """The definition of that name visible here, and the instance that contains it; None if there is none."""
-        instance: _Instance | None = self
-        while instance is not None:
-            if name in instance.definition.inner:
-                return instance.definition.inner[name], instance
-            instance = instance.outside
-        return None
+        if name in self.definition.inner:
+            return self.definition.inner[name], self
+        return self.outside.find(name) if self.outside is not None else None
 
     def visible(self) -> list[str]:
-        """Names that an X line may call from here."""
-        names = list(layer_devices())
-        instance: _Instance | None = self
-        while instance is not None:
-            names += [sub.name for sub in instance.definition.inner.values()]
-            instance = instance.outside
-        return names
-
-
-def directive_of(name: str, line: Line, rest: int, scope: Scope) -> Directive:
-    """A directive whose arguments start at position `rest`, evaluated in a scope."""
-    words = group(line, lex(line, rest), probes=True)
-    args = scope.words(line, words.words)
-    start = line.start
-    return Directive(name, args, *scope.pairs(line, words), line.where(start), line.text[start:])
+        """Names of the subcircuits that an X line may call from here."""
+        own = [sub.name for sub in self.definition.inner.values()]
+        return own if self.outside is None else [*own, *self.outside.visible()]
 
 
 class Flattener:
-    """Turns the element lines of a deck into statements.
+    """Turns the lines of a deck into statements and directives.
 
-    Attributes
-    ----------
-    statements : list of Statement
-        Statements in the order of the deck; a call is replaced by the statements of its subcircuit.
-    starts : list of Directive
-        The `.ic` lines, also of subcircuits, with the nodes of the flat circuit.
+    A call is replaced by the statements of its subcircuit. An `.ic` line has the nodes of the flat circuit.
     """
 
     def __init__(self) -> None:
         self.statements: list[Statement] = []
-        self.starts: list[Directive] = []
+        self.directives: list[Directive] = []
         self._names: dict[str, Where] = {}
         self._expanded = 0
         self._expanded_text = 0
@@ -140,20 +109,16 @@ class Flattener:
     def _expand(self, instance: _Instance) -> None:
         for line in instance.definition.elements:
             self._element(line, instance)
-        for line, rest in instance.definition.starts:
-            self.starts.append(_flat_start(directive_of(".ic", line, rest, instance.scope), instance))
+        self.directives += [_directive(read, instance) for read in instance.definition.directives]
 
     def _element(self, line: Line, instance: _Instance) -> None:
-        lexemes = lex(line) or [Lexeme("", ",", line.start)]  # a line of commas has none
+        lexemes = lex(line) or [Lexeme("", ",", line.start, line)]  # a line of commas has none
         first = lexemes[0]
-        where = line.where(first.position)
-        letter = first.text[:1].upper()
+        where, letter = first.where, first.text[:1].upper()
         if first.kind != "word" or not (letter.isascii() and letter.isalpha()):
-            problem = (
-                f"'{line.written(first)}' is no element: a line begins with R, C, V, I, X or a dot, a comment with *"
-            )
+            problem = f"'{first.written}' is no element: a line begins with R, C, V, I, X or a dot, a comment with *"
             raise InputError(problem, where)
-        if letter != "X" and letter not in _VALUED:
+        if letter != "X" and letter not in KINDS:
             raise InputError(_unknown_element(lexemes), where)
         name = f"{instance.prefix}{first.text}"
         if len(name) > MAX_NAME:
@@ -162,54 +127,53 @@ class Flattener:
         if earlier is not where:
             raise InputError(f"element '{name}' is defined twice, first at {earlier}", where)
         if letter == "X":
-            self._call(line, lexemes, name, instance)
+            self._call(name, lexemes, instance)
         else:
-            self.statements.append(_valued(line, lexemes, name, instance))
+            self.statements.append(_valued(name, lexemes, instance))
 
-    def _call(self, line: Line, lexemes: list[Lexeme], name: str, instance: _Instance) -> None:
+    def _call(self, name: str, lexemes: list[Lexeme], instance: _Instance) -> None:
         """An X line: a native device becomes a statement, and a subcircuit is expanded."""
-        words = group(line, lexemes[1:], plain=len(lexemes))
-        if words.stray is not None:
-            hint = stray_word(words.stray.text, line.text[: words.stray.position])
-            problem = f"'{words.stray.text}' follows the parameters: nodes and the device's name come first{hint}"
-            raise InputError(problem, line.where(words.stray.position))
+        words = group(lexemes[1:], plain=len(lexemes))
+        stray = words.stray
+        if stray is not None:
+            hint = stray_word(stray.text, stray.line.text[: stray.position])
+            problem = f"'{stray.text}' follows the parameters: nodes and the device's name come first{hint}"
+            raise InputError(problem, stray.where)
         plain = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
         if not plain:
-            problem = f"missing value: {name} needs nodes and a device's name"
-            raise InputError(problem, line.where(lexemes[0].position))
+            raise InputError(f"missing value: {name} needs nodes and a device's name", lexemes[0].where)
         nodes, device = plain[:-1], plain[-1]
-        where = line.where(device.position)
         if device.kind != "word":
-            raise InputError(f"{line.written(device)} stands where a device's name belongs", where)
+            raise InputError(f"{device.written} stands where a device's name belongs", device.where)
         native = device.text.upper()
         if native in layer_devices():
-            _check_nodes(name, native, len(nodes), DEVICES[native].nodes, where)
-            canonical, written = _nodes(line, nodes, instance)
-            params = instance.scope.pairs(line, words, bare="arithmetic")
-            given = {key: value.value for key, value in params[0].items() if isinstance(value, Number)}
-            _refuse_captured(native, given, line, words, instance.scope)
-            start = line.where(lexemes[0].position)
-            self.statements.append(Statement(name, "X", canonical, written, native, (), *params, start))
+            _check_nodes(name, native, len(nodes), DEVICES[native].nodes, device.where)
+            canonical, written = zip(*instance.nodes(nodes), strict=True)
+            params = instance.scope.pairs(words, bare="arithmetic")
+            given = {key: value.value for key, value in params.items() if isinstance(value, Number)}
+            _refuse_captured(native, given, words, instance.scope)
+            where = lexemes[0].where
+            self.statements.append(Statement(name, "X", canonical, written, native, (), params, where))
             return
         found = instance.find(device.text.lower())
         if found is None:
-            raise InputError(_unknown_device(line, plain, instance), where)
+            raise InputError(_unknown_device(plain, [*layer_devices(), *instance.visible()]), device.where)
         called, outside = found
-        _check_nodes(name, called.name, len(nodes), called.ports, where)
-        self._check_depth(called, instance, len(instance.calls), where)
-        ports = zip(called.ports, zip(*_nodes(line, nodes, instance), strict=True), strict=True)
-        inner = _Instance(called, Scope(instance.scope), outside, f"{name}.", dict(ports))
-        inner.calls = (*instance.calls, called)
-        _bind(inner, line, words, instance.scope)
+        _check_nodes(name, called.name, len(nodes), called.ports, device.where)
+        self._count(called, instance, device.where)
+        ports = dict(zip(called.ports, instance.nodes(nodes), strict=True))
+        inner = _Instance(called, Scope(instance.scope), outside, f"{name}.", ports, (*instance.calls, called))
+        _bind(inner, words, instance.scope)
         called.called = True
         self._expand(inner)
 
-    def _check_depth(self, called: Subcircuit, instance: _Instance, depth: int, where: Where) -> None:
+    def _count(self, called: Subcircuit, instance: _Instance, where: Where) -> None:
+        """Count what a call expands to; refuse circles, and what is too deep or too much."""
         if any(called is outer for outer in instance.calls):
             start = next(i for i, outer in enumerate(instance.calls) if outer is called)
             path = " -> ".join(sub.name for sub in (*instance.calls[start:], called))
             raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
-        if depth >= MAX_DEPTH:
+        if len(instance.calls) >= MAX_DEPTH:
             raise InputError(f"subcircuits call each other more than {MAX_DEPTH} deep", where)
         self._expanded += 1 + len(called.elements) + len(called.params) + len(called.defaults)
         if self._expanded > MAX_EXPANDED:
@@ -219,71 +183,60 @@ class Flattener:
             raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
 
 
-def _flat_start(start: Directive, instance: _Instance) -> Directive:
-    """An `.ic` line with the canonical names of its nodes, which are those of a subcircuit's call."""
-    params, places = dict[str, Value](), dict[str, Where]()
-    for key, value in start.params.items():
-        flat = f"v({instance.node(key[2:-1].strip())[0]})" if key.startswith("v(") else key
-        if flat in params:
-            raise InputError(f".ic gives node {flat[2:-1]!r} twice", start.param_where[key])
-        params[flat], places[flat] = value, start.param_where[key]
-    return replace(start, params=params, param_where=places)
+def _directive(read: DirectiveLine, instance: _Instance) -> Directive:
+    """An evaluated directive; an `.ic` line has the canonical names of its nodes, which are those of a call."""
+    line, scope = read.line, instance.scope
+    words = group(lex(line, read.rest), probes=True)
+    args, params = scope.words(words.words), scope.pairs(words)
+    if read.name == ".ic":
+        given, params = params, dict[str, Value]()
+        for key, value in given.items():
+            flat = f"v({instance.node(key[2:-1].strip())[0]})" if key.startswith("v(") else key
+            if flat in params:
+                raise InputError(f".ic gives node {flat[2:-1]!r} twice", value.key)
+            params[flat] = value
+    return Directive(read.name, args, params, line.place, line.text[line.start :])
 
 
-def _bind(inner: _Instance, line: Line, words: Group, caller: Scope) -> None:
+def _bind(inner: _Instance, words: Group, caller: Scope) -> None:
     """Evaluate a call's parameters: values on the X line in the caller's scope, defaults in the subcircuit's."""
     definition = inner.definition
     for formula in (*definition.defaults, *definition.params):
         inner.scope.define(formula)
-    allowed = {formula.name.lower(): formula.name for formula in definition.defaults}
-    for key, pair in words.params.items():
-        if key not in allowed:
-            hint = nearest(key, allowed) or f"; it has {' '.join(allowed.values()) or 'none'}"
-            problem = f"subcircuit '{definition.name}' has no parameter '{pair.key.text}'{hint}"
-            raise InputError(problem, line.where(pair.key.position))
-        inner.scope.preset(key, caller.number(line, pair.value))
+    allowed = {default.key.text.lower(): default.key.text for default in definition.defaults}
+    for name, (key, value) in words.params.items():
+        if name not in allowed:
+            hint = nearest(name, allowed) or f"; it has {' '.join(allowed.values()) or 'none'}"
+            raise InputError(f"subcircuit '{definition.name}' has no parameter '{key.text}'{hint}", key.where)
+        inner.scope.preset(name, caller.number(value))
     inner.scope.solve()
-    _refuse_captured(definition.name, inner.scope.values, line, words, caller)
+    _refuse_captured(definition.name, inner.scope.values, words, caller)
 
 
-def _refuse_captured(device: str, own: dict[str, float], line: Line, words: Group, caller: Scope) -> None:
+def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:
     """Refuse a value on an X line with a name that is the caller's parameter here, and the device's own in ngspice."""
-    for key, pair in words.params.items():
-        for name, value in caller.references(line, pair.value).items():
-            if name != key and own.get(name, value) != value:
+    for given, (key, value) in words.params.items():
+        for name, here in caller.references(value).items():
+            if name != given and own.get(name, here) != here:
                 problem = (
-                    f"{pair.key.text}={line.written(pair.value)} means {name} = {value:g} of the calling netlist here, "
-                    f"and in ngspice {device}'s own {name} = {own[name]:g}; allowed: another name for one of them"
+                    f"{key.text}={value.written} means {name} = {here:g} of the calling netlist here, and in ngspice "
+                    f"{device}'s own {name} = {own[name]:g}; allowed: another name for one of them"
                 )
-                raise InputError(problem, line.where(pair.value.position))
+                raise InputError(problem, value.where)
 
 
-def _valued(line: Line, lexemes: list[Lexeme], name: str, instance: _Instance) -> Statement:
-    """Statement of an R, C, V or I line."""
-    letter = lexemes[0].text[0].upper()
-    where = line.where(lexemes[0].position)
-    words = group(line, lexemes[1:], plain=2)
+def _valued(name: str, lexemes: list[Lexeme], instance: _Instance) -> Statement:
+    """Statement of a line with two nodes and a value."""
+    letter, where = lexemes[0].text[0].upper(), lexemes[0].where
+    kind, scope = KINDS[letter], instance.scope
+    words = group(lexemes[1:], plain=2)
     nodes = [word for word in words.words[:2] if isinstance(word, Lexeme)]
     if len(nodes) < 2 or (len(words.words) == 2 and not words.params):
         missing = "node" if len(nodes) < 2 else "value"
-        problem = f"missing {missing}: a {_VALUED[letter]} is written {name} node node value"
-        raise InputError(problem, where)
-    canonical, written = _nodes(line, nodes, instance)
-    # The words of a source are keywords (DC, SIN); a word of a resistor or capacitor names a parameter.
-    bare: Bare = "name" if letter in "RC" else "nothing"
-    body = instance.scope.words(line, words.words[2:], bare)
-    params = instance.scope.pairs(line, words, bare)
-    return Statement(name, letter, canonical, written, None, body, *params, where)
-
-
-def _nodes(line: Line, words: list[Lexeme], instance: _Instance) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Canonical and written names of nodes."""
-    for word in words:
-        if word.kind != "word":
-            problem = f"{line.written(word)} stands where a node's name belongs"
-            raise InputError(problem, line.where(word.position))
-    pairs = [instance.node(word.text) for word in words]
-    return tuple(pair[0] for pair in pairs), tuple(pair[1] for pair in pairs)
+        raise InputError(f"missing {missing}: a {kind.what} is written {name} node node value", where)
+    canonical, written = zip(*instance.nodes(nodes), strict=True)
+    body, params = scope.words(words.words[2:], kind.bare), scope.pairs(words, kind.bare)
+    return Statement(name, letter, canonical, written, None, body, params, where)
 
 
 def _check_nodes(name: str, device: str, given: int, wanted: tuple[str, ...], where: Where) -> None:
@@ -293,17 +246,16 @@ def _check_nodes(name: str, device: str, given: int, wanted: tuple[str, ...], wh
         raise InputError(f"{name}: {device} has {len(wanted)} node{plural}{nodes}, {given} given", where)
 
 
-def _unknown_device(line: Line, words: list[Lexeme], instance: _Instance) -> str:
+def _unknown_device(words: list[Lexeme], visible: list[str]) -> str:
     """The message that the last word of an X line is not a device, with a hint."""
-    last = line.written(words[-1])
-    visible = instance.visible()
+    last = words[-1]
     known = {name.lower() for name in visible}
-    for word in words[:-1]:
+    for word in words[2:-1]:
         # A device's name after two words or more is probably the device, and the words after it lack their `key=`.
-        if word.text.lower() in known and word is not words[0] and words.index(word) >= 2:
-            return f"{last} follows the device {word.text}: its parameters are written key=value"
-    hint = nearest(words[-1].text, visible) or f"; devices are {' '.join(visible[:40])}"
-    return f"'{words[-1].text}' is not a device or a .subckt{hint}"
+        if word.text.lower() in known:
+            return f"{last.written} follows the device {word.text}: its parameters are written key=value"
+    hint = nearest(last.text, visible) or f"; devices are {' '.join(visible[:40])}"
+    return f"'{last.text}' is not a device or a .subckt{hint}"
 
 
 def _unknown_element(lexemes: list[Lexeme]) -> str:

@@ -25,65 +25,65 @@ _KEY = re.compile(r"[A-Za-z_]\w*")
 _NUMERIC = re.compile(r"[+-]?\.?[0-9]")
 
 
-class Line:
-    """A logical line: a physical line without its comment, joined with the `+` lines that continue it.
+class Line(NamedTuple):
+    """A logical line: a physical line without its comment, joined by one space with the `+` lines that continue it."""
 
-    Attributes
-    ----------
-    file : str
-        The file's name as shown to the user.
-    text : str
-        The joined text; continuations are separated by one space.
-    """
-
-    __slots__ = ("_numbers", "_shifts", "_starts", "file", "text")
-
-    def __init__(self, file: str, number: int, text: str) -> None:
-        self.file = file
-        self.text = text
-        self._starts: list[int] | None = None  # only continued lines need the lists
-        self._numbers = [number]
-        self._shifts = [1]
+    file: str  # The file's name as shown to the user
+    text: str
+    # Of each physical line: the position of its text, its number, and what a position in it lacks to its column
+    parts: tuple[tuple[int, int, int], ...]
 
     @classmethod
     def joined(cls, file: str, parts: list[tuple[int, int, str]]) -> Line:
         """Line made of (line number, column before the text, text) of each physical line."""
-        line = cls(file, parts[0][0], " ".join(text for _, _, text in parts))
-        line._starts, line._numbers, line._shifts = [], [], []
-        start = 0
+        places, start = [], 0
         for number, column, text in parts:
-            line._starts.append(start)
-            line._numbers.append(number)
-            line._shifts.append(column + 1 - start)
+            places.append((start, number, column + 1 - start))
             start += len(text) + 1
-        return line
+        return cls(file, " ".join(text for _, _, text in parts), tuple(places))
 
-    def where(self, position: int = 0) -> Where:
-        """Place of one character of the joined text."""
-        index = 0 if self._starts is None else bisect_right(self._starts, position) - 1
-        return Where(self.file, self._numbers[index], position + self._shifts[index])
-
-    def written(self, lexeme: Lexeme) -> str:
-        """Text of a lexeme with its braces or quotes."""
-        marks = 2 * (lexeme.kind in ("expression", "string"))
-        return self.text[lexeme.position : lexeme.position + len(lexeme.text) + marks]
+    def where(self, position: int) -> Where:
+        """Place of one character of the text."""
+        _, number, shift = self.parts[bisect_right(self.parts, position, key=lambda part: part[0]) - 1]
+        return Where(self.file, number, position + shift)
 
     def words(self, most: int) -> int:
         """An upper bound of the number of lexemes, counted up to `most`."""
-        return len(self._numbers) + sum(1 for _ in islice(_SPLIT.finditer(self.text), most))
+        return len(self.parts) + sum(1 for _ in islice(_SPLIT.finditer(self.text), most))
 
     @property
     def start(self) -> int:
         """Position of the first character that is not blank."""
         return len(self.text) - len(self.text.lstrip())
 
+    @property
+    def place(self) -> Where:
+        """Place of the first character that is not blank."""
+        return self.where(self.start)
+
 
 class Lexeme(NamedTuple):
-    """A piece of a line: `kind` is word, expression, string or one of ``( ) =``."""
+    """A piece of a line."""
 
-    kind: str
+    kind: str  # word, expression, string, probe, or one of ( ) =
     text: str  # without the braces or quotes
     position: int
+    line: Line
+
+    @property
+    def where(self) -> Where:
+        """Place of the first character."""
+        return self.line.where(self.position)
+
+    def place(self, offset: int) -> Where:
+        """Place of one character of the text."""
+        return self.line.where(self.position + (self.kind in ("expression", "string")) + offset)
+
+    @property
+    def written(self) -> str:
+        """The text with its braces or quotes."""
+        marks = 2 * (self.kind in ("expression", "string"))
+        return self.line.text[self.position : self.position + len(self.text) + marks]
 
 
 class Assignment(NamedTuple):
@@ -111,13 +111,7 @@ def split_lines(text: str) -> list[str]:
 
 
 def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]:
-    """Logical lines, without comments and blank lines; `first` is the number of the first physical line.
-
-    Raises
-    ------
-    InputError
-        If a continuation has no line before it.
-    """
+    """Logical lines, without comments and blank lines; `first` is the number of the first physical line."""
     pending: list[tuple[int, int, str]] = []
     for number, raw in enumerate(lines, first):
         body = _without_comment(raw)
@@ -132,14 +126,10 @@ def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]
             pending.append((number, column + 1, bare[1:]))
             continue
         if pending:
-            yield _finished(file, pending)
+            yield Line.joined(file, pending)
         pending = [(number, 0, body)]
     if pending:
-        yield _finished(file, pending)
-
-
-def _finished(file: str, parts: list[tuple[int, int, str]]) -> Line:
-    return Line(file, parts[0][0], parts[0][2]) if len(parts) == 1 else Line.joined(file, parts)
+        yield Line.joined(file, pending)
 
 
 def _without_comment(raw: str) -> str:
@@ -151,34 +141,25 @@ def _without_comment(raw: str) -> str:
 
 
 def lex(line: Line, start: int = 0) -> list[Lexeme]:
-    """Lexemes of a line from a position on; blanks and commas separate them.
-
-    Raises
-    ------
-    InputError
-        If a brace or quote is not closed.
-    """
+    """Lexemes of a line from a position on; blanks and commas separate them."""
     text, position = line.text, start
     lexemes: list[Lexeme] = []
     while position < len(text):
         match = _LEX.match(text, position)
         if match is None:
-            inner = _braced(line, position)
-            lexemes.append(Lexeme("expression", inner, position))
-            position += len(inner) + 2
+            lexemes.append(Lexeme("expression", _braced(line, position), position, line))
+            position += len(lexemes[-1].text) + 2
             continue
-        kind = match.lastindex
-        if kind == 1:
-            lexemes.append(Lexeme(match[1], match[1], position))
-        elif kind == 2:
-            lexemes.append(Lexeme("string", match[2][1:-1], position))
-        elif kind == 3:
-            lexemes.append(Lexeme("expression", match[3][1:-1], position))
-        elif kind == 4:
-            if match[4][0] == "$":
-                problem = f"'{match[4]}': a comment after '$' needs a blank between them"
-                raise InputError(problem, line.where(position))
-            lexemes.append(Lexeme("word", match[4], position))
+        mark, string, quoted, word = match.groups()
+        if mark:
+            lexemes.append(Lexeme(mark, mark, position, line))
+        elif string or quoted:
+            kind, inner = ("string", string) if string else ("expression", quoted)
+            lexemes.append(Lexeme(kind, inner[1:-1], position, line))
+        elif word:
+            if word[0] == "$":
+                raise InputError(f"'{word}': a comment after '$' needs a blank between them", line.where(position))
+            lexemes.append(Lexeme("word", word, position, line))
         position = match.end()
     return lexemes
 
@@ -197,24 +178,11 @@ def _braced(line: Line, position: int) -> str:
     raise InputError("'{' is never closed", line.where(position))
 
 
-def group(line: Line, lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Group:
-    """Sort the lexemes of a line into words, calls and `key=value` pairs.
+def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Group:
+    """Sort the lexemes after a line's first word into words, calls and `key=value` pairs.
 
-    Parameters
-    ----------
-    line : Line
-        The line, for places.
-    lexemes : list of Lexeme
-        The lexemes after the line's first word.
-    plain : int
-        Number of words at the beginning that are nodes, which may stand in brackets without being calls.
-    probes : bool
-        Whether `v(node)=value` is a pair with the key ``v(node)``.
-
-    Raises
-    ------
-    InputError
-        If a bracket has no partner, or a pair has no name or value, or is given twice.
+    The first `plain` words are nodes, which may stand in brackets without being calls. With `probes`, `v(node)=value`
+    is a pair with the key ``v(node)``.
     """
     top = Group()
     inside, brackets = top, list[tuple[Lexeme, Group]]()
@@ -227,16 +195,25 @@ def group(line: Line, lexemes: list[Lexeme], plain: int = 0, *, probes: bool = F
         probe = _probe(lexemes, index) if probes and following == "(" else None
         if probe is not None or (following == "=" and lexeme.kind not in _MARKS):
             key, equals = probe or (lexeme, after)
-            _assign(line, inside, key, lexemes, equals)
+            _assign(inside, key, lexemes[equals + 1 : equals + 3])
             index = equals + 2
             continue
         if lexeme.kind == "(":
             brackets.append((lexeme, inside))
-        elif lexeme.kind in _MARKS:
-            inside = _closed(line, lexeme, brackets)
+        elif lexeme.kind == "=":
+            raise InputError("the name before '=' is missing", lexeme.where)
+        elif lexeme.kind == ")":
+            if not brackets:
+                raise InputError("')' without an opening '('", lexeme.where)
+            inside = brackets.pop()[1]
         elif following == "(" and _may_be_called(lexeme) and len(top.words) >= plain:
+            if inside is not top:
+                name = lexeme.text
+                problem = f"'{name}(' inside brackets: arithmetic goes in braces, as in {{{name}(...)}}"
+                raise InputError(problem, lexeme.where)
             brackets.append((lexemes[after], inside))
-            inside = _call(line, lexeme, inside, top)
+            inside = Group(lexeme)
+            top.words.append(inside)
             after += 1
         else:
             if inside.params and inside.stray is None:
@@ -244,30 +221,12 @@ def group(line: Line, lexemes: list[Lexeme], plain: int = 0, *, probes: bool = F
             inside.words.append(lexeme)
         index = after
     if brackets:
-        raise InputError("'(' is never closed", line.where(brackets[-1][0].position))
+        raise InputError("'(' is never closed", brackets[-1][0].where)
     return top
-
-
-def _closed(line: Line, lexeme: Lexeme, brackets: list[tuple[Lexeme, Group]]) -> Group:
-    """The group around a bracket that a `)` closes."""
-    if lexeme.kind == "=":
-        raise InputError("the name before '=' is missing", line.where(lexeme.position))
-    if not brackets:
-        raise InputError("')' without an opening '('", line.where(lexeme.position))
-    return brackets.pop()[1]
 
 
 def _may_be_called(lexeme: Lexeme) -> bool:
     return lexeme.kind == "word" and _NUMERIC.match(lexeme.text) is None
-
-
-def _call(line: Line, name: Lexeme, inside: Group, top: Group) -> Group:
-    if inside is not top:
-        problem = f"'{name.text}(' inside brackets: arithmetic goes in braces, as in {{{name.text}(...)}}"
-        raise InputError(problem, line.where(name.position))
-    call = Group(name)
-    top.words.append(call)
-    return call
 
 
 def _with_brackets(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int]:
@@ -290,26 +249,26 @@ def _probe(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int] | None:
     while end < len(lexemes) and lexemes[end].kind == "word":
         node, end = _with_brackets(lexemes, end)
         nodes.append(node.text)
-    if end + 1 >= len(lexemes) or lexemes[end].kind != ")" or lexemes[end + 1].kind != "=":
+    if [lexeme.kind for lexeme in lexemes[end : end + 2]] != [")", "="]:
         return None
     name = lexemes[index]
-    return Lexeme("probe", f"{name.text}({','.join(nodes)})", name.position), end + 1
+    return name._replace(kind="probe", text=f"{name.text}({','.join(nodes)})"), end + 1
 
 
-def _assign(line: Line, inside: Group, key: Lexeme, lexemes: list[Lexeme], equals: int) -> None:
-    """Enter the pair `key = value` whose `=` is the lexeme number `equals`."""
+def _assign(inside: Group, key: Lexeme, following: list[Lexeme]) -> None:
+    """Enter the pair `key = value`, given up to two of the lexemes after its `=`."""
     name = key.text.lower()
     if key.kind not in ("word", "probe") or (key.kind == "word" and not _KEY.fullmatch(key.text)):
-        problem = f"{line.written(key)} cannot be a parameter's name: letters, digits and _ are allowed"
-        raise InputError(problem, line.where(key.position))
+        problem = f"{key.written} cannot be a parameter's name: letters, digits and _ are allowed"
+        raise InputError(problem, key.where)
     if name in inside.params:
-        first = line.where(inside.params[name].key.position)
-        raise InputError(f"'{key.text}' is given twice, first at {first}", line.where(key.position))
-    value = lexemes[equals + 1] if equals + 1 < len(lexemes) else None
-    after = lexemes[equals + 2].kind if equals + 2 < len(lexemes) else ""
+        first = inside.params[name].key.where
+        raise InputError(f"'{key.text}' is given twice, first at {first}", key.where)
+    value = following[0] if following else None
+    after = following[1].kind if len(following) > 1 else ""
     if value is not None and (value.kind == "(" or (after == "(" and value.kind == "word")):
         problem = f"the value of '{key.text}' holds brackets: arithmetic goes in braces, as in {{(a + b)*2}}"
-        raise InputError(problem, line.where(value.position))
+        raise InputError(problem, value.where)
     if value is None or value.kind in (")", "=") or (after == "=" and value.kind == "word"):
-        raise InputError(f"missing value of '{key.text}'", line.where(key.position))
+        raise InputError(f"missing value of '{key.text}'", key.where)
     inside.params[name] = Assignment(key, value)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import Circuit, Element, Tran, check
+from fingerspice.circuit.circuit import AcSweep, Circuit, Element, Tran, check
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.usual import REST_AREA
 from fingerspice.circuit.values import unusual
@@ -74,12 +74,6 @@ def _circuit(deck: Deck) -> Circuit:
     return circuit
 
 
-def _first(notes: list[str]) -> tuple[str, ...]:
-    """The first `MAX_WARNINGS` warnings, and the number of the others."""
-    more = len(notes) - MAX_WARNINGS
-    return (*notes[:MAX_WARNINGS], f"{more} more warnings are not shown") if more > 1 else tuple(notes)
-
-
 def _in_deck(error: InputError, deck: Deck) -> InputError:
     """The error with the deck's name if it has no place, and with a note if the title reads like a statement."""
     error = with_comma(error, deck.warnings)
@@ -89,23 +83,25 @@ def _in_deck(error: InputError, deck: Deck) -> InputError:
 
 
 def _read(deck: Deck, notes: list[str]) -> Circuit:
-    tran = read_tran(deck.tran, notes) if deck.tran else None
-    files = SourceFiles(None if deck.path is None else deck.path.parent)
-    context = Context(tran.step if tran else None, tran.stop if tran else None, files)
+    tran = next((read_tran(directive, notes) for directive in deck.named(".tran")), None)
+    context = Context(tran, SourceFiles(None if deck.path is None else deck.path.parent))
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
-    work, unused = read_options(deck.options)
-    initial = read_initial(deck.ic, elements)
+    work, unused = read_options(deck.named(".options"))
+    initial = read_initial(deck.named(".ic"), elements)
     notes.extend(_unusual_areas(elements, initial))
     notes.extend(_coarse_outputs(deck, elements, tran))
+    more = len(notes) - MAX_WARNINGS
+    if more > 1:
+        notes[MAX_WARNINGS:] = [f"{more} more warnings are not shown"]
     circuit = Circuit(
         title=deck.title,
         elements=elements,
         tran=tran,
-        ac=read_ac(deck.ac) if deck.ac else None,
+        ac=next(map(read_ac, deck.named(".ac")), None),
         initial=initial,
         charge_law=_charge_law(deck.includes),
         work=work,
-        warnings=_first(notes),
+        warnings=tuple(notes),
         unused=(*deck.unused, *unused, *unused_starts(initial, elements, tran is None or tran.uic)),
         text=deck.text,
         path=deck.path,
@@ -131,14 +127,15 @@ def _unusual_areas(elements: tuple[Element, ...], initial: Mapping[str, float]) 
 
 def _coarse_outputs(deck: Deck, elements: tuple[Element, ...], tran: Tran | None) -> Iterator[str]:
     """A warning about each source with a period shorter than TSTEP, unless there is one about its frequency."""
-    if deck.tran is None or tran is None:
+    if tran is None:
         return
     for e in elements:
         period = e.waveform.period if e.waveform is not None else None
         if period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
             yield (
-                f"{deck.tran.where}: {e.name}: TSTEP is {format_si(tran.step, 's')}, longer than this source's period "
-                f"of {format_si(period, 's')}: the outputs do not show its course, and the figures of a run still do"
+                f"{deck.named('.tran')[0].where}: {e.name}: TSTEP is {format_si(tran.step, 's')}, longer than this "
+                f"source's period of {format_si(period, 's')}: the outputs do not show its course, and the figures of "
+                "a run still do"
             )
 
 
@@ -154,16 +151,10 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
 
     SPICE's defaults come from the circuit's .tran, and file names are relative to the working directory. Without
     `files`, for a text from elsewhere, no file is read.
-
-    Raises
-    ------
-    InputError
-        If the text is not a source.
     """
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
-    found = SourceFiles(anywhere=files)
-    context = Context(tran.step if tran else None, tran.stop if tran else None, found, in_deck=False)
+    context = Context(tran, SourceFiles(anywhere=files), in_deck=False)
     try:
         deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
         if len(deck.statements) != 1:
@@ -178,3 +169,14 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
         # A note begins with a place in the one-source deck made here, which the user does not know: cut it off.
         warnings.warn(f"{text!r}: {note.partition(': ')[2]}", FingerspiceWarning, stacklevel=2)
     return source.waveform
+
+
+def sweep_from_text(text: str) -> AcSweep:
+    """A sweep from text such as ``dec 10 10 100k``."""
+    try:
+        sweeps = parse_deck(f"sweep\n.ac {text}\n").named(".ac")
+        if not sweeps:
+            raise InputError("not a sweep")
+        return read_ac(sweeps[0])
+    except InputError as error:
+        raise InputError(f"{text!r}: {error.message}") from None

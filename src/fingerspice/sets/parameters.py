@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -26,57 +25,6 @@ from fingerspice.waveforms.waveform import Sine, Waveform
 
 #: Waveforms of drives, by the name that a set gives.
 WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM}
-
-
-def changes_by(
-    name: str, values: Mapping[str, SetValue], waveform: str | None, circuit: Circuit, to: str | None
-) -> Circuit:
-    """The circuit with the values of the set of that name, as `ParameterSet.apply` describes it."""
-    require_circuit(circuit)
-    changes: dict[str, float | Waveform] = {}
-    for kind in dict.fromkeys(value.element for value in values.values()):
-        own = [value for value in values.values() if value.element == kind]
-        needed = not all(value.optional for value in own)
-        elements = _elements(name, kind, circuit, to, needed)
-        if kind == "source":
-            assert waveform is not None
-            changes[elements[0].name] = WAVEFORMS[waveform](**{value.parameter: value.value for value in own})
-            continue
-        changes |= {
-            f"{element.name}.{value.parameter}": value.value
-            for element in elements
-            for value in own
-            if value.parameter in element.values
-        }
-    return remembering(circuit.replace(changes), name, changes)
-
-
-def _elements(name: str, kind: str, circuit: Circuit, to: str | None, needed: bool) -> list[Element]:
-    """The elements that a set's values for a kind of element go to.
-
-    Raises
-    ------
-    InputError
-        If there is none and one is needed, or if it is not clear which is meant.
-    """
-    devices = ELEMENTS[kind]
-    known = driving_sources(circuit) if kind == "source" else list(circuit.elements)
-    known = [e for e in known if e.device in devices]
-    found = [e for e in known if to is None or f"{e.name}.".lower().startswith(f"{to}.".lower())]
-    what = {"source": "driving V source"}.get(kind, " or ".join(devices))
-    if not found and needed:
-        inside = "the circuit" if to is None else f"{to!r} of the circuit"
-        there = f"its {', '.join(e.name for e in known)}" if known else f"a circuit with a {what}"
-        raise InputError(f"the set {name!r} has values for a {what}, which {inside} lacks; allowed: {there}")
-    # A finger has one layer of each kind on its area; two would be two parts of the screen, of which one is meant.
-    at = Counter("" if kind == "source" else e.nodes[2] for e in found)
-    if any(count > 1 for count in at.values()):
-        names = ", ".join(e.name for e in found)
-        raise InputError(
-            f"the set {name!r} has values for one {what}, and the circuit has {names}; allowed: one of these names "
-            f"(to={found[0].name!r}, or {found[0].name}={name} on the command line)"
-        )
-    return found
 
 
 #: Units that take a prefix in tables.
@@ -141,7 +89,44 @@ class ParameterSet(Shown):
         FingerspiceWarning
             As `Circuit.replace`.
         """
-        return changes_by(self.name, self.values, self.waveform, circuit, to)
+        require_circuit(circuit)
+        changes: dict[str, float | Waveform] = {}
+        for kind in dict.fromkeys(value.element for value in self.values.values()):
+            own = [value for value in self.values.values() if value.element == kind]
+            elements = self._elements(kind, circuit, to, needed=not all(value.optional for value in own))
+            if kind == "source":
+                assert self.waveform is not None
+                figures = {value.parameter: value.value for value in own}
+                changes[elements[0].name] = WAVEFORMS[self.waveform](**figures)
+                continue
+            changes |= {
+                f"{element.name}.{value.parameter}": value.value
+                for element in elements
+                for value in own
+                if value.parameter in element.values
+            }
+        return remembering(circuit.replace(changes), self.name, changes)
+
+    def _elements(self, kind: str, circuit: Circuit, to: str | None, needed: bool) -> list[Element]:
+        """The elements that the values for a kind of element go to, refused if it is not clear which are meant."""
+        devices, name = ELEMENTS[kind], self.name
+        known = driving_sources(circuit) if kind == "source" else list(circuit.elements)
+        known = [e for e in known if e.device in devices]
+        found = [e for e in known if to is None or f"{e.name}.".lower().startswith(f"{to}.".lower())]
+        what = "driving V source" if kind == "source" else " or ".join(devices)
+        if not found and needed:
+            inside = "the circuit" if to is None else f"{to!r} of the circuit"
+            there = f"its {', '.join(e.name for e in known)}" if known else f"a circuit with a {what}"
+            raise InputError(f"the set {name!r} has values for a {what}, which {inside} lacks; allowed: {there}")
+        # A finger has one layer of each kind on its area; two would be two parts of the screen, of which one is meant.
+        at = Counter("" if kind == "source" else e.nodes[2] for e in found)
+        if any(count > 1 for count in at.values()):
+            names = ", ".join(e.name for e in found)
+            raise InputError(
+                f"the set {name!r} has values for one {what}, and the circuit has {names}; allowed: one of these names "
+                f"(to={found[0].name!r}, or {found[0].name}={name} on the command line)"
+            )
+        return found
 
     def to_dict(self) -> dict[str, Any]:
         """The set as plain data, for JSON."""
@@ -152,25 +137,18 @@ class ParameterSet(Shown):
         }
 
     def _page(self) -> Page:
-        rows = [(v.path, quantity(v.value, v.unit), _range(v), _briefly(v)) for v in self.values.values()]
+        rows = []
+        for v in self.values.values():
+            ends = "this value" if v.low == v.high else f"{quantity(v.low, v.unit)} to {quantity(v.high, v.unit)}"
+            origin = "assumed" if v.assumed else ", ".join(keys_in(v.source))
+            rows.append((v.path, quantity(v.value, v.unit), ends, origin))
         drive = [f"waveform of the source: {self.waveform}"] if self.waveform else []
-        table = Table(("", "value", "range", "source"), rows, left=4)
         said = [f"claims: {self.claims}", f"does not claim: {self.not_claimed}"]
         origins = [f"{v.path}: {v.source}; range: {v.range}" for v in self.values.values()]
         cited = [f"[{r.key}] {r.text()}" for r in self.references]
-        blocks: list[str | Table] = [
-            f"{self.name} ({self.kind}): {self.title}",
-            *drive,
-            "",
-            table,
-            "",
-            *said,
-            "",
-            *origins,
-            "",
-            *cited,
-        ]
-        return Page(blocks)
+        table = Table(("", "value", "range", "source"), rows, left=4)
+        head = f"{self.name} ({self.kind}): {self.title}"
+        return Page([head, *drive, "", table, "", *said, "", *origins, "", *cited])
 
 
 class ParameterSets(Shown, Mapping[str, ParameterSet]):
@@ -186,35 +164,20 @@ class ParameterSets(Shown, Mapping[str, ParameterSet]):
         return len(_sets())
 
     def _page(self) -> Page:
-        rows = [(one.name, one.kind, one.title, _sourced(one)) for one in self.values()]
+        rows = []
+        for one in self.values():
+            assumed = f", {len(one.assumed)} assumed" if one.assumed else ""
+            rows.append((one.name, one.kind, one.title, f"{len(one.values)}{assumed}"))
         return Page([Table(("name", "kind", "what it is", "values"), rows, left=4)])
-
-
-def _range(value: SetValue) -> str:
-    ends = (quantity(end, value.unit) for end in (value.low, value.high))
-    return "this value" if value.low == value.high else " to ".join(ends)
-
-
-def _briefly(value: SetValue) -> str:
-    return "assumed" if value.assumed else ", ".join(keys_in(value.source))
-
-
-def _sourced(one: ParameterSet) -> str:
-    count = len(one.assumed)
-    return f"{len(one.values)}, {count} assumed" if count else f"{len(one.values)}"
 
 
 @cache
 def _sets() -> dict[str, ParameterSet]:
-    own = ("name", "title", "kind", "claims", "not_claimed")
-    return {
-        name: ParameterSet(
-            **{key: table[key] for key in own},
-            values=MappingProxyType(values_of(name)),
-            waveform=table.get("waveform"),
-        )
-        for name, table in tables().items()
-    }
+    found = {}
+    for name, table in tables().items():
+        own = {key: table[key] for key in ("name", "title", "kind", "claims", "not_claimed")}
+        found[name] = ParameterSet(**own, values=MappingProxyType(values_of(name)), waveform=table.get("waveform"))
+    return found
 
 
 @overload
@@ -261,8 +224,7 @@ def parameters(name: str | None = None, kind: str | None = None) -> ParameterSet
 
 def quantity(value: float, unit: str) -> str:
     """A value with its unit, with a prefix where the unit takes one."""
-    plain = unit not in _PREFIXED or value == 0.0 or not math.isfinite(value)
-    return f"{value:g} {unit}".rstrip() if plain else format_si(value, unit)
+    return format_si(value, unit) if unit in _PREFIXED else f"{value:g} {unit}".rstrip()
 
 
 #: The paper whose model is simulated.

@@ -21,32 +21,20 @@ _KEY = re.compile(r"\[(\w+)\]")
 
 @dataclass(frozen=True)
 class SetValue:
-    """One value of a set.
+    """One value of a set."""
 
-    Attributes
-    ----------
-    element : str
-        A key of `ELEMENTS`.
-    parameter, unit : str
-        As in the netlist, or a parameter of the set's waveform.
-    value, low, high : float
-        The value and its range, in `unit`.
-    source, range : str
-        Where value and range come from, with keys of references in brackets; a source that begins with ``assumed`` is
-        no published value.
-    optional : bool
-        Whether a circuit may lack the parameter.
-    """
-
-    element: str
-    parameter: str
+    element: str  # A key of `ELEMENTS`
+    parameter: str  # As in the netlist, or a parameter of the set's waveform
     value: float
     unit: str
+    # low, high: The range of the value, in `unit`
     low: float
     high: float
+    # source, range: Where value and range come from, with keys of references in brackets; a source that begins with
+    # ``assumed`` is no published value
     source: str
     range: str
-    optional: bool = False
+    optional: bool = False  # Whether a circuit may lack the parameter
 
     @property
     def path(self) -> str:
@@ -104,19 +92,15 @@ def keys_in(text: str) -> list[str]:
     return _KEY.findall(text)
 
 
-def reference_of(key: str, data: Mapping[str, Any]) -> Reference:
-    """The reference from its table."""
-    where = {name: str(data[name]) for name, _ in _SAID if name in data}
-    authors = tuple(data["authors"])
-    own = (key, data["kind"], data["title"], authors, data.get("year"), MappingProxyType(where))
-    return Reference(*own, data.get("doi", ""), data.get("url", ""))
-
-
 @cache
 def references() -> Mapping[str, Reference]:
     """Every reference by its key."""
-    data = tomllib.loads((DATA / "references.toml").read_text(encoding="utf-8"))
-    return MappingProxyType({key: reference_of(key, one) for key, one in data.items()})
+    found = {}
+    for key, data in tomllib.loads((DATA / "references.toml").read_text(encoding="utf-8")).items():
+        where = MappingProxyType({name: str(data[name]) for name, _ in _SAID if name in data})
+        own = (key, data["kind"], data["title"], tuple(data["authors"]), data.get("year"), where)
+        found[key] = Reference(*own, data.get("doi", ""), data.get("url", ""))
+    return MappingProxyType(found)
 
 
 @cache
