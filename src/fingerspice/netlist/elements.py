@@ -10,7 +10,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.base.units import exponent_and_scale
 from fingerspice.circuit.circuit import Element
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
-from fingerspice.circuit.values import is_resistance, mega_note, unit_trap, unusual
+from fingerspice.circuit.usual import is_resistance, mega_note, unit_trap, unusual
 from fingerspice.netlist.deck import Call, Number, Statement, Token
 from fingerspice.netlist.directives import start_volts
 from fingerspice.netlist.scope import Value
