@@ -163,11 +163,11 @@ def head_lines(circuit: Circuit) -> list[str]:
 
 def circuit_page(circuit: Circuit) -> Page:
     """The elements of a circuit and the analyses of its deck."""
-    rows = []
-    for element in circuit.elements[:MOST_ELEMENTS]:
-        rows.append((element.name, element.device, " ".join(element.node_names), _cut(values_text(element), 96)))
-    lines: list[str | Table] = [heading(circuit), ""]
-    lines.append(Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4))
+    rows = [
+        (e.name, e.device, " ".join(e.node_names), _cut(values_text(e), 96)) for e in circuit.elements[:MOST_ELEMENTS]
+    ]
+    table = Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4)
+    lines: list[str | Table] = [heading(circuit), "", table]
     if len(circuit.elements) > MOST_ELEMENTS:
         lines.append(f"... and {len(circuit.elements) - MOST_ELEMENTS} more elements")
     lines.append("")

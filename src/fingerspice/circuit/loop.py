@@ -39,13 +39,9 @@ def _network(circuit: Circuit) -> Network:
 
 
 def _of_stack(circuit: Circuit, skin_at: float | None) -> Network:
-    """The network of a circuit's stack, taken from a related circuit's if the two differ in their sources only."""
-    stack, key = build_stack(circuit, skin_at), ("loop network", skin_at)
-    before: Network | None = circuit.related.get(key)
-    if before is not None and before.stack is not None and before.stack.c is stack.c:
-        return dataclasses.replace(before, sources=(_source(stack),), stack=stack)
-    circuit.related[key] = found = loop_network(stack)
-    return found
+    stack = build_stack(circuit, skin_at)
+    network = shared(circuit, ("loop network", skin_at), lambda: loop_network(stack))
+    return dataclasses.replace(network, sources=(_source(stack),), stack=stack)
 
 
 def _source(stack: Stack) -> Element:

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-import operator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.topology import Hop, Loop, loop_of
+from fingerspice.circuit.topology import Hop, Loop, loop_of, shared
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.waveforms.combinations import Product, Sum
@@ -49,16 +48,13 @@ class Stack:
     contact: Contact | None
     area_given: float | None  # Area fixed by the deck, m^2
     hops: tuple[Hop, ...]  # The elements of the loop in order, from ground to ground
+    # Whatever else is computed from the layers alone, shared by stacks that differ in their sources only
+    kept: dict[Any, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:
         """Voltage sources in the loop, each with the sign of its voltage in the sum U."""
         return tuple((h.element, -h.sign) for h in self.hops if h.element.device == "V")
-
-    @cached_property
-    def kept(self) -> dict[Any, Any]:
-        """Whatever else has been computed from the layers alone."""
-        return {}
 
     @cached_property
     def first_cell(self) -> NDArray[np.intp]:
@@ -218,25 +214,19 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     """
 
     def make() -> Stack:
-        key, loop = ("stack", skin_at, circuit.work), loop_of(circuit)
-        before: Stack | None = circuit.related.get(key)
-        if before is not None and loop is not None and all(map(operator.is_, before.layers, loop.layers)):
-            found = before.between(loop.hops)
-        else:
-            found = _build(circuit, loop, skin_at)
-        # The latest one, because runs have computed more from it.
-        circuit.related[key] = found
-        return found
+        loop = loop_of(circuit)
+        if loop is None:
+            raise InputError(
+                "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is "
+                "another network; allowed for any network: simulate (run), plan, phasor (ac) and export"
+            )
+        key = ("stack", skin_at, circuit.work)
+        return shared(circuit, key, lambda: _build(circuit, loop, skin_at)).between(loop.hops)
 
     return circuit.remember(("stack", skin_at), make)
 
 
-def _build(circuit: Circuit, loop: Loop | None, skin_at: float | None) -> Stack:
-    if loop is None:
-        raise InputError(
-            "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is another "
-            "network; allowed for any network: simulate (run), plan, phasor (ac) and export"
-        )
+def _build(circuit: Circuit, loop: Loop, skin_at: float | None) -> Stack:
     layers = loop.layers
     parts = [layer_constants(e, skin_at) for e in layers]
     cells = tuple(len(part) for part in parts)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -93,7 +94,7 @@ def driving_sources(circuit: Circuit) -> list[Element]:
     return driving(circuit)
 
 
-def shared(circuit: Circuit, key: str, make: Callable[[], T]) -> T:
+def shared(circuit: Circuit, key: Any, make: Callable[[], T]) -> T:
     """The result of `make`, kept for all related circuits that differ in the sources that carry current only."""
     drives = {e.name for e in driving(circuit)}
     passive = [e for e in circuit.elements if e.name not in drives]

@@ -83,23 +83,21 @@ MEASURED = {
 #: Usual range of the largest amplitude (V) under which forces, friction and areas are measured.
 MEASURING = Usual(1.0, 10e3, "forces are measured at 10 V to some kV", "volt, not kilovolt")
 
-#: Largest plausible results, N, Pa and m^2. A finger bears 100 N. Air, and most solids, break down far below an
-#: electric pressure of 10 MPa (1.5 GV/m). No finger has a contact of 10 cm^2.
-LARGEST_FORCE = 100.0
-LARGEST_PRESSURE = 10e6
-LARGEST_AREA = 1e-3
+# Largest plausible results, each with its unit and the reason. Air, and most solids, break down far below an electric
+# pressure of 10 MPa.
+_LARGEST = (
+    ("electroadhesive force", 100.0, "N", "as much as a finger bears"),
+    ("electric pressure", 10e6, "Pa", "that of 1.5 GV/m, beyond the strength of any layer"),
+    ("contact area", 1e-3, "m^2", "10 cm^2, more than a finger has"),
+)
 
 
 def beyond_fingers(where: str, force: float, pressure: float, area: float) -> Iterator[str]:
     """Warnings about largest values of a run (N, Pa and m^2) that no finger can have; `where` may be `` of Xgap``."""
-    for what, value, largest, unit, source in (
-        ("electroadhesive force", force, LARGEST_FORCE, "N", "as much as a finger bears"),
-        ("electric pressure", pressure, LARGEST_PRESSURE, "Pa", "that of 1.5 GV/m, beyond the strength of any layer"),
-        ("contact area", area, LARGEST_AREA, "m^2", "10 cm^2, more than a finger has"),
-    ):
+    for value, (what, largest, unit, reason) in zip((force, pressure, area), _LARGEST, strict=True):
         if value > largest:
             yield (
-                f"the {what}{where} reaches {shown(value, unit)}, over {shown(largest, unit)} ({source}): some value "
+                f"the {what}{where} reaches {shown(value, unit)}, over {shown(largest, unit)} ({reason}): some value "
                 "is probably in another unit"
             )
 
