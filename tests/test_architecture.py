@@ -74,8 +74,8 @@ STRANGERS = (
 # Methods that call a part above their own, and load it only when they are called.
 LENT = {
     "circuit.circuit.Circuit._waveform": "netlist.netlist",
-    "circuit.doors.Doors.draw": "plots.schematic",
-    "circuit.doors.Doors.explore": "explorer.server",
+    "circuit.circuit.Circuit.draw": "plots.schematic",
+    "circuit.circuit.Circuit.explore": "explorer.server",
     "results.doors.Doors.plot": "plots.traces",
     "results.doors.Doors.explore": "explorer.server",
     "results.doors.Doors.sample_gradient": "solve.adjoint",

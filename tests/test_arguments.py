@@ -76,6 +76,12 @@ def test_what_is_no_source_or_parameter_is_refused_with_one_sentence(call: Any, 
         call(table1(), **given)
 
 
+def test_one_source_for_a_circuit_without_any_is_refused() -> None:
+    alone = fs.parse_netlist("t\nC1 a 0 1n IC=5\nR1 a 0 1meg\n.tran 1u 1m uic\n")
+    with pytest.raises(fs.InputError, match="the circuit has none; allowed: no sources"):
+        fs.simulate(alone, sources=5.0)
+
+
 def test_one_source_for_a_circuit_of_several_is_refused_with_their_names() -> None:
     two = fs.read_netlist(Path(__file__).parents[1] / "circuits" / "ungrounded_user.cir")
     names = [e.name for e in two.by_device("V", "I")]

@@ -18,8 +18,7 @@ import fingerspice as fs
 from commands import Command
 from fingerspice.explorer.changed import applied, before, unsaid
 from fingerspice.explorer.examples import EXAMPLES
-from fingerspice.explorer.recordings import framed
-from fingerspice.explorer.request import asked_by
+from fingerspice.explorer.request import asked_by, framed
 from fingerspice.explorer.scene import as_python, scene
 from fingerspice.explorer.sliders import read_source, text_of
 

@@ -290,3 +290,13 @@ def eps_sc_of(f: np.ndarray) -> np.ndarray:
 def test_an_area_fixed_by_the_gap_or_by_a_source_is_the_stacks_area() -> None:
     assert build_stack(table1(gap={"a_fix": 30})).area_given == pytest.approx(30e-6, rel=1e-15)
     assert build_stack(table1(gap={"a_fix": 0})).area_given is None
+
+
+def test_a_given_area_that_is_replaced_counts_after_the_circuit_has_run() -> None:
+    text = "t\nV1 a 0 SIN(0 20 1k)\nX1 a b area LAYER d=1u eps_r=3.9 r=1meg\nX2 b 0 area SLAB d=100u eps_r=10 rho=1e4\n"
+    first = fs.parse_netlist(f"{text}Varea area 0 35\n.tran 1u 1m uic\n")
+    fresh = fs.parse_netlist(f"{text}Varea area 0 70\n.tran 1u 1m uic\n")
+    fs.simulate(first)
+    for changed in (first.replace({"Varea": 70.0}), first.replace({"Varea.level": 70.0})):
+        np.testing.assert_array_equal(fs.simulate(changed).i_source, fs.simulate(fresh).i_source)
+        assert fs.phasor(changed, frequency=1e3).impedance == fs.phasor(fresh, frequency=1e3).impedance

@@ -21,26 +21,10 @@ Parameters = Mapping[str, float]
 
 
 def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Parameters | None = None) -> Circuit:
-    """The circuit with the sources and parameters given in a call.
+    """The circuit with the sources and parameters given in a call, with warnings about sources that stay on.
 
-    Parameters
-    ----------
-    circuit : Circuit
-    sources : mapping or waveform, optional
-        From the name of a source to a waveform, a constant (V, or A) or a function of time (s); for a circuit with one
-        source, the waveform, constant or function alone is enough.
-    parameters : mapping, optional
-        From path to value, as in `Circuit.replace`.
-
-    Raises
-    ------
-    InputError
-        If `circuit` is not a circuit, a name is unknown, or a source is given without a name and there are several.
-
-    Warns
-    -----
-    FingerspiceWarning
-        If sources that `sources` does not name remain switched on.
+    For a circuit with one source, its waveform, constant or function alone is enough; `parameters` is as in
+    `Circuit.replace`.
     """
     require_circuit(circuit)
     if parameters:
@@ -55,10 +39,8 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
     if not isinstance(sources, Mapping):
         if len(driving) != 1:
             names = ", ".join(e.name for e in driving)
-            raise InputError(
-                f"sources is one source, and the circuit has {names}; allowed: a mapping such as "
-                f"{{{driving[0].name!r}: ...}}"
-            )
+            allowed = f"a mapping such as {{{driving[0].name!r}: ...}}" if driving else "no sources"
+            raise InputError(f"sources is one source, and the circuit has {names or 'none'}; allowed: {allowed}")
         sources = {driving[0].name: sources}
     for name in sources:
         if not isinstance(name, str):
@@ -77,13 +59,7 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
 
 
 def require_circuit(circuit: Any) -> None:
-    """Refuse anything but a circuit.
-
-    Raises
-    ------
-    InputError
-        If it is not; the message names the given type, and says how a circuit is made.
-    """
+    """Refuse anything but a circuit, and say how a circuit is made."""
     if not isinstance(circuit, Circuit):
         raise InputError(
             f"the circuit is a {type(circuit).__name__}; allowed: a Circuit, such as fs.read_netlist('deck.cir') gives"
@@ -91,13 +67,7 @@ def require_circuit(circuit: Any) -> None:
 
 
 def area_given(area: Any) -> str | float:
-    """An area as one of the model's modes or a positive number, m^2.
-
-    Raises
-    ------
-    InputError
-        If it is neither; the message names the given value.
-    """
+    """An area as one of the model's modes or a positive number, m^2."""
     if isinstance(area, str):
         require(area in ("coupled", "mean", "frozen"), "area", repr(area), "'coupled', 'mean', 'frozen' or m^2")
         return area

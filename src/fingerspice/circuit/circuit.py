@@ -13,18 +13,21 @@ from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
-from fingerspice.base.pages import Page
+from fingerspice.base.pages import Page, Shown
 from fingerspice.circuit.devices import DEVICES, DeviceSpec
-from fingerspice.circuit.doors import Doors
-from fingerspice.circuit.values import concerns, unusual, unusual_of_changed, value_of
+from fingerspice.circuit.usual import check, concerns, unusual_of_changed, value_of
 from fingerspice.waveforms.waveform import Waveform, as_waveform
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
 _REMEMBERING = threading.Lock()
+T = TypeVar("T")
+#: A value in the netlist's unit, as a number or text, or a source's waveform or function of time (s); by path.
+Change = float | str | Waveform | Callable[[float], float]
+Changes = Mapping[str, Change]
 
 
 @dataclass(frozen=True)
@@ -97,8 +100,15 @@ class Element:
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
-        """Cache of results that depend on this element alone, shared by all circuits that contain it."""
+        """Cache of `remember`."""
         return {}
+
+    def remember(self, key: Any, make: Callable[[], T]) -> T:
+        """The result of `make`, which depends on this element alone, for all circuits that contain it."""
+        if key not in self.kept:
+            self.kept[key] = make()
+        found: T = self.kept[key]
+        return found
 
 
 @dataclass(frozen=True)
@@ -131,7 +141,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, repr=False)
-class Circuit(Doors):
+class Circuit(Shown):
     """A netlist, read.
 
     Attributes
@@ -186,9 +196,9 @@ class Circuit(Doors):
 
         return circuit_page(self)
 
-    def remember(self, key: Any, make: Callable[[], Any]) -> Any:
+    def remember(self, key: Any, make: Callable[[], T]) -> T:
         """The result of `make`, cached by the key; this is safe because circuits do not change."""
-        kept = self._memory.get(key)
+        kept: tuple[T] | None = self._memory.get(key)
         if kept is None:
             # Two threads may both call `make`, with the same result.
             kept = (make(),)
@@ -239,7 +249,44 @@ class Circuit(Doors):
                     if hasattr(element.waveform, name):
                         yield f"{element.name}.{name}", Parameter(getattr(element.waveform, name), unit)
 
-    def replace(self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]) -> Circuit:
+    def draw(self, path: str | Path | None = None) -> Any:
+        """Draw the schematic: a notebook shows it as SVG, and from a script ``draw().show()`` opens a window.
+
+        Layers stand as a resistor beside a capacitor, or as a capacitor alone where they do not leak; nodes are rows,
+        and the lowest one is ground.
+
+        Parameters
+        ----------
+        path : str or Path, optional
+            File to write, whose end says its kind: ``.svg`` or ``.png``.
+
+        Returns
+        -------
+        Schematic
+            A matplotlib figure.
+
+        Raises
+        ------
+        InputError
+            If the path has another end or cannot be written, or the circuit has too many elements for a picture.
+        """
+        from fingerspice.plots.schematic import draw_circuit
+
+        return draw_circuit(self, path)
+
+    def explore(self) -> Any:
+        """Show the circuit on a local page, in a notebook below the cell (docs/explore.md).
+
+        Returns
+        -------
+        Explorer
+            The running page.
+        """
+        from fingerspice.explorer.server import explore
+
+        return explore(self)
+
+    def replace(self, changes: Changes) -> Circuit:
         """A changed circuit.
 
         Parameters
@@ -258,25 +305,21 @@ class Circuit(Doors):
         FingerspiceWarning
             About a value outside the usual range, which was probably meant in another unit.
         """
-        changed, notes = self._replaced(changes)
+        changed, notes, gone = self._replaced(changes)
         if not self.warnings and not notes:
             return changed
-        # Drop warnings about replaced values; as the reader's begin with a place in the deck, compare their ends.
-        before, after = unusual_of_changed(self, changed)
-        gone = tuple(before.keys() - after.keys())
+        # The reader's warnings begin with a place in the deck.
         kept = [text for text in self.warnings if not text.endswith(gone) and not concerns(text, changes)]
         for text in notes:
             warnings.warn(text, FingerspiceWarning, stacklevel=2)
         return changed._with(warnings=(*kept, *notes))
 
-    def varied(self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]) -> Circuit:
+    def varied(self, changes: Changes) -> Circuit:
         """As `replace`, without warnings: for values that this package's sweeps choose, and not the user."""
         return self._replaced(changes)[0]
 
-    def _replaced(
-        self, changes: Mapping[str, float | str | Waveform | Callable[[float], float]]
-    ) -> tuple[Circuit, list[str]]:
-        """A changed circuit, and the warnings about the changes."""
+    def _replaced(self, changes: Changes) -> tuple[Circuit, list[str], tuple[str, ...]]:
+        """A changed circuit, the warnings about the changes, and the warnings about values that are replaced."""
         if not isinstance(changes, Mapping) or not all(isinstance(path, str) for path in changes):
             raise InputError(f"replace is given {changes!r}; allowed: a mapping such as {{'Xgap.d': 3e-6}}")
         elements = {e.name.lower(): e for e in self.elements}
@@ -298,7 +341,7 @@ class Circuit(Doors):
         before, after = unusual_of_changed(self, changed)
         # One warning per value is enough: none about its size where there is one about its notation.
         new = [text for text, path in after.items() if text not in before and path not in traps]
-        return changed, [*traps.values(), *new]
+        return changed, [*traps.values(), *new], tuple(before.keys() - after.keys())
 
     def _with(self, **changes: Any) -> Circuit:
         """This circuit with changes that affect neither nodes nor devices, so that the cache `related` stays valid."""
@@ -319,7 +362,7 @@ class Circuit(Doors):
         known = [*self.parameters, *(e.name for e in self.by_device("V", "I"))]
         return _unknown("parameter", path, known)
 
-    def _waveform(self, given: float | str | Waveform | Callable[[float], float]) -> Waveform:
+    def _waveform(self, given: Change) -> Waveform:
         if not isinstance(given, str):
             return as_waveform(given)
         from fingerspice.netlist.netlist import source_from_text
@@ -343,54 +386,12 @@ def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[E
 
 
 def _unknown(kind: str, given: str, known: list[str]) -> str:
+    near = nearest(given, known)
+    return f"unknown {kind} {given!r}; " + ("there is none" if near is None else f"nearest: {near!r}")
+
+
+def nearest(given: str, known: list[str]) -> str | None:
+    """The known name that a given one resembles most, whatever the case; None only if no name is known."""
     lower = {k.lower(): k for k in known}
     near = get_close_matches(given.lower(), lower, 1, 0.0)
-    text = f"unknown {kind} {given!r}"
-    return f"{text}; nearest: {lower[near[0]]!r}" if near else f"{text}; there is none"
-
-
-def check(circuit: Circuit) -> None:
-    """Refuse values out of range and contacts that cannot exist.
-
-    Raises
-    ------
-    InputError
-        If there is such a value; the message names the parameter, its value and unit, the allowed range, and the line.
-    """
-    for element in circuit.elements:
-        if "checked" in element.kept:
-            continue
-        for spec in element.spec.parameters:
-            value: Any = element.values[spec.name]
-            if not spec.accepts(value):
-                unit = f" {spec.unit}" if spec.unit else ""
-                raise InputError(
-                    f"{element.name} {spec.name} is {value:g}{unit}; allowed: {spec.allowed()}", element.where
-                )
-        if element.device == "GAP":
-            _check_contact(element)
-        element.kept["checked"] = True
-    if circuit.tran is not None and not circuit.tran.stop > 0.0:
-        raise InputError(f"t_stop is {circuit.tran.stop:g} s; allowed: more than 0")
-
-
-def _check_contact(gap: Element) -> None:
-    m, n = gap.values["m_exp"], gap.values["n_exp"]
-    if not 0.0 < m < n:
-        raise InputError(f"{gap.name} exponents are m_exp={m:g}, n_exp={n:g}; allowed: 0 < m_exp < n_exp", gap.where)
-    if not 1.0 / m + 1.0 / n > 1.0:
-        raise InputError(
-            f"{gap.name} exponents m_exp={m:g}, n_exp={n:g} give 1/m + 1/n = {1 / m + 1 / n:.4g}; allowed: more "
-            "than 1 (else Eq. 4 has no single root)",
-            gap.where,
-        )
-    area = gap.values["alpha"] * gap.values["fn"] ** m
-    loss = math.sqrt(gap.values["c2"]) * gap.values["mu"] * gap.values["fn"]
-    if gap.values["a_fix"] == 0.0 and not area > loss:
-        hint = "".join(f"; note {text}" for _, text in unusual(gap))
-        raise InputError(
-            f"{gap.name} has no contact: friction takes the whole ridge area at 0 V "
-            f"(A0 = alpha fn^m_exp = {area:.4g} mm^2, sqrt(c2) mu fn = {loss:.4g} mm^2); allowed: "
-            f"A0^2 > c2 mu^2 fn^2, so less load fn, less friction mu or less c2{hint}",
-            gap.where,
-        )
+    return lower[near[0]] if near else None

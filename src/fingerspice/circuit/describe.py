@@ -11,6 +11,8 @@ from typing import Any
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.topology import driving
+from fingerspice.circuit.usual import shown
 from fingerspice.waveforms.combinations import Burst, Product, Repeat, Sum
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.samples import Samples
@@ -52,20 +54,7 @@ def digests(circuit: Circuit) -> tuple[str, str]:
     return elements.hexdigest(), sources.hexdigest()
 
 
-#: What the parameters are, in few words: by device and name, and those of waveforms by name.
-MEANINGS = {
-    "LAYER": {"d": "thickness", "eps_r": "permittivity", "r": "leak resistance", "e_max": "dielectric strength"},
-    "SLAB": {"d": "thickness", "eps_r": "permittivity", "rho": "resistivity", "e_max": "dielectric strength"},
-    "SKIN": {"d": "thickness", "f": "data taken at"},
-    "SKIN_DISPERSIVE": {"d": "thickness"},
-    "GAP": {
-        "d": "gap height", "eps_r": "permittivity", "r": "leak resistance", "fn": "load", "mu": "friction coeff.",
-        "alpha": "area at 1 N", "m_exp": "load exp.", "beta": "area at 1 mm", "n_exp": "indent exp.",
-        "c2": "friction loss", "a_fix": "fixed area", "tau": "area lag",
-    },
-    "R": {"value": "resistance"},
-    "C": {"value": "capacitance"},
-}  # fmt: skip
+#: What the numbers of waveforms are, in few words.
 MEANINGS_OF_WAVEFORMS = {
     "modulation": "envelope", "phase_deg": "phase", "f0": "first frequency", "f1": "last frequency", "v1": "low level",
     "v2": "high level", "td1": "rise begins", "tau1": "rise constant", "td2": "fall begins", "tau2": "fall constant",
@@ -79,7 +68,7 @@ MOST_ELEMENTS = 25
 def meaning_of(circuit: Circuit, path: str) -> str:
     """A parameter in words, as in ``load of Xgap``."""
     name, _, parameter = path.rpartition(".")
-    known = MEANINGS.get(circuit[name].device, MEANINGS_OF_WAVEFORMS)
+    known = MEANINGS_OF_WAVEFORMS | {p.name: p.meaning for p in circuit[name].spec.parameters}
     return f"{known.get(parameter, parameter)} of {name}"
 
 
@@ -104,7 +93,7 @@ def waveform_text(waveform: Waveform, unit: str = "V") -> str:
         if field.name not in waveform.units or value == field.default:
             continue
         own = waveform.units[field.name].replace("V", unit)
-        text = _quantity(value, own)
+        text = shown(value, own)
         # A required figure is known by its position; one that has a default needs its name.
         said.append(text if field.default is dataclasses.MISSING else f"{field.name} {text}")
     return f"{type(waveform).__name__}({', '.join(said)})"
@@ -117,11 +106,9 @@ def drive_text(circuit: Circuit) -> str:
     """
     said = []
     replaced = {path.lower() for path in circuit.overrides} - _given_by_sets(circuit)
-    areas = {node for element in circuit.elements if element.spec.is_layer for node in element.nodes[2:]}
-    for element in circuit.by_device("V", "I"):
+    for element in driving(circuit):
         wave = element.waveform
-        # A V element at an area node gives the area, and drives nothing.
-        if wave is None or wave == DC(0.0) or element.nodes[0] in areas or element.name.lower() in replaced:
+        if wave is None or wave == DC(0.0) or element.name.lower() in replaced:
             continue
         said.append(f"{element.name}: {waveform_text(wave, 'A' if element.device == 'I' else 'V')}")
     return _joined(said)
@@ -141,7 +128,7 @@ def changes_text(circuit: Circuit) -> str:
             continue
         if path in known:
             name, parameter = known[path]
-            said.append(f"{name} = {_quantity(parameter.value, parameter.unit)}")
+            said.append(f"{name} = {shown(parameter.value, parameter.unit)}")
             continue
         said += [
             f"{element.name} = {waveform_text(element.waveform, 'A' if element.device == 'I' else 'V')}"
@@ -176,11 +163,11 @@ def head_lines(circuit: Circuit) -> list[str]:
 
 def circuit_page(circuit: Circuit) -> Page:
     """The elements of a circuit and the analyses of its deck."""
-    rows = []
-    for element in circuit.elements[:MOST_ELEMENTS]:
-        rows.append((element.name, element.device, " ".join(element.node_names), _cut(values_text(element), 96)))
-    lines: list[str | Table] = [heading(circuit), ""]
-    lines.append(Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4))
+    rows = [
+        (e.name, e.device, " ".join(e.node_names), _cut(values_text(e), 96)) for e in circuit.elements[:MOST_ELEMENTS]
+    ]
+    table = Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4)
+    lines: list[str | Table] = [heading(circuit), "", table]
     if len(circuit.elements) > MOST_ELEMENTS:
         lines.append(f"... and {len(circuit.elements) - MOST_ELEMENTS} more elements")
     lines.append("")
@@ -214,11 +201,6 @@ def _deck_value(value: float) -> str:
 
 def _cut(text: str, longest: int) -> str:
     return text if len(text) <= longest else f"{text[: longest - 4]} ..."
-
-
-def _quantity(value: float, unit: str) -> str:
-    # Powers of a unit and angles take no prefix: 1 kmm^2 would not be 1000 mm^2.
-    return f"{value:.4g} {unit}".rstrip() if "^" in unit or unit in ("", "deg") else format_si(value, unit)
 
 
 def _joined(said: list[str]) -> str:

@@ -32,6 +32,8 @@ class ParameterSpec:
     unit: str
     default: float | None = None  # None for a parameter that the netlist must give
     usual: Usual | None = None  # Range outside which a warning is given
+    meaning: str = ""  # What it is, in few words, beside its slider
+    first: bool = False  # Whether the explorer's page shows it at once: the paper varies it, or Table 1 gives it
     # may_be_zero, may_be_infinite: Whether 0, or infinity, is allowed besides positive numbers
     may_be_zero: bool = False
     may_be_infinite: bool = False
@@ -64,6 +66,7 @@ class DeviceSpec:
     nodes: tuple[str, ...]
     parameters: tuple[ParameterSpec, ...]
     cells: Cells | None = None
+    what: str = ""  # What it is, in few words, above its sliders
 
     def __post_init__(self) -> None:
         if self.is_layer != (self.cells is not None):
@@ -100,9 +103,6 @@ def _dispersive_cells(v: Mapping[str, float], at: float | None) -> FloatArray:
         return _slabs(v["d"], *SKIN_LADDER.cells())
     return _slabs(v["d"], SKIN_LADDER.permittivity([at]), SKIN_LADDER.resistivity([at]))
 
-
-_P = ParameterSpec
-_LAYER_NODES = ("p", "n", "area")
 
 # Usual ranges, each with its source.
 
@@ -144,59 +144,68 @@ _BAND = Usual(*SKIN_BAND, "where the data of Eqs. 18 and 19 were measured")
 _OHM = Usual(1e-3, 1e15, "a lead has milliohms, an insulator up to 1e15 ohm")
 _FARAD = Usual(1e-16, 1e-2, "a body has 150 pF to ground, a supply's capacitor some mF")
 
-_EPS = _P("eps_r", "", usual=_EPS_R)
-_R = _P("r", "ohm", math.inf, _LEAK, may_be_infinite=True)
-_E_MAX = _P("e_max", "V/m", math.inf, _STRENGTH, may_be_infinite=True)
+_P = ParameterSpec
+_LAYER_NODES, _ENDS = ("p", "n", "area"), ("p", "n")
+_THICKNESS, _SKIN_THICKNESS = (_P("d", "m", None, usual, "thickness", first=True) for usual in (_COATING, _SKIN))
+_R = _P("r", "ohm", math.inf, _LEAK, "leak resistance", first=True, may_be_infinite=True)
+_E_MAX = _P("e_max", "V/m", math.inf, _STRENGTH, "dielectric strength", may_be_infinite=True)
+_DEVICES = (
+    DeviceSpec(
+        "LAYER",
+        _LAYER_NODES,
+        (_THICKNESS, _P("eps_r", "", None, _EPS_R, "permittivity", first=True), _R, _E_MAX),
+        _layer_cells,
+        "layer",
+    ),
+    DeviceSpec(
+        "SLAB",
+        _LAYER_NODES,
+        (
+            _THICKNESS,
+            _P("eps_r", "", None, _EPS_R_MATERIAL, "permittivity", first=True),
+            _P("rho", "ohm m", None, _RHO, "resistivity", first=True, may_be_infinite=True),
+            _E_MAX,
+        ),
+        _slab_cells,
+        "layer",
+    ),
+    DeviceSpec(
+        "SKIN",
+        _LAYER_NODES,
+        (_SKIN_THICKNESS, _P("f", "Hz", None, _BAND, "data taken at", first=True, least=1e-3, most=1e9)),
+        _skin_cells,
+        "skin",
+    ),
+    DeviceSpec("SKIN_DISPERSIVE", _LAYER_NODES, (_SKIN_THICKNESS,), _dispersive_cells, "skin, dispersive"),
+    DeviceSpec(
+        "GAP",
+        _LAYER_NODES,
+        # The defaults are Table 1's, and equal those of the ngspice libraries.
+        (
+            _P("d", "m", 3.5e-6, _AIR, "gap height", first=True),
+            _P("eps_r", "", 1.0, _EPS_R, "permittivity"),
+            _R,
+            _P("fn", "N", 0.5, _LOAD, "load", first=True),
+            _P("mu", "", 0.3, _FRICTION, "friction coeff.", first=True, may_be_zero=True),
+            _P("alpha", "mm^2/N^m", 54.4, _ALPHA, "area at 1 N"),
+            _P("m_exp", "", 0.52, _M_EXP, "load exp."),
+            _P("beta", "mm^(2-n)", 32.0, _BETA, "area at 1 mm"),
+            _P("n_exp", "", 1.41, _N_EXP, "indent exp."),
+            _P("c2", "mm^4/N^2", 5000.0, _C2, "friction loss", may_be_zero=True),
+            _P("a_fix", "mm^2", 0.0, REST_AREA, "fixed area", may_be_zero=True),
+            _P("tau", "s", 0.0, _TAU, "area lag", may_be_zero=True),
+        ),
+        _layer_cells,
+        "gap and contact",
+    ),
+    DeviceSpec("R", _ENDS, (_P("value", "ohm", None, _OHM, "resistance", first=True),), what="resistor"),
+    DeviceSpec("C", _ENDS, (_P("value", "F", None, _FARAD, "capacitance", first=True),), what="capacitor"),
+    DeviceSpec("V", _ENDS, (), what="voltage source"),
+    DeviceSpec("I", _ENDS, (), what="current source"),
+)
 
-DEVICES: dict[str, DeviceSpec] = {
-    spec.name: spec
-    for spec in (
-        DeviceSpec("LAYER", _LAYER_NODES, (_P("d", "m", usual=_COATING), _EPS, _R, _E_MAX), _layer_cells),
-        DeviceSpec(
-            "SLAB",
-            _LAYER_NODES,
-            (
-                _P("d", "m", usual=_COATING),
-                _P("eps_r", "", usual=_EPS_R_MATERIAL),
-                _P("rho", "ohm m", usual=_RHO, may_be_infinite=True),
-                _E_MAX,
-            ),
-            _slab_cells,
-        ),
-        DeviceSpec(
-            "SKIN",
-            _LAYER_NODES,
-            (_P("d", "m", usual=_SKIN), _P("f", "Hz", usual=_BAND, least=1e-3, most=1e9)),
-            _skin_cells,
-        ),
-        DeviceSpec("SKIN_DISPERSIVE", _LAYER_NODES, (_P("d", "m", usual=_SKIN),), _dispersive_cells),
-        DeviceSpec(
-            "GAP",
-            _LAYER_NODES,
-            # The defaults are Table 1's, and equal those of the ngspice libraries.
-            (
-                _P("d", "m", 3.5e-6, _AIR),
-                _P("eps_r", "", 1.0, _EPS_R),
-                _R,
-                _P("fn", "N", 0.5, _LOAD),
-                _P("mu", "", 0.3, _FRICTION, may_be_zero=True),
-                _P("alpha", "mm^2/N^m", 54.4, _ALPHA),
-                _P("m_exp", "", 0.52, _M_EXP),
-                _P("beta", "mm^(2-n)", 32.0, _BETA),
-                _P("n_exp", "", 1.41, _N_EXP),
-                _P("c2", "mm^4/N^2", 5000.0, _C2, may_be_zero=True),
-                _P("a_fix", "mm^2", 0.0, REST_AREA, may_be_zero=True),
-                _P("tau", "s", 0.0, _TAU, may_be_zero=True),
-            ),
-            _layer_cells,
-        ),
-        DeviceSpec("R", ("p", "n"), (_P("value", "ohm", usual=_OHM),)),
-        DeviceSpec("C", ("p", "n"), (_P("value", "F", usual=_FARAD),)),
-        DeviceSpec("V", ("p", "n"), ()),
-        DeviceSpec("I", ("p", "n"), ()),
-    )
-}
-"""Every device that the reader knows, by name."""
+#: Every device that the reader knows, by name.
+DEVICES: dict[str, DeviceSpec] = {spec.name: spec for spec in _DEVICES}
 
 
 def layer_devices() -> tuple[str, ...]:

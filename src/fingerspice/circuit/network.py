@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,12 +21,13 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.reduction import Tree, eliminate, source_currents
-from fingerspice.circuit.statespace import Stack, contact_of, layer_constants
-from fingerspice.circuit.topology import Area, find_branches
+from fingerspice.circuit.statespace import Stack, contact_of, layer_constants, skin_admittance
+from fingerspice.circuit.topology import Area, Tree, find_branches
 from fingerspice.physics.contact import Contact
-from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.waveforms.waveform import Waveform
+
+# A current of a source that is this small, relative to what it is the difference of, is rounding.
+_ROUNDING = 1e-13
 
 
 @dataclass(frozen=True)
@@ -130,8 +131,7 @@ class Network:
         y = self.leak(area) + 2j * np.pi * f[..., None] * self.capacitance(area)
         for i, cell in enumerate(self.cells):
             if cell.element.device == "SKIN" and cell.area is not None:
-                per_area = 1.0 / skin_resistivity(f) + 2j * np.pi * f * EPS0 * skin_permittivity(f)
-                y[..., i] = per_area * area[cell.area] / cell.element.values["d"]
+                y[..., i] = skin_admittance(cell.element, f, area[cell.area])
         return np.asarray(y)
 
     def phasors(self, frequency: ArrayLike, area: FloatArray, s: ComplexArray) -> ComplexArray:
@@ -163,14 +163,9 @@ class Network:
 
 
 def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
-    """The network of a circuit.
+    """The network of a circuit, or its refusal.
 
     The voltage sources in `held` are added, to hold the voltages of nodes; they may close no loop of voltage sources.
-
-    Raises
-    ------
-    InputError
-        As `topology.find_branches`, and if Eq. 7 holds the total voltage, which only a series stack has.
     """
     areas, branches = find_branches(circuit)
     branches = [*branches, *held]
@@ -248,6 +243,65 @@ def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
         Cell(element, (path[i], path[i + 1]), float(c), float(g), float(g_area), area)
         for i, (c, g, g_area) in enumerate(constants)
     ]
+
+
+class Resistors(NamedTuple):
+    """What resistors do in a network, with the voltages of the tree's resistors eliminated.
+
+    The tree's other voltages are e = (s, x), those of its sources and its capacitors.
+    """
+
+    # from_e, from_i (n_r, n_e): Voltages of the tree's resistors by e, and by the currents of the current sources
+    from_e: FloatArray
+    from_i: FloatArray
+    # into_e, into_i (n_e, n_e): Currents into the cuts of the tree's sources and capacitors, by both
+    into_e: FloatArray
+    into_i: FloatArray
+    factor: FloatArray  # (n_resistor, n_e): Square roots of the power in each resistor, by e: into_e = factor' factor
+
+
+def eliminate(over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_e: int) -> Resistors:
+    """Eliminate the voltages of the tree's resistors: given e, they minimise the dissipated power.
+
+    `over_resistors` (n_resistor, n_e + n_r) and `over_currents` (n_i, n_e + n_r) are the voltages of all resistors and
+    current sources by those of the tree's branches, its own resistors last; `conductance` (n_resistor,) is in S.
+    """
+    e, r = slice(0, n_e), slice(n_e, None)
+    weight, n_r, n_i = np.sqrt(conductance)[:, None], over_resistors.shape[1] - n_e, over_currents.shape[0]
+    orthogonal, upper = np.linalg.qr(weight * over_resistors[:, r])
+    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_resistors[:, e])) if n_r else np.zeros((0, n_e))
+    back = np.linalg.solve(upper.T, over_currents[:, r].T) if n_r else np.zeros((0, n_i))
+    from_i = -np.linalg.solve(upper, back) if n_r else back
+    by_e = over_resistors[:, e] + over_resistors[:, r] @ from_e
+    by_i = over_resistors[:, r] @ from_i
+    into_e = by_e.T @ (conductance[:, None] * by_e)
+    into_i = over_resistors[:, e].T @ (conductance[:, None] * by_i) + over_currents[:, e].T
+    return Resistors(from_e, from_i, into_e, into_i, weight * by_e)
+
+
+def source_currents(found: Resistors, n_v: int) -> tuple[FloatArray, FloatArray]:
+    """What the sources deliver to resistors, and the cuts of capacitors that are added to their own.
+
+    The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
+    capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
+
+    The first is (n_v + n_i, n + n_v + n_i), the current of each source (A) by the voltages of the capacitors and of
+    the n_v voltage sources and the currents of the others; the second (n_v, n), shares of the capacitors' cuts.
+    """
+    n_e, n_i = found.into_i.shape
+    s, x, n, factor = slice(0, n_v), slice(n_v, n_e), n_e - n_v, found.factor
+    into_e, into_i = found.into_e, found.into_i
+    together: FloatArray = np.zeros((n_v, n))
+    if factor.size:
+        together = np.asarray(-np.linalg.lstsq(factor[:, x], factor[:, s], rcond=None)[0].T, float)
+    delivered: FloatArray = np.zeros((n_v + n_i, n_e + n_i))
+    delivered[:n_v] = np.hstack([into_e[s, x], into_e[s, s], into_i[s]])
+    delivered[:n_v] += together @ np.hstack([into_e[x, x], into_e[x, s], into_i[x]])
+    largest = np.linalg.norm(factor[:, s], axis=0)[:, None] * np.linalg.norm(factor, axis=0)
+    rounding = np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.hstack([largest[:, x], largest[:, s]])
+    delivered[:n_v, :n_e][rounding] = 0.0
+    delivered[n_v:, n_e:] = np.eye(n_i)
+    return delivered, together
 
 
 @dataclass(frozen=True)

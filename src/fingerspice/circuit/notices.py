@@ -11,11 +11,11 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.spectrum import energy_outside, skin_error, surely_wide
-from fingerspice.circuit.topology import driving_sources
-from fingerspice.circuit.values import unusual_of_changed
+from fingerspice.circuit.topology import driving, driving_sources
+from fingerspice.circuit.usual import unusual_of_changed
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.waveform import Waveform
@@ -42,13 +42,12 @@ def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
 
     The run is taken to end at `t_stop` (s), or at the deck's own end where that is None.
     """
-    stop = t_stop or (circuit.tran.stop if circuit.tran is not None else math.nan)
+    stop = _end(circuit, t_stop)
+    return circuit.remember(("notices", stop), lambda: (*directive_warnings(circuit), *_skin_warnings(circuit, stop)))
 
-    def make() -> tuple[str, ...]:
-        return (*directive_warnings(circuit), *_skin_warnings(circuit, stop))
 
-    found: tuple[str, ...] = circuit.remember(("notices", stop), make)
-    return found
+def _end(circuit: Circuit, t_stop: float | None) -> float:
+    return t_stop or (circuit.tran.stop if circuit.tran is not None else math.nan)
 
 
 def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
@@ -61,8 +60,7 @@ def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) 
 
     A recording is cut off without a warning unless the deck's own TSTOP does it, as `by_deck` says.
     """
-    drives = driving(circuit)
-    for name, wave in ((e.name, e.waveform) for e in drives if e.waveform is not None):
+    for name, wave in ((e.name, e.waveform) for e in driving(circuit) if e.waveform is not None):
         (first, last), count = wave.course, _points(wave)
         if (count > 1 and last < start == 0.0) or stop <= first < math.inf:
             until = f" to {last:g} s" if last < math.inf else " on"
@@ -80,12 +78,6 @@ def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) 
                 f"{name}: the recording ends at {last:g} s, and the run at the deck's TSTOP = {stop:g} s; --stop "
                 f"{last:.9g} takes all of it (in Python t_stop={last:.9g})"
             )
-
-
-def driving(circuit: Circuit) -> list[Element]:
-    """The V and I elements that do not give an area."""
-    areas = {e.nodes[2] for e in circuit.elements if e.spec.is_layer}
-    return [e for e in circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
 
 
 def _points(wave: Waveform) -> int:
@@ -119,7 +111,7 @@ def scenes_warnings(
             # A scene that cannot be run says so itself.
             with suppress(InputError):
                 yield from unusual_of_changed(circuit, circuit.varied({path: float(end)}))[1]
-    stop = t_stop or (circuit.tran.stop if circuit.tran is not None else math.nan)
+    stop = _end(circuit, t_stop)
     if not any(path.startswith(f"{e.name}.") for e in driving(circuit) for path in scenes):
         yield from course_warnings(circuit, 0.0, stop, t_stop is None)
     if skin != "own":

@@ -71,11 +71,7 @@ class LinearScene:
 def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     """The linear scene of a circuit's GAP, which has to be named if there are several.
 
-    Raises
-    ------
-    InputError
-        If the circuit has no GAP, if no GAP has the given name, if several GAPs exist and none is named, or if a
-        network has several sources, which have no common amplitude and frequency.
+    Refused are names of no GAP, and networks with several sources, which have no common amplitude and frequency.
     """
     gaps = {e.name.lower(): e.name for e in circuit.by_device("GAP")}
     if finger is not None and finger.lower() not in gaps:
@@ -113,13 +109,7 @@ def with_skin_held(circuit: Circuit) -> Circuit:
 
 
 def mean_areas(network: Network) -> FloatArray:
-    """Areas of a coupled phasor at its source's fundamental, m^2, shape (n_area,).
-
-    Raises
-    ------
-    InputError
-        If there are several sources, if the source has no fundamental, or if the areas do not converge.
-    """
+    """Areas of a coupled phasor at its source's fundamental, m^2, shape (n_area,); refused if there is none."""
     several = len(network.sources) > 1
     fundamental = None if several else network.waveforms[0].fundamental
     if fundamental is None:
@@ -144,18 +134,17 @@ def _stack_gains(stack: Stack, f: float, areas: FloatArray) -> ComplexArray:
 
 
 def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
-    """Areas under one source's amplitude (V or A) at one frequency (Hz), each at its gap's rms voltage.
-
-    Raises
-    ------
-    InputError
-        If the areas do not converge.
-    """
+    """Areas under one source's amplitude (V or A) at one frequency (Hz), each at its gap's rms voltage."""
     area = areas_at_rest(network)
     if all(a.given is not None for a in network.areas):
         return area
-    if network.stack is not None:
-        return np.array([_stack_area(network.stack, f, amplitude)])
+    stack, finger = network.stack, network.contacts[0]
+    if stack is not None and finger is not None:
+
+        def gain(area: float) -> float:
+            return float(np.abs(_stack_gains(stack, f, np.array([area]))[stack.gap_layer]))
+
+        return np.array([coupled_area(lambda u: float(finger.area(u)), gain, amplitude)])
     s = np.array([complex(amplitude)])
     for attempt in range(500):
         u = np.abs(network.phasors(f, area, s))
@@ -170,14 +159,3 @@ def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
         # The fixed-point iteration may oscillate between two values: after 50 iterations, damp it by taking the mean.
         area = new if attempt < 50 else 0.5 * (area + new)
     raise InputError("the phasor's areas do not settle; allowed: area='frozen' or an area in m^2")
-
-
-def _stack_area(stack: Stack, f: float, amplitude: float) -> float:
-    """Coupled area (m^2) of a stack at a source amplitude (V) and frequency (Hz), as in `coupled_areas`."""
-    contact, gap = stack.contact, stack.gap_layer
-    assert contact is not None
-
-    def gain(area: float) -> float:
-        return float(np.abs(_stack_gains(stack, f, np.array([area]))[gap]))
-
-    return coupled_area(lambda u: float(contact.area(u)), gain, amplitude)

@@ -8,11 +8,11 @@ from functools import lru_cache
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.response import areas_at_rest, with_skin_held
 from fingerspice.circuit.statespace import build_stack
-from fingerspice.circuit.topology import driving_sources
+from fingerspice.circuit.topology import shared
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.samples import Samples
@@ -81,8 +81,10 @@ def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatA
 
 def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | None:
     """As `_energies`, from the samples themselves: pieces spread over the run to `t_stop` (s); None for few samples."""
-    last = min(wave.count, math.floor((t_stop - wave.start) * wave.rate) + 1) if isinstance(wave, Samples) else 0
-    if not isinstance(wave, Samples) or last < _FEW:
+    if not isinstance(wave, Samples):
+        return None
+    last = min(wave.count, math.floor((t_stop - wave.start) * wave.rate) + 1)
+    if last < _FEW:
         return None
     # Key and value are one entry, because another thread may replace it at any time.
     kept: tuple[float, tuple[FloatArray, FloatArray]] | None = wave.kept.get("spectrum")
@@ -101,14 +103,8 @@ def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | 
     return found
 
 
-def energy_outside(
-    waveform: Waveform, t_stop: float, band: tuple[float, float] = SKIN_BAND
-) -> tuple[float, float]:  # fmt: skip
-    """Fractions of the source's energy below and above a band (Hz), by default the band of the skin's data.
-
-    The energy is that of one period of a periodic source, and else that of the run to `t_stop` (s). For a source with
-    values that are not finite both fractions are 0.
-    """
+def energy_outside(waveform: Waveform, t_stop: float, band: tuple[float, float] = SKIN_BAND) -> tuple[float, float]:
+    """Fractions of the source's energy in a run to `t_stop` (s) below and above a band (Hz); see `_energies`."""
     low, high = band
     # Above their rate, straight lines between samples of white noise have 0.3 % of its energy.
     slow = isinstance(waveform, Samples) and waveform.rate <= high
@@ -120,10 +116,7 @@ def energy_outside(
 
 
 def surely_wide(waveform: Waveform, t_stop: float, frequency: float) -> bool:
-    """Whether a fifth of a recording's energy is clearly more than half an octave away from a frequency (Hz).
-
-    This is seen without the fine spectrum that a narrow band needs.
-    """
+    """Whether a fifth of a recording's energy is more than half an octave from a frequency (Hz), at a coarse look."""
     found = _recorded(waveform, t_stop)
     if found is None:
         return False
@@ -161,23 +154,18 @@ def _shared_out(step: float, energy: FloatArray) -> FloatArray:
 def _squared_gains(circuit: Circuit) -> tuple[FloatArray, FloatArray] | None:
     """Squared gains from the one source to each gap (_GRID, n_gap), with the skin's own data at each frequency and with
     those held at one; None if they cannot be computed. Circuits that differ in their sources only share them."""
-    drives = {e.name for e in driving_sources(circuit)}
-    passive = tuple(e for e in circuit.elements if e.name not in drives)
-    before: tuple[Element, ...]
-    found: tuple[FloatArray, FloatArray] | None
-    before, found = circuit.related.get("squared gains", ((), None))
-    if len(before) == len(passive) and all(a is b for a, b in zip(before, passive, strict=True)):
-        return found
-    networks = network_of(circuit), network_of(with_skin_held(circuit))
-    gaps = [gap for gap in networks[0].gaps if gap is not None]
-    grid, areas = np.geomspace(*SKIN_BAND, _GRID), areas_at_rest(networks[0])
-    try:
-        own, held = (np.abs(n.phasors(grid, areas, np.ones(1, complex))[:, gaps]) ** 2 for n in networks)
-        found = own, held
-    except np.linalg.LinAlgError:
-        found = None
-    circuit.related["squared gains"] = passive, found
-    return found
+
+    def make() -> tuple[FloatArray, FloatArray] | None:
+        networks = network_of(circuit), network_of(with_skin_held(circuit))
+        gaps = [gap for gap in networks[0].gaps if gap is not None]
+        grid, areas = np.geomspace(*SKIN_BAND, _GRID), areas_at_rest(networks[0])
+        try:
+            own, held = (np.abs(n.phasors(grid, areas, np.ones(1, complex))[:, gaps]) ** 2 for n in networks)
+        except np.linalg.LinAlgError:
+            return None
+        return own, held
+
+    return shared(circuit, "squared gains", make)
 
 
 def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
@@ -221,22 +209,10 @@ def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str
 
 
 def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity: float, t_stop: float) -> float:
-    """Error of the gap voltage, relative to its peak, if a dispersive skin's data are taken at one frequency.
+    """Error of the gap voltage, relative to its peak, if a dispersive skin's data are taken at one frequency (Hz).
 
-    It is the error of the linear response at one area from the uncharged start, by superposition of phasors, plus an
-    estimate of the error due to the change of the area.
-
-    Parameters
-    ----------
-    circuit : Circuit
-    frequency : float
-        Hz.
-    area : float
-        m^2.
-    sensitivity : float
-        Relative change of the area over the run.
-    t_stop : float
-        s.
+    It is the error of the linear response at one area (m^2) from the uncharged start to `t_stop` (s), by superposition
+    of phasors, plus an estimate of the error due to the change of the area, `sensitivity` relative to the area.
     """
     dispersive, frozen = build_stack(circuit), build_stack(circuit, skin_at=frequency)
     gap = dispersive.gap_layer

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-import operator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.topology import Hop, Loop, find_loop, same_loop
+from fingerspice.circuit.topology import Hop, Loop, loop_of, shared
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.waveforms.combinations import Product, Sum
@@ -49,16 +48,13 @@ class Stack:
     contact: Contact | None
     area_given: float | None  # Area fixed by the deck, m^2
     hops: tuple[Hop, ...]  # The elements of the loop in order, from ground to ground
+    # Whatever else is computed from the layers alone, shared by stacks that differ in their sources only
+    kept: dict[Any, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:
         """Voltage sources in the loop, each with the sign of its voltage in the sum U."""
         return tuple((h.element, -h.sign) for h in self.hops if h.element.device == "V")
-
-    @cached_property
-    def kept(self) -> dict[Any, Any]:
-        """Whatever else has been computed from the layers alone."""
-        return {}
 
     @cached_property
     def first_cell(self) -> NDArray[np.intp]:
@@ -68,7 +64,7 @@ class Stack:
     @property
     def gap_layer(self) -> int | None:
         """Index of the gap among the layers."""
-        return None if self.gap is None else self.layer_of(self.gap)
+        return None if self.gap is None else int(self.layer_of[self.gap])
 
     def layers_of(self, cells: NDArray[np.bool_]) -> list[str]:
         """Names of the layers that have at least one marked cell."""
@@ -98,9 +94,9 @@ class Stack:
 
     @property
     def state_order(self) -> tuple[int, ...]:
-        """Cells in the order of the states; the last cell has no state, as its voltage is the source's less all others.
+        """Cells in the order of the states; the last one has no state, as its voltage is the source's less all others.
 
-        The last cell is never the gap (unless the gap is the only cell), so that the gap voltage is a state of its own.
+        It is never the gap (unless the gap is the only cell), so that the gap voltage is a state of its own.
         """
         left_out = next((i for i in reversed(range(self.c.size)) if i != self.gap), 0)
         return (*(i for i in range(self.c.size) if i != left_out), left_out)
@@ -128,16 +124,13 @@ class Stack:
     @cached_property
     def grouping(self) -> FloatArray:
         """Matrix of 0 and 1 from live cells to recorded layers, shape (n_layer - 1, n_cell - 1)."""
-        layers = np.array([self.layer_of(cell) for cell in self.state_order[:-1]], int)
-        return np.asarray(np.array(self.by_layer.state_order[:-1], int)[:, None] == layers, float)
-
-    def layer_of(self, cell: int) -> int:
-        """Index of the layer that a cell is part of."""
-        return self._layers_of_cells[cell]
+        layers = np.array(self.by_layer.state_order[:-1], int)
+        return np.asarray(layers[:, None] == self.layer_of[np.array(self.state_order[:-1], int)], float)
 
     @cached_property
-    def _layers_of_cells(self) -> tuple[int, ...]:
-        return tuple(i for i, count in enumerate(self.cells) for _ in range(count))
+    def layer_of(self) -> NDArray[np.intp]:
+        """Index of the layer that each cell is part of."""
+        return np.repeat(np.arange(len(self.cells)), self.cells)
 
     def leak_rates(self, area: float) -> FloatArray:
         """Leak rate of each cell, g/c, at an area (m^2), 1/s, shape (n_cell,)."""
@@ -152,9 +145,15 @@ class Stack:
             y = 1.0 / np.add.reduceat(1.0 / y, self.first_cell, axis=1)
         for i, layer in enumerate(self.layers):
             if layer.device == "SKIN":
-                skin = 1.0 / skin_resistivity(f) + 2j * math.pi * f * EPS0 * skin_permittivity(f)
-                y[:, i] = (skin * a / layer.values["d"])[:, 0]
+                y[:, i] = skin_admittance(layer, f, a)[:, 0]
         return np.asarray(y)
+
+
+def skin_admittance(skin: Element, frequency: FloatArray, area: FloatArray) -> ComplexArray:
+    """Complex admittance of a SKIN with its data at each frequency (Hz), S; `area` (m^2) is broadcast."""
+    f = frequency
+    per_area = 1.0 / skin_resistivity(f) + 2j * math.pi * f * EPS0 * skin_permittivity(f)
+    return np.asarray(per_area * area / skin.values["d"])
 
 
 def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
@@ -162,26 +161,14 @@ def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
 
     With `skin_at` (Hz) a dispersive skin is one cell with its data at that frequency.
     """
-    assert layer.spec.cells is not None
-    key = ("cells", skin_at)
-    if key not in layer.kept:
-        layer.kept[key] = layer.spec.cells(layer.values, skin_at)
-    constants: FloatArray = layer.kept[key]
-    return constants
+    cells = layer.spec.cells
+    assert cells is not None
+    return layer.remember(("cells", skin_at), lambda: cells(layer.values, skin_at))
 
 
 def contact_of(gap: Element) -> Contact:
-    """The contact of a GAP; here, and nowhere else, the paper's mm are converted to m.
-
-    Raises
-    ------
-    InputError
-        If its constants overflow or underflow.
-    """
-    if "contact" not in gap.kept:
-        gap.kept["contact"] = _contact_of(gap)
-    contact: Contact = gap.kept["contact"]
-    return contact
+    """The contact of a GAP; here, and nowhere else, the paper's mm are converted to m."""
+    return gap.remember("contact", lambda: _contact_of(gap))
 
 
 def _contact_of(gap: Element) -> Contact:
@@ -213,66 +200,34 @@ def _contact_of(gap: Element) -> Contact:
 def is_stack(circuit: Circuit) -> bool:
     """Whether a circuit is one series loop of sources and layers, with one area that follows the voltage without delay.
 
-    Raises
-    ------
-    InputError
-        As `topology.find_branches`.
+    A circuit that `topology.find_branches` refuses is refused.
     """
-    return _loop(circuit) is not None
-
-
-def _loop(circuit: Circuit) -> Loop | None:
-    """The circuit's loop; the search is done once for all circuits that `Circuit.replace` derives from one another."""
-
-    def make() -> Loop | None:
-        if "loop" not in circuit.related:
-            circuit.related["loop"] = find_loop(circuit)
-        walked: Loop | None = circuit.related["loop"]
-        return None if walked is None else same_loop(circuit, walked)
-
-    loop: Loop | None = circuit.remember("loop", make)
-    return loop
+    return loop_of(circuit) is not None
 
 
 def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     """The series stack of a circuit; with `skin_at`, dispersive skins have their data at that frequency (Hz).
 
     If the deck holds the total voltage in Eq. 7, the contact uses the stack's capacitances alone: a dispersive skin
-    enters with eps_inf, its permittivity above all poles, or with its permittivity at `skin_at`.
-
-    Raises
-    ------
-    InputError
-        As `topology.find_branches`, and if the circuit is not a series stack.
+    enters with eps_inf, its permittivity above all poles, or with its permittivity at `skin_at`. A circuit that is no
+    series stack is refused.
     """
 
     def make() -> Stack:
-        key, loop = ("stack", skin_at, circuit.work), _loop(circuit)
-        before: Stack | None = circuit.related.get(key)
-        if before is not None and loop is not None and all(map(operator.is_, before.layers, layers_of(loop))):
-            found = before.between(loop.hops)
-        else:
-            found = _build(circuit, loop, skin_at)
-        # The latest one, because runs have computed more from it.
-        circuit.related[key] = found
-        return found
+        loop = loop_of(circuit)
+        if loop is None:
+            raise InputError(
+                "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is "
+                "another network; allowed for any network: simulate (run), plan, phasor (ac) and export"
+            )
+        key = ("stack", skin_at, circuit.work)
+        return shared(circuit, key, lambda: _build(circuit, loop, skin_at)).between(loop.hops)
 
-    stack: Stack = circuit.remember(("stack", skin_at), make)
-    return stack
+    return circuit.remember(("stack", skin_at), make)
 
 
-def layers_of(loop: Loop) -> list[Element]:
-    """Layers of a loop in its order."""
-    return [h.element for h in loop.hops if h.element.spec.is_layer]
-
-
-def _build(circuit: Circuit, loop: Loop | None, skin_at: float | None) -> Stack:
-    if loop is None:
-        raise InputError(
-            "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is another "
-            "network; allowed for any network: simulate (run), plan, phasor (ac) and export"
-        )
-    layers = layers_of(loop)
+def _build(circuit: Circuit, loop: Loop, skin_at: float | None) -> Stack:
+    layers = loop.layers
     parts = [layer_constants(e, skin_at) for e in layers]
     cells = tuple(len(part) for part in parts)
     constants = np.concatenate(parts)

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import operator
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from types import MappingProxyType
+from typing import Any
 
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.circuit import Circuit, Element, T
 from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.waveforms.waveform import DC
 
 #: Largest number of elements of a circuit, because every matrix of a network is dense.
 MAX_ELEMENTS = 2000
+#: Number of slabs of a dispersive skin.
+SLABS = len(SKIN_LADDER.poles) + 1
 _GROUNDS = ("gnd", "ground", "earth", "vss")
 
 
@@ -24,8 +31,7 @@ class Hop:
 
     element: Element
     sign: float
-    node: str
-    """Name, as written, of the node after the element."""
+    node: str  # Name, as written, of the node after the element
 
 
 @dataclass(frozen=True)
@@ -35,7 +41,6 @@ class Area:
     node: str  # Canonical name of the area node
     gap: Element | None  # The GAP that drives it
     given: float | None  # m^2, from a DC source on the node or the gap's a_fix
-    source: Element | None = None  # The DC source that gives the area, or None
 
 
 @dataclass(frozen=True)
@@ -44,24 +49,20 @@ class Loop:
 
     hops: tuple[Hop, ...]
     gap: Element | None
-    area_given: float | None
-    """m^2, from a DC source on the area node or the gap's a_fix."""
+    area_given: float | None  # m^2, from a DC source on the area node or the gap's a_fix
+
+    @property
+    def layers(self) -> list[Element]:
+        """Its layers in its order."""
+        return [h.element for h in self.hops if h.element.spec.is_layer]
 
 
 def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
-    """Areas of a circuit, and the elements that carry current.
-
-    Raises
-    ------
-    InputError
-        If there is neither source nor start, a floating node, a loop of voltage sources, a current source without a
-        path, an area that no element or several elements drive, or too many elements; the message names those at fault.
-    """
+    """Areas of a circuit, and the elements that carry current; a circuit that has no solution is refused."""
     _refuse_large(circuit)
-    areas = _areas(circuit)
-    on_areas = {id(area.source) for area in areas}
-    branches = [e for e in circuit.elements if id(e) not in on_areas]
-    if not any(e.device in "VI" for e in branches):
+    areas, drives = _areas(circuit), {e.name for e in driving(circuit)}
+    branches = [e for e in circuit.elements if e.device not in "VI" or e.name in drives]
+    if not drives:
         if not circuit.initial and all(e.initial is None for e in branches):
             raise InputError(
                 "the circuit has no source; allowed: a V element that drives the stack, such as V1 drive 0 "
@@ -79,59 +80,70 @@ def _no_source(beside: Element) -> Element:
     return Element("none", "I", beside.nodes[1::-1], beside.node_names[1::-1], MappingProxyType({}), DC(0.0))
 
 
+def driving(circuit: Circuit) -> list[Element]:
+    """The V and I elements that do not give an area, of any circuit."""
+    areas = {e.nodes[2] for e in circuit.elements if e.spec.is_layer}
+    return [e for e in circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
+
+
 def driving_sources(circuit: Circuit) -> list[Element]:
-    """The sources of a circuit that carry current.
+    """As `driving`, of a circuit that `find_branches` does not refuse."""
+    if "solvable" not in circuit.related:
+        find_branches(circuit)
+        circuit.related["solvable"] = True
+    return driving(circuit)
 
-    Raises
-    ------
-    InputError
-        As `find_branches`.
+
+def shared(circuit: Circuit, key: Any, make: Callable[[], T]) -> T:
+    """The result of `make`, kept for all related circuits that differ in the sources that carry current only."""
+    drives = {e.name for e in driving(circuit)}
+    passive = [e for e in circuit.elements if e.name not in drives]
+    before, found = circuit.related.get(key, (None, None))
+    if before is None or not all(map(operator.is_, before, passive)):
+        circuit.related[key] = passive, (found := make())
+    kept: T = found
+    return kept
+
+
+def loop_of(circuit: Circuit) -> Loop | None:
+    """The loop of a circuit that is one series loop with one area that follows without delay; None for any other.
+
+    All circuits that `Circuit.replace` derives from one another share the way round the loop.
     """
-    if "driving" not in circuit.related:
-        circuit.related["driving"] = {e.name for e in find_branches(circuit)[1] if e.device in "VI"}
-    return [e for e in circuit.elements if e.name in circuit.related["driving"]]
+
+    def make() -> Loop | None:
+        if "hops" not in circuit.related:
+            circuit.related["hops"] = _find_hops(circuit)
+        walked: tuple[Hop, ...] | None = circuit.related["hops"]
+        if walked is None:
+            return None
+        (area,) = _areas(circuit)
+        if area.gap is not None and area.gap.values["tau"] > 0.0 and area.given is None:
+            return None
+        now = {e.name: e for e in circuit.elements}
+        return Loop(tuple(Hop(now[hop.element.name], hop.sign, hop.node) for hop in walked), area.gap, area.given)
+
+    return circuit.remember("loop", make)
 
 
-def find_loop(circuit: Circuit) -> Loop | None:
-    """The loop of a circuit that consists of one series loop with one area; None for any other network.
-
-    Raises
-    ------
-    InputError
-        As `find_branches`.
-    """
+def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
     areas, branches = find_branches(circuit)
     if len(areas) != 1 or any(e.device != "V" and not e.spec.is_layer for e in branches):
         return None
     if any(len(elements) > 2 for elements in _incidence(branches).values()):
         return None
-    return Loop(_walk(branches), areas[0].gap, areas[0].given)
+    return _walk(branches)
 
 
-def same_loop(circuit: Circuit, before: Loop) -> Loop | None:
-    """The loop of a circuit whose devices and nodes are those of a related circuit with a known loop.
-
-    None if the area follows with a delay (tau > 0): such a circuit is not solved as a stack.
-
-    Raises
-    ------
-    InputError
-        If an area has no valid drive, as in `find_branches`.
-    """
-    now = {e.name: e for e in circuit.elements}
-    gap = None if before.gap is None else now[before.gap.name]
-    given = _areas(circuit)[0].given if gap is None else _area_fixed(gap)
-    if gap is not None and gap.values["tau"] > 0.0 and given is None:
-        return None
-    return Loop(tuple(Hop(now[hop.element.name], hop.sign, hop.node) for hop in before.hops), gap, given)
+def count_of(circuit: Circuit) -> int:
+    """Number of elements of a circuit, each dispersive skin counted as its slabs."""
+    return len(circuit.elements) + (SLABS - 1) * len(circuit.by_device("SKIN_DISPERSIVE"))
 
 
 def _refuse_large(circuit: Circuit) -> None:
-    skins = len(circuit.by_device("SKIN_DISPERSIVE"))
-    more = len(SKIN_LADDER.poles)
-    count = len(circuit.elements) + skins * more
+    count = count_of(circuit)
     if count > MAX_ELEMENTS:
-        counted = f", a SKIN_DISPERSIVE counted as its {more + 1} slabs" if skins else ""
+        counted = f", a SKIN_DISPERSIVE counted as its {SLABS} slabs" if count > len(circuit.elements) else ""
         raise InputError(f"the circuit has {count:,} elements{counted}; allowed: at most {MAX_ELEMENTS:,}")
 
 
@@ -153,7 +165,7 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
         on_node = list({id(e): e for e in at.get(node, ())}.values())
         owner = owners.get(node)
         if owner is None:
-            out.append(Area(node, None, *_given_by_source(layer, on_node, list(owners.values()))))
+            out.append(Area(node, None, _given_by_source(layer, on_node, list(owners.values()))))
             continue
         if on_node:
             raise InputError(
@@ -161,17 +173,12 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
                 f"signal; allowed: a_fix= on {owner.name} for a given area, another node for what carries current",
                 on_node[0].where,
             )
-        out.append(Area(node, owner, _area_fixed(owner)))
+        fixed = owner.values["a_fix"]
+        out.append(Area(node, owner, fixed * 1e-6 if fixed > 0.0 else None))
     return tuple(reversed(out))
 
 
-def _area_fixed(gap: Element) -> float | None:
-    """The fixed area of a GAP, a_fix in m^2, or None."""
-    a_fix = gap.values["a_fix"]
-    return a_fix * 1e-6 if a_fix > 0.0 else None
-
-
-def _given_by_source(layer: Element, sources: list[Element], gaps: list[Element]) -> tuple[float, Element]:
+def _given_by_source(layer: Element, sources: list[Element], gaps: list[Element]) -> float:
     if len(sources) != 1:
         driven = "".join(f"; {gap.name} drives {gap.node_names[2]!r}" for gap in gaps)
         raise InputError(
@@ -187,7 +194,7 @@ def _given_by_source(layer: Element, sources: list[Element], gaps: list[Element]
             "node to 0",
             source.where,
         )
-    return source.waveform.level * 1e-6, source
+    return source.waveform.level * 1e-6
 
 
 def _incidence(branches: list[Element]) -> dict[str, list[Element]]:
@@ -202,15 +209,18 @@ def _as_written(node: str, element: Element) -> str:
     return element.node_names[element.nodes.index(node)]
 
 
-def _reached(at: dict[str, list[Element]]) -> set[str]:
-    """Nodes with a path of elements to ground."""
-    reached, todo = {"0"}, ["0"]
-    while todo:
-        for element in at.get(todo.pop(), ()):
-            new = set(element.nodes[:2]) - reached
-            reached |= new
-            todo += new
-    return reached
+def _ways(branches: list[Element], start: str) -> dict[str, Element | None]:
+    """The element by which one gets to each node that is connected to the start."""
+    at = _incidence(branches)
+    came: dict[str, Element | None] = {start: None}
+    ahead = [start]
+    while ahead:
+        for element in at.get(ahead.pop(), ()):
+            for node in element.nodes[:2]:
+                if node not in came:
+                    came[node] = element
+                    ahead.append(node)
+    return came
 
 
 def _refuse_floating(branches: list[Element]) -> None:
@@ -229,7 +239,7 @@ def _refuse_floating(branches: list[Element]) -> None:
             )
     if "0" not in at:
         raise InputError("no element touches ground; allowed: one node must be 0 (or gnd)")
-    reached = _reached(at)
+    reached = _ways(branches, "0")
     for node, elements in at.items():
         if node not in reached:
             e = elements[0]
@@ -247,44 +257,64 @@ def _lookalike(node: str, at: Mapping[str, list[Element]]) -> str:
     return f"; is {_as_written(near[0], at[near[0]][0])!r} the same node?" if near else ""
 
 
-def _refuse_source_conflicts(branches: list[Element]) -> None:
-    pairs: dict[frozenset[str], Element] = {}
-    parent: dict[str, str] = {}
+class Tree:
+    """A spanning tree that grows branch by branch."""
 
-    def root(node: str) -> str:
-        while parent.setdefault(node, node) != node:
-            parent[node] = parent[parent[node]]  # path halving, so that a long path is walked only once
-            node = parent[node]
+    def __init__(self) -> None:
+        self._parent: dict[str, str] = {}
+        self._branches: dict[str, list[tuple[str, int, float]]] = defaultdict(list)
+        self._count = 0
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._branches)
+
+    def _root(self, node: str) -> str:
+        while self._parent.setdefault(node, node) != node:
+            self._parent[node] = self._parent[self._parent[node]]
+            node = self._parent[node]
         return node
 
-    for element in branches:
-        if element.device != "V":
-            continue
-        pair = frozenset(element.nodes[:2])
-        if pair in pairs:
-            raise InputError(f"{pairs[pair].name} and {element.name} are voltage sources in parallel", element.where)
-        pairs[pair] = element
-        a, b = root(element.nodes[0]), root(element.nodes[1])
+    def add(self, p: str, n: str) -> bool:
+        """Add a branch if it closes no loop, and return whether it was added."""
+        a, b = self._root(p), self._root(n)
         if a == b:
-            others = ", ".join(e.name for e in _path(list(pairs.values())[:-1], *element.nodes[:2]))
-            raise InputError(f"{element.name} closes a loop of voltage sources with {others}", element.where)
-        parent[a] = b
+            return False
+        self._parent[a] = b
+        self._branches[p].append((n, self._count, -1.0))
+        self._branches[n].append((p, self._count, 1.0))
+        self._count += 1
+        return True
+
+    def potentials(self) -> dict[str, FloatArray]:
+        """Voltage of every node against ground, as a row of coefficients of the branch voltages."""
+        out = {"0": np.zeros(self._count)}
+        todo = ["0"]
+        while todo:
+            node = todo.pop()
+            for other, branch, sign in self._branches[node]:
+                if other not in out:
+                    out[other] = out[node].copy()
+                    out[other][branch] = sign
+                    todo.append(other)
+        return out
+
+
+def _refuse_source_conflicts(branches: list[Element]) -> None:
+    tree, before = Tree(), list[Element]()
+    for element in (e for e in branches if e.device == "V"):
+        if not tree.add(*element.nodes[:2]):
+            others = _path(before, *element.nodes[:2])
+            if len(others) == 1:
+                raise InputError(f"{others[0].name} and {element.name} are voltage sources in parallel", element.where)
+            names = ", ".join(e.name for e in others)
+            raise InputError(f"{element.name} closes a loop of voltage sources with {names}", element.where)
+        before.append(element)
 
 
 def _path(branches: list[Element], start: str, end: str) -> list[Element]:
     """The branches on the path from one node to another; the given branches form no loop, so the path is unique."""
-    at = _incidence(branches)
-    came: dict[str, Element | None] = {start: None}
-    ahead = [start]
-    while end not in came:
-        node = ahead.pop()
-        for e in at[node]:
-            for other in e.nodes[:2]:
-                if other not in came:
-                    came[other] = e
-                    ahead.append(other)
-    found = []
-    node = end
+    came, found, node = _ways(branches, start), list[Element](), end
     while (step := came[node]) is not None:
         found.append(step)
         node = step.nodes[0] if step.nodes[1] == node else step.nodes[1]
@@ -293,7 +323,7 @@ def _path(branches: list[Element], start: str, end: str) -> list[Element]:
 
 def _refuse_current_without_path(branches: list[Element]) -> None:
     """Refuse a current source at a node that is connected to ground through current sources only."""
-    reached = _reached(_incidence([e for e in branches if e.device != "I"]))
+    reached = _ways([e for e in branches if e.device != "I"], "0")
     for element in branches:
         for node in element.nodes[:2]:
             if element.device == "I" and node not in reached:

@@ -1,15 +1,29 @@
-"""Usual ranges of values: a value outside its range is allowed, and causes a warning."""
+"""Values of parameters: their notation, those that are refused, and usual ranges, outside which there is a warning."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-from fingerspice.base.units import format_si, spice_text
+from fingerspice.base.arrays import real_number
+from fingerspice.base.errors import InputError
+from fingerspice.base.units import (
+    format_si,
+    parse_number,
+    spice_text,
+    suggest_mega,
+    suspicious_mega,
+    unit_read_as_scale,
+)
+
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Circuit, Element
+    from fingerspice.circuit.devices import ParameterSpec
 
 # Units that take a prefix, where a slip of the user is a power of 1000; in the other units the slip is m^2 for mm^2.
-_PREFIXED = ("m", "N", "Pa", "ohm", "ohm m", "V", "V/m", "F", "Hz", "s")
+_PREFIXED = ("m", "N", "Pa", "ohm", "ohm m", "A", "V", "V/m", "F", "Hz", "s")
 _THOUSANDS = tuple(sign * 3 * k for k in (1, 2, 3, 4, 5) for sign in (-1, 1))
 _MILLIONS = {"mm^2": (6, -6), "mm^2/N^m": (6, -6), "mm^4/N^2": (12, -12)}
 
@@ -26,21 +40,12 @@ class Usual:
     slip: str = ""  # The unit, and the other unit for which it is often taken, such as ``newton, not millinewton``
 
     def warning(self, what: str, value: float, unit: str) -> str | None:
-        """The warning about a value outside the range; None for a value inside.
-
-        Parameters
-        ----------
-        what : str
-            Name of the quantity, such as ``Xgap d``.
-        value : float
-            Value in `unit`.
-        unit : str
-        """
+        """The warning about a value of `what`, such as ``Xgap d``, outside the range; None for a value inside."""
         size = abs(value)
         if size == 0.0 or not math.isfinite(size) or self.least <= size <= self.most:
             return None
-        ends = f"{_shown(self.least, unit if unit in _PREFIXED else '')} to {_shown(self.most, unit)}"
-        said = f"{what} is {_shown(value, unit)}, outside {ends}, the usual range ({self.source})"
+        ends = f"{shown(self.least, unit if unit in _PREFIXED else '')} to {shown(self.most, unit)}"
+        said = f"{what} is {shown(value, unit)}, outside {ends}, the usual range ({self.source})"
         if self.slip:
             said += f": it is in {self.slip}"
         meant = self._meant(value, unit)
@@ -54,7 +59,8 @@ class Usual:
         return " or ".join([", ".join(texts[:-1]), texts[-1]] if len(texts) > 1 else texts)
 
 
-def _shown(value: float, unit: str) -> str:
+def shown(value: float, unit: str) -> str:
+    """A value with its unit; powers of a unit and angles take no prefix: 1 kmm^2 would not be 1000 mm^2."""
     return format_si(value, unit) if unit in _PREFIXED else f"{value:.4g} {unit}".rstrip()
 
 
@@ -77,30 +83,153 @@ MEASURED = {
 #: Usual range of the largest amplitude (V) under which forces, friction and areas are measured.
 MEASURING = Usual(1.0, 10e3, "forces are measured at 10 V to some kV", "volt, not kilovolt")
 
-#: Largest plausible results, N, Pa and m^2. A finger bears 100 N. Air, and most solids, break down far below an
-#: electric pressure of 10 MPa (1.5 GV/m). No finger has a contact of 10 cm^2.
-LARGEST_FORCE = 100.0
-LARGEST_PRESSURE = 10e6
-LARGEST_AREA = 1e-3
+# Largest plausible results, each with its unit and the reason. Air, and most solids, break down far below an electric
+# pressure of 10 MPa.
+_LARGEST = (
+    ("electroadhesive force", 100.0, "N", "as much as a finger bears"),
+    ("electric pressure", 10e6, "Pa", "that of 1.5 GV/m, beyond the strength of any layer"),
+    ("contact area", 1e-3, "m^2", "10 cm^2, more than a finger has"),
+)
 
 
 def beyond_fingers(where: str, force: float, pressure: float, area: float) -> Iterator[str]:
-    """Warnings about results that no finger can have.
-
-    Parameters
-    ----------
-    where : str
-        Empty, or a text such as `` of Xgap``.
-    force, pressure, area : float
-        Largest values of the run, N, Pa and m^2.
-    """
-    for what, value, largest, unit, source in (
-        ("electroadhesive force", force, LARGEST_FORCE, "N", "as much as a finger bears"),
-        ("electric pressure", pressure, LARGEST_PRESSURE, "Pa", "that of 1.5 GV/m, beyond the strength of any layer"),
-        ("contact area", area, LARGEST_AREA, "m^2", "10 cm^2, more than a finger has"),
-    ):
+    """Warnings about largest values of a run (N, Pa and m^2) that no finger can have; `where` may be `` of Xgap``."""
+    for value, (what, largest, unit, reason) in zip((force, pressure, area), _LARGEST, strict=True):
         if value > largest:
             yield (
-                f"the {what}{where} reaches {_shown(value, unit)}, over {_shown(largest, unit)} ({source}): some value "
+                f"the {what}{where} reaches {shown(value, unit)}, over {shown(largest, unit)} ({reason}): some value "
                 "is probably in another unit"
             )
+
+
+# Units whose letter SPICE reads as a scale factor, with their names, and how SPICE reads them.
+_UNIT_TRAPS = {"F": ("farad", "femto (1e-15)"), "N": ("newton", "nano (1e-9)")}
+
+
+def unit_trap(spec: ParameterSpec, text: str) -> str | None:
+    """Reason to refuse a number whose unit SPICE would read as a scale factor; None if SPICE would not."""
+    word, prefix = _UNIT_TRAPS.get(spec.unit, ("", ""))
+    if not word or not unit_read_as_scale(text, spec.unit, word):
+        return None
+    return f"is {text!r}: SPICE reads {spec.unit} as {prefix}; write the number alone, in {word}"
+
+
+def is_resistance(spec: ParameterSpec) -> bool:
+    """Whether the parameter is a resistance, in which a capital M is probably meant as mega."""
+    return spec.unit in ("ohm", "ohm m")
+
+
+def mega_note(text: str, value: float, spec: ParameterSpec) -> str:
+    """The warning about a capital M in a resistance, which SPICE reads as milli."""
+    return (
+        f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for mega{spec.unit.partition(' ')[0]} "
+        f"write {suggest_mega(text)}"
+    ).replace("megaohm", "megohm")
+
+
+def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tuple[float, str | None]:
+    """A parameter's new value, given as a number or as text, and a warning about how it is written, or None.
+
+    `path` names it in messages, and `spec` is None for a parameter of a waveform.
+    """
+    if not isinstance(given, str):
+        return real_number(path, given, f"a number {unit}".rstrip() + ", or text such as '3.5u'"), None
+    text = given.strip()
+    if text.lower() in ("inf", "none"):
+        return math.inf, None
+    try:
+        value = parse_number(text)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    if spec is None:
+        return value, None
+    trap = unit_trap(spec, text)
+    if trap:
+        raise InputError(f"{path} {trap}")
+    mega = is_resistance(spec) and suspicious_mega(text)
+    return value, f"{path}: {mega_note(text, value, spec)}" if mega else None
+
+
+def unusual(element: Element) -> Iterator[tuple[str, str]]:
+    """Warnings about an element's unusual values, each with the parameter's name (empty for the area at 0 V)."""
+    found = [(p.name, p.unusual(element.name, element.values[p.name])) for p in element.spec.parameters]
+    if element.waveform is not None:
+        found = [
+            (name, SOURCES[unit].warning(f"{element.name} {name}", getattr(element.waveform, name), unit))
+            for name, unit in type(element.waveform).units.items()
+            if unit in SOURCES and hasattr(element.waveform, name)
+        ]
+    if element.device == "GAP" and not any(text for _, text in found):
+        v = element.values
+        area = (v["alpha"] * v["fn"] ** v["m_exp"]) ** 2 - v["c2"] * (v["mu"] * v["fn"]) ** 2
+        if v["a_fix"] == 0.0 and area > 0.0:
+            at_rest = area / (v["alpha"] * v["fn"] ** v["m_exp"])
+            found.append(("", REST_AREA.warning(f"{element.name} area at 0 V", at_rest, "mm^2")))
+    yield from ((name, text) for name, text in found if text is not None)
+
+
+def unusual_of_changed(before: Circuit, after: Circuit) -> tuple[dict[str, str], dict[str, str]]:
+    """Warnings about unusual values in the elements that differ between two circuits, with the parameters' paths."""
+
+    def texts(e: Element) -> dict[str, str]:
+        return e.remember("unusual", lambda: {text: f"{e.name}.{name}".lower() for name, text in unusual(e)})
+
+    found: tuple[dict[str, str], dict[str, str]] = {}, {}
+    for a, b in zip(before.elements, after.elements, strict=True):
+        if a is not b:
+            found[0].update(texts(a))
+            found[1].update(texts(b))
+    return found
+
+
+def concerns(warning: str, changes: Mapping[str, Any]) -> bool:
+    """Whether a warning of the reader is about the notation of a value that `changes` now replaces."""
+    said = warning.lower()
+    for path in map(str.lower, changes):
+        name, _, parameter = path.rpartition(".")
+        # A warning that names only the source may be about its frequency.
+        subjects = [path, f"{name} {parameter}", *([name] if parameter == "frequency" else [])]
+        if any(f": {subject}: " in said for subject in subjects):
+            return True
+    return False
+
+
+def check(circuit: Circuit) -> None:
+    """Refuse values out of range and contacts that cannot exist."""
+    for element in circuit.elements:
+        if "checked" in element.kept:
+            continue
+        for spec in element.spec.parameters:
+            value: Any = element.values[spec.name]
+            if not spec.accepts(value):
+                unit = f" {spec.unit}" if spec.unit else ""
+                raise InputError(
+                    f"{element.name} {spec.name} is {value:g}{unit}; allowed: {spec.allowed()}", element.where
+                )
+        if element.device == "GAP":
+            _check_contact(element)
+        element.kept["checked"] = True
+    if circuit.tran is not None and not circuit.tran.stop > 0.0:
+        raise InputError(f"t_stop is {circuit.tran.stop:g} s; allowed: more than 0")
+
+
+def _check_contact(gap: Element) -> None:
+    m, n = gap.values["m_exp"], gap.values["n_exp"]
+    if not 0.0 < m < n:
+        raise InputError(f"{gap.name} exponents are m_exp={m:g}, n_exp={n:g}; allowed: 0 < m_exp < n_exp", gap.where)
+    if not 1.0 / m + 1.0 / n > 1.0:
+        raise InputError(
+            f"{gap.name} exponents m_exp={m:g}, n_exp={n:g} give 1/m + 1/n = {1 / m + 1 / n:.4g}; allowed: more "
+            "than 1 (else Eq. 4 has no single root)",
+            gap.where,
+        )
+    area = gap.values["alpha"] * gap.values["fn"] ** m
+    loss = math.sqrt(gap.values["c2"]) * gap.values["mu"] * gap.values["fn"]
+    if gap.values["a_fix"] == 0.0 and not area > loss:
+        hint = "".join(f"; note {text}" for _, text in unusual(gap))
+        raise InputError(
+            f"{gap.name} has no contact: friction takes the whole ridge area at 0 V "
+            f"(A0 = alpha fn^m_exp = {area:.4g} mm^2, sqrt(c2) mu fn = {loss:.4g} mm^2); allowed: "
+            f"A0^2 > c2 mu^2 fn^2, so less load fn, less friction mu or less c2{hint}",
+            gap.where,
+        )

@@ -23,20 +23,10 @@ def menu() -> list[dict[str, str]]:
 
 
 def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
-    """What a set changes in the scene.
+    """What the set changes in the scene that a request names in its key ``apply``, as in `Request.sets`.
 
-    Parameters
-    ----------
-    given : dict
-        A request; its key ``apply`` names the set, as in `Request.sets`.
-    own : Circuit, optional
-        As in `scene`.
-
-    Returns
-    -------
-    dict
-        ``ok`` and ``message``; ``overrides`` (path to value as text), ``source`` (text, or None where the set is no
-        drive) and ``set``, the set's entry in `Request.sets`.
+    The answer has ``ok`` and ``message``; ``overrides`` (path to value as text), ``source`` (text, or None where the
+    set is no drive) and ``set``, the set's entry in `Request.sets`.
     """
     asked = dict(given) if isinstance(given, dict) else {}
     entry = asked.pop("apply", None)
@@ -51,26 +41,19 @@ def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]
     except InputError as error:
         return {"ok": False, "message": str(error)}
     units = {path.lower(): parameter.unit for path, parameter in circuit.parameters.items()}
-    overrides = {
-        path: value_text(value, units[path.lower()])
-        for path, value in changes.items()
-        if not isinstance(value, Waveform)
-    }
-    drives = [
-        f"{name}={text_of(wave)}" if len(driving_sources(circuit)) > 1 else text_of(wave)
-        for name, wave in changes.items()
-        if isinstance(wave, Waveform)
-    ]
-    return {
-        "ok": True, "message": "", "overrides": overrides, "source": drives[0] if drives else None,
-        "set": one.name if to is None else f"{to}={one.name}",
-    }  # fmt: skip
+    overrides, source = {}, None
+    for path, value in changes.items():
+        if not isinstance(value, Waveform):
+            overrides[path] = value_text(value, units[path.lower()])
+        elif source is None:
+            source = f"{path}={text_of(value)}" if len(driving_sources(circuit)) > 1 else text_of(value)
+    return {"ok": True, "message": "", "overrides": overrides, "source": source, "set": _entry(one.name, to)}
 
 
 def marked(circuit: Circuit, base: Circuit, request: Request) -> tuple[Circuit, list[str]]:
     """The circuit of a request, which remembers the request's sets, and sentences about sets that mean nothing here."""
     circuit, lost = circuit._with(sets={}), []
-    for entry in filter(None, map(str.strip, request.sets.split(","))):
+    for entry in request.sets:
         try:
             name, changes = base.remember(("set", entry), partial(_changes, base, entry))
         except InputError as error:
@@ -92,21 +75,17 @@ def sentences(circuit: Circuit, request: Request) -> list[dict[str, Any]]:
 
 def entries(circuit: Circuit, request: Request) -> Iterator[tuple[str, str | None]]:
     """Name and element of each set of a request that still gives a value to the circuit, in their order."""
-    names = {name for name, (kept, _) in in_force(circuit).items() if kept}
-    for entry in filter(None, map(str.strip, request.sets.split(","))):
+    force = in_force(circuit)
+    for entry in request.sets:
         to, _, name = entry.rpartition("=")
-        if name in names:
+        if name in force and force[name][0]:
             yield name, to or None
 
 
 def before(circuit: Circuit) -> dict[str, Any]:
-    """What had been changed in a circuit before the page was opened, as keys of a request.
+    """What had been changed in a circuit before the page was opened, as the request's overrides, source and sets.
 
-    Returns
-    -------
-    dict
-        ``overrides``, ``source`` and ``sets`` as in `Request`, where there are any. A source that no text of the page
-        can say, such as a recording or a function, is in none of them.
+    A source that no text of the page can say, such as a recording or a function, is in none of them.
     """
     known = {path.lower(): (path, parameter) for path, parameter in circuit.parameters.items()}
     given = {path.lower() for path in circuit.overrides}
@@ -117,7 +96,7 @@ def before(circuit: Circuit) -> dict[str, Any]:
         for path in sorted(given & set(known))
         if path.rpartition(".")[0] not in said
     }
-    sets = [entry for name in circuit.sets if (entry := _entry(circuit, name)) is not None]
+    sets = [entry for name in circuit.sets if (entry := _applied_entry(circuit, name)) is not None]
     found = {"overrides": overrides, "source": texts[0] if texts else "", "sets": ",".join(sets)}
     return {key: value for key, value in found.items() if value}
 
@@ -146,7 +125,7 @@ def _source_text(circuit: Circuit, element: Element) -> str | None:
     return None
 
 
-def _entry(circuit: Circuit, name: str) -> str | None:
+def _applied_entry(circuit: Circuit, name: str) -> str | None:
     """The set of that name as in `Request.sets`: applied to all, or as narrowly as gives its values in the circuit."""
     values = circuit.sets[name]
     elements = dict.fromkeys(path.rpartition(".")[0] or path for path in values)
@@ -157,8 +136,13 @@ def _entry(circuit: Circuit, name: str) -> str | None:
         except InputError:
             continue
         if values == found or (to is not None and values.items() <= found.items()):
-            return name if to is None else f"{to}={name}"
+            return _entry(name, to)
     return None
+
+
+def _entry(name: str, to: str | None) -> str:
+    """A set in `Request.sets`."""
+    return name if to is None else f"{to}={name}"
 
 
 def _changes(base: Circuit, entry: str) -> tuple[str, Mapping[str, Any]]:

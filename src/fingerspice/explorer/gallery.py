@@ -16,10 +16,9 @@ import numpy as np
 from fingerspice.base.errors import FingerspiceWarning
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.explorer import examples
-from fingerspice.explorer.recordings import as_json
-from fingerspice.explorer.request import circuits_of, request_of, times_of
-from fingerspice.explorer.scene import scene
-from fingerspice.explorer.server import beginning, pages
+from fingerspice.explorer.request import as_json, circuits_of, request_of, times_of
+from fingerspice.explorer.scene import beginning, scene
+from fingerspice.explorer.server import pages
 from fingerspice.netlist.netlist import read_netlist
 from fingerspice.plots.drawing import save
 from fingerspice.results.solution import Solution
@@ -83,14 +82,7 @@ _IMPORT = re.compile(r'from "\./(\w+)\.js"')
 def static_page(circuit: Circuit | None = None) -> str:
     """The page as HTML that needs no other file: with the circuit's run, or with those of all example scenes.
 
-    Parameters
-    ----------
-    circuit : Circuit, optional
-
-    Returns
-    -------
-    str
-        The page. Its sliders show the values, and do not move.
+    Its sliders show the values, and do not move.
     """
     files = {name: content.decode("utf-8") for name, content in pages().items()}
     start = beginning(circuit)

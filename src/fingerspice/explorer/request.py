@@ -1,29 +1,33 @@
-"""What the page asks for: its values checked, and the circuit made of them."""
+"""What the page asks for: its values checked, and the circuit made of them; and how answers are written."""
 
 from __future__ import annotations
 
+import base64
+import binascii
 import dataclasses
+import json
 import math
-from collections.abc import Mapping
+import struct
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number
-from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
 from fingerspice.circuit.loop import network_of
-from fingerspice.circuit.topology import driving_sources
-from fingerspice.explorer.recordings import Recording, recording_of
+from fingerspice.circuit.topology import SLABS, count_of, driving_sources
 from fingerspice.explorer.sliders import gain_of, read_source
 from fingerspice.netlist.netlist import parse_netlist
-from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.results.solution import Solution
 from fingerspice.waveforms.combinations import Sum
+from fingerspice.waveforms.ramps import PWL
+from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import Waveform, require
 
 #: Limits of a deck and of its run: each answer has to come within seconds.
@@ -36,6 +40,39 @@ _OF_OSCILLATION, _OF_PIECE = 16, 2
 SKINS = ("own", "follow", "dispersive")
 _LARGEST, _LONGEST_SETS = 1e300, 2000
 _AREAS = ("coupled", "mean", "frozen")
+_RANGES = {"rtol": (1e-12, 0.1), "periods": (0.01, MOST_PERIODS), "last": (0.01, MOST_PERIODS)}
+
+#: Most numbers of a recording: four seconds at 48 kHz.
+MOST_SAMPLES = 200_000
+_KEYS_OF_RECORDING = "an object with the keys name, values, and rate or times"
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A file's numbers."""
+
+    name: str  # Of the file, for the script that "Copy as Python" gives
+    values: FloatArray  # From -1 to 1 for full scale of a recording; as in the file for a table
+    rate: float | None = None  # Samples per second
+    times: FloatArray | None = None  # Times of a table, s
+
+    @property
+    def duration(self) -> float:
+        """Time of the last value, s."""
+        return float(self.times[-1]) if self.times is not None else self.values.size / (self.rate or 1.0)
+
+    def waveform(self, gain: float) -> Waveform:
+        """The values times the gain (V) as a source."""
+        if self.times is not None:
+            return PWL(tuple(self.times.tolist()), tuple((gain * self.values).tolist()))
+        assert self.rate is not None
+        return Samples(gain * self.values, self.rate)
+
+    def python(self, gain: float) -> str:
+        """The same source from its file, as Python."""
+        if self.times is not None:
+            return f"{gain!r} * fs.PWL.from_table({self.name!r})"
+        return f"fs.Samples.from_wav({self.name!r}, {gain!r}, channel=0)"
 
 
 @dataclass(frozen=True)
@@ -56,9 +93,9 @@ class Request:
     periods: float = 5.0
     last: float | None = None  # How many of the last periods are shown; None for all of the run
     recording: Recording | None = None  # The file dropped on the page, for the source ``RECORDING(gain)``
-    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME`` with commas; they change
-    # nothing, and the page shows their caveats
-    sets: str = ""
+    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME``; they change nothing, and
+    # the page shows their caveats
+    sets: tuple[str, ...] = ()
     unknown: tuple[str, ...] = ()  # Names that mean nothing here, each in a sentence
 
 
@@ -66,17 +103,11 @@ _NAMES = tuple(f.name for f in dataclasses.fields(Request) if f.name != "unknown
 
 
 def request_of(given: Any) -> Request:
-    """A request from plain data.
-
-    Raises
-    ------
-    InputError
-        If a value is wrong; names that are not known are only noted.
-    """
+    """A request from plain data; wrong values are refused, and names that are not known only noted."""
     require(
         isinstance(given, dict), "the request", type(given).__name__, "an object with the keys " + ", ".join(_NAMES)
     )
-    unknown = tuple(_unknown("name", str(name), list(_NAMES)) for name in given if name not in _NAMES)
+    unknown = tuple(_unknown("name", str(name), _NAMES) for name in given if name not in _NAMES)
     asked = {name: given[name] for name in _NAMES if given.get(name) is not None}
     deck, source = asked.get("deck"), asked.get("source", "")
     require(isinstance(deck, str), "deck", f"of type {type(deck).__name__}", "the text of a netlist")
@@ -90,13 +121,13 @@ def request_of(given: Any) -> Request:
     require(good, "sets", _short(sets), f"names with commas, at most {_LONGEST_SETS:,} characters")
     if "area" in asked:
         asked["area"] = _area(asked["area"])
-    for name in (name for name in ("rtol", "periods", "last") if name in asked):
-        value = asked[name]
-        most = 0.1 if name == "rtol" else MOST_PERIODS
-        good = _is_number(value) and (1e-12 if name == "rtol" else 0.01) <= value <= most
-        require(good, name, _short(value), "1e-12 to 0.1" if name == "rtol" else f"0.01 to {most:g}")
-        asked[name] = float(value)
+    for name, (least, most) in _RANGES.items():
+        if name in asked:
+            good = _is_number(asked[name]) and least <= asked[name] <= most
+            require(good, name, _short(asked[name]), f"{least:g} to {most:g}")
+            asked[name] = float(asked[name])
     asked |= {"source": source.strip(), "overrides": _overrides(asked.get("overrides", {}))}
+    asked["sets"] = tuple(filter(None, map(str.strip, sets.split(","))))
     if "recording" in asked:
         asked["recording"] = recording_of(asked["recording"])
     return Request(**asked, unknown=unknown)
@@ -115,16 +146,50 @@ def _area(given: Any) -> str | float:
     return float(area)
 
 
+def recording_of(given: Any) -> Recording:
+    """A recording from plain data, checked."""
+    require(isinstance(given, dict), "recording", type(given).__name__, _KEYS_OF_RECORDING)
+    name, rate = given.get("name"), given.get("rate")
+    require(isinstance(name, str) and len(name) <= 200, "recording name", repr(name)[:80], "a file's name")
+    values = _numbers("values", given.get("values"))
+    if given.get("times") is not None:
+        times = _numbers("times", given["times"])
+        require(times.size == values.size, "recording", f"{times.size} times, {values.size} values", "as many of each")
+        return Recording(name, values, times=times)
+    good = isinstance(rate, (int, float)) and not isinstance(rate, bool) and 1.0 <= rate <= 1e7
+    require(good, "recording rate", repr(rate)[:80], "1 to 1e7 samples per second")
+    assert rate is not None
+    return Recording(name, values, float(rate))
+
+
+def _numbers(what: str, given: Any) -> FloatArray:
+    """Numbers from base64 of little-endian doubles."""
+    try:
+        data = base64.b64decode(given if isinstance(given, str) else "?", validate=True)
+        values = np.frombuffer(data, "<f8").astype(float)
+    except (ValueError, binascii.Error):
+        raise InputError(f"recording {what}: not base64 of doubles") from None
+    allowed = f"2 to {MOST_SAMPLES:,}"
+    require(2 <= values.size <= MOST_SAMPLES, f"recording {what}", f"{values.size:,} numbers", allowed)
+    require(bool(np.isfinite(values).all()), f"recording {what}", "not finite", "finite numbers")
+    return values
+
+
 def asked_by(solution: Solution) -> dict[str, Any]:
     """How a run was made, as far as a request can say it."""
-    asked: dict[str, Any] = {"charge_law": solution.charge_law, "rtol": min(max(solution.rtol, 1e-12), 0.1)}
-    asked["area"] = solution.area_mode
+    area: str | float = solution.area_mode
     if solution.area_mode not in _AREAS and solution.area is not None:
         # All areas of such a run are the one number that it was given.
-        asked["area"] = float(np.ravel(solution.area)[0])
+        area = float(np.ravel(solution.area)[0])
+    asked = {"charge_law": solution.charge_law, "rtol": _within("rtol", solution.rtol), "area": area}
     if solution.period:
-        asked["periods"] = float(f"{min(max(solution.t_stop / solution.period, 0.01), MOST_PERIODS):.6g}")
+        asked["periods"] = float(f"{_within('periods', solution.t_stop / solution.period):.6g}")
     return asked
+
+
+def _within(name: str, value: float) -> float:
+    least, most = _RANGES[name]
+    return min(max(value, least), most)
 
 
 def _overrides(given: Any) -> dict[str, float]:
@@ -148,17 +213,8 @@ def _overrides(given: Any) -> dict[str, float]:
 def circuits_of(request: Request, own: Circuit | None = None) -> tuple[Circuit, Circuit, tuple[str, ...]]:
     """The deck's circuit, the circuit with all changes, and sentences about names that it does not know.
 
-    Parameters
-    ----------
-    request : Request
-    own : Circuit, optional
-        The circuit for which the page was opened. It stands for its own text, and may have files and functions that a
-        text from the page may not name.
-
-    Raises
-    ------
-    InputError
-        If the deck, the source or a value is wrong.
+    The circuit for which the page was opened, `own`, stands for its own text, and may have files and functions that a
+    text from the page may not name.
     """
     base = own if own is not None and request.deck == own.text else _parsed(request.deck)
     if request.skin == "dispersive":
@@ -177,7 +233,7 @@ def circuits_of(request: Request, own: Circuit | None = None) -> tuple[Circuit, 
         circuit = circuit.replace(known)
     if request.skin == "follow":
         circuit = _following(circuit)
-    return base, circuit, tuple(_unknown("parameter", path, list(circuit.parameters)) for path in lost)
+    return base, circuit, tuple(_unknown("parameter", path, circuit.parameters) for path in lost)
 
 
 def waveform_of(circuit: Circuit) -> Waveform:
@@ -189,10 +245,7 @@ def waveform_of(circuit: Circuit) -> Waveform:
 def times_of(circuit: Circuit, request: Request) -> tuple[float, float, float | None]:
     """First time shown and end of the run, s, and the period of the source, s, or None.
 
-    Raises
-    ------
-    InputError
-        If the run is too long for a page that answers at once.
+    A run that is too long for a page that answers at once is refused.
     """
     waveform = waveform_of(circuit)
     period = waveform.period
@@ -239,12 +292,10 @@ def _parsed(text: str) -> Circuit:
 
 def _refuse_large(circuit: Circuit) -> None:
     """Refuse a circuit whose run would take longer than a page may."""
-    slabs = len(SKIN_LADDER.poles)
-    count = len(circuit.elements) + slabs * len(circuit.by_device("SKIN_DISPERSIVE"))
-    if count > MOST_ELEMENTS:
+    if count_of(circuit) > MOST_ELEMENTS:
         raise InputError(
-            f"the deck has {count:,} elements, a dispersive skin counted as its {slabs + 1} slabs; allowed: at most "
-            f"{MOST_ELEMENTS} on this page"
+            f"the deck has {count_of(circuit):,} elements, a dispersive skin counted as its {SLABS} slabs; allowed: "
+            f"at most {MOST_ELEMENTS} on this page"
         )
 
 
@@ -267,9 +318,9 @@ def _following(circuit: Circuit) -> Circuit:
     return circuit.replace({f"{e.name}.f": fundamental.frequency for e in circuit.by_device("SKIN")})
 
 
-def _unknown(kind: str, name: str, known: list[str]) -> str:
-    near = get_close_matches(name.lower(), {k.lower(): k for k in known}, 1, 0.0)
-    hint = next((f"; nearest: {k!r}" for k in known if near and k.lower() == near[0]), "")
+def _unknown(kind: str, name: str, known: Iterable[str]) -> str:
+    near = nearest(name, list(known))
+    hint = "" if near is None else f"; nearest: {near!r}"
     return f"unknown {kind} {_short(name)}, which is left out{hint}"
 
 
@@ -280,3 +331,53 @@ def _is_number(x: Any) -> bool:
 def _short(x: Any) -> str:
     text = repr(x)
     return text if len(text) <= 80 else f"{text[:60]}..."
+
+
+def as_json(data: Any) -> bytes:
+    """Data as JSON: arrays of numbers as base64 of little-endian doubles, and null for what is not finite."""
+    return _dumped(data, lambda x: {"f64": base64.b64encode(_doubles(x)).decode("ascii")})
+
+
+def framed(data: Any) -> bytes:
+    """Data as the JSON's length and the number of doubles (four bytes each), the JSON, and the doubles of all arrays.
+
+    All numbers are little-endian. In the JSON an array is its place among the doubles, and its size. The doubles begin
+    at a multiple of eight bytes, so that the page need not copy them.
+    """
+    arrays: list[bytes] = []
+    places: dict[int, list[int]] = {}
+    end = 0
+
+    def place(x: Any) -> dict[str, list[int]]:
+        nonlocal end
+        if id(x) not in places:
+            arrays.append(_doubles(x))
+            places[id(x)] = [end, x.size]
+            end += x.size
+        return {"f64": places[id(x)]}
+
+    text = _dumped(data, place)
+    text += b" " * (-len(text) % 8)
+    return b"".join([struct.pack("<II", len(text), end), text, *arrays])
+
+
+def _doubles(x: Any) -> bytes:
+    assert isinstance(x, np.ndarray)
+    return np.ascontiguousarray(x, "<f8").tobytes()
+
+
+def _dumped(data: Any, array: Callable[[Any], Any]) -> bytes:
+    """Data as JSON, with `array` for its arrays, and null for what is not finite."""
+
+    def finite(x: Any) -> Any:
+        if isinstance(x, dict):
+            return {key: finite(value) for key, value in x.items()}
+        if isinstance(x, list | tuple):
+            return [finite(value) for value in x]
+        return x if not isinstance(x, float) or math.isfinite(x) else None
+
+    try:
+        return json.dumps(data, allow_nan=False, default=array).encode()
+    except ValueError:
+        # Seldom, and all data have to be gone through.
+        return json.dumps(finite(data), allow_nan=False, default=array).encode()

@@ -7,19 +7,20 @@ import math
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
+from fingerspice import __version__
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Tran
 from fingerspice.circuit.describe import in_force
-from fingerspice.explorer.changed import entries, marked, sentences
+from fingerspice.explorer import changed, sliders
+from fingerspice.explorer.examples import EXAMPLES
 from fingerspice.explorer.request import Request, circuits_of, points_of, request_of, times_of, waveform_of
-from fingerspice.explorer.sliders import gain_of, read_source, sliders, text_of
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
@@ -38,29 +39,39 @@ _FIGURES = ("mean", "max", "min", "mean_periodic")
 
 
 def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
-    """Run what the page asks for.
+    """Run what the page asks for, for the circuit `own` if the page was opened for it, which stands for its own text.
 
-    Parameters
-    ----------
-    given : dict
-        Keys and values as in `request.Request`; only ``deck`` is needed.
-    own : Circuit, optional
-        The circuit for which the page was opened; it stands for its own text.
-
-    Returns
-    -------
-    dict
-        ``ok``, ``status`` and ``message``; ``sliders``, ``sets``, ``waveform`` (text), ``warnings`` and ``unknown``; of
-        a run ``t`` and ``traces`` (arrays in SI units), ``figures``, ``error``, ``plan``, ``harmonics``, ``stacks``,
-        ``period``, ``t_stop`` and ``failed_at``. A request that is refused, or a run that fails, says why in
-        ``message``; neither raises an exception.
+    The keys of the request are those of `request.Request`; only ``deck`` is needed. The answer has ``ok``, ``status``
+    and ``message``; ``sliders``, ``sets``, ``waveform`` (text), ``warnings`` and ``unknown``; of a run ``t`` and
+    ``traces`` (arrays in SI units), ``figures``, ``error``, ``plan``, ``harmonics``, ``stacks``, ``period``, ``t_stop``
+    and ``failed_at``. A request that is refused, or a run that fails, says why in ``message``; neither raises an
+    exception.
     """
-    first, rest = begun(given, own)
-    return first | rest()
+    traces, rest = parts(given, own)
+    return traces | rest
 
 
-def begun(given: dict[str, Any], own: Circuit | None = None) -> tuple[dict[str, Any], Callable[[], dict[str, Any]]]:
-    """The answer of `scene` but for ``figures``, ``harmonics`` and ``stacks``, and a function that gives these.
+def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """What the page needs first: its menus, and the scene to begin with."""
+    examples = [
+        {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
+    ]
+    own = None
+    if circuit is not None:
+        before = changed.before(circuit)
+        asked = {"deck": circuit.text, **before, **(asked or {})}
+        own = {"title": circuit.title, "request": asked, "unsaid": changed.unsaid(circuit)}
+    return {
+        "version": __version__,
+        "own": own,
+        "examples": examples,
+        "waveforms": sliders.menu(),
+        "sets": changed.menu(),
+    }
+
+
+def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[str, Any]]:
+    """The answer of `scene` but for ``figures``, ``harmonics`` and ``stacks``, and then these.
 
     The traces can be drawn while the figures are computed, which takes longer than the run.
     """
@@ -70,12 +81,12 @@ def begun(given: dict[str, Any], own: Circuit | None = None) -> tuple[dict[str, 
         try:
             request = request_of(given)
             base, circuit, lost = circuits_of(request, own)
-            circuit, without = marked(circuit, base, request)
+            circuit, without = changed.marked(circuit, base, request)
             answer |= {
-                "title": circuit.title, "sliders": sliders(base, circuit), "sets": sentences(circuit, request),
-                "unknown": [*request.unknown, *lost, *without],
+                "title": circuit.title, "sliders": sliders.sliders(base, circuit),
+                "sets": changed.sentences(circuit, request), "unknown": [*request.unknown, *lost, *without],
             }  # fmt: skip
-            answer["waveform"] = text_of(waveform_of(circuit))
+            answer["waveform"] = sliders.text_of(waveform_of(circuit))
             run, more = _run(circuit, request)
             answer |= run
         except InputError as error:
@@ -84,14 +95,11 @@ def begun(given: dict[str, Any], own: Circuit | None = None) -> tuple[dict[str, 
             answer |= {"status": error.failure.status.name, "message": error.message, "failed_at": error.failure.t}
         except MemoryError:
             answer["message"] = "not enough memory for this scene; allowed: fewer periods or elements"
-
-    def rest() -> dict[str, Any]:
-        found = {"warnings": answer["warnings"]}
-        with _noticing(found):
-            found |= more()
-        return found
-
-    return answer, rest
+    yield answer
+    rest = {"warnings": answer["warnings"]}
+    with _noticing(rest):
+        rest |= more()
+    yield rest
 
 
 @contextmanager
@@ -122,7 +130,7 @@ def deadline(seconds: float = LONGEST_RUN) -> Callable[[float], None]:
 
 
 def _run(circuit: Circuit, request: Request) -> tuple[dict[str, Any], Callable[[], dict[str, Any]]]:
-    """The part of an answer that a run gives, in the two parts of `begun`."""
+    """The part of an answer that a run gives, in the two parts of `parts`."""
     first, stop, period = times_of(circuit, request)
     solution = _simulated(circuit, request, stop, first, stop)
     if solution.failure is not None and solution.failure.t and solution.t.size < 2:
@@ -160,11 +168,10 @@ def _simulated(circuit: Circuit, request: Request, stop: float, first: float, la
 def _traces(solution: Solution, key: str) -> list[dict[str, Any]]:
     """The columns of a signal, each as one trace."""
     unit, label = SIGNALS[key]
-    out = []
-    for name, values in list(solution.by_name(key).items())[:MOST_TRACES]:
-        element = name.partition(":")[2]
-        out.append({"name": name, "signal": key, "element": element, "unit": unit, "label": label, "values": values})
-    return out
+    return [
+        {"name": name, "signal": key, "element": name.partition(":")[2], "unit": unit, "label": label, "values": values}
+        for name, values in list(solution.by_name(key).items())[:MOST_TRACES]
+    ]
 
 
 def _stacks(solution: Solution) -> list[dict[str, Any]]:
@@ -176,8 +183,8 @@ def _stacks(solution: Solution) -> list[dict[str, Any]]:
         stack = stacks.setdefault(e.nodes[2], {"gap": None, "layers": []})
         if e.device == "GAP":
             stack["gap"] = name
-        layer = {"name": name, "device": e.device, "d": e.values["d"], "values": voltages[f"u_layer:{name}"]}
-        stack["layers"].append(layer)
+        values = voltages[f"u_layer:{name}"]
+        stack["layers"].append({"name": name, "device": e.device, "d": e.values["d"], "values": values})
     return [stack for stack in stacks.values() if stack["gap"] is not None][:MOST_TRACES]
 
 
@@ -190,14 +197,11 @@ def _error_text(solution: Solution) -> str:
 
 def _figures(solution: Solution, traces: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Mean, largest and smallest value of each trace's signal over the run, and the mean over the last period."""
-    rows = []
-    for trace in traces:
-        name = trace["name"]
-        found = {figure: solution._figures.value(name, figure) for figure in _FIGURES}
-        rows.append(
-            {"name": name, "label": trace["label"], "element": trace["element"], "unit": trace["unit"], **found}
-        )
-    return rows
+    return [
+        {key: trace[key] for key in ("name", "label", "element", "unit")}
+        | {figure: solution._figures.value(trace["name"], figure) for figure in _FIGURES}
+        for trace in traces
+    ]
 
 
 def _harmonics(solution: Solution, period: float | None) -> list[dict[str, Any]]:
@@ -232,46 +236,37 @@ circuit = dataclasses.replace(circuit, elements=tuple(map(dispersive, circuit.el
 
 
 def as_deck(given: dict[str, Any], own: Circuit | None = None) -> str:
-    """The scene as one deck that fingerspice and ngspice run.
-
-    Raises
-    ------
-    InputError
-        If the request is wrong, or the deck would be too long.
-    """
+    """The scene as one deck that fingerspice and ngspice run, with the length of the page's run and its outputs."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         request = request_of(given)
         _, circuit, _ = circuits_of(request, own)
-        text = export_netlist(_timed(circuit, request), charge_law=request.charge_law)
+        first, stop, _ = times_of(circuit, request)
+        step = (stop - first) / points_of(circuit, first, stop)[0]
+        tran = Tran(step, stop, uic=circuit.tran is None or circuit.tran.uic)
+        text = export_netlist(dataclasses.replace(circuit, tran=tran), charge_law=request.charge_law)
     if len(text) > _LONGEST_EXPORT:
         raise InputError(f"the deck would have {len(text):,} characters; allowed: at most {_LONGEST_EXPORT:,}")
     return text
 
 
 def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
-    """The scene as Python that gives the page's solution.
-
-    Raises
-    ------
-    InputError
-        If the request is wrong.
-    """
+    """The scene as Python that gives the page's solution."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         request = request_of(given)
         base, circuit, _ = circuits_of(request, own)
-        circuit, _ = marked(circuit, base, request)
+        circuit, _ = changed.marked(circuit, base, request)
         first, stop, _ = times_of(circuit, request)
     by_sets = {path.lower() for kept, _ in in_force(circuit).values() for path in kept}
-    name, waveform = read_source(request.source, base, request.recording) if request.source else ("", None)
+    name, waveform = sliders.read_source(request.source, base, request.recording) if request.source else ("", None)
     lines, changes = _beginning(request.deck, own, name)
     if request.skin == "dispersive":
         lines += _DISPERSIVE.splitlines()
-    for one, to in entries(circuit, request):
+    for one, to in changed.entries(circuit, request):
         lines.append(f"circuit = fs.parameters({one!r}).apply(circuit{'' if to is None else f', {to!r}'})")
     if waveform is not None and name.lower() not in by_sets:
-        gain = gain_of(request.source)
+        gain = sliders.gain_of(request.source)
         recorded = request.recording.python(gain) if request.recording is not None and gain is not None else None
         code = recorded or _AS_CODE.sub(r"fs.\1(", repr(waveform))
         lines.append(f"circuit = circuit.replace({{{name!r}: {code}}})")
@@ -317,27 +312,11 @@ def _beginning(deck: str, own: Circuit | None, replaced: str) -> tuple[list[str]
     return lines, changes
 
 
-def _timed(circuit: Circuit, request: Request) -> Circuit:
-    """The circuit with the length of the page's run, and as many outputs."""
-    first, stop, _ = times_of(circuit, request)
-    uic = circuit.tran is None or circuit.tran.uic
-    return dataclasses.replace(circuit, tran=Tran((stop - first) / points_of(circuit, first, stop)[0], stop, uic=uic))
-
-
 def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
-    """Mean force of the periodic state at some frequencies, under sines of the source's amplitude.
+    """Mean force of the periodic state under sines of the source's amplitude, at frequencies that the request names.
 
-    Parameters
-    ----------
-    given : dict
-        A request; its key ``frequencies`` (Hz, at most 16) says where.
-    own : Circuit, optional
-        As in `scene`.
-
-    Returns
-    -------
-    dict
-        ``ok`` and ``message``; ``frequency`` and ``force`` (Hz and N, arrays), and ``gap`` and ``amplitude``, in words.
+    Its key ``frequencies`` (Hz) has at most 16. The answer has ``ok`` and ``message``; ``frequency`` and ``force`` (Hz
+    and N, arrays), and ``gap`` and ``amplitude``, in words.
     """
     frequencies = given.get("frequencies") if isinstance(given, dict) else None
     try:

@@ -10,23 +10,17 @@ import threading
 import webbrowser
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from itertools import chain
 from typing import Any, ClassVar
 
-from fingerspice import __version__
 from fingerspice.base.errors import InputError, printable
 from fingerspice.base.pages import in_notebook
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.explorer import changed
-from fingerspice.explorer.examples import EXAMPLES
-from fingerspice.explorer.recordings import as_json, framed
-from fingerspice.explorer.request import asked_by
-from fingerspice.explorer.scene import begun
-from fingerspice.explorer.sliders import menu
+from fingerspice.explorer import changed, scene
+from fingerspice.explorer.request import as_json, asked_by, framed
 from fingerspice.results.solution import Solution
 
 ADDRESS = "127.0.0.1"
@@ -144,34 +138,14 @@ class Explorer:
 
     def answers(self, what: str, given: Any) -> Iterator[bytes]:
         """The answer to what the page asks for, in the parts in which it is found."""
-        rest: Callable[[], dict[str, Any]] | None = None
-        # Python's filters of warnings belong to the whole process, and two runs at once would not be faster.
-        with self._one_at_a_time:
-            try:
-                if what == SCENE:
-                    found, rest = begun(given, self.circuit)
-                else:
-                    found = _ACTIONS[what](given, self.circuit)
-            except InputError as error:
-                found = {"ok": False, "message": str(error)}
-        yield framed(found)
-        if rest is not None:
+        parts = _ACTIONS[what](given, self.circuit)
+        while True:
+            # Python's filters of warnings belong to the whole process, and two runs at once would not be faster.
             with self._one_at_a_time:
-                found = rest()
+                found = next(parts, None)
+            if found is None:
+                return
             yield framed(found)
-
-
-def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """What the page needs first: its menus, and the scene to begin with."""
-    examples = [
-        {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
-    ]
-    own = None
-    if circuit is not None:
-        before = changed.before(circuit)
-        asked = {"deck": circuit.text, **before, **(asked or {})}
-        own = {"title": circuit.title, "request": asked, "unsaid": changed.unsaid(circuit)}
-    return {"version": __version__, "own": own, "examples": examples, "waveforms": menu(), "sets": changed.menu()}
 
 
 def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
@@ -211,21 +185,27 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
     return explorer
 
 
-def _handed_on(what: str, given: Any, own: Circuit | None) -> dict[str, Any]:
-    """What the page hands on; the studies that it takes are loaded only now, so that the first picture comes sooner."""
-    from fingerspice.explorer import scene
-
-    if what == "means":
-        return scene.means(given, own)
-    return {"ok": True, "text": (scene.as_deck if what == "deck" else scene.as_python)(given, own)}
+Action = Callable[[Any, Circuit | None], Iterator[dict[str, Any]]]
 
 
-#: What the page asks for most, whose answer comes in two parts; and all else that it asks for.
-SCENE = "scene"
-_ACTIONS: dict[str, Callable[[Any, Circuit | None], dict[str, Any]]] = {
-    "set": changed.applied,
-    **{what: partial(_handed_on, what) for what in ("means", "deck", "python")},
-}
+def _whole(make: Callable[[Any, Circuit | None], dict[str, Any] | str]) -> Action:
+    """An action whose answer, or refusal, comes in one part."""
+
+    def parts(given: Any, own: Circuit | None) -> Iterator[dict[str, Any]]:
+        try:
+            found = make(given, own)
+        except InputError as error:
+            found = {"ok": False, "message": str(error)}
+        yield {"ok": True, "text": found} if isinstance(found, str) else found
+
+    return parts
+
+
+#: What the page asks for.
+_ACTIONS: dict[str, Action] = {
+    "scene": scene.parts, "set": _whole(changed.applied), "means": _whole(scene.means),
+    "deck": _whole(scene.as_deck), "python": _whole(scene.as_python),
+}  # fmt: skip
 
 
 class _Server(ThreadingHTTPServer):
@@ -255,11 +235,7 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Refused(Exception):
-    """A request that gets no answer but a sentence."""
-
-    def __init__(self, status: HTTPStatus, text: str) -> None:
-        self.status, self.text = status, text
-        super().__init__(text)
+    """A request that gets no answer but a status and a sentence, its arguments."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -290,12 +266,13 @@ class _Handler(BaseHTTPRequestHandler):
             answer = make(self._allowed())
         except _Refused as error:
             self._discard()
-            answer = error.status, "application/json", iter([as_json({"ok": False, "message": error.text})])
+            status, text = error.args
+            answer = status, "application/json", iter([as_json({"ok": False, "message": text})])
         self._send(*answer)
 
     def _run(self, what: str) -> Answer:
-        if what != SCENE and what not in _ACTIONS:
-            raise _Refused(HTTPStatus.NOT_FOUND, f"nothing of that name; allowed: {', '.join([SCENE, *_ACTIONS])}")
+        if what not in _ACTIONS:
+            raise _Refused(HTTPStatus.NOT_FOUND, f"nothing of that name; allowed: {', '.join(_ACTIONS)}")
         return HTTPStatus.OK, "application/octet-stream", self._parts(what, self._body())
 
     def _parts(self, what: str, given: Any) -> Iterator[bytes]:
@@ -326,7 +303,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _got(self, what: str) -> Answer:
         if what == "start":
-            start = as_json(beginning(self.explorer.circuit, self.explorer.asked))
+            start = as_json(scene.beginning(self.explorer.circuit, self.explorer.asked))
             return HTTPStatus.OK, "application/json", iter([start])
         name = what or "index.html"
         if name not in self.explorer.files:

@@ -6,33 +6,27 @@ import math
 import re
 import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.describe import MEANINGS, MEANINGS_OF_WAVEFORMS
+from fingerspice.circuit.describe import MEANINGS_OF_WAVEFORMS
 from fingerspice.circuit.devices import ParameterSpec
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.explorer.recordings import Recording
 from fingerspice.netlist.netlist import source_from_text
 from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.periodic import Sawtooth, Square, Triangle
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 
-#: Parameters that the paper varies or Table 1 gives, by device; the page shows the others on request.
-_FIRST = {
-    "LAYER": ("d", "eps_r", "r"), "SLAB": ("d", "eps_r", "rho"), "SKIN": ("d", "f"), "SKIN_DISPERSIVE": ("d",),
-    "GAP": ("d", "r", "fn", "mu"), "R": ("value",), "C": ("value",),
-}  # fmt: skip
+if TYPE_CHECKING:
+    from fingerspice.explorer.request import Recording
+
+#: Numbers of waveforms that the page shows at once; the others it shows on request.
 _FIRST_OF_SOURCES = (
     *("amplitude", "frequency", "level", "v1", "v2", "carrier", "modulation", "depth", "f0", "f1", "duration"),
     *("duty", "pulse_period", "period", "td1", "tau1", "td2", "tau2"),
 )
-_WHAT = {
-    "LAYER": "layer", "SLAB": "layer", "SKIN": "skin", "SKIN_DISPERSIVE": "skin, dispersive", "GAP": "gap and contact",
-    "R": "resistor", "C": "capacitor", "V": "voltage source", "I": "current source",
-}  # fmt: skip
 #: Ends of sliders of values that are 0 in the deck.
 _FROM_ZERO = {"a_fix": 100.0, "tau": 0.1, "mu": 1.0, "c2": 20e3}
 #: A slider goes from the deck's value over this to its value times this, within the usual range.
@@ -47,12 +41,8 @@ _PREFIXED = ("m", "V", "A", "ohm", "ohm m", "F", "Hz", "s", "V/m")
 def sliders(base: Circuit, shown: Circuit) -> list[dict[str, Any]]:
     """The sliders by element, those of the sources, the gap and the layers first.
 
-    Parameters
-    ----------
-    base : Circuit
-        The circuit of the deck, whose values set the ranges, so that these stay while a slider moves.
-    shown : Circuit
-        The same circuit with the values of now.
+    `base` is the circuit of the deck, whose values set the ranges, so that these stay while a slider moves; `shown` has
+    the values of now.
     """
     driving = {e.name for e in driving_sources(shown)}
     before = {e.name: e for e in base.elements}
@@ -67,9 +57,8 @@ def _group(base: Element, e: Element, drives: bool) -> dict[str, Any]:
     found = []
     for spec in e.spec.parameters:
         value, own = e.values[spec.name], base.values.get(spec.name, e.values[spec.name])
-        first = spec.name in _FIRST.get(e.device, ())
-        meaning = MEANINGS.get(e.device, {}).get(spec.name, "")
-        found.append(_slider(f"{e.name}.{spec.name}", spec.unit, value, first, _of_parameter(spec, own), meaning))
+        limits = _of_parameter(spec, own)
+        found.append(_slider(f"{e.name}.{spec.name}", spec.unit, value, spec.first, limits, spec.meaning))
     if e.waveform is not None:
         same = type(base.waveform) is type(e.waveform)
         for name, unit in type(e.waveform).units.items():
@@ -81,7 +70,7 @@ def _group(base: Element, e: Element, drives: bool) -> dict[str, Any]:
             first = name in _FIRST_OF_SOURCES
             meaning = MEANINGS_OF_WAVEFORMS.get(name, "")
             found.append(_slider(f"{e.name}.{name}", _unit(e, unit, drives), now, first, limits, meaning))
-    return {"element": e.name, "device": e.device, "what": _WHAT.get(e.device, e.device), "sliders": found}
+    return {"element": e.name, "device": e.device, "what": e.spec.what or e.device, "sliders": found}
 
 
 def _unit(e: Element, unit: str, drives: bool) -> str:
@@ -139,15 +128,6 @@ def _of_waveform(name: str, unit: str, value: float) -> tuple[float, float, bool
     return 0.0, (5.0 * abs(value) or (0.1 if unit == "s" else 1000.0)), False
 
 
-#: By function: its waveform, and the names of its numbers in their order.
-_TEXTS: dict[str, tuple[type[Waveform], tuple[str, ...]]] = {
-    "SIN": (Sine, ("offset", "amplitude", "frequency")),
-    "SQUARE": (Square, ("amplitude", "frequency", "duty")),
-    "AM": (AM, ("amplitude", "carrier", "modulation", "depth")),
-    "TRIANGLE": (Triangle, ("amplitude", "frequency")),
-    "SAWTOOTH": (Sawtooth, ("amplitude", "frequency")),
-    "DC": (DC, ("level",)),
-}
 #: Largest number of characters of a source's text.
 LONGEST = 20_000
 _CALL = re.compile(r"\s*([A-Za-z]+)\s*\(([^()]*)\)\s*")
@@ -177,20 +157,24 @@ def _volt(name: str = "amplitude", value: float = 200.0) -> Argument:
 
 #: The source that stands for the file dropped on the page.
 RECORDING = "RECORDING"
-_DUTY = Argument("duty", "", 0.5, 0.01, 0.99, optional=True)
+_AMPLITUDE, _FREQUENCY, _FAST = _volt(), _hz("frequency", 100.0), _hz("frequency", 5e3)
+#: By function: its name on the page, and its numbers in their order.
 WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
-    "SIN": ("Sine", (_volt("offset", 0.0), _volt(), _hz("frequency", 100.0))),
-    "SQUARE": ("Square wave", (_volt(), _hz("frequency", 100.0), _DUTY)),
-    "TRIANGLE": ("Triangle", (_volt(), _hz("frequency", 100.0))),
-    "SAWTOOTH": ("Sawtooth", (_volt(), _hz("frequency", 100.0))),
+    "SIN": ("Sine", (_volt("offset", 0.0), _AMPLITUDE, _FREQUENCY)),
+    "SQUARE": ("Square wave", (_AMPLITUDE, _FREQUENCY, Argument("duty", "", 0.5, 0.01, 0.99, optional=True))),
+    "TRIANGLE": ("Triangle", (_AMPLITUDE, _FREQUENCY)),
+    "SAWTOOTH": ("Sawtooth", (_AMPLITUDE, _FREQUENCY)),
     "AM": (
         "Carrier with envelope",
-        (_volt(), _hz("carrier", 5e3), _hz("envelope", 50.0), Argument("depth", "", 1.0, 0.0, 1.0, optional=True)),
+        (
+            *(_AMPLITUDE, _hz("carrier", 5e3), _hz("envelope", 50.0)),
+            Argument("depth", "", 1.0, 0.0, 1.0, optional=True),
+        ),
     ),
     "BURST": (
         "Bursts",
         (
-            *(_volt(), _hz("frequency", 5e3), Argument("cycles", "", 10.0, 1.0, 100.0)),
+            *(_AMPLITUDE, _FAST, Argument("cycles", "", 10.0, 1.0, 100.0)),
             Argument("every", "s", 10e-3, 1e-3, 1.0, True),
         ),
     ),
@@ -212,7 +196,9 @@ WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
     RECORDING: ("Recording or table, dropped here", (Argument("gain", "V", 150.0, 0.0, 400.0),)),
     "DC": ("Constant", (_volt("level", 200.0),)),
 }
-"""By function: its name on the page, and its numbers in their order."""
+#: Waveforms that the page can say as text; their numbers are those of the menu, one of them by another name.
+_TEXTS = {Sine: "SIN", Square: "SQUARE", Triangle: "TRIANGLE", Sawtooth: "SAWTOOTH", AM: "AM", DC: "DC"}
+_FIELDS = {"envelope": "modulation"}
 
 
 def menu() -> list[dict[str, Any]]:
@@ -227,55 +213,44 @@ def read_source(text: str, circuit: Circuit, recording: Recording | None = None)
     """The source's name and its new waveform, from text such as ``SQUARE(200 100)`` or ``Vdrive=AM(200 5k 50)``.
 
     No file is read, whatever the text names; ``RECORDING(150)`` is the recording given.
-
-    Raises
-    ------
-    InputError
-        If the text is not a source, or the circuit has no source of that name.
     """
     if len(text) > LONGEST:
         raise InputError(f"the source has {len(text):,} characters; allowed: at most {LONGEST:,}")
     names = {e.name.lower(): e.name for e in driving_sources(circuit)}
     named = _NAMED.fullmatch(text)
-    if named is not None:
-        if named[1].lower() not in names:
-            known = ", ".join(names.values())
-            raise InputError(f"{named[1]!r} is not a source of the circuit; allowed: {known}")
-        name, text = names[named[1].lower()], named[2]
-    else:
-        name = next(iter(names.values()))
-    call = _CALL.fullmatch(text)
-    if call is not None and call[1].upper() == RECORDING:
-        gain = _gain(call[2])
+    given = next(iter(names), "") if named is None else named[1]
+    if given.lower() not in names:
+        known = ", ".join(names.values()) or "none, as it has no source"
+        raise InputError(f"{given or text!r} is not a source of the circuit; allowed: {known}")
+    gain = gain_of(text)
+    if gain is not None:
         if recording is None:
             raise InputError(
                 "the source is a recording, which a link does not carry; allowed: drop its file on the page"
             )
-        return name, recording.waveform(gain)
+        return names[given.lower()], recording.waveform(gain)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FingerspiceWarning)
-        return name, source_from_text(text, circuit, files=False)
+        call = text if named is None else named[2]
+        return names[given.lower()], source_from_text(call, circuit, files=False)
 
 
 def text_of(waveform: Waveform) -> str | None:
     """The text that `read_source` reads as this waveform; None of one for which the page has no function."""
-    for kind, (made, names) in _TEXTS.items():
-        if type(waveform) is made:
-            numbers = [value_text(getattr(waveform, name), made.units[name]) for name in names]
-            return f"{kind}({' '.join(numbers)})"
-    return None
+    kind = _TEXTS.get(type(waveform))
+    if kind is None:
+        return None
+    names = [_FIELDS.get(a.name, a.name) for a in WAVEFORMS[kind][1]]
+    return f"{kind}({' '.join(value_text(getattr(waveform, name), waveform.units[name]) for name in names)})"
 
 
 def gain_of(text: str) -> float | None:
     """The gain of a source that is a recording; None of another source."""
     named = _NAMED.fullmatch(text)
     call = _CALL.fullmatch(text if named is None else named[2])
-    return _gain(call[2]) if call is not None and call[1].upper() == RECORDING else None
-
-
-def _gain(text: str) -> float:
-    """The number of a call of `RECORDING`."""
-    words = text.replace(",", " ").split()
+    if call is None or call[1].upper() != RECORDING:
+        return None
+    words = call[2].replace(",", " ").split()
     if len(words) != 1:
         raise InputError(f"{RECORDING} is given {len(words)} numbers; allowed: {RECORDING}(gain)")
     try:

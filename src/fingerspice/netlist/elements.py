@@ -12,7 +12,7 @@ from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import exponent_and_scale
 from fingerspice.circuit.circuit import Element
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
-from fingerspice.circuit.values import is_resistance, mega_note, unit_trap, unusual
+from fingerspice.circuit.usual import is_resistance, mega_note, unit_trap, unusual
 from fingerspice.netlist.directives import start_volts
 from fingerspice.netlist.flatten import KINDS
 from fingerspice.netlist.slips import nearest

@@ -10,10 +10,9 @@ from pathlib import Path
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import AcSweep, Circuit, Element, Tran, check
-from fingerspice.circuit.loop import network_of
-from fingerspice.circuit.usual import REST_AREA
-from fingerspice.circuit.values import unusual
+from fingerspice.circuit.circuit import AcSweep, Circuit, Element, Tran
+from fingerspice.circuit.loop import checked
+from fingerspice.circuit.usual import REST_AREA, unusual
 from fingerspice.netlist.deck import Deck, parse_deck, read_deck
 from fingerspice.netlist.directives import read_ac, read_initial, read_options, read_tran, unused_starts
 from fingerspice.netlist.elements import read_elements, source_of
@@ -106,9 +105,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
         text=deck.text,
         path=deck.path,
     )
-    check(circuit)
-    network_of(circuit)
-    return circuit
+    return checked(circuit)
 
 
 def _unusual_areas(elements: tuple[Element, ...], initial: Mapping[str, float]) -> Iterator[str]:

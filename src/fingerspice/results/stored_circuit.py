@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran, check
-from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran
+from fingerspice.circuit.loop import checked
 from fingerspice.waveforms import combinations, periodic, ramps, samples
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
@@ -116,10 +116,7 @@ def made_again(kept: Mapping[str, Any], arrays: list[FloatArray]) -> Circuit:
     plain |= {name: tuple(map(str, kept[name])) for name in ("warnings", "unused")}
     sets = {name: {path: _value(x, arrays) for path, x in one.items()} for name, one in kept["sets"].items()}
     tran, ac = kept["tran"] and Tran(**kept["tran"]), kept["ac"] and AcSweep(**kept["ac"])
-    circuit = Circuit(**{**plain, "elements": elements, "tran": tran, "ac": ac, "sets": sets})
-    check(circuit)
-    network_of(circuit)
-    return circuit
+    return checked(Circuit(**{**plain, "elements": elements, "tran": tran, "ac": ac, "sets": sets}))
 
 
 def _value(plain: Any, arrays: list[FloatArray]) -> Any:

@@ -12,8 +12,9 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Element
-from fingerspice.circuit.notices import circuit_warnings, course_warnings, driving
+from fingerspice.circuit.notices import circuit_warnings, course_warnings
 from fingerspice.circuit.spectrum import spectrum_warning
+from fingerspice.circuit.topology import driving
 from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.engine.model import Model
 from fingerspice.physics.contact import inverse_area, inverse_area_range

@@ -1,6 +1,6 @@
 // The explorer: a state, a request in flight, and what its answer shows.
 
-import { Sliders, Waveforms, write } from "./controls.js";
+import { Sliders, Waveforms, make, write } from "./controls.js";
 import { Sets } from "./sets.js";
 import { read } from "./recording.js";
 import { Harmonics, Means, Traces } from "./plots.js";
@@ -143,7 +143,7 @@ function clear() {
 
 function warn(answer) {
   const said = [...unknownInLink, ...(answer.unknown || []), ...(answer.warnings || [])];
-  $("warnings").replaceChildren(...said.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+  $("warnings").replaceChildren(...said.map((textContent) => make("li", { textContent })));
 }
 
 /** Show what comes after the traces: harmonics, the stack, figures and facts. */
@@ -186,10 +186,9 @@ function still() {
 function table() {
   const old = new Map((pinned && pinned.figures ? pinned.figures : []).map((f) => [f.name, f]));
   const head = ["signal", "mean", "mean, last period", "smallest", "largest", ...(pinned ? ["pinned mean", "change"] : [])];
-  const cell = (tag, text) => Object.assign(document.createElement(tag), { textContent: text });
   const row = (tag, texts) => {
-    const out = document.createElement("tr");
-    out.append(...texts.map((text) => cell(tag, text)));
+    const out = make("tr");
+    out.append(...texts.map((textContent) => make(tag, { textContent })));
     return out;
   };
   const rows = good.figures.map((f) => {
@@ -336,9 +335,7 @@ function another() {
 }
 
 function save(name, blob) {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(blob);
-  link.download = name;
+  const link = make("a", { href: URL.createObjectURL(blob), download: name });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }

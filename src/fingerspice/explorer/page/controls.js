@@ -21,7 +21,8 @@ function at(position, s) {
   return Number(value.toPrecision(4));
 }
 
-function make(tag, properties = {}, parent = null) {
+/** A new element of the page. */
+export function make(tag, properties = {}, parent = null) {
   const element = Object.assign(document.createElement(tag), properties);
   if (parent) parent.append(element);
   return element;

@@ -1,5 +1,6 @@
 // Traces against time, harmonics, and mean force against frequency.
 
+import { make } from "./controls.js";
 import { quantity, scale } from "./units.js";
 
 const COLOURS = ["#0a5a9c", "#b3400d", "#2c7a3f", "#7b3f9e", "#8a6d00", "#00707a", "#9c1f56", "#444"];
@@ -89,9 +90,7 @@ export class Traces {
     for (const plot of this.plots) plot.destroy();
     this.parent.replaceChildren();
     this.plots = wanted.map(({ panel, series }, i) => {
-      const box = document.createElement("div");
-      box.className = "panel";
-      this.parent.append(box);
+      const box = make("div", { className: "panel" }, this.parent);
       const line = (s) => ({ label: s.label, stroke: s.colour, width: s.dashed ? 1.2 : 1.6, dash: s.dashed ? [6, 4] : undefined,
         pxAlign: 0, points: { show: false }, value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) });
       const last = i === wanted.length - 1;
@@ -186,14 +185,14 @@ class Small {
     this.plot = null;
     this.parent.replaceChildren();
     if (!text) return;
-    this.parent.append(Object.assign(document.createElement("h2"), { textContent: this.title }));
-    this.parent.append(Object.assign(document.createElement("p"), { textContent: text }));
+    make("h2", { textContent: this.title }, this.parent);
+    make("p", { textContent: text }, this.parent);
   }
 
   draw(series, data, labels, scales) {
     if (!this.plot || this.plot.series.length !== series.length + 1) {
       this.clear();
-      this.parent.append(Object.assign(document.createElement("h2"), { textContent: this.title }));
+      make("h2", { textContent: this.title }, this.parent);
       const axis = { font: "11px sans-serif", labelFont: "12px sans-serif", labelSize: 18, label: "" };
       this.plot = new uPlot({ width: this.width(), height: 190, scales,
         axes: [{ ...axis, size: 30 }, { ...axis, size: 52, space: 28 }], cursor: { show: false },

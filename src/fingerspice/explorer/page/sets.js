@@ -1,14 +1,10 @@
 // Named sets of parameters: the menu, and what is said of those whose values are in force.
 
+import { make } from "./controls.js";
+
 const KINDS = { finger: "finger", load: "load", coating: "coating", drive: "drive", scene: "whole scene" };
 /** Devices with values that a set may give. */
 const GIVEN = ["GAP", "LAYER", "SKIN", "SKIN_DISPERSIVE", "V"];
-
-function make(tag, text, parent) {
-  const element = Object.assign(document.createElement(tag), { textContent: text });
-  parent.append(element);
-  return element;
-}
 
 export class Sets {
   /** `apply(entry)` applies a set: NAME, or ELEMENT=NAME. */
@@ -19,9 +15,8 @@ export class Sets {
     this.key = "";
     this.menu.append(new Option("choose a set", ""));
     for (const [kind, label] of Object.entries(KINDS)) {
-      const group = Object.assign(document.createElement("optgroup"), { label });
+      const group = make("optgroup", { label }, this.menu);
       group.append(...menu.filter((one) => one.kind === kind).map((one) => new Option(`${one.name}: ${one.title}`, one.name)));
-      this.menu.append(group);
     }
     this.menu.addEventListener("change", () => {
       if (this.menu.value) apply(this.to.value ? `${this.to.value}=${this.menu.value}` : this.menu.value);
@@ -36,12 +31,13 @@ export class Sets {
     this.key = key;
     this.choices(answer.sliders.filter((g) => GIVEN.includes(g.device)));
     this.list.replaceChildren(...(answer.sets || []).map((one) => {
-      const item = document.createElement("li");
-      make("b", one.to ? `${one.name}, ${one.to}` : one.name, item);
+      const item = make("li");
+      const say = (textContent) => make("span", { textContent }, item);
+      make("b", { textContent: one.to ? `${one.name}, ${one.to}` : one.name }, item);
       item.append(` ${one.title}. `);
-      if (one.assumed.length) make("span", `Assumed, not published: ${one.assumed.join(", ")}. `, item);
-      if (one.changed.length) make("span", `Changed since: ${one.changed.join(", ")}. `, item);
-      make("span", `Not claimed: ${one.caveat}`, item);
+      if (one.assumed.length) say(`Assumed, not published: ${one.assumed.join(", ")}. `);
+      if (one.changed.length) say(`Changed since: ${one.changed.join(", ")}. `);
+      say(`Not claimed: ${one.caveat}`);
       return item;
     }));
   }

@@ -1,5 +1,6 @@
 // A drawing of the stack that moves with the traces in slow motion.
 
+import { make } from "./controls.js";
 import { quantity } from "./units.js";
 
 /** Seconds in which the traces shown go by. */
@@ -29,12 +30,12 @@ export class Stack {
     this.point = point;
     this.stacks = [];
     this.playing = false;
-    this.canvas = document.createElement("canvas");
+    this.canvas = make("canvas");
     this.canvas.setAttribute("role", "img");
-    this.button = Object.assign(document.createElement("button"), { type: "button", textContent: "Play in slow motion" });
+    this.button = make("button", { type: "button", textContent: "Play in slow motion" });
     this.button.addEventListener("click", () => this.play(!this.playing));
-    this.title = Object.assign(document.createElement("h2"), { textContent: "the stack" });
-    this.note = document.createElement("p");
+    this.title = make("h2", { textContent: "the stack" });
+    this.note = make("p");
     new ResizeObserver(() => this.stacks.length && !this.playing && this.draw()).observe(parent);
   }
 
