@@ -13,7 +13,7 @@ from scipy import stats
 
 import fingerspice as fs
 from commands import Command
-from fingerspice.studies import populations
+from fingerspice.studies.sweep import populations
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 

@@ -23,9 +23,9 @@ from scipy import stats
 
 import fingerspice as fs
 from commands import Command, tree
-from fingerspice.studies import sweepchunks, sweepstore
-from fingerspice.studies.sweepplan import make_plan
-from fingerspice.studies.sweepstore import SweepStore
+from fingerspice.studies.sweep import chunks, workers
+from fingerspice.studies.sweep.plan import make_plan
+from fingerspice.studies.sweep.store import SweepStore
 from processes import ended, no_room, start
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
@@ -50,7 +50,7 @@ def circuit() -> fs.Circuit:
 
 @pytest.fixture(autouse=True)
 def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sweepstore, "CHUNK", 64)
+    monkeypatch.setattr(chunks, "CHUNK", 64)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def whole(circuit: fs.Circuit, tmp_path_factory: pytest.TempPathFactory) -> dict
     """The store that one call makes, file by file."""
     path = tmp_path_factory.mktemp("whole") / "whole.zarr"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweepstore, "CHUNK", 64)
+        patch.setattr(chunks, "CHUNK", 64)
         found = fs.sweep(circuit, PARAMETERS, store=path, **HOW)
     assert (found.attrs["chunks"], found.attrs["chunks_found"], found.attrs["chunks_missing"]) == (192, 0, 0)
     return tree(path)
@@ -192,7 +192,7 @@ class Deadly:
 def test_chunks_that_always_cost_their_worker_end_the_sweep(
     circuit: fs.Circuit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sweepchunks, "MOST_LOST", 2)
+    monkeypatch.setattr(workers, "MOST_LOST", 2)
     with pytest.raises(fs.InputError, match=r"one chunk after another were lost, 2 times.* what is written stays"):
         fs.sweep(circuit, {"Xgap.d": Deadly()}, store=tmp_path / "s.zarr", workers=1, **{**HOW, "n": 64})
 
@@ -221,10 +221,10 @@ SCRIPT = """
 import sys
 import fingerspice as fs
 import test_sweepstore as here
-from fingerspice.studies import sweepstore
+from fingerspice.studies.sweep import chunks
 
 if __name__ == "__main__":
-    sweepstore.CHUNK = 64
+    chunks.CHUNK = 64
     circuit = fs.read_netlist(here.CIRCUITS / "fingerpad.cir")
     asked = {"store": sys.argv[1], "shard": (int(sys.argv[2]), int(sys.argv[3]))}
     fs.sweep(circuit, here.PARAMETERS, **asked, **({"workers": 2} if len(sys.argv) > 4 else {}), **here.HOW)
@@ -300,7 +300,7 @@ def test_dask_workers_that_are_killed_20_times_cost_nothing(
         assert found.attrs["chunks_missing"] == 0
         assert tree(path) == whole
         # What a worker refuses is told as it is.
-        monkeypatch.setattr(sweepstore, "programs", lambda: "fingerspice 0.0")
+        monkeypatch.setattr(chunks, "programs", lambda: "fingerspice 0.0")
         with pytest.raises(fs.InputError, match="a worker has fingerspice"):
             fs.sweep(circuit, PARAMETERS, store=tmp_path / "o.zarr", scheduler=cluster.scheduler_address, **HOW)
 
@@ -309,7 +309,7 @@ def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     distributed = pytest.importorskip("distributed")
-    path, computed, write = tmp_path / "s.zarr", sweepchunks._computed, SweepStore.write
+    path, computed, write = tmp_path / "s.zarr", chunks._computed, SweepStore.write
     begun, written, at_once = 0, 0, 0
 
     def computing(*given: Any) -> Any:
@@ -328,7 +328,7 @@ def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
         written += 1
         write(*given)
 
-    monkeypatch.setattr(sweepchunks, "_computed", computing)
+    monkeypatch.setattr(chunks, "_computed", computing)
     monkeypatch.setattr(SweepStore, "write", writing)
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=logging.CRITICAL
@@ -422,6 +422,17 @@ def test_a_chunk_of_which_a_bit_has_changed_is_run_again(
         assert tree(path) == whole
     (path / "error/c/1/7").unlink()
     assert f"{path / 'error'} has 191 of 192 chunks" in command("check", str(path)).lines[-1]
+
+
+def test_a_single_set_of_parameters_goes_into_a_store(circuit: fs.Circuit, tmp_path: Path, command: Command) -> None:
+    # It is number 0 of its table, and a grid of nothing but 0 is in the store, too.
+    asked = {"finger": ["moist"], "Xgap.d": [3e-6, 4e-6]}
+    memory = fs.sweep(circuit, asked, **HOW)
+    stored = fs.sweep(circuit, asked, store=tmp_path / "s.zarr", **HOW)
+    assert stored.finger.values.tolist() == memory.finger.values.tolist() == ["moist"]
+    np.testing.assert_array_equal(stored.f_el_mean_periodic.values, memory.f_el_mean_periodic.values)
+    done = command("check", str(tmp_path / "s.zarr"))
+    assert (done.code, done.lines) == (0, [])
 
 
 @pytest.mark.parametrize(

@@ -57,10 +57,10 @@ if TYPE_CHECKING:
     from fingerspice.studies.limits import FoldLimits as FoldLimits
     from fingerspice.studies.limits import fold_limits as fold_limits
     from fingerspice.studies.phasors import phasor as phasor
-    from fingerspice.studies.populations import sobol as sobol
-    from fingerspice.studies.populations import sweep as sweep
     from fingerspice.studies.steady import SteadyState as SteadyState
     from fingerspice.studies.steady import steady_state as steady_state
+    from fingerspice.studies.sweep.populations import sobol as sobol
+    from fingerspice.studies.sweep.populations import sweep as sweep
     from fingerspice.waveforms.combinations import AM as AM
     from fingerspice.waveforms.combinations import Burst as Burst
     from fingerspice.waveforms.combinations import Product as Product
@@ -103,7 +103,7 @@ _HOMES = {
     "studies.inverse": ("InverseDrive", "inverse_drive"),
     "studies.phasors": ("phasor",),
     "studies.limits": ("FoldLimits", "fold_limits"),
-    "studies.populations": ("sobol", "sweep"),
+    "studies.sweep.populations": ("sobol", "sweep"),
     "results.loading": ("load",),
     "results.outcome": ("Plan", "SolveError", "Status"),
     "sets.parameters": ("Citation", "ParameterSet", "parameters"),

@@ -21,46 +21,25 @@ COMMON = (
     *("title", "overrides", "sets", "charge_law", "method", "rtol"),
 )
 #: Further keys of each command.
-OWN: dict[str, tuple[str, ...]] = {
-    "run": (
-        "area",
-        "tier",
-        "t_stop",
-        "figures_from",
-        "error",
-        "fundamental",
-        "fold_margin_min",
-        "signals",
-        "feel",
-        "stream",
-    ),
-    "ac": ("area", "skin", "sweeps"),
-    "plan": ("area", "tier", "reasons", "start", "rates", "stiff", "sensitivity", "error_bound", "plan_area"),
-    "compare": ("frequency", "gaps", "phasor", "transient_mean_area", "transient_coupled"),
-    "limits": ("peak", "voltage", "sweeps", "capability"),
-    "design": (
-        *("kind", "rate", "samples", "carrier", "limit", "slew", "lead", "peak", "at_limit", "worst", "rms"),
-        *("worst_share", "rms_share", "largest_wanted", "largest_reached", "corrections"),
-    ),
-    "fit": (
-        "parameters",
-        "correlation",
-        "groups",
-        "signal",
-        "count",
-        "residual_rms",
-        "objective",
-        "objectives",
-        "notes",
-        "profiles",
-    ),
-    "fit-contact": ("gap", "parameters", "correlation", "relations", "objective", "notes", "profiles"),
-    "sweep": ("scenes", "failed", "n", "seed", "figures", "shares", "store"),
-    "export": (),
-    "figures": (),
-    "explore": ("url",),
-    "sets": ("parameter_sets",),
-    "check": ("chunks",),
+OWN = {
+    command: tuple(keys.split())
+    for command, keys in {
+        "run": "area tier t_stop figures_from error fundamental fold_margin_min signals feel stream",
+        "ac": "area skin sweeps",
+        "plan": "area tier reasons start rates stiff sensitivity error_bound plan_area",
+        "compare": "frequency gaps phasor transient_mean_area transient_coupled",
+        "limits": "peak voltage sweeps capability",
+        "design": "kind rate samples carrier limit slew lead peak at_limit worst rms worst_share rms_share "
+        "largest_wanted largest_reached corrections",
+        "fit": "parameters correlation groups signal count residual_rms objective objectives notes profiles",
+        "fit-contact": "gap parameters correlation relations objective notes profiles",
+        "sweep": "scenes failed n seed figures shares store",
+        "export": "",
+        "figures": "",
+        "explore": "url",
+        "sets": "parameter_sets",
+        "check": "chunks",
+    }.items()
 }
 #: Figures of a signal; a figure that a signal lacks is null.
 FIGURES = ("min", "max", "peak", "mean", "rms", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
@@ -70,18 +49,12 @@ _UNITS = {"u_source": "V", "u_gap": "V", "u_layer": "V", "v": "V", "area": "m^2"
 def blank(command: str | None) -> Answer:
     """An answer with all its keys, before any result is known."""
     keys = (*COMMON, *OWN.get(command or "", ()))
-    known = {"version": __version__, "command": command, "success": False}
-    return {**dict.fromkeys(keys), "warnings": [], "files": [], "overrides": {}, "sets": [], **known}
+    empty = {"success": False, "warnings": [], "files": [], "overrides": {}, "sets": []}
+    return {**dict.fromkeys(keys), **empty, "version": __version__, "command": command}
 
 
 def of_circuit(circuit: Circuit, charge_law: str | None) -> Answer:
-    """The part of an answer that describes the circuit.
-
-    Raises
-    ------
-    InputError
-        If the charge law is unknown.
-    """
+    """The part of an answer that describes the circuit; an unknown charge law is refused."""
     from fingerspice.circuit.circuit import CHARGE_LAWS
     from fingerspice.waveforms.waveform import require
 

@@ -3,68 +3,27 @@
 from __future__ import annotations
 
 import gc
+import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fingerspice.base.arrays import positive_row
 from fingerspice.base.errors import InputError
-from fingerspice.cli import answers, options
+from fingerspice.cli import answers, options, tools
 from fingerspice.cli import design as designs
 from fingerspice.cli import fit as fits
 from fingerspice.cli import sweep as sweeps
-from fingerspice.cli.answers import (
-    AsJson,
-    ChargeLaw,
-    Chunk,
-    Coating,
-    Deck,
-    Drive,
-    Finger,
-    Name,
-    NetCdf,
-    NoPlot,
-    Out,
-    Overwrite,
-    Rtol,
-    Schematic,
-    Set,
-    Signals,
-    Source,
-    Stop,
-    Streamed,
-)  # fmt: skip
-from fingerspice.cli.check import check
-from fingerspice.cli.design import limits
-from fingerspice.cli.explore import explore
-from fingerspice.cli.figures import figures
-from fingerspice.cli.options import area_from_text, check_output, read_circuit
+from fingerspice.cli.options import area_from_text, read_circuit
 from fingerspice.cli.result_files import Results
-from fingerspice.cli.run_files import Touch, large_sweep, run_streamed, written
 from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
 from fingerspice.results.outcome import SolveError
 
-
-def sets(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="A set; without it all are listed.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """List the named sets of parameters, or show the values of one with their ranges and sources.
-
-    Examples:
-
-      fingerspice sets
-
-      fingerspice sets moist
-    """
-    from fingerspice.sets.parameters import parameters
-
-    with Answering("sets", as_json) as answer:
-        found = parameters() if name is None else parameters(name)
-        shown = parameters().values() if name is None else [parameters(name)]
-        answer.update(parameter_sets=[one.to_dict() for one in shown])
-        answer.give(lambda: str(found))
+if TYPE_CHECKING:
+    from fingerspice.results.solution import Solution
+    from fingerspice.studies.feel import Feel
 
 
 app = typer.Typer(
@@ -99,22 +58,22 @@ def main() -> None:
 
 @app.command()
 def run(
-    deck: Deck,
-    out: Out = None,
-    name: Name = None,
-    overwrite: Overwrite = False,
-    rtol: Rtol = 1e-8,
-    charge_law: ChargeLaw = None,
+    deck: answers.Deck,
+    out: answers.Out = None,
+    name: answers.Name = None,
+    overwrite: answers.Overwrite = False,
+    rtol: answers.Rtol = 1e-8,
+    charge_law: answers.ChargeLaw = None,
     area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
     method: Annotated[
         str, typer.Option(help="auto, exponential, radau, scipy:LSODA, torchdiffeq:dopri5, ...")
     ] = "auto",
-    changes: Set = None,
-    finger: Finger = None,
-    coating: Coating = None,
-    drive: Drive = None,
-    source: Source = None,
-    stop: Stop = None,
+    changes: answers.Set = None,
+    finger: answers.Finger = None,
+    coating: answers.Coating = None,
+    drive: answers.Drive = None,
+    source: answers.Source = None,
+    stop: answers.Stop = None,
     start: Annotated[
         str, typer.Option(help="deck (as its .tran says), uncharged, dc, periodic; or TIME of the first output: 5m.")
     ] = "deck",
@@ -122,14 +81,14 @@ def run(
         str, typer.Option(help="Rows at jumps of the source: both, or none, so that time rises strictly.")
     ] = "both",
     csv: Annotated[bool, typer.Option("--csv", help="Write CSV instead of NetCDF.")] = False,
-    stream: Streamed = False,
-    chunk: Chunk = None,
-    signals: Signals = None,
-    netcdf: NetCdf = False,
+    stream: answers.Streamed = False,
+    chunk: answers.Chunk = None,
+    signals: answers.Signals = None,
+    netcdf: answers.NetCdf = False,
     feel: Annotated[bool, typer.Option("--feel", help="Say, and draw, what the hand feels of the friction.")] = False,
-    schematic: Schematic = False,
-    as_json: AsJson = False,
-    no_plot: NoPlot = False,
+    schematic: answers.Schematic = False,
+    as_json: answers.AsJson = False,
+    no_plot: answers.NoPlot = False,
 ) -> None:
     """Simulate DECK in time: a summary, a data file and a picture.
 
@@ -165,15 +124,17 @@ def run(
         check_arguments(rtol, method, fixed, start, jumps)
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         if stream or chunk or signals or netcdf:
+            from fingerspice.cli.store import run_streamed
+
             options.check_streamed(stream, csv=csv, feel=feel, schematic=schematic)
             how = {"charge_law": charge_law, "area": fixed, "rtol": rtol}
             how |= {"method": method, "start": start, "t_stop": t_stop}
             run_streamed(answer, results, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
             return
-        data = results.file(".csv" if csv else ".nc")
-        picture = None if no_plot else results.file(".png")
-        drawn = results.file("_schematic.svg") if schematic else None
-        touch = Touch(circuit, None if no_plot else results) if feel else None
+        _name_files(results, lambda: solution, csv=csv, no_plot=no_plot, schematic=schematic)
+        if feel and not circuit.by_device("GAP"):
+            raise InputError("--feel: the circuit has no GAP, so there is no friction to feel")
+        image = results.file("_feel.png") if feel and not no_plot else None
         with progress() as update:
             solution = simulate(
                 circuit, t_stop=t_stop, charge_law=charge_law, area=fixed, rtol=rtol, method=method,
@@ -181,23 +142,62 @@ def run(
             )  # fmt: skip
         if as_json:
             answer.update(**answers.of_run(solution))
-        writes = written(solution, data, picture, results, drawn)
-        if touch is not None and solution.success:
-            answer.update(feel=touch.look(solution))
-            writes += touch.writes
-        answer.give(lambda: "\n\n".join([summary_table(solution), *(touch.said if touch else ())]), writes)
+        writes = results.ready() if solution.t.size else []
+        fingers, unfelt = _felt(solution) if feel and solution.success else (None, None)
+        if fingers is not None:
+            answer.update(feel=[one.to_dict() for one in fingers])
+        if fingers:
+            writes += results.pictures(image, lambda: fingers[0].plot(fingers[1:]))
+        answer.give(lambda: "\n\n".join([summary_table(solution), *map(str, fingers or ())]), writes)
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
-        if touch is not None and touch.failed is not None:
-            raise touch.failed
+        if unfelt is not None:
+            raise unfelt
+
+
+def _name_files(
+    results: Results, solution: Callable[[], Solution], *, csv: bool, no_plot: bool, schematic: bool
+) -> None:
+    """Check the files of a run, which has not begun, and say how its solution is written."""
+
+    def drawn() -> Any:
+        from fingerspice.plots.schematic import put_beside
+
+        picture = solution().plot()
+        return put_beside(picture, results.circuit) if schematic else picture
+
+    def symbols(file: Path) -> Path:
+        # An SVG file knows no names of our own, and keeps all of them as one text.
+        return results.circuit.draw().write(file, {"Description": json.dumps(results.about)})
+
+    if csv:
+        results.will_write(".csv", lambda file: solution().to_csv(file))
+    else:
+        results.will_write(".nc", lambda file: solution().to_netcdf(file))
+    results.will_draw(".png", drawn, unless=no_plot)
+    if schematic:
+        results.will_write("_schematic.svg", symbols)
+
+
+def _felt(solution: Solution) -> tuple[list[Feel] | None, InputError | None]:
+    """What each finger feels of a run; None, and why, if its outputs are too few or uneven.
+
+    The reason is told later, after the files of the run have been written.
+    """
+    from fingerspice.studies.feel import feel
+
+    try:
+        return [feel(solution, name) for name in solution.all_signals.names("f_t")], None
+    except InputError as error:
+        return None, error
 
 
 @app.command()
 def ac(
-    deck: Deck,
-    out: Out = None,
-    name: Name = None,
-    overwrite: Overwrite = False,
+    deck: answers.Deck,
+    out: answers.Out = None,
+    name: answers.Name = None,
+    overwrite: answers.Overwrite = False,
     sweep: Annotated[
         str | None, typer.Option(metavar="'dec N F1 F2'", help="Sweep; the deck's .ac line by default.")
     ] = None,
@@ -207,12 +207,12 @@ def ac(
     ] = None,
     skin: Annotated[str, typer.Option(help="SKIN's data: swept, at each frequency; own, at its f.")] = "swept",
     finger: Annotated[str | None, typer.Option(metavar="GAP", help="Which of several GAPs.")] = None,
-    charge_law: ChargeLaw = None,
-    rtol: Rtol = 1e-8,
-    changes: Set = None,
-    source: Source = None,
-    as_json: AsJson = False,
-    no_plot: NoPlot = False,
+    charge_law: answers.ChargeLaw = None,
+    rtol: answers.Rtol = 1e-8,
+    changes: answers.Set = None,
+    source: answers.Source = None,
+    as_json: answers.AsJson = False,
+    no_plot: answers.NoPlot = False,
 ) -> None:
     """Phasor sweep of DECK: gap voltage, phase, area and mean force against frequency.
 
@@ -226,10 +226,11 @@ def ac(
 
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
+    from fingerspice.plots.traces import plot_phasor
     from fingerspice.results.report import phasor_csv, phasor_dict, phasor_tables
     from fingerspice.solve.simulation import check_arguments
-    from fingerspice.studies.phasors import phasor
-    from fingerspice.studies.sweeps import sweep_frequencies
+    from fingerspice.studies.comparison import large_signal
+    from fingerspice.studies.phasors import phasor, sweep_frequencies
 
     how = "steady_state" if area == "coupled" else "phasor"
     with Answering("ac", as_json, charge_law=charge_law, method=how, rtol=rtol, area=area, skin=skin) as answer:
@@ -247,33 +248,29 @@ def ac(
                 raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
             found = [phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger)]
         results = Results(deck, circuit, out, name, overwrite, charge_law)
-        data = results.file("_ac.csv")
-        picture = None if no_plot else results.file("_ac.png")
+        results.will_write("_ac.csv", lambda file: phasor_csv(found, file))
+        results.will_draw("_ac.png", lambda: plot_phasor(found, circuit), unless=no_plot)
         if area == "coupled":
-            found = [*large_sweep(circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger)]
-        results.open()
-
-        def drawn() -> object:
-            from fingerspice.plots.traces import plot_phasor
-
-            return plot_phasor(found, circuit)
-
+            with progress("sweeping") as update:
+                every = large_signal(
+                    circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger, progress=update
+                )
+            found = [*every]
         answer.update(sweeps=[phasor_dict(r) for r in found] if as_json else None)
-        writes = [lambda: phasor_csv(found, data), *results.pictures(picture, drawn)]
-        answer.give(lambda: phasor_tables(found, circuit), writes)
+        answer.give(lambda: phasor_tables(found, circuit), results.ready())
 
 
 @app.command()
 def plan(
-    deck: Deck,
-    rtol: Rtol = 1e-8,
-    charge_law: ChargeLaw = None,
+    deck: answers.Deck,
+    rtol: answers.Rtol = 1e-8,
+    charge_law: answers.ChargeLaw = None,
     area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
-    stop: Stop = None,
+    stop: answers.Stop = None,
     charge: Annotated[bool, typer.Option(help="Whether the source's charge and current are wanted.")] = True,
-    changes: Set = None,
-    source: Source = None,
-    as_json: AsJson = False,
+    changes: answers.Set = None,
+    source: answers.Source = None,
+    as_json: answers.AsJson = False,
 ) -> None:
     """Tell which model DECK needs for the error asked for, and why, without a run.
 
@@ -297,16 +294,16 @@ def plan(
 
 @app.command()
 def compare(
-    deck: Deck,
-    out: Out = None,
-    name: Name = None,
-    overwrite: Overwrite = False,
-    rtol: Rtol = 1e-8,
-    charge_law: ChargeLaw = None,
-    changes: Set = None,
-    source: Source = None,
-    as_json: AsJson = False,
-    no_plot: NoPlot = False,
+    deck: answers.Deck,
+    out: answers.Out = None,
+    name: answers.Name = None,
+    overwrite: answers.Overwrite = False,
+    rtol: answers.Rtol = 1e-8,
+    charge_law: answers.ChargeLaw = None,
+    changes: answers.Set = None,
+    source: answers.Source = None,
+    as_json: answers.AsJson = False,
+    no_plot: answers.NoPlot = False,
 ) -> None:
     """Compare the periodic state of DECK with its phasor solution, and say what the ripple of the area does.
 
@@ -325,50 +322,17 @@ def compare(
         answer.update(**answers.of_circuit(circuit, charge_law))
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         check_arguments(rtol)
-        picture = None if no_plot else results.file("_compare.png")
+        results.will_draw("_compare.png", lambda: result.plot(), unless=no_plot)
         result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
-        if picture is not None:
-            results.open()
         answer.update(method=result.solution.method, **result.to_dict())
-        answer.give(lambda: comparison_table(result), results.pictures(picture, result.plot))
+        answer.give(lambda: comparison_table(result), results.ready())
 
 
-for _command in (limits, designs.design, fits.fit, fits.fit_contact, sweeps.sweep):
+for _command in (
+    *(designs.limits, designs.design, fits.fit, fits.fit_contact, sweeps.sweep),
+    *(tools.export, tools.figures, tools.explore, tools.sets, tools.check),
+):
     app.command()(_command)
-
-
-@app.command()
-def export(
-    deck: Deck,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The ngspice deck to write.")],
-    charge_law: ChargeLaw = None,
-    changes: Set = None,
-    source: Source = None,
-    stop: Stop = None,
-    as_json: AsJson = False,
-) -> None:
-    """Write DECK as one self-contained ngspice deck: bodies included, parameters folded in.
-
-    Example:
-
-      fingerspice export circuits/fingerpad.cir -o fingerpad_ngspice.cir
-    """
-    from fingerspice.base.files import write_aside
-    from fingerspice.studies.export import export_netlist
-
-    with Answering("export", as_json, charge_law=charge_law) as answer:
-        circuit = read_circuit(deck, changes, source)
-        answer.update(**answers.of_circuit(circuit, charge_law))
-        circuit, _ = options.with_times(circuit, stop)
-        check_output(output, deck)
-        text = export_netlist(circuit, charge_law=charge_law)
-        answer.give(str, [lambda: write_aside(output, lambda path: path.write_text(text, encoding="utf-8"))])
-
-
-app.command()(figures)
-app.command()(explore)
-app.command()(sets)
-app.command()(check)
 
 
 @app.callback(invoke_without_command=True)

@@ -18,11 +18,10 @@ if TYPE_CHECKING:
     from fingerspice.circuit.circuit import AcSweep, Circuit
     from fingerspice.waveforms.waveform import Waveform
 
+#: Largest area that causes no warning, m^2; a larger one was probably given in mm^2.
 LARGEST_AREA = 0.01
-"""Largest area that causes no warning, m^2; a larger one was probably given in mm^2."""
-
+#: Largest number of characters of a source's numbers that are stored with the results.
 LONGEST_SOURCE = 1000
-"""Largest number of characters of a source's numbers that are stored with the results."""
 
 
 def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None, **sets: list[str] | None) -> Circuit:
@@ -92,9 +91,7 @@ def _is_name(change: str) -> bool:
 def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
     """The circuit with all ``--set`` changes applied together, as two exponents may only be legal together."""
     values: dict[str, str] = {}
-    for change in changes:
-        if _is_name(change):
-            continue
+    for change in (change for change in changes if not _is_name(change)):
         path, equals, text = (part.strip() for part in change.partition("="))
         if not equals or not path:
             raise InputError(f"--set {change!r} is not understood; allowed: PATH=VALUE, such as Xgap.d=3u")

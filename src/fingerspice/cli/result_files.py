@@ -31,32 +31,16 @@ _KNOWN = ("deck_sha256", "overrides", "charge_law")
 
 
 class Results:
-    """The files of one command.
+    """The files of one command, which has `circuit`, with all changes, from `deck`.
 
-    Parameters
-    ----------
-    deck : Path
-    circuit : Circuit
-        The circuit with all changes.
-    folder : Path or None
-        `FOLDER` by default.
-    name : str or None
-        Name of the files without their endings; the deck's name by default.
-    overwrite : bool
-        Whether files of other or unknown circuits may be replaced.
-    charge_law : str or None
-        The requested charge law.
+    They go into `folder` (`FOLDER` by default) under `name` (that of the deck) with their endings; with `overwrite`
+    they may replace files of other or unknown circuits. `charge_law` is that asked for.
     """
 
     def __init__(
-        self,
-        deck: Path,
-        circuit: Circuit,
-        folder: Path | None,
-        name: str | None,
-        overwrite: bool,
+        self, deck: Path, circuit: Circuit, folder: Path | None, name: str | None, overwrite: bool,
         charge_law: str | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if name is not None and (name in ("", ".", "..") or Path(name).name != name or not name.isprintable()):
             raise InputError(
                 f"--name is {name!r}; allowed: a file's name without folder and end; --out names the folder"
@@ -72,15 +56,10 @@ class Results:
             "deck_sha256": _hash(circuit.text), "overrides": json.dumps(dict(circuit.overrides)),
             "charge_law": charge_law or circuit.charge_law or "local",
         }  # fmt: skip
+        self._writes: list[Callable[[], Path]] = []
 
     def file(self, end: str) -> Path:
-        """Path of the file with this ending, checked and not yet written.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be written, or must not be replaced.
-        """
+        """Path of the file with this ending; refused if it cannot be written, or must not be replaced."""
         file = self.folder / f"{self.name}{end}"
         check_output(file, self.deck)
         self.names.append(file.name)
@@ -93,13 +72,30 @@ class Results:
         """Texts kept in a picture: the circuit, and the files that were made with the picture."""
         return {**self._own, "files": json.dumps(self.names)}
 
+    def will_write(self, end: str, write: Callable[[Path], Path]) -> None:
+        """Check the file with this ending now, and let `ready` have the function that writes it."""
+        file = self.file(end)
+        self._writes.append(lambda: write(file))
+
+    def will_draw(self, end: str, draw: Callable[[], Any], *, unless: bool) -> None:
+        """As `will_write`, of the picture that a function draws, unless none is wanted."""
+        self._writes += self.pictures(None if unless else self.file(end), draw)
+
+    def ready(self) -> list[Callable[[], Path]]:
+        """The functions that write the files, for which there is a folder now."""
+        if self._writes:
+            self.open()
+        return self._writes
+
     def pictures(self, path: Path | None, draw: Callable[[], Any]) -> list[Callable[[], Path]]:
         """The function that draws and writes a picture; none without a path."""
-        if path is None:
-            return []
-        from fingerspice.plots.drawing import save
 
-        return [lambda: save(draw(), path, about=self.about)]
+        def write(file: Path) -> Path:
+            from fingerspice.plots.drawing import save
+
+            return save(draw(), file, about=self.about)
+
+        return [] if path is None else [lambda: write(path)]
 
     def open(self) -> None:
         """When the default folder is created, put a .gitignore into it, to keep results out of version control."""

@@ -1,4 +1,4 @@
-"""A run on the disk as a Zarr store that grows chunk by chunk, and can be continued after a crash.
+"""A run on the disk (``run --stream``): a Zarr store that grows chunk by chunk, and can be continued after a crash.
 
 Every chunk of the run is one chunk of each array. The number of finished chunks is an attribute of the store's group,
 whose file is replaced atomically after the chunk's data have reached the disk.
@@ -9,33 +9,42 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import time
+import warnings
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fingerspice.base.errors import InputError
-from fingerspice.base.files import UNFINISHED, settle_on_disk, write_aside, write_durably
-from fingerspice.results.datafiles import CHECKSUM, SIGNATURE, Variable, fault, signature, variables, zarr_library
-from fingerspice.results.solution import Solution
+from fingerspice import __version__
+from fingerspice.base.announcing import paced
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.files import settle_on_disk, write_aside, write_durably
+from fingerspice.cli.options import check_output, time_from_text
+from fingerspice.cli.result_files import Results
+from fingerspice.cli.terminal import Answering
+from fingerspice.results.datafiles import variables
+from fingerspice.results.store import CHECKSUM, SIGNATURE, Array, attributes_of, create, signature, tidy, zarr_library
 
-#: Attributes of the group: identity of the run, number of finished chunks, state to continue from, and results so far.
-RUN, DONE, MARK, SO_FAR = "run", "chunks_done", "goes_on", "so_far"
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Circuit
+    from fingerspice.results.solution import Solution
+    from fingerspice.solve.streaming import Stream
+
+#: Attributes of the group: identity of the run, number of finished chunks, state to continue from, results so far, and
+#: the number of columns of each array, 0 for one without.
+RUN, DONE, MARK, SO_FAR, COLUMNS = "run", "chunks_done", "goes_on", "so_far", "arrays"
 # Number of bytes of the store that are copied at once.
 _PIECE = 1 << 25
 
 
 class Store:
-    """A store of one run.
+    """A store of one run in a folder.
 
-    Parameters
-    ----------
-    path : Path
-        Folder of the store.
-    run : mapping
-        Identity of the run: all inputs that determine its results, as plain data.
-    total, count : int
-        Number of outputs of the run, and of a chunk.
+    `run` is its identity, all inputs that determine its results, as plain data; the run has `total` outputs, and a
+    chunk `count`.
     """
 
     def __init__(self, path: Path, run: dict[str, Any], total: int, count: int) -> None:
@@ -75,41 +84,37 @@ class Store:
                 other = "other" if key == "signals" else "another"
                 raise InputError(f"{self.path} holds a run of {other} {key.replace('_', ' ')}{said}; {ways}")
         self.done, self.mark, self.so_far = attributes[DONE], attributes[MARK], attributes[SO_FAR]
-        for file, size in self._files(attributes):
-            what = fault(file, size)
+        arrays = [self._array(name, columns) for name, columns in attributes[COLUMNS].items()]
+        written = [(one, self._place(one, chunk)) for one in arrays for chunk in range(self.done)]
+        for one, place in written:
+            what = one.fault(place)
             if what is not None:
-                raise InputError(f"{self.path} is damaged: {file} {what}; allowed: --overwrite")
-        self._tidy(attributes)
-
-    def _tidy(self, attributes: dict[str, Any]) -> None:
-        """Remove unfinished files of a call that was killed."""
-        whole = {file for file, _ in self._files(attributes)}
-        begun = [file for name in attributes["arrays"] for file in (self.path / name / "c").rglob("*")]
-        for file in [*self.path.glob(f"{UNFINISHED}*"), *begun]:
+                raise InputError(f"{self.path} is damaged: {one.file(place)} {what}; allowed: --overwrite")
+        # What a call that was killed has left.
+        tidy(self.path)
+        whole = {one.file(place) for one, place in written}
+        for file in self.path.glob("*/c/**/*"):
             if file not in whole and file.is_file():
                 file.unlink()
 
     def _attributes(self) -> dict[str, Any] | None:
         """Attributes of the group; None if it is not a store of this program, or they have changed."""
         try:
-            found = json.loads((self.path / "zarr.json").read_text())["attributes"]
-            whole = all(isinstance(found[key], dict) for key in (RUN, MARK, SO_FAR, "arrays"))
+            found = attributes_of(self.path)
+            whole = all(isinstance(found[key], dict) for key in (RUN, MARK, SO_FAR, COLUMNS))
             sound = found.get(SIGNATURE, "") in ("", signature(found))
             return found if whole and sound and isinstance(found[DONE], int) and found[DONE] >= 0 else None
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
-    def _files(self, attributes: dict[str, Any]) -> list[tuple[Path, int]]:
-        """Files of the finished chunks, and their sizes without checksum, bytes."""
-        return [
-            (self._file(name, k, columns), 8 * self.count * max(columns, 1))
-            for name, columns in attributes["arrays"].items()
-            for k in range(attributes[DONE])
-        ]
+    def _array(
+        self, name: str, columns: int, dims: tuple[str, ...] = (), attributes: Mapping[str, Any] | None = None
+    ) -> Array:
+        more = (columns,) if columns else ()
+        return Array(self.path / name, dims, (self.total, *more), (self.count, *more), attributes or {})
 
-    def _file(self, name: str, chunk: int, columns: int) -> Path:
-        folder = self.path / name / "c" / str(chunk)
-        return folder / "0" if columns else folder
+    def _place(self, array: Array, chunk: int) -> tuple[int, ...]:
+        return chunk, *(0 for _ in array.shape[1:])
 
     def write(self, chunk: int, solution: Solution, signals: list[str], about: dict[str, Any], mark: Any) -> None:
         """Write a chunk, then record it as finished; `mark` is the state from which the run continues.
@@ -121,17 +126,20 @@ class Store:
         """
         data, coords = variables(solution, np.ones(solution.t.size, bool), signals)
         data = {"time": coords["time"], **data}
+        columns = {name: values.shape[1] if values.ndim > 1 else 0 for name, (_, values, _) in data.items()}
+        names = {dim: one[1].tolist() for dim, one in coords.items() if dim != "time"}
+        arrays = {
+            name: self._array(name, columns[name], dims, said | {d: names[d] for d in dims[1:]})
+            for name, (dims, _, said) in data.items()
+        }
         try:
             if not self.path.exists():
-                self._create(data, coords, about)
-            start = chunk * self.count
-            group = self.zarr.open_group(self.path, mode="r+", use_consolidated=False)
-            for name, (_, values, _) in data.items():
-                with self.zarr.config.set({"array.write_empty_chunks": True}):
-                    group[name][start : start + len(values)] = values
-                file = self._file(name, chunk, values.shape[1] if values.ndim > 1 else 0)
-                settle_on_disk(file)
-                settle_on_disk(file.parent)
+                attributes = {**about, RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, COLUMNS: columns}
+                create(self.path, attributes, arrays, {}, self.path.name)
+            for name, one in arrays.items():
+                place = self._place(one, chunk)
+                one.put(place, data[name][1])
+                settle_on_disk(one.file(place).parent)
             self._note(chunk + 1, mark, solution)
         except OSError as error:
             raise InputError(
@@ -139,27 +147,6 @@ class Store:
                 "written, and the same command goes on from there"
             ) from None
         self.done = chunk + 1
-
-    def _create(self, data: dict[str, Variable], coords: dict[str, Variable], about: dict[str, Any]) -> None:
-        """Create the store with its arrays, still without values, under a temporary name, then rename it."""
-        aside = self.path.with_name(f"{UNFINISHED}{self.path.name}")
-        shutil.rmtree(aside, ignore_errors=True)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        columns = {name: values.shape[1] if values.ndim > 1 else 0 for name, (_, values, _) in data.items()}
-        attributes = {**about, RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, "arrays": columns}
-        try:
-            group = self.zarr.create_group(aside, zarr_format=3, attributes=attributes)
-            for name, (dimensions, values, said) in data.items():
-                names = {d: coords[d][1].tolist() for d in dimensions if d != "time"}
-                group.create_array(
-                    name, shape=(self.total, *values.shape[1:]), chunks=(self.count, *values.shape[1:]), dtype="<f8",
-                    compressors=[self.zarr.codecs.Crc32cCodec()], fill_value=np.nan, dimension_names=dimensions,
-                    attributes={**said, **names},
-                )  # fmt: skip
-            aside.rename(self.path)
-            settle_on_disk(self.path.parent)
-        finally:
-            shutil.rmtree(aside, ignore_errors=True)
 
     def _note(self, done: int, mark: Any, solution: Solution) -> None:
         self.so_far = {
@@ -215,3 +202,102 @@ class Store:
         for key, value in group.attrs.asdict().items():
             if isinstance(value, str):
                 file.attrs[key] = value
+
+
+def run_streamed(
+    answer: Answering, results: Results, circuit: Circuit, how: dict[str, Any], *, chunk: str | None,
+    signals: str | None, netcdf: bool,
+) -> None:  # fmt: skip
+    """Run a circuit, write its chunks to a store, and fill the answer.
+
+    Raises
+    ------
+    InputError
+        If the request cannot be run, the store is damaged or holds another run, or the disk is full.
+    SolveError
+        If the run fails; the chunks before the failure are in the store.
+    """
+    from fingerspice.solve.streaming import stream
+
+    path = results.folder / f"{results.name}.zarr"
+    # The store is a folder, so check that a file can be written next to it.
+    check_output(path.with_suffix(".zarr.part"), results.deck)
+    names = _names(signals, circuit)
+    charge = any(name in ("q_source", "i_source") for name in names)
+    run = stream(circuit, chunk=time_from_text("--chunk", chunk), charge=charge, **how)
+    if netcdf:
+        results.will_write(".nc", lambda file: store.to_netcdf(file))
+    store = Store(path, _identity(run, circuit, how, names), run.outputs.total, run.count)
+    store.open(results.overwrite)
+    if store.done and store.done < store.chunks:
+        run.go_to(store.mark, store.done * store.count)
+    results.open()
+    begun, first = time.perf_counter(), store.done
+    answer.data["files"].append(str(path))
+    if first < store.chunks:
+        _fill(run, store, names, results)
+    answer.update(**store.so_far)
+    took, made = time.perf_counter() - begun, (store.chunks - first) / store.chunks
+    span = run.problem.t_stop - run.problem.t_start
+    pieces = f"{store.chunks:,} piece{'s' if store.chunks > 1 else ''}"
+    said = [f"{run.outputs.total:,} outputs of {span:g} s in {pieces}: {path}"]
+    if made > 0.0:
+        said.append(f"{made * span / took:,.3g} times real time")
+    error = store.so_far["error"]
+    said.append(f"stated error {error['u_gap']:.2g} V of the gap voltage, {error['f_el']:.2g} N of the force")
+    if first:
+        said.append(f"the first {first:,} were there already")
+    answer.update(stream={"chunks": store.chunks, "found": first, "outputs": run.outputs.total, "seconds": took})
+    answer.give(lambda: "; ".join(said), results.ready())
+
+
+def _names(signals: str | None, circuit: Circuit) -> list[str]:
+    """Keys of the signals that are written."""
+    from fingerspice.results.signals import SIGNALS
+
+    if signals is None:
+        layers = any(element.spec.is_layer for element in circuit.elements)
+        return ["u_gap", "f_el"] if circuit.by_device("GAP") else ["u_layer"] if layers else ["v"]
+    names = [name.strip() for name in signals.split(",")]
+    for name in names:
+        if name not in SIGNALS:
+            raise InputError(f"--signals names {name!r}; allowed: {', '.join(SIGNALS)}")
+    return sorted(set(names), key=list(SIGNALS).index)
+
+
+def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[str]) -> dict[str, Any]:
+    """All inputs that determine the bytes of a store, by which a later call recognises its own store."""
+    from fingerspice.base.compiled import STAMP
+    from fingerspice.circuit.describe import digests
+
+    elements, sources = digests(circuit)
+    o = run.outputs
+    return {
+        "circuit": elements, "source": sources, "rtol": how["rtol"],
+        "charge_law": run.problem.scene.charge_law, "area": run.problem.scene.area_mode, "method": how["method"],
+        "start": str(how["start"]), "chunk": run.count, "signals": names, "end": run.problem.t_stop,
+        "output_times": [o.start, o.over, o.low, o.total],
+        "program": f"fingerspice {__version__} ({STAMP[:12]}), NumPy {np.__version__}",
+    }  # fmt: skip
+
+
+def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None:
+    """Compute and write all missing chunks; a chunk is written while the next one is computed."""
+    about = {key: text for key, text in results.about.items() if key != "files"}
+    known: set[str] = set()
+    writing: Future[None] | None = None
+    start, stop = run.problem.t_start, run.problem.t_stop
+    first = float(run.outputs.times(run.done, run.done + 1)[0])
+    with ThreadPoolExecutor(1) as writer, paced("simulating", (first - start) / (stop - start)) as show:
+        for number, solution in enumerate(run, store.done):
+            for text in solution.warnings:
+                if text not in known:
+                    known.add(text)
+                    warnings.warn(text, FingerspiceWarning, stacklevel=2)
+            if writing is not None:
+                writing.result()
+            writing = writer.submit(store.write, number, solution, names, about, run.mark())
+            reached = solution.t_stop
+            show((reached - start) / (stop - start), lambda s, t=reached: f"{(t - first) / s:,.3g} times real time,")
+        if writing is not None:
+            writing.result()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +11,6 @@ import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.cli import answers
-from fingerspice.cli.answers import AsJson, Name, NoPlot, Out, Overwrite
 from fingerspice.cli.options import read_circuit
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import Answering
@@ -33,11 +32,11 @@ _LARGEST = 1 << 20
 
 def sweep(
     file: Annotated[Path, typer.Argument(metavar="SWEEP.toml", help="Deck, parameters and outputs.")],
-    out: Out = None,
-    name: Name = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-    no_plot: NoPlot = False,
+    out: answers.Out = None,
+    name: answers.Name = None,
+    overwrite: answers.Overwrite = False,
+    as_json: answers.AsJson = False,
+    no_plot: answers.NoPlot = False,
     store: Annotated[
         Path | None,
         typer.Option(
@@ -59,7 +58,8 @@ def sweep(
       fingerspice sweep circuits/population.toml
     """
     with Answering("sweep", as_json) as answer:
-        from fingerspice.studies import populations
+        from fingerspice.plots.populations import plot_sweep
+        from fingerspice.studies.sweep import populations
 
         asked = _read(file)
         deck = _beside(file, asked["deck"])
@@ -79,52 +79,51 @@ def sweep(
             if given is not None:
                 raise InputError(f"--{option} is given without --store; allowed: --store OUT.zarr, too")
         results = Results(deck, circuit, out, name or file.stem, overwrite, None)
-        table, image = results.file(".nc"), None if no_plot else results.file(".png")
+        results.will_write(".nc", lambda path: _written(found, indices, {"deck": circuit.text, **results.about}, path))
+        results.will_draw(".png", lambda: plot_sweep(found, output, indices), unless=no_plot)
         found = populations.sweep(circuit, parameters, **options)
+        output = str(next(iter(found.data_vars)))
         indices = populations.sobol(circuit, parameters, **options) if asked.get("indices") else None
-        results.open()
-        _give(answer, found, indices, {"deck": circuit.text, **results.about}, table, image)
+        said = [_told(answer, found)]
+        if indices is not None:
+            shares = populations.ranking(indices, output)
+            answer.update(shares=shares)
+            said.append(_shared(shares, output))
+        answer.give(lambda: "\n\n".join(said), results.ready())
 
 
-def _give(
-    answer: Answering, found: Any, indices: Any, about: Mapping[str, str], table: Path, image: Path | None
-) -> None:
-    """Write the table and the picture, and fill the answer."""
-    from fingerspice.plots.drawing import save
-    from fingerspice.plots.populations import plot_sweep
-    from fingerspice.studies import populations
+def _told(answer: Answering, found: Any, *, whole: bool = True) -> str:
+    """Fill the answer with what a sweep has run, and, if it is whole, with the percentiles that this text has."""
+    from fingerspice.studies.sweep import populations
 
-    output = str(next(iter(found.data_vars)))
-    writes: list[Callable[[], Path]] = [lambda: _written(found, indices, about, table)]
-    if image is not None:
-        own = {key: text for key, text in about.items() if key != "deck"}
-        writes.append(lambda: save(plot_sweep(found, output, indices), image, about=own))
-    told = populations.summary(found)
-    shares = [] if indices is None else populations.ranking(indices, output)
-    answer.update(
-        sets=found.attrs.get("sets", []), scenes=int(found.status.size), failed=int((found.status >= 2).sum()),
-        n=found.attrs.get("n"), seed=found.attrs.get("seed"), figures=told, shares=shares or None,
-    )  # fmt: skip
-    answer.give(lambda: _told(told) + (f"\n\n{_shared(shares, output)}" if shares else ""), writes)
+    about = found.attrs
+    known = {"sets": about.get("sets", []), "n": about.get("n"), "seed": about.get("seed")}
+    answer.update(scenes=int(found.status.size), **known)
+    if not whole:
+        return ""
+    rows = populations.summary(found)
+    answer.update(figures=rows, failed=int((found.status >= 2).sum()))
+    head = f"{'output':<24}{'unit':<8}{'5 %':>12}{'median':>12}{'95 %':>12}{'mean':>12}"
+    lines = [
+        f"{row['output']:<24}{row['unit']:<8}"
+        + "".join(f"{row[key]:>12.4g}" for key in ("p5", "median", "p95", "mean"))
+        for row in rows
+    ]
+    return "\n".join([head, *lines])
 
 
 def _give_stored(answer: Answering, found: Any, store: Path) -> None:
     """Fill the answer with what a call has done for a store, and percentiles of a store that is whole."""
-    from fingerspice.studies import populations
+    from fingerspice.studies.sweep.populations import MOST_SCENES
 
     about = found.attrs
     answer.data["files"].append(str(store))
-    answer.update(
-        sets=about.get("sets", []), scenes=int(found.status.size), n=about.get("n"), seed=about.get("seed"),
-        store={key: about[key] for key in ("chunks", "chunks_found", "chunks_missing", "seconds")},
-    )  # fmt: skip
-    said = [f"{about['chunks']:,} pieces ({about['chunks_found']:,} were there already) in {store}"]
+    answer.update(store={key: about[key] for key in ("chunks", "chunks_found", "chunks_missing", "seconds")})
+    told = _told(answer, found, whole=not about["chunks_missing"] and found.status.size <= MOST_SCENES)
+    said = [told] if told else []
+    said.append(f"{about['chunks']:,} pieces ({about['chunks_found']:,} were there already) in {store}")
     if about["chunks_missing"]:
         said.append(f"{about['chunks_missing']:,} pieces of other parts are missing")
-    elif found.status.size <= populations.MOST_SCENES:
-        told = populations.summary(found)
-        answer.update(figures=told, failed=int((found.status >= 2).sum()))
-        said.insert(0, _told(told))
     said += about["failures"][:_MOST_TOLD]
     answer.give(lambda: "\n".join(said))
 
@@ -202,17 +201,6 @@ def _parameter(path: str, one: Any) -> Any:
     if kind == "loguniform":
         return stats.loguniform(a, b)
     return stats.norm(a, b) if kind == "normal" else stats.lognorm(b, scale=a)
-
-
-def _told(rows: list[dict[str, float | str]]) -> str:
-    """The percentiles of every output as text."""
-    head = f"{'output':<24}{'unit':<8}{'5 %':>12}{'median':>12}{'95 %':>12}{'mean':>12}"
-    lines = [
-        f"{row['output']:<24}{row['unit']:<8}"
-        + "".join(f"{row[key]:>12.4g}" for key in ("p5", "median", "p95", "mean"))
-        for row in rows
-    ]
-    return "\n".join([head, *lines])
 
 
 def _shared(rows: list[dict[str, Any]], output: str) -> str:

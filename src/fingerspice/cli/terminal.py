@@ -118,14 +118,7 @@ class Answering:
     """The answer of one command, collected while it runs and printed at its end as text or JSON.
 
     It is used as a context. Each warning becomes one line on stderr and a part of the answer. If JSON is wanted, it is
-    printed even when the command ends with an error.
-
-    Parameters
-    ----------
-    command : str
-    as_json : bool
-    known : any
-        Values of keys that are known at the start.
+    printed even when the command ends with an error. `known` are values of keys that are known at the start.
     """
 
     def __init__(self, command: str, as_json: bool, **known: Any) -> None:
@@ -165,19 +158,8 @@ class Answering:
     def give(self, text: Callable[[], str], writes: Sequence[Write] = ()) -> None:
         """Write files, then print the result as text unless JSON is wanted.
 
-        If a file cannot be written, the text is still printed before the error is raised.
-
-        Parameters
-        ----------
-        text : callable
-            Function that returns the result as text.
-        writes : sequence of callable
-            Functions that each write a file and return its path.
-
-        Raises
-        ------
-        InputError
-            If a file cannot be written.
+        Each of `writes` writes a file and returns its path. If one cannot be written, the text is still printed before
+        the error is raised.
         """
         files: list[str] = self.data["files"]
         failed = None

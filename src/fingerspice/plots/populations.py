@@ -23,23 +23,9 @@ _WIDE = 20.0
 def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> Picture:
     """An output of `sweep` along its grid, with the band from 5 to 95 %, or its histogram.
 
-    Parameters
-    ----------
-    found : xarray.Dataset
-        Of `sweep`, with at most one dimension beside ``scene``.
-    output : str
-    indices : xarray.Dataset, optional
-        Of `sobol`, for the same parameters. Then each parameter has a panel with the band and three curves, where it
-        takes low, middle and high values and the others stay at their medians; the last panel has the total indices.
-
-    Returns
-    -------
-    Picture
-
-    Raises
-    ------
-    InputError
-        If the grid has several dimensions.
+    More than one dimension beside ``scene`` is refused. With `indices` of `sobol`, for the same parameters, each
+    parameter has a panel with the band and three curves, where it takes low, middle and high values and the others stay
+    at their medians; the last panel has the total indices.
     """
     one = found[output]
     dims = [str(dim) for dim in one.dims if dim != "scene"]
@@ -180,18 +166,7 @@ class Panel(NamedTuple):
 
 
 def plot_fit(curves: Sequence[Curve], x_label: str, signal: str, unit: str) -> Picture:
-    """Data with error bars (one standard deviation) and the fit, and the residuals over sigma below.
-
-    Parameters
-    ----------
-    curves : sequence of Curve
-        Each has a colour and a line.
-    x_label, signal, unit : str
-
-    Returns
-    -------
-    Picture
-    """
+    """Data with error bars (one standard deviation) and the fit, and the residuals over sigma below."""
     return plot_panels([Panel(curves, x_label, signal, unit)])
 
 

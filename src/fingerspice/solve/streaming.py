@@ -41,12 +41,8 @@ class Stream:
         Number of outputs in the chunks returned so far.
     """
 
-    def __init__(
-        self, problem: Problem, plan: Plan, outputs: Outputs, count: int, rtol: float, method: str
-    ) -> None:  # fmt: skip
-        self.problem, self.plan, self.outputs, self.count, self.rtol, self.asked = (
-            problem, plan, outputs, count, rtol, method,
-        )  # fmt: skip
+    def __init__(self, problem: Problem, plan: Plan, outputs: Outputs, count: int, rtol: float, method: str) -> None:
+        self.problem, self.plan, self.outputs, self.count, self.rtol = problem, plan, outputs, count, rtol
         self.done = 0
         self._source: BySamples | ByWindows = (
             BySamples(problem, outputs, plan, rtol)
@@ -80,13 +76,12 @@ class Stream:
 
     def mark(self) -> Mark:
         """The state before the piece that contains the next chunk's first output, as plain data; see `go_to`."""
-        found = [m for m in [*self._marks, self._mark()] if m["written"] <= self.done]
-        return found[-1]
+        return [m for m in [*self._marks, self._source.mark()] if m["written"] <= self.done][-1]
 
     def go_to(self, mark: Mark, done: int) -> None:
         """Continue a stream from its mark, after `done` outputs; allowed before this stream's first chunk only."""
         if "state" in mark and isinstance(self._source, BySamples):
-            self._source = self._stepped(self._source.problem)
+            self._source = self._stepped()
         self._source.go_to(mark)
         self.done = done
         while self._source.written <= done and not self._source.over:
@@ -94,25 +89,22 @@ class Stream:
         first = self._marks[0]["written"] if self._marks else done
         self._take(done - first)
 
-    def _mark(self) -> Mark:
-        return self._source.mark()
-
-    def _stepped(self, problem: Problem) -> ByWindows:
-        return ByWindows(problem, self.outputs, self.plan, self.rtol, "exponential")
+    def _stepped(self) -> ByWindows:
+        """The method for a recording that the one for recordings fails on."""
+        return ByWindows(self.problem, self.outputs, self.plan, self.rtol, "exponential")
 
     def _advance(self) -> None:
         """Integrate the next piece."""
-        mark = self._mark()
+        mark = self._source.mark()
         found = self._source.advance()
         if found is None:
-            # The method for recordings has failed on this piece: integrate the rest by exponential steps.
+            # Integrate this piece, and the rest, by exponential steps.
             assert isinstance(self._source, BySamples)
             self._source.go_to(mark)
-            other = self._stepped(self.problem)
+            other = self._stepped()
             other.written, other.state = mark["written"], self._source.march.state()
             self._source = other
-            self._advance()
-            return
+            mark, found = other.mark(), other.advance()
         self._marks.append(mark)
         self._ready.append(found)
 

@@ -24,9 +24,8 @@ from fingerspice.results.phasor_solution import PhasorSolution
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Value
 from fingerspice.solve.runs import Progress
-from fingerspice.studies.phasors import phasor
+from fingerspice.studies.phasors import Drive, phasor, sweep_drive, sweep_notes
 from fingerspice.studies.steady import steady_state
-from fingerspice.studies.sweeps import Drive, sweep_drive, sweep_notes
 from fingerspice.waveforms.waveform import Sine, Waveform
 
 if TYPE_CHECKING:

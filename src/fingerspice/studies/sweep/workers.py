@@ -1,39 +1,38 @@
-"""A sweep chunk by chunk, into a store: by this process, or by the workers of a Dask scheduler, here or elsewhere."""
+"""A sweep into a store: its chunks run by this process, or by the workers of a Dask scheduler, here or elsewhere."""
 
 from __future__ import annotations
 
 import logging
+import os
 import time
 import warnings
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from multiprocessing import parent_process
+from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from fingerspice import __version__
 from fingerspice.base.announcing import paced
-from fingerspice.base.arrays import FloatArray, keep_freed_memory
+from fingerspice.base.arrays import keep_freed_memory, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.studies import sweepplan
-from fingerspice.studies.batch import MESSAGES, batch
-from fingerspice.studies.sweepplan import Plan
+from fingerspice.results.store import tidy
+from fingerspice.studies.batch import MESSAGES
+from fingerspice.studies.sweep.chunks import Done, Work, identity_of, make_work, run_chunk
+from fingerspice.studies.sweep.plan import Plan
+from fingerspice.studies.sweep.store import NAMES, identity
+from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
-    from fingerspice.studies.sweepstore import SweepStore
-
 # Chunks that a process has at once: it computes one while another one is waiting for the disk.
 AT_ONCE = 2
-_FREE = nullcontext()
 _WRITING = Lock()
 # How often the scheduler may give up one chunk, and chunks one after another: each time it has lost several workers.
 TRIES, MOST_LOST = 2, 20
@@ -41,105 +40,47 @@ TRIES, MOST_LOST = 2, 20
 AHEAD, PATIENCE = 4096, 5.0
 
 
-@dataclass(frozen=True)
-class Work:
-    """A sweep with all that it takes to run any chunk of it; `draws` are None where nothing is drawn."""
-
-    circuit: Circuit
-    plan: Plan
-    draws: sweepplan.Sequence | None
-    options: Mapping[str, Any]
-    store: SweepStore
-    programs: str
-
-
-@dataclass(frozen=True)
-class Done:
-    """A chunk that is in the store: its number, how many scenes it has, and why some of them have no result."""
-
-    index: int
-    count: int
-    failures: list[str]
-
-
-def programs() -> str:
-    """What the bytes of a result depend on beside the request."""
-    import scipy
-
-    return f"fingerspice {__version__}, NumPy {np.__version__}, SciPy {scipy.__version__}"
-
-
-def run_chunk(
-    work: Work, index: int, computing: AbstractContextManager[Any] = _FREE, writing: AbstractContextManager[Any] = _FREE
-) -> Done:
-    """Run the scenes of a chunk, write them to the store, and mark the chunk as done.
-
-    Scenes are run within `computing`: a lock, where several chunks of a process are to be computed one after another;
-    and written within `writing`.
+def stored(
+    circuit: Circuit, plan: Plan, options: Mapping[str, Any], path: Path, workers: int | None, scheduler: str | None,
+    shard: tuple[int, int],
+) -> Dataset:  # fmt: skip
+    """Run the missing chunks of a sweep, or of a shard of it, and return what the store has.
 
     Raises
     ------
     InputError
-        If a value is out of range, or the store is not there or cannot be written.
+        If the request or a value is not allowed, the folder is there and is no store of this sweep, or the scheduler
+        does not answer.
     """
-    store = work.store
-    if not (store.path / "zarr.json").is_file():
-        raise InputError(f"{store.path} is not there on a worker; allowed: a folder that all machines share")
-    if programs() != work.programs:
-        raise InputError(f"a worker has {programs()}, and the sweep is of {work.programs}; allowed: the same")
-    part = store.part(index)
-    with computing:
-        found, draws = _computed(work, index, part)
-    shape = tuple(one.stop - one.start for one in part)
-    values = {}
-    for name in store.arrays:
-        own, more = found[name].values, tuple(store.arrays[name].further.values())
-        if own.ndim == 1 and more:
-            # No scene of the chunk has a result.
-            own = np.full((own.size, *more), np.nan)
-        values[name] = own.reshape((*shape, *more))
-    with writing:
-        store.write(index, values | draws)
-    return Done(index, found.sizes["scene"], [_by_its_number(told, work, part) for told in found.attrs["failures"]])
+    if workers is not None:
+        whole_number("workers", workers, 1)
+        if scheduler is not None:
+            raise InputError("workers and scheduler are both given; allowed: one of them")
+    good = len(shard) == 2 and all(isinstance(x, int) for x in shard) and 1 <= shard[0] <= shard[1]
+    require(good, "shard", shard, "two whole numbers (i, m), with i from 1 to m")
+    if os.path.lexists(path):
+        identity(path)
+    work, about = make_work(circuit, plan, options, path)
+    if workers is not None or scheduler is not None:
+        work = replace(work, options={"threads": 1, **options})
+    grid = {
+        name: (values, {NAMES: list(plan.tables[name].names)} if name in plan.tables else {"units": plan.units[name]})
+        for name, values in plan.grid.items()
+    }
+    with at_work(None if workers is None else min(workers, work.store.chunks), scheduler) as client:
+        work.store.open(identity_of(work), about, grid)
+        told = _run_chunks(work, shard, client)
+    found = work.store.dataset()
+    found.attrs |= told
+    return found
 
 
-def _computed(work: Work, index: int, part: tuple[slice, ...]) -> tuple[Dataset, dict[str, FloatArray]]:
-    """The batch of a chunk's scenes, and the values that are drawn."""
-    draws = {} if work.draws is None else work.draws.part(work.store.place(index)[-1])
-    grid = {name: values[one] for (name, values), one in zip(work.plan.grid.items(), part, strict=False)}
-    return batch(work.circuit, work.plan.spread(grid, draws), **work.options), draws
-
-
-def _by_its_number(told: str, work: Work, part: tuple[slice, ...]) -> str:
-    """The message about a scene of a chunk, with the scene's number in the whole sweep."""
-    scene, _, message = told.partition(": ")
-    place = np.unravel_index(int(scene.removeprefix("scene ")), [one.stop - one.start for one in part])
-    whole = [one.start + int(i) for one, i in zip(part, place, strict=True)]
-    return f"scene {np.ravel_multi_index(whole, work.plan.sizes) if whole else 0}: {message}"
-
-
-def run_chunks(work: Work, shard: tuple[int, int], client: Any) -> dict[str, Any]:
-    """Run the chunks of a shard that are not yet done, in this process or by the workers of a `client` of Dask.
-
-    Returns
-    -------
-    dict
-        `chunks` of the shard, how many were found (`chunks_found`), how many the whole store still lacks
-        (`chunks_missing`), the `seconds` taken, and `failures`, why scenes have no result.
-
-    Raises
-    ------
-    InputError
-        As `run_chunk`, and if too many workers are lost.
-    """
+def _run_chunks(work: Work, shard: tuple[int, int], client: Any) -> dict[str, Any]:
+    """Run the chunks of a shard that are not yet done, and return what is told of it, as `sweep` does in attributes."""
     begun, store = time.perf_counter(), work.store
     mine = range(shard[0] - 1, store.chunks, shard[1])
     missing = [index for index in mine if not store.is_done(index)]
-    answers: Iterator[Done] = iter(())
-    if missing and client is not None:
-        answers = _by_scheduler(work, missing, client)
-    elif missing:
-        answers = _here(work, missing)
+    answers = _here(work, missing) if client is None or not missing else _by_scheduler(work, missing, client)
     failures: list[str] = []
     scenes, found, whole = 0, len(mine) - len(missing), max(len(mine), 1)
     with paced("sweeping", found / whole) as show:
@@ -148,7 +89,7 @@ def run_chunks(work: Work, shard: tuple[int, int], client: Any) -> dict[str, Any
             show(number / whole, lambda s, count=scenes: f"{count / s:,.3g} scenes/s,")
     lacking = store.chunks - store.marked()
     if not lacking:
-        store.tidy()
+        tidy(store.path)
     return {
         "chunks": len(mine), "chunks_found": found, "chunks_missing": lacking,
         "seconds": time.perf_counter() - begun, "failures": failures[:MESSAGES],

@@ -32,25 +32,15 @@ class SetTable:
 def with_sets(circuit: Circuit, asked: Mapping[str, Any]) -> tuple[Circuit, dict[str, Any]]:
     """The circuit with all values that sets give to every scene, and what else is asked for.
 
-    Parameters
-    ----------
-    circuit : Circuit
-    asked : mapping
-        As `parameters` of `sweep`: under a kind of sets, such as ``finger``, stands the name of a set (or
-        ELEMENT=NAME), or a list of these, which becomes a `SetTable`.
-
-    Raises
-    ------
-    InputError
-        If there is no such set of this kind, the circuit has no place for its values, one is given twice, or one of
-        several replaces the source.
+    `asked` is as `parameters` of `sweep`: under a kind of sets, such as ``finger``, stands the name of a set (or
+    ELEMENT=NAME), or a list of these, which becomes a `SetTable`.
     """
     if not isinstance(asked, Mapping):
         return circuit, asked
     rest = dict(asked)
     for kind in (kind for kind in KINDS if kind in asked):
         if isinstance(asked[kind], str):
-            circuit, _ = _applied(circuit, kind, rest.pop(kind))
+            circuit = _applied(circuit, kind, rest.pop(kind))[0]
         else:
             circuit, rest[kind] = _together(circuit, kind, asked[kind])
     if asked and not rest:
@@ -66,7 +56,7 @@ def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, SetTabl
     given = list(names) if isinstance(names, list | tuple | np.ndarray) else []
     if not given or not all(isinstance(name, str) for name in given):
         raise InputError(f"{kind} is {names!r}; allowed: the name of a set of parameters, or a list of names")
-    found = dict(_given(circuit, kind, name) for name in given)
+    found = dict(_applied(circuit, kind, name)[1:] for name in given)
     if len(found) < len(given):
         raise InputError(f"{kind} is {given!r}, where a set is named twice; allowed: each once")
     if any(isinstance(value, Waveform) for one in found.values() for value in one.values()):
@@ -82,21 +72,15 @@ def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, SetTabl
     return circuit.replace(same) if same else circuit, SetTable(tuple(found), differ)
 
 
-def _given(circuit: Circuit, kind: str, entry: str) -> tuple[str, Mapping[str, Any]]:
-    """The name of a set as the sweep shows it, and the values that it gives by path."""
-    changed, name = _applied(circuit, kind, entry)
-    to = entry.rpartition("=")[0].strip()
-    return f"{to}={name}" if to else name, changed.sets[name]
-
-
-def _applied(circuit: Circuit, kind: str, entry: str) -> tuple[Circuit, str]:
-    """The circuit with a set, and the set's name."""
+def _applied(circuit: Circuit, kind: str, entry: str) -> tuple[Circuit, str, Mapping[str, Any]]:
+    """The circuit with a set, the set's name as the sweep shows it, and the values that it gives by path."""
     to, _, name = (part.strip() for part in entry.rpartition("="))
     try:
         one = parameters(name, kind)
-        return one.apply(circuit, to or None), one.name
+        changed = one.apply(circuit, to or None)
     except InputError as error:
         raise InputError(f"{kind} {entry!r}: {error.message}") from None
+    return changed, f"{to}={one.name}" if to else one.name, changed.sets[one.name]
 
 
 # Bits of a Sobol point, and so the largest number of draws of all.
@@ -151,6 +135,11 @@ class Plan:
         for name in values.keys() & self.tables.keys():
             found |= {path: each[np.asarray(values[name], int)] for path, each in self.tables[name].columns.items()}
         return found
+
+    def about(self, circuit: Circuit) -> dict[str, Any]:
+        """Attributes of a sweep of the circuit: its draws, and the named sets in it."""
+        drawn = {"n": self.n, "seed": self.seed} if self.drawn else {}
+        return drawn | ({"sets": list(circuit.sets)} if circuit.sets else {})
 
     @property
     def coordinates(self) -> dict[str, Any]:
@@ -234,13 +223,7 @@ def _bits(points: FloatArray) -> NDArray[np.int64]:
 
 
 def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int, most: int) -> Plan:
-    """The plan of checked arguments of `sweep`, with `most` draws or fewer.
-
-    Raises
-    ------
-    InputError
-        If a path is unknown or given twice, or its values are none.
-    """
+    """The plan of checked arguments of `sweep`, with `most` draws or fewer."""
     require_circuit(circuit)
     if not isinstance(parameters, Mapping) or not parameters:
         raise InputError(f"parameters is {parameters!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,8 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies.batch import batch
 from fingerspice.studies.batchtask import REFUSED
-from fingerspice.studies.sweepplan import BITS, Plan, make_plan, with_sets
+from fingerspice.studies.sweep.plan import BITS, Plan, make_plan, with_sets
+from fingerspice.studies.sweep.workers import stored
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -89,8 +91,6 @@ def sweep(
     """
     circuit, parameters = with_sets(circuit, parameters)
     if store is not None:
-        from fingerspice.studies.sweepstore import stored
-
         plan = make_plan(circuit, parameters, n, seed, MOST_STORED_SAMPLES)
         return stored(circuit, plan, options, Path(store), workers, scheduler, shard)
     if workers is not None or scheduler is not None or tuple(shard) != (1, 1):
@@ -116,8 +116,7 @@ def _in_memory(circuit: Circuit, plan: Plan, options: Mapping[str, Any]) -> Data
     coords: dict[str, Any] = plan.coordinates
     coords |= {name: ("scene", values, {"units": plan.units[name]}) for name, values in draws.items()}
     coords |= {name: one for name, one in found.coords.items() if name == "turn"}
-    about = {"n": plan.n, "seed": plan.seed} if draws else {}
-    return Dataset(data, coords, found.attrs | about | ({"sets": list(circuit.sets)} if circuit.sets else {}))
+    return Dataset(data, coords, found.attrs | plan.about(circuit))
 
 
 def sobol(
@@ -163,15 +162,9 @@ def sobol(
     outputs = options.get("outputs", ("f_el_mean",))
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     require("u_gap" not in outputs, "outputs", "u_gap", "figures, which are one number for each scene")
-    places = [dict(zip(plan.grid, values, strict=True)) for values in _product(plan)]
+    places = [dict(zip(plan.grid, values, strict=True)) for values in product(*plan.grid.values())]
     rows = [_indices(circuit, plan, place, outputs, confidence, options) for place in places]
     return _as_dataset(plan, outputs, rows)
-
-
-def _product(plan: Plan) -> FloatArray:
-    """Values at every place of the grid, shape (n_place, n_grid)."""
-    mesh = np.meshgrid(*plan.grid.values(), indexing="ij")
-    return np.array([values.ravel() for values in mesh]).T if mesh else np.zeros((1, 0))
 
 
 def _indices(
@@ -185,8 +178,7 @@ def _indices(
 
     def figures(x: FloatArray) -> FloatArray:
         found = batch(circuit, plan.scenes(dict(zip(plan.drawn, np.asarray(x, float), strict=True)) | place), **options)
-        lost = int(np.count_nonzero(found.status >= REFUSED))
-        if lost:
+        if lost := int(np.count_nonzero(found.status >= REFUSED)):
             why = f" ({found.attrs['failures'][0]})" if len(found.attrs["failures"]) else ""
             raise InputError(
                 f"{lost} of {found.sizes['scene']} scenes have no result{why}, and indices need all; allowed: "
