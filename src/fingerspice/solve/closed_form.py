@@ -30,8 +30,8 @@ from fingerspice.waveforms.sampling import on_grid, same_time
 ROUNDING, ROUNDING_OF_MATRICES = 1e-13, 1e-12
 # Number of sets of areas whose modes are cached with a scene.
 MOST_MODES = 8
-# Samples in a stretch of `first_order_hold`.
-STRETCH = 500
+# Samples in a stretch of `first_order_hold`; a state below counts as zero, before it becomes a (slow) denormal number.
+STRETCH, SMALLEST = 500, 1e-300
 
 
 def solve_linear(
@@ -156,6 +156,7 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
     return live.T, _Answer(end[None], s, np.zeros((1, 1)), np.zeros((1, 1)))
 
 
+@np.errstate(invalid="ignore")  # Samples that are not finite stay in what follows them.
 def first_order_hold(
     u: FloatArray, dt: float, rates: FloatArray, gains: FloatArray, direct: FloatArray, weights: FloatArray,
     w0: FloatArray,
@@ -169,7 +170,6 @@ def first_order_hold(
     from scipy.signal import lfilter
 
     steps, y, end, by = u.size - 1, np.multiply.outer(direct, u), w0.astype(float), np.empty(2)
-    y[:, 0] += weights @ w0
     count = -(-steps // STRETCH)
     drive, along, starts = np.zeros((count, STRETCH)), np.arange(1.0, STRETCH + 1.0), np.empty((count, 1))
     for k, (z, gain) in enumerate(zip(rates * dt, gains * dt, strict=True)):
@@ -183,9 +183,10 @@ def first_order_hold(
             starts[i] = state
             change = gained + (left * state + carry)
             new = kept * state + change
-            carry, state = (kept * state - new) + change, new
+            carry, state = (kept * state - new) + change, 0.0 if abs(new) < SMALLEST else new
         w = (from_zero + starts * np.exp(-z * along)).ravel()[:steps]
         end[k] = w[-1] if steps else w0[k]
+        y[:, 0] += weights[:, k] * w0[k]
         y[:, 1:] += weights[:, k, None] * w
     return y, end
 
