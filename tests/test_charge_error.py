@@ -134,20 +134,19 @@ def stack(rng: np.random.Generator, law: str, parts: str) -> Stack:
 
 
 def engine_account(
-    step: Stack, collected: float = 0.0, last_area: float | None = None, kept: float = 0.0
-) -> np.ndarray:
-    """`control` after the engine's account of the step, with a jump before it from an area (m^2) if that is given."""
+    step: Stack, before: float = 0.0, last_area: float | None = None, kept: float = 0.0
+) -> tuple[float, float]:
+    """What stayed and the error after the engine's account of the step, with a jump before it from an area (m^2)."""
     u, _, area = step.at(POINTS, 0.0)
     w = np.array([m(POINTS) for m in step.modes])
     places = np.array([e(POINTS[PLACES]) for e in step.errors])
     r = np.zeros((rows.N_FLAT, ROWS))
     r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
     r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
-    control = np.zeros(1, readout.CONTROL)[0]
-    control["collected"] = collected
+    control, collected = np.zeros(1, readout.CONTROL)[0], np.array([[before], [0.0]])
     control["last_q"] = 0.0 if last_area is None else 1.0 / last_area
-    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, kept, control)
-    return control
+    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, kept, control, collected)
+    return float(collected[0, 0]), float(control["error_q"])
 
 
 @every_law
@@ -157,26 +156,26 @@ def test_what_a_step_of_a_stack_leaves_in_the_charge_is_its_derivative_by_the_vo
     seed: int, parts: str, law: str
 ) -> None:
     step = stack(np.random.default_rng([seed, 3]), law, parts)
-    control = engine_account(step)
+    collected, error = engine_account(step)
     fractions = POINTS[PLACES]
     total = np.array([slope_of(lambda e, x=x: np.array([step.charge(x, e)[0]]))[0] for x in fractions])
     held = np.array([step.held(x) for x in fractions])
     stays = total - (held - held[0])
     spread = np.cumsum(np.abs(np.diff(stays, prepend=0.0)))
     scale = max(np.abs(stays).max(), np.abs(held).max())
-    assert control["collected"] == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
+    assert collected == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
     # Since the start of the run, where nothing was off.
     # What the trapezoids miss is a share of all that was added up, whatever is left of it.
     want = np.max(np.abs(held + stays))
-    assert control["error_q"] == pytest.approx(want, rel=0.0, abs=2.0 * ROUGH * (want + spread[-1]))
+    assert error == pytest.approx(want, rel=0.0, abs=2.0 * ROUGH * (want + spread[-1]))
     # What was collected before adds to it with its sign.
     for before in (3.0 * scale, -3.0 * scale):
         want = np.max(np.abs(held + stays + before))
         rough = 2.0 * ROUGH * (want + spread[-1])
-        assert engine_account(step, before)["error_q"] == pytest.approx(want, rel=0.0, abs=rough)
+        assert engine_account(step, before)[1] == pytest.approx(want, rel=0.0, abs=rough)
     # What stays with a sign that is not known is as likely to add as to take away.
-    both = engine_account(step, kept=3.0 * scale)["error_q"]
-    assert both == pytest.approx(np.hypot(control["error_q"], 3.0 * scale), rel=1e-12, abs=0.0)
+    both = engine_account(step, kept=3.0 * scale)[1]
+    assert both == pytest.approx(np.hypot(error, 3.0 * scale), rel=1e-12, abs=0.0)
 
 
 def test_both_ends_of_a_jump_s_move_are_off_in_its_charge() -> None:
@@ -184,7 +183,7 @@ def test_both_ends_of_a_jump_s_move_are_off_in_its_charge() -> None:
     step = stack(np.random.default_rng(8), "local", "stores")
     area = float(step.at(np.array([0.0]), 0.0)[2][0])
     before = 1.1 * area
-    added = engine_account(step, last_area=before)["collected"] - engine_account(step)["collected"]
+    added = engine_account(step, last_area=before)[0] - engine_account(step)[0]
     # From u1 to u2 the charge is the integral of A du / (k S): moved by d, (A(u2) - A(u1)) d / (k S).
     moved = float(step.gap @ [e(0.0) for e in step.errors])
     assert added == pytest.approx((area - before) * moved / (step.k_gap * step.s), rel=1e-9, abs=0.0)
@@ -206,10 +205,10 @@ def test_what_a_stack_s_polynomials_miss_between_nodes_does_not_leak(law: str) -
     r = np.zeros((rows.N_FLAT, ROWS))
     r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
     r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
-    control = np.zeros(1, readout.CONTROL)[0]
-    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, 0.0, control)
+    control, collected = np.zeros(1, readout.CONTROL)[0], np.zeros((2, 1))
+    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, 0.0, control, collected)
     leaked = size * H * 3e-7 * np.abs(step.slow).sum()
-    assert abs(control["collected"]) <= 1e-6 * leaked
+    assert abs(collected[0, 0]) <= 1e-6 * leaked
 
 
 # A network --------------------------------------------------------------------------------------------------

@@ -18,7 +18,6 @@ LONG = {
     ("engine.lanes.begin", "StackMarks"): "the steps of a recording, about 20 s",
     ("engine.lanes.begin", "MobileMarks"): "the steps of a recording, about 20 s",
     ("engine.lanes.begin", "NetworkMarks"): "the steps of a recording in a network, about 30 s",
-    ("engine.shooting.close_period", "Stack"): "the periodic state, about 25 s",
     ("engine.collocation.advance", "Nodal"): "implicit steps, about 15 s",
     ("engine.lockmarch.march", ""): "scenes in lockstep, about 20 s",
 }

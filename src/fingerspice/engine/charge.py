@@ -31,7 +31,7 @@ _DERIVATIVE_BETWEEN = np.ascontiguousarray(BETWEEN.T @ DERIVATIVE)
 @jit_within
 def charge_step(
     system: System, work: Work, level: int, integral: FloatArray, h: float, z0: float, theta: float,
-    control: Control, z: FloatArray, current: FloatArray,
+    control: Control, collected: FloatArray, z: FloatArray, current: FloatArray,
 ) -> None:  # fmt: skip
     """Charge z (C) and current (A) at the nodes of a step of length h (s) that starts with the charge z0.
 
@@ -79,7 +79,7 @@ def charge_step(
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
         control.peak_q = max(control.peak_q, abs(z[j]))
     kept = missed if theta < 1.0 else kept
-    _account(model, gap, slow_share, w, r, h, work.places, theta, missed, kept, control)
+    _account(model, gap, slow_share, w, r, h, work.places, theta, missed, kept, control, collected)
 
 
 @jit
@@ -115,7 +115,7 @@ def _integrate(integral: FloatArray, h: float, z0: float, z: FloatArray) -> None
 @jit
 def _account(
     model: Model, gap: FloatArray, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, places: FloatArray,
-    theta: float, missed: float, kept: float, control: Control,
+    theta: float, missed: float, kept: float, control: Control, collected: FloatArray,
 ) -> None:  # fmt: skip
     """Update the largest error of the charge, over the part of a step that counts, from the signed error of the modes.
 
@@ -132,7 +132,7 @@ def _account(
     last_area, last_voltage, last_gap, last_error, last_gap_error = 0.0, 0.0, 0.0, 0.0, 0.0
     last_theta = 0.0
     added = 0.0
-    control.spread += kept * kept
+    collected[1, 0] += kept * kept
     brief, brief_gap = np.zeros(N_PLACES), np.zeros(N_PLACES)
     for k in range(n):
         first, second, third = between(w[k])
@@ -182,12 +182,12 @@ def _account(
             if reached < POINTS[row]:
                 break
             last_theta = reached
-        known = now + control.collected + added
-        # The signs of `missed` and of the shares in SPREAD are not known: add squares.
-        control.error_q = max(control.error_q, math.sqrt(known * known + missed * missed + control.spread))
+        known = now + collected[0, 0] + added
+        # The signs of `missed` and of the shares in `collected[1]` are not known: add squares.
+        control.error_q = max(control.error_q, math.sqrt(known * known + missed * missed + collected[1, 0]))
         last_area, last_voltage, last_gap = area, voltage, r[U, row]
         last_error, last_gap_error = lasting, lasting_gap
-    control.collected += added
+    collected[0, 0] += added
 
 
 @jit

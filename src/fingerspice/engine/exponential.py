@@ -268,7 +268,7 @@ def largest(first: float, second: float, third: float) -> float:
 @jit_within
 def assess(
     system: System, tables: Tables, work: Work, slot: int, level: int, error: FloatArray
-) -> tuple[float, float, float]:  # fmt: skip
+) -> tuple[float, float]:  # fmt: skip
     """Error of a converged step: interpolation error between the nodes, residual of the iteration, earlier error.
 
     Parameters
@@ -282,10 +282,10 @@ def assess(
 
     Returns
     -------
-    step, run, magnified : float
-        Largest error of the gap voltage in the step, V: that by this step's interpolation alone, which the step length
-        controls, and the whole error, with the residual of the iteration and the errors of earlier steps. Largest
-        ratio of a move of the gap voltage to the move of a state voltage that causes it.
+    step, magnified : float
+        Largest error of the gap voltage in the step by this step's interpolation alone, which the step length controls,
+        V. Largest ratio of a move of the gap voltage to the move of a state voltage that causes it. `work.run` takes
+        the whole error at the places, with the residual of the iteration and the errors of earlier steps.
     """
     r, w, pull, used, carried, places, sums = (
         work.r, work.w, work.pull, work.used, work.carried, work.places, work.sums
@@ -320,8 +320,8 @@ def assess(
         places[k, 2] += mode_second
         places[k, 3] += mode_third
     step = 0.0
-    run = 0.0
     magnified = 1.0
+    work.run[0] = 0.0
     for p in range(4):
         row = FIRST + p if p < 3 else END
         factor = 1.0
@@ -330,10 +330,10 @@ def assess(
             factor = area0 * r[Q, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
             magnified = max(magnified, factor)
         step = max(step, abs(factor * sums[1, p] + sums[0, p]))
-        run = max(run, abs(factor * sums[2, p] + sums[0, p]))
+        work.run[p + 1] = abs(factor * sums[2, p] + sums[0, p])
     # The charge contains the integral of A dU: the interpolation error of 1/A counts times the change of the source.
     area_first, area_second, area_third = between(r[Q])
     swing = 0.3 * abs(r[SOURCE, END] - r[SOURCE, 0])
     missed = abs(largest(area_first / MISS[0], area_second / MISS[1], area_third / MISS[2]))
     charged = swing * missed / r[Q, 0]
-    return max(step, charged), run, magnified
+    return max(step, charged), magnified

@@ -22,27 +22,24 @@ from fingerspice.engine.loopstate import (
     SAME_TIME,
     LoopState,
 )  # fmt: skip
-from fingerspice.engine.mesh import Mesh, begin_mesh, edges_of_mesh, start_mesh, worst_of_mesh
+from fingerspice.engine.mesh import Mesh, begin_mesh, start_mesh
 from fingerspice.engine.meshstep import attempt_mesh, beyond_mesh, complete_mesh, end_mesh, refuse_mesh
 from fingerspice.engine.pace import NOT_FRESH, Pace, accept, allowed_factor, rung, shorten
-from fingerspice.engine.readout import (
-    ACCEPTED,
-    REJECTED,
-    note,
-)
-from fingerspice.engine.stackend import complete_stack, end_stack, worst_of_stack
+from fingerspice.engine.readout import ACCEPTED, ERROR_F, ERROR_U, PEAK_F, PEAK_U, REJECTED, note
+from fingerspice.engine.stackend import complete_stack, end_stack
 from fingerspice.engine.stackstep import (
     Stack,
     attempt_stack,
     begin_stack,
     beyond_stack,
-    edges_of_stack,
     refuse_stack,
     start_stack,
 )  # fmt: skip
 
 # The coupling may make the slowest mode slower than with the area frozen; this fraction of its rate is a safe bound.
 RATE_SHARE = 0.5
+# Part of the largest gap voltage up to which another one is taken for 0.
+_UNNOTICED = 1e-9
 # Looks with finer steps after which the charge counts as settled with the voltages: what is left of it is stated.
 _FINE_LOOKS = 3
 # Entries of `Looks.values`. Times (s): next look; first comparison of the stated error with the one asked for; start,
@@ -174,16 +171,18 @@ def end(circuit: Circuit, state: LoopState) -> None:
     """End a call of the loop."""
 
 
-@jit_by_kind(Stack=worst_of_stack, Mesh=worst_of_mesh)
-def worst(circuit: Circuit, state: LoopState) -> float:
+@jit_within
+def worst(peaks: FloatArray) -> float:
     """Largest ratio of the estimated error to the peak so far, over the voltages and forces of all gaps."""
-    raise NotImplementedError
-
-
-@jit_by_kind(Stack=edges_of_stack, Mesh=edges_of_mesh)
-def edges(circuit: Circuit) -> FloatArray:
-    """Edges of the sources, s."""
-    raise NotImplementedError
+    found, largest = 0.0, 0.0
+    for a in range(peaks.shape[0]):
+        largest = max(largest, peaks[a, PEAK_U])
+    for a in range(peaks.shape[0] - 1):
+        if peaks[a, PEAK_U] > _UNNOTICED * largest:
+            found = max(found, peaks[a, ERROR_U] / peaks[a, PEAK_U])
+            if peaks[a, PEAK_F] > 0.0:
+                found = max(found, peaks[a, ERROR_F] / peaks[a, PEAK_F])
+    return found
 
 
 @jit
@@ -194,14 +193,14 @@ def march_on(circuit: Circuit, pace: Pace, state: LoopState, looks: Looks, t_end
     """
     circuit, state, looks = borrow(circuit), borrow(state), borrow(looks)
     while True:
-        stop = next_stop(looks, edges(circuit), t_end)
+        stop = next_stop(looks, circuit.sources.edges, t_end)
         code = march(circuit, pace, state, stop)
         if code != DONE:
             return code
         slack = SAME_TIME * abs(stop)
         if stop >= looks.values[TRIAL] - slack:
             looks.values[TRIAL] = math.inf
-            if worst(circuit, state) > looks.values[ACCEPTABLE]:
+            if worst(state.peaks) > looks.values[ACCEPTABLE]:
                 return EXCESSIVE
         if stop >= looks.values[NEXT] - slack and look(looks, state):
             return LOOKED_AT

@@ -170,7 +170,6 @@ STEP = np.dtype([
     ("theta", float),  # Fraction of the length that counts
     ("t_new", float),  # s: reached at that fraction
     ("step_error", float),  # V: of the step, which controls its length
-    ("run_error", float),  # V: of the whole run
     ("grown", float),  # Largest ratio of a move of the gap voltage to the move of a state voltage
     ("start", float),  # s: of the source's segment at hand
     ("edge", float),  # s: its end
@@ -215,6 +214,10 @@ class LoopState(NamedTuple):
     control: Control
     counters: IntArray
     step: NDArray[Any]  # (1,): A record of type `STEP`
+    # (n_area + 1, 4): Largest voltage (V) and force (N) of each gap and, in the last row, of the nodes; errors of both
+    peaks: FloatArray
+    # (2, n_s): Lasting errors of the charges: the sum of those of known sign (C), that of the squares of others (C^2)
+    collected: FloatArray
     outputs: Outputs
     # Takes the first steps, for repeated periods, until it is full; `counters` tells how many steps there were
     kept: Kept

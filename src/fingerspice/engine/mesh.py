@@ -12,7 +12,7 @@ from fingerspice.base.compiled import jit, jit_within
 from fingerspice.engine import netform
 from fingerspice.engine.exponential import Tables
 from fingerspice.engine.loopstate import DONE, GO_ON, PAUSED, REFERENCE, TOO_MANY, LoopState
-from fingerspice.engine.netassess import ERROR_F, ERROR_U, PEAK_F, PEAK_U, load
+from fingerspice.engine.netassess import load
 from fingerspice.engine.netform import Form, Leaks, Work
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.engine.pace import AFTER_EDGE, NOT_FRESH, Pace, choose_step
@@ -115,28 +115,6 @@ class Mesh(NamedTuple):
     sign: FloatArray
     s_before: FloatArray
     branch: FloatArray  # (n_area, 2): Time at which each area's branch began, and length of the branch before, s
-    # peaks, collected: As described in `netassess` and `netcharge.charge_error`
-    peaks: FloatArray
-    collected: FloatArray
-
-
-@jit_within
-def edges_of_mesh(c: Mesh) -> FloatArray:
-    """Edges of all sources, s, one source after the other."""
-    return c.sources.edges
-
-
-@jit_within
-def worst_of_mesh(c: Mesh, s: LoopState) -> float:
-    """Largest ratio of the estimated error to the peak so far, over the voltages and forces of all areas."""
-    worst = 0.0
-    for a in range(c.sign.size):
-        peaks = c.peaks[a]
-        if peaks[PEAK_U] > _UNNOTICED * c.u_scale:
-            worst = max(worst, peaks[ERROR_U] / peaks[PEAK_U])
-            if peaks[PEAK_F] > 0.0:
-                worst = max(worst, peaks[ERROR_F] / peaks[PEAK_F])
-    return worst
 
 
 @jit_within

@@ -15,7 +15,6 @@ from fingerspice.engine.exponential import make_tables, weigh
 from fingerspice.engine.loopstate import AGAIN, GO_ON, NO_STEP, RETRY, LoopState, is_wanted, may_shorten, write_step
 from fingerspice.engine.mesh import Mesh, branch_of, leaks_of, resume_time
 from fingerspice.engine.netassess import (
-    account,
     account_nodes,
     assess,
     carry,
@@ -35,6 +34,7 @@ from fingerspice.engine.readout import (
     N_PLACES,
     NFEV,
     ZEROS,
+    account,
     at,
     basis_at,
     error_at,
@@ -210,7 +210,7 @@ def _write(c: Mesh, pace: Pace, s: LoopState, t: float) -> None:
         step_charges(form, work, leaks, step.length, c.integral, c.sign, values[first_z:n_y], values[n_y:])
         charge_error(
             form, work, step.length, leaks.lost, leaks.g, step.theta, work.cells[netform.CELL_U], work.areas,
-            values[first_z:], c.collected, s.control[0],
+            values[first_z:], s.collected, s.control[0],
         )  # fmt: skip
     for e in range(c.s_before.size):
         work.gained[e] = at(values[first_z + e], work.basis) if pace.charge else 0.0
@@ -228,11 +228,16 @@ def _account(c: Mesh, s: LoopState) -> None:
     form, work, areas = c.form, c.work, c.work.areas
     for a in range(c.sign.size):
         if form.stress[a] > 0.0:
+            area_off = 0.0
+            if form.slow[a] >= 0:
+                # The mode of a delayed area is the area itself.
+                for p in range(N_PLACES):
+                    area_off = max(area_off, abs(work.places[form.slow[a], p]))
             account(
-                areas[netform.U, a], areas[netform.AREA, a], form.stress[a], s.step[0].theta, work.run[a], work.places,
-                form.slow[a], c.peaks[a],
+                areas[netform.U, a], areas[netform.AREA, a], form.stress[a], s.step[0].theta, work.run[a], area_off,
+                s.peaks[a],
             )  # fmt: skip
-    account_nodes(form.node, form.node_s, work.places, work.off, c.peaks[c.sign.size])
+    account_nodes(form.node, form.node_s, work.places, work.off, s.peaks[c.sign.size])
 
 
 @jit_within

@@ -16,22 +16,17 @@ from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.exponential import Tables, between, largest, left_over, respond
 from fingerspice.engine.netform import CHI_S, ETA_S, LIN, PULL, RHO, U_S, USED, Form, Leaks, W, Work
 from fingerspice.engine.netrows import combine, evaluate
-from fingerspice.engine.readout import N_PLACES
+from fingerspice.engine.readout import ERROR_U, N_PLACES
 from fingerspice.engine.zeros import first_wrong, leaves
 from fingerspice.numerics.lobatto import DERIVATIVE, END, MISS, NODES, POINTS, ROWS
 from fingerspice.numerics.small import copy_to
 
-# Columns of `peaks`: the largest voltage (V) and force (N) of each gap and, in the last row, of the nodes; then the
-# errors of both.
-PEAK_U, PEAK_F, ERROR_U, ERROR_F = 0, 1, 2, 3
 # A decay that is over within this fraction of the step, a third of the way to the first node, is not seen by the
 # polynomials.
 _EARLY = POINTS[1] / 3.0
 # Rows at which the response to the interpolation error is taken for the points between the nodes and for the end: this
 # error changes its sign at every node, so that its integral is largest at the nodes beside those points.
 _WORST = (1, NODES // 2, 9, END)
-# For each place: the first and the last node between its neighbouring places.
-_NEAR = ((0, 1), (0, 5), (1, 9), (6, END), (10, END))
 
 
 @jit
@@ -199,39 +194,6 @@ def first_zero(
             if crossing <= theta and t + crossing * h <= t_new and not (later and t + crossing * h <= t):
                 which, theta, t_new = a, crossing, t + crossing * h
     return which, theta, t_new
-
-
-@jit_rows
-def account(
-    u: FloatArray, area: FloatArray, stress: float, theta: float, run: FloatArray, places: FloatArray, slow: int,
-    peaks: FloatArray,
-) -> None:  # fmt: skip
-    """Peaks of a gap's voltage and force over the part of a step that counts, and the errors of both.
-
-    `run` and `places` hold the errors of the voltage and of the modes (see `assess`); mode number `slow` is the area
-    itself, unless `slow` is negative.
-    """
-    area_off = 0.0
-    if slow >= 0:
-        for p in range(N_PLACES):
-            area_off = max(area_off, abs(places[slow, p]))
-    force = 0.0
-    for i in range(NODES):
-        if POINTS[i] <= theta:
-            size = abs(u[i])
-            peaks[PEAK_U] = max(peaks[PEAK_U], size)
-            force = max(force, stress * size * size * area[i])
-    moved = 0.0
-    for p in range(N_PLACES):
-        steepest = 0.0
-        for i in range(_NEAR[p][0], _NEAR[p][1] + 1):
-            if POINTS[i] <= theta:
-                # F ~ u^2 A: an error du changes F by at most 2 F du / u, because the area falls with |u|.
-                steepest = max(steepest, 2.0 * stress * abs(u[i]) * area[i])
-        moved = max(moved, run[p] * steepest)
-        peaks[ERROR_U] = max(peaks[ERROR_U], run[p])
-    peaks[PEAK_F] = max(peaks[PEAK_F], force)
-    peaks[ERROR_F] = max(peaks[ERROR_F], moved + area_off * force)
 
 
 @jit_rows

@@ -19,30 +19,27 @@ CONTROL = np.dtype([
     ("u_gap", float),  # V
     ("branch_start", float),  # s
     ("branch_length", float),  # s: of the branch before; infinite before the first
-    ("peak_u", float),  # V
-    ("peak_f", float),  # N
-    ("error_u", float),  # V
-    ("error_f", float),  # N
     ("too_long", float),  # s: a length that was rejected recently
     ("h_after_edge", float),  # s: the first step taken after an edge of the source
     ("magnified", float),  # Largest change of the gap voltage for a change of 1 V of a state voltage
     ("error_q", float),  # C: largest error of the charge so far
-    ("collected", float),  # C: sum of the charge's errors with known signs
-    ("spread", float),  # C^2: sum of the squares of its other errors
     ("last_q", float),  # 1/m^2: 1/A where the last step ended
     ("allowed", float),  # s: length that the last step's error would have allowed; 0 if it says nothing about the next
     ("h_after_zero", float),  # s: the first step taken after a zero of the gap voltage; 0 before the first
     ("margin", float),  # Smallest distance to the fold so far
     ("peak_q", float),  # C
-    ("error_v", float),  # V: largest error of a node's voltage
 ])  # fmt: skip
 """Bookkeeping of a run."""
 Control = Any  # A record of type `CONTROL`
 # Entries of `counters`: rows evaluated, steps accepted and rejected, zeros, outputs written, steps kept, recorded.
 NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT, RECORDED = 0, 1, 2, 3, 4, 5, 6
 N_COUNTERS = 7
-# Places of a step at which the error is known: its start, the three points between nodes, its end.
+# Columns of `LoopState.peaks`.
+PEAK_U, PEAK_F, ERROR_U, ERROR_F = range(4)
+# Places of a step at which the error is known: its start, the three points between nodes, its end; and for each, the
+# first and the last node between its neighbours.
 N_PLACES = 5
+_NEAR = ((0, 1), (0, 5), (1, 9), (6, END), (10, END))
 # Number of last steps tried that are kept, as rows: start and length (s), error over the one allowed, number.
 TRIED = 8
 # Most steps, accepted and rejected, in a window of the source, which has a few thousand periods at most. A run that
@@ -272,28 +269,26 @@ def write_outputs(
 
 @jit_rows
 def account(
-    mobile: bool, area0: float, stress: float, u: FloatArray, q: FloatArray, x_gap: FloatArray, dq: FloatArray,
-    theta: float, run_error: float, control: Control,
+    u: FloatArray, area: FloatArray, stress: float, theta: float, run: FloatArray, area_off: float, peaks: FloatArray
 ) -> None:  # fmt: skip
-    """Peaks of gap voltage and force, their largest errors and the distance to the fold in the part that counts."""
-    if mobile:
-        margin = control.margin
-        for j in range(NODES):
-            if POINTS[j] <= theta:
-                margin = min(margin, 1.0 - area0 * x_gap[j] * dq[j])
-        control.margin = margin
-    peak_u = control.peak_u
-    peak_f = control.peak_f
-    steepest = 0.0
-    for j in range(NODES):
-        if POINTS[j] <= theta:
-            size = abs(u[j])
-            pressure = stress * size / q[j]
-            peak_u = max(peak_u, size)
-            peak_f = max(peak_f, pressure * size)
-            # F ~ u^2 A: an error du changes F by at most 2 F du / u, because the area falls with |u|.
-            steepest = max(steepest, 2.0 * pressure)
-    control.peak_u = peak_u
-    control.peak_f = peak_f
-    control.error_u = max(control.error_u, run_error)
-    control.error_f = max(control.error_f, run_error * steepest)
+    """Peaks of a gap's voltage and force over the part of a step that counts, and the errors of both.
+
+    `run` holds the errors of the voltage at the places, V, and `area_off` is the relative error of the area beside it.
+    """
+    force = 0.0
+    for i in range(NODES):
+        if POINTS[i] <= theta:
+            size = abs(u[i])
+            peaks[PEAK_U] = max(peaks[PEAK_U], size)
+            force = max(force, stress * size * size * area[i])
+    moved = 0.0
+    for p in range(N_PLACES):
+        steepest = 0.0
+        for i in range(_NEAR[p][0], _NEAR[p][1] + 1):
+            if POINTS[i] <= theta:
+                # F ~ u^2 A: an error du changes F by at most 2 F du / u, because the area falls with |u|.
+                steepest = max(steepest, 2.0 * stress * abs(u[i]) * area[i])
+        moved = max(moved, run[p] * steepest)
+        peaks[ERROR_U] = max(peaks[ERROR_U], run[p])
+    peaks[PEAK_F] = max(peaks[PEAK_F], force)
+    peaks[ERROR_F] = max(peaks[ERROR_F], moved + area_off * force)

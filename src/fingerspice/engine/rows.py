@@ -35,6 +35,8 @@ class Work(NamedTuple):
         The modes at the start of the step; effect of each on the gap voltage (see `exponential.weigh`).
     places, carried : ndarray, shape (n, N_PLACES) and (n, N_PLACES - 1)
         Errors of the modes, and those carried over from earlier steps.
+    run : ndarray, shape (N_PLACES,)
+        Errors of the gap voltage, V.
     values, coefficients : ndarray, shape (n + 2, ROWS)
         Output columns and their Chebyshev coefficients.
     tapped : ndarray, shape (n + 1, ROWS)
@@ -53,6 +55,7 @@ class Work(NamedTuple):
     w0: FloatArray
     places: FloatArray
     carried: FloatArray
+    run: FloatArray
     values: FloatArray
     coefficients: FloatArray
     outputs: FloatArray
@@ -75,6 +78,7 @@ def new_work(n: int) -> Work:
         np.zeros(n),
         np.zeros((n, N_PLACES)),
         np.zeros((n, N_PLACES - 1)),
+        np.zeros(N_PLACES),
         np.zeros((n + 2, ROWS)),
         np.zeros((n + 2, ROWS)),
         np.zeros((2, WRITTEN_AT_ONCE)),

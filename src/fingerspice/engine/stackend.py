@@ -22,7 +22,9 @@ from fingerspice.engine.model import dot, turns_at_zero
 from fingerspice.engine.pace import AFTER_ZERO, Pace
 from fingerspice.engine.readout import (
     ACCEPTED,
+    ERROR_U,
     N_PLACES,
+    PEAK_U,
     ZEROS,
     account,
     at,
@@ -31,10 +33,10 @@ from fingerspice.engine.readout import (
     layers,
     row_of,
 )
-from fingerspice.engine.rows import DQ, SOURCE, X_GAP, Q, U
+from fingerspice.engine.rows import DQ, SCRATCH, SOURCE, X_GAP, Q, U
 from fingerspice.engine.stackstep import Stack, flip, source_voltage
 from fingerspice.engine.zeros import farthest_off, zero
-from fingerspice.numerics.lobatto import END, ROWS
+from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 
 
 @jit
@@ -128,7 +130,7 @@ def complete_stack(c: Stack, pace: Pace, s: LoopState) -> int:
     if control.t >= step.stop:
         control.u_before = source_voltage(c, s, control.t - step.start)
     s.counters[ACCEPTED] += 1
-    return OUT_OF_RANGE if control.peak_u > c.system.u_top else GO_ON
+    return OUT_OF_RANGE if s.peaks[0, PEAK_U] > c.system.u_top else GO_ON
 
 
 @jit_within
@@ -139,8 +141,8 @@ def _write(c: Stack, pace: Pace, s: LoopState, t: float) -> None:
     n_shown = shown.shape[0]
     if pace.charge:
         charge_step(
-            system, work, level, c.integral, step.length, s.y[work.w0.size], step.theta, s.control[0], values[n_shown],
-            values[n_shown + 1],
+            system, work, level, c.integral, step.length, s.y[work.w0.size], step.theta, s.control[0], s.collected,
+            values[n_shown], values[n_shown + 1],
         )  # fmt: skip
     if not is_wanted(s, step.t_new):
         return
@@ -154,14 +156,15 @@ def _account(c: Stack, s: LoopState) -> None:
     system, work, step, control, level = c.system, c.work, s.step[0], s.control[0], s.step[0].level
     model, r = system.model, c.work.r
     control.magnified = max(control.magnified, step.grown)
-    account(
-        model.mobile and model.coupled, model.area0, system.stress, r[U], r[Q], r[X_GAP], r[DQ], step.theta,
-        step.run_error, control,
-    )  # fmt: skip
+    for i in range(ROWS):
+        r[SCRATCH, i] = 1.0 / r[Q, i]
+        if model.mobile and model.coupled and i < NODES and POINTS[i] <= step.theta:
+            control.margin = min(control.margin, 1.0 - model.area0 * r[X_GAP, i] * r[DQ, i])
+    account(r[U], r[SCRATCH], system.stress, step.theta, work.run, 0.0, s.peaks[0])
     v_error = node_error(
         model.mobile, model.area0, system.node[level], system.k_node, system.gap[level], work.w, r, work.places
     )  # fmt: skip
-    control.error_v = max(control.error_v, v_error)
+    s.peaks[1, ERROR_U] = max(s.peaks[1, ERROR_U], v_error)
 
 
 @jit_within
@@ -219,12 +222,3 @@ def _cross(c: Stack, s: LoopState) -> bool:
 @jit_within
 def end_stack(c: Stack, s: LoopState) -> None:
     """End a call of the loop: nothing is left to do."""
-
-
-@jit_within
-def worst_of_stack(c: Stack, s: LoopState) -> float:
-    """Largest ratio of the estimated error to the peak so far, of the gap's voltage and force."""
-    control = s.control[0]
-    of_voltage = control.error_u / control.peak_u if control.peak_u > 0.0 else 0.0
-    of_force = control.error_f / control.peak_f if control.peak_f > 0.0 else 0.0
-    return max(of_voltage, of_force)

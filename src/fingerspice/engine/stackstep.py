@@ -14,7 +14,7 @@ from fingerspice.engine.exponential import Tables, assess, converge, make_tables
 from fingerspice.engine.growth import SLIGHT, carry, loop_gain
 from fingerspice.engine.loopstate import AGAIN, DONE, GO_ON, NO_STEP, OUT_OF_RANGE, PAUSED, RETRY, TOO_MANY, LoopState
 from fingerspice.engine.model import branch_area, turns_at_zero
-from fingerspice.engine.network import Segment, segment_at, source
+from fingerspice.engine.network import Segment, Sources, segment_at, source
 from fingerspice.engine.pace import (
     AFTER_EDGE,
     NOT_FRESH,
@@ -56,17 +56,7 @@ class Stack(NamedTuple):
     tables: Tables
     work: Work
     integral: FloatArray  # `lobatto.integral_table()`
-    # (m + 1,): Edges of the source's segments, s; `terms` (m, k, 6) and `series` (m, l) hold the source on each (see
-    # `Segment`)
-    edges: FloatArray
-    terms: FloatArray
-    series: FloatArray
-
-
-@jit_within
-def edges_of_stack(c: Stack) -> FloatArray:
-    """Edges of the source, s."""
-    return c.edges
+    sources: Sources  # One alone
 
 
 @jit_within
@@ -78,7 +68,8 @@ def start_stack(c: Stack, s: LoopState) -> None:
     if step.is_paused > 0:
         step.is_paused = 0
         return
-    step.index = segment_at(c.edges, control.t) - 1 if c.edges[0] < control.t else -1
+    edges = c.sources.edges
+    step.index = segment_at(edges, control.t) - 1 if edges[0] < control.t else -1
     # The segment is entered at the first step, as its edge is not before the present time.
     step.start, step.edge, step.since, step.begun = 0.0, control.t, 0.0, control.t
     step.fresh, step.evaluated = NOT_FRESH, counters[NFEV]
@@ -104,7 +95,7 @@ def begin_stack(c: Stack, pace: Pace, s: LoopState, t_end: float) -> int:
             return TOO_MANY
     while t >= step.edge:
         step.index += 1
-        step.start, step.edge = c.edges[step.index], c.edges[step.index + 1]
+        step.start, step.edge = c.sources.edges[step.index], c.sources.edges[step.index + 1]
         if step.edge > t and not _enter_segment(c, pace, s):
             return NO_STEP
     step.stop = min(step.edge, t_end)
@@ -116,7 +107,7 @@ def begin_stack(c: Stack, pace: Pace, s: LoopState, t_end: float) -> int:
             w0[k] += project[k, i] * s.y[i]
     length = step.stop - step.start
     step.length = choose_step(
-        pace, model.tau, model.coupled, c.series[step.index].size > 0, t, length - step.since, control
+        pace, model.tau, model.coupled, c.sources.series.shape[1] > 0, t, length - step.since, control
     )  # fmt: skip
     return GO_ON
 
@@ -147,7 +138,7 @@ def _enter_segment(c: Stack, pace: Pace, s: LoopState) -> bool:
 def source_voltage(c: Stack, s: LoopState, tau: float) -> float:
     """Source voltage (V) `tau` s into the segment at hand."""
     index, start = s.step[0].index, s.step[0].start
-    u, _ = source(Segment(start, s.step[0].edge - start, c.terms[index], c.series[index]), tau)
+    u, _ = source(Segment(start, s.step[0].edge - start, c.sources.terms[index], c.sources.series[index]), tau)
     return u
 
 
@@ -180,8 +171,9 @@ def attempt_stack(c: Stack, pace: Pace, s: LoopState) -> int:
         )  # fmt: skip
         step.tabled = h
         weigh(system.rates[level], system.gap[level], tables.decay[step.slot], h, work.weight)
-    segment = c.terms[step.index], c.series[step.index]
-    source_rows(segment[0], segment[1], step.edge - step.start, step.since, h, pace.charge, r)
+    source_rows(
+        c.sources.terms[step.index], c.sources.series[step.index], step.edge - step.start, step.since, h, pace.charge, r
+    )  # fmt: skip
     if model.mobile:
         for i in range(ROWS):
             r[GUESS, i] = control.u_gap
@@ -229,7 +221,7 @@ def _assess(c: Stack, s: LoopState) -> None:
     grown = loop_gain(system, work, level)
     if grown > SLIGHT:
         carry(system, work, level, decay, step.length, s.control[0].sign, grown, s.error)
-    step.step_error, step.run_error, step.grown = assess(system, c.tables, work, slot, level, s.error)
+    step.step_error, step.grown = assess(system, c.tables, work, slot, level, s.error)
 
 
 @jit_within

@@ -24,15 +24,6 @@ def copy_to(out: FloatArray, x: FloatArray) -> None:
 
 
 @jit
-def inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a square matrix (n, n); NaN where it is singular."""
-    out = matrix.copy()
-    if not invert(out):
-        out[:] = np.nan
-    return out
-
-
-@jit
 def invert(matrix: FloatArray | ComplexArray) -> bool:
     """Invert a matrix (n, n) in place by Gauss-Jordan elimination with row pivoting; False where it is singular."""
     n = matrix.shape[0]

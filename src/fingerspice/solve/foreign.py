@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib.util import find_spec
 
 import numpy as np
@@ -36,6 +35,9 @@ _TORCH_FIXED = {"rk4": 4, "midpoint": 2, "euler": 1}
 REFERENCE, FIRST, ATTEMPTS = 0.03, 0.1, 6
 
 
+Rate = Callable[[float, FloatArray], FloatArray]
+
+
 class _FailedError(Exception):
     """A library's integrator gave up."""
 
@@ -53,20 +55,10 @@ def _rate(
     return out
 
 
-@dataclass
-class _Piece:
-    """A smooth part of a run: y'(t, y) = rate from the state `y`, at `times` (s, ascending) from 0 to its end."""
-
-    rate: Callable[[float, FloatArray], FloatArray]
-    times: FloatArray
-    y: FloatArray
-    tol: float
-    scale: FloatArray
-    tau: float
-
-
-def _scipy_piece(piece: _Piece, name: str) -> tuple[FloatArray, int]:
-    """States at the times, and the number of evaluations."""
+def _by_scipy(
+    name: str, rate: Rate, times: FloatArray, y: FloatArray, tol: float, scale: FloatArray, tau: float
+) -> tuple[FloatArray, int]:
+    """States at `times` (s, ascending from 0) of y' = rate(t, y), and the number of evaluations."""
     from scipy.integrate import solve_ivp
 
     # Warning filters belong to the whole process: change them in one thread at a time, for scipy's warnings only.
@@ -74,9 +66,8 @@ def _scipy_piece(piece: _Piece, name: str) -> tuple[FloatArray, int]:
         warnings.filterwarnings("ignore", module=r"scipy\.")
         try:
             result = solve_ivp(
-                piece.rate, (0.0, piece.times[-1]), piece.y, method=name, t_eval=piece.times,
-                rtol=max(piece.tol, 3e-14), atol=piece.tol * piece.scale,
-            )  # fmt: skip
+                rate, (0.0, times[-1]), y, method=name, t_eval=times, rtol=max(tol, 3e-14), atol=tol * scale
+            )
         except ValueError as error:
             # Past a fold y' is NaN, and scipy's implicit methods refuse to factor a matrix with NaN.
             raise _FailedError(f"scipy: {error}") from None
@@ -86,36 +77,40 @@ def _scipy_piece(piece: _Piece, name: str) -> tuple[FloatArray, int]:
     return result.y.T, int(result.nfev)
 
 
-def _torch_piece(piece: _Piece, name: str) -> tuple[FloatArray, int]:
+def _by_torch(
+    name: str, rate: Rate, times: FloatArray, y: FloatArray, tol: float, scale: FloatArray, tau: float
+) -> tuple[FloatArray, int]:
+    """As `_by_scipy`; the shortest time constant `tau` (s) gives the step of a method with fixed steps."""
     import torch
     from torchdiffeq import odeint
 
-    counts = [0]
+    count, length = 0, float(times[-1])
 
-    def slope(t: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        counts[0] += 1
+    def slope(t: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+        nonlocal count
+        count += 1
         # torchdiffeq takes one atol for all entries, so each entry is integrated in units of its scale.
-        rate = piece.rate(float(t), y.numpy() * piece.scale) / piece.scale
+        found = rate(float(t), z.numpy() * scale) / scale
         # Past a fold y' is NaN, which would make torchdiffeq's step length NaN; it rejects the step if y' is huge.
-        return torch.from_numpy(np.where(np.isfinite(rate), rate, 1e9 / length))
+        return torch.from_numpy(np.where(np.isfinite(found), found, 1e9 / length))
 
-    length, options = float(piece.times[-1]), {}
+    options = {}
     if name in _TORCH_FIXED:
         # A fixed step h from the tolerance, with the error model (h / tau)^order.
-        longest = min(piece.tau, length / 4.0)
-        options = {"step_size": float(min(longest, 2.0 * longest * piece.tol ** (1.0 / _TORCH_FIXED[name])))}
+        longest = min(tau, length / 4.0)
+        options = {"step_size": min(longest, 2.0 * longest * tol ** (1.0 / _TORCH_FIXED[name]))}
     try:
         with torch.no_grad():
-            y = odeint(
-                slope, torch.from_numpy(piece.y / piece.scale), torch.from_numpy(piece.times), method=name,
-                rtol=max(piece.tol, 3e-14), atol=piece.tol, options=options,
-            ).numpy() * piece.scale  # fmt: skip
+            states = odeint(
+                slope, torch.from_numpy(y / scale), torch.from_numpy(times), method=name, rtol=max(tol, 3e-14),
+                atol=tol, options=options,
+            ).numpy() * scale  # fmt: skip
     except AssertionError as error:
         short = "torchdiffeq's step underflowed: its methods are explicit, and this scene may be too stiff for them"
         raise _FailedError(short if "underflow in dt" in str(error) else str(error)) from None
-    if not np.all(np.isfinite(y[-1])):
+    if not np.all(np.isfinite(states[-1])):
         raise _FailedError("torchdiffeq returned NaN")
-    return y, counts[0]
+    return states, count
 
 
 class Foreign(Collocation):
@@ -126,7 +121,7 @@ class Foreign(Collocation):
         left: BoolArray,
     ) -> None:  # fmt: skip
         super().__init__(problem, radau_scheme(STAGES), tol, u_scale, t_out, left)
-        self.by, self.name, self.detail = _torch_piece if library == "torchdiffeq" else _scipy_piece, name, ""
+        self.by, self.name, self.detail = _by_torch if library == "torchdiffeq" else _by_scipy, name, ""
         # Without a request for charge its scale is infinite, which libraries cannot take: 1 C is as good as infinite.
         self.scale = np.where(np.isfinite(self.scale), self.scale, 1.0)
         self.tau = 1.0 / max(float(problem.scene.rates.max(initial=0.0)), 1e-300)
@@ -159,7 +154,7 @@ class Foreign(Collocation):
         inside = (self.t_out < stop) | ((self.t_out == stop) & self.left)
         times = self.t_out[done : int(np.count_nonzero(inside))] - base
         every = np.unique(np.concatenate([[0.0], times, [stop - base]]))
-        states, used = self.by(_Piece(rate, every, self.y.copy(), self.tol, self.scale, self.tau), self.name)
+        states, used = self.by(self.name, rate, every, self.y.copy(), self.tol, self.scale, self.tau)
         for row, since, state in zip(self.rows[done:], times, states[np.searchsorted(every, times)], strict=False):
             row[: state.size] = state
             if self.problem.charge:

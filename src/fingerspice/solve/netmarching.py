@@ -14,7 +14,7 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, views_of
 from fingerspice.circuit.network import Modes, network_modes
-from fingerspice.engine import loop, loopstate, netassess, readout
+from fingerspice.engine import loopstate, readout
 from fingerspice.engine.exponential import Tables, new_tables
 from fingerspice.engine.loop import Looks, no_looks
 from fingerspice.engine.mesh import LEVEL_RATIO, Mesh, References
@@ -24,10 +24,10 @@ from fingerspice.engine.system import area_error, area_missed, area_polynomials
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import NetworkIntegration, Run, kept_with
+from fingerspice.solve.runs import NetworkIntegration, kept_with
 from fingerspice.solve.scenes import Scene
 from fingerspice.solve.sources import held as held_at
-from fingerspice.solve.stepping import SAFETY, Stepping, looks_of
+from fingerspice.solve.stepping import Stepping, looks_of
 
 # Number of sets of references cached with a scene: one for each thread and decade of tolerances.
 MOST_SETS = 16
@@ -238,13 +238,13 @@ class March(Stepping, NetworkIntegration):
         scene, size = problem.scene, problem.initial.y.size
         n_s, n_area = len(scene.waveforms), scene.net.gap.size
         self.u_scale, self.decade = u_scale, int(np.floor(np.log10(rtol)))
-        self.collected = np.zeros((2, n_s))
+        self.gaps, self.largest = list(scene.network.fingers), u_scale
+        self.area_error = max((area_missed(curve, self.decade) for curve in scene.net.curves), default=0.0)
         width = size + n_s if problem.charge else size
         super().__init__(problem, tol * u_scale, t_out, left, size - n_s, width)
         self.control["magnified"] = 1.0
         self.rows = self.out.T
         self.error = np.zeros(self.n + self.n_slow)
-        self.met = np.zeros((n_area + 1, 4))
         self.branch = np.tile([problem.t_start, math.inf], (n_area, 1))
         self.shortest = problem.waveform.shortest_time()
         self.integral = integral_table()
@@ -255,37 +255,32 @@ class March(Stepping, NetworkIntegration):
         scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
         self.looks = looks_of(problem, self.form.rates.copy(), self.pace.tol, scale, repeat)
 
+    @property
+    def rounding(self) -> FloatArray:
+        u_peak = self.peaks[:, readout.PEAK_U]
+        # Enlarged by the condition of the modes.
+        return np.asarray(4e-16 * (self.references.magnified * (float(u_peak.max()) + self.u_scale) + u_peak))
+
+    @property
+    def capacitance(self) -> float:
+        return float(self.problem.network.capacitance(self.problem.scene.area0).sum())
+
+    @property
+    def margin(self) -> float:
+        return 1.0 / float(self.control["magnified"])
+
+    def circuit(self, sources: Sources) -> Mesh:
+        known = self.references
+        return Mesh(
+            self.form, known.arrays, known.tables, self.work, self.integral, sources, self.u_scale, self.sign,
+            self.s_before, self.branch,
+        )  # fmt: skip
+
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
         more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
         self.step[0]["most"] = taken + int(more)
-        while True:
-            known = self.references
-            mesh = Mesh(
-                self.form, known.arrays, known.tables, self.work, self.integral, sources, self.u_scale, self.sign,
-                self.s_before, self.branch, self.met, self.collected,
-            )  # fmt: skip
-            code = int(loop.march_on(mesh, self.pace, self.loop_state(), looks, t_end))
-            if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
-                self.recorder.drain(self.counters)
-            if code == loopstate.REFERENCE:
-                self._add_reference()
-            elif code != loopstate.PAUSED:
-                return code
-
-    def _collected(self) -> FloatArray:
-        return self.collected.copy()
-
-    def _pass(self, periods: int, off: float, owed: float, collected: FloatArray) -> None:
-        self.branch[:, 0] += periods * self.period
-        met = self.met
-        met[:, netassess.ERROR_U] += off
-        steepest = 2.0 * met[:, netassess.PEAK_F] / np.maximum(met[:, netassess.PEAK_U], 1e-300)
-        met[:, netassess.ERROR_F] += off * steepest
-        missed, spread = self.collected - collected
-        self.collected[0] += periods * missed
-        held = float(self.problem.network.capacitance(self.problem.scene.area0).sum())
-        self.control["error_q"] += periods * float((np.abs(missed) + np.sqrt(spread)).max()) + held * owed
+        return super().march(sources, t_end, looks)
 
     def _failed(self, code: int, sources: Sources) -> Status:
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
@@ -306,32 +301,3 @@ class March(Stepping, NetworkIntegration):
             at[0] = known.count - 1
             self.work.own.keys[:] = self.work.own.key[:] = -1
         known.add(self.problem.scene, wanted)
-
-    def stated_gaps(self) -> FloatArray:
-        return self._stated()[list(self.problem.scene.network.fingers)]
-
-    def _stated(self) -> FloatArray:
-        """Peaks and stated errors of the gaps of all areas; the last row is that of the nodes."""
-        gaps = self.met.copy()
-        u_peak = gaps[:, netassess.PEAK_U]
-        # Round-off, enlarged by the condition of the modes, adds to the truncation error.
-        floor = 4e-16 * (self.references.magnified * (float(u_peak.max(initial=0.0)) + self.u_scale) + u_peak)
-        steepest = 2.0 * gaps[:, netassess.PEAK_F] / np.where(u_peak > 0.0, u_peak, np.inf)
-        gaps[:, netassess.ERROR_U] = SAFETY * gaps[:, netassess.ERROR_U] + floor
-        gaps[:, netassess.ERROR_F] = SAFETY * gaps[:, netassess.ERROR_F] + floor * steepest
-        return gaps
-
-    def stated(self, run: Run) -> None:
-        scene = self.problem.scene
-        run.gaps = self.stated_gaps()
-        run.node_error = float(self._stated()[-1, netassess.ERROR_U])
-        run.margin = 1.0 / float(self.control["magnified"])
-        if self.problem.charge:
-            steps = 1.0 + float(self.counters[readout.ACCEPTED])
-            largest = self.u_scale + float(self.met[:, netassess.PEAK_U].max(initial=0.0))
-            held = float(scene.network.capacitance(scene.area0).sum()) * largest
-            # The relative error of the areas' polynomials is also a relative error of all charge moved.
-            moved = held + float(np.abs(self.y[-self.s_before.size :]).max(initial=0.0))
-            missed = max((area_missed(curve, self.decade) for curve in self.net.curves), default=0.0)
-            error_q = self.charge_error(float(self.collected[1].max(initial=0.0)))
-            run.charge_error = error_q + 4e-16 * held * steps + moved * missed

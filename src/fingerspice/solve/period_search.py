@@ -16,7 +16,8 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.network import network_modes
-from fingerspice.engine import netassess
+from fingerspice.engine import readout
+from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.solve.marching import GUESS
 from fingerspice.solve.netmarching import March
@@ -24,7 +25,8 @@ from fingerspice.solve.nodal import pass_through
 from fingerspice.solve.period import CHARGING, Found, Period, Stopped
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import period_failure
-from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY
+from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
+from fingerspice.solve.track import Track, prepare_system
 
 # Tolerance of the early passes: relative to the last Newton step, and at most, relative to the voltage scale.
 _CRUDE, _FIRST = 1e-3, 1e-4
@@ -50,8 +52,8 @@ _AVERAGES = 3
 class _Pass:
     """Result of one pass over the period: the image of z, its signed error, and the figures of the pass.
 
-    `met` (n_area, 4) has the columns of `netassess`; `rounding` (n_area,) is the round-off of the gap voltages in units
-    of the machine precision times the largest voltage.
+    `met` (n_area, 4) has the columns of `LoopState.peaks`; `rounding` (n_area,) is the round-off of the gap voltages in
+    units of the machine precision times the largest voltage.
     """
 
     end: FloatArray
@@ -71,6 +73,8 @@ class Search:
     def __init__(self, period: Period, rtol: float) -> None:
         self.period, self.rtol, self.passes = period, rtol, 0
         self.implicit = False
+        # The gap voltage that a stack's area curve reaches, V; 0: that of its scene.
+        self.top = 0.0
         # A conserved charge is no unknown. If half a period is used, all voltages change sign: such a charge is 0.
         self.free = ~period.neutral if period.parts == 1 else np.ones(period.rates.size, bool)
         self.slow = np.arange(period.rates.size) >= period.n
@@ -131,7 +135,8 @@ class Search:
         initial = dataclasses.replace(period.problem.initial, y=y)
         problem = dataclasses.replace(period.problem, initial=initial)
         self.passes += 1
-        made = None if self.implicit else self._marched(problem, tol)
+        march = self._marched if problem.scene.stack is None else self._tracked
+        made = None if self.implicit else march(problem, tol)
         if made is None:
             # The exponential steps failed: the implicit method either succeeds or tells that no solution exists.
             self.implicit, made = True, self._collocated(problem, tol)
@@ -149,7 +154,26 @@ class Search:
             return None
         error = np.append(one.form.shape @ one.error[:n], one.error[n:])
         magnified = max(1.0, float(one.control["magnified"]))
-        return one.y, one.s_before, error, _Pass(none, none, one.met.copy(), magnified, one.references.magnified)
+        return one.y, one.s_before, error, _Pass(none, none, one.peaks.copy(), magnified, one.references.magnified)
+
+    def _tracked(self, problem: Problem, tol: float) -> _Made | None:
+        """One pass of a stack; None where it fails before the end."""
+        none, scene = np.zeros(0), problem.scene
+        while True:
+            prepared = prepare_system(scene, self.rtol, self.top)
+            one = Track(problem, prepared, max(tol, FINEST) * self.scale, none, none.astype(bool), False)
+            try:
+                if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
+                    return None
+                break
+            except OutOfRangeError as left:
+                self.top = 1.5 * left.top
+        end, n, model = one.state(), self.period.n, prepared.system.model
+        error = prepared.system.live[int(one.error[n])] @ one.error[:n]
+        if model.mobile:
+            error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
+        figures = _Pass(none, none, one.peaks, max(1.0, float(one.control["magnified"])), np.array([model.k_gap]))
+        return end.y, end.s_before, scene.turn * error, figures
 
     def _collocated(self, problem: Problem, tol: float) -> _Made:
         """One pass by the implicit method, with its error from a coarser pass."""
@@ -298,7 +322,7 @@ class Search:
         memory = self._memory()
         grown = solver @ np.abs(last.error)
         met = last.met[self.fingers]
-        peak, force = met[:, netassess.PEAK_U], met[:, netassess.PEAK_F]
+        peak, force = met[:, readout.PEAK_U], met[:, readout.PEAK_F]
         largest = float(peak.max(initial=0.0))
         gap = np.abs(self.gap)
         # Add round-off, and the last Newton step as a bound of the error that remains after it.

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine import loop, loopstate, readout
-from fingerspice.engine.loop import Looks
+from fingerspice.engine.loop import Circuit, Looks
 from fingerspice.engine.loopstate import LoopState
 from fingerspice.engine.network import Sources
 from fingerspice.engine.pace import Pace
@@ -86,6 +85,12 @@ LONGEST_STEP = 0.6
 KEPT_STEPS = 2000
 
 
+def _steepest(peaks: FloatArray) -> FloatArray:
+    """Largest change of every force (N) for a change of its voltage (V): F ~ u^2 A, and A falls with u."""
+    u = peaks[:, readout.PEAK_U]
+    return np.asarray(2.0 * peaks[:, readout.PEAK_F] / np.where(u > 0.0, u, np.inf))
+
+
 class OutOfRangeError(Exception):
     """A gap voltage left the range of its area's curve, which ends at `top` (V)."""
 
@@ -104,6 +109,14 @@ class Stepping(Integration):
         Bookkeeping of the compiled loop, of type `engine.readout.CONTROL`.
     out : ndarray, shape (width, n_out)
         Output rows as columns.
+    peaks, collected : ndarray
+        As in `LoopState`; those of the gaps whose errors are stated are in the rows `gaps`.
+    branch : ndarray, shape (n, 2)
+        As in `Mesh`.
+    largest : float
+        Voltage (V) beside the peaks that the round-off of the charge goes with.
+    area_error, charge_safety : float
+        Relative error of the areas' polynomials; stated error of the charge over the estimate.
     repeated : int
         Number of periods that were not integrated but repeat another.
     asked : float
@@ -114,6 +127,10 @@ class Stepping(Integration):
 
     looks: Looks
     error: FloatArray
+    gaps: list[int]
+    largest: float
+    area_error: float
+    charge_safety = 1.0
     asked = math.inf
 
     def __init__(
@@ -129,6 +146,8 @@ class Stepping(Integration):
         self.pace = Pace(tol, longest, h_fixed == 0.0, problem.charge)
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.step = np.zeros(1, loopstate.STEP)
+        self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
+        self.branch = np.zeros((0, 2))
         self.out = np.empty((width, t_out.size))
         self.period, self.repeated = problem.waveform.period or math.inf, 0
         self.recorder = Recorder(shown)
@@ -141,8 +160,8 @@ class Stepping(Integration):
     def loop_state(self) -> LoopState:
         """The integration as the compiled loop takes and updates it."""
         return LoopState(
-            self.y, self.error, self.controls, self.counters, self.step, self.outputs, self.kept,
-            self.recorder.room, self.tried,
+            self.y, self.error, self.controls, self.counters, self.step, self.peaks, self.collected, self.outputs,
+            self.kept, self.recorder.room, self.tried,
         )  # fmt: skip
 
     @property
@@ -156,32 +175,85 @@ class Stepping(Integration):
         try_out(self.looks.values, asked / SAFETY)
 
     @abstractmethod
-    def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
-        """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `loopstate`."""
+    def circuit(self, sources: Sources) -> Circuit:
+        """The circuit as the compiled loop takes it, for one call."""
+
+    @property
+    @abstractmethod
+    def rounding(self) -> FloatArray:
+        """Round-off of the voltage of every area's gap and, last, of the nodes, V, shape (n_area + 1,)."""
+
+    @property
+    @abstractmethod
+    def capacitance(self) -> float:
+        """Capacitance of what holds the charge, at the areas at 0 V, F."""
+
+    @property
+    @abstractmethod
+    def margin(self) -> float:
+        """Smallest distance to a fold so far."""
 
     @abstractmethod
     def _failed(self, code: int, sources: Sources) -> Status:
         """Status of a run whose loop ended with a code other than DONE."""
 
-    @abstractmethod
-    def _collected(self) -> Any:
-        """Accumulated error of the charge so far."""
+    def _add_reference(self) -> None:
+        """Make the reference areas that the loop has asked for."""
+        raise NotImplementedError
 
-    @abstractmethod
-    def _pass(self, periods: int, off: float, owed: float, collected: Any) -> None:
+    def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
+        """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `loopstate`."""
+        while True:
+            code = int(loop.march_on(self.circuit(sources), self.pace, self.loop_state(), looks, t_end))
+            if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
+                self.recorder.drain(self.counters)
+            if code == loopstate.REFERENCE:
+                self._add_reference()
+            elif code != loopstate.PAUSED:
+                return code
+
+    def _pass(self, periods: int, off: float, owed: float, collected: FloatArray) -> None:
         """Advance the error by `periods` whole periods, each of which repeats the charge error of the integrated one.
 
         `off` (V) is the error of the voltages of these periods, `owed` (V) that of the charge over the capacitance, and
         `collected` the accumulated error of the charge before the integrated period.
         """
+        self.branch[:, 0] += periods * self.period
+        self.control["branch_start"] += periods * self.period
+        self.peaks[:, readout.ERROR_U] += off
+        self.peaks[:, readout.ERROR_F] += off * _steepest(self.peaks)
+        missed, spread = self.collected - collected
+        self.collected[0] += periods * missed
+        if self.pace.charge:
+            added = periods * float((np.abs(missed) + np.sqrt(spread)).max())
+            self.control["error_q"] += added + self.capacitance * owed
 
-    @abstractmethod
-    def stated_gaps(self) -> FloatArray:
-        """Peaks and stated errors so far, as in `Run.gaps`."""
+    def stated_peaks(self) -> FloatArray:
+        """Peaks so far, of every area's gap and of the nodes, with their stated errors: estimates and round-off."""
+        peaks, floor = self.peaks.copy(), self.rounding
+        peaks[:, readout.ERROR_U] = SAFETY * peaks[:, readout.ERROR_U] + floor
+        peaks[:, readout.ERROR_F] = SAFETY * peaks[:, readout.ERROR_F] + floor * _steepest(peaks)
+        return peaks
 
-    @abstractmethod
     def stated(self, run: Run) -> None:
         """Write the stated errors and the margin into a run."""
+        peaks = self.stated_peaks()
+        run.gaps, run.margin = peaks[self.gaps], self.margin
+        run.node_error = float(peaks[-1, readout.ERROR_U])
+        if self.pace.charge:
+            run.charge_error = self._charge_error()
+
+    def _charge_error(self) -> float:
+        """Stated error of the charge, C; every step adds the round-off of the charge that is held."""
+        # Errors of unknown sign are the same in every period: they add up from one to the next, instead of cancelling.
+        period, steps = self.problem.waveform.period, 1.0 + float(self.counters[readout.ACCEPTED])
+        alike = (self.t - self.problem.t_start) / period - self.repeated if period else 0.0
+        known, spread = float(self.control["error_q"]), float(self.collected[1].max(initial=0.0))
+        estimate = SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
+        held = self.capacitance * (self.largest + float(self.peaks[:, readout.PEAK_U].max()))
+        moved = max(float(self.control["peak_q"]), float(np.abs(self.y[-self.s_before.size :]).max(initial=0.0)))
+        # The relative error of the areas' polynomials is also a relative error of all charge moved.
+        return self.charge_safety * estimate + 4e-16 * held * steps + self.area_error * (held + moved)
 
     def through(self, sources: Sources, t_end: float) -> Status:
         # A period that has been repeated may have led there already.
@@ -190,7 +262,7 @@ class Stepping(Integration):
             if code == loopstate.LOOKED_AT:
                 self._settle()
             elif code == loopstate.EXCESSIVE:
-                if excess_of(self.stated_gaps(), self.problem.rounding) > self.asked:
+                if excess_of(self.stated_peaks()[self.gaps], self.problem.rounding) > self.asked:
                     return Status.ERROR_NOT_MET
             elif code != loopstate.DONE:
                 return self._failed(code, sources)
@@ -201,7 +273,7 @@ class Stepping(Integration):
         found = self.looks.values
         if found[loop.HAS_SETTLED] == 0.0:
             # The voltages have, and the charge has not.
-            tol, finest = self.pace.tol, FINEST * float(self.stated_gaps()[:, 0].max(initial=0.0))
+            tol, finest = self.pace.tol, FINEST * float(self.peaks[self.gaps, readout.PEAK_U].max(initial=0.0))
             share = min(1.0, max(FINER, finest / tol))
             found[loop.ALLOWED], found[loop.FINE] = share * found[loop.ALLOWED], 1.0
             self.pace = self.pace._replace(tol=share * tol)
@@ -221,7 +293,7 @@ class Stepping(Integration):
             self.counters[readout.KEPT] = 0
             self.recorder.drain(self.counters)
             self.kept_from = len(self.recorder.parts)
-            self.before = self.y[-self.s_before.size :].copy(), self._collected()
+            self.before = self.y[-self.s_before.size :].copy(), self.collected.copy()
 
     @property
     def keeps_all(self) -> bool:
@@ -249,17 +321,6 @@ class Stepping(Integration):
         self.control["t"] = stop if abs(stop - reached) <= same_time(stop) else reached
         self._pass(periods, float(found[loop.DISTANCE]), float(found[loop.REMAINING]), collected)
         self.repeated += periods
-
-    def charge_error(self, spread: float) -> float:
-        """Estimated error of the charge, C; `spread` (C^2) is the sum of squares of the errors of unknown sign.
-
-        These errors are the same in every period: they add up from period to period, instead of cancelling at random.
-        """
-        period = self.problem.waveform.period
-        passed = self.t - self.problem.t_start
-        alike = passed / period - self.repeated if period else 0.0
-        known = float(self.control["error_q"])
-        return SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
 
     def recorded(self) -> Recorded | None:
         """The recorded steps of the run so far."""

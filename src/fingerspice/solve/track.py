@@ -12,10 +12,9 @@ from typing import Literal
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import loop, loopstate, readout
+from fingerspice.engine import loopstate, readout
 from fingerspice.engine.exponential import Tables as StepTables
 from fingerspice.engine.exponential import forget, new_tables
-from fingerspice.engine.loop import Looks
 from fingerspice.engine.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.network import Segment, Sources, source
 from fingerspice.engine.pace import end_row
@@ -36,14 +35,16 @@ from fingerspice.solve.initial import (
     row_width,
 )
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Run, kept_with
+from fingerspice.solve.runs import kept_with
 from fingerspice.solve.scenes import Scene
 from fingerspice.solve.sources import segment_index
-from fingerspice.solve.stepping import SAFETY, OutOfRangeError, Stepping, looks_of
+from fingerspice.solve.stepping import OutOfRangeError, Stepping, looks_of
 
 # Number of modal systems cached with a scene: one for each thread and decade of tolerances, of up to 1 MB each.
 MOST_SYSTEMS = 64
-# Stated error of the charge over the estimate; see `Track._charge_error`.
+# Stated error of the charge over the estimate. It comes from a stack whose layers all leak fast: compared with a
+# reference, the errors of gap voltage and charge were 1.5 times the estimates, because they peak between the points of
+# the estimate; and from scene 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
 CHARGE_SAFETY = 1.75
 
 
@@ -146,6 +147,8 @@ class Track(Stepping):
     ) -> None:  # fmt: skip
         scene, start = problem.scene, problem.inner
         self.prepared, self.start, n = prepared, start, start.y.size - 1
+        self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
+        self.area_error = prepared.area_error if prepared.system.model.coupled else 0.0
         shown = scene.shown.turn.size
         super().__init__(problem, tol, t_out, left, shown, shown + 2 if problem.charge else shown, h_fixed)
         self.y = start.y.copy()
@@ -163,14 +166,19 @@ class Track(Stepping):
         model = self.prepared.system.model
         return float(model.slow[-3]) * model.area0
 
-    def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
+    @property
+    def rounding(self) -> FloatArray:
+        u_size = self.problem.scene.u_size
+        # Of the nodes, the peak is that of the gap.
+        return np.asarray(4e-16 * (self.peaks[0, 0] + u_size * np.array([self.prepared.system.model.k_gap, 1.0])))
+
+    @property
+    def margin(self) -> float:
+        return float(self.control["margin"])
+
+    def circuit(self, sources: Sources) -> Stack:
         p = self.prepared
-        stack = Stack(p.system, p.tables, p.work, p.integral, sources.edges, sources.terms, sources.series)
-        while True:
-            code = int(loop.march_on(stack, self.pace, self.loop_state(), looks, t_end))
-            if code != loopstate.PAUSED:
-                return code
-            self.recorder.drain(self.counters)
+        return Stack(p.system, p.tables, p.work, p.integral, sources)
 
     def _failed(self, code: int, sources: Sources) -> Status:
         if code == loopstate.OUT_OF_RANGE:
@@ -179,24 +187,6 @@ class Track(Stepping):
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
             self.control["u_before"], _ = source(*_segment(sources, self.t, "left"))
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
-
-    def _collected(self) -> tuple[float, float]:
-        return float(self.control["collected"]), float(self.control["spread"])
-
-    def _pass(self, periods: int, off: float, owed: float, collected: tuple[float, float]) -> None:
-        self.control["branch_start"] += periods * self.period
-        self.control["error_u"] += off
-        self.control["error_v"] += off
-        if self.control["peak_u"] > 0.0:
-            steepest = 2.0 * self.control["peak_f"] / self.control["peak_u"]
-            self.control["error_f"] += off * steepest
-        if self.pace.charge:
-            missed = self.control["collected"] - collected[0]
-            self.control["collected"] += periods * missed
-            self.control["error_q"] += (
-                periods * (abs(missed) + np.sqrt(self.control["spread"] - collected[1]))
-                + self.capacitance * owed
-            )  # fmt: skip
 
     def state(self) -> State:
         return from_stack(self.problem.scene, self.inner_state())
@@ -241,34 +231,6 @@ class Track(Stepping):
         if recorded is None or not shown.is_turned:
             return recorded
         return dataclasses.replace(recorded, make=partial(_turned, recorded.make, shown.turn))
-
-    def stated_gaps(self) -> FloatArray:
-        control, model = self.control, model_of(self.problem.scene)
-        peak_u, peak_f = float(control["peak_u"]), float(control["peak_f"])
-        # Round-off adds to the truncation error.
-        floor = 4e-16 * (peak_u + model.k_gap * self.problem.scene.u_size)
-        u_error = SAFETY * float(control["error_u"]) + floor
-        f_error = SAFETY * float(control["error_f"]) + 2.0 * floor / (peak_u or 1.0) * peak_f
-        return np.array([[peak_u, peak_f, u_error, f_error]])
-
-    def stated(self, run: Run) -> None:
-        run.gaps, run.margin = self.stated_gaps(), float(self.control["margin"])
-        floor = 4e-16 * (float(self.control["peak_u"]) + self.problem.scene.u_size)
-        run.node_error = SAFETY * float(self.control["error_v"]) + floor
-        if self.problem.charge:
-            run.charge_error = self._charge_error(float(self.control["peak_u"]))
-
-    def _charge_error(self, peak_u: float) -> float:
-        """Estimated error of the charge, C; every step adds the round-off of the charge that a layer holds."""
-        held = self.capacitance * (self.problem.scene.u_size + peak_u)
-        steps = 1.0 + float(self.counters[readout.ACCEPTED])
-        # The relative error of the area's polynomial is also a relative error of all charge moved.
-        moved = held + float(self.control["peak_q"])
-        missed = self.prepared.area_error * moved if self.prepared.system.model.coupled else 0.0
-        # The factor comes from a stack whose layers all leak fast: compared with a reference, the errors of gap voltage
-        # and charge were 1.5 times the estimates, because they peak between the points of the estimate; and from scene
-        # 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
-        return CHARGE_SAFETY * self.charge_error(float(self.control["spread"])) + 4e-16 * held * steps + missed
 
 
 def on_branch(model: Model, state: StackState, sign: float) -> StackState:
