@@ -28,8 +28,8 @@ from typing import Any
 
 import fingerspice as fs
 import fuzz_inputs as make
+from evaluation import evaluate
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
-from fingerspice.netlist import expressions
 from fingerspice.netlist.deck import LONGEST_TITLE
 from fingerspice.netlist.netlist import source_from_text, sweep_from_text
 from fingerspice.netlist.reader import MAX_WARNINGS
@@ -148,7 +148,7 @@ def _read_file(rng: random.Random, bench: Bench) -> object:
 def _evaluate(rng: random.Random, bench: Bench) -> object:
     text, names = make.expression(rng), {"a": 2.0, "w": -1.5, "p0": 1e-6, "Top": 1e300}
     with WATCH.over(bench.folder):
-        value = expressions.evaluate(text, names, Where("deck.cir", 1))
+        value = evaluate(text, names, Where("deck.cir", 1))
     if not abs(value) < float("inf"):
         raise Defect(f"the value is {value}")
     return value

@@ -189,6 +189,12 @@ SOURCES = [
     (("SIN(0 200 100)", "TABLE(a.csv)"), 3, ["'a.csv' does not exist"]),
     (("SIN(0 200 100)", "PWL file=a.txt"), 3, ["'a.txt' does not exist"]),
     (("SIN(0 200 100)", "SINE(0 200 100 0 0 0 5)"), 3, ["SINE takes at most 6", "Ncycles is not supported"]),
+    (
+        ("SIN(0 200 100)", "SIN(0 200 100 r=0)"),
+        3,
+        ["SIN has no parameter 'r'; allowed: SIN(VO VA FREQ TD THETA PHASE)"],
+    ),
+    (("SIN(0 200 100)", "SQUARE(9 1 duty=.2)"), 3, ["SQUARE has no parameter 'duty'; allowed: SQUARE(amplitude"]),
     (("SIN(0 200 100)", "PULSE(0 1 0 1u 1u 1m 2m 5)"), 3, ["PULSE takes at most 7", "Ncycles is not supported"]),
     (("SIN(0 200 100)", "SIN(0 200 100) Lser=1"), 3, ["Vdrive takes no parameter 'lser'; allowed: Rser, Cpar"]),
     (("SIN(0 200 100)", "SIN(0 200 100 0 0 90°)"), 3, ["'90°' is not a number: write 90"]),

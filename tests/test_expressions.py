@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
+from evaluation import evaluate
 from fingerspice.base.errors import InputError, Where
-from fingerspice.netlist.expressions import FUNCTIONS, evaluate
+from fingerspice.netlist.expressions import FUNCTIONS
 from ngspice_tools import call_ngspice
 
 HERE = Where("deck.cir", 3, 10)

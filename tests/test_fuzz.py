@@ -20,8 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fuzz
+from evaluation import evaluate
 from fingerspice.base.errors import InputError, Where
-from fingerspice.netlist.expressions import FUNCTIONS, evaluate
+from fingerspice.netlist.expressions import FUNCTIONS, compiled
 from fingerspice.netlist.lexer import group, lex, logical_lines, split_lines
 
 HERE = Where("deck.cir", 1)
@@ -136,7 +137,7 @@ def test_memory_that_is_kept_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_reading_the_same_again_keeps_nothing() -> None:
     def blocks_after() -> int:
         fuzz.run(400, seed="again")
-        fuzz.expressions.compiled.cache_clear()
+        compiled.cache_clear()
         fuzz.gc.collect()
         return sys.getallocatedblocks()
 

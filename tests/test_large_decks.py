@@ -13,11 +13,11 @@ import pytest
 
 import fingerspice as fs
 import fuzz
+from evaluation import evaluate
 from fingerspice.base.errors import LONGEST_MESSAGE, FingerspiceWarning, InputError, Where
 from fingerspice.circuit import topology
 from fingerspice.netlist import flatten, reader
 from fingerspice.netlist.deck import LONGEST_TITLE, parse_deck
-from fingerspice.netlist.expressions import evaluate
 from fingerspice.netlist.slips import nearest
 from fingerspice.netlist.words import Number
 

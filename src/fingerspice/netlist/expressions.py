@@ -199,7 +199,7 @@ class _Parser:
         return partial(_folded, first, rest)
 
     def _signed(self, of_power: bool = False) -> Term:
-        """A value behind its signs.
+        """A value or a power behind its signs; in an exponent (`of_power`) no second power follows.
 
         ngspice moves a minus after an operator to the next number in the text, wherever that stands, so that `2*-(3)+4`
         is 2 there, and applies it before a power, so that `2*-3^2` is 18: such a minus is refused.
@@ -209,8 +209,12 @@ class _Parser:
             negative ^= sign.text == "-"
             if self._at - begin > MAX_SIGNS:
                 raise Problem(f"more than {MAX_SIGNS} signs in a row", sign.position)
-        end = self._at
-        value = self._raised(of_power)
+        end, value = self._at, self._value()
+        power = self._take(*_POWERS)
+        if power is not None:
+            if of_power:  # ngspice groups to the left, and mathematics to the right
+                raise Problem("a second '^' in a row has two readings: use brackets", power.position)
+            value = partial(_folded, value, [(_power, self._signed(of_power=True))])
         for index in range(max(begin, 1), end):
             before, sign, number, after = self.pieces[index - 1 : index + 3]
             moved = number.kind != "number" or (after.text in _POWERS and before.text not in _POWERS)
@@ -218,16 +222,6 @@ class _Parser:
                 problem = "a '-' after an operator has two readings here: use brackets, as in 2*(-x)"
                 raise Problem(problem, sign.position)
         return (lambda names: -value(names)) if negative else value
-
-    def _raised(self, of_power: bool) -> Term:
-        """`a^b`; `a^b^c` is refused, which ngspice groups to the left and mathematics to the right."""
-        base = self._value()
-        found = self._take(*_POWERS)
-        if found is None:
-            return base
-        if of_power:
-            raise Problem("a second '^' in a row has two readings: use brackets", found.position)
-        return partial(_folded, base, [(_power, self._signed(of_power=True))])
 
     def _value(self) -> Term:
         """A number, a name, or what is in brackets."""
@@ -358,12 +352,3 @@ def compiled(text: str) -> Expression:
     term = parser.whole()
     mega = next(((p.text, p.position) for p in parser.pieces if p.kind == "number" and suspicious_mega(p.text)), None)
     return Expression(text, parser.names, mega, term)
-
-
-def evaluate(text: str, names: Mapping[str, float], where: Where) -> float:
-    """Value of an expression, whose names are matched without case; `where` is the place of its first character."""
-
-    def place(position: int) -> Where:
-        return Where(where.file, where.line, where.column + position)
-
-    return compile_expression(text, place).evaluate({name.lower(): value for name, value in names.items()}, place)

@@ -144,14 +144,11 @@ def library_changed(root: Path, folder: Path, name: str) -> bool:
         if path.stat().st_size > 4 * len(own):
             return True
         text = read_text(path, name)
-        return text != own and _lines(text) != _lines(own)
+        read, shipped = ([line.rstrip() for line in split_lines(x.rstrip())] for x in (text, own))
+        return read != shipped
     except (OSError, ValueError, RuntimeError):
         # A file that cannot be read is not this version's library.
         return True
-
-
-def _lines(text: str) -> list[str]:
-    return [line.rstrip() for line in split_lines(text.rstrip())]
 
 
 def _similar_file(path: Path, shown: str, root: Path | None) -> str:

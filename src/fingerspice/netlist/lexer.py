@@ -206,7 +206,7 @@ def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Gro
             if not brackets:
                 raise InputError("')' without an opening '('", lexeme.where)
             inside = brackets.pop()[1]
-        elif following == "(" and _may_be_called(lexeme) and len(top.words) >= plain:
+        elif following == "(" and lexeme.kind == "word" and not _NUMERIC.match(lexeme.text) and len(top.words) >= plain:
             if inside is not top:
                 name = lexeme.text
                 problem = f"'{name}(' inside brackets: arithmetic goes in braces, as in {{{name}(...)}}"
@@ -223,10 +223,6 @@ def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Gro
     if brackets:
         raise InputError("'(' is never closed", brackets[-1][0].where)
     return top
-
-
-def _may_be_called(lexeme: Lexeme) -> bool:
-    return lexeme.kind == "word" and _NUMERIC.match(lexeme.text) is None
 
 
 def _with_brackets(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int]:

@@ -63,22 +63,17 @@ def parse_netlist(text: str, path: str | Path | None = None) -> Circuit:
 
 
 def _circuit(deck: Deck) -> Circuit:
-    notes: list[str] = list(deck.warnings)
+    """The circuit of a deck; an error without a place gets the deck's name, and a note if the title is a statement."""
     try:
-        circuit = _read(deck, notes)
+        circuit = _read(deck, list(deck.warnings))
     except InputError as error:
-        raise _in_deck(error, deck) from None
+        told = with_comma(error, deck.warnings)
+        text = told.message if told.where else f"{deck.path or '<netlist>'}: {told.message}"
+        title = [note for note in deck.warnings if "the first line is the title" in note]
+        raise InputError("; note ".join([text, *title]), told.where) from None
     for note in circuit.warnings:
         warnings.warn(note, FingerspiceWarning, stacklevel=3)
     return circuit
-
-
-def _in_deck(error: InputError, deck: Deck) -> InputError:
-    """The error with the deck's name if it has no place, and with a note if the title reads like a statement."""
-    error = with_comma(error, deck.warnings)
-    text = error.message if error.where else f"{deck.path or '<netlist>'}: {error.message}"
-    title = [note for note in deck.warnings if "the first line is the title" in note]
-    return InputError("; note ".join([text, *title]), error.where)
 
 
 def _read(deck: Deck, notes: list[str]) -> Circuit:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import ChainMap
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
@@ -110,11 +111,7 @@ class Scope:
 
     def references(self, lexeme: Lexeme) -> dict[str, float]:
         """Values in this scope of the parameters in a lexeme; empty if the lexeme is not arithmetic."""
-        try:
-            names = compiled(lexeme.text).names
-        except Problem:
-            return {}
-        return {name: self._visible[name] for name in names if name in self._visible}
+        return {name: self._visible[name] for name in _names_in(lexeme.text) or () if name in self._visible}
 
     def value(self, lexeme: Lexeme, bare: Bare = "nothing") -> Value:
         """Number or token of a word, string or expression; `bare` is what is evaluated without braces."""
@@ -146,11 +143,8 @@ class Scope:
             return True
         if _OPERATOR.search(text) is None or _PLAIN_NUMBER.fullmatch(text):
             return False
-        try:
-            names = compiled(text).names
-        except Problem:
-            return False
-        return all(name in self._visible or name in CONSTANTS for name in names)
+        names = _names_in(text)
+        return names is not None and all(name in self._visible or name in CONSTANTS for name in names)
 
     def pairs(self, group: Group, bare: Bare = "nothing") -> dict[str, Value]:
         """Values of `key=value` pairs, each with the place of its key."""
@@ -164,6 +158,14 @@ class Scope:
         assert group.name is not None
         args = tuple(self.value(word) for word in group.words if isinstance(word, Lexeme))
         return Call(group.name.text, args, self.pairs(group), group.name.where)
+
+
+def _names_in(text: str) -> Mapping[str, int] | None:
+    """The names in an expression; None if it is not arithmetic."""
+    try:
+        return compiled(text).names
+    except Problem:
+        return None
 
 
 def definitions(line: Line, start: int) -> list[Assignment]:
