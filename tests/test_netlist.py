@@ -326,6 +326,11 @@ def test_a_capital_m_in_a_change_is_milli_and_warned_about() -> None:
     assert changed["Xcoat"].values["r"] == 2e-4
 
 
+def test_a_rate_has_no_prefix_where_changes_are_told() -> None:
+    changed = read().replace({"Vdrive": "SIN(0 200 100 0 5k)"}).replace({"Vdrive.damping": 2e-3})
+    assert "Vdrive.damping = 0.002 1/s" in str(changed)
+
+
 def test_a_circuit_cannot_be_changed_in_place() -> None:
     circuit = read()
     with pytest.raises(dataclasses.FrozenInstanceError):

@@ -41,7 +41,7 @@ def _network(circuit: Circuit) -> Network:
 def _of_stack(circuit: Circuit, skin_at: float | None) -> Network:
     stack = build_stack(circuit, skin_at)
     network = shared(circuit, ("loop network", skin_at), lambda: loop_network(stack))
-    return dataclasses.replace(network, sources=(_source(stack),), stack=stack)
+    return network if network.stack is stack else dataclasses.replace(network, sources=(_source(stack),), stack=stack)
 
 
 def _source(stack: Stack) -> Element:

@@ -267,11 +267,10 @@ def eliminate(over_resistors: FloatArray, over_currents: FloatArray, conductance
     current sources by those of the tree's branches, its own resistors last; `conductance` (n_resistor,) is in S.
     """
     e, r = slice(0, n_e), slice(n_e, None)
-    weight, n_r, n_i = np.sqrt(conductance)[:, None], over_resistors.shape[1] - n_e, over_currents.shape[0]
+    weight = np.sqrt(conductance)[:, None]
     orthogonal, upper = np.linalg.qr(weight * over_resistors[:, r])
-    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_resistors[:, e])) if n_r else np.zeros((0, n_e))
-    back = np.linalg.solve(upper.T, over_currents[:, r].T) if n_r else np.zeros((0, n_i))
-    from_i = -np.linalg.solve(upper, back) if n_r else back
+    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_resistors[:, e]))
+    from_i = -np.linalg.solve(upper, np.linalg.solve(upper.T, over_currents[:, r].T))
     by_e = over_resistors[:, e] + over_resistors[:, r] @ from_e
     by_i = over_resistors[:, r] @ from_i
     into_e = by_e.T @ (conductance[:, None] * by_e)
@@ -326,23 +325,21 @@ def network_modes(network: Network, area: FloatArray) -> Modes:
     """
     capacitance, leak = network.capacitance(area), network.leak(area)
     n, n_v = network.k.shape[0], network.n_voltage
-    lower = np.linalg.cholesky(network.mass(area)) if n else np.zeros((0, 0))
+    lower = np.linalg.cholesky(network.mass(area))
     weight = np.sqrt(leak)[:, None]
     factor = np.vstack([network.resistor_factor, weight * network.p])
     factor_s = np.vstack([network.resistor_factor_s, weight * network.q])
-    left, sigma, turned = np.zeros((factor.shape[0], 0)), np.zeros(0), lower
-    if factor.size:
-        left, sigma, turned = np.linalg.svd(np.linalg.solve(lower, factor.T).T)
+    left, sigma, turned = np.linalg.svd(np.linalg.solve(lower, factor.T).T)
     rates = np.zeros(n)
     rates[: sigma.size] = sigma**2
     # The computed rate of a charge that no conductance drains is round-off.
     rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0
     inverse = turned @ lower.T
-    take = turned @ (np.linalg.solve(lower, network.p.T) if n else network.p.T)
+    take = turned @ np.linalg.solve(lower, network.p.T)
     moved = take @ (capacitance[:, None] * network.q)
     pushed = np.zeros((n, network.b.shape[1]))
     pushed[: sigma.size] = sigma[:, None] * (left[:, : sigma.size].T @ factor_s)
-    pushed[:, n_v:] += turned @ (np.linalg.solve(lower, network.b[:, n_v:]) if n else network.b[:, n_v:])
-    shape = np.linalg.solve(lower.T, turned.T) if n else turned.T
+    pushed[:, n_v:] += turned @ np.linalg.solve(lower, network.b[:, n_v:])
+    shape = np.linalg.solve(lower.T, turned.T)
     gains = rates[:, None] * moved - pushed
     return Modes(*(np.asarray(x, float) for x in (rates, gains, shape, inverse, shape @ moved, take)))

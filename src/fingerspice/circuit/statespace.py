@@ -10,7 +10,6 @@ sum v_x = 0 fixes the neutral gauge of the leaked charges. So N layers have N - 
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -103,8 +102,8 @@ class Stack:
 
     def between(self, hops: tuple[Hop, ...]) -> Stack:
         """The stack of the same layers between other sources; it keeps what has been computed from the layers."""
-        changed = copy.copy(self)
-        vars(changed).update(hops=hops)
+        changed = object.__new__(Stack)
+        vars(changed).update({**vars(self), "hops": hops})
         for name in ("waveform", "_of_whole_layers"):
             vars(changed).pop(name, None)
         return changed
@@ -221,7 +220,8 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
                 "another network; allowed for any network: simulate (run), plan, phasor (ac) and export"
             )
         key = ("stack", skin_at, circuit.work)
-        return shared(circuit, key, lambda: _build(circuit, loop, skin_at)).between(loop.hops)
+        found = shared(circuit, key, lambda: _build(circuit, loop, skin_at))
+        return found if found.hops is loop.hops else found.between(loop.hops)
 
     return circuit.remember(("stack", skin_at), make)
 

@@ -82,8 +82,11 @@ def _no_source(beside: Element) -> Element:
 
 def driving(circuit: Circuit) -> list[Element]:
     """The V and I elements that do not give an area, of any circuit."""
-    areas = {e.nodes[2] for e in circuit.elements if e.spec.is_layer}
-    return [e for e in circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
+    if "driving" not in circuit.related:
+        areas = {e.nodes[2] for e in circuit.elements if e.spec.is_layer}
+        found = (e for e in circuit.by_device("V", "I") if areas.isdisjoint(e.nodes))
+        circuit.related["driving"] = {e.name for e in found}
+    return [e for e in circuit.elements if e.name in circuit.related["driving"]]
 
 
 def driving_sources(circuit: Circuit) -> list[Element]:

@@ -17,6 +17,14 @@ def _skin(frequency: str, node: str = "0") -> str:
     return f"Xskin   skin  {node:<4} area  SKIN  d=350u f={frequency}"
 
 
+def _made(gap: str, **changes: str) -> str:
+    """The line of the gap with other values."""
+    for name, value in changes.items():
+        head, _, rest = gap.partition(f" {name}=")
+        gap = f"{head} {name}={value}{rest[len(rest.split()[0]) :]}"
+    return gap
+
+
 def _deck(title: str, *lines: str) -> str:
     return "\n".join([title, ".include fingerspice.lib", *lines, ".end", ""])
 
@@ -24,21 +32,6 @@ def _deck(title: str, *lines: str) -> str:
 def _finger(title: str, source: str, skin: str, tran: str, *more: str, gap: str = _GAP) -> str:
     """Table 1's finger on one source."""
     return _deck(title, f"Vdrive  drive 0          {source}", *more, _COAT, gap, skin, f".tran {tran} uic")
-
-
-_TWO = """\
-Vdrive  drive 0           SIN(0 200 5k)
-.subckt finger drive body area fn=0.5
-Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg
-Xgap    top   skin area  GAP   d=3.5u eps_r=1 r=1meg fn={fn} mu=0.3
-+                              alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000
-Xskin   skin  body area  SKIN  d=350u f=5k
-.ends
-Xfirm   drive body firm   finger fn=0.5
-Xlight  drive body light  finger fn=0.2
-Rbody   body  far         1.5k
-Cbody   far   0           150p
-.tran 0.5u 1m uic"""
 
 
 @dataclass(frozen=True)
@@ -53,14 +46,6 @@ class Example:
     asked: dict[str, object] = field(default_factory=dict)  # Further keys of the request, as in `scene.scene`
 
 
-def _made(gap: str, **changes: str) -> str:
-    """The line of the gap with other values."""
-    for name, value in changes.items():
-        head, _, rest = gap.partition(f" {name}=")
-        gap = f"{head} {name}={value}{rest[len(rest.split()[0]) :]}"
-    return gap
-
-
 _AMPLIFIER = _deck(
     "Finger behind an amplifier with a safety resistor, 5 kHz",
     "Vdrive  amp   0          SIN(0 200 5k)",
@@ -72,6 +57,17 @@ _UNGROUNDED = _finger(
     "User not grounded, 5 kHz", "SIN(0 200 5k)", _skin("5k", "body"), "0.5u 1m",
     "Rbody   body  far        1.5k", "Cbody   far   0          150p",
 )  # fmt: skip
+_TWO = _deck(
+    "Two fingers on one screen, 5 kHz",
+    "Vdrive  drive 0           SIN(0 200 5k)",
+    ".subckt finger drive body area fn=0.5",
+    *(_COAT, _made(_GAP, fn="{fn}"), _skin("5k", "body"), ".ends"),
+    "Xfirm   drive body firm   finger fn=0.5",
+    "Xlight  drive body light  finger fn=0.2",
+    "Rbody   body  far         1.5k",
+    "Cbody   far   0           150p",
+    ".tran 0.5u 1m uic",
+)
 _TONES = _deck(
     "Two tones on a dispersive skin",
     "Vdrive  drive fast       SIN(0 120 100)",
@@ -97,8 +93,7 @@ EXAMPLES: tuple[Example, ...] = (
     Example("square-5k", "Square wave, 5 kHz (Fig. 5, right)", "The force is nearly constant.",
             _finger("Table 1, square wave of 5 kHz", "SQUARE(200 5k)", _skin("5k"), "0.2u 1m")),
     Example("ungrounded", "User not grounded", "The body's capacitance to ground takes voltage.", _UNGROUNDED),
-    Example("two-fingers", "Two fingers of one hand", "A firm and a light finger share a body that floats.",
-            _deck("Two fingers on one screen, 5 kHz", *_TWO.splitlines())),
+    Example("two-fingers", "Two fingers of one hand", "A firm and a light finger share a body that floats.", _TWO),
     Example("amplifier", "Amplifier's limit", "A safety resistor and the cable take voltage at high frequencies.",
             _AMPLIFIER),
     Example("tones", "Two tones, dispersive skin", "The skin's data at all frequencies, for two tones at once.", _TONES,
