@@ -64,6 +64,14 @@ def whole(circuit: fs.Circuit, tmp_path_factory: pytest.TempPathFactory) -> dict
     return tree(path)
 
 
+def copied(whole: dict[str, bytes | None], path: Path) -> None:
+    """Write a store that is given file by file."""
+    for name, content in whole.items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        if content is not None:
+            (path / name).write_bytes(content)
+
+
 def marks(store: Path) -> int:
     return sum(len(files) for _, _, files in os.walk(store / "status" / "c"))
 
@@ -386,10 +394,7 @@ def test_a_chunk_that_is_cut_short_or_not_marked_is_run_again(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
 ) -> None:
     path = tmp_path / "s.zarr"
-    for name, content in whole.items():
-        (path / name).parent.mkdir(parents=True, exist_ok=True)
-        if content is not None:
-            (path / name).write_bytes(content)
+    copied(whole, path)
     os.truncate(path / "error" / "c" / "1" / "7", 100)
     (path / "f_el_mean_periodic" / "c" / "0" / "3").unlink()
     (path / "status" / "c" / "2" / "9").unlink()
@@ -405,10 +410,7 @@ def test_a_chunk_of_which_a_bit_has_changed_is_run_again(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, command: Command
 ) -> None:
     path, rng = tmp_path / "s.zarr", np.random.default_rng(5)
-    for name, content in whole.items():
-        (path / name).parent.mkdir(parents=True, exist_ok=True)
-        if content is not None:
-            (path / name).write_bytes(content)
+    copied(whole, path)
     assert "chunks of 6 arrays are as they were written" in command("check", str(path)).out
     for name in ("f_el_mean_periodic/c/0/3", "error/c/1/7", "status/c/2/9", "Xgap.d/c/5", "Xskin.d/c/63"):
         content = bytearray((path / name).read_bytes())

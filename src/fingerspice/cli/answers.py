@@ -43,7 +43,6 @@ OWN = {
 }
 #: Figures of a signal; a figure that a signal lacks is null.
 FIGURES = ("min", "max", "peak", "mean", "rms", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
-_UNITS = {"u_source": "V", "u_gap": "V", "u_layer": "V", "v": "V", "area": "m^2", "f_el": "N", "f_t": "N"}
 
 
 def blank(command: str | None) -> Answer:
@@ -89,11 +88,13 @@ def of_plan(plan: Plan) -> Answer:
 
 
 def _row(solution: Solution, name: str, summary: dict[str, Any]) -> Answer:
+    from fingerspice.results.signals import SIGNALS
+
     signal, _, element = name.partition(":")
     if not element and signal in ("u_gap", "area", "f_el", "f_t", "friction") and len(solution.gaps) == 1:
         element = solution.gaps[0]
     figures = {figure: summary.get(f"{name}_{figure}") for figure in FIGURES}
-    return {"signal": signal, "element": element or None, "unit": _UNITS.get(signal, "1"), **figures}
+    return {"signal": signal, "element": element or None, "unit": SIGNALS[signal][0], **figures}
 
 
 Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir), - for standard input.")]

@@ -63,10 +63,7 @@ class Store:
     def open(self, overwrite: bool) -> None:
         """Open an existing store of the same run, to continue it; with `overwrite` remove any store.
 
-        Raises
-        ------
-        InputError
-            If the folder is not a store, or the store is damaged or holds another run.
+        A folder that is no store is refused, as is a store that is damaged or of another run.
         """
         if not os.path.lexists(self.path):
             return
@@ -117,13 +114,7 @@ class Store:
         return chunk, *(0 for _ in array.shape[1:])
 
     def write(self, chunk: int, solution: Solution, signals: list[str], about: dict[str, Any], mark: Any) -> None:
-        """Write a chunk, then record it as finished; `mark` is the state from which the run continues.
-
-        Raises
-        ------
-        InputError
-            If it cannot be written; the earlier chunks stay.
-        """
+        """Write a chunk, then record it as finished; `mark` is the state from which the run continues."""
         data, coords = variables(solution, np.ones(solution.t.size, bool), signals)
         data = {"time": coords["time"], **data}
         columns = {name: values.shape[1] if values.ndim > 1 else 0 for name, (_, values, _) in data.items()}
@@ -160,17 +151,12 @@ class Store:
         write_durably(file, json.dumps(about, indent=1).encode())
 
     def to_netcdf(self, path: Path) -> Path:
-        """Write the whole run as NetCDF, piece by piece.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be written, or the disk has too little room.
-        """
+        """Write the whole run as NetCDF, piece by piece."""
         import h5netcdf
 
         group = self.zarr.open_group(self.path, mode="r")
-        arrays = dict(group.arrays())
+        # In an order of their own: that of a folder differs from machine to machine.
+        arrays = dict(sorted(group.arrays()))
         size = sum(array.nbytes for array in arrays.values()) + 2**20
 
         def write(target: Path) -> None:
@@ -208,15 +194,7 @@ def run_streamed(
     answer: Answering, results: Results, circuit: Circuit, how: dict[str, Any], *, chunk: str | None,
     signals: str | None, netcdf: bool,
 ) -> None:  # fmt: skip
-    """Run a circuit, write its chunks to a store, and fill the answer.
-
-    Raises
-    ------
-    InputError
-        If the request cannot be run, the store is damaged or holds another run, or the disk is full.
-    SolveError
-        If the run fails; the chunks before the failure are in the store.
-    """
+    """Run a circuit, write its chunks to a store, and fill the answer; what a failed run has written stays."""
     from fingerspice.solve.streaming import stream
 
     path = results.folder / f"{results.name}.zarr"

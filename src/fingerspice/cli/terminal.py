@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from fingerspice.base.announcing import paced
 from fingerspice.base.errors import FingerspiceWarning, InputError, printable
@@ -21,12 +21,16 @@ from fingerspice.results.outcome import SolveError
 
 #: Largest number of characters of a printed line; the middle of a longer line is left out.
 LONGEST_LINE = 2000
-Report = dict[str, Any]
 Write = Callable[[], Path]
 
 
-def json_text(data: Report) -> str:
-    """Data as JSON, with null for NaN and infinities, which JSON lacks."""
+def say(text: str = "", end: str = "\n") -> None:
+    """Print lines of text, which may come from a deck, in printable characters."""
+    _print("\n".join(printable(line, LONGEST_LINE) for line in text.split("\n")), end)
+
+
+def say_json(data: dict[str, Any]) -> None:
+    """Print data as JSON in ASCII, with null for NaN and infinities, which JSON lacks."""
 
     def clean(x: Any) -> Any:
         if isinstance(x, dict):
@@ -35,17 +39,7 @@ def json_text(data: Report) -> str:
             return [clean(v) for v in x]
         return None if isinstance(x, float) and not math.isfinite(x) else x
 
-    return json.dumps(clean(data), indent=2, allow_nan=False)
-
-
-def say(text: str = "", end: str = "\n") -> None:
-    """Print lines of text, which may come from a deck, in printable characters."""
-    _print("\n".join(printable(line, LONGEST_LINE) for line in text.split("\n")), end)
-
-
-def say_json(data: Report) -> None:
-    """Print data as JSON in ASCII."""
-    _print(json_text(data), "\n")
+    _print(json.dumps(clean(data), indent=2, allow_nan=False), "\n")
 
 
 def _print(text: str, end: str) -> None:
@@ -90,7 +84,8 @@ def plain_errors() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        _fail(said_of(error), 2 if is_input(error) else 1)
+        complain(said_of(error))
+        raise SystemExit(2 if is_input(error) else 1) from None
 
 
 def is_input(error: Exception) -> bool:
@@ -107,11 +102,6 @@ def said_of(error: Exception) -> str:
     place = traceback.extract_tb(error.__traceback__)[-1]
     said = f"{type(error).__name__} in {Path(place.filename).name}:{place.lineno}, {error}"
     return f"this is a fault of fingerspice, please report it with the deck ({said})"
-
-
-def _fail(message: str, code: int) -> NoReturn:
-    complain(message)
-    raise SystemExit(code)
 
 
 class Answering:

@@ -140,14 +140,7 @@ def tidy(path: Path) -> None:
 
 
 def check_store(path: Path) -> dict[str, int]:
-    """Number of chunks of each array of a store, all of which are as they were written.
-
-    Raises
-    ------
-    InputError
-        If it is no store of a run or a sweep, has no checksums, or is damaged; the message names the first file at
-        fault.
-    """
+    """Number of chunks of each array of a store, all as they were written; else an error names the first fault."""
     try:
         head = attributes_of(path)
         about = {file.parent.name: json.loads(file.read_text()) for file in sorted(path.glob("*/zarr.json"))}

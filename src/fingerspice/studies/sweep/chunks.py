@@ -165,11 +165,6 @@ def run_chunk(
 
     Scenes are run within `computing`: a lock, where several chunks of a process are to be computed one after another;
     and written within `writing`.
-
-    Raises
-    ------
-    InputError
-        If a value is out of range, or the store is not there or cannot be written.
     """
     store = work.store
     if not (store.path / "zarr.json").is_file():

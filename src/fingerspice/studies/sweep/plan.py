@@ -230,33 +230,29 @@ def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int
     n, seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
     power = most.bit_length() - 1
     require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
-    grid: dict[str, FloatArray] = {}
-    drawn: dict[str, Any] = {}
-    fixed: dict[str, FloatArray] = {}
-    own: dict[str, dict[str, float]] = {}
-    units: dict[str, str] = {}
     tables = {kind: value for kind, value in parameters.items() if isinstance(value, SetTable)}
+    plan = Plan({}, {}, {}, {}, {}, n, seed, tables)
     taken = [path for value in tables.values() for path in value.columns]
     for given, value in parameters.items():
         if given in tables:
-            grid[given] = np.arange(len(tables[given].names), dtype=float)
+            plan.grid[given] = np.arange(len(tables[given].names), dtype=float)
             continue
         paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
         taken += paths
         _refuse_twice(taken)
         path = ",".join(paths)
         alone = len(paths) == 1
-        own[path] = {one: 1.0 if alone else circuit.parameters[one].value for one in paths}
-        units[path] = circuit.parameters[path].unit if alone else "1"
+        plan.own[path] = {one: 1.0 if alone else circuit.parameters[one].value for one in paths}
+        plan.units[path] = circuit.parameters[path].unit if alone else "1"
         if hasattr(value, "ppf"):
-            drawn[path] = value
+            plan.drawn[path] = value
             continue
         allowed = "a number, an array of numbers, or a frozen distribution of scipy.stats such as norm(3.5e-6, 0.3e-6)"
         array = real_numbers(path, value, allowed)
         require(array.ndim < 2 and array.size > 0, path, f"of shape {array.shape}", "numbers in one row")
-        (grid if array.ndim else fixed)[path] = array
+        (plan.grid if array.ndim else plan.fixed)[path] = array
     _refuse_twice(taken)
-    return Plan(grid, drawn, fixed, own, units, n, seed, tables)
+    return plan
 
 
 def _refuse_twice(paths: list[str]) -> None:

@@ -84,13 +84,7 @@ class SweepStore:
         return all(one.fault(place) is None for _, one, place in self._pieces(index))
 
     def write(self, index: int, values: Mapping[str, NDArray[Any]]) -> None:
-        """Write a chunk, and mark it as done; `values` has every array in the shape of the chunk's part.
-
-        Raises
-        ------
-        InputError
-            If it cannot be written; the chunks before it stay.
-        """
+        """Write a chunk, and mark it as done; `values` has every array in the shape of the chunk's part."""
         try:
             for name, one, place in self._pieces(index):
                 one.put(place, np.asarray(values[name]))
@@ -106,12 +100,8 @@ class SweepStore:
         """Create the store, or make sure that the one there is of this sweep.
 
         `run` is all that determines the bytes, as plain data, and `about` has further attributes of the store; `grid`
-        has the values and attributes (the unit, or `NAMES`) of each parameter of the grid.
-
-        Raises
-        ------
-        InputError
-            If there is something else, or a store of another sweep; nothing is changed then.
+        has the values and attributes (the unit, or `NAMES`) of each parameter of the grid. Anything else there, or a
+        store of another sweep, is refused and left as it is.
         """
         own = json.loads(json.dumps({**run, "kind of checksum": CHECKSUM}, default=float))
         if not os.path.lexists(self.path):

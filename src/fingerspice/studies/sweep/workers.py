@@ -44,14 +44,7 @@ def stored(
     circuit: Circuit, plan: Plan, options: Mapping[str, Any], path: Path, workers: int | None, scheduler: str | None,
     shard: tuple[int, int],
 ) -> Dataset:  # fmt: skip
-    """Run the missing chunks of a sweep, or of a shard of it, and return what the store has.
-
-    Raises
-    ------
-    InputError
-        If the request or a value is not allowed, the folder is there and is no store of this sweep, or the scheduler
-        does not answer.
-    """
+    """Run the missing chunks of a sweep, or of a shard of it, and return what the store has."""
     if workers is not None:
         whole_number("workers", workers, 1)
         if scheduler is not None:
@@ -106,13 +99,7 @@ def _here(work: Work, missing: Sequence[int]) -> Iterator[Done]:
 
 @contextmanager
 def at_work(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """A client of the `workers` that run the chunks on this machine, or of those of a scheduler; None for neither.
-
-    Raises
-    ------
-    InputError
-        If Dask is not installed, no worker can start, or nothing answers at the scheduler's address.
-    """
+    """A client of the `workers` that run the chunks on this machine, or of those of a scheduler; None for neither."""
     if workers is None and scheduler is None:
         yield None
         return
