@@ -43,7 +43,7 @@ def find_drive(
     table: Path, circuit: Circuit, results: Results, picture: bool, options: dict[str, Any]
 ) -> tuple[Any, Writes]:
     """The drive for the friction or force of a table, and the functions that write its files."""
-    from fingerspice.studies.inverse import inverse_drive
+    from fingerspice.studies.design.inverse import inverse_drive
     from fingerspice.studies.wanted import read_wanted
 
     kind, profile = read_wanted(table, options["rate"])
@@ -61,7 +61,7 @@ def map_capability(
     circuit: Circuit, results: Results, picture: bool, limit: float | None, carrier: float | None
 ) -> tuple[Any, Writes]:
     """The map of the friction that the screen can produce, and the functions that write its files."""
-    from fingerspice.studies.capability import capability as find
+    from fingerspice.studies.design.capability import capability as find
 
     if limit is None:
         peaks = [e.waveform.peak(0.0, circuit.tran.stop if circuit.tran else 1.0)
@@ -130,7 +130,7 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.studies.limits import fold_limits, grid_of
+    from fingerspice.studies.design.folds import fold_limits, grid_of
     from fingerspice.studies.reports import limits_csv, limits_text
 
     law = None if capability else "mobile"

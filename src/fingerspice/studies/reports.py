@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from fingerspice.plots.picture import Picture
     from fingerspice.studies.comparison import Comparison
+    from fingerspice.studies.design.folds import FoldLimits
     from fingerspice.studies.fitting import MaterialFit
-    from fingerspice.studies.limits import FoldLimits
     from fingerspice.studies.steady import SteadyState
 
 
