@@ -111,9 +111,11 @@ class Capability(Shown):
         """Picture with a map of the amplitude over frequency and mean, and the largest amplitude over frequency."""
         figure, (left, right) = new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))
         factor, unit = engineering(self.largest_mean, "N")
-        mesh = left.contourf(
-            self.frequency, factor * self.mean, factor * self.amplitude, levels=12, cmap="viridis"
-        )  # fmt: skip
+        f, amplitude = self.frequency, factor * self.amplitude
+        if f.size == 1:
+            # A map needs two frequencies: a single one is drawn as a band around it, with room for the axis to be read.
+            f, amplitude = np.append(0.1 * f, 10.0 * f), np.repeat(amplitude, 2, axis=1)
+        mesh = left.contourf(f, factor * self.mean, amplitude, levels=12, cmap="viridis")
         bar = figure.colorbar(mesh, ax=left, pad=0.02)
         bar.set_label(f"Largest amplitude [{unit}]", fontsize=8)
         bar.ax.tick_params(labelsize=8)
