@@ -98,26 +98,9 @@ def variations() -> tuple[Variation, ...]:
 def make_figures(
     folder: str | Path, *, only: int | Iterable[int] | None = None, progress: Progress | None = None
 ) -> list[Path]:
-    """Write the paper's figures, each as ``figN.png`` with its data in ``figN.csv``.
+    """Write the paper's figures, each as ``figN.png`` with its data in ``figN.csv``, and return the files' paths.
 
-    Parameters
-    ----------
-    folder : str or Path
-        Folder of the files; it is created if it does not exist.
-    only : int or iterable of int, optional
-        Numbers of the wanted figures, from 2 to 5; all by default.
-    progress : callable, optional
-        Called with the fraction done.
-
-    Returns
-    -------
-    list of Path
-        The files written.
-
-    Raises
-    ------
-    InputError
-        If there is no figure of that number, or the folder cannot be written.
+    `only` names the wanted figures, from 2 to 5; all by default. A folder that does not exist is created.
     """
     wanted = list(FIGURES) if only is None else [only] if isinstance(only, int) else list(only)
     for number in wanted:

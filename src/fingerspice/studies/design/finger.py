@@ -63,14 +63,7 @@ class Finger:
 
 
 def the_finger(circuit: Circuit, charge_law: str | None) -> Finger:
-    """The finger and the source of a circuit that has one of each.
-
-    Raises
-    ------
-    InputError
-        If the law is unknown, if there is not exactly one finger and one voltage source, or if the area follows with a
-        delay.
-    """
+    """The finger and the source of a circuit that has one of each; others, and a delayed area, are refused."""
     law = charge_law or circuit.charge_law or "local"
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     gaps = circuit.by_device("GAP")
@@ -134,13 +127,7 @@ class NetworkInverter:
         self._last: tuple[tuple[int, float], ComplexArray] | None = None
 
     def response(self, s: ComplexArray) -> ComplexArray:
-        """Ratio of the gap voltage to the source voltage at complex frequencies (1/s), shape (n,).
-
-        Raises
-        ------
-        InputError
-            If the source does not drive the gap at one of the frequencies.
-        """
+        """Ratio of the gap voltage to the source voltage at complex frequencies (1/s), shape (n,)."""
         net = self._network
         y = self._leak + s[:, None] * self._c
         kernel = net.k + np.einsum("ci,fc,cj->fij", net.p, y, net.p, optimize=True)
