@@ -19,7 +19,6 @@ from PIL import Image
 import fingerspice as fs
 from fingerspice.plots import drawing, traces
 from fingerspice.solve.simulation import simulate
-from fingerspice.studies import reports
 from fingerspice.studies.comparison import compare
 from scenes import deck, table1
 
@@ -183,7 +182,7 @@ def test_a_single_frequency_and_a_source_without_fundamental_are_drawn_too(tmp_p
 @pytest.mark.parametrize("phase", [0.0, 70.0])
 def test_the_phasor_lies_on_the_transient_where_the_area_is_fixed(phase: float) -> None:
     circuit = table1(f"SIN(0 200 100 0 0 {phase})", gap={"a_fix": 35})
-    figure = reports.plot_comparison(compare(circuit))
+    figure = compare(circuit).plot()
     for ax, transient, p, scale in (
         (figure.axes[0], "gap", "gap, phasor", 200.0),
         (figure.axes[1], "electroadhesive force", "electroadhesive force, phasor", 0.2),
@@ -193,7 +192,7 @@ def test_the_phasor_lies_on_the_transient_where_the_area_is_fixed(phase: float) 
 
 def test_the_comparison_shows_its_table() -> None:
     comparison = compare(table1())
-    table = reports.plot_comparison(comparison).axes[2].tables[0].get_celld()
+    table = comparison.plot().axes[2].tables[0].get_celld()
     assert table[1, 0].get_text().get_text() == "Gap voltage at the fundamental [V]"
     assert table[3, 3].get_text().get_text() == f"{comparison.coupled.f_el_mean:.5g}"
 

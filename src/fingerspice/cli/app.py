@@ -318,7 +318,6 @@ def compare(
     """
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.comparison import compare as run_comparison
-    from fingerspice.studies.reports import comparison_table
 
     with Answering("compare", as_json, charge_law=charge_law, rtol=rtol) as answer:
         circuit = read_circuit(deck, changes, source)
@@ -330,7 +329,7 @@ def compare(
         if picture is not None:
             results.open()
         answer.update(method=result.solution.method, **result.to_dict())
-        answer.give(lambda: comparison_table(result), results.pictures(picture, result.plot))
+        answer.give(lambda: str(result), results.pictures(picture, result.plot))
 
 
 for _command in (limits, designs.design, fits.fit, fits.fit_contact, sweeps.sweep):

@@ -131,7 +131,6 @@ def limits(
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
     from fingerspice.studies.design.folds import fold_limits, grid_of
-    from fingerspice.studies.reports import limits_csv, limits_text
 
     law = None if capability else "mobile"
     with Answering("limits", as_json, charge_law=law) as answer:
@@ -154,6 +153,6 @@ def limits(
         with progress("looking for folds") as update:
             result = fold_limits(circuit, points=points, span=span, progress=update)
         results.open()
-        writes = [lambda: limits_csv(result, table), *results.pictures(picture, result.plot)]
+        writes = [lambda: result.to_csv(table), *results.pictures(picture, result.plot)]
         answer.update(**result.to_dict())
-        answer.give(lambda: limits_text(result), writes)
+        answer.give(lambda: str(result), writes)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, real_number, whole_number
 from fingerspice.base.errors import InputError
-from fingerspice.base.pages import Page, Shown
+from fingerspice.base.files import write_csv
+from fingerspice.base.pages import Page, Shown, Table
+from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import heading
+from fingerspice.circuit.describe import head_lines, heading
 from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.solve.folding import meets_fold
@@ -75,9 +78,22 @@ class FoldLimits(Shown):
     sweeps: tuple[FoldSweep, ...]
 
     def _page(self) -> Page:
-        from fingerspice.studies.reports import limits_text
-
-        return limits_text(self)
+        own = format_si(self.peak, "V")
+        if math.isfinite(self.voltage):
+            head = (
+                f"under the mobile law this deck folds at {format_si(self.voltage, 'V')} peak; its source reaches "
+                f"{own}, {100.0 * self.peak / self.voltage:.3g} % of that"
+            )
+        else:
+            head = f"under the mobile law this deck does not fold; its source reaches {own}"
+        lines: list[str | Table] = [*head_lines(self.circuit), head]
+        for sweep in self.sweeps:
+            rows = [
+                (format_si(x, sweep.unit), format_si(u, "V") if math.isfinite(u) else "none")
+                for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
+            ]
+            lines += ["", Table((sweep.name, "folds at"), rows)]
+        return Page(lines)
 
     def plot(self) -> Picture:
         """Picture of the fold's voltage against every parameter, with a mark at the deck's own point."""
@@ -101,6 +117,15 @@ class FoldLimits(Shown):
         """Plain data, SI units."""
         sweeps = [{name: np.asarray(x).tolist() for name, x in vars(sweep).items()} for sweep in self.sweeps]
         return {"peak": self.peak, "voltage": self.voltage, "sweeps": sweeps}
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write the map as CSV; a row without a fold has an empty voltage."""
+        rows = [
+            (sweep.name, x, sweep.unit, u if math.isfinite(u) else "")
+            for sweep in self.sweeps
+            for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
+        ]
+        return write_csv(path, ("parameter", "value [SI]", "unit", "fold [V]"), rows)
 
 
 def grid_of(points: int, span: float) -> tuple[int, float]:
