@@ -120,7 +120,9 @@ class Comparison(Shown):
 
     def plot(self) -> Picture:
         """Picture of one period of the transient and of the phasor, with the figures of both."""
-        figure, axes = drawing.new_figure(3, height=5.6, height_ratios=[1.3, 1.3, 0.75])
+        # The table has four rows for each GAP.
+        more = 0.53 * (len(self.gaps) - 1)
+        figure, axes = drawing.new_figure(3, height=5.6 + 1.67 * more, height_ratios=[1.3, 1.3, 0.75 + more])
         solution, p = self.solution, self.phasor
         runs = [lines.Drawn(solution, "")]
         start, stop = float(solution.t[0]), float(solution.t[-1])
@@ -157,10 +159,12 @@ class Comparison(Shown):
             marks = unit.replace("deg", "°").replace("^2", "²")
             cells.append([f"{label} [{marks}]", *(text.replace("-", "−") for text in texts)])
         ax.axis("off")
-        widths = [0.36, *[0.128] * 5]
+        # Names of GAPs need more room.
+        first, size = (0.36, drawing.FONT - 0.5) if len(self.gaps) == 1 else (0.42, drawing.SMALL)
+        widths = [first, *[0.2 * (1.0 - first)] * 5]
         table = ax.table([head, *cells], cellLoc="right", loc="center", edges="horizontal", colWidths=widths)
         table.auto_set_font_size(False)
-        table.set_fontsize(drawing.FONT - 0.5)
+        table.set_fontsize(size)
         for (row, column), cell in table.get_celld().items():
             cell.set_edgecolor("#BBBBBB")
             cell.set_linewidth(0.6)

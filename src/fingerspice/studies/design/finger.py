@@ -163,7 +163,7 @@ def gap_voltages(curve: ForceCurve, force: FloatArray, rate: float, carrier: flo
     u = curve.amplitude(force)
     # The rise has zero first and second derivative at both ends.
     x = np.arange(lead) / max(lead, 1)
-    u = np.append(u[0] * x**3 * (10.0 - 15.0 * x + 6.0 * x * x), u)
+    u = np.append(u[0] * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x)), u)
     if carrier is not None:
         u *= np.sin(2.0 * np.pi * carrier / rate * (np.arange(u.size) - lead))
     return u
