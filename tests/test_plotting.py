@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import math
 import os
 import subprocess
@@ -195,6 +196,15 @@ def test_the_comparison_shows_its_table() -> None:
     table = comparison.plot().axes[2].tables[0].get_celld()
     assert table[1, 0].get_text().get_text() == "Gap voltage at the fundamental [V]"
     assert table[3, 3].get_text().get_text() == f"{comparison.coupled.f_el_mean:.5g}"
+
+
+def test_the_table_of_several_fingers_has_room_for_their_names() -> None:
+    figure = compare(fs.read_netlist(Path(__file__).parents[1] / "circuits" / "two_fingers.cir"), rtol=1e-5).plot()
+    figure.canvas.draw()
+    cells = figure.axes[2].tables[0].get_celld()
+    for row in range(1, 9):
+        texts = [cells[row, column].get_text().get_window_extent() for column in range(6)]
+        assert all(left.x1 < right.x0 for left, right in itertools.pairwise(texts))
 
 
 def test_a_picture_has_150_dots_an_inch_or_more(sine: fs.Solution, tmp_path: Path) -> None:

@@ -21,6 +21,8 @@ from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from fingerspice.plots.picture import Picture
 
 _FULL = 2.0**31
@@ -154,13 +156,14 @@ class InverseDrive(Shown):
         scale, unit = drawing.engineering(float(at[-1]), "s")
         force, newton = drawing.engineering(float(wanted.max(initial=0.0)) or 1.0, "N")
         small, milli = drawing.engineering(max(self.worst, 1e-12), "N")
-        for ax, t, x, style in (
+        lines: list[tuple[Axes, FloatArray, FloatArray, dict[str, Any]]] = [
             (top, self.times, force * wanted, {"color": drawing.BLACK, "linewidth": 2.2, "label": "wanted"}),
             (top, self.times, force * reached,
              {"color": drawing.ORANGE, "linewidth": 1.2, "linestyle": (0, (4, 1.5)), "label": "reached"}),
             (middle, self.times, small * self._miss, {"color": drawing.VERMILION, "linewidth": 1.0}),
             (bottom, at, volts, {"color": drawing.BLUE, "linewidth": 0.9}),
-        ):  # fmt: skip
+        ]  # fmt: skip
+        for ax, t, x, style in lines:
             ax.plot(*drawing.thin(scale * t, x), **style)
         drawing.dress(top, f"{self.kind.capitalize()} [{newton}]")
         drawing.legend_above(top, 2)

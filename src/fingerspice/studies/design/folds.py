@@ -181,7 +181,8 @@ def fold_limits(
         skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
         varied.append(("frequency", "Hz", [f"{sources[0].name}.frequency", *skins]))
     factors = np.geomspace(1.0 / span, span, points)
-    around, sweeps = fold_voltage(circuit, peak, t_stop), []
+    around = fold_voltage(circuit, peak, t_stop)
+    sweeps: list[FoldSweep] = []
     for name, unit, paths in varied:
         own, voltages, guess = float(circuit.parameters[paths[0]].value), np.zeros(points), peak
         for i, x in enumerate(factors):

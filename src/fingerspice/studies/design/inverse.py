@@ -216,7 +216,8 @@ class Task:
         def means(fine: FloatArray) -> FloatArray:
             parts = (fine[:-2:2] + 4.0 * fine[1::2] + fine[2::2]) / (6.0 * self.rate)
             total = np.append(0.0, np.cumsum(parts))
-            return np.diff(np.interp(edges, np.arange(total.size) / self.rate, total)) / np.diff(edges)
+            at_edges = np.interp(edges, np.arange(total.size) / self.rate, total)
+            return np.asarray(np.diff(at_edges) / np.diff(edges))
 
         return 0.5 * (edges[1:] + edges[:-1]), means(self.wanted), means(reached)
 
