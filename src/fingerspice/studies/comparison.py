@@ -30,7 +30,7 @@ from fingerspice.solve.runs import Progress
 from fingerspice.studies.phasors import phasor
 from fingerspice.studies.steady import steady_state
 from fingerspice.studies.sweeps import Drive, sweep_drive, sweep_notes
-from fingerspice.waveforms.waveform import Sine, Waveform
+from fingerspice.waveforms.waveform import Sine
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -345,20 +345,16 @@ def _sweep(
 ) -> PhasorSolution:  # fmt: skip
     (source, sign), *_ = scene.sources
     name = scene.layers[scene.gap]
-    skins = [e.name for e in circuit.by_device("SKIN")]
+    skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     gains, areas, forces, amplitude = [], [], [], drive.amplitude
-    for f in frequency:
-        changes: dict[str, float | Waveform] = {f"{name}.f": float(f) for name in skins}
-        changes[source.name] = Sine(amplitude, float(f))
-        state = steady_state(
-            circuit.varied(changes), charge_law=charge_law, rtol=rtol, points=POINTS, charge=False
-        )  # fmt: skip
-        s = state.solution
+    for f in frequency.tolist():
+        changed = circuit.varied({**dict.fromkeys(skins, f), source.name: Sine(amplitude, f)})
+        s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution
         # The output starts at a multiple of the period, so that phases from its start are phases relative to the
         # source.
         period = s.t - s.t[0]
         area, force = (s.by_name(key)[key if len(s.gaps) == 1 else f"{key}:{name}"] for key in ("area", "f_el"))
-        gains.append([weigh_outputs(period, u).phasor(float(f)) * sign / amplitude for u in s.u_layer.T])
+        gains.append([weigh_outputs(period, u).phasor(f) * sign / amplitude for u in s.u_layer.T])
         areas.append(weigh_outputs(period, area).mean())
         forces.append(weigh_outputs(period, force).mean())
         one()
