@@ -42,7 +42,7 @@ MANY_PARAMETERS = {
     "cli.fit.fit",
     "cli.sweep.sweep",
     "cli.fit.fit_contact",
-    "studies.inverse.inverse_drive",
+    "studies.design.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
     "studies.batch.batch",

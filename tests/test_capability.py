@@ -131,6 +131,13 @@ def test_the_picture_is_a_map_and_a_curve() -> None:
     assert right.get_lines()[0].get_xdata().size == 3
 
 
+def test_a_single_frequency_has_a_picture_too() -> None:
+    left, right = fs.capability(table1(), 150.0, frequency=[60.0], means=4).plot().axes[:2]
+    low, high = left.get_xlim()
+    assert low < 60.0 < high
+    assert right.get_lines()[0].get_xdata().tolist() == [60.0]
+
+
 def test_the_command_writes_table_and_picture(command: Command) -> None:
     result = command("limits", "pad.cir", "--capability", "--limit", "120", "--out", "maps", "--json")
     answer = json.loads(result.out)

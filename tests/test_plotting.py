@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import math
 import os
 import subprocess
@@ -19,7 +20,6 @@ from PIL import Image
 import fingerspice as fs
 from fingerspice.plots import drawing, traces
 from fingerspice.solve.simulation import simulate
-from fingerspice.studies import reports
 from fingerspice.studies.comparison import compare
 from scenes import deck, table1
 
@@ -183,7 +183,7 @@ def test_a_single_frequency_and_a_source_without_fundamental_are_drawn_too(tmp_p
 @pytest.mark.parametrize("phase", [0.0, 70.0])
 def test_the_phasor_lies_on_the_transient_where_the_area_is_fixed(phase: float) -> None:
     circuit = table1(f"SIN(0 200 100 0 0 {phase})", gap={"a_fix": 35})
-    figure = reports.plot_comparison(compare(circuit))
+    figure = compare(circuit).plot()
     for ax, transient, p, scale in (
         (figure.axes[0], "gap", "gap, phasor", 200.0),
         (figure.axes[1], "electroadhesive force", "electroadhesive force, phasor", 0.2),
@@ -193,9 +193,18 @@ def test_the_phasor_lies_on_the_transient_where_the_area_is_fixed(phase: float) 
 
 def test_the_comparison_shows_its_table() -> None:
     comparison = compare(table1())
-    table = reports.plot_comparison(comparison).axes[2].tables[0].get_celld()
+    table = comparison.plot().axes[2].tables[0].get_celld()
     assert table[1, 0].get_text().get_text() == "Gap voltage at the fundamental [V]"
     assert table[3, 3].get_text().get_text() == f"{comparison.coupled.f_el_mean:.5g}"
+
+
+def test_the_table_of_several_fingers_has_room_for_their_names() -> None:
+    figure = compare(fs.read_netlist(Path(__file__).parents[1] / "circuits" / "two_fingers.cir"), rtol=1e-5).plot()
+    figure.canvas.draw()
+    cells = figure.axes[2].tables[0].get_celld()
+    for row in range(1, 9):
+        texts = [cells[row, column].get_text().get_window_extent() for column in range(6)]
+        assert all(left.x1 < right.x0 for left, right in itertools.pairwise(texts))
 
 
 def test_a_picture_has_150_dots_an_inch_or_more(sine: fs.Solution, tmp_path: Path) -> None:

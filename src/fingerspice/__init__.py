@@ -37,13 +37,17 @@ if TYPE_CHECKING:
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream
     from fingerspice.studies.batch import batch as batch
-    from fingerspice.studies.capability import Capability as Capability
-    from fingerspice.studies.capability import capability as capability
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.comparison import large_signal as large_signal
     from fingerspice.studies.contactfit import fit_contact as fit_contact
     from fingerspice.studies.contactresult import ContactFit as ContactFit
+    from fingerspice.studies.design.capability import Capability as Capability
+    from fingerspice.studies.design.capability import capability as capability
+    from fingerspice.studies.design.drive import InverseDrive as InverseDrive
+    from fingerspice.studies.design.folds import FoldLimits as FoldLimits
+    from fingerspice.studies.design.folds import fold_limits as fold_limits
+    from fingerspice.studies.design.inverse import inverse_drive as inverse_drive
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
@@ -52,10 +56,6 @@ if TYPE_CHECKING:
     from fingerspice.studies.fitting import ColeCole as ColeCole
     from fingerspice.studies.fitting import MaterialFit as MaterialFit
     from fingerspice.studies.fitting import fit_material as fit_material
-    from fingerspice.studies.inverse import InverseDrive as InverseDrive
-    from fingerspice.studies.inverse import inverse_drive as inverse_drive
-    from fingerspice.studies.limits import FoldLimits as FoldLimits
-    from fingerspice.studies.limits import fold_limits as fold_limits
     from fingerspice.studies.phasors import phasor as phasor
     from fingerspice.studies.steady import SteadyState as SteadyState
     from fingerspice.studies.steady import steady_state as steady_state
@@ -89,7 +89,7 @@ _HOMES = {
     "waveforms.combinations": ("AM", "Burst", "Product", "Repeat", "Sum"),
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
     "studies.batch": ("batch",),
-    "studies.capability": ("Capability", "capability"),
+    "studies.design.capability": ("Capability", "capability"),
     "studies.comparison": ("Comparison", "compare", "large_signal"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "explorer.server": ("Explorer", "explore"),
@@ -100,9 +100,10 @@ _HOMES = {
     "studies.fit": ("fit",),
     "studies.fitresult": ("Fit",),
     "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
-    "studies.inverse": ("InverseDrive", "inverse_drive"),
+    "studies.design.drive": ("InverseDrive",),
+    "studies.design.inverse": ("inverse_drive",),
     "studies.phasors": ("phasor",),
-    "studies.limits": ("FoldLimits", "fold_limits"),
+    "studies.design.folds": ("FoldLimits", "fold_limits"),
     "studies.sweep.populations": ("sobol", "sweep"),
     "results.loading": ("load",),
     "results.outcome": ("Plan", "SolveError", "Status"),

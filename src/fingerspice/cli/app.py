@@ -315,7 +315,6 @@ def compare(
     """
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.comparison import compare as run_comparison
-    from fingerspice.studies.reports import comparison_table
 
     with Answering("compare", as_json, charge_law=charge_law, rtol=rtol) as answer:
         circuit = read_circuit(deck, changes, source)
@@ -325,7 +324,7 @@ def compare(
         results.will_draw("_compare.png", lambda: result.plot(), unless=no_plot)
         result = run_comparison(circuit, charge_law=charge_law, rtol=rtol)
         answer.update(method=result.solution.method, **result.to_dict())
-        answer.give(lambda: comparison_table(result), results.ready())
+        answer.give(lambda: str(result), results.ready())
 
 
 for _command in (

@@ -17,8 +17,8 @@ from fingerspice.cli.terminal import Answering, progress
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
-    from fingerspice.studies.capability import Capability
-    from fingerspice.studies.limits import FoldLimits
+    from fingerspice.studies.design.capability import Capability
+    from fingerspice.studies.design.folds import FoldLimits
 
 
 def number(option: str, text: str | None) -> float | None:
@@ -54,7 +54,7 @@ def design(
 
       fingerspice design wanted.csv circuits/fingerpad_5khz.cir --carrier 5k --limit 200
     """
-    from fingerspice.studies.inverse import inverse_drive
+    from fingerspice.studies.design.inverse import inverse_drive
     from fingerspice.studies.wanted import read_wanted
 
     with Answering("design", as_json, charge_law=charge_law) as answer:
@@ -97,8 +97,7 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.studies.limits import grid_of
-    from fingerspice.studies.reports import limits_csv, limits_text
+    from fingerspice.studies.design.folds import grid_of
 
     law = None if capability else "mobile"
     with Answering("limits", as_json, charge_law=law) as answer:
@@ -111,16 +110,16 @@ def limits(
         largest, tone = number("--limit", limit), number("--carrier", carrier)
         results = Results(deck, circuit, out, name, overwrite, law)
         end = "_capability" if capability else "_limits"
-        results.will_write(f"{end}.csv", lambda file: found.to_csv(file) if capability else limits_csv(found, file))
+        results.will_write(f"{end}.csv", lambda file: found.to_csv(file))
         results.will_draw(f"{end}.png", lambda: found.plot(), unless=no_plot)
         found: Any = _capability(circuit, largest, tone) if capability else _folds(circuit, points, span)
         answer.update(**({"capability": found.to_dict()} if capability else found.to_dict()))
-        answer.give(lambda: str(found) if capability else limits_text(found), results.ready())
+        answer.give(lambda: str(found), results.ready())
 
 
 def _folds(circuit: Circuit, points: int, span: float) -> FoldLimits:
     """Where the mobile law folds."""
-    from fingerspice.studies.limits import fold_limits
+    from fingerspice.studies.design.folds import fold_limits
 
     with progress("looking for folds") as update:
         return fold_limits(circuit, points=points, span=span, progress=update)
@@ -128,7 +127,7 @@ def _folds(circuit: Circuit, points: int, span: float) -> FoldLimits:
 
 def _capability(circuit: Circuit, limit: float | None, carrier: float | None) -> Capability:
     """The friction that the screen can produce, up to the peak of the deck's own sources if there is no limit."""
-    from fingerspice.studies.capability import capability
+    from fingerspice.studies.design.capability import capability
 
     if limit is None:
         stop = circuit.tran.stop if circuit.tran else 1.0

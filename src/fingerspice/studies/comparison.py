@@ -7,18 +7,21 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.base.arrays import FloatArray, positive_row
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.pages import Page, Shown
+from fingerspice.base.pages import Page, Shown, Table
+from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_circuit
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.describe import head_lines
 from fingerspice.circuit.response import LinearScene, linear_scene
 from fingerspice.circuit.usual import beyond_fingers
+from fingerspice.plots import drawing, lines
 from fingerspice.results.measures import weigh_outputs
 from fingerspice.results.phasor_solution import PhasorSolution
 from fingerspice.results.solution import Solution
@@ -26,9 +29,11 @@ from fingerspice.results.summary import Value
 from fingerspice.solve.runs import Progress
 from fingerspice.studies.phasors import Drive, phasor, sweep_drive, sweep_notes
 from fingerspice.studies.steady import steady_state
-from fingerspice.waveforms.waveform import Sine, Waveform
+from fingerspice.waveforms.waveform import Sine
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from fingerspice.plots.picture import Picture
 
 
@@ -47,6 +52,24 @@ class Figures:
     def of_gap(self, i: int) -> dict[str, float]:
         """The figures of one GAP by their names."""
         return {name: float(np.atleast_1d(value)[i]) for name, value in vars(self).items()}
+
+
+class _Kind(NamedTuple):
+    """A figure in a table."""
+
+    unit: str
+    factor: float  # From SI to that unit
+    # text, title: Its name on the page and in the picture
+    text: str
+    title: str
+
+
+_FIGURES = {
+    "amplitude": _Kind("V", 1.0, "gap voltage amplitude", "Gap voltage at the fundamental"),
+    "phase_deg": _Kind("deg", 1.0, "lead over the source", "Its lead over the source"),
+    "f_el_mean": _Kind("N", 1.0, "mean force", "Mean electroadhesive force"),
+    "area_mean": _Kind("mm^2", 1e6, "mean area", "Mean ridge area"),
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -74,15 +97,81 @@ class Comparison(Shown):
     solution: Solution
 
     def _page(self) -> Page:
-        from fingerspice.studies.reports import comparison_table
-
-        return comparison_table(self)
+        rows = []
+        for what, unit, *numbers in self.rows():
+            name, _, gap = what.partition(":")
+            rows.append((f"{_FIGURES[name].text} {gap}".rstrip() + f" [{unit}]", *(f"{x:.6g}" for x in numbers)))
+        head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
+        said = []
+        for i, gap in enumerate(self.gaps):
+            figures = self.phasor, self.mean, self.coupled
+            reference, mean, coupled = (f.of_gap(i)["f_el_mean"] for f in figures)
+            # Round before formatting, and add 0.0, so that -0.00 is not printed.
+            total = round(100.0 * (coupled / reference - 1.0), 2) + 0.0
+            waveform = round(100.0 * (mean / reference - 1.0), 2) + 0.0
+            said.append(
+                f"mean force{f' of {gap}' if len(self.gaps) > 1 else ''}: {total:+.2f} % against the phasor; "
+                f"{total - waveform:+.2f} % of that is the ripple of the area, {waveform:+.2f} % is the waveform's "
+                "(zero for a sine)"
+            )
+        state = f"periodic state at {format_si(self.frequency, 'Hz')}, charge law {self.solution.charge_law}"
+        return Page([*head_lines(self.solution.circuit), state, "", Table(head, rows), "", *said])
 
     def plot(self) -> Picture:
         """Picture of one period of the transient and of the phasor, with the figures of both."""
-        from fingerspice.studies.reports import plot_comparison
+        # The table has four rows for each GAP.
+        more = 0.53 * (len(self.gaps) - 1)
+        figure, axes = drawing.new_figure(3, height=5.6 + 1.67 * more, height_ratios=[1.3, 1.3, 0.75 + more])
+        solution, p = self.solution, self.phasor
+        runs = [lines.Drawn(solution, "")]
+        start, stop = float(solution.t[0]), float(solution.t[-1])
+        source_phase = solution.fundamental.phase if solution.fundamental else 0.0
+        turns = 2.0 * np.pi * self.frequency * solution.t + source_phase
+        of_gaps = [p.of_gap(i) for i in range(len(self.gaps))]
+        waves = [np.sin(turns + np.radians(one["phase_deg"])) for one in of_gaps]
+        voltages = [one["amplitude"] * wave for one, wave in zip(of_gaps, waves, strict=True)]
+        forces = [2.0 * one["f_el_mean"] * wave**2 for one, wave in zip(of_gaps, waves, strict=True)]
+        for ax, keys, curves in zip(axes, (["u_source", "u_gap"], ["f_el"]), (voltages, forces), strict=False):
+            quantity, traces = lines.QUANTITIES[keys[-1]], lines.traces_of(runs, keys)
+            factor, unit = lines.scale_of(quantity, traces, start, stop)
+            for trace in traces:
+                lines.draw_line(ax, trace, factor, start, stop, runs)
+            t = lines.time_unit(runs)[0] * solution.t
+            style: dict[str, Any] = {"color": drawing.BLACK, "linestyle": drawing.DASHES[3], "linewidth": 1.5}
+            for trace, curve in zip(traces[-len(curves) :], curves, strict=True):
+                ax.plot(t, factor * curve, label=f"{trace.label}, phasor", **style)
+            lines.finish_panel(ax, quantity, unit, [factor * trace.x for trace in traces])
+        lines.time_axis(axes[:2], runs, start, stop)
+        self._draw_table(axes[2])
+        drawing.caption(figure, f"{lines.about(solution)} · periodic state; the phasor is of the fundamental alone")
+        figure.align_ylabels(axes[:2])
+        return figure
 
-        return plot_comparison(self)
+    def _draw_table(self, ax: Axes) -> None:
+        split = "transient,\nmean area", "transient,\ncoupled", "coupled −\nphasor", "of it, ripple\nof the area"
+        head = ["", "phasor", *split]
+        cells = []
+        for what, unit, *numbers in self.rows():
+            name, _, gap = what.partition(":")
+            label = f"{_FIGURES[name].title} {gap}".rstrip()
+            texts = [*(f"{x:.5g}" for x in numbers[:3]), *(f"{x:+.2g}" for x in numbers[3:])]
+            marks = unit.replace("deg", "°").replace("^2", "²")
+            cells.append([f"{label} [{marks}]", *(text.replace("-", "−") for text in texts)])
+        ax.axis("off")
+        # Names of GAPs need more room.
+        first, size = (0.36, drawing.FONT - 0.5) if len(self.gaps) == 1 else (0.42, drawing.SMALL)
+        widths = [first, *[0.2 * (1.0 - first)] * 5]
+        table = ax.table([head, *cells], cellLoc="right", loc="center", edges="horizontal", colWidths=widths)
+        table.auto_set_font_size(False)
+        table.set_fontsize(size)
+        for (row, column), cell in table.get_celld().items():
+            cell.set_edgecolor("#BBBBBB")
+            cell.set_linewidth(0.6)
+            if row == 0:
+                cell.set_height(1.7 * cell.get_height())
+            if column == 0:
+                cell.get_text().set_horizontalalignment("left")
+                cell.PAD = 0.0
 
     def rows(self) -> list[tuple[str, str, float, float, float, float, float]]:
         """Rows of quantity, unit, phasor, transient at mean area, coupled, coupled - phasor, coupled - mean area.
@@ -91,14 +180,9 @@ class Comparison(Shown):
         """
         out = []
         for i, gap in enumerate(self.gaps):
-            for name, unit, factor in (
-                ("amplitude", "V", 1.0),
-                ("phase_deg", "deg", 1.0),
-                ("f_el_mean", "N", 1.0),
-                ("area_mean", "mm^2", 1e6),
-            ):
-                p, m, c = (factor * f.of_gap(i)[name] for f in (self.phasor, self.mean, self.coupled))
-                out.append((name if len(self.gaps) == 1 else f"{name}:{gap}", unit, p, m, c, c - p, c - m))
+            for name, kind in _FIGURES.items():
+                p, m, c = (kind.factor * f.of_gap(i)[name] for f in (self.phasor, self.mean, self.coupled))
+                out.append((name if len(self.gaps) == 1 else f"{name}:{gap}", kind.unit, p, m, c, c - p, c - m))
         return out
 
     @property
@@ -109,15 +193,11 @@ class Comparison(Shown):
     def to_dict(self) -> dict[str, Any]:
         """The figures as plain data, in SI units."""
 
-        def plain(figures: Figures) -> dict[str, Any]:
-            return {name: np.asarray(value).tolist() for name, value in vars(figures).items()}
-
+        parts = {"phasor": self.phasor, "transient_mean_area": self.mean, "transient_coupled": self.coupled}
         return {
             "frequency": self.frequency,
             "gaps": list(self.gaps),
-            "phasor": plain(self.phasor),
-            "transient_mean_area": plain(self.mean),
-            "transient_coupled": plain(self.coupled),
+            **{key: {name: np.asarray(x).tolist() for name, x in vars(part).items()} for key, part in parts.items()},
         }
 
 
@@ -264,20 +344,16 @@ def _sweep(
 ) -> PhasorSolution:  # fmt: skip
     (source, sign), *_ = scene.sources
     name = scene.layers[scene.gap]
-    skins = [e.name for e in circuit.by_device("SKIN")]
+    skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     gains, areas, forces, amplitude = [], [], [], drive.amplitude
-    for f in frequency:
-        changes: dict[str, float | Waveform] = {f"{name}.f": float(f) for name in skins}
-        changes[source.name] = Sine(amplitude, float(f))
-        state = steady_state(
-            circuit.varied(changes), charge_law=charge_law, rtol=rtol, points=POINTS, charge=False
-        )  # fmt: skip
-        s = state.solution
+    for f in frequency.tolist():
+        changed = circuit.varied({**dict.fromkeys(skins, f), source.name: Sine(amplitude, f)})
+        s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution
         # The output starts at a multiple of the period, so that phases from its start are phases relative to the
         # source.
         period = s.t - s.t[0]
         area, force = (s.by_name(key)[key if len(s.gaps) == 1 else f"{key}:{name}"] for key in ("area", "f_el"))
-        gains.append([weigh_outputs(period, u).phasor(float(f)) * sign / amplitude for u in s.u_layer.T])
+        gains.append([weigh_outputs(period, u).phasor(f) * sign / amplitude for u in s.u_layer.T])
         areas.append(weigh_outputs(period, area).mean())
         forces.append(weigh_outputs(period, force).mean())
         one()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -119,30 +120,23 @@ def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
     """Area (mm^2) of each area node at the start of a run with ``uic``; empty for a run that starts otherwise."""
     if circuit.tran is None or not starts_uncharged(circuit):
         return {}
+    contacts, out = _contacts(circuit), {}
     areas, _ = find_branches(circuit)
-    contacts = _contacts(circuit)
-    out = {}
     for area in areas:
         value = area.given
         if value is None and area.gap is not None:
             value = float(contacts[area.node].area(abs(start_voltage(area.gap, circuit.initial))))
         assert value is not None
         out[area.node] = 1e6 * value
-    if any(area.gap and area.gap.values["tau"] > 0.0 for area in areas):
-        out |= _slow_areas(circuit, law)
+    if any(gap.values["tau"] > 0.0 for gap in circuit.by_device("GAP")):
+        # Areas that follow with a delay start where the problem says.
+        problem = prepare(circuit, t_stop=None, t_eval=None, charge_law=law, area="coupled", start="deck", charge=False)
+        net = problem.scene.net
+        slow = problem.initial.y[net.k.shape[0] :]
+        for area, place, area0 in zip(problem.network.areas, net.slow, net.area0, strict=True):
+            if place >= 0:
+                out[area.node] = 1e6 * float(slow[place] * area0)
     return out
-
-
-def _slow_areas(circuit: Circuit, law: str) -> dict[str, float]:
-    """Start values (mm^2) of the areas that follow with a delay (tau > 0)."""
-    problem = prepare(circuit, t_stop=None, t_eval=None, charge_law=law, area="coupled", start="deck", charge=False)
-    net, n = problem.scene.net, problem.scene.net.k.shape[0]
-    slow = problem.initial.y[n:]
-    return {
-        area.node: 1e6 * float(slow[place] * area0)
-        for area, place, area0 in zip(problem.network.areas, net.slow, net.area0, strict=True)
-        if place >= 0
-    }
 
 
 def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
@@ -170,14 +164,10 @@ def _guesses_inside(gap: Element, contact: Contact, u: float) -> Iterator[str]:
     """Guesses for the nodes inside a GAP at `u` V, without which ngspice's first Newton iteration fails at u != 0."""
     at_rest, adhesive = (float(contact.area_adhesive(v)) for v in (0.0, u))
     y = adhesive / at_rest
-    guesses = {
-        "x": math.log(y),
-        "y": y,
-        "v": float(contact.stress(u)) * at_rest / contact.f_n,
-        "follow": 1e6 * float(contact.area(u)),
-    }
+    pull, area = float(contact.stress(u)) * at_rest / contact.f_n, 1e6 * float(contact.area(u))
+    guesses = ("x", math.log(y)), ("y", y), ("v", pull), ("follow", area)
     name = _element_name(gap)
-    yield ".nodeset " + " ".join(f"v({name}.{node})={value!r}" for node, value in guesses.items())
+    yield ".nodeset " + " ".join(f"v({name}.{node})={value!r}" for node, value in guesses)
 
 
 def _element_lines(
@@ -207,9 +197,8 @@ def _number(value: float) -> str:
 
 
 def _wrapped(line: str, width: int = 100) -> Iterator[str]:
-    words = line.split(" ")
-    current = words[0]
-    for word in words[1:]:
+    current, *words = line.split(" ")
+    for word in words:
         if len(current) + len(word) + 1 > width:
             yield current
             current = "+ " + word
@@ -218,27 +207,28 @@ def _wrapped(line: str, width: int = 100) -> Iterator[str]:
     yield current
 
 
-def _source_text(waveform: Waveform, element: Element, circuit: Circuit) -> str:
-    if isinstance(waveform, DC):
-        return f"DC {waveform.level!r}"
-    if isinstance(waveform, Sine):
-        w = waveform
-        numbers = (w.offset, w.amplitude, w.frequency, w.delay, w.damping, w.phase_deg)
-        return f"SIN({' '.join(repr(float(x)) for x in numbers)})"
-    pulse = _pulse_text(waveform, circuit) if isinstance(waveform, Pulse) else None
+def _call(name: str, numbers: Iterable[float]) -> str:
+    return f"{name}({' '.join(repr(float(x)) for x in numbers)})"
+
+
+def _source_text(w: Waveform, element: Element, circuit: Circuit) -> str:
+    if isinstance(w, DC):
+        return f"DC {w.level!r}"
+    if isinstance(w, Sine):
+        return _call("SIN", (w.offset, w.amplitude, w.frequency, w.delay, w.damping, w.phase_deg))
+    if isinstance(w, Exp):
+        return _call("EXP", (w.v1, w.v2, w.td1 or NOW, w.tau1, w.td2 or NOW, w.tau2))
+    pulse = _pulse_numbers(w, circuit) if isinstance(w, Pulse) else None
     if pulse is not None:
-        return pulse
-    if isinstance(waveform, Exp):
-        e = waveform
-        return f"EXP({' '.join(repr(float(x)) for x in (e.v1, e.v2, e.td1 or NOW, e.tau1, e.td2 or NOW, e.tau2))})"
-    if isinstance(waveform, PWL | Samples) and waveform.period is None:
-        t, v = _own_points(waveform, element, circuit)
+        return _call("PULSE", pulse)
+    if isinstance(w, PWL | Samples) and w.period is None:
+        t, v = _own_points(w, element, circuit)
     else:
-        t, v = _sampled(waveform, element, circuit)
+        t, v = _sampled(w, element, circuit)
     if _starts_empty(circuit):
         # All voltages start at 0, so let the source start at 0 V and jump: otherwise ngspice often fails at its first
         # step.
-        t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, waveform.value(0.0)], v[t > 0.0])
+        t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, w.value(0.0)], v[t > 0.0])
     return _pwl_text(t, v, _edge(circuit))
 
 
@@ -279,8 +269,8 @@ def _edge(circuit: Circuit) -> float:
     return min(EDGE, 1e-3 * circuit.tran.step) if circuit.tran else EDGE
 
 
-def _pulse_text(p: Pulse, circuit: Circuit) -> str | None:
-    """A pulse in ngspice's notation; None if its edges have no room, or if it should start at 0 V and does not."""
+def _pulse_numbers(p: Pulse, circuit: Circuit) -> tuple[float, ...] | None:
+    """A pulse's numbers in ngspice; None if its edges have no room, or if it should start at 0 V and does not."""
     if _starts_empty(circuit) and p.value(0.0) != 0.0 and p.breakpoint_rate() * _stop(circuit) < _FEW_POINTS:
         return None
     edge, span = _edge(circuit), _stop(circuit) + abs(p.delay)
@@ -290,8 +280,7 @@ def _pulse_text(p: Pulse, circuit: Circuit) -> str | None:
     period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * span + rise + width + fall
     if width <= 0.0 or rise + width + fall > period:
         return None
-    numbers = (p.v1, p.v2, p.delay, rise, fall, width, period)
-    return f"PULSE({' '.join(repr(float(x)) for x in numbers)})"
+    return p.v1, p.v2, p.delay, rise, fall, width, period
 
 
 def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
@@ -334,18 +323,16 @@ def _pwl_text(t: np.ndarray, v: np.ndarray, edge: float) -> str:
             time = max(times[-1] + edge, np.nextafter(times[-1], math.inf).item())
         times.append(time)
         values.append(value)
-    return "PWL(" + " ".join(f"{a!r} {b!r}" for a, b in zip(times, values, strict=True)) + ")"
+    return _call("PWL", itertools.chain.from_iterable(zip(times, values, strict=True)))
 
 
 def _analysis_lines(circuit: Circuit) -> Iterator[str]:
     if circuit.tran is not None:
         tran = circuit.tran
-        words = [f"{tran.step!r}", f"{tran.stop!r}"]
-        if tran.start or tran.max_step:
-            words.append(f"{tran.start!r}")
+        numbers = [tran.step, tran.stop, *([tran.start] if tran.start or tran.max_step else [])]
         if tran.max_step:
-            words.append(f"{tran.max_step!r}")
-        yield f".tran {' '.join(words)}{' uic' if tran.uic else ''}"
+            numbers.append(tran.max_step)
+        yield f".tran {' '.join(map(repr, numbers))}{' uic' if tran.uic else ''}"
     if circuit.ac is not None:
         ac = circuit.ac
         yield f".ac {ac.scale} {ac.points} {ac.start!r} {ac.stop!r}"

@@ -13,6 +13,8 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
+from fingerspice.plots import drawing
+from fingerspice.plots.traces import stems
 from fingerspice.results.record import Sealed, sealed
 from fingerspice.studies.perception import (
     DIFFERENCE_DB,
@@ -35,17 +37,20 @@ if TYPE_CHECKING:
 _EDGE, _FEWEST = 2.0 ** (1.0 / 6.0), 2
 #: Lines weaker than this fraction of the strongest acceleration are round-off, and are left out.
 _NOTHING = 1e-9
-#: Largest number of rows in a report.
-_SHOWN = 10
+#: Largest number of rows in a report, and of lines whose level is written in the picture.
+_SHOWN, _NAMED = 10, 6
+_MARKERS = "osD^vP"
+#: In the picture the vertical axis reaches down to the threshold, but spans at most the factor _DEPTH. The frequency
+#: axis ends at _BEYOND times the threshold's highest frequency.
+_DEPTH, _BEYOND = 1e7, 5.0
 
 
 class Unjudged(NamedTuple):
     """Friction that the threshold cannot judge: outside its frequencies, or slower than the lowest band."""
 
     level: float  # Highest level above the threshold that it may have, dB (`Threshold.beyond`)
-    # force, frequency: Amplitude (N) and frequency (Hz); of what is slower than the lowest band, that band's lower edge
-    force: float
-    frequency: float
+    force: float  # Amplitude, N
+    frequency: float  # Hz; of what is slower than the lowest band, that band's lower edge
     slower: bool
 
     def __str__(self) -> str:
@@ -96,8 +101,12 @@ class Feel(Sealed, Shown):
     threshold: Threshold
 
     def __post_init__(self) -> None:
-        for x in (self.frequency, self.force, self.displacement, self.acceleration, self.level):
+        for x in self._columns:
             sealed(x)
+
+    @property
+    def _columns(self) -> tuple[FloatArray, ...]:
+        return self.frequency, self.force, self.displacement, self.acceleration, self.level
 
     @property
     def strongest(self) -> int | None:
@@ -130,8 +139,7 @@ class Feel(Sealed, Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The keys of ``--json``; lines outside the threshold's frequencies are left out."""
-        every = (self.frequency, self.force, self.displacement, self.acceleration, self.level)
-        rows = zip(*(x[np.isfinite(self.level)] for x in every), strict=True)
+        rows = zip(*(x[np.isfinite(self.level)] for x in self._columns), strict=True)
         keys = ("frequency", "force", "displacement", "acceleration", "level_db")
         place = self.strongest
         return {
@@ -144,8 +152,7 @@ class Feel(Sealed, Shown):
             "difference_steps": self.steps,
             "friction_change": self.change,
             "friction_change_felt": self.change_felt,
-            "mechanics": {"name": self.mechanics.name, "mass": self.mechanics.mass, "damping": self.mechanics.damping,
-                          "stiffness": self.mechanics.stiffness, "source": self.mechanics.source},
+            "mechanics": dict(vars(self.mechanics)),
             "threshold": {"name": self.threshold.name, "source": self.threshold.source},
             "lines": [dict(zip(keys, map(float, row), strict=True)) for row in rows],
         }  # fmt: skip
@@ -156,14 +163,10 @@ class Feel(Sealed, Shown):
         judged = np.flatnonzero(np.isfinite(self.level))
         if judged.size:
             shown = np.sort(judged[np.argsort(self.level[judged])[::-1][:_SHOWN]])
+            units = ("Hz", "N", "m", "m/s^2")
             rows = [
-                (
-                    *(format_si(float(x[i]), unit) for x, unit in (
-                        (self.frequency, "Hz"), (self.force, "N"), (self.displacement, "m"),
-                        (self.acceleration, "m/s^2"),
-                    )),
-                    f"{self.level[i]:+.1f} dB",
-                )
+                (*(format_si(float(x[i]), unit) for x, unit in zip(self._columns, units, strict=False)),
+                 f"{self.level[i]:+.1f} dB")
                 for i in shown
             ]  # fmt: skip
             blocks += ["", Table((what, "friction", "skin moves", "accelerates", "above threshold"), rows), ""]
@@ -171,9 +174,8 @@ class Feel(Sealed, Shown):
             f"friction changes by {100.0 * self.change:.3g} % within these frequencies; "
             f"{100.0 * WEBER_FRICTION:g} % are noticed as a transient reduction"
         )
-        m = self.mechanics
         blocks.append(f"threshold: {self.threshold.name} ({self.threshold.source})")
-        blocks.append(f"skin: {m.name}: {1e3 * m.mass:g} g, {m.damping:g} N s/m, {1e-3 * m.stiffness:g} N/mm")
+        blocks.append(f"skin: {self.mechanics.name}: {self.mechanics.said}")
         return Page(blocks)
 
     def verdict(self) -> str:
@@ -202,9 +204,39 @@ class Feel(Sealed, Shown):
         matplotlib.figure.Figure
             ``savefig("x.pdf")`` saves it, ``show()`` shows it.
         """
-        from fingerspice.studies.feel_picture import plot_feel
-
-        return plot_feel([self, *others])
+        fingers = [self, *others]
+        figure, (ax,) = drawing.new_figure(1, height=4.0)
+        table, m = self.threshold, self.mechanics
+        low, high = map(float, table.frequency[[0, -1]])
+        ends = max(low, 1e-3), _BEYOND * high
+        f = np.geomspace(ends[0], high, 400)
+        curve = table.acceleration(f)
+        drawn = [(one.frequency >= ends[0]) & (one.frequency <= ends[1]) for one in fingers]
+        highest = max(drawing.peak_of(one.acceleration[some]) for one, some in zip(fingers, drawn, strict=True))
+        top = 3.0 * max(float(curve.max()), highest)
+        bottom = max(top / _DEPTH, 0.3 * float(curve.min()))
+        ax.fill_between(f, bottom, curve, color=drawing.GREY, alpha=0.15, linewidth=0.0)
+        ax.plot(f, curve, color=drawing.BLACK, linewidth=1.4, label=table.name)
+        for number, (one, some) in enumerate(zip(fingers, drawn, strict=True)):
+            color, marker = drawing.CYCLE[number % 6], _MARKERS[number % 6]
+            name = f"skin, {one.kind} {one.signal.partition(':')[2]}".rstrip()
+            stems(ax, one.frequency[some], one.acceleration[some], bottom, label=name, color=color, marker=marker)
+            loud = np.flatnonzero(one.level >= 0.0)
+            for i in loud[np.argsort(one.level[loud])[::-1][:_NAMED]]:
+                ax.annotate(
+                    f"{one.level[i]:+.0f}", (one.frequency[i], one.acceleration[i]), xytext=(0, 4),
+                    textcoords="offset points", ha="center", fontsize=drawing.SMALL, color=color,
+                )  # fmt: skip
+        ax.set(xscale="log", yscale="log", xlim=ends, ylim=(bottom, top))
+        drawing.dress(ax, "Acceleration amplitude [m/s²]", "Frequency [Hz]")
+        drawing.legend_above(ax, 3)
+        said = "; ".join(one.verdict() for one in fingers)
+        drawing.caption(
+            figure,
+            f"{said} · numbers: dB above the threshold; grey: not felt; nothing is known beyond {low:g} to {high:g} Hz "
+            f"· threshold: {table.source} · skin: {m.name}, {m.said}",
+        )
+        return figure
 
 
 def feel(

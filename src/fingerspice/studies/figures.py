@@ -7,7 +7,7 @@ as periodic states of the transient. The measured points that the paper shows in
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -95,41 +95,12 @@ def variations() -> tuple[Variation, ...]:
     )
 
 
-@dataclass(frozen=True)
-class Table:
-    """Data of a figure: column names with units, and columns of equal length."""
-
-    header: tuple[str, ...]
-    columns: tuple[FloatArray, ...]
-
-    def write(self, path: Path) -> Path:
-        """Write the table as CSV with ten digits."""
-        return write_csv(path, self.header, ([f"{x:.10g}" for x in row] for row in zip(*self.columns, strict=True)))
-
-
 def make_figures(
     folder: str | Path, *, only: int | Iterable[int] | None = None, progress: Progress | None = None
 ) -> list[Path]:
-    """Write the paper's figures, each as ``figN.png`` with its data in ``figN.csv``.
+    """Write the paper's figures, each as ``figN.png`` with its data in ``figN.csv``, and return the files' paths.
 
-    Parameters
-    ----------
-    folder : str or Path
-        Folder of the files; it is created if it does not exist.
-    only : int or iterable of int, optional
-        Numbers of the wanted figures, from 2 to 5; all by default.
-    progress : callable, optional
-        Called with the fraction done.
-
-    Returns
-    -------
-    list of Path
-        The files written.
-
-    Raises
-    ------
-    InputError
-        If there is no figure of that number, or the folder cannot be written.
+    `only` names the wanted figures, from 2 to 5; all by default. A folder that does not exist is created.
     """
     wanted = list(FIGURES) if only is None else [only] if isinstance(only, int) else list(only)
     for number in wanted:
@@ -138,59 +109,55 @@ def make_figures(
     for place, number in enumerate(sorted(set(wanted))):
         if progress is not None:
             progress(place / len(set(wanted)))
-        figure, table = FIGURES[number]()
+        figure, columns = FIGURES[number]()
+        rows = ([f"{x:.10g}" for x in row] for row in zip(*columns.values(), strict=True))
         written.append(drawing.save(figure, Path(folder) / f"fig{number}.png"))
-        written.append(table.write(Path(folder) / f"fig{number}.csv"))
+        written.append(write_csv(Path(folder) / f"fig{number}.csv", columns, rows))
     return written
 
 
-def figure_2() -> tuple[Figure, Table]:
+#: A picture, and its data: columns by their names with units.
+Drawn = tuple["Figure", dict[str, FloatArray]]
+
+
+def figure_2() -> Drawn:
     """Resistivity and relative permittivity of stratum corneum against frequency."""
     f = np.geomspace(*SKIN_BAND, 161)
     rho, eps = skin_resistivity(f), skin_permittivity(f)
     figure, (left, right) = drawing.new_figure(1, 2, height=2.7)
-    for ax, y, label, title, color in (
-        (
-            left,
-            rho,
-            r"Resistivity $\rho_\mathrm{sc}$ [Ω m]",
-            r"Eq. 18, read as a cubic in $\log_{10} f$",
-            drawing.BLUE,
-        ),
-        (right, eps, r"Relative permittivity $\varepsilon_\mathrm{r,sc}$", "Eq. 19", drawing.VERMILION),
+    cubic = r"Eq. 18, read as a cubic in $\log_{10} f$"
+    for ax, y, label, title, color, limits in (
+        (left, rho, r"Resistivity $\rho_\mathrm{sc}$ [Ω m]", cubic, drawing.BLUE, (5e2, 1e5)),
+        (right, eps, r"Relative permittivity $\varepsilon_\mathrm{r,sc}$", "Eq. 19", drawing.VERMILION, (1e3, 1e4)),
     ):
         ax.loglog(f, y, color=color, linewidth=1.6)
         drawing.dress(ax, label, "Frequency $f$ [Hz]")
         ax.set_title(title, fontsize=drawing.FONT, loc="left")
-        ax.set_xlim(*SKIN_BAND)
-    left.set_ylim(5e2, 1e5)
-    right.set_ylim(1e3, 1e4)
-    return figure, Table(("frequency [Hz]", "rho_sc [ohm m]", "eps_r_sc [1]"), (f, rho, eps))
+        ax.set(xlim=SKIN_BAND, ylim=limits)
+    return figure, {"frequency [Hz]": f, "rho_sc [ohm m]": rho, "eps_r_sc [1]": eps}
 
 
-def figure_3(points: int = 46) -> tuple[Figure, Table]:
+def figure_3(points: int = 46) -> Drawn:
     """Mean electroadhesive force against frequency; each panel varies one parameter."""
     f = np.geomspace(10.0, 1e4, points)
     circuit = table1_circuit().replace({"Vdrive.amplitude": U0_FORCE})
     base = phasor(circuit, f).f_el_mean
     figure, axes = drawing.new_figure(2, 2, height=5.0, sharex=True)
-    header, columns = ["frequency [Hz]", "f_el_mean [N] Table 1"], [f, base]
+    columns = {"frequency [Hz]": f, "f_el_mean [N] Table 1": base}
     for ax, variation in zip(axes, variations(), strict=True):
-        for value, style in zip(variation.values, _styles(variation), strict=True):
-            force = base
+        # Table 1 is black, and the others have colours and dashes.
+        others = zip((drawing.BLUE, drawing.VERMILION, drawing.GREEN), drawing.DASHES[1:], strict=True)
+        for value in variation.values:
+            force, style = base, {"color": drawing.BLACK, "linewidth": 1.8}
             if value != variation.base:
                 force = phasor(variation.apply(circuit, value), f).f_el_mean
-                header.append(f"f_el_mean [N] {variation.name}={value:g} {_ascii(variation.unit)}")
-                columns.append(force)
-            label = f"${variation.symbol}$ = {value:.3g} {variation.unit}"
-            ax.semilogx(f, force, label=label, **style)
-        ax.set_title(
-            variation.title + (" (other scale)" if variation.name == "d_a" else ""),
-            fontsize=drawing.FONT,
-            loc="left",
-        )
-        ax.set_xlim(f[0], f[-1])
-        ax.set_ylim(0.0, 0.25 if variation.name == "d_a" else 0.125)
+                columns[f"f_el_mean [N] {variation.name}={value:g} {_ASCII[variation.unit]}"] = force
+                color, dash = next(others)
+                style = {"color": color, "linestyle": dash, "linewidth": 1.5}
+            ax.semilogx(f, force, label=f"${variation.symbol}$ = {value:.3g} {variation.unit}", **style)
+        other_scale = variation.name == "d_a"
+        ax.set_title(variation.title + " (other scale)" * other_scale, fontsize=drawing.FONT, loc="left")
+        ax.set(xlim=(f[0], f[-1]), ylim=(0.0, 0.25 if other_scale else 0.125))
         # The legend stands in the corner that the panel's curves leave free.
         corner: Any = "lower right" if variation.name == "r_a" else "upper left"
         ax.legend(loc=corner, fontsize=drawing.FONT - 1.0, frameon=False)
@@ -198,22 +165,11 @@ def figure_3(points: int = 46) -> tuple[Figure, Table]:
         drawing.dress(ax, r"Mean force $F_\mathrm{el}$ [N]")
     for ax in axes[2:]:
         drawing.dress(ax, "", "Frequency $f$ [Hz]")
-    return figure, Table(tuple(header), tuple(columns))
+    return figure, columns
 
 
-def _styles(variation: Variation) -> Iterator[dict[str, Any]]:
-    """Line styles: black for Table 1, and different colours and dashes for the others."""
-    others = iter(zip((drawing.BLUE, drawing.VERMILION, drawing.GREEN), drawing.DASHES[1:], strict=True))
-    for value in variation.values:
-        if value == variation.base:
-            yield {"color": drawing.BLACK, "linewidth": 1.8}
-        else:
-            color, dash = next(others)
-            yield {"color": color, "linestyle": dash, "linewidth": 1.5}
-
-
-def _ascii(unit: str) -> str:
-    return {"µm": "um", "mm²": "mm^2", "MΩ": "Mohm"}[unit]
+#: Units of the parameters of Fig. 3, as in its data file.
+_ASCII = {"µm": "um", "mm²": "mm^2", "MΩ": "Mohm"}
 
 
 def time_response(shape: type[Sine] | type[Square], frequency: float, *, dispersive: bool = False) -> Solution:
@@ -242,7 +198,7 @@ def two_periods(solution: Solution) -> dict[str, FloatArray]:
     return {"t": t[rows] + shift, **{name: getattr(solution, name)[rows] for name in names}}
 
 
-def _time_figure(shape: type[Sine] | type[Square]) -> tuple[Figure, Table]:
+def _time_figure(shape: type[Sine] | type[Square]) -> Drawn:
     """Gap voltage and force over two periods of the periodic state, 100 Hz left, 5000 Hz right.
 
     A square wave has many harmonics, so a dispersive skin is shown as well.
@@ -264,7 +220,7 @@ def _time_figure(shape: type[Sine] | type[Square]) -> tuple[Figure, Table]:
     header = ["frequency [Hz]", "t [s]", "u_source [V]", "u_gap [V]", "f_el [N]", "area [m^2]"]
     if dispersive:
         header += ["u_gap_dispersive [V]", "f_el_dispersive [N]"]
-    return figure, Table(tuple(header), tuple(np.concatenate(c) for c in zip(*parts, strict=True)))
+    return figure, {name: np.concatenate(c) for name, c in zip(header, zip(*parts, strict=True), strict=True)}
 
 
 def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: float) -> None:
@@ -292,7 +248,7 @@ def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: f
     drawing.dress(lower, "", f"Time [{unit}]")
 
 
-FIGURES: dict[int, Callable[[], tuple[Figure, Table]]] = {
+FIGURES: dict[int, Callable[[], Drawn]] = {
     2: figure_2,
     3: figure_3,
     4: partial(_time_figure, Sine),

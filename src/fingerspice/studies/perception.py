@@ -65,6 +65,11 @@ class SkinMechanics:
             require(0.0 <= value < np.inf, what, f"{value} {unit}", f"finite, 0 or more {unit}")
         require(self.stiffness > 0.0, "stiffness", f"{self.stiffness} N/m", "more than 0 N/m")
 
+    @property
+    def said(self) -> str:
+        """The three values in words."""
+        return f"{1e3 * self.mass:g} g, {self.damping:g} N s/m, {1e-3 * self.stiffness:g} N/mm"
+
     def displacement(self, frequency: FloatArray) -> NDArray[np.complex128]:
         """Displacement per force at frequencies (Hz), m/N, same shape."""
         omega = 2.0 * np.pi * np.asarray(frequency)

@@ -14,9 +14,11 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
+from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.outcome import ErrorEstimate, SolveError
+from fingerspice.results.report import summary_table
 from fingerspice.results.sensitivity import Sensitivity
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Figured, Figures, KeptFigures
@@ -66,9 +68,17 @@ class SteadyState(Shown, Figured):
     asked: tuple[str, ...] = ()
 
     def _page(self) -> Page:
-        from fingerspice.studies.reports import steady_page
-
-        return steady_page(self)
+        largest = 1.0 - self.stability_margin
+        found = f"periodic state of {format_si(self.period, 's')}, found in {self.periods:.3g} periods"
+        left = (
+            f"a further period changes the voltages by {self.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % "
+            "of a small disturbance"
+        )
+        try:
+            period = summary_table(self.solution).blocks
+        except SolveError as error:
+            period = (error.message,)
+        return Page([found, left, "", *period])
 
     def plot(self, signals: str | Sequence[str] | None = None) -> Figure:
         """The period's signals against time; `signals` as in `Solution.plot`."""

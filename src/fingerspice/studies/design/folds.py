@@ -2,32 +2,37 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, real_number, whole_number
 from fingerspice.base.errors import InputError
-from fingerspice.base.pages import Page, Shown
+from fingerspice.base.files import write_csv
+from fingerspice.base.pages import Page, Shown, Table
+from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import heading
+from fingerspice.circuit.describe import head_lines, heading
+from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.solve.folding import meets_fold
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.runs import Progress
 from fingerspice.solve.simulation import run_problem
 from fingerspice.waveforms.combinations import Product
-from fingerspice.waveforms.waveform import Waveform, as_waveform, require
+from fingerspice.waveforms.waveform import as_waveform, require
 
 if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
 
-# Range of voltages that is searched, V; relative accuracy of the voltage at the fold; relative error of each run.
+# Range of voltages that is searched, V; factor between two voltages that are tried until the fold is between them;
+# relative accuracy of the voltage at the fold; relative error of each run.
 LOWEST, HIGHEST = 1e-3, 1e5
+STEP = 0.7
 EXACT = 1e-3
 RTOL = 1e-5
 
@@ -73,14 +78,25 @@ class FoldLimits(Shown):
     sweeps: tuple[FoldSweep, ...]
 
     def _page(self) -> Page:
-        from fingerspice.studies.reports import limits_text
-
-        return limits_text(self)
+        own = format_si(self.peak, "V")
+        if math.isfinite(self.voltage):
+            head = (
+                f"under the mobile law this deck folds at {format_si(self.voltage, 'V')} peak; its source reaches "
+                f"{own}, {100.0 * self.peak / self.voltage:.3g} % of that"
+            )
+        else:
+            head = f"under the mobile law this deck does not fold; its source reaches {own}"
+        lines: list[str | Table] = [*head_lines(self.circuit), head]
+        for sweep in self.sweeps:
+            rows = [
+                (format_si(x, sweep.unit), format_si(u, "V") if math.isfinite(u) else "none")
+                for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
+            ]
+            lines += ["", Table((sweep.name, "folds at"), rows)]
+        return Page(lines)
 
     def plot(self) -> Picture:
         """Picture of the fold's voltage against every parameter, with a mark at the deck's own point."""
-        from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
-
         figure, axes = new_figure(1, len(self.sweeps), height=3.2, sharey=True)
         for ax, sweep in zip(axes, self.sweeps, strict=True):
             factor, unit = engineering(sweep.own, sweep.unit)
@@ -88,8 +104,7 @@ class FoldLimits(Shown):
             ax.plot(x, sweep.voltages, color=BLUE, marker="o", markersize=3, label="fold of the mobile law")
             ax.fill_between(x, sweep.voltages, 1e6, color=GREY, alpha=0.2, linewidth=0, label="no solution")
             ax.plot([own], [self.peak], color=VERMILION, marker="D", linestyle="none", label="this deck")
-            ax.set_xscale("log")
-            ax.set_yscale("log")
+            ax.set(xscale="log", yscale="log")
             dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
         shown = np.concatenate([s.voltages[np.isfinite(s.voltages)] for s in self.sweeps] + [[self.peak]])
         axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
@@ -100,14 +115,17 @@ class FoldLimits(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, SI units."""
-        return {
-            "peak": self.peak, "voltage": self.voltage,
-            "sweeps": [
-                {"name": s.name, "unit": s.unit, "own": s.own, "values": s.values.tolist(),
-                 "voltages": s.voltages.tolist()}
-                for s in self.sweeps
-            ],
-        }  # fmt: skip
+        sweeps = [{name: np.asarray(x).tolist() for name, x in vars(sweep).items()} for sweep in self.sweeps]
+        return {"peak": self.peak, "voltage": self.voltage, "sweeps": sweeps}
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write the map as CSV; a row without a fold has an empty voltage."""
+        rows = [
+            (sweep.name, x, sweep.unit, u if math.isfinite(u) else "")
+            for sweep in self.sweeps
+            for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
+        ]
+        return write_csv(path, ("parameter", "value [SI]", "unit", "fold [V]"), rows)
 
 
 def grid_of(points: int, span: float) -> tuple[int, float]:
@@ -157,61 +175,29 @@ def fold_limits(
     peak = max((e.waveform.peak(0.0, t_stop) for e in sources if e.waveform is not None), default=0.0)
     if not 0.0 < peak < math.inf:
         raise InputError("a map of the fold needs a V element with a voltage to raise; this circuit has none")
-    gap = gaps[0]
+    # Each parameter's name and unit, its path, and the paths of what changes along with it.
+    varied = [("load", "N", [f"{gaps[0].name}.fn"]), ("gap", "m", [f"{gaps[0].name}.d"])]
+    if len(sources) == 1 and f"{sources[0].name}.frequency" in circuit.parameters:
+        skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
+        varied.append(("frequency", "Hz", [f"{sources[0].name}.frequency", *skins]))
     factors = np.geomspace(1.0 / span, span, points)
-    waves = [e.waveform for e in sources]
-    tuned = len(waves) == 1 and isinstance(getattr(waves[0], "frequency", None), float)
-    done = _Count(1 + points * (3 if tuned else 2), progress)
     around = fold_voltage(circuit, peak, t_stop)
-    done.one()
-    sweeps = []
-    for key, name, unit in (("fn", "load", "N"), ("d", "gap", "m")):
-        own = float(gap.values[key])
-        changed = [circuit.varied({f"{gap.name}.{key}": own * x}) for x in factors]
-        sweeps.append(FoldSweep(name, unit, own, own * factors, _along(changed, peak, [t_stop] * points, done)))
-    if tuned:
-        own = float(waves[0].frequency)  # type: ignore[union-attr]
-        skins = [e.name for e in circuit.by_device("SKIN")]
-        changed = []
-        for x in factors:
-            wave: Waveform = dataclasses.replace(waves[0], frequency=own * x)  # type: ignore[type-var, assignment]
-            changes: dict[str, float | Waveform] = {f"{skin}.f": own * x for skin in skins}
-            changed.append(circuit.varied({**changes, sources[0].name: wave}))
-        voltages = _along(changed, peak, [t_stop / x for x in factors], done)
-        sweeps.append(FoldSweep("frequency", "Hz", own, own * factors, voltages))
-    return FoldLimits(circuit, peak, around, tuple(_with_own(sweep, around) for sweep in sweeps))
-
-
-def _with_own(sweep: FoldSweep, voltage: float) -> FoldSweep:
-    """The sweep with the fold voltage known at the deck's own value, as its own bisection may end 1e-3 beside it."""
-    own = np.abs(sweep.values - sweep.own) <= 1e-12 * sweep.own
-    return dataclasses.replace(sweep, voltages=np.where(own, voltage, sweep.voltages))
-
-
-@dataclass
-class _Count:
-    """Count of the fold voltages found so far, and of all, for reports of progress."""
-
-    all: int
-    told: Progress | None
-    found: int = 0
-
-    def one(self) -> None:
-        """Count one more."""
-        self.found += 1
-        if self.told is not None:
-            self.told(self.found / self.all)
-
-
-def _along(circuits: list[Circuit], peak: float, ends: list[float], done: _Count) -> FloatArray:
-    """Fold voltages of circuits; each search starts at the voltage of the circuit before."""
-    out = []
-    guess = peak
-    for circuit, t_stop in zip(circuits, ends, strict=True):
-        out.append(fold_voltage(circuit, peak, t_stop, guess))
-        done.one()
-        guess = out[-1] if math.isfinite(out[-1]) else HIGHEST
-    return np.array(out)
+    sweeps: list[FoldSweep] = []
+    for name, unit, paths in varied:
+        own, voltages, guess = float(circuit.parameters[paths[0]].value), np.zeros(points), peak
+        for i, x in enumerate(factors):
+            if progress is not None:
+                progress((1 + i + points * len(sweeps)) / (1 + points * len(varied)))
+            changed = circuit.varied(dict.fromkeys(paths, own * x))
+            voltages[i] = fold_voltage(changed, peak, t_stop / x if name == "frequency" else t_stop, guess)
+            # The next search starts at this voltage.
+            guess = voltages[i] if math.isfinite(voltages[i]) else HIGHEST
+        # The fold at the deck's own value is known: the bisection of the sweep may end 1e-3 beside it.
+        voltages[np.abs(factors - 1.0) <= 1e-12] = around
+        sweeps.append(FoldSweep(name, unit, own, own * factors, voltages))
+    if progress is not None:
+        progress(1.0)
+    return FoldLimits(circuit, peak, around, tuple(sweeps))
 
 
 def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | None = None) -> float:
@@ -220,47 +206,47 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
     It is found by bisection to a relative 1e-3. The run starts as the deck's run does. `peak` is the present peak
     voltage of the circuit's sources (V), and `guess` the voltage where the search starts (V).
     """
-
-    def folds(voltage: float) -> bool:
-        factor = as_waveform(voltage / peak)
-        raised = circuit.varied(
-            {e.name: Product((factor, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
-        )
-        try:
-            problem = prepare(
-                raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck", charge=False,
-                rtol=RTOL,
-            )  # fmt: skip
-            if problem.scene.stack is not None:
-                return meets_fold(problem, RTOL)
-            # Not by `simulate`, which would warn about voltages that the user did not ask for.
-            run = run_problem(problem, np.array([0.0, problem.t_stop]), RTOL)
-        except InputError as error:
-            # An operating point depends on the raised source, and may itself be past the fold, which counts as a fold.
-            # A start given by .ic does not depend on the source: report the error.
-            if circuit.initial or "past the fold" not in str(error):
-                raise
-            return True
-        if run.failure is not None and run.status is not Status.FOLD:
-            raise SolveError(run.failure, run)
-        return run.status is Status.FOLD
-
     low = high = min(max(guess or peak, LOWEST), HIGHEST)
-    if folds(low):
-        while True:
-            low, high = 0.7 * low, low
-            if not folds(low):
-                break
+    if _folds(circuit, high / peak, t_stop):
+        low = STEP * high
+        while _folds(circuit, low / peak, t_stop):
             if low < LOWEST:
                 return low
+            low, high = STEP * low, low
     else:
-        while True:
-            if high >= HIGHEST:
-                return math.nan
-            low, high = high, min(high / 0.7, HIGHEST)
-            if folds(high):
+        while high < HIGHEST:
+            low, high = high, min(high / STEP, HIGHEST)
+            if _folds(circuit, high / peak, t_stop):
                 break
+        else:
+            return math.nan
     while high > low * (1.0 + EXACT):
         middle = math.sqrt(low * high)
-        low, high = (low, middle) if folds(middle) else (middle, high)
+        low, high = (low, middle) if _folds(circuit, middle / peak, t_stop) else (middle, high)
     return math.sqrt(low * high)
+
+
+def _folds(circuit: Circuit, factor: float, t_stop: float) -> bool:
+    """Whether a run up to `t_stop` (s) reaches the fold, with every voltage source `factor` times its own."""
+    by = as_waveform(factor)
+    raised = circuit.varied(
+        {e.name: Product((by, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
+    )
+    try:
+        problem = prepare(
+            raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck", charge=False,
+            rtol=RTOL,
+        )  # fmt: skip
+        if problem.scene.stack is not None:
+            return meets_fold(problem, RTOL)
+        # Not by `simulate`, which would warn about voltages that the user did not ask for.
+        run = run_problem(problem, np.array([0.0, problem.t_stop]), RTOL)
+    except InputError as error:
+        # An operating point depends on the raised source, and may itself be past the fold, which counts as a fold.
+        # A start given by .ic does not depend on the source: report the error.
+        if circuit.initial or "past the fold" not in str(error):
+            raise
+        return True
+    if run.failure is not None and run.status is not Status.FOLD:
+        raise SolveError(run.failure, run)
+    return run.status is Status.FOLD

@@ -1,27 +1,28 @@
-"""Source voltage for a wanted gap voltage; the rise of a drive, and means of its force."""
+"""The finger of an inverse drive, and the source voltage for a gap voltage wanted there."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import BoolArray, ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, Element
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.network import Network
 from fingerspice.circuit.response import areas_at_rest
-from fingerspice.circuit.statespace import Stack, build_stack, contact_of, is_stack
+from fingerspice.circuit.statespace import Stack
 from fingerspice.circuit.topology import find_branches
 from fingerspice.engine.inverse import drive_stack, hold
 from fingerspice.physics.contact import Contact, fixed_area_curve
+from fingerspice.studies.wanted import ForceCurve
+from fingerspice.waveforms.waveform import require
 
-BoolArray = NDArray[np.bool_]
-
+# Default time in which the force rises to its first value, for networks other than a series stack, s.
+_LEAD = 2e-3
 # Over the length of the Fourier transform a signal is damped by exp(-_DAMPING), so that its end does not wrap round to
 # its beginning. The signal fills at most half of that length, so undoing the damping amplifies round-off by the square
 # root of that factor.
@@ -31,43 +32,40 @@ _DAMPING = 14.0
 _DEAF = 1e-9
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Limits of the source: its largest absolute `voltage` (V) and its largest `slew` rate (V/s)."""
+class Limits(NamedTuple):
+    """Limits of the source."""
 
-    voltage: float = math.inf
-    slew: float = math.inf
-
-
-class Inverter(Protocol):
-    """Computes the source voltage for a wanted gap voltage."""
-
-    sign: float
-
-    def drive(self, u: FloatArray, h: float, limits: Limits) -> tuple[FloatArray, BoolArray]:
-        """Source voltages for gap voltages `u` (V, shape (n,)) at intervals `h` (s), and the samples at a limit."""
-        ...
+    voltage: float = math.inf  # Largest absolute voltage, V
+    slew: float = math.inf  # Largest slew rate, V/s
 
 
 @dataclass(frozen=True)
 class Finger:
-    """The one finger of a circuit."""
+    """The one finger of a circuit with one source, under a charge law."""
 
+    circuit: Circuit
+    law: str
     gap: Element
     source: Element
     contact: Contact
     area: float | None  # Area fixed by the deck, m^2, or None
-    direct: bool  # Whether the circuit is a series stack, so that the gap voltage jumps with the source
+    network: Network
+
+    @property
+    def lead(self) -> float:
+        """Default time in which the force rises, s: none for a stack, whose gap voltage jumps with the source."""
+        return _LEAD if self.network.stack is None else 0.0
+
+    def inverter(self, u_max: float) -> StackInverter | NetworkInverter:
+        """What computes the source voltage for gap voltages up to `u_max` (V)."""
+        stack = self.network.stack
+        return NetworkInverter(self.network) if stack is None else StackInverter(stack, u_max, self.law == "mobile")
 
 
-def the_finger(circuit: Circuit) -> Finger:
-    """The finger and the source of a circuit that has one of each.
-
-    Raises
-    ------
-    InputError
-        If there is not exactly one finger and one voltage source, or if the area follows with a delay.
-    """
+def the_finger(circuit: Circuit, charge_law: str | None) -> Finger:
+    """The finger and the source of a circuit that has one of each; others, and a delayed area, are refused."""
+    law = charge_law or circuit.charge_law or "local"
+    require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     gaps = circuit.by_device("GAP")
     if len(gaps) != 1:
         found = ", ".join(g.name for g in gaps) or "none"
@@ -76,23 +74,14 @@ def the_finger(circuit: Circuit) -> Finger:
     if len(sources) != 1 or sources[0].device != "V":
         found = ", ".join(e.name for e in sources) or "none"
         raise InputError(f"an inverse drive is that of one V source; this circuit has {found}; allowed: one V element")
-    if gaps[0].values["tau"] > 0.0:
-        tau = gaps[0].values["tau"]
+    tau = gaps[0].values["tau"]
+    if tau > 0.0:
         raise InputError(f"{gaps[0].name} has tau={tau:g} s: its area follows with a delay; allowed here: tau=0")
-    if is_stack(circuit):
-        stack = build_stack(circuit)
-        assert stack.contact is not None
-        return Finger(gaps[0], sources[0], stack.contact, stack.area_given, True)
     network = network_of(circuit)
-    area = next(a for a in network.areas if a.gap is not None and a.gap.name == gaps[0].name)
-    return Finger(gaps[0], sources[0], contact_of(gaps[0]), area.given, False)
-
-
-def inverter_of(circuit: Circuit, u_max: float, law: str) -> Inverter:
-    """The inverter of a circuit for gap voltages up to `u_max` (V) under a charge law."""
-    if not is_stack(circuit):
-        return NetworkInverter(network_of(circuit))
-    return StackInverter(build_stack(circuit), u_max, law == "mobile")
+    (place,) = network.fingers
+    contact = network.contacts[place]
+    assert contact is not None
+    return Finger(circuit, law, gaps[0], sources[0], contact, network.areas[place].given, network)
 
 
 class StackInverter:
@@ -105,12 +94,14 @@ class StackInverter:
         self._curve = stack.contact.curve(1.2 * max(u_max, 1.0)) if area is None else fixed_area_curve(area)
         self._cells = np.column_stack([stack.c, stack.g_total, stack.g_area])
         self._gap, self._mobile = stack.gap, mobile
-        self._source = stack.sources[0][1]
         #: Sign of the GAP's voltage, from p to n, relative to the voltage along the source.
-        self.sign = float(stack.sign[stack.gap]) * self._source
+        self.sign = float(stack.sign[stack.gap]) * stack.sources[0][1]
 
     def drive(self, u: FloatArray, h: float, limits: Limits) -> tuple[FloatArray, BoolArray]:
-        """As `Inverter.drive`; `u` is positive in the direction of the source."""
+        """Source voltages for gap voltages `u` (V, shape (n,)) at intervals `h` (s), and the samples at a limit.
+
+        `u` is positive in the direction of the source.
+        """
         out, held = np.empty(u.size), np.empty(u.size, np.bool_)
         drive_stack(
             u, h, self._curve, self._cells, self._gap, self._mobile, limits.voltage, limits.slew * h, out, held
@@ -133,16 +124,10 @@ class NetworkInverter:
         self._network = network
         self._gap = next(g for g in network.gaps if g is not None)
         # The last number of frequencies and interval (s), and the response there: it takes longer than the transforms.
-        self._last: tuple[tuple[int, float], NDArray[np.complex128]] | None = None
+        self._last: tuple[tuple[int, float], ComplexArray] | None = None
 
-    def response(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Ratio of the gap voltage to the source voltage at complex frequencies (1/s), shape (n,).
-
-        Raises
-        ------
-        InputError
-            If the source does not drive the gap at one of the frequencies.
-        """
+    def response(self, s: ComplexArray) -> ComplexArray:
+        """Ratio of the gap voltage to the source voltage at complex frequencies (1/s), shape (n,)."""
         net = self._network
         y = self._leak + s[:, None] * self._c
         kernel = net.k + np.einsum("ci,fc,cj->fij", net.p, y, net.p, optimize=True)
@@ -157,7 +142,7 @@ class NetworkInverter:
         return np.asarray(gain)
 
     def drive(self, u: FloatArray, h: float, limits: Limits) -> tuple[FloatArray, BoolArray]:
-        """As `Inverter.drive`."""
+        """As `StackInverter.drive`."""
         from scipy.fft import irfft, next_fast_len, rfft
 
         n = u.size
@@ -173,14 +158,12 @@ class NetworkInverter:
         return out, held
 
 
-def rise(count: int) -> FloatArray:
-    """A rise from 0 to 1 (left out) in `count` steps, with zero first and second derivative at both ends."""
-    x = np.arange(count) / max(count, 1)
-    return np.asarray(x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
-
-
-def means(fine: FloatArray, rate: float, edges: FloatArray) -> FloatArray:
-    """Means between `edges` (s), by Simpson's rule, of values at samples of a rate (Hz) and midway between them."""
-    parts = (fine[:-2:2] + 4.0 * fine[1::2] + fine[2::2]) / (6.0 * rate)
-    total = np.append(0.0, np.cumsum(parts))
-    return np.asarray(np.diff(np.interp(edges, np.arange(total.size) / rate, total)) / np.diff(edges))
+def gap_voltages(curve: ForceCurve, force: FloatArray, rate: float, carrier: float | None, lead: int) -> FloatArray:
+    """Gap voltages (V) at a rate (Hz) that rise in `lead` steps, and then produce the forces (N) on a carrier (Hz)."""
+    u = curve.amplitude(force)
+    # The rise has zero first and second derivative at both ends.
+    x = np.arange(lead) / max(lead, 1)
+    u = np.append(u[0] * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x)), u)
+    if carrier is not None:
+        u *= np.sin(2.0 * np.pi * carrier / rate * (np.arange(u.size) - lead))
+    return u

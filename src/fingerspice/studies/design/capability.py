@@ -17,14 +17,21 @@ from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import require_circuit
-from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import heading
+from fingerspice.plots.drawing import BLUE, caption, dress, engineering, new_figure
 from fingerspice.solve.runs import Progress
-from fingerspice.studies.inverse import LEAD, Task
-from fingerspice.studies.inversion import Finger, Inverter, Limits, inverter_of, rise, the_finger
-from fingerspice.studies.wanted import ForceCurve, Profile
+from fingerspice.studies.design.finger import (
+    Finger,
+    Limits,
+    NetworkInverter,
+    StackInverter,
+    gap_voltages,
+    the_finger,
+)  # fmt: skip
+from fingerspice.studies.design.inverse import Task
+from fingerspice.studies.wanted import ForceCurve, as_profile
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
@@ -85,12 +92,8 @@ class Capability(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, SI units."""
-        return {
-            "limit": self.limit, "carrier": self.carrier, "frequency": self.frequency.tolist(),
-            "mean": self.mean.tolist(), "amplitude": self.amplitude.tolist(), "largest": self.largest.tolist(),
-            "best_mean": self.best_mean.tolist(), "smallest_mean": self.smallest_mean,
-            "largest_mean": self.largest_mean,
-        }  # fmt: skip
+        names = ("limit", "carrier", "frequency", "mean", "amplitude", "largest", "best_mean", "smallest_mean")
+        return {name: np.asarray(getattr(self, name)).tolist() for name in (*names, "largest_mean")}
 
     def _page(self) -> Page:
         wave = "without a carrier" if self.carrier is None else f"on a carrier of {format_si(self.carrier, 'Hz')}"
@@ -106,7 +109,28 @@ class Capability(Shown):
 
     def plot(self) -> Picture:
         """Picture with a map of the amplitude over frequency and mean, and the largest amplitude over frequency."""
-        return plot_capability(self)
+        figure, (left, right) = new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))
+        factor, unit = engineering(self.largest_mean, "N")
+        f, amplitude = self.frequency, factor * self.amplitude
+        if f.size == 1:
+            # A map needs two frequencies: a single one is drawn as a band around it, with room for the axis to be read.
+            f, amplitude = np.append(0.1 * f, 10.0 * f), np.repeat(amplitude, 2, axis=1)
+        mesh = left.contourf(f, factor * self.mean, amplitude, levels=12, cmap="viridis")
+        bar = figure.colorbar(mesh, ax=left, pad=0.02)
+        bar.set_label(f"Largest amplitude [{unit}]", fontsize=8)
+        bar.ax.tick_params(labelsize=8)
+        right.plot(self.frequency, factor * self.largest, color=BLUE, marker="o", markersize=3)
+        right.set_ylim(bottom=0.0)
+        for ax, label in ((left, f"Mean friction [{unit}]"), (right, f"Largest amplitude, best mean [{unit}]")):
+            ax.set_xscale("log")
+            dress(ax, label, "Modulation frequency [Hz]")
+        wave = "unipolar drive" if self.carrier is None else f"carrier {format_si(self.carrier, 'Hz')}"
+        caption(
+            figure,
+            f"{heading(self.circuit)} · at most {format_si(self.limit, 'V')}, {wave} · mean friction "
+            f"{format_si(self.smallest_mean, 'N')} to {format_si(self.largest_mean, 'N')}",
+        )
+        return figure
 
     def to_csv(self, path: str | Path) -> Path:
         """Write the map as CSV: one row for each frequency and mean."""
@@ -162,24 +186,20 @@ def capability(
         raise InputError(
             f"frequency reaches {f.max():g} Hz; allowed: at most a quarter of the carrier's {carrier:g} Hz"
         )
-    law = charge_law or circuit.charge_law or "local"
-    require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
-    finger = the_finger(circuit)
+    finger = the_finger(circuit, charge_law)
     contact = finger.contact
     if contact.mu == 0.0:
         raise InputError(f"{finger.gap.name} has mu=0 and no friction; allowed: mu > 0")
     # The charges in the layers can raise the gap voltage above the source voltage, but not to ten times the limit.
-    points = None if carrier is None else float(_PER_CARRIER)
-    area = finger.area
-    most = float(contact.stress(10.0 * limit)) * (float(contact.area(10.0 * limit)) if area is None else area)
-    curve = ForceCurve(contact, area, points, 0.4 * most)
-    search = _Search(circuit, finger, curve, inverter_of(circuit, 10.0 * limit, law), law, limit, carrier)
-    largest = search.largest_mean(0.4 * most)
+    area = float(contact.area(10.0 * limit)) if finger.area is None else finger.area
+    most = 0.4 * float(contact.stress(10.0 * limit)) * area
+    curve = ForceCurve(contact, finger.area, None if carrier is None else float(_PER_CARRIER), most)
+    search = _Search(finger, curve, finger.inverter(10.0 * limit), limit, carrier)
+    largest = search.largest_mean(most)
     force = np.linspace(0.0, largest, means)
     amplitude = np.zeros((means, f.size))
     for i in range(1, means - 1):
-        for k, x in enumerate(f.tolist()):
-            amplitude[i, k] = search.amplitude(float(force[i]), x)
+        amplitude[i] = [search.amplitude(float(force[i]), x) for x in f.tolist()]
         if progress is not None:
             progress(i / (means - 2))
     friction = contact.mu * (contact.f_n + force)
@@ -197,13 +217,11 @@ class _Search:
     runs.
     """
 
-    circuit: Circuit
     finger: Finger
     curve: ForceCurve
-    inverter: Inverter
-    law: str
-    limit: float
-    carrier: float | None
+    inverter: StackInverter | NetworkInverter
+    limit: float  # V
+    carrier: float | None  # Hz
     ratio: float = 1.0
 
     def largest_mean(self, most: float) -> float:
@@ -224,7 +242,7 @@ class _Search:
         """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit."""
         for _ in range(_MOST):
             found = _largest(lambda x: self.ratio * self._peak(wanted(x)) <= self.limit, most)
-            if self.finger.direct or found == 0.0:
+            if self.finger.network.stack is not None or found == 0.0:
                 break
             peak = self._corrected_peak(wanted(found))
             before, self.ratio = self.ratio, peak / self._peak(wanted(found))
@@ -232,24 +250,16 @@ class _Search:
                 break
         return found
 
-    def _lead(self, rate: float) -> int:
-        """Number of samples in which the force rises before the wanted one begins."""
-        return 0 if self.finger.direct else round(LEAD * rate)
-
     def _peak(self, force: Samples) -> float:
         """Largest voltage (V) of the inverter's drive for a force."""
-        u, lead = self.curve.amplitude(force.values), self._lead(force.rate)
-        u = np.append(u[0] * rise(lead), u)
-        if self.carrier is not None:
-            u *= np.sin(2.0 * np.pi * self.carrier * (np.arange(u.size) - lead) / force.rate)
+        lead = round(self.finger.lead * force.rate)
+        u = gap_voltages(self.curve, force.values, force.rate, self.carrier, lead)
         return float(np.abs(self.inverter.drive(u, 1.0 / force.rate, Limits())[0]).max())
 
     def _corrected_peak(self, force: Samples) -> float:
         """Largest voltage (V) of the drive for a force, corrected by forward runs."""
-        profile = Profile(force, (force.count - 1) / force.rate, force.rate)
-        task = Task(
-            self.circuit, self.finger, "force", profile, force.rate, self.carrier, self._lead(force.rate), self.law
-        )  # fmt: skip
+        profile = as_profile(force, "force", None, None)
+        task = Task(self.finger, "force", profile, force.rate, self.carrier, self.finger.lead)
         return task.solve(Limits(), 0.3 * _EXACT).peak
 
 
@@ -262,30 +272,3 @@ def _largest(holds: Callable[[float], bool], most: float) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if holds(middle) else (low, middle)
     return low
-
-
-def plot_capability(found: Capability) -> Picture:
-    """Picture with the map of amplitudes, and the largest amplitude over frequency."""
-    from fingerspice.plots.drawing import BLUE, caption, dress, engineering, new_figure
-
-    figure, (left, right) = new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))
-    factor, unit = engineering(found.largest_mean, "N")
-    mesh = left.contourf(
-        found.frequency, factor * found.mean, factor * found.amplitude, levels=12, cmap="viridis"
-    )  # fmt: skip
-    left.set_xscale("log")
-    dress(left, f"Mean friction [{unit}]", "Modulation frequency [Hz]")
-    bar = figure.colorbar(mesh, ax=left, pad=0.02)
-    bar.set_label(f"Largest amplitude [{unit}]", fontsize=8)
-    bar.ax.tick_params(labelsize=8)
-    right.plot(found.frequency, factor * found.largest, color=BLUE, marker="o", markersize=3)
-    right.set_xscale("log")
-    right.set_ylim(bottom=0.0)
-    dress(right, f"Largest amplitude, best mean [{unit}]", "Modulation frequency [Hz]")
-    wave = "unipolar drive" if found.carrier is None else f"carrier {format_si(found.carrier, 'Hz')}"
-    caption(
-        figure,
-        f"{heading(found.circuit)} · at most {format_si(found.limit, 'V')}, {wave} · mean friction "
-        f"{format_si(found.smallest_mean, 'N')} to {format_si(found.largest_mean, 'N')}",
-    )
-    return figure

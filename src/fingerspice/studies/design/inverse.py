@@ -1,0 +1,243 @@
+"""The drive that produces a wanted electroadhesive force or friction, checked by forward runs."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+
+from fingerspice.base.arrays import BoolArray, FloatArray, positive_number, real_number
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.circuit.arguments import require_circuit
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.solve.simulation import simulate
+from fingerspice.studies.design.drive import InverseDrive
+from fingerspice.studies.design.finger import Finger, Limits, gap_voltages, the_finger
+from fingerspice.studies.wanted import ForceCurve, Profile, Wanted, as_profile, check_forces, force_of_friction
+from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.waveform import require
+
+# Default rate of a drive, Hz; default and smallest number of samples in a period of the carrier.
+RATE, PER_PERIOD, FEWEST = 48_000.0, 128, 20
+# Largest number of samples of a drive: its Fourier transform and its run then need less than a gigabyte.
+MOST_SAMPLES = 5_000_000
+# Relative error of the forward run; relative error of the gap voltage at which the corrections end; largest number of
+# corrections. A correction that leaves more than the fraction STALLED of the smallest error so far is the last one.
+RTOL, CLOSE, CORRECTIONS, STALLED = 1e-6, 1e-5, 25, 0.7
+# Largest voltage of a drive without a warning where no limit is given, V: usual amplifiers end below it.
+HUGE = 1000.0
+
+
+def inverse_drive(
+    circuit: Circuit,
+    *,
+    force: Wanted | None = None,
+    friction: Wanted | None = None,
+    rate: float | None = None,
+    carrier: float | None = None,
+    limit: float | None = None,
+    slew: float | None = None,
+    duration: float | None = None,
+    lead: float | None = None,
+    charge_law: str | None = None,
+) -> InverseDrive:
+    """Find the source voltage that produces a wanted electroadhesive force or friction, starting uncharged.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        A circuit with one GAP and one V source, whose own waveform is not used.
+    force, friction : array_like, waveform or function of time (s)
+        Wanted force, or wanted friction, N; one of the two. An array has the sample rate `rate`. The force is Eq. 2
+        times the area, and the friction is mu (F_N + force).
+    rate : float, optional
+        Samples per second of the drive, which is linear between them. By default it is the rate of the wanted samples,
+        or else 48 kHz; with a carrier it is 128 times the carrier's frequency.
+    carrier : float, optional
+        Hz: the gap voltage is then an envelope times a sine, such that the mean force over each period of the sine is
+        the wanted one. Without a carrier the gap voltage does not change its sign.
+    limit : float, optional
+        Largest voltage of the source, V.
+    slew : float, optional
+        Largest slew rate of the source, V/s.
+    duration : float, optional
+        Length of a waveform or function without an end, s.
+    lead : float, optional
+        Time in which the gap voltage rises to its first value, s; by default 0 for a series stack, whose gap voltage
+        jumps with the source, and 2 ms for another network.
+    charge_law : str, optional
+        As in `simulate`.
+
+    Returns
+    -------
+    InverseDrive
+
+    Raises
+    ------
+    InputError
+        If no voltage produces the force, if the circuit has several fingers or sources, or if arguments contradict each
+        other.
+    SolveError
+        If the forward run fails.
+
+    Warns
+    -----
+    FingerspiceWarning
+        If no limit is given and the drive exceeds 1000 V.
+
+    Notes
+    -----
+    While a limit holds the drive, the drive stays at the limit and the layers' state follows from it; the force is the
+    wanted one again as soon as the limits allow. The drive does not act in advance of a limit that it will reach later.
+    """
+    require_circuit(circuit)
+    asked = [(kind, wanted) for kind, wanted in (("force", force), ("friction", friction)) if wanted is not None]
+    if len(asked) != 1:
+        raise InputError(f"of force and friction {'both' if asked else 'neither'} is given; allowed: one of them")
+    ((kind, wanted),) = asked
+    rate, carrier, limit, slew = (
+        None if number is None else positive_number(name, number, unit)
+        for name, number, unit in (
+            ("rate", rate, "Hz"), ("carrier", carrier, "Hz"), ("limit", limit, "V"), ("slew", slew, "V/s")
+        )
+    )  # fmt: skip
+    finger = the_finger(circuit, charge_law)
+    profile = as_profile(wanted, kind, rate, duration)
+    rate = _rate(rate, carrier, profile)
+    begin = finger.lead if lead is None else real_number("lead", lead, "a number in s")
+    require(0.0 <= begin < 1e3, "lead", f"{begin:g} s", "0 or more, less than 1000")
+    found = Task(finger, kind, profile, rate, carrier, begin).solve(Limits(limit or math.inf, slew or math.inf))
+    if limit is None and found.peak > HUGE:
+        text = (
+            f"the drive reaches {found.peak:.0f} V; limit= (V) keeps it within what the amplifier gives, and says what "
+            "that costs"
+        )
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    return found
+
+
+def _rate(rate: float | None, carrier: float | None, profile: Profile) -> float:
+    """The drive's rate, Hz."""
+    if carrier is not None:
+        if rate is not None and rate < FEWEST * carrier:
+            raise InputError(
+                f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: at most a {FEWEST}th of "
+                f"it, {rate / FEWEST:g} Hz, or a higher rate"
+            )
+        rate = PER_PERIOD * carrier if rate is None else rate
+        if profile.duration * carrier < 1.0:
+            raise InputError(f"{profile.duration:g} s hold no period of the carrier; allowed: 1 or more")
+    rate = (profile.rate or RATE) if rate is None else rate
+    count = profile.duration * rate
+    allowed = f"2 to {MOST_SAMPLES:,} samples"
+    require(2.0 <= count + 1.0 <= MOST_SAMPLES, "the drive", f"{count:,.0f} samples long", allowed)
+    return rate
+
+
+class Task:
+    """The gap voltage that produces a wanted force or friction (`kind`), and the iteration for its drive.
+
+    The force first rises for `lead` (s). `rate` and `carrier` (Hz) are those of `inverse_drive`.
+    """
+
+    def __init__(
+        self, finger: Finger, kind: str, profile: Profile, rate: float, carrier: float | None, lead: float
+    ) -> None:
+        self.finger, self.kind, self.rate, self.carrier, self.lead = finger, kind, rate, carrier, round(lead * rate)
+        # With a carrier the force is also evaluated midway between samples, as Simpson's rule for its mean needs it.
+        self.fine = 1 if carrier is None else 2
+        count = math.floor(profile.duration * rate * (1.0 + 1e-12)) + 1
+        t = np.arange(self.fine * (count - 1) + 1) / (self.fine * rate)
+        values = profile.wave.value(t)
+        if kind == "friction":
+            values = force_of_friction(values, finger.contact)
+        self.wanted = check_forces(values, t, kind, finger.contact)
+        self.curve = ForceCurve(
+            finger.contact, finger.area, None if carrier is None else rate / carrier, float(self.wanted.max())
+        )
+        self.target = gap_voltages(self.curve, self.wanted[:: self.fine], rate, carrier, self.lead)
+
+    def solve(self, limits: Limits, close: float = CLOSE) -> InverseDrive:
+        """The drive, corrected by the errors of the gap voltage that forward runs show, until they are `close`."""
+        peak = float(np.abs(self.target).max())
+        inverter = self.finger.inverter(peak)
+        target, best, least, done = self.target, None, math.inf, -1
+        wish, levelled = target.copy(), self.carrier is None
+        while best is None or done < CORRECTIONS:
+            drive, held = inverter.drive(wish, 1.0 / self.rate, limits)
+            u, force = self._forward(drive, close * RTOL / CLOSE)
+            miss = np.where(held, 0.0, target - inverter.sign * u)
+            size = float(np.abs(miss[self.lead :]).max()) / max(peak, 1e-300)
+            done += 1
+            stalled = size > STALLED * least
+            if size < least:
+                best, least = (drive, held, force, done), size
+            if (size <= close or stalled) and levelled:
+                break
+            wish = wish + miss
+            if size <= close or stalled:
+                # The gap voltage is linear between samples, not a sine, which changes the mean force: now that the
+                # force is known, scale the envelope once.
+                factor, levelled, least = np.where(held, 1.0, self._level(force)), True, math.inf
+                target, wish = target * factor, wish * factor
+        assert best is not None
+        return self._result(limits, *best)
+
+    def _forward(self, drive: FloatArray, rtol: float) -> tuple[FloatArray, FloatArray]:
+        """Gap voltage at the samples (V), and force at the fine times (N), that a drive gives."""
+        t = np.arange(self.fine * (drive.size - 1) + 1) / (self.fine * self.rate)
+        with warnings.catch_warnings():
+            # The reader has given the deck's warnings, and warnings about an uncorrected drive do not concern the user.
+            warnings.simplefilter("ignore", FingerspiceWarning)
+            run = simulate(
+                self._driven(Samples(drive, self.rate)), t_stop=float(t[-1]), t_eval=t, charge_law=self.finger.law,
+                rtol=rtol, start="uncharged", charge=False,
+            )  # fmt: skip
+        u, force = run.u_gap, run.f_el
+        assert u is not None
+        assert force is not None
+        return u[:: self.fine], force
+
+    def _driven(self, drive: Samples) -> Circuit:
+        return self.finger.circuit.varied({self.finger.source.name: drive})
+
+    def _compared(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times after the lead (s), and the wanted and the reached force there (N), from the force at the fine times.
+
+        With a carrier they are means over its whole periods, by Simpson's rule.
+        """
+        reached = force[self.lead * self.fine :]
+        if self.carrier is None:
+            return np.arange(reached.size) / self.rate, self.wanted, reached
+        count = math.floor((self.wanted.size - 1) / (2.0 * self.rate) * self.carrier * (1.0 + 1e-12))
+        edges = np.arange(count + 1) / self.carrier
+
+        def means(fine: FloatArray) -> FloatArray:
+            parts = (fine[:-2:2] + 4.0 * fine[1::2] + fine[2::2]) / (6.0 * self.rate)
+            total = np.append(0.0, np.cumsum(parts))
+            at_edges = np.interp(edges, np.arange(total.size) / self.rate, total)
+            return np.asarray(np.diff(at_edges) / np.diff(edges))
+
+        return 0.5 * (edges[1:] + edges[:-1]), means(self.wanted), means(reached)
+
+    def _level(self, force: FloatArray) -> FloatArray:
+        """Factors for the gap voltage at the samples, by which the mean force of each period becomes the wanted one."""
+        times, wanted, reached = self._compared(force)
+        some = (reached > 0.5 * wanted) & (wanted > 1e-3 * wanted.max())
+        factor = np.sqrt(np.divide(wanted, reached, out=np.ones_like(wanted), where=some))
+        return np.interp((np.arange(self.target.size) - self.lead) / self.rate, times, factor)
+
+    def _result(
+        self, limits: Limits, drive: FloatArray, held: BoolArray, force: FloatArray, corrections: int
+    ) -> InverseDrive:
+        lead, wave = self.lead / self.rate, Samples(drive, self.rate)
+        times, wanted, reached = self._compared(force)
+        times, contact = lead + times, self.finger.contact
+        wanted_friction, friction = (contact.mu * (contact.f_n + x) for x in (wanted, reached))
+        for array in (times, wanted, reached, wanted_friction, friction):
+            array.flags.writeable = False
+        return InverseDrive(
+            self._driven(wave), wave, times, wanted, reached, wanted_friction, friction, self.kind, self.carrier,
+            limits.voltage, limits.slew, lead, float(held.mean()), corrections,
+        )  # fmt: skip
