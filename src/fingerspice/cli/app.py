@@ -226,7 +226,7 @@ def ac(
 
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
-    from fingerspice.results.report import phasor_csv, phasor_dict, phasor_tables
+    from fingerspice.results.phasor_solution import phasor_csv, phasor_tables
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.phasors import phasor
     from fingerspice.studies.sweeps import sweep_frequencies
@@ -258,7 +258,7 @@ def ac(
 
             return plot_phasor(found, circuit)
 
-        answer.update(sweeps=[phasor_dict(r) for r in found] if as_json else None)
+        answer.update(sweeps=[r.to_dict() for r in found] if as_json else None)
         writes = [lambda: phasor_csv(found, data), *results.pictures(picture, drawn)]
         answer.give(lambda: phasor_tables(found, circuit), writes)
 
@@ -283,7 +283,7 @@ def plan(
 
       fingerspice plan circuits/fingerpad.cir --area frozen --rtol 1e-6 --json
     """
-    from fingerspice.results.report import plan_text
+    from fingerspice.circuit.describe import head_lines
     from fingerspice.solve.simulation import plan as make
 
     with Answering("plan", as_json, charge_law=charge_law, rtol=rtol, area=area) as answer:
@@ -292,7 +292,7 @@ def plan(
         circuit, _ = options.with_times(circuit, stop)
         result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
         answer.update(**answers.of_plan(result))
-        answer.give(lambda: plan_text(result, circuit))
+        answer.give(lambda: "\n".join([*head_lines(circuit), "", str(result)]))
 
 
 @app.command()

@@ -159,7 +159,7 @@ def _simulated(circuit: Circuit, request: Request, stop: float, first: float, la
 
 def _traces(solution: Solution, key: str) -> list[dict[str, Any]]:
     """The columns of a signal, each as one trace."""
-    unit, label = SIGNALS[key]
+    unit, label = SIGNALS[key][:2]
     out = []
     for name, values in list(solution.by_name(key).items())[:MOST_TRACES]:
         element = name.partition(":")[2]

@@ -180,18 +180,7 @@ class Panel(NamedTuple):
 
 
 def plot_fit(curves: Sequence[Curve], x_label: str, signal: str, unit: str) -> Picture:
-    """Data with error bars (one standard deviation) and the fit, and the residuals over sigma below.
-
-    Parameters
-    ----------
-    curves : sequence of Curve
-        Each has a colour and a line.
-    x_label, signal, unit : str
-
-    Returns
-    -------
-    Picture
-    """
+    """Data with error bars (one standard deviation) and the fit, and the residuals over sigma below."""
     return plot_panels([Panel(curves, x_label, signal, unit)])
 
 
