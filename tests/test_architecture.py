@@ -76,9 +76,9 @@ LENT = {
     "circuit.circuit.Circuit._waveform": "netlist.netlist",
     "circuit.circuit.Circuit.draw": "plots.schematic",
     "circuit.circuit.Circuit.explore": "explorer.server",
-    "results.doors.Doors.plot": "plots.traces",
-    "results.doors.Doors.explore": "explorer.server",
-    "results.doors.Doors.sample_gradient": "solve.adjoint",
+    "results.solution.Solution.plot": "plots.traces",
+    "results.solution.Solution.explore": "explorer.server",
+    "results.solution.Solution.sample_gradient": "solve.adjoint",
     "results.spectrum.Spectrum.plot": "plots.traces",
     "results.phasor_solution.PhasorSolution.plot": "plots.traces",
 }

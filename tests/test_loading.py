@@ -15,7 +15,7 @@ from scipy.io import wavfile
 
 import fingerspice as fs
 from fingerspice.results import stored_circuit
-from fingerspice.results.datafiles import GROUP
+from fingerspice.results.runfile import GROUP
 from scenes import table1, table1_deck
 
 AM = fs.AM(150.0, 5000.0, 50.0) + 3.0 * fs.Square(1.0, 50.0, duty=0.25)
@@ -127,6 +127,13 @@ def same_spectra(run: fs.Solution, again: fs.Solution) -> None:
 def test_a_loaded_run_has_the_lines_of_the_run(name: str, tmp_path: Path) -> None:
     run = one(name)
     same_spectra(run, fs.load(run.to_netcdf(tmp_path / "run.nc")))
+
+
+@pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
+def test_a_loaded_run_that_is_written_again_keeps_its_lines(tmp_path: Path) -> None:
+    run = one("fingerpad_square")
+    again = fs.load(run.to_netcdf(tmp_path / "run.nc"))
+    same_spectra(run, fs.load(again.to_netcdf(tmp_path / "again.nc")))
 
 
 def test_a_file_holds_what_a_deck_includes_and_plays(tmp_path: Path) -> None:

@@ -75,6 +75,15 @@ def test_a_run_read_from_a_file_has_its_lines(sine: fs.Solution, tmp_path: Path)
     np.testing.assert_allclose(found.amplitude, sine.spectrum(highest=1000.0).amplitude, rtol=0, atol=1e-11)
 
 
+def test_charge_and_current_have_the_lines_of_their_outputs() -> None:
+    run = fs.simulate(table1(), area="frozen", start="periodic", t_stop=0.02, t_eval=np.linspace(0.0, 0.02, 2001))
+    charge, current = run.spectrum("q_source"), run.spectrum("i_source")
+    assert charge.amplitude is not None
+    assert current.amplitude is not None
+    assert current.amplitude[0] == pytest.approx(2.0 * np.pi * 100.0 * charge.amplitude[0], rel=1e-6)
+    assert charge.amplitude[1:20].max() <= 1e-6 * charge.amplitude[0]
+
+
 def test_the_integral_of_a_tones_density_is_its_variance() -> None:
     solution = resistor(fs.Sine(3.0, 500.0), 1.0)
     found = solution.spectrum("u_source", method="welch", resolution=10.0)

@@ -80,8 +80,8 @@ def test_a_period_that_ends_with_a_jump_is_looked_at_a_few_times(
 ) -> None:
     # By rounding of the time the jump fell into the last panel, which was halved two thousand times.
     looks = []
-    look = steps.Stretches.values_at
-    monkeypatch.setattr(steps.Stretches, "values_at", lambda *a: looks.append(a) or look(*a))
+    look = steps.Recorded.values_at
+    monkeypatch.setattr(steps.Recorded, "values_at", lambda *a: looks.append(a) or look(*a))
     run = fs.simulate(table1(), sources={"Vdrive": source}, t_stop=0.05, rtol=1e-8)
     assert run.summary()["figures_from"] == "steps"
     assert len(looks) < 100

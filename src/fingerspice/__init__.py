@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from fingerspice.explorer.server import explore as explore
     from fingerspice.netlist.netlist import parse_netlist as parse_netlist
     from fingerspice.netlist.netlist import read_netlist as read_netlist
-    from fingerspice.results.loading import load as load
     from fingerspice.results.outcome import Plan as Plan
     from fingerspice.results.outcome import SolveError as SolveError
     from fingerspice.results.outcome import Status as Status
+    from fingerspice.results.runfile import load as load
     from fingerspice.results.solution import Solution as Solution
     from fingerspice.sets.parameters import Citation as Citation
     from fingerspice.sets.parameters import ParameterSet as ParameterSet
@@ -105,7 +105,7 @@ _HOMES = {
     "studies.phasors": ("phasor",),
     "studies.design.folds": ("FoldLimits", "fold_limits"),
     "studies.sweep.populations": ("sobol", "sweep"),
-    "results.loading": ("load",),
+    "results.runfile": ("load",),
     "results.outcome": ("Plan", "SolveError", "Status"),
     "sets.parameters": ("Citation", "ParameterSet", "parameters"),
     "solve.simulation": ("plan", "simulate"),

@@ -168,7 +168,8 @@ def _name_files(
 
     def symbols(file: Path) -> Path:
         # An SVG file knows no names of our own, and keeps all of them as one text.
-        return results.circuit.draw().write(file, {"Description": json.dumps(results.about)})
+        written: Path = results.circuit.draw().write(file, {"Description": json.dumps(results.about)})
+        return written
 
     if csv:
         results.will_write(".csv", lambda file: solution().to_csv(file))
@@ -227,7 +228,7 @@ def ac(
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
     from fingerspice.plots.traces import plot_phasor
-    from fingerspice.results.report import phasor_csv, phasor_dict, phasor_tables
+    from fingerspice.results.phasor_solution import phasor_csv, phasor_tables
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.comparison import large_signal
     from fingerspice.studies.phasors import phasor, sweep_frequencies
@@ -256,7 +257,7 @@ def ac(
                     circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger, progress=update
                 )
             found = [*every]
-        answer.update(sweeps=[phasor_dict(r) for r in found] if as_json else None)
+        answer.update(sweeps=[r.to_dict() for r in found] if as_json else None)
         answer.give(lambda: phasor_tables(found, circuit), results.ready())
 
 
@@ -280,7 +281,7 @@ def plan(
 
       fingerspice plan circuits/fingerpad.cir --area frozen --rtol 1e-6 --json
     """
-    from fingerspice.results.report import plan_text
+    from fingerspice.circuit.describe import head_lines
     from fingerspice.solve.simulation import plan as make
 
     with Answering("plan", as_json, charge_law=charge_law, rtol=rtol, area=area) as answer:
@@ -289,7 +290,7 @@ def plan(
         circuit, _ = options.with_times(circuit, stop)
         result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
         answer.update(**answers.of_plan(result))
-        answer.give(lambda: plan_text(result, circuit))
+        answer.give(lambda: "\n".join([*head_lines(circuit), "", str(result)]))
 
 
 @app.command()

@@ -167,7 +167,7 @@ def _simulated(circuit: Circuit, request: Request, stop: float, first: float, la
 
 def _traces(solution: Solution, key: str) -> list[dict[str, Any]]:
     """The columns of a signal, each as one trace."""
-    unit, label = SIGNALS[key]
+    unit, label = SIGNALS[key][:2]
     return [
         {"name": name, "signal": key, "element": name.partition(":")[2], "unit": unit, "label": label, "values": values}
         for name, values in list(solution.by_name(key).items())[:MOST_TRACES]

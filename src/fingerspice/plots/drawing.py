@@ -42,29 +42,13 @@ _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"
 
 
 def new_figure(rows: int, columns: int = 1, height: float = 3.0, **options: Any) -> tuple[Picture, list[Axes]]:
-    """A figure of `rows` by `columns` panels, 7 inches wide and `height` inches high.
+    """A figure of `rows` by `columns` panels, 7 inches wide and `height` inches high, and the panels, row by row.
 
-    Parameters
-    ----------
-    rows, columns : int
-    height : float
-        Inches.
-    **options
-        For ``Figure.subplots``: ``sharex``, ``height_ratios``, ...
-
-    Returns
-    -------
-    figure : Picture
-        Figure with an Agg canvas, so that it can be saved without a display.
-    axes : list of Axes
-        Panels, row by row.
+    It can be saved without a display; `options` are those of ``Figure.subplots``.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     from fingerspice.plots.picture import Picture
 
     figure = Picture(figsize=(WIDTH, height), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
     figure.get_layout_engine().set(w_pad=0.06, h_pad=0.05)  # type: ignore[union-attr, call-arg]
     axes = figure.subplots(rows, columns, squeeze=False, **options).ravel().tolist()
     for ax in axes:
@@ -128,16 +112,7 @@ def caption(figure: Figure, text: str, color: str = GREY) -> None:
 
 
 def save(figure: Figure, path: str | Path, *, about: Mapping[str, str] | None = None, dpi: float = 160.0) -> Path:
-    """Write a figure as PNG; the file is complete or absent.
-
-    Parameters
-    ----------
-    figure : Figure
-    path : str or Path
-    about : mapping, optional
-        Texts that are stored in the file, such as the origin of the figure.
-    dpi : float
-        Dots per inch.
+    """Write a figure as PNG, with the texts in `about`; the file is complete or absent.
 
     Raises
     ------
@@ -158,14 +133,7 @@ def engineering(peak: float, unit: str, least: float = 1.0) -> tuple[float, str]
 
 
 def thin(t: FloatArray, x: FloatArray, bins: int = MAX_BINS) -> tuple[FloatArray, FloatArray]:
-    """A curve with about 4 points per bin that looks the same: the first, last, smallest and largest of each bin.
-
-    Parameters
-    ----------
-    t, x : ndarray, shape (n,)
-    bins : int
-        Number of bins, larger than the number of dots across the page.
-    """
+    """A curve that looks the same, with the first, last, smallest and largest point (n,) of each bin."""
     width = t.size // bins
     if width < 8:
         return t, x

@@ -13,6 +13,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.circuit.describe import drive_text, heading
 from fingerspice.plots import drawing
 from fingerspice.results.outcome import Status
+from fingerspice.results.signals import SIGNALS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,22 +31,13 @@ _PALE: dict[str, Any] = {"linewidth": 3.2, "alpha": 0.45, "linestyle": "-", "sol
 
 
 class Quantity(NamedTuple):
-    """The physical quantity of a panel, with its label, unit and colour.
-
-    Attributes
-    ----------
-    label, unit, color : str
-    least : float
-        The unit's prefix is chosen so that the peak is at least this number; 0 means no prefix.
-    from_zero : bool
-        Whether the scale starts at 0.
-    """
+    """The physical quantity of a panel."""
 
     label: str
     unit: str
-    least: float
+    least: float  # The unit's prefix is chosen so that the peak is at least this number; 0 means no prefix
     color: str
-    from_zero: bool
+    from_zero: bool  # Whether the scale starts at 0
 
 
 VOLTAGE = Quantity("Voltage", "V", 2.0, drawing.BLUE, False)
@@ -60,9 +52,6 @@ QUANTITIES = {
     "i_source": Quantity("Current", "A", 2.0, drawing.BLUE, False),
     "fold_margin": Quantity("Distance to the fold", "", 0.0, drawing.BLACK, True),
 }
-_CALLED = {"u_source": "source", "u_gap": "gap", "f_el": "electroadhesive force", "f_t": "friction", "v": "node",
-           "u_layer": "layer", "friction": "coefficient", "sigma_el": "electroadhesive stress", "q_source": "charge",
-           "i_source": "current", "fold_margin": "distance to the fold"}  # fmt: skip
 
 
 class Drawn(NamedTuple):
@@ -109,8 +98,7 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
                 source = kind == "u_source"
                 if source and shared and number > 0:
                     continue
-                word = _CALLED.get(kind, kind)
-                label = element if kind == "v" else f"{word} {element}".rstrip()
+                label = element if kind == "v" else f"{SIGNALS[kind].short} {element}".rstrip()
                 if len(gaps) > 1 and element in gaps:
                     color = drawing.CYCLE[gaps.index(element) % len(drawing.CYCLE)]
                 elif len(runs) > 1 and not (source and shared):
@@ -147,23 +135,12 @@ def draw_line(
     ax: Axes, trace: Trace, factor: float, start: float, stop: float, runs: Sequence[Drawn],
     envelope: FloatArray | None = None,
 ) -> None:  # fmt: skip
-    """Draw a line from `start` to `stop` (s), or its envelope.
+    """Draw a line from `start` to `stop` (s) with a factor from its SI unit, beside the other `runs` of the picture.
 
-    One output beyond each end of the window is drawn too, so that the line reaches the edges of the picture.
-
-    Parameters
-    ----------
-    ax : Axes
-    trace : Trace
-    factor : float
-        Factor from the signal's SI unit to the panel's unit.
-    start, stop : float
-    runs : sequence of Drawn
-        All runs of the picture, which determine the unit of the time axis.
-    envelope : ndarray, optional
-        Times (s) of the turning points, two per oscillation; with them an envelope is drawn.
+    With the times (s) of its turning points, two per oscillation, an envelope is drawn.
     """
     t = trace.solution.t
+    # One output beyond each end of the window is drawn too, so that the line reaches the edges of the picture.
     first, last = max(int(np.searchsorted(t, start)) - 1, 0), int(np.searchsorted(t, stop, side="right")) + 1
     t, x = t[first:last], factor * trace.x[first:last]
     scale = time_unit(runs)[0]

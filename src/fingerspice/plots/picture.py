@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 from matplotlib.backend_bases import FigureManagerBase
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from fingerspice.base.errors import InputError
@@ -21,6 +22,8 @@ class Picture(Figure):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
+        # With this canvas it can be saved without a display.
+        FigureCanvasAgg(self)
         if in_notebook():
             _waiting.append(self)
             sys.modules["IPython"].get_ipython().events.register("post_execute", _show_waiting)

@@ -24,6 +24,7 @@ from fingerspice.plots.picture import Picture
 from fingerspice.plots.placement import GROUND, Place, Placement, place
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Stroke = Sequence[tuple[float, float]]
@@ -190,7 +191,7 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     if len(circuit.elements) > MOST_ELEMENTS:
         count = f"{len(circuit.elements):,}"
         raise InputError(f"the circuit has {count} elements; allowed: at most {MOST_ELEMENTS} in a picture")
-    figure = _new()
+    figure = Schematic(facecolor="white")
     size = _measure(figure)
     placed = place(circuit)
     names = _node_names(circuit)
@@ -205,29 +206,20 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set(xlim=(0.0, sheet.width), ylim=(0.0, sheet.height))
     ax.set_axis_off()
-    write = _writer(figure)
     for k, line in enumerate(title):
-        write(_MARGIN, sheet.height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, bold=True)
+        _write(ax, _MARGIN, sheet.height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, bold=True)
     strokes = _wires(placed, sheet)
     for p in placed.places:
-        strokes += _draw_element(figure, sheet, p, labels[p.element.name])
+        strokes += _draw_element(ax, sheet, p, labels[p.element.name])
     for node, name in names.items():
         x, y = sheet.x[placed.extents[node][0]] + 0.07, sheet.y[placed.rows[node]] + 0.08
-        write(x, y, name, color=drawing.BLUE)
+        _write(ax, x, y, name, color=drawing.BLUE)
     for stroke in strokes:
         ax.plot(*zip(*stroke, strict=True), color=drawing.BLACK, linewidth=1.0, solid_capstyle="round")
     for x, y in _dots(placed, sheet):
         ax.plot([x], [y], "o", color=drawing.BLACK, markersize=3.5)
     if path is not None:
         figure.write(path)
-    return figure
-
-
-def _new() -> Schematic:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    figure = Schematic(facecolor="white")
-    FigureCanvasAgg(figure)
     return figure
 
 
@@ -241,20 +233,10 @@ def _measure(figure: Schematic) -> Callable[[str, bool], float]:
     return lambda text, bold: float(renderer.get_text_width_height_descent(text, fonts[bold], False)[0]) / dots
 
 
-def _writer(figure: Schematic) -> Callable[..., None]:
-    """A function that writes a line of text, its left middle at (x, y)."""
-    (ax,) = figure.axes
-
-    def write(x: float, y: float, text: str, *, bold: bool = False, color: str = drawing.BLACK) -> None:
-        how: dict[str, Any] = {
-            "fontsize": drawing.FONT,
-            "weight": "bold" if bold else "normal",
-            "color": color,
-            "va": "center",
-        }
-        ax.text(x, y, text, parse_math=False, **how)
-
-    return write
+def _write(ax: Axes, x: float, y: float, text: str, *, bold: bool = False, color: str = drawing.BLACK) -> None:
+    """A line of text, its left middle at (x, y)."""
+    weight = "bold" if bold else "normal"
+    ax.text(x, y, text, fontsize=drawing.FONT, weight=weight, color=color, va="center", parse_math=False)
 
 
 def _node_names(circuit: Circuit) -> dict[str, str]:
@@ -334,7 +316,7 @@ def _sheet(
     return _Sheet(x, y, width, height)
 
 
-def _draw_element(figure: Schematic, sheet: _Sheet, p: Place, label: _Label) -> list[Stroke]:
+def _draw_element(ax: Axes, sheet: _Sheet, p: Place, label: _Label) -> list[Stroke]:
     """Write an element's label; gives the strokes of its symbol and of its wires."""
     from matplotlib.patches import Rectangle
 
@@ -345,10 +327,9 @@ def _draw_element(figure: Schematic, sheet: _Sheet, p: Place, label: _Label) -> 
     tint = _TINTS.get(p.element.device)
     if tint is not None:
         corner = (x - wide - 0.02, y - tall)
-        figure.axes[0].add_patch(Rectangle(corner, 2.0 * wide + 0.04, 2.0 * tall, color=tint, alpha=0.2, linewidth=0))
-    write = _writer(figure)
+        ax.add_patch(Rectangle(corner, 2.0 * wide + 0.04, 2.0 * tall, color=tint, alpha=0.2, linewidth=0))
     for k, line in enumerate(label.lines):
-        write(x + wide + _BESIDE, y + 0.5 * label.height - (k + 0.5) * _LINE, line, bold=k == 0)
+        _write(ax, x + wide + _BESIDE, y + 0.5 * label.height - (k + 0.5) * _LINE, line, bold=k == 0)
     up = 1.0 if p.upright else -1.0
     moved: list[Stroke] = [[(x + dx, y + up * dy) for dx, dy in stroke] for stroke in strokes]
     return [*moved, [(x, sheet.y[p.top]), (x, y + tall)], [(x, y - tall), (x, sheet.y[p.bottom])]]

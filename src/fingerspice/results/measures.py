@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.polynomial import legendre
 
-from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS
-
-#: From the record of a run to one of its signals, shape (n_t,).
-Read = Callable[[Any], FloatArray]
+from fingerspice.results.signals import AnyRecord
+from fingerspice.results.steps import Panels, Read, Recorded
 
 _NODES = POINTS[:NODES]
 #: Smallest tolerance of the interpolation error of a panel, relative to the signal's peak.
@@ -26,45 +24,6 @@ _MOST_CUT = 4096
 _MOST_ROUNDS = 60
 #: Gauss-Lobatto weights on [0, 1]: exact for polynomials of degree 23.
 _WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * _NODES - 1.0) ** 2)
-
-
-class Panels(NamedTuple):
-    """Parts of a run on each of which every signal is smooth."""
-
-    step: IntArray  # (p,)
-    # low, high (p,): The part of that step that the panel covers, as fractions of its length
-    low: FloatArray
-    high: FloatArray
-    # (p,): Duration, s; longer than the panel itself if the panel represents several equal periods
-    duration: FloatArray
-
-    def take(self, which: IntArray) -> Panels:
-        """The panels with these numbers."""
-        return Panels(self.step[which], self.low[which], self.high[which], self.duration[which])
-
-    def halved(self) -> Panels:
-        """The two halves of every panel."""
-        middle, half = 0.5 * (self.low + self.high), 0.5 * self.duration
-        low, high = np.append(self.low, middle), np.append(middle, self.high)
-        return Panels(np.tile(self.step, 2), low, high, np.tile(half, 2))
-
-    def fractions(self, points: FloatArray) -> FloatArray:
-        """Points in [0, 1] of each panel as fractions of its step, shape (p, n)."""
-        # Written so that the points 0 and 1 give exactly `low` and `high`.
-        return np.asarray(self.low[:, None] * (1.0 - points) + self.high[:, None] * points)
-
-
-class Run(Protocol):
-    """A run whose signals can be evaluated between its outputs."""
-
-    def panels(self, since: float, until: float) -> Panels:
-        """Parts of the run between two times, s."""
-
-    def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
-        """Times (s) and a signal at the `POINTS` of panels, shape (p, ROWS) each."""
-
-    def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Times (s) and a signal at fractions (p, n) of the steps with these indices (p,), shape (p, n) each."""
 
 
 @dataclass(frozen=True)
@@ -93,23 +52,15 @@ class Stretch:
     A panel is halved where the polynomial through its nodes differs from the signal between them: steps are chosen to
     resolve the gap voltage, and the area may change within a small part of the voltage's range.
 
-    Parameters
-    ----------
-    run : Run
-    since, until : float
-        s.
-    rtol : float
-        Error of the run relative to its peaks; means and extremes are computed more exactly.
-    longest : float
-        s: panels are halved until none is longer.
+    `rtol` is the error of the run relative to its peaks, than which means and extremes are more exact; no panel is
+    longer than `longest` (s).
     """
 
-    def __init__(self, run: Run, since: float, until: float, rtol: float, longest: float = math.inf) -> None:
+    def __init__(self, run: Recorded, since: float, until: float, rtol: float, longest: float = math.inf) -> None:
         self.run, self.span, self.rtol = run, (since, until), rtol
         self.panels = run.panels(since, until)
         while (long := self.panels.duration > longest).any():
-            short, halves = self.panels.take(np.flatnonzero(~long)), self.panels.take(np.flatnonzero(long)).halved()
-            self.panels = _joined([short, halves])
+            self.panels = _joined([self.panels.take(~long), self.panels.take(long).halved()])
         self._share, self._shares = _shares(self.panels)
 
     def weigh(self, read: Read) -> Weighed:
@@ -159,10 +110,10 @@ class Stretch:
             if most <= 0 or left == 1:
                 # Panels that are still not smooth hold round-off, or a jump that round-off has shifted across an end.
                 wrong[:] = False
-            parts.append((panels.take(np.flatnonzero(~wrong)), t[~wrong, :NODES], x[~wrong, :NODES]))
+            parts.append((panels.take(~wrong), t[~wrong, :NODES], x[~wrong, :NODES]))
             if not wrong.any():
                 break
-            panels = panels.take(np.flatnonzero(wrong)).halved()
+            panels = panels.take(wrong).halved()
             most -= panels.step.size
             t, x = self.run.at_points(read, panels)
         every = _joined([part[0] for part in parts])
@@ -183,6 +134,28 @@ def _shares(panels: Panels) -> tuple[FloatArray, FloatArray]:
     """Weight of each panel, shape (p,), and of the values at its nodes, shape (p, NODES), in a mean."""
     share = panels.duration / panels.duration.sum()
     return share, share[:, None] * _WEIGHTS
+
+
+class Outputs:
+    """Outputs of a record from number `first` on; after interpolated ones at a time `start` (s) if that is given."""
+
+    def __init__(self, record: AnyRecord, first: int = 0, start: float | None = None) -> None:
+        self.record, self.first, self.start = record, first, start
+
+    def _values(self, read: Read) -> tuple[FloatArray, FloatArray]:
+        t, x = self.record.t, read(self.record)
+        if self.start is None:
+            return t[self.first :], x[self.first :]
+        return np.append(self.start, t[self.first :]), np.append(np.interp(self.start, t, x), x[self.first :])
+
+    def weigh(self, read: Read) -> Weighed:
+        """A signal with weights for its means."""
+        return weigh_outputs(*self._values(read))
+
+    def extremes(self, read: Read) -> tuple[float, float]:
+        """Smallest and largest value of a signal."""
+        _, x = self._values(read)
+        return float(x.min()), float(x.max())
 
 
 def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -236,9 +237,12 @@ class Plan(Shown):
     area: float
 
     def _page(self) -> Page:
-        from fingerspice.results.report import plan_text
-
-        return plan_text(self)
+        rates = ", ".join(f"{r:.4g}" for r in self.rates) or "none"
+        lines = [f"model: {self.tier}", *(f"  because {r}" for r in self.reasons)]
+        lines.append(f"rates, area frozen: {rates} 1/s ({'' if self.stiff else 'not '}stiff for this source)")
+        if not math.isnan(self.sensitivity):
+            lines.append(f"the area differs from its middle by at most {100.0 * self.sensitivity:.3g} %")
+        return Page(lines)
 
     def to_dict(self) -> dict[str, object]:
         """The plan as plain data."""

@@ -1,13 +1,22 @@
-"""The result of a phasor sweep."""
+"""The result of a phasor sweep, with its columns, from which its table, file and plain data follow."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
+from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown
+from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.describe import heading
+from fingerspice.results.report import Column, table_of
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -70,10 +79,45 @@ class PhasorSolution(Shown):
     nodes: tuple[str, ...] = ()
     v_nodes: ComplexArray | None = None
 
-    def _page(self) -> Page:
-        from fingerspice.results.report import phasor_table
+    def _columns(self) -> list[Column]:
+        """The columns of its table and its file; the amplitude, without a heading, only belongs into the file."""
 
-        return phasor_table(self, most=20)
+        def polar(key: str, phase: str, x: ComplexArray, unit: str, heads: tuple[str, str], form: str = ".5g") -> None:
+            out.append(Column(key, unit, np.abs(x), heads[0], form=form))
+            out.append(Column(phase, "deg", np.degrees(np.angle(x)), heads[1], form=".3f"))
+
+        out = [Column("frequency", "Hz", self.frequency, "frequency [Hz]", form=".6g")]
+        for i, node in enumerate(self.nodes):
+            assert self.v_nodes is not None
+            polar(f"v:{node}", f"phase_deg:{node}", self.v_nodes[:, i], "V", (f"|v({node})| [V]", "phase [deg]"))
+        if not self.nodes:
+            polar("gain", "phase_deg", self.gain, "1", ("|u_gap/U|", "phase [deg]"), ".5f")
+            out.append(Column("u_gap", "V", np.abs(self.u_gap), "u_gap [V]"))
+            out.append(Column("area", "m^2", self.area, "area [mm^2]", 1e6))
+            out.append(Column("f_el_mean", "N", self.f_el_mean, "mean force [N]"))
+        out.append(Column("amplitude", "V", np.full(self.frequency.size, self.amplitude)))
+        if self.impedance is not None:
+            polar("impedance", "impedance_phase_deg", self.impedance, "ohm", ("|Z| [ohm]", "phase of Z [deg]"))
+        return out
+
+    def _page(self, most: int = 20) -> Page:
+        """A table; of a long sweep, only every n-th row, so that at most `most` rows remain."""
+        rows = slice(None, None, max(1, -(-self.frequency.size // most)))
+        drive = f"source amplitude {format_si(self.amplitude, 'V')}, phase {math.degrees(self.phase):.4g} deg"
+        return Page([f"{drive}: {self.drive}", *self.notes, table_of(self._columns(), rows)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The sweep as plain data, SI units."""
+        columns = [column for column in self._columns() if column.key != "amplitude"]
+        # Phases of nodes come after all amplitudes.
+        columns.sort(key=lambda column: column.key.startswith("phase_deg:"))
+        found: dict[str, Any] = {column.key: column.values.tolist() for column in columns}
+        found.setdefault("impedance", None)
+        found.setdefault("impedance_phase_deg", None)
+        return found | {
+            "amplitude": self.amplitude, "source_phase_deg": math.degrees(self.phase), "drive": self.drive,
+            "notes": list(self.notes), "warnings": list(self.warnings),
+        }  # fmt: skip
 
     def plot(self) -> Figure:
         """Gain, phase, mean force and area, or without GAP the node voltages, against frequency."""
@@ -82,3 +126,15 @@ class PhasorSolution(Shown):
         require(self.circuit is not None, "circuit", self.circuit, "a sweep that phasor or large_signal made")
         assert self.circuit is not None
         return plot_phasor((self,), self.circuit)
+
+
+def phasor_tables(results: Sequence[PhasorSolution], circuit: Circuit) -> str:
+    """Sweeps of a circuit at several amplitudes as tables."""
+    return "\n\n".join([heading(circuit), *(r._page(40) for r in results)])
+
+
+def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
+    """Write sweeps as CSV, one after the other where there are several amplitudes."""
+    header = [f"{column.key} [{column.unit}]" for column in results[0]._columns()]
+    rows = (row for r in results for row in zip(*(c.values.tolist() for c in r._columns()), strict=True))
+    return write_csv(path, header, rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,14 +23,17 @@ def sealed(x: FloatArray) -> FloatArray:
 
 
 class Sealed:
-    """A result whose arrays stay read-only after copying or unpickling, which both make writable arrays."""
+    """A result whose arrays are read-only, also after copying or unpickling, which both make writable arrays."""
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        for value in state.values():
+    def __post_init__(self) -> None:
+        for value in vars(self).values():
             for array in value.values() if isinstance(value, dict) else (value,):
                 if isinstance(array, np.ndarray):
                     sealed(array)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        Sealed.__post_init__(self)
 
 
 def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
@@ -59,10 +63,6 @@ class Record(Sealed):
     # and without it the columns of the charges may be missing
     rows: FloatArray
     has_charge: bool
-
-    def __post_init__(self) -> None:
-        for array in (self.t, self.left, self.rows):
-            array.flags.writeable = False
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -170,28 +170,28 @@ class Record(Sealed):
     @cached_property
     def u_gap(self) -> FloatArray:
         """Gap voltage, V."""
-        return _side_by_side([self.finger_voltage(i) for i in range(len(self.fingers))])
+        return side_by_side([self.finger_voltage(i) for i in range(len(self.fingers))])
 
     @cached_property
     def area(self) -> FloatArray | None:
         """Contact area of each GAP, m^2; without a GAP the circuit's first area; None where there is none."""
         shown = self.network.fingers or ((0,) if self.network.areas else ())
-        return _side_by_side([self._area_of(i) for i in shown]) if shown else None
+        return side_by_side([self._area_of(i) for i in shown]) if shown else None
 
     @cached_property
-    def force(self) -> FloatArray:
+    def f_el(self) -> FloatArray:
         """Electroadhesive force, N."""
-        return _side_by_side([self.finger_force(i) for i in range(len(self.fingers))])
+        return side_by_side([self.finger_force(i) for i in range(len(self.fingers))])
 
     @cached_property
-    def charge(self) -> FloatArray | None:
+    def q_source(self) -> FloatArray | None:
         """Charge (C) that each source has delivered at its p node, or at its n node if it is an I."""
         n_s = len(self.network.sources)
         end = self.rows.shape[1] - n_s
         return _columns(self.rows[:, end - n_s : end].copy()) if self.has_charge else None
 
     @cached_property
-    def current(self) -> FloatArray | None:
+    def i_source(self) -> FloatArray | None:
         """Current (A) that each source delivers at that node, without the impulses at jumps."""
         return _columns(self.rows[:, -len(self.network.sources) :].copy()) if self.has_charge else None
 
@@ -226,7 +226,7 @@ class Record(Sealed):
         return {name: sealed(self._voltage(row[:n], row[n:])) for name, row in rows}
 
 
-def _side_by_side(columns: list[FloatArray]) -> FloatArray:
+def side_by_side(columns: Sequence[FloatArray]) -> FloatArray:
     """Signals of several elements as a table, that of one as it is."""
     return sealed(columns[0] if len(columns) == 1 else np.column_stack(columns))
 

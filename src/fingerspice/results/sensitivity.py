@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.results.record import Sealed, sealed
+from fingerspice.results.record import Sealed
 
 #: Signals and means that have derivatives.
 SIGNALS = ("u_gap", "area", "f_el", "f_t", "friction")
@@ -43,10 +43,6 @@ class Sensitivity(Sealed):
     friction_mean: float
     area_mean: float
 
-    def __post_init__(self) -> None:
-        for array in (self.u_gap, self.area, self.f_el, self.f_t, self.friction):
-            sealed(array)
-
     def __repr__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
         relative = f"{self.value * self.f_el_mean:.4g} N for a change of 100 %"
@@ -74,9 +70,6 @@ class SampleGradient(Sealed):
     start: float
     values: FloatArray
     error: float
-
-    def __post_init__(self) -> None:
-        sealed(self.values)
 
     def __repr__(self) -> str:
         largest = float(np.abs(self.values).max(initial=0.0))

@@ -1,117 +1,88 @@
-"""Signals of a run by name: those of its record, or of a file, and further ones computed from them for each gap."""
+"""Signals of a run: what is fixed about each, and their values by name from a record or from a file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.numerics.lobatto import NODES, POINTS
 from fingerspice.physics.contact import Contact
-from fingerspice.results.measures import Panels, Read
-from fingerspice.results.record import Record, Sealed, sealed
-from fingerspice.results.steps import basis
+from fingerspice.results.record import Record, Sealed, side_by_side
+
+
+class Signal(NamedTuple):
+    """What is fixed about a signal, wherever it is printed, drawn or written."""
+
+    unit: str
+    text: str  # Its long name
+    short: str  # Its name in a legend
+    of: str = ""  # "source", "layer", "gap" or "node" where each of these has a column
+    # Other signals follow from the record itself: this one from another signal, with the contact of the gap
+    base: str = ""
+    make: Callable[[Contact, FloatArray], FloatArray] | None = None
+    ripple: bool = False  # Whether its summary has a ripple instead of an rms
+
+
+#: Signals in the order of tables and files; those of layers and nodes are ``u_layer:NAME`` and ``v:NAME``.
+SIGNALS = {
+    "u_source": Signal("V", "source voltage", "source", "source"),
+    "u_layer": Signal("V", "layer voltage", "layer", "layer"),
+    "u_gap": Signal("V", "gap voltage", "gap", "gap"),
+    "area": Signal("m^2", "ridge contact area", "area", "gap", ripple=True),
+    "sigma_el": Signal("Pa", "electroadhesive stress", "electroadhesive stress", "gap", "u_gap", Contact.stress),
+    "f_el": Signal("N", "electroadhesive force", "electroadhesive force", "gap", ripple=True),
+    "f_t": Signal(
+        "N", "friction force", "friction", "gap", "f_el", lambda contact, f: contact.mu * (contact.f_n + f), ripple=True
+    ),
+    "friction": Signal(
+        "1", "friction coefficient f_t / f_n", "coefficient", "gap", "f_t", lambda contact, f: f / contact.f_n,
+        ripple=True,
+    ),
+    "q_source": Signal("C", "charge delivered by the source", "charge", "source"),
+    "i_source": Signal("A", "source current, regular part", "current", "source"),
+    "fold_margin": Signal("1", "distance to the fold of the mobile law", "distance to the fold"),
+    "v": Signal("V", "node voltage", "node", "node"),
+}  # fmt: skip
+
+
+def signal_of(name: str) -> Signal:
+    """What is fixed about a signal that is given as ``key`` or ``key:element``."""
+    return SIGNALS[name.partition(":")[0]]
 
 
 @dataclass(frozen=True, eq=False)
 class StoredRecord(Sealed):
-    """Outputs of a run as they were read from a file.
+    """Outputs of a run as they were read from a file."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (n_t,)
-        s; at a jump two entries share a time.
-    layers, sources : tuple of str
-    fingers : tuple of (str, Contact)
-        Each GAP's name and contact.
-    u_source, charge, current : ndarray, shape (n_t,) or (n_t, n_source)
-        V, C and A; the last two None where the run left them out.
-    u_layer : ndarray, shape (n_t, n_layer)
-        V.
-    u_gap, area, force : ndarray, shape (n_t,) or (n_t, n_gap)
-        V, m^2 and N; `area` is None for a circuit without any area.
-    fold_margin : ndarray, shape (n_t,)
-    node_voltages : dict of str to ndarray, shape (n_t,)
-        V.
-    """
-
-    t: FloatArray
-    layers: tuple[str, ...]
+    t: FloatArray  # (n_t,): s; at a jump two entries share a time
     sources: tuple[str, ...]
-    fingers: tuple[tuple[str, Contact], ...]
-    u_source: FloatArray
-    u_layer: FloatArray
-    u_gap: FloatArray
-    area: FloatArray | None
-    force: FloatArray
-    charge: FloatArray | None
-    current: FloatArray | None
-    fold_margin: FloatArray
+    fingers: tuple[tuple[str, Contact], ...]  # Each GAP's name and contact
+    layers: tuple[str, ...]
+    values: dict[str, FloatArray]  # Signals that the run has, by name, shaped as those of `Record`
     node_voltages: dict[str, FloatArray]
 
-    def __post_init__(self) -> None:
-        for value in vars(self).values():
-            for array in value.values() if isinstance(value, dict) else (value,):
-                if isinstance(array, np.ndarray):
-                    sealed(array)
 
-
-@dataclass(frozen=True, eq=False)
-class StoredRun:
-    """The last period of a run between its outputs, by polynomials on panels; see `measures.Run`."""
-
-    since: float  # Start of the period, s
-    nodes: StoredRecord  # Signals at the nodes of each panel, one panel after another
-
-    def run(self, readers: Mapping[str, Read], since: float, until: float) -> StoredRun | None:
-        """This period itself; None for any other part of the run."""
-        return self if abs(since - self.since) <= 1e-9 * (until - self.since) else None
-
-    def panels(self, since: float, until: float) -> Panels:
-        """All panels."""
-        t = self.nodes.t.reshape(-1, NODES)
-        return Panels(np.arange(len(t)), np.zeros(len(t)), np.ones(len(t)), t[:, -1] - t[:, 0])
-
-    def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
-        """See `measures.Run`."""
-        return self.values_at(read, panels.step, panels.fractions(POINTS))
-
-    def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """See `measures.Run`; evaluates the polynomials."""
-        t, x = (values.reshape(-1, NODES)[index] for values in (self.nodes.t, read(self.nodes)))
-        return t[:, :1] + fraction * (t[:, -1:] - t[:, :1]), np.einsum("pn,pqn->pq", x, basis(fraction))
+def stored_record(
+    names: Sequence[str], t: FloatArray, left: BoolArray | None, columns: FloatArray, *, sources: tuple[str, ...],
+    fingers: tuple[tuple[str, Contact], ...],
+) -> StoredRecord:  # fmt: skip
+    """A record at times (s), left-hand values or not, of signals ``key`` or ``key:element`` of shape (n, n_t)."""
+    own: dict[str, dict[str, FloatArray]] = {key: {} for key in SIGNALS}
+    for name, column in zip(names, columns, strict=True):
+        key, _, element = name.partition(":")
+        own[key][element] = np.ascontiguousarray(column)
+    nodes, layers = own.pop("v"), own.pop("u_layer")
+    values = {key: side_by_side([*one.values()]) for key, one in own.items() if one and not SIGNALS[key].base}
+    values["u_layer"] = np.column_stack([np.zeros((t.size, 0)), *layers.values()])
+    return StoredRecord(t, sources, fingers, tuple(layers), values, nodes)
 
 
 AnyRecord = Record | StoredRecord
-
-#: Unit and long name of each signal; layers and nodes are ``u_layer:NAME`` and ``v:NAME``.
-SIGNALS = {
-    "u_source": ("V", "source voltage"),
-    "u_layer": ("V", "layer voltage"),
-    "u_gap": ("V", "gap voltage"),
-    "area": ("m^2", "ridge contact area"),
-    "sigma_el": ("Pa", "electroadhesive stress"),
-    "f_el": ("N", "electroadhesive force"),
-    "f_t": ("N", "friction force"),
-    "friction": ("1", "friction coefficient f_t / f_n"),
-    "q_source": ("C", "charge delivered by the source"),
-    "i_source": ("A", "source current, regular part"),
-    "fold_margin": ("1", "distance to the fold of the mobile law"),
-    "v": ("V", "node voltage"),
-}
-#: Signals that every gap has.
-_OF_A_GAP = ("u_gap", "sigma_el", "f_el", "f_t", "friction")
-#: Attribute names in the record of signals that are named differently there.
-_IN_RECORD = {"f_el": "force", "q_source": "charge", "i_source": "current"}
-#: Signals that are computed from another one, with the contact of the gap.
-_DERIVED: dict[str, tuple[str, Callable[[Contact, FloatArray], FloatArray]]] = {
-    "sigma_el": ("u_gap", lambda contact, u: contact.stress(u)),
-    "f_t": ("f_el", lambda contact, f: contact.mu * (contact.f_n + f)),
-    "friction": ("f_t", lambda contact, f: f / contact.f_n),
-}
 
 
 class Signals:
@@ -128,33 +99,28 @@ class Signals:
 
     def value(self, key: str) -> FloatArray | None:
         """A signal, shape (n_t,), or (n_t, n) where n elements have it; None where the run has no such signal."""
-        if key in _OF_A_GAP and not self.gaps:
+        signal = SIGNALS[key]
+        if signal.of == "gap" and key != "area" and not self.gaps:
             return None
-        if key in _DERIVED:
-            if key not in self._derived:
-                base, make = _DERIVED[key]
-                self._derived[key] = self._per_gap(self.value(base), make)
-            return self._derived[key]
-        held: FloatArray | None = getattr(self.record, _IN_RECORD.get(key, key))
-        return held
-
-    def _per_gap(self, x: FloatArray | None, make: Callable[[Contact, FloatArray], FloatArray]) -> FloatArray:
-        """A signal of every gap computed from another one."""
-        assert x is not None
-        contacts = [contact for _, contact in self.record.fingers]
-        if len(contacts) == 1:
-            return sealed(make(contacts[0], x))
-        return sealed(np.column_stack([make(contact, x[:, i]) for i, contact in enumerate(contacts)]))
+        if signal.make is None:
+            held: FloatArray | None
+            held = self.record.values.get(key) if isinstance(self.record, StoredRecord) else getattr(self.record, key)
+            return held
+        if key not in self._derived:
+            base, contacts = self.value(signal.base), [contact for _, contact in self.record.fingers]
+            assert base is not None
+            columns = [base] if len(contacts) == 1 else base.T
+            made = [signal.make(contact, x) for contact, x in zip(contacts, columns, strict=True)]
+            self._derived[key] = side_by_side(made)
+        return self._derived[key]
 
     def columns(self, key: str) -> tuple[str, ...]:
         """Names of the layers, gaps, sources or nodes to which the columns of a signal belong."""
-        if key == "v":
-            return tuple(self.record.node_voltages)
-        if key == "fold_margin":
-            return ()
-        if key == "u_layer":
-            return self.record.layers
-        return self.record.sources if key.endswith("_source") else self.gaps
+        record = self.record
+        of = SIGNALS[key].of
+        if of == "node":
+            return tuple(record.node_voltages)
+        return {"": (), "source": record.sources, "layer": record.layers, "gap": self.gaps}[of]
 
     def names(self, key: str) -> tuple[str, ...]:
         """``key`` itself, or ``key:element`` for each of several elements; empty where the run has no such signal.
@@ -173,8 +139,8 @@ class Signals:
         if key in ("u_layer", "v"):
             return tuple(f"{key}:{name}" for name in several)
         # Decide without computing the signal, where possible.
-        missing = not several if key in _OF_A_GAP else False
-        if key in ("q_source", "i_source") or (key == "area" and not several):
+        missing = SIGNALS[key].of == "gap" and not several
+        if key in ("q_source", "i_source") or (key == "area" and missing):
             missing = self.value(key) is None
         return () if missing else (key,) if len(several) < 2 else tuple(f"{key}:{name}" for name in several)
 
@@ -186,3 +152,103 @@ class Signals:
         value = self.value(key)
         assert value is not None
         return value[:, self.columns(key).index(element)] if colon else value
+
+
+class _Given(property):
+    """A signal as an attribute; None where the run has no such signal."""
+
+    def __init__(self, key: str, doc: str) -> None:
+        super().__init__(lambda result: result.all_signals.value(key), doc=doc)
+
+    def __get__(self, result: Any, owner: type | None = None, /) -> FloatArray | None:  # type: ignore[override]
+        found: FloatArray | None = super().__get__(result, owner)
+        return found
+
+
+class Signalled:
+    """A result with the signals of a record."""
+
+    record: AnyRecord
+
+    @cached_property
+    def all_signals(self) -> Signals:
+        """The signals by name, with the elements to which their columns belong."""
+        return Signals(self.record)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the columns of `u_layer`."""
+        return self.record.layers
+
+    @property
+    def gaps(self) -> tuple[str, ...]:
+        """Names of the GAPs."""
+        return self.all_signals.gaps
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the sources of a network; of a series stack there is one, its loop."""
+        return self.record.sources
+
+    @property
+    def u_source(self) -> FloatArray:
+        """Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,)."""
+        return self.all_signals.one("u_source")
+
+    @property
+    def u_layer(self) -> FloatArray:
+        """Voltage of each layer from its p to its n node, V, shape (n_t, n_layer)."""
+        return self.all_signals.one("u_layer")
+
+    @property
+    def node_voltages(self) -> dict[str, FloatArray]:
+        """Node name to its voltage, V, shape (n_t,)."""
+        return self.record.node_voltages
+
+    @property
+    def fold_margin(self) -> FloatArray:
+        """Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`."""
+        return self.all_signals.one("fold_margin")
+
+    area = _Given("area", "Ridge contact area, m^2, shape (n_t,); None for a circuit without any.")
+    q_source = _Given(
+        "q_source",
+        "Charge delivered by the source since the start, C, shape (n_t,), with the impulses at jumps.\n\n"
+        "None where the run was asked to leave it out.",
+    )
+    i_source = _Given(
+        "i_source",
+        "Current of the source, A, shape (n_t,), without the impulses at jumps, which only `q_source` shows.",
+    )
+    u_gap = _Given("u_gap", "Gap voltage, V, shape (n_t,); None for a circuit without GAP.")
+    sigma_el = _Given("sigma_el", "Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP.")
+    f_el = _Given(
+        "f_el",
+        "Electroadhesive force, N, shape (n_t,); None for a circuit without GAP.\n\n"
+        "Its mean is `f_el_mean`, and over the last period `f_el_mean_periodic`. ``f_el.mean()`` is another figure: it "
+        "gives every output the same weight, including both ends of a period and both rows of a jump, which causes an "
+        "error of some per cent at 50 to 200 outputs per period.",
+    )
+    f_t = _Given("f_t", "Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP.")
+    friction = _Given("friction", "Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP.")
+
+    def by_name(self, key: str) -> dict[str, FloatArray]:
+        """A signal by its name, or the columns of several elements by ``name:element``.
+
+        Raises
+        ------
+        InputError
+            For a name that no signal has.
+        """
+        return {name: self.all_signals.one(name) for name in self.all_signals.names(key)}
+
+    @property
+    def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
+        """Every signal by name, with its values (n_t,), unit and long name."""
+        out: dict[str, tuple[FloatArray, str, str]] = {}
+        for key, signal in SIGNALS.items():
+            for name, value in self.by_name(key).items():
+                element = name.partition(":")[2]
+                said = {"u_layer": f"voltage of {element}", "v": f"voltage of node {element}"}.get(key, signal.text)
+                out[name] = value, signal.unit, said
+        return out

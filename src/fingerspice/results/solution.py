@@ -9,32 +9,37 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.pages import Page
-from fingerspice.results.datafiles import dataset, to_dataframe, write_csv, write_netcdf
-from fingerspice.results.doors import Doors
+from fingerspice.base.files import write_csv
+from fingerspice.base.pages import Page, Shown
+from fingerspice.results.datafiles import kept_rows, variables
 from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status
-from fingerspice.results.record import Sealed, sealed
-from fingerspice.results.signals import SIGNALS, AnyRecord, Signals
-from fingerspice.results.summary import Figured, Figures, KeptFigures
+from fingerspice.results.record import Sealed
+from fingerspice.results.report import summary_table
+from fingerspice.results.signals import AnyRecord, Signalled
+from fingerspice.results.summary import Figured, Figures
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     import pandas
     import xarray
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
 
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.outcome import Plan
-    from fingerspice.results.sensitivity import Sensitivity
-    from fingerspice.results.signals import StoredRun
+    from fingerspice.results.sensitivity import SampleGradient, Sensitivity
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import ClosedForm, Recorded
+    from fingerspice.sets.parameters import Citation
     from fingerspice.waveforms.waveform import Fundamental
 
 
 @dataclass(frozen=True, repr=False)
-class Solution(Sealed, Doors, Figured):
+class Solution(Sealed, Shown, Signalled, Figured):
     """Time response of a circuit.
 
     Signals are read-only arrays in SI units, computed when they are first asked for. A jump of the source has two rows
@@ -65,7 +70,7 @@ class Solution(Sealed, Doors, Figured):
         TSTART and the end of the run, s.
     start : str
         How the run started, as in `simulate`; ``"given"`` where it went on from another one.
-    continuous : Recorded or ClosedForm or StoredRun or None
+    continuous : Recorded or ClosedForm or None
         The run between its outputs, or the last period of one from a file; None where only its outputs are known.
     fundamental, period : Fundamental or None, float or None
         Fundamental and period (s) of the source; None where it has none.
@@ -98,115 +103,12 @@ class Solution(Sealed, Doors, Figured):
     first: float = 0.0
     t_stop: float = 0.0
     start: str = "deck"
-    continuous: Recorded | ClosedForm | StoredRun | None = None
+    continuous: Recorded | ClosedForm | None = None
     stored: Mapping[str, Any] | None = None
     sensitivities: Mapping[str, Sensitivity] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        sealed(self.t)
-
     def _page(self) -> Page:
-        from fingerspice.results.report import summary_table
-
         return summary_table(self)
-
-    @cached_property
-    def all_signals(self) -> Signals:
-        """The signals by name, with the elements to which their columns belong."""
-        return Signals(self.record)
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the columns of `u_layer`."""
-        return self.record.layers
-
-    @property
-    def gaps(self) -> tuple[str, ...]:
-        """Names of the GAPs."""
-        return self.all_signals.gaps
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """Names of the sources of a network; of a series stack there is one, its loop."""
-        return self.record.sources
-
-    @property
-    def u_source(self) -> FloatArray:
-        """Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,)."""
-        return self.record.u_source
-
-    @property
-    def u_layer(self) -> FloatArray:
-        """Voltage of each layer from its p to its n node, V, shape (n_t, n_layer)."""
-        return self.record.u_layer
-
-    @property
-    def node_voltages(self) -> dict[str, FloatArray]:
-        """Node name to its voltage, V, shape (n_t,)."""
-        return self.record.node_voltages
-
-    @property
-    def area(self) -> FloatArray | None:
-        """Ridge contact area, m^2, shape (n_t,); None for a circuit without any."""
-        return self.record.area
-
-    @property
-    def q_source(self) -> FloatArray | None:
-        """Charge delivered by the source since the start, C, shape (n_t,), with the impulses at jumps.
-
-        None where the run was asked to leave it out.
-        """
-        return self.record.charge
-
-    @property
-    def i_source(self) -> FloatArray | None:
-        """Current of the source, A, shape (n_t,), without the impulses at jumps, which only `q_source` shows."""
-        return self.record.current
-
-    @property
-    def fold_margin(self) -> FloatArray:
-        """Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`."""
-        return self.record.fold_margin
-
-    @property
-    def u_gap(self) -> FloatArray | None:
-        """Gap voltage, V, shape (n_t,); None for a circuit without GAP."""
-        return self.all_signals.value("u_gap")
-
-    @property
-    def sigma_el(self) -> FloatArray | None:
-        """Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP."""
-        return self.all_signals.value("sigma_el")
-
-    @property
-    def f_el(self) -> FloatArray | None:
-        """Electroadhesive force, N, shape (n_t,); None for a circuit without GAP.
-
-        Its mean is `f_el_mean`, and over the last period `f_el_mean_periodic`. ``f_el.mean()`` is another figure: it
-        gives every output the same weight, including both ends of a period and both rows of a jump, which causes an
-        error of some per cent at 50 to 200 outputs per period.
-        """
-        return self.all_signals.value("f_el")
-
-    @property
-    def f_t(self) -> FloatArray | None:
-        """Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP."""
-        return self.all_signals.value("f_t")
-
-    @property
-    def friction(self) -> FloatArray | None:
-        """Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP."""
-        return self.all_signals.value("friction")
-
-    def by_name(self, key: str) -> dict[str, FloatArray]:
-        """A signal by its name, or the columns of several elements by ``name:element``.
-
-        Raises
-        ------
-        InputError
-            For a name that no signal has.
-        """
-        return {name: self.all_signals.one(name) for name in self.all_signals.names(key)}
 
     @property
     def message(self) -> str:
@@ -218,24 +120,13 @@ class Solution(Sealed, Doors, Figured):
         """Whether the run reached its end with the error met."""
         return self.status is Status.SUCCESS
 
-    @property
-    def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
-        """Every signal by name, with its values (n_t,), unit and long name."""
-        out: dict[str, tuple[FloatArray, str, str]] = {}
-        for key, (unit, text) in SIGNALS.items():
-            for name, value in self.by_name(key).items():
-                element = name.partition(":")[2]
-                said = {"u_layer": f"voltage of {element}", "v": f"voltage of node {element}"}.get(key, text)
-                out[name] = value, unit, said
-        return out
-
     @cached_property
-    def _figures(self) -> Figures | KeptFigures:
+    def _figures(self) -> Figures:
         # Of a copy, as two objects that hold each other stay in memory until Python looks for such cycles.
-        return Figures(copy(self)) if self.stored is None else KeptFigures(self.all_signals, self.stored)
+        return Figures(copy(self))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in vars(self).items() if key not in ("_figures", "all_signals", "_summary")}
+        return {key: value for key, value in vars(self).items() if key not in ("_figures", "all_signals")}
 
     def summary(self) -> dict[str, Any]:
         """Figures of the run: peak, rms, mean, ripple, amplitude and phase at the fundamental; SI units.
@@ -247,10 +138,6 @@ class Solution(Sealed, Doors, Figured):
         `f_el_mean_periodic` the mean over the last period of the source; figures of a period are None where the run is
         shorter. A circuit without GAP has figures of its layer voltages (``u_layer:Xcoat_max``) instead.
         """
-        return dict(self._summary)
-
-    @cached_property
-    def _summary(self) -> dict[str, Any]:
         return self._figures.summary()
 
     def provenance(self) -> dict[str, str]:
@@ -284,7 +171,10 @@ class Solution(Sealed, Doors, Figured):
         InputError
             Where the folder cannot be written.
         """
-        return write_csv(self, Path(path))
+        signals = self.signals
+        header = ["t [s]", *(f"{name} [{unit}]" for name, (_, unit, _) in signals.items())]
+        table = np.column_stack([self.t, *(value for value, _, _ in signals.values())])
+        return write_csv(path, header, (row.tolist() for row in table))
 
     def to_xarray(self, *, jumps: str = "right") -> xarray.Dataset:
         """The run as an xarray Dataset with units and provenance.
@@ -304,7 +194,7 @@ class Solution(Sealed, Doors, Figured):
         """
         import xarray
 
-        data, coords = dataset(self, jumps)
+        data, coords = variables(self, kept_rows(self, jumps))
         return xarray.Dataset(data, coords=coords, attrs=self.provenance())
 
     def to_dataframe(self, *, jumps: str = "right") -> pandas.DataFrame:
@@ -320,7 +210,11 @@ class Solution(Sealed, Doors, Figured):
         InputError
             For another value of `jumps`.
         """
-        return to_dataframe(self, jumps)
+        import pandas
+
+        keep = kept_rows(self, jumps)
+        index = pandas.Index(self.t[keep], name="time")
+        return pandas.DataFrame({name: x[keep] for name, (x, _, _) in self.signals.items()}, index=index)
 
     def to_netcdf(self, path: str | Path, *, jumps: str = "right") -> Path:
         """Write `to_xarray` as a NetCDF file, without the cost of loading xarray; `fs.load` reads it back.
@@ -333,6 +227,8 @@ class Solution(Sealed, Doors, Figured):
         InputError
             Where the folder cannot be written, or for another value of `jumps`.
         """
+        from fingerspice.results.runfile import write_netcdf
+
         return write_netcdf(self, Path(path), jumps)
 
     def spectrum(
@@ -371,3 +267,92 @@ class Solution(Sealed, Doors, Figured):
         from fingerspice.results.spectrum import spectrum_of
 
         return spectrum_of(self, signal, method, highest, resolution, since)
+
+    def plot(
+        self,
+        signals: str | Sequence[str] | None = None,
+        *,
+        window: tuple[float, float] | None = None,
+        others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
+    ) -> Figure:
+        """Draw signals against time: a notebook shows the figure, and from a script ``plot().show()`` opens a window.
+
+        More than about 30 oscillations are drawn as envelopes, and a second column shows the last few of them enlarged;
+        it also shows a short event enlarged.
+
+        Parameters
+        ----------
+        signals : str or sequence of str, optional
+            Keys of `signals`, such as ``"f_el"``, ``"u_layer:Xcoat"``, or ``"u_layer"`` for all layers; signals of the
+            same quantity share a panel. The default is source and gap voltage, force, area and friction.
+        window : tuple of float, optional
+            Start and end, s; the whole run by default.
+        others : Solution, sequence or mapping of str to Solution, optional
+            Runs to draw over this one; without names they are called by the facts in which they differ.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            ``savefig("x.pdf")`` saves it, ``show()`` shows it.
+
+        Raises
+        ------
+        InputError
+            For an unknown signal, or a window without outputs.
+        """
+        from fingerspice.plots.traces import plot_solution
+
+        return plot_solution(self, signals, window, others)
+
+    def explore(self) -> Any:
+        """Show the run's circuit on a local page as it was run, in a notebook below the cell (docs/explore.md).
+
+        Returns
+        -------
+        Explorer
+            The running page.
+        """
+        from fingerspice.explorer.server import explore
+
+        return explore(self)
+
+    def sample_gradient(self, **of: ArrayLike) -> SampleGradient:
+        """Derivatives of a number that follows from this run by every sample of its source (docs/sensitivities.md).
+
+        For ``J = sum((run.f_t - wanted) ** 2)`` that is ``run.sample_gradient(f_t=2.0 * (run.f_t - wanted))``. The run
+        has one GAP whose area follows its voltage, under one recording: `Samples`, or a PWL on an even grid. One way
+        back through the run's steps gives the derivatives by all samples.
+
+        Parameters
+        ----------
+        **of : array_like
+            Derivatives of J by signals of the run, shape (n_t,): ``u_gap``, ``area``, ``f_el``, ``f_t``, ``friction``;
+            and by its means, numbers: ``area_mean``, ``f_el_mean``, ``f_t_mean``, ``friction_mean``.
+
+        Returns
+        -------
+        SampleGradient
+            Shape (n_sample,), with the error stated.
+
+        Raises
+        ------
+        InputError
+            For another circuit, source or run, or an unknown signal.
+        SolveError
+            If the run cannot be followed sample by sample.
+        """
+        from fingerspice.solve.adjoint import sample_gradient
+
+        return sample_gradient(self, of)
+
+    def cite(self) -> Citation:
+        """What to cite for this run: the model's paper, the program, and the sets of parameters that were applied.
+
+        Returns
+        -------
+        Citation
+            ``print`` shows the text and the BibTeX, which is also in `Citation.bibtex`.
+        """
+        from fingerspice.sets.parameters import cite
+
+        return cite(self.circuit, self.method)

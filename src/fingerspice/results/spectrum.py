@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +15,8 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.spectrum import NOTABLE, energy_outside
-from fingerspice.results.record import Sealed, sealed
-from fingerspice.results.signals import SIGNALS
-from fingerspice.results.summary import Figures
+from fingerspice.results.record import Sealed
+from fingerspice.results.signals import signal_of
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -77,11 +76,6 @@ class Spectrum(Sealed, Shown):
     resolution: float
     segments: float
 
-    def __post_init__(self) -> None:
-        for x in (self.frequency, self.amplitude, self.density, self.lower, self.upper):
-            if x is not None:
-                sealed(x)
-
     @property
     def shown_variance(self) -> float:
         """Variance in the spectrum: less than `variance` where the signal has frequencies beyond the highest one."""
@@ -91,7 +85,7 @@ class Spectrum(Sealed, Shown):
         return float(self.density.sum()) * self.resolution
 
     def _page(self) -> Page:
-        name = f"{SIGNALS[self.signal.partition(':')[0]][1]} ({self.signal})"
+        name = f"{signal_of(self.signal).text} ({self.signal})"
         rms = format_si(math.sqrt(self.variance), self.unit)
         head = f"spectrum of the {name}: mean {format_si(self.mean, self.unit)}, rms about it {rms}"
         if self.amplitude is not None:
@@ -145,46 +139,38 @@ def spectrum_of(
 
 def _lines(solution: Solution, name: str, highest: float | None) -> Spectrum | None:
     """Lines of the source's last period; None where the run holds none."""
-    figures = solution._figures if isinstance(solution._figures, Figures) else Figures(solution)
     period = solution.period
-    if period is None or figures.last is None:
+    if period is None or solution._figures.last is None:
         return None
     count = _LINES if highest is None else int(highest * period * (1.0 + 1e-12))
     allowed = f"{1.0 / period:g} Hz, the lowest line, to {_MOST_LINES / period:g} Hz"
     require(1 <= count <= _MOST_LINES, "highest", f"{highest} Hz", allowed)
-    weighed, exact = figures.last_finely(name, period / count)
+    found = solution._figures.last_finely(name, period / count)
+    if found is None:
+        return None
+    weighed, exact = found
     if not exact:
         # The outputs alone determine no frequency beyond half their rate.
         count = max(min(count, (weighed.t.size - 1) // 2), 1)
     _warn_if_open(solution, name, weighed)
     mean = weighed.mean()
-    about = Centred(weighed.t.ravel(), weighed.weight.ravel(), weighed.x.ravel() - mean)
+    weight, x = weighed.weight.ravel(), weighed.x.ravel() - mean
+    variance = float((weight * x**2).sum())
     return Spectrum(
-        name, SIGNALS[name.partition(":")[0]][0], np.arange(1, count + 1) / period, about.amplitudes(period, count),
-        None, None, None, mean, about.variance, 1.0 / period, 1.0,
+        name, signal_of(name).unit, np.arange(1, count + 1) / period,
+        _amplitudes(weighed.t.ravel(), weight * x, period, count), None, None, None, mean, variance, 1.0 / period, 1.0,
     )  # fmt: skip
 
 
-class Centred(NamedTuple):
-    """Values of a signal about its mean at times (s) of one period, with quadrature weights; shape (n,) each."""
-
-    t: FloatArray
-    weight: FloatArray
-    x: FloatArray
-
-    @property
-    def variance(self) -> float:
-        return float((self.weight * self.x**2).sum())
-
-    def amplitudes(self, period: float, count: int) -> FloatArray:
-        """Amplitudes of the first `count` harmonics, shape (count,)."""
-        turn = np.exp(-2j * np.pi * np.remainder(self.t / period, 1.0))
-        turning = 2.0 * self.weight * self.x + 0j
-        out = np.empty(count)
-        for k in range(count):
-            turning *= turn
-            out[k] = abs(turning.sum())
-        return out
+def _amplitudes(t: FloatArray, weighed: FloatArray, period: float, count: int) -> FloatArray:
+    """Amplitudes of the first `count` harmonics of a signal times its quadrature weights, at times t (s)."""
+    turn = np.exp(-2j * np.pi * np.remainder(t / period, 1.0))
+    turning = 2.0 * weighed + 0j
+    out = np.empty(count)
+    for k in range(count):
+        turning *= turn
+        out[k] = abs(turning.sum())
+    return out
 
 
 def _warn_if_open(solution: Solution, name: str, weighed: Weighed) -> None:
@@ -228,7 +214,7 @@ def _density(
     kept = slice(None) if highest is None else f <= highest
     require(bool(np.any(f[kept])), "highest", f"{highest} Hz", f"{f[1]:.4g} Hz or more")
     return Spectrum(
-        name, SIGNALS[name.partition(":")[0]][0], f[kept], None, density[kept], low * density[kept],
+        name, signal_of(name).unit, f[kept], None, density[kept], low * density[kept],
         high * density[kept], mean, variance, float(f[1]), segments,
     )  # fmt: skip
 

@@ -6,15 +6,15 @@ import cmath
 import math
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.numerics.lobatto import NODES
-from fingerspice.results.measures import Stretch, Weighed, weigh_outputs
+from fingerspice.results.measures import Outputs, Stretch, Weighed
 from fingerspice.results.record import sealed
-from fingerspice.results.signals import AnyRecord, Signals
+from fingerspice.results.signals import AnyRecord, Signals, signal_of
 
 if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
@@ -25,59 +25,14 @@ Value = float | FloatArray | None
 MOST_BETWEEN = 2_000_000
 # The signals in it, and how far they may be from their polynomials, relative to their peaks.
 _BETWEEN, _MISSED = ("u_source", "u_layer", "v", "u_gap", "area", "f_el", "fold_margin"), 1e-10
-# Signals whose summary has a ripple instead of an rms.
-_RIPPLE = ("area", "f_el", "f_t", "friction")
 
 
 def _read(name: str, record: AnyRecord) -> FloatArray:
     return Signals(record).one(name)
 
 
-class Span(Protocol):
-    """A part of a run, from which figures are computed."""
-
-    def weigh(self, name: str) -> Weighed:
-        """A signal with its weights."""
-
-    def extremes(self, name: str) -> tuple[float, float]:
-        """Smallest and largest value of a signal."""
-
-
-class _Steps:
-    """A part of a run whose signals are known between the outputs."""
-
-    def __init__(self, stretch: Stretch) -> None:
-        self.stretch = stretch
-
-    def weigh(self, name: str) -> Weighed:
-        return self.stretch.weigh(partial(_read, name))
-
-    def extremes(self, name: str) -> tuple[float, float]:
-        return self.stretch.extremes(partial(_read, name))
-
-
-class _Outputs:
-    """Outputs from number `first` on; if a time `start` (s) is given, interpolated values there come first."""
-
-    def __init__(self, t: FloatArray, signals: Signals, first: int = 0, start: float | None = None) -> None:
-        self.t, self.signals, self.first, self.start = t, signals, first, start
-
-    def _values(self, name: str) -> tuple[FloatArray, FloatArray]:
-        t, x = self.t, self.signals.one(name)
-        if self.start is None:
-            return t[self.first :], x[self.first :]
-        return np.append(self.start, t[self.first :]), np.append(np.interp(self.start, t, x), x[self.first :])
-
-    def weigh(self, name: str) -> Weighed:
-        return weigh_outputs(*self._values(name))
-
-    def extremes(self, name: str) -> tuple[float, float]:
-        _, x = self._values(name)
-        return float(x.min()), float(x.max())
-
-
 class Figures:
-    """Figures of a solution, each computed on first use and cached."""
+    """Figures of a solution, each computed on first use and cached, or those that its file holds."""
 
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
@@ -89,57 +44,56 @@ class Figures:
 
         `kind` is mean, rms, min, max, peak, ripple, amplitude, phase_deg, or one of the first two with ``_periodic``.
         """
-        found = self._kept.get((key, kind), self)
-        if found is self:
-            found = self._kept[key, kind] = _together([self._one(name, kind) for name in self.signals.names(key)])
-        return found  # type: ignore[no-any-return]
+        values = [self._one(name, kind) for name in self.signals.names(key)]
+        if len(values) < 2:
+            return values[0] if values else None
+        return None if None in values else sealed(np.array(values, float))
 
     def _one(self, name: str, kind: str) -> float | None:
-        found = self._kept.get((name, kind), self)
-        if found is self:
-            found = self._kept[name, kind] = self._made(name, kind)
-        return found  # type: ignore[no-any-return]
+        if self.solution.stored is not None:
+            return self.solution.stored.get(f"{name}_{kind}")
+        if (name, kind) not in self._kept:
+            self._kept[name, kind] = self._made(name, kind)
+        return self._kept[name, kind]  # type: ignore[no-any-return]
 
     def _made(self, name: str, kind: str) -> float | None:
         kind, periodic, _ = kind.partition("_periodic")
         span = self.last if periodic or kind in ("ripple", "amplitude", "phase_deg") else self.whole
         if span is None:
             return None
+        read = partial(_read, name)
         if kind in ("mean", "rms"):
-            return span.weigh(name).mean() if kind == "mean" else math.sqrt(span.weigh(name).mean(2))
+            return span.weigh(read).mean() if kind == "mean" else math.sqrt(span.weigh(read).mean(2))
         if kind in ("amplitude", "phase_deg"):
             if self.solution.fundamental is None:
                 return None
-            p = span.weigh(name).phasor(self.solution.fundamental.frequency)
+            p = span.weigh(read).phasor(self.solution.fundamental.frequency)
             return abs(p) if kind == "amplitude" else math.degrees(cmath.phase(p))
-        low, high = self._extremes(name, span)
-        return {"min": low, "max": high, "peak": max(high, -low), "ripple": high - low}[kind]
-
-    def _extremes(self, name: str, span: Span) -> tuple[float, float]:
         key = name, f"extremes {span is self.whole}"
         if key not in self._kept:
-            self._kept[key] = span.extremes(name)
-        return self._kept[key]  # type: ignore[no-any-return]
+            self._kept[key] = span.extremes(read)
+        low, high = self._kept[key]
+        figures: dict[str, float] = {"min": low, "max": high, "peak": max(high, -low), "ripple": high - low}
+        return figures[kind]
 
     @cached_property
     def _readers(self) -> Mapping[str, Callable[[Any], FloatArray]]:
         return {name: partial(_read, name) for name in self.shown}
 
-    def _between(self, since: float, until: float) -> Span | None:
+    def _between(self, since: float, until: float) -> Stretch | None:
         """The run between two times (s); None where it is not known between its outputs."""
         continuous = self.solution.continuous
         run = None if continuous is None else continuous.run(self._readers, since, until)
-        return None if run is None else _Steps(Stretch(run, since, until, self.solution.rtol))
+        return None if run is None else Stretch(run, since, until, self.solution.rtol)
 
     @cached_property
-    def whole(self) -> Span | None:
+    def whole(self) -> Stretch | Outputs | None:
         """The run from TSTART to its end; None where there are no outputs."""
         s = self.solution
-        found = self._between(s.first, s.t_stop)
-        return found if found is not None or s.t.size < 2 else _Outputs(s.t, self.signals)
+        return self._between(s.first, s.t_stop) or (None if s.t.size < 2 else Outputs(s.record))
 
     @cached_property
-    def last(self) -> Span | None:
+    def last(self) -> Stretch | Outputs | None:
         """The last period of the source; None where the run holds none."""
         s = self.solution
         if s.period is None or not s.t.size:
@@ -152,26 +106,35 @@ class Figures:
             found = self._between(since, s.t_stop)
             if found is not None:
                 return found
+        return self._last_outputs
+
+    @cached_property
+    def _last_outputs(self) -> Outputs | None:
+        """The outputs of the source's last period; None where they are too few."""
+        s = self.solution
+        assert s.period is not None
+        tolerance = 1e-9 * s.period
         start = float(s.t[-1] - s.period)
         if start < s.t[0] - tolerance or np.count_nonzero(s.t >= start) < 8:
             return None
         first = int(np.searchsorted(s.t, start - tolerance, side="right"))
         if abs(s.t[first] - start) <= tolerance:
             # Of two outputs at a jump, the period starts with the right-hand one.
-            return _Outputs(s.t, self.signals, int(np.searchsorted(s.t, start + tolerance, side="right")) - 1)
-        return _Outputs(s.t, self.signals, first, start)
+            return Outputs(s.record, int(np.searchsorted(s.t, start + tolerance, side="right")) - 1)
+        return Outputs(s.record, first, start)
 
-    def last_finely(self, name: str, longest: float) -> tuple[Weighed, bool]:
-        """A signal with weights over the last period, and whether it is known between the outputs.
+    def last_finely(self, name: str, longest: float) -> tuple[Weighed, bool] | None:
+        """A signal with weights over the last period, and whether it is known between the outputs; None without one.
 
         If it is known, its panels are no longer than `longest` (s), so that the weights also integrate the product of
         the signal with an oscillation of that period.
         """
-        assert self.last is not None
-        if not isinstance(self.last, _Steps):
-            return self.last.weigh(name), False
-        coarse = self.last.stretch
-        return _Steps(Stretch(coarse.run, *coarse.span, coarse.rtol, longest)).weigh(name), True
+        # Charges and currents are those of the outputs alone.
+        last = self._last_outputs if self.last is not None and name.startswith(("q_", "i_")) else self.last
+        read = partial(_read, name)
+        if isinstance(last, Stretch):
+            return Stretch(last.run, *last.span, last.rtol, longest).weigh(read), True
+        return None if last is None else (last.weigh(read), False)
 
     def between(self) -> tuple[list[str], FloatArray] | None:
         """Names of the voltages, areas and forces, and a table of the last period: times (s), then these signals.
@@ -179,13 +142,13 @@ class Figures:
         Its rows are the nodes of panels on which all are polynomials. None where the run is not known between its
         outputs, or the table is larger than `MOST_BETWEEN`.
         """
-        if not isinstance(self.last, _Steps):
+        if not isinstance(self.last, Stretch):
             return None
-        coarse = self.last.stretch
+        fine = Stretch(self.last.run, *self.last.span, self.last.rtol)
         names = [name for key in _BETWEEN for name in self.signals.names(key)]
-        if coarse.panels.step.size * NODES * len(names) > MOST_BETWEEN:
+        if fine.panels.step.size * NODES * len(names) > MOST_BETWEEN:
             return None
-        columns = Stretch(coarse.run, *coarse.span, coarse.rtol).at_nodes([partial(_read, x) for x in names], _MISSED)
+        columns = fine.at_nodes([partial(_read, x) for x in names], _MISSED)
         table = np.column_stack([x.ravel() for x in columns])
         return (names, table) if table.size <= MOST_BETWEEN else None
 
@@ -201,15 +164,17 @@ class Figures:
     def summary(self) -> dict[str, Any]:
         """As `Solution.summary` says."""
         s, one = self.solution, self._one
+        if s.stored is not None:
+            return dict(s.stored)
         out: dict[str, Any] = {"t_stop": float(s.t[-1]) if s.t.size else None, "status": s.status.name}
         out.update({f"error_{k}": v for k, v in vars(s.error).items()})
         if self.whole is None:
             return out
-        out["figures_from"] = "steps" if isinstance(self.whole, _Steps) else "outputs"
+        out["figures_from"] = "steps" if isinstance(self.whole, Stretch) else "outputs"
         for name in self.shown:
             kinds = ["max", "min", "peak", "mean", "rms", "mean_periodic"]
             if self.last is not None:
-                kinds.append("ripple" if name.partition(":")[0] in _RIPPLE else "rms_periodic")
+                kinds.append("ripple" if signal_of(name).ripple else "rms_periodic")
             out.update({f"{name}_{kind}": one(name, kind) for kind in kinds})
         if self.last is not None and s.fundamental is not None:
             for name in ("u_source", "u_gap"):
@@ -221,26 +186,15 @@ class Figures:
         return out
 
 
-def _together(values: list[float | None]) -> Value:
-    """Figures of several gaps or sources as an array; a single one as a number; None where one is missing."""
-    if len(values) < 2:
-        return values[0] if values else None
-    return None if None in values else sealed(np.array(values, float))
+class Figure(property):
+    """A figure of a signal as an attribute of a result that has `_figures`."""
 
+    def __init__(self, key: str, kind: str, doc: str) -> None:
+        super().__init__(lambda result: result._figures.value(key, kind), doc=doc)
 
-class KeptFigures:
-    """Figures that were stored in a run's file, from which they cannot be computed again."""
-
-    def __init__(self, signals: Signals, summary: Mapping[str, Any]) -> None:
-        self.signals, self._summary = signals, summary
-
-    def value(self, key: str, kind: str) -> Value:
-        """As `Figures.value`."""
-        return _together([self._summary.get(f"{name}_{kind}") for name in self.signals.names(key)])
-
-    def summary(self) -> dict[str, Any]:
-        """As `Solution.summary` says."""
-        return dict(self._summary)
+    def __get__(self, result: Any, owner: type | None = None, /) -> Value:  # type: ignore[override]
+        found: Value = super().__get__(result, owner)
+        return found
 
 
 class Figured:
@@ -250,60 +204,30 @@ class Figured:
     """
 
     @property
-    def _figures(self) -> Figures | KeptFigures:
+    def _figures(self) -> Figures:
         raise NotImplementedError
 
-    @property
-    def f_el_mean(self) -> Value:
-        """Mean electroadhesive force over the run, N."""
-        return self._figures.value("f_el", "mean")
-
-    @property
-    def f_el_mean_periodic(self) -> Value:
-        """Mean electroadhesive force over the source's last period, N; None where the run holds none."""
-        return self._figures.value("f_el", "mean_periodic")
-
-    @property
-    def f_el_peak(self) -> Value:
-        """Largest electroadhesive force, N."""
-        return self._figures.value("f_el", "peak")
-
-    @property
-    def f_t_mean(self) -> Value:
-        """Mean friction force over the run, N."""
-        return self._figures.value("f_t", "mean")
-
-    @property
-    def f_t_mean_periodic(self) -> Value:
-        """Mean friction force over the source's last period, N; None where the run holds none."""
-        return self._figures.value("f_t", "mean_periodic")
-
-    @property
-    def friction_mean(self) -> Value:
-        """Mean friction coefficient over the run."""
-        return self._figures.value("friction", "mean")
-
-    @property
-    def area_mean(self) -> Value:
-        """Mean ridge contact area over the run, m^2."""
-        return self._figures.value("area", "mean")
-
-    @property
-    def u_gap_peak(self) -> Value:
-        """Largest modulus of the gap voltage, V."""
-        return self._figures.value("u_gap", "peak")
-
-    @property
-    def u_gap_rms(self) -> Value:
-        """Root of the mean square of the gap voltage over the run, V."""
-        return self._figures.value("u_gap", "rms")
-
-    @property
-    def u_gap_amplitude(self) -> Value:
-        """Amplitude of the gap voltage at the source's fundamental, over its last period, V; None without one."""
-        return self._figures.value("u_gap", "amplitude")
-
-    @property
-    def u_gap_phase_deg(self) -> Value:
-        """Phase of the gap voltage at the source's fundamental, relative to a sine, degrees."""
-        return self._figures.value("u_gap", "phase_deg")
+    f_el_mean = Figure("f_el", "mean", "Mean electroadhesive force over the run, N.")
+    f_el_mean_periodic = Figure(
+        "f_el",
+        "mean_periodic",
+        "Mean electroadhesive force over the source's last period, N; None where the run holds none.",
+    )
+    f_el_peak = Figure("f_el", "peak", "Largest electroadhesive force, N.")
+    f_t_mean = Figure("f_t", "mean", "Mean friction force over the run, N.")
+    f_t_mean_periodic = Figure(
+        "f_t", "mean_periodic", "Mean friction force over the source's last period, N; None where the run holds none."
+    )
+    friction_mean = Figure("friction", "mean", "Mean friction coefficient over the run.")
+    area_mean = Figure("area", "mean", "Mean ridge contact area over the run, m^2.")
+    u_gap_peak = Figure("u_gap", "peak", "Largest modulus of the gap voltage, V.")
+    u_gap_rms = Figure("u_gap", "rms", "Root of the mean square of the gap voltage over the run, V.")
+    u_gap_amplitude = Figure(
+        "u_gap",
+        "amplitude",
+        "Amplitude of the gap voltage at the source's fundamental, over its last period, V; None without one.",
+    )
+    u_gap_phase_deg = Figure(
+        "u_gap", "phase_deg",
+        "Phase of the gap voltage at the source's fundamental, relative to a sine, degrees.",
+    )  # fmt: skip

@@ -328,4 +328,4 @@ class Stepping(Integration):
         problem = self.problem
         shown = problem.scene.shown
         make = partial(bare_record, shown.network, shown.net)
-        return self.recorder.finish(problem.first, problem.t_stop, make)
+        return self.recorder.finish(problem.first, make)

@@ -374,7 +374,7 @@ def gradient_data(slopes: Slopes) -> dict[str, Any]:
     """Variables of a Dataset."""
     data: dict[str, Any] = {}
     for name, values in slopes.values.items():
-        unit, text = SIGNALS[name.removesuffix("_mean")]
+        unit, text = SIGNALS[name.removesuffix("_mean")][:2]
         attrs = {"units": f"{unit} per parameter_unit", "long_name": f"derivative of {text}_mean by each parameter"}
         data[f"d_{name}"] = (("scene", "parameter"), values, attrs)
     told = "stated error of a derivative times its parameter, relative to the output"

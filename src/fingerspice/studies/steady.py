@@ -21,7 +21,7 @@ from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.report import summary_table
 from fingerspice.results.sensitivity import Sensitivity
 from fingerspice.results.solution import Solution
-from fingerspice.results.summary import Figured, Figures, KeptFigures
+from fingerspice.results.summary import Figured, Figures
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.sensitivities import check_request, period_of, sensitivities_of
@@ -101,7 +101,7 @@ class SteadyState(Shown, Figured):
         return 1.0 - float(self.multipliers.max(initial=0.0))
 
     @property
-    def _figures(self) -> Figures | KeptFigures:
+    def _figures(self) -> Figures:
         return self.solution._figures
 
     @property
