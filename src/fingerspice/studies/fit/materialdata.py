@@ -130,34 +130,22 @@ def _column(name: str, file: str) -> tuple[str, float] | None:
 
 #: Possible slips of the user, each with the function from the table as given to the table as meant.
 _SLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
-    ("the frequency is in rad/s", lambda t: _scaled(t, 0, 0.5 / np.pi)),
-    ("the second column is a conductivity in S/m", lambda t: _inverse(t, 1.0)),
-    ("the frequency is in kHz", lambda t: _scaled(t, 0, 1e3)),
-    ("the resistivity is in ohm cm", lambda t: _scaled(t, 1, 1e-2)),
-    ("the resistivity is in kohm m", lambda t: _scaled(t, 1, 1e3)),
+    ("the frequency is in rad/s", lambda t: t * (0.5 / np.pi, 1.0, 1.0)),
+    ("the second column is a conductivity in S/m", lambda t: t ** (1.0, -1.0, 1.0)),
+    ("the frequency is in kHz", lambda t: t * (1e3, 1.0, 1.0)),
+    ("the resistivity is in ohm cm", lambda t: t * (1.0, 1e-2, 1.0)),
+    ("the resistivity is in kohm m", lambda t: t * (1.0, 1e3, 1.0)),
     ("resistivity and permittivity have changed places", lambda t: t[:, [0, 2, 1]]),
     ("frequency and resistivity have changed places", lambda t: t[:, [1, 0, 2]]),
     ("frequency and permittivity have changed places", lambda t: t[:, [2, 1, 0]]),
     ("the columns are resistivity, permittivity, frequency", lambda t: t[:, [2, 0, 1]]),
     ("the columns are permittivity, frequency, resistivity", lambda t: t[:, [1, 2, 0]]),
-    ("the second column is a conductivity in mS/m", lambda t: _inverse(t, 1e-3)),
-    ("the second column is a conductivity in uS/cm", lambda t: _inverse(t, 1e-4)),
-    ("the second column is a conductivity in S/cm", lambda t: _inverse(t, 1e2)),
-    ("the frequency is in MHz", lambda t: _scaled(t, 0, 1e6)),
-    ("the permittivity is in F/m", lambda t: _scaled(t, 2, 1.0 / EPS0)),
+    ("the second column is a conductivity in mS/m", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e3, 1.0)),
+    ("the second column is a conductivity in uS/cm", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e4, 1.0)),
+    ("the second column is a conductivity in S/cm", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e-2, 1.0)),
+    ("the frequency is in MHz", lambda t: t * (1e6, 1.0, 1.0)),
+    ("the permittivity is in F/m", lambda t: t * (1.0, 1.0, 1.0 / EPS0)),
 )
-
-
-def _scaled(table: FloatArray, column: int, factor: float) -> FloatArray:
-    out = table.copy()
-    out[:, column] *= factor
-    return out
-
-
-def _inverse(table: FloatArray, unit: float) -> FloatArray:
-    out = table.copy()
-    out[:, 1] = 1.0 / (unit * table[:, 1])
-    return out
 
 
 def likely_slips(table: FloatArray, misfit: Callable[[FloatArray], float], least: float) -> list[str]:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.pages import Shown, Table
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.studies.fit.search import Fitted, Problem, Profile
 
 # Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
 # the error of a parameter, in its logarithm, from which on nothing is known of it.
@@ -41,74 +43,28 @@ class Estimate:
     at_bound: bool
 
 
-@dataclass(frozen=True)
-class Profile:
-    """The best fits with one parameter held at each of several values.
+@dataclass(frozen=True, repr=False, kw_only=True)
+class FitResult(Shown):
+    """What results of fits have in common; `Fit` says what its attributes are."""
 
-    Attributes
-    ----------
-    path : str
-    values : ndarray, shape (n,)
-        Values of the parameter, ascending.
-    objective : ndarray, shape (n,)
-        Sum of the squared residuals at each, as `Fit.objective`.
-    limit : float
-        The objective at the ends of the 95 % interval.
-    low, high : float
-        The interval; 0 or a bound, and infinity or a bound, where the data set no end.
-    shape : str
-        ``"symmetric"`` (in the logarithm), ``"skewed"``, ``"open below"``, ``"open above"`` or ``"open"``.
-    """
-
-    path: str
-    values: FloatArray
-    objective: FloatArray
-    limit: float
-    low: float
-    high: float
-    shape: str
-
-
-def covariance_of(by_log: FloatArray) -> FloatArray:
-    """Covariance of the logarithms of the parameters, for residuals of variance 1.
-
-    Combinations of parameters that no datum feels have a large variance, and not an infinite one, of which no
-    correlation would be known.
-    """
-    _, singular, right = np.linalg.svd(by_log, full_matrices=False)
-    spread = 1.0 / np.maximum(singular, _LEAST * max(float(singular.max()), 1e-300))
-    return np.asarray((right.T * spread**2) @ right)
-
-
-def correlation_of(covariance: FloatArray) -> FloatArray:
-    """The correlations in a covariance."""
-    error = np.sqrt(np.diag(covariance))
-    return np.asarray(covariance / np.outer(error, error))
-
-
-def estimate_of(
-    path: str, unit: str, initial: float, value: float, error: float, reach: float, bounds: FloatArray
-) -> Estimate:
-    """A parameter with the error of its logarithm, and the interval of so many errors."""
-    at_bound = bool(np.any(np.abs(value / bounds[np.isfinite(bounds) & (bounds > 0.0)] - 1.0) < _AT_BOUND))
-    far = math.exp(reach * error) if reach * error < _NO_END else math.inf
-    return Estimate(path, unit, float(value), float(initial), value * error, value / far, value * far, at_bound)
-
-
-class Estimates(Shown):
-    """What results of fits have in common, which are data classes with these fields."""
-
+    circuit: Circuit
     estimates: dict[str, Estimate]
     correlation: FloatArray
     objective: float
+    freedom: int
     evaluations: int
+    closed: bool
     notes: tuple[str, ...]
-    profiles: dict[str, Profile]
+    profiles: dict[str, Profile] = field(default_factory=dict)
 
     @property
     def _count(self) -> int:
         """Number of data."""
         raise NotImplementedError
+
+    @property
+    def _effort(self) -> str:
+        return f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
 
     def _lines(self) -> list[str | Table]:
         """Table of the parameters, correlations, profiles and notes, as a report has them."""
@@ -182,7 +138,46 @@ class Estimates(Shown):
         }
 
 
-def notes_of(
+def covariance_of(by_log: FloatArray) -> FloatArray:
+    """Covariance of the logarithms of the parameters, for residuals of variance 1.
+
+    Combinations of parameters that no datum feels have a large variance, and not an infinite one, of which no
+    correlation would be known.
+    """
+    _, singular, right = np.linalg.svd(by_log, full_matrices=False)
+    spread = 1.0 / np.maximum(singular, _LEAST * max(float(singular.max()), 1e-300))
+    return np.asarray((right.T * spread**2) @ right)
+
+
+def estimated(
+    task: Problem, best: Fitted, covariance: FloatArray, error: FloatArray, reach: Sequence[float],
+    remedy: Callable[[tuple[str, ...]], str], more: Sequence[str],
+) -> dict[str, Any]:  # fmt: skip
+    """Fields of a `FitResult` from the best fit.
+
+    `error` has the standard errors of the logarithms and `reach` how many of them half an interval is; `remedy` says of
+    one or two parameters what would tell them, and `more` are further notes.
+    """
+    estimates = {}
+    for one, start, value, off, far, box in zip(
+        task.unknowns, task.initial.tolist(), best.values.tolist(), error.tolist(), reach, task.bounds, strict=True
+    ):
+        at_bound = bool(np.any(np.abs(value / box[np.isfinite(box) & (box > 0.0)] - 1.0) < _AT_BOUND))
+        ratio = math.exp(far * off) if far * off < _NO_END else math.inf
+        unit = task.circuit.parameters[one.path].unit
+        estimates[one.name] = Estimate(
+            one.name, unit, value, start, value * off, value / ratio, value * ratio, at_bound
+        )  # fmt: skip
+    spread = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(spread, spread)
+    notes = [*_notes(estimates, correlation, error.tolist(), remedy), *more]
+    return {
+        "estimates": estimates, "correlation": correlation, "objective": best.objective,
+        "evaluations": best.evaluations, "closed": best.closed, "notes": tuple(notes),
+    }  # fmt: skip
+
+
+def _notes(
     estimates: Mapping[str, Estimate], correlation: FloatArray, error: Sequence[float],
     remedy: Callable[[tuple[str, ...]], str],
 ) -> list[str]:  # fmt: skip

@@ -6,21 +6,17 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import ComplexArray, FloatArray, positive_number, real_numbers, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.pages import Page, Shown
 from fingerspice.physics.ladder import Ladder
 from fingerspice.physics.materials import EPS0
-from fingerspice.studies.materialdata import ALLOWED, COLUMNS, likely_slips, read_table
+from fingerspice.studies.fit.materialdata import ALLOWED, COLUMNS, likely_slips, read_table
+from fingerspice.studies.fit.materialresult import Consistency, MaterialFit
 from fingerspice.waveforms.waveform import require
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 MOST_POLES = 12
 # The densely placed poles that stand for any causal and passive material: number per decade, and decades beyond the
@@ -71,91 +67,6 @@ class ColeCole:
         s = 2j * np.pi * np.asarray(frequency, float)
         eps = self.eps_inf + sum(delta / (1.0 + (s * tau) ** (1.0 - alpha)) for delta, tau, alpha in self.terms)
         return np.asarray(self.conductivity + s * EPS0 * eps)
-
-
-@dataclass(frozen=True)
-class Consistency:
-    """Distance of data from the nearest causal and passive material (relations of Kramers and Kronig).
-
-    Attributes
-    ----------
-    rms, largest : float
-        Misfit ``|y_fit / y - 1|`` of the best sum of Debye terms with densely placed poles.
-    frequency, misfit : ndarray, shape (n,)
-        The misfit at each frequency (Hz).
-    systematic : float
-        Correlation of the complex misfits of neighbouring frequencies: about 0 for noise, near 1 for a drift or a wrong
-        scale of a column.
-    """
-
-    rms: float
-    largest: float
-    frequency: FloatArray
-    misfit: FloatArray
-    systematic: float
-
-
-@dataclass(frozen=True, repr=False)
-class MaterialFit(Shown):
-    """A ladder fitted to data.
-
-    Attributes
-    ----------
-    ladder : Ladder
-    rms, largest : float
-        Misfit ``|y_fit / y - 1|`` over the data.
-    frequency : ndarray, shape (n,)
-        Frequencies of the data, Hz.
-    misfit : ndarray, shape (n,)
-        Misfit at each frequency.
-    kramers_kronig : Consistency
-        Smallest misfit that any ladder can have.
-    data : ndarray of complex, shape (n,)
-        Admittivity of the data, S/m.
-    """
-
-    ladder: Ladder
-    rms: float
-    largest: float
-    frequency: FloatArray
-    misfit: FloatArray
-    kramers_kronig: Consistency
-    data: ComplexArray
-
-    def _page(self) -> Page:
-        from fingerspice.studies.reports import fit_page
-
-        return fit_page(self)
-
-    def to_netlist(self, name: str) -> str:
-        """A subcircuit of slabs in series with the thickness as parameter, for decks here and in ngspice.
-
-        Write it to ``myskin.lib`` in the folder of the deck; ``.include myskin.lib`` and
-        ``Xskin skin 0 area NAME d=350u`` then replace a SKIN.
-
-        Raises
-        ------
-        InputError
-            If the name is not allowed in a netlist.
-        """
-        require(name.isidentifier(), "name", repr(name), "letters, digits and _, not first a digit")
-        return subcircuit(self.ladder, name)
-
-    def plot(self) -> Figure:
-        """Resistivity and permittivity of the data and of the ladder, and the misfit, against frequency."""
-        from fingerspice.studies.reports import plot_material
-
-        return plot_material(self)
-
-
-def subcircuit(ladder: Ladder, name: str) -> str:
-    """Netlist text of a ladder as slabs in series."""
-    eps_r, rho = ladder.cells()
-    nodes = ["p", *(f"c{i}" for i in range(1, eps_r.size)), "n"]
-    lines = [f".subckt {name} p n area params: d=350u"]
-    for i, (eps, resistivity) in enumerate(zip(eps_r, rho, strict=True)):
-        lines.append(f"X{i + 1} {nodes[i]} {nodes[i + 1]} area SLAB d={{d}} eps_r={eps:.10g} rho={resistivity:.10g}")
-    return "\n".join([*lines, ".ends", ""])
 
 
 def fit_material(

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.studies.contactdata import ContactTask, Given, Relation, relations_of, solved
-from fingerspice.studies.contactresult import ContactFit, contact_result
-from fingerspice.studies.fit import bounds_of, profiled, refuse_twice
-from fingerspice.studies.fittask import REFUSED, profile_of
+from fingerspice.studies.fit.contactdata import Relation, relations_of
+from fingerspice.studies.fit.contactresult import ContactFit, contact_result
+from fingerspice.studies.fit.contacttask import ContactTask, solved
+from fingerspice.studies.fit.measured import Given
+from fingerspice.studies.fit.request import bounds_of, profiled, refuse_few, refuse_twice
+from fingerspice.studies.fit.search import Unknown, profile_of
 from fingerspice.waveforms.waveform import require
 
 PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
@@ -84,14 +84,13 @@ def fit_contact(
     least |= {f"{gap}.c2": 0.0} if {one.kind for one in relations} <= {"area", "indentation"} else {}
     start = circuit.varied(least | {path: value for path, value in zero.items() if value is not None})
     paths = tuple(f"{gap}.{name}" for name in names)
-    count = sum(relation.values.size for relation in relations)
-    if count < len(paths):
-        raise InputError(f"{count} data cannot tell {len(paths)} parameters; allowed: at least as many data")
+    scale = np.concatenate([np.full(one.values.size, _SHARE) if one.sigma is None else one.sigma for one in relations])
+    refuse_few(scale.size, paths)
     start, box = bounds_of(start, paths, {_named(gap, path): pair for path, pair in (bounds or {}).items()})
     wanted = profiles if isinstance(profiles, bool) else [_named(gap, path) for path in profiles]
     asked = profiled(paths, wanted)
-    task, best, freedom = solved(ContactTask(start, gap, relations, paths, box, (_SHARE,) * len(relations)))
-    if not best.objective < 0.5 * REFUSED**2:
+    task, best, freedom = solved(ContactTask(start, tuple(map(Unknown, paths)), box, scale, gap, relations))
+    if not best.found:
         raise InputError(
             f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data; "
             "allowed: values nearer to the data, such as a smaller c2 or a larger alpha"
@@ -109,9 +108,8 @@ def fit_contact(
             )
             warnings.warn(f"{said}, or a column is in another unit", FingerspiceWarning, stacklevel=2)
     for path in asked:
-        error = math.log(found.estimates[path].high / found.estimates[path].value) / found.reach[path]
-        limit = best.objective + found.reach[path] ** 2
-        found.profiles[path] = profile_of(task, paths, best, path, error, limit)
+        one, limit = found.estimates[path], best.objective + found.reach[path] ** 2
+        found.profiles[path] = profile_of(task, best, path, one.error / one.value, limit)
     return found
 
 
@@ -156,7 +154,7 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
 
 def _look_at_loads(relations: Sequence[Relation]) -> None:
     """Warn about loads that no finger bears."""
-    loads: FloatArray = np.concatenate([relation.fn for relation in relations])
-    text = DEVICES["GAP"].parameter("fn").unusual("the data's largest", float(loads.max()))
+    largest = max(float(relation.fn.max()) for relation in relations)
+    text = DEVICES["GAP"].parameter("fn").unusual("the data's largest", largest)
     if text is not None:
         warnings.warn(text, FingerspiceWarning, stacklevel=3)
