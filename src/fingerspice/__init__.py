@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.fit.contactfit import fit_contact as fit_contact
     from fingerspice.studies.fit.contactresult import ContactFit as ContactFit
     from fingerspice.studies.fit.materialfit import ColeCole as ColeCole
+    from fingerspice.studies.fit.materialfit import MaterialFit as MaterialFit
     from fingerspice.studies.fit.materialfit import fit_material as fit_material
-    from fingerspice.studies.fit.materialresult import MaterialFit as MaterialFit
     from fingerspice.studies.inverse import InverseDrive as InverseDrive
     from fingerspice.studies.inverse import inverse_drive as inverse_drive
     from fingerspice.studies.limits import FoldLimits as FoldLimits
@@ -99,8 +99,7 @@ _HOMES = {
     "studies.feel": ("Feel", "feel"),
     "studies.fit.circuitfit": ("fit",),
     "studies.fit.circuitresult": ("Fit",),
-    "studies.fit.materialfit": ("ColeCole", "fit_material"),
-    "studies.fit.materialresult": ("MaterialFit",),
+    "studies.fit.materialfit": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.inverse": ("InverseDrive", "inverse_drive"),
     "studies.phasors": ("phasor",),
     "studies.limits": ("FoldLimits", "fold_limits"),

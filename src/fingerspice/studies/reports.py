@@ -26,16 +26,7 @@ if TYPE_CHECKING:
 
 
 def plot_comparison(comparison: Comparison) -> Picture:
-    """One period of the transient and of the phasor solution in one picture, with a table of their figures.
-
-    Parameters
-    ----------
-    comparison : Comparison
-
-    Returns
-    -------
-    Picture
-    """
+    """One period of the transient and of the phasor solution in one picture, with a table of their figures."""
     figure, axes = drawing.new_figure(3, height=5.6, height_ratios=[1.3, 1.3, 0.75])
     solution, p = comparison.solution, comparison.phasor
     runs = [lines.Drawn(solution, "")]

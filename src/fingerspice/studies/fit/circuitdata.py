@@ -64,14 +64,7 @@ class Data:
 
 
 def data_of(circuit: Circuit, given: Given, by: str | None = None) -> Data:
-    """The data that a caller of `fit` gave; the column `by` tells which group a measurement belongs to.
-
-    Raises
-    ------
-    InputError
-        If a column or unit is unknown, columns have different lengths, or a value is no finite number or has a sign
-        that it cannot have.
-    """
+    """The checked data that a caller of `fit` gave; the column `by` tells which group a measurement belongs to."""
     found = _read(circuit, given, by)
     columns, place = found.columns, found.place
     names = {f"{name}_mean": name for name in _MEANS}

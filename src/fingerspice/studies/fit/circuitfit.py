@@ -24,8 +24,7 @@ from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.fit.circuitdata import IMPEDANCE, Data, data_of
 from fingerspice.studies.fit.circuitresult import Fit, fit_result
 from fingerspice.studies.fit.circuittask import Task
-from fingerspice.studies.fit.request import bounds_of, profiled, refuse_few, refuse_twice
-from fingerspice.studies.fit.search import FARTHEST, Fitted, Unknown, followed, profile_of
+from fingerspice.studies.fit.search import FARTHEST, Fitted, Unknown, bounds_of, followed, profile_of, refuse_few
 from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
@@ -104,7 +103,7 @@ def fit(
     start, box = bounds_of(circuit, tuple(one.path for one in unknowns), bounds or {})
     target, scale = _target(measured)
     task = Task(start, unknowns, box, scale, measured, average, skin, rtol, charge_law, target)
-    wanted = profiled(task.names, profiles)
+    wanted = task.profiled(profiles)
     said = [*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin)]
     for text in filter(None, said):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
@@ -198,7 +197,8 @@ def _request(
         if path.lower() not in known:
             circuit.varied({path: 1.0})
     paths = tuple(known[path.lower()] for path in parameters)
-    refuse_twice(paths)
+    for path in paths:
+        require(paths.count(path) == 1, path, "named twice", "once")
     by = _group_column(circuit, groups)
     data = data_of(circuit, given, by)
     both = sorted(set(paths) & set(data.conditions))

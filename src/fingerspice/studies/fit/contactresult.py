@@ -14,8 +14,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.studies.fit.contactdata import Relation
-from fingerspice.studies.fit.contacttask import FEWEST, ContactTask, Pool, pools_of
+from fingerspice.studies.fit.contactdata import FEWEST, ContactTask, Pool, Relation, pools_of
 from fingerspice.studies.fit.result import FitResult, covariance_of, estimated, misfit_note
 from fingerspice.studies.fit.search import Fitted
 
@@ -86,14 +85,15 @@ class ContactFit(FitResult):
 
         panels = []
         for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True):
-            x, label, others = _abscissa(one)
+            x, label, others, name = _abscissa(one)
             kinds = np.unique(others)
             curves = [
-                Curve(f"{_OTHER[label][0]} = {kind:g} {_OTHER[label][1]}" if kinds.size > 1 else one.name, *(
-                    part[others == kind] for part in (x, one.values, fitted, sigma)
-                ))
+                Curve(
+                    name.format(kind) if kinds.size > 1 else one.name,
+                    *(part[others == kind] for part in (x, one.values, fitted, sigma)),
+                )
                 for kind in kinds
-            ]  # fmt: skip
+            ]
             panels.append(Panel(curves, label, one.name, one.unit))
         return plot_panels(panels)
 
@@ -125,18 +125,13 @@ class ContactFit(FitResult):
         return write_csv(path, header, rows)
 
 
-# The condition that tells curves apart, by the one along the axis.
-_LOAD = "normal load", "N"
-_OTHER = {"normal load [N]": ("gap voltage", "V"), "gap voltage [V]": _LOAD, "indentation [mm]": _LOAD}
-
-
-def _abscissa(one: Relation) -> tuple[FloatArray, str, FloatArray]:
-    """Values along the axis and its label, and those of the condition that tells curves apart."""
+def _abscissa(one: Relation) -> tuple[FloatArray, str, FloatArray, str]:
+    """Values along the axis and its label, and those of the condition that tells curves apart with a curve's name."""
     if one.kind == "indentation":
-        return 1e3 * one.indentation, "indentation [mm]", np.zeros(one.fn.size)
+        return 1e3 * one.indentation, "indentation [mm]", np.zeros(one.fn.size), ""
     if np.unique(one.u_gap).size > np.unique(one.fn).size:
-        return one.u_gap, "gap voltage [V]", one.fn
-    return one.fn, "normal load [N]", one.u_gap
+        return one.u_gap, "gap voltage [V]", one.fn, "normal load = {:g} N"
+    return one.fn, "normal load [N]", one.u_gap, "gap voltage = {:g} V"
 
 
 def contact_result(circuit: Circuit, task: ContactTask, best: Fitted, freedom: Sequence[float]) -> ContactFit:

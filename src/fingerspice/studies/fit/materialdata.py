@@ -44,11 +44,6 @@ def read_table(path: Path) -> FloatArray:
 
     Columns are separated by commas, tabs or semicolons; with semicolons decimal commas are allowed. A line of names
     may give quantities, order and units of the columns; conductivities and angular frequencies are converted.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read; the message names the row at fault.
     """
     try:
         lines = read_text(path, str(path)).splitlines(keepends=True)
@@ -73,30 +68,24 @@ def read_table(path: Path) -> FloatArray:
 
 def _as_named(table: FloatArray, head: list[str], file: str) -> FloatArray:
     """Columns put into order and SI units by their names; columns with unknown names fill the remaining places."""
-    named = [_column(name, file) for name in head]
-    out = table.copy()
-    left = [k for k in range(3) if named[k] is None]
-    used: set[int] = set()
-    for k, found in enumerate(named):
-        if found is None:
+    named: dict[str, FloatArray] = {}
+    others = []
+    for column, x in zip([_column(name, file) for name in head], table.T, strict=True):
+        if column is None:
+            others.append(x)
             continue
-        quantity, factor = found
-        values = factor * table[:, k]
+        quantity, values = column[0], column[1] * x
         with np.errstate(divide="ignore"):
             if quantity == "conductivity":
                 quantity, values = "resistivity", 1.0 / values
         if quantity == "angular frequency":
             quantity, values = "frequency", values / (2.0 * np.pi)
-        place = COLUMNS.index(quantity)
-        if place in used:
+        if quantity in named:
             raise InputError(
                 f"{file}: two columns are a {quantity} by their names, {', '.join(head)}; allowed: {ALLOWED}"
             )
-        used.add(place)
-        out[:, place] = values
-    for place, k in zip([p for p in range(3) if p not in used], left, strict=True):
-        out[:, place] = table[:, k]
-    return out
+        named[quantity] = values
+    return np.column_stack([named[name] if name in named else others.pop(0) for name in COLUMNS])
 
 
 def _column(name: str, file: str) -> tuple[str, float] | None:
@@ -151,14 +140,7 @@ _SLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
 def likely_slips(table: FloatArray, misfit: Callable[[FloatArray], float], least: float) -> list[str]:
     """Slips that may explain data that fit no material: at most two that reduce the misfit to less than a third.
 
-    Parameters
-    ----------
-    table : ndarray, shape (n, 3)
-        Frequency (Hz), resistivity (ohm m) and relative permittivity.
-    misfit : callable
-        Misfit of a table to the nearest causal and passive material.
-    least : float
-        Misfit of the data as given.
+    `misfit` is that of a table (n, 3) to the nearest causal and passive material, `least` that of the data as given.
     """
     found = []
     for text, meant in _SLIPS:

@@ -49,13 +49,9 @@ class Measured:
 def measured_of(
     given: Given, meaning: Meaning, example: str, by: str | None = None, place: str = "the data"
 ) -> Measured:
-    """The columns that a caller gave, of which that named `by` tells the group of a measurement.
+    """The columns that a caller gave, finite numbers; that named `by` tells the group of a measurement.
 
-    Raises
-    ------
-    InputError
-        If a table has no header (`example` shows one) or a unit is unknown, if columns have different lengths, or if a
-        value is no finite number.
+    `example` shows the header that a table needs, and `place` names columns that come from none.
     """
     if isinstance(given, (str, Path)):
         return _from_table(Path(given), meaning, example, by)

@@ -63,31 +63,32 @@ class FitResult(Shown):
         raise NotImplementedError
 
     @property
+    def _pairs(self) -> list[tuple[str, str, float]]:
+        """Every two parameters, and the correlation of their errors."""
+        named = itertools.combinations(enumerate(self.estimates), 2)
+        return [(a, b, float(self.correlation[i, j])) for (i, a), (j, b) in named]
+
+    @property
     def _effort(self) -> str:
         return f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
 
     def _lines(self) -> list[str | Table]:
         """Table of the parameters, correlations, profiles and notes, as a report has them."""
-        estimates, correlation = self.estimates, self.correlation
         rows = [
             (
                 e.path, f"{e.value:.6g}", f"{e.error:.2g}", f"{100.0 * e.error / e.value:.2g} %",
                 f"{e.low:.4g} to {e.high:.4g}", e.unit, f"{e.initial:.4g}", "at a bound" if e.at_bound else "",
             )
-            for e in estimates.values()
+            for e in self.estimates.values()
         ]  # fmt: skip
         lines: list[str | Table] = [
             "", Table(("parameter", "value", "error", "", "95 % interval", "unit", "started at", ""), rows)
         ]  # fmt: skip
-        pairs = [
-            f"{a}, {b}: {correlation[i, j]:+.3f}"
-            for (i, a), (j, b) in itertools.combinations(enumerate(estimates), 2)
-            if abs(correlation[i, j]) > 0.1
-        ]
+        pairs = [f"{a}, {b}: {both:+.3f}" for a, b, both in self._pairs if abs(both) > 0.1]
         if pairs:
             lines += ["", "correlations beyond 0.1: " + "; ".join(pairs)]
         for one in self.profiles.values():
-            ends = f"{one.low:.4g} to {one.high:.4g} {estimates[one.path].unit}, {one.shape}"
+            ends = f"{one.low:.4g} to {one.high:.4g} {self.estimates[one.path].unit}, {one.shape}"
             lines.append(f"profile of {one.path}: {ends}".replace(" ,", ","))
         return [*lines, *(["", *self.notes] if self.notes else [])]
 
@@ -97,7 +98,7 @@ class FitResult(Shown):
         As there, the criteria of Akaike and Bayes are n log(chi-square / n) + 2 k, and + k log(n), of n data and k
         parameters.
         """
-        estimates, correlation, square, count = self.estimates, self.correlation, self.objective, self._count
+        estimates, square, count = self.estimates, self.objective, self._count
         k, freedom = len(estimates), count - len(estimates)
         level = count * math.log(max(square, 1e-300) / count)
         wide = max(map(len, estimates)) + 1
@@ -116,12 +117,11 @@ class FitResult(Shown):
         for name, e in estimates.items():
             share = f"({100.0 * e.error / e.value:.2f}%) (init = {e.initial:.7g})"
             lines.append(f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} {share}")
-        pairs = [(i, j) for i, j in itertools.combinations(range(k), 2) if abs(correlation[i, j]) >= 0.1]
+        pairs = [pair for pair in self._pairs if abs(pair[2]) >= 0.1]
         if pairs:
-            names = list(estimates)
             lines.append("[[Correlations]] (unreported correlations are < 0.100)")
-            pairs.sort(key=lambda pair: -abs(correlation[pair]))
-            lines += [f"    C({names[i]}, {names[j]}) = {correlation[i, j]:+.4f}" for i, j in pairs]
+            pairs.sort(key=lambda pair: -abs(pair[2]))
+            lines += [f"    C({a}, {b}) = {both:+.4f}" for a, b, both in pairs]
         return "\n".join(lines)
 
     def _plain(self) -> dict[str, Any]:
