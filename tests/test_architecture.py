@@ -46,7 +46,7 @@ MANY_PARAMETERS = {
     "solve.simulation.simulate",
     "solve.simulation.plan",
     "studies.batch.batch",
-    "studies.fit.fit",
+    "studies.fit.circuitfit.fit",
     "studies.sweep.populations.sweep",
     "studies.steady.steady_state",
     "solve.streaming.stream",

@@ -256,3 +256,12 @@ def test_tables_with_bad_units_are_refused(circuit: fs.Circuit, tmp_path: Path) 
     found = fs.fit_contact(circuit, table)
     assert found.relations[0].fn == pytest.approx([0.1, 1.0, 2.0])
     assert found.relations[0].sigma == pytest.approx([1e-6, 2e-6, 2e-6])
+    # The prefix of a unit of area is squared with it.
+    table.write_text("fn (N),area (um^2)\n0.1,2e7\n1,4e7\n2,5e7\n")
+    assert fs.fit_contact(circuit, table).relations[0].values == pytest.approx([2e-5, 4e-5, 5e-5])
+
+
+def test_the_warning_about_a_start_outside_its_bounds_names_the_callers_line(circuit: fs.Circuit) -> None:
+    with pytest.warns(fs.FingerspiceWarning, match=r"Xgap\.mu is 0\.3, outside .* it starts at 0\.32") as told:
+        fs.fit_contact(circuit, {"fn": FN, "f_t": TRUE["mu"] * FN}, ["mu"], bounds={"mu": (0.32, 0.4)})
+    assert told[0].filename == __file__

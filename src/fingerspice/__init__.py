@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.comparison import large_signal as large_signal
-    from fingerspice.studies.contactfit import fit_contact as fit_contact
-    from fingerspice.studies.contactresult import ContactFit as ContactFit
     from fingerspice.studies.design.capability import Capability as Capability
     from fingerspice.studies.design.capability import capability as capability
     from fingerspice.studies.design.drive import InverseDrive as InverseDrive
@@ -51,11 +49,13 @@ if TYPE_CHECKING:
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
-    from fingerspice.studies.fit import fit as fit
-    from fingerspice.studies.fitresult import Fit as Fit
-    from fingerspice.studies.fitting import ColeCole as ColeCole
-    from fingerspice.studies.fitting import MaterialFit as MaterialFit
-    from fingerspice.studies.fitting import fit_material as fit_material
+    from fingerspice.studies.fit.circuitfit import fit as fit
+    from fingerspice.studies.fit.circuitresult import Fit as Fit
+    from fingerspice.studies.fit.contactfit import fit_contact as fit_contact
+    from fingerspice.studies.fit.contactresult import ContactFit as ContactFit
+    from fingerspice.studies.fit.materialfit import ColeCole as ColeCole
+    from fingerspice.studies.fit.materialfit import MaterialFit as MaterialFit
+    from fingerspice.studies.fit.materialfit import fit_material as fit_material
     from fingerspice.studies.phasors import phasor as phasor
     from fingerspice.studies.steady import SteadyState as SteadyState
     from fingerspice.studies.steady import steady_state as steady_state
@@ -93,13 +93,13 @@ _HOMES = {
     "studies.comparison": ("Comparison", "compare", "large_signal"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "explorer.server": ("Explorer", "explore"),
-    "studies.contactfit": ("fit_contact",),
-    "studies.contactresult": ("ContactFit",),
+    "studies.fit.contactfit": ("fit_contact",),
+    "studies.fit.contactresult": ("ContactFit",),
     "studies.export": ("export_netlist",),
     "studies.feel": ("Feel", "feel"),
-    "studies.fit": ("fit",),
-    "studies.fitresult": ("Fit",),
-    "studies.fitting": ("ColeCole", "MaterialFit", "fit_material"),
+    "studies.fit.circuitfit": ("fit",),
+    "studies.fit.circuitresult": ("Fit",),
+    "studies.fit.materialfit": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.design.drive": ("InverseDrive",),
     "studies.design.inverse": ("inverse_drive",),
     "studies.phasors": ("phasor",),

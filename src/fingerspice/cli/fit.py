@@ -15,8 +15,8 @@ from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import Answering
 
 if TYPE_CHECKING:
-    from fingerspice.studies.contactresult import ContactFit
-    from fingerspice.studies.fitresult import Fit
+    from fingerspice.studies.fit.circuitresult import Fit
+    from fingerspice.studies.fit.contactresult import ContactFit
 
 
 def fit(
@@ -44,7 +44,7 @@ def fit(
       fingerspice fit circuits/measured.csv circuits/fingerpad.cir --free Xgap.d,Xgap.r --skin follow
     """
     with Answering("fit", as_json, charge_law=charge_law) as answer:
-        from fingerspice.studies.fit import fit as find
+        from fingerspice.studies.fit.circuitfit import fit as find
 
         grouped = _groups(groups)
         circuit = read_circuit(deck, changes, None)
@@ -93,7 +93,7 @@ def fit_contact(
       fingerspice fit-contact circuits/contact.csv circuits/indentation.csv circuits/fingerpad.cir
     """
     with Answering("fit-contact", as_json) as answer:
-        from fingerspice.studies.contactfit import fit_contact as find
+        from fingerspice.studies.fit.contactfit import fit_contact as find
 
         circuit = read_circuit(deck, changes, None)
         answer.update(**answers.of_circuit(circuit, None))

@@ -35,13 +35,7 @@ class Profile:
 
 
 def as_profile(given: Wanted, what: str, rate: float | None, duration: float | None) -> Profile:
-    """The profile that a caller gave; an array needs its `rate`, and a waveform without an end a `duration`.
-
-    Raises
-    ------
-    InputError
-        If it is not made of finite numbers, or its rate or duration is missing.
-    """
+    """The profile that a caller gave; an array needs its `rate`, and a waveform without an end a `duration`."""
     if isinstance(given, Waveform) or callable(given):
         wave = as_waveform(given)
         own = wave.rate if isinstance(wave, Samples) else None
@@ -68,12 +62,6 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Profi
 
     The header names a column ``force`` or ``friction`` (N or mN), and a column of times, ``t`` or ``time``, unless a
     `rate` (Hz) is given: ``time (ms), friction (N)``.
-
-    Raises
-    ------
-    InputError
-        If the table has NaN, semicolons, decimal commas, or decreasing times (with the line); if it has no header, or
-        columns of both quantities; if its times contradict the rate.
     """
     path = checked_file(path, MAX_TEXT_BYTES)
     found = read_text_columns(path)
@@ -116,13 +104,7 @@ def _timed(found: Columns, t: FloatArray, values: FloatArray, rate: float | None
 
 
 def force_of_friction(friction: FloatArray, contact: Contact) -> FloatArray:
-    """F_el = F_T / mu - F_N (Eq. 1 with full slip), N.
-
-    Raises
-    ------
-    InputError
-        If mu is 0, so that there is no friction at all.
-    """
+    """F_el = F_T / mu - F_N (Eq. 1 with full slip), N."""
     if contact.mu == 0.0:
         raise InputError("the GAP has mu=0, so that no voltage makes friction; allowed: mu > 0, or a wanted force")
     return friction / contact.mu - contact.f_n
@@ -131,15 +113,8 @@ def force_of_friction(friction: FloatArray, contact: Contact) -> FloatArray:
 class ForceCurve:
     """Mean force over a period of the carrier against the carrier's amplitude; without a carrier, the force itself.
 
-    Parameters
-    ----------
-    contact : Contact
-    area : float or None
-        Area fixed by the deck, m^2, or None.
-    points : float or None
-        Number of samples in a period of the carrier, between which the voltage is linear; None for no carrier.
-    most : float
-        Largest force that is needed, N.
+    `area` (m^2) is that fixed by the deck, if any; `points` the number of samples in a period of the carrier, between
+    which the voltage is linear, or None without a carrier; `most` (N) the largest force that is needed.
     """
 
     def __init__(self, contact: Contact, area: float | None, points: float | None, most: float) -> None:
@@ -195,13 +170,7 @@ class ForceCurve:
 
 
 def check_forces(force: FloatArray, times: FloatArray, what: str, contact: Contact) -> FloatArray:
-    """The forces (N), checked to be attractive, with negative round-off set to 0.
-
-    Raises
-    ------
-    InputError
-        If a force is negative, as voltages only attract; the message gives the first such time.
-    """
+    """The forces (N), checked to be attractive, with negative round-off set to 0."""
     floor = -1e-12 * max(1.0, float(np.abs(force).max()))
     bad = np.flatnonzero(~(force >= floor))
     if bad.size:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.pages import Shown, Table
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.studies.fit.search import Fitted, Problem, Profile
 
 # Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
 # the error of a parameter, in its logarithm, from which on nothing is known of it.
@@ -41,97 +43,52 @@ class Estimate:
     at_bound: bool
 
 
-@dataclass(frozen=True)
-class Profile:
-    """The best fits with one parameter held at each of several values.
+@dataclass(frozen=True, repr=False, kw_only=True)
+class FitResult(Shown):
+    """What results of fits have in common; `Fit` says what its attributes are."""
 
-    Attributes
-    ----------
-    path : str
-    values : ndarray, shape (n,)
-        Values of the parameter, ascending.
-    objective : ndarray, shape (n,)
-        Sum of the squared residuals at each, as `Fit.objective`.
-    limit : float
-        The objective at the ends of the 95 % interval.
-    low, high : float
-        The interval; 0 or a bound, and infinity or a bound, where the data set no end.
-    shape : str
-        ``"symmetric"`` (in the logarithm), ``"skewed"``, ``"open below"``, ``"open above"`` or ``"open"``.
-    """
-
-    path: str
-    values: FloatArray
-    objective: FloatArray
-    limit: float
-    low: float
-    high: float
-    shape: str
-
-
-def covariance_of(by_log: FloatArray) -> FloatArray:
-    """Covariance of the logarithms of the parameters, for residuals of variance 1.
-
-    Combinations of parameters that no datum feels have a large variance, and not an infinite one, of which no
-    correlation would be known.
-    """
-    _, singular, right = np.linalg.svd(by_log, full_matrices=False)
-    spread = 1.0 / np.maximum(singular, _LEAST * max(float(singular.max()), 1e-300))
-    return np.asarray((right.T * spread**2) @ right)
-
-
-def correlation_of(covariance: FloatArray) -> FloatArray:
-    """The correlations in a covariance."""
-    error = np.sqrt(np.diag(covariance))
-    return np.asarray(covariance / np.outer(error, error))
-
-
-def estimate_of(
-    path: str, unit: str, initial: float, value: float, error: float, reach: float, bounds: FloatArray
-) -> Estimate:
-    """A parameter with the error of its logarithm, and the interval of so many errors."""
-    at_bound = bool(np.any(np.abs(value / bounds[np.isfinite(bounds) & (bounds > 0.0)] - 1.0) < _AT_BOUND))
-    far = math.exp(reach * error) if reach * error < _NO_END else math.inf
-    return Estimate(path, unit, float(value), float(initial), value * error, value / far, value * far, at_bound)
-
-
-class Estimates(Shown):
-    """What results of fits have in common, which are data classes with these fields."""
-
+    circuit: Circuit
     estimates: dict[str, Estimate]
     correlation: FloatArray
     objective: float
+    freedom: int
     evaluations: int
+    closed: bool
     notes: tuple[str, ...]
-    profiles: dict[str, Profile]
+    profiles: dict[str, Profile] = field(default_factory=dict)
 
     @property
     def _count(self) -> int:
         """Number of data."""
         raise NotImplementedError
 
+    @property
+    def _pairs(self) -> list[tuple[str, str, float]]:
+        """Every two parameters, and the correlation of their errors."""
+        named = itertools.combinations(enumerate(self.estimates), 2)
+        return [(a, b, float(self.correlation[i, j])) for (i, a), (j, b) in named]
+
+    @property
+    def _effort(self) -> str:
+        return f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
+
     def _lines(self) -> list[str | Table]:
         """Table of the parameters, correlations, profiles and notes, as a report has them."""
-        estimates, correlation = self.estimates, self.correlation
         rows = [
             (
                 e.path, f"{e.value:.6g}", f"{e.error:.2g}", f"{100.0 * e.error / e.value:.2g} %",
                 f"{e.low:.4g} to {e.high:.4g}", e.unit, f"{e.initial:.4g}", "at a bound" if e.at_bound else "",
             )
-            for e in estimates.values()
+            for e in self.estimates.values()
         ]  # fmt: skip
         lines: list[str | Table] = [
             "", Table(("parameter", "value", "error", "", "95 % interval", "unit", "started at", ""), rows)
         ]  # fmt: skip
-        pairs = [
-            f"{a}, {b}: {correlation[i, j]:+.3f}"
-            for (i, a), (j, b) in itertools.combinations(enumerate(estimates), 2)
-            if abs(correlation[i, j]) > 0.1
-        ]
+        pairs = [f"{a}, {b}: {both:+.3f}" for a, b, both in self._pairs if abs(both) > 0.1]
         if pairs:
             lines += ["", "correlations beyond 0.1: " + "; ".join(pairs)]
         for one in self.profiles.values():
-            ends = f"{one.low:.4g} to {one.high:.4g} {estimates[one.path].unit}, {one.shape}"
+            ends = f"{one.low:.4g} to {one.high:.4g} {self.estimates[one.path].unit}, {one.shape}"
             lines.append(f"profile of {one.path}: {ends}".replace(" ,", ","))
         return [*lines, *(["", *self.notes] if self.notes else [])]
 
@@ -141,7 +98,7 @@ class Estimates(Shown):
         As there, the criteria of Akaike and Bayes are n log(chi-square / n) + 2 k, and + k log(n), of n data and k
         parameters.
         """
-        estimates, correlation, square, count = self.estimates, self.correlation, self.objective, self._count
+        estimates, square, count = self.estimates, self.objective, self._count
         k, freedom = len(estimates), count - len(estimates)
         level = count * math.log(max(square, 1e-300) / count)
         wide = max(map(len, estimates)) + 1
@@ -160,12 +117,11 @@ class Estimates(Shown):
         for name, e in estimates.items():
             share = f"({100.0 * e.error / e.value:.2f}%) (init = {e.initial:.7g})"
             lines.append(f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} {share}")
-        pairs = [(i, j) for i, j in itertools.combinations(range(k), 2) if abs(correlation[i, j]) >= 0.1]
+        pairs = [pair for pair in self._pairs if abs(pair[2]) >= 0.1]
         if pairs:
-            names = list(estimates)
             lines.append("[[Correlations]] (unreported correlations are < 0.100)")
-            pairs.sort(key=lambda pair: -abs(correlation[pair]))
-            lines += [f"    C({names[i]}, {names[j]}) = {correlation[i, j]:+.4f}" for i, j in pairs]
+            pairs.sort(key=lambda pair: -abs(pair[2]))
+            lines += [f"    C({a}, {b}) = {both:+.4f}" for a, b, both in pairs]
         return "\n".join(lines)
 
     def _plain(self) -> dict[str, Any]:
@@ -182,7 +138,46 @@ class Estimates(Shown):
         }
 
 
-def notes_of(
+def covariance_of(by_log: FloatArray) -> FloatArray:
+    """Covariance of the logarithms of the parameters, for residuals of variance 1.
+
+    Combinations of parameters that no datum feels have a large variance, and not an infinite one, of which no
+    correlation would be known.
+    """
+    _, singular, right = np.linalg.svd(by_log, full_matrices=False)
+    spread = 1.0 / np.maximum(singular, _LEAST * max(float(singular.max()), 1e-300))
+    return np.asarray((right.T * spread**2) @ right)
+
+
+def estimated(
+    task: Problem, best: Fitted, covariance: FloatArray, error: FloatArray, reach: Sequence[float],
+    remedy: Callable[[tuple[str, ...]], str], more: Sequence[str],
+) -> dict[str, Any]:  # fmt: skip
+    """Fields of a `FitResult` from the best fit.
+
+    `error` has the standard errors of the logarithms and `reach` how many of them half an interval is; `remedy` says of
+    one or two parameters what would tell them, and `more` are further notes.
+    """
+    estimates = {}
+    for one, start, value, off, far, box in zip(
+        task.unknowns, task.initial.tolist(), best.values.tolist(), error.tolist(), reach, task.bounds, strict=True
+    ):
+        at_bound = bool(np.any(np.abs(value / box[np.isfinite(box) & (box > 0.0)] - 1.0) < _AT_BOUND))
+        ratio = math.exp(far * off) if far * off < _NO_END else math.inf
+        unit = task.circuit.parameters[one.path].unit
+        estimates[one.name] = Estimate(
+            one.name, unit, value, start, value * off, value / ratio, value * ratio, at_bound
+        )  # fmt: skip
+    spread = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(spread, spread)
+    notes = [*_notes(estimates, correlation, error.tolist(), remedy), *more]
+    return {
+        "estimates": estimates, "correlation": correlation, "objective": best.objective,
+        "evaluations": best.evaluations, "closed": best.closed, "notes": tuple(notes),
+    }  # fmt: skip
+
+
+def _notes(
     estimates: Mapping[str, Estimate], correlation: FloatArray, error: Sequence[float],
     remedy: Callable[[tuple[str, ...]], str],
 ) -> list[str]:  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,18 +14,9 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.studies.contactdata import FEWEST, ContactTask, Relation, pools_of
-from fingerspice.studies.fitestimates import (
-    Estimate,
-    Estimates,
-    Profile,
-    correlation_of,
-    covariance_of,
-    estimate_of,
-    misfit_note,
-    notes_of,
-)
-from fingerspice.studies.fitresult import Fitted
+from fingerspice.studies.fit.contactdata import FEWEST, ContactTask, Pool, Relation, pools_of
+from fingerspice.studies.fit.result import FitResult, covariance_of, estimated, misfit_note
+from fingerspice.studies.fit.search import Fitted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,20 +25,16 @@ if TYPE_CHECKING:
 _NO_PART = 1e-9
 
 
-@dataclass(frozen=True, repr=False)
-class ContactFit(Estimates):
+@dataclass(frozen=True, repr=False, kw_only=True)
+class ContactFit(FitResult):
     """A fit of a contact to data; `circuit` is ready to run.
 
     Attributes
     ----------
-    circuit : Circuit
-        With the fitted values.
+    circuit, estimates, correlation, evaluations, closed, notes, profiles
+        As of `Fit`.
     gap : str
         Name of the GAP.
-    estimates : dict of str to Estimate
-        By path.
-    correlation : ndarray, shape (n_parameter, n_parameter)
-        Of the errors of the logarithms.
     relations : tuple of Relation
         The data, by kind.
     predicted, sigma : tuple of ndarray
@@ -58,33 +45,17 @@ class ContactFit(Estimates):
         Sum of the squared residuals over sigma.
     freedom : int
         Data less parameters.
-    evaluations : int
-    closed : bool
-        Whether the iteration closed.
-    notes : tuple of str
-        What the data do not tell, and which measurement would.
     reach : dict of str to float
         Half of each interval in the logarithm over the standard error: Student's t, with the degrees of freedom of the
         relations that the parameter is known from.
-    profiles : dict of str to Profile
-        By path, as far as they were asked for.
     """
 
-    circuit: Circuit
     gap: str
-    estimates: dict[str, Estimate]
-    correlation: FloatArray
     relations: tuple[Relation, ...]
     predicted: tuple[FloatArray, ...]
     sigma: tuple[FloatArray, ...]
     misfits: tuple[float, ...]
-    objective: float
-    freedom: int
-    evaluations: int
-    closed: bool
-    notes: tuple[str, ...]
     reach: dict[str, float]
-    profiles: dict[str, Profile] = field(default_factory=dict)
 
     @property
     def values(self) -> dict[str, float]:
@@ -97,11 +68,8 @@ class ContactFit(Estimates):
         return " ".join(f"{path.rpartition('.')[2]}={one.value:.6g}" for path, one in self.estimates.items())
 
     def _page(self) -> Page:
-        count = sum(one.values.size for one in self.relations)
-        lines = [
-            f"contact of {self.gap}: {len(self.estimates)} parameters fitted to {count} values, "
-            f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
-        ]
+        fitted = f"{len(self.estimates)} parameters fitted to {self._count} values"
+        lines = [f"contact of {self.gap}: {fitted}, {self._effort}"]
         for one, misfit in zip(self.relations, self.misfits, strict=True):
             known = "sigma as given" if one.sigma is not None else "sigma estimated from the residuals"
             lines.append(f"{one.name}: {one.values.size} values, residual {100.0 * misfit:.3g} % rms; {known}")
@@ -117,14 +85,15 @@ class ContactFit(Estimates):
 
         panels = []
         for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True):
-            x, label, others = _abscissa(one)
+            x, label, others, name = _abscissa(one)
             kinds = np.unique(others)
             curves = [
-                Curve(f"{_OTHER[label][0]} = {kind:g} {_OTHER[label][1]}" if kinds.size > 1 else one.name, *(
-                    part[others == kind] for part in (x, one.values, fitted, sigma)
-                ))
+                Curve(
+                    name.format(kind) if kinds.size > 1 else one.name,
+                    *(part[others == kind] for part in (x, one.values, fitted, sigma)),
+                )
                 for kind in kinds
-            ]  # fmt: skip
+            ]
             panels.append(Panel(curves, label, one.name, one.unit))
         return plot_panels(panels)
 
@@ -156,52 +125,44 @@ class ContactFit(Estimates):
         return write_csv(path, header, rows)
 
 
-# The condition that tells curves apart, by the one along the axis.
-_LOAD = "normal load", "N"
-_OTHER = {"normal load [N]": ("gap voltage", "V"), "gap voltage [V]": _LOAD, "indentation [mm]": _LOAD}
-
-
-def _abscissa(one: Relation) -> tuple[FloatArray, str, FloatArray]:
-    """Values along the axis and its label, and those of the condition that tells curves apart."""
+def _abscissa(one: Relation) -> tuple[FloatArray, str, FloatArray, str]:
+    """Values along the axis and its label, and those of the condition that tells curves apart with a curve's name."""
     if one.kind == "indentation":
-        return 1e3 * one.indentation, "indentation [mm]", np.zeros(one.fn.size)
+        return 1e3 * one.indentation, "indentation [mm]", np.zeros(one.fn.size), ""
     if np.unique(one.u_gap).size > np.unique(one.fn).size:
-        return one.u_gap, "gap voltage [V]", one.fn
-    return one.fn, "normal load [N]", one.u_gap
+        return one.u_gap, "gap voltage [V]", one.fn, "normal load = {:g} N"
+    return one.fn, "normal load [N]", one.u_gap, "gap voltage = {:g} V"
 
 
 def contact_result(circuit: Circuit, task: ContactTask, best: Fitted, freedom: Sequence[float]) -> ContactFit:
     """The result of a fit; `freedom` has the degrees of freedom of every pool."""
-    covariance = covariance_of(best.by_log)
-    error, reach = _errors(task, best, covariance, freedom)
-    estimates = {
-        path: estimate_of(path, circuit.parameters[path].unit, start, value, off, far, box)
-        for path, start, value, off, far, box in zip(
-            task.paths, task.initial.tolist(), best.values.tolist(), error, reach, task.bounds, strict=True
-        )
-    }
-    correlation = correlation_of(covariance)
-    notes = notes_of(estimates, correlation, error, lambda names: _remedy(task, names))
-    notes += _further_notes(task, best, freedom)
-    predicted = tuple(task.predict(best.values))
+    covariance, pools, predicted = covariance_of(best.by_log), pools_of(task), task.predict(best.values)
+    error, reach = _errors(best, covariance, pools, freedom)
     return ContactFit(
-        circuit, task.gap, estimates, correlation, task.relations, predicted,
-        tuple(
-            one.sigma if one.sigma is not None else share * found
-            for one, share, found in zip(task.relations, task.shares, predicted, strict=True)
+        **estimated(
+            task, best, covariance, error, reach, lambda names: _remedy(task, names),
+            _further_notes(task, best, pools, freedom),
         ),
-        tuple(
+        circuit=circuit,
+        gap=task.gap,
+        relations=task.relations,
+        predicted=tuple(predicted),
+        sigma=tuple(
+            one.sigma if one.sigma is not None else share * found
+            for one, share, found in zip(task.relations, task.split(task.scale), predicted, strict=True)
+        ),
+        misfits=tuple(
             float(np.sqrt(np.mean(np.log(np.maximum(found, 1e-300) / one.values) ** 2)))
             for one, found in zip(task.relations, predicted, strict=True)
         ),
-        best.objective, best.residual.size - len(task.paths), best.evaluations, best.closed, tuple(notes),
-        dict(zip(task.paths, reach, strict=True)),
+        freedom=best.residual.size - len(task.unknowns),
+        reach=dict(zip(task.names, reach, strict=True)),
     )  # fmt: skip
 
 
 def _errors(
-    task: ContactTask, best: Fitted, covariance: FloatArray, freedom: Sequence[float]
-) -> tuple[list[float], list[float]]:
+    best: Fitted, covariance: FloatArray, pools: Sequence[Pool], freedom: Sequence[float]
+) -> tuple[FloatArray, list[float]]:
     """Standard errors of the logarithms, and Student's t with the degrees of freedom of Satterthwaite.
 
     (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946.) Each pool has its own variance, known from its own
@@ -209,10 +170,10 @@ def _errors(
     """
     from scipy.stats import norm, t
 
-    parts = np.array([np.sum((covariance @ best.by_log[pool.at].T) ** 2, axis=1) for pool in pools_of(task.relations)])
-    error, reach = np.sqrt(np.diag(covariance)).tolist(), []
-    for k in range(len(task.paths)):
-        shares = parts[:, k] / max(float(parts[:, k].sum()), 1e-300)
+    parts = np.array([np.sum((covariance @ best.by_log[pool.at].T) ** 2, axis=1) for pool in pools])
+    error, reach = np.sqrt(np.diag(covariance)), []
+    for k, own in enumerate(parts.T):
+        shares = own / max(float(own.sum()), 1e-300)
         felt = [(share, left) for share, left in zip(shares.tolist(), freedom, strict=True) if share > _NO_PART]
         inverse = sum(share**2 / left if left >= FEWEST else math.inf for share, left in felt)
         if math.isinf(inverse):
@@ -222,19 +183,18 @@ def _errors(
     return error, reach
 
 
-def _further_notes(task: ContactTask, best: Fitted, freedom: Sequence[float]) -> list[str]:
+def _further_notes(task: ContactTask, best: Fitted, pools: Sequence[Pool], freedom: Sequence[float]) -> list[str]:
     found = []
-    for pool, left in zip(pools_of(task.relations), freedom, strict=True):
-        name = " and the ".join(task.relations[i].name for i in pool.members)
+    for pool, left in zip(pools, freedom, strict=True):
         if left < FEWEST:
             found.append(
-                f"Of the {name} there are hardly more values ({pool.at.size}) than parameters, which leaves no measure "
-                "of their errors: measure more of them, or give sigma."
+                f"Of the {pool.name} there are hardly more values ({pool.at.size}) than parameters, which leaves no "
+                "measure of their errors: measure more of them, or give sigma."
             )
         if not pool.estimated:
             own = misfit_note(float(np.sum(best.residual[pool.at] ** 2)), pool.at.size)
-            found += [note.replace("The residuals", f"The residuals of the {name}", 1) for note in own]
-    fitted = {path.rpartition(".")[2] for path in task.paths}
+            found += [note.replace("The residuals", f"The residuals of the {pool.name}", 1) for note in own]
+    fitted = {path.rpartition(".")[2] for path in task.names}
     if "c2" in fitted and "mu" not in fitted:
         mu = task.circuit[task.gap].values["mu"]
         found.append(

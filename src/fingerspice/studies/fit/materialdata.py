@@ -44,11 +44,6 @@ def read_table(path: Path) -> FloatArray:
 
     Columns are separated by commas, tabs or semicolons; with semicolons decimal commas are allowed. A line of names
     may give quantities, order and units of the columns; conductivities and angular frequencies are converted.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read; the message names the row at fault.
     """
     try:
         lines = read_text(path, str(path)).splitlines(keepends=True)
@@ -73,30 +68,24 @@ def read_table(path: Path) -> FloatArray:
 
 def _as_named(table: FloatArray, head: list[str], file: str) -> FloatArray:
     """Columns put into order and SI units by their names; columns with unknown names fill the remaining places."""
-    named = [_column(name, file) for name in head]
-    out = table.copy()
-    left = [k for k in range(3) if named[k] is None]
-    used: set[int] = set()
-    for k, found in enumerate(named):
-        if found is None:
+    named: dict[str, FloatArray] = {}
+    others = []
+    for column, x in zip([_column(name, file) for name in head], table.T, strict=True):
+        if column is None:
+            others.append(x)
             continue
-        quantity, factor = found
-        values = factor * table[:, k]
+        quantity, values = column[0], column[1] * x
         with np.errstate(divide="ignore"):
             if quantity == "conductivity":
                 quantity, values = "resistivity", 1.0 / values
         if quantity == "angular frequency":
             quantity, values = "frequency", values / (2.0 * np.pi)
-        place = COLUMNS.index(quantity)
-        if place in used:
+        if quantity in named:
             raise InputError(
                 f"{file}: two columns are a {quantity} by their names, {', '.join(head)}; allowed: {ALLOWED}"
             )
-        used.add(place)
-        out[:, place] = values
-    for place, k in zip([p for p in range(3) if p not in used], left, strict=True):
-        out[:, place] = table[:, k]
-    return out
+        named[quantity] = values
+    return np.column_stack([named[name] if name in named else others.pop(0) for name in COLUMNS])
 
 
 def _column(name: str, file: str) -> tuple[str, float] | None:
@@ -130,47 +119,28 @@ def _column(name: str, file: str) -> tuple[str, float] | None:
 
 #: Possible slips of the user, each with the function from the table as given to the table as meant.
 _SLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
-    ("the frequency is in rad/s", lambda t: _scaled(t, 0, 0.5 / np.pi)),
-    ("the second column is a conductivity in S/m", lambda t: _inverse(t, 1.0)),
-    ("the frequency is in kHz", lambda t: _scaled(t, 0, 1e3)),
-    ("the resistivity is in ohm cm", lambda t: _scaled(t, 1, 1e-2)),
-    ("the resistivity is in kohm m", lambda t: _scaled(t, 1, 1e3)),
+    ("the frequency is in rad/s", lambda t: t * (0.5 / np.pi, 1.0, 1.0)),
+    ("the second column is a conductivity in S/m", lambda t: t ** (1.0, -1.0, 1.0)),
+    ("the frequency is in kHz", lambda t: t * (1e3, 1.0, 1.0)),
+    ("the resistivity is in ohm cm", lambda t: t * (1.0, 1e-2, 1.0)),
+    ("the resistivity is in kohm m", lambda t: t * (1.0, 1e3, 1.0)),
     ("resistivity and permittivity have changed places", lambda t: t[:, [0, 2, 1]]),
     ("frequency and resistivity have changed places", lambda t: t[:, [1, 0, 2]]),
     ("frequency and permittivity have changed places", lambda t: t[:, [2, 1, 0]]),
     ("the columns are resistivity, permittivity, frequency", lambda t: t[:, [2, 0, 1]]),
     ("the columns are permittivity, frequency, resistivity", lambda t: t[:, [1, 2, 0]]),
-    ("the second column is a conductivity in mS/m", lambda t: _inverse(t, 1e-3)),
-    ("the second column is a conductivity in uS/cm", lambda t: _inverse(t, 1e-4)),
-    ("the second column is a conductivity in S/cm", lambda t: _inverse(t, 1e2)),
-    ("the frequency is in MHz", lambda t: _scaled(t, 0, 1e6)),
-    ("the permittivity is in F/m", lambda t: _scaled(t, 2, 1.0 / EPS0)),
+    ("the second column is a conductivity in mS/m", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e3, 1.0)),
+    ("the second column is a conductivity in uS/cm", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e4, 1.0)),
+    ("the second column is a conductivity in S/cm", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e-2, 1.0)),
+    ("the frequency is in MHz", lambda t: t * (1e6, 1.0, 1.0)),
+    ("the permittivity is in F/m", lambda t: t * (1.0, 1.0, 1.0 / EPS0)),
 )
-
-
-def _scaled(table: FloatArray, column: int, factor: float) -> FloatArray:
-    out = table.copy()
-    out[:, column] *= factor
-    return out
-
-
-def _inverse(table: FloatArray, unit: float) -> FloatArray:
-    out = table.copy()
-    out[:, 1] = 1.0 / (unit * table[:, 1])
-    return out
 
 
 def likely_slips(table: FloatArray, misfit: Callable[[FloatArray], float], least: float) -> list[str]:
     """Slips that may explain data that fit no material: at most two that reduce the misfit to less than a third.
 
-    Parameters
-    ----------
-    table : ndarray, shape (n, 3)
-        Frequency (Hz), resistivity (ohm m) and relative permittivity.
-    misfit : callable
-        Misfit of a table to the nearest causal and passive material.
-    least : float
-        Misfit of the data as given.
+    `misfit` is that of a table (n, 3) to the nearest causal and passive material, `least` that of the data as given.
     """
     found = []
     for text, meant in _SLIPS:

@@ -16,36 +16,17 @@ from fingerspice.base.pages import Page, Table
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import meaning_of
 from fingerspice.results.signals import SIGNALS
-from fingerspice.studies.fitdata import MEASURED, Data, Unknown, fitted_circuits
-from fingerspice.studies.fitestimates import (
-    Estimate,
-    Estimates,
-    Profile,
-    correlation_of,
-    covariance_of,
-    estimate_of,
-    misfit_note,
-    notes_of,
-)
+from fingerspice.studies.fit.circuitdata import MEASURED, Data
+from fingerspice.studies.fit.circuittask import Task
+from fingerspice.studies.fit.result import FitResult, covariance_of, estimated, misfit_note
+from fingerspice.studies.fit.search import Fitted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """Where least squares have led: values, residuals over their scale, and their derivatives by logarithms."""
-
-    values: FloatArray
-    residual: FloatArray
-    by_log: FloatArray
-    objective: float
-    evaluations: int
-    closed: bool
-
-
-@dataclass(frozen=True, repr=False)
-class Fit(Estimates):
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Fit(FitResult):
     """A fit of parameters to data; `circuit` is ready to run.
 
     Attributes
@@ -79,33 +60,27 @@ class Fit(Estimates):
         By path, as far as they were asked for.
     """
 
-    circuit: Circuit
-    estimates: dict[str, Estimate]
-    correlation: FloatArray
     data: Data
     predicted: FloatArray
     sigma: FloatArray
-    objective: float
     objectives: tuple[float, ...]
-    freedom: int
-    evaluations: int
-    closed: bool
-    notes: tuple[str, ...]
     circuits: dict[str, Circuit] = field(default_factory=dict)
-    profiles: dict[str, Profile] = field(default_factory=dict)
 
     @property
     def residual(self) -> FloatArray:
         """Data less prediction, in the unit of the data, shape (n,)."""
         return np.asarray(self.data.values - self.predicted)
 
+    @property
+    def _rms(self) -> float:
+        return float(np.sqrt(np.mean(self.residual**2)))
+
     def _page(self) -> Page:
-        rms = float(np.sqrt(np.mean(self.residual**2)))
-        peak = float(np.abs(self.data.values).max()) or 1.0
+        share = 100.0 * self._rms / (float(np.abs(self.data.values).max()) or 1.0)
         lines: list[str | Table] = [
             f"{len(self.estimates)} parameters fitted to {self.data.values.size} values of {self.data.name}, "
-            f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}",
-            f"residual {rms:.3g} {MEASURED[self.data.signal]} rms, {100.0 * rms / peak:.2g} % of the largest value; "
+            f"{self._effort}",
+            f"residual {self._rms:.3g} {MEASURED[self.data.signal]} rms, {share:.2g} % of the largest value; "
             f"{self._noise()}",
         ]
         if self.data.groups is not None:
@@ -120,39 +95,34 @@ class Fit(Estimates):
 
     @property
     def _count(self) -> int:
-        return self.data.values.size * (1 if self.data.phase is None else 2)
+        return self.data.count
 
     def plot(self) -> Figure:
         """Data and fit, with the residuals below."""
         from fingerspice.plots.populations import Curve, plot_fit
 
-        data, circuit = self.data, self.circuit
+        data = self.data
         signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal
         signal = f"mean {signal}" if data.name.endswith("_mean") else signal
         varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
-        groups, names = np.zeros(data.values.size, int), ["measured and fitted"]
+        names = ["measured and fitted"] * data.values.size
         if data.t is not None:
             x, label = data.t, "time [s]"
         elif varying:
             (path, x), others = varying[0], varying[1:]
-            unit = circuit.parameters[path].unit
-            label = meaning_of(circuit, path) + (f" [{unit}]" if unit else "")
-            keys = [
-                (meaning_of(circuit, path), [f"{y:g} {circuit.parameters[path].unit}".rstrip() for y in values])
-                for path, values in others
-            ]
-            if data.groups is not None:
-                keys.insert(0, (data.groups.column, [data.groups.labels[i] for i in data.groups.of]))
+            unit = self.circuit.parameters[path].unit
+            label = meaning_of(self.circuit, path) + (f" [{unit}]" if unit else "")
+            keys = [] if data.groups is None else [[f"{data.groups.column} = {one}" for one in data.groups.of]]
+            for path, values in others:
+                unit = self.circuit.parameters[path].unit
+                keys.append([f"{meaning_of(self.circuit, path)} = {y:g} {unit}".rstrip() for y in values])
             if keys:
-                told = [", ".join(f"{a} = {b[row]}" for a, b in keys) for row in range(x.size)]
-                names = list(dict.fromkeys(told))
-                groups = np.array([names.index(one) for one in told])
+                names = [", ".join(told) for told in zip(*keys, strict=True)]
         else:
             x, label = np.arange(1.0, data.values.size + 1.0), "measurement"
         curves = [
-            Curve(name, x[own], data.values[own], self.predicted[own], self.sigma[own])
-            for group, name in enumerate(names)
-            for own in [groups == group]
+            Curve(name, *(part[np.array(names) == name] for part in (x, data.values, self.predicted, self.sigma)))
+            for name in dict.fromkeys(names)
         ]
         return plot_fit(curves, label, signal, MEASURED[data.signal])
 
@@ -163,7 +133,7 @@ class Fit(Estimates):
             "groups": list(self.circuits),
             "signal": self.data.signal,
             "count": int(self.data.values.size),
-            "residual_rms": float(np.sqrt(np.mean(self.residual**2))),
+            "residual_rms": self._rms,
             "objectives": list(self.objectives),
         }
 
@@ -179,35 +149,44 @@ class Fit(Estimates):
         columns: dict[str, Any] = {"t": data.t} if data.t is not None else {}
         columns |= {**data.conditions, data.signal: data.values, "fitted": self.predicted, "sigma": self.sigma}
         if groups is not None:
-            columns = {groups.column: [groups.labels[i] for i in groups.of], **columns}
+            columns = {groups.column: groups.of, **columns}
         return write_csv(path, columns, zip(*columns.values(), strict=True))
 
 
 def fit_result(
-    circuit: Circuit, data: Data, unknowns: tuple[Unknown, ...], bounds: FloatArray, best: Fitted,
-    objectives: Sequence[float], scale: FloatArray, freedom: int,
-) -> Fit:  # fmt: skip
-    """The result of the best of several fits."""
-    from scipy.stats import norm, t
-
-    n = data.values.size
-    variance = 1.0 if data.sigma is not None else best.objective / freedom if freedom > 0 else math.inf
-    covariance = covariance_of(best.by_log)
-    error = np.sqrt(np.diag(covariance) * variance)
-    reach = float(norm.ppf(0.975) if data.sigma is not None else t.ppf(0.975, freedom) if freedom > 0 else math.inf)
-    estimates = {}
-    for one, value, off, box in zip(unknowns, best.values.tolist(), error.tolist(), bounds, strict=True):
-        start = circuit.parameters[one.path]
-        estimates[one.name] = estimate_of(one.name, start.unit, start.value, value, off, reach, box)
-    sigma = data.sigma if data.sigma is not None else math.sqrt(variance) * scale[:n]
-    correlation, remedy = correlation_of(covariance), _remedy(circuit, data)
-    notes = notes_of(estimates, correlation, error.tolist(), lambda _: remedy)
-    notes += misfit_note(best.objective, freedom) if data.sigma is not None else []
-    fitted, each = fitted_circuits(circuit, unknowns, best.values.tolist(), data.groups)
+    task: Task, best: Fitted, objectives: Sequence[float], freedom: int, variance: float, reach: float
+) -> Fit:
+    """The result of the best of several fits; half an interval is `reach` standard errors."""
+    data, n = task.data, task.data.values.size
+    covariance, remedy = covariance_of(best.by_log), _remedy(task.circuit, data)
     return Fit(
-        fitted, estimates, correlation, data, data.values + (best.residual * scale)[:n], sigma, best.objective,
-        tuple(objectives), freedom, best.evaluations, best.closed, tuple(notes), each,
+        **estimated(
+            task, best, covariance, np.sqrt(np.diag(covariance) * variance), [reach] * len(task.unknowns),
+            lambda _: remedy, misfit_note(best.objective, freedom) if data.sigma is not None else [],
+        ),
+        data=data,
+        predicted=data.values + (best.residual * task.scale)[:n],
+        sigma=data.sigma if data.sigma is not None else math.sqrt(variance) * task.scale[:n],
+        objectives=tuple(objectives),
+        freedom=freedom,
+        **_fitted_circuits(task, best.values),
     )  # fmt: skip
+
+
+def _fitted_circuits(task: Task, values: FloatArray) -> dict[str, Any]:
+    """`circuit` and `circuits` of a `Fit`."""
+    found = list(zip(task.unknowns, values.tolist(), strict=True))
+    mean = {}
+    for path in task.paths:
+        own = [value for one, value in found if one.path == path]
+        mean[path] = own[0] if len(own) == 1 else math.exp(sum(map(math.log, own)) / len(own))
+    return {
+        "circuit": task.circuit.varied(mean),
+        "circuits": {
+            label: task.circuit.varied({one.path: value for one, value in found if one.label in (None, label)})
+            for label in (task.data.groups.labels if task.data.groups is not None else ())
+        },
+    }
 
 
 def _remedy(circuit: Circuit, data: Data) -> str:

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fingerspice.base.announcing import Bar
 from fingerspice.base.arrays import FloatArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.solve.simulation import rtol_given
-from fingerspice.studies.batch import batch
-from fingerspice.studies.fitdata import IMPEDANCE, Data, Unknown, data_of, group_column, unknowns_of
-from fingerspice.studies.fitresult import Fit, Fitted, fit_result
-from fingerspice.studies.fittask import FARTHEST, REFUSED, Task, evaluations_shown, followed, limit_of, profile_of
+from fingerspice.studies.fit.circuitdata import IMPEDANCE, Data, data_of
+from fingerspice.studies.fit.circuitresult import Fit, fit_result
+from fingerspice.studies.fit.circuittask import Task
+from fingerspice.studies.fit.search import FARTHEST, Fitted, Unknown, bounds_of, followed, profile_of, refuse_few
 from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
@@ -93,44 +97,73 @@ def fit(
     """
     require_circuit(circuit)
     starts, rtol = whole_number("starts", starts, 1), rtol_given(rtol)
-    table, unknowns = _request(circuit, data, parameters, groups)
-    task = _task(circuit, table, unknowns, bounds, average, skin, charge_law, rtol)
-    wanted = profiled(tuple(one.name for one in task.unknowns), profiles)
-    said = [*table.unusual(), *scenes_warnings(circuit, None, table.conditions, skin)]
+    measured, unknowns = _request(circuit, data, parameters, groups)
+    require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
+    require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
+    start, box = bounds_of(circuit, tuple(one.path for one in unknowns), bounds or {})
+    target, scale = _target(measured)
+    task = Task(start, unknowns, box, scale, measured, average, skin, rtol, charge_law, target)
+    wanted = task.profiled(profiles)
+    said = [*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin)]
     for text in filter(None, said):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    with evaluations_shown() as watch:
+    with _evaluations_shown() as watch:
         return _fitted(replace(task, watch=watch), starts, wanted)
+
+
+@contextmanager
+def _evaluations_shown() -> Iterator[Callable[[], None]]:
+    """A progress bar of a fit, which appears after one second; the function counts the evaluations."""
+    bar, begun, count = Bar("fitting", endless=True), time.perf_counter(), itertools.count(1)
+
+    def watch() -> None:
+        number = next(count)
+        if time.perf_counter() - begun > 1.0:
+            bar.show(note=f"evaluation {number}")
+
+    try:
+        yield watch
+    finally:
+        bar.stop()
 
 
 def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
     """The fit, with the profiles `wanted`."""
-    table, names = free.data, tuple(one.name for one in free.unknowns)
+    data = free.data
     # Where no bounds are given, nothing is looked for far from the start: there are no likely values, and slow runs.
     (low, high), near, far = free.bounds.T, free.initial / FARTHEST, free.initial * FARTHEST
     walls = np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
     task = replace(free, bounds=walls)
-    ends = [followed(task, begin) for begin in _starts(task, starts)]
+    ends = [followed(task.residuals, walls, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
-    if not best.objective < 0.5 * REFUSED**2:
+    if not best.found:
         raise InputError(
             "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
             "circuit that runs under the conditions of the data"
         )
-    spare = task.target.size - len(names)
-    chosen = table.sigma is None and table.t is None and table.signal != IMPEDANCE and spare >= _CHOOSING
-    if chosen:
+    freedom = task.target.size - len(task.unknowns)
+    if data.sigma is None and data.t is None and data.signal != IMPEDANCE and freedom >= _CHOOSING:
         task, ends = _with_likelier_noise(task, ends, best)
         best = min(ends, key=lambda end: end.objective)
-    objectives = [end.objective for end in ends]
-    found = fit_result(
-        task.circuit, table, task.unknowns, task.bounds, best, objectives, task.scale, spare - chosen
-    )  # fmt: skip
-    limit = limit_of(best.objective, found.freedom, given=table.sigma is not None)
-    free = replace(task, bounds=free.bounds)
-    return replace(
-        found, profiles={name: profile_of(free, names, best, name, _error(found, name), limit) for name in wanted}
-    )
+        freedom -= 1
+    variance, reach = _spread(best, freedom, given=data.sigma is not None)
+    found = fit_result(task, best, [end.objective for end in ends], freedom, variance, reach)
+    # Of chi squared and F with one degree of freedom, quantiles are the squares of those of the normal distribution
+    # and of Student's (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
+    limit = best.objective + variance * reach**2
+    for name in wanted:
+        one = found.estimates[name]
+        found.profiles[name] = profile_of(replace(task, bounds=free.bounds), best, name, one.error / one.value, limit)
+    return found
+
+
+def _spread(best: Fitted, freedom: int, *, given: bool) -> tuple[float, float]:
+    """Variance of the residuals over their scale, and half a 95 % interval over a standard error."""
+    from scipy.stats import norm, t
+
+    if given:
+        return 1.0, float(norm.ppf(0.975))
+    return (best.objective / freedom, float(t.ppf(0.975, freedom))) if freedom > 0 else (math.inf, math.inf)
 
 
 def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[Task, list[Fitted]]:
@@ -142,7 +175,7 @@ def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[
     if not np.all(predicted > 0.0) or best.objective == 0.0:
         return task, ends
     shares = replace(task, scale=predicted)
-    others = [followed(shares, end.values) for end in ends]
+    others = [followed(shares.residuals, shares.bounds, end.values) for end in ends]
     least, n = min(end.objective for end in others), predicted.size
     equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
     return (
@@ -152,24 +185,8 @@ def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[
     )
 
 
-def _error(found: Fit, path: str) -> float:
-    """Standard error of a parameter's logarithm."""
-    return found.estimates[path].error / found.estimates[path].value
-
-
-def profiled(paths: tuple[str, ...], wanted: bool | Sequence[str]) -> list[str]:
-    """The paths whose profiles are wanted, in the circuit's own spelling."""
-    if isinstance(wanted, bool):
-        return list(paths) if wanted else []
-    known = {path.lower(): path for path in paths}
-    for path in wanted:
-        if not isinstance(path, str) or path.lower() not in known:
-            raise InputError(f"profiles names {path!r}, which is not fitted; allowed: True, or {', '.join(paths)}")
-    return [known[path.lower()] for path in wanted]
-
-
 def _request(
-    circuit: Circuit, data: Mapping[str, ArrayLike] | str | Path, parameters: Sequence[str],
+    circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, parameters: Sequence[str],
     groups: Mapping[str, Sequence[str]] | None,
 ) -> tuple[Data, tuple[Unknown, ...]]:  # fmt: skip
     """The checked data, and what is to be fitted to them."""
@@ -180,40 +197,41 @@ def _request(
         if path.lower() not in known:
             circuit.varied({path: 1.0})
     paths = tuple(known[path.lower()] for path in parameters)
-    refuse_twice(paths)
-    by = group_column(circuit, groups)
-    table = data_of(circuit, data, by)
-    both = sorted(set(paths) & set(table.conditions))
+    for path in paths:
+        require(paths.count(path) == 1, path, "named twice", "once")
+    by = _group_column(circuit, groups)
+    data = data_of(circuit, given, by)
+    both = sorted(set(paths) & set(data.conditions))
     if both:
         raise InputError(f"{both[0]} is to be fitted, and is a condition of the data; allowed: one of both")
     for path in paths:
         value = circuit.parameters[path].value
         if not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
-    unknowns = unknowns_of(paths, (groups or {}).get(by or "", ()), table.groups)
-    count = table.values.size * (1 if table.phase is None else 2)
-    if count < len(unknowns):
-        raise InputError(f"{count} data cannot tell {len(unknowns)} parameters; allowed: at least as many data")
-    return table, unknowns
+    separate = [path.lower() for path in (groups or {}).get(by or "", ())]
+    for path in (groups or {}).get(by or "", ()):
+        if path.lower() not in map(str.lower, paths):
+            raise InputError(f"groups names {path!r}, which is not fitted; allowed: {', '.join(paths)}")
+    labels = data.groups.labels if data.groups is not None else ()
+    unknowns = tuple(
+        Unknown(path, label) for path in paths for label in (labels if path.lower() in separate else (None,))
+    )
+    refuse_few(data.count, unknowns)
+    return data, unknowns
 
 
-def refuse_twice(paths: Sequence[str]) -> None:
-    """Refuse a parameter that is named twice."""
-    for path in paths:
-        require(paths.count(path) == 1, path, "named twice", "once")
-
-
-def _task(
-    circuit: Circuit, table: Data, unknowns: tuple[Unknown, ...], bounds: Mapping[str, tuple[float, float]] | None,
-    average: str, skin: str, charge_law: str | None, rtol: float,
-) -> Task:  # fmt: skip
-    """The checked request."""
-    require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
-    require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
-    target, scale = _target(table)
-    every = tuple(one.path for one in unknowns)
-    circuit, box = bounds_of(circuit, every, bounds or {})
-    return Task(circuit, table, unknowns, box, average, skin, rtol, charge_law, target, scale)
+def _group_column(circuit: Circuit, groups: Mapping[str, Sequence[str]] | None) -> str | None:
+    """The column that tells the group, of a request such as ``{"finger": ["Xgap.d"]}``."""
+    if groups is None:
+        return None
+    wanted = "a mapping of a column of the data to the parameters of each group, such as {'finger': ['Xgap.d']}"
+    if isinstance(groups, Mapping) and len(groups) == 1:
+        ((column, paths),) = groups.items()
+        if isinstance(column, str) and not isinstance(paths, str) and paths:
+            if column.lower() in map(str.lower, circuit.parameters):
+                raise InputError(f"groups names the column {column!r}, which is a parameter; allowed: {wanted}")
+            return column
+    raise InputError(f"groups is {groups!r}; allowed: {wanted}")
 
 
 def _target(table: Data) -> tuple[FloatArray, FloatArray]:
@@ -229,33 +247,6 @@ def _target(table: Data) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([table.values, table.phase]), np.concatenate([scale, np.degrees(scale / sizes)])
 
 
-def bounds_of(
-    circuit: Circuit, paths: tuple[str, ...], given: Mapping[str, tuple[float, float]]
-) -> tuple[Circuit, FloatArray]:
-    """The circuit to start from, and smallest and largest values, shape (n_parameter, 2): 0 and infinity by default.
-
-    A start outside its bounds moves to the nearer one, with a warning.
-    """
-    lower = {path.lower(): tuple(pair) for path, pair in given.items()}
-    unknown = [path for path in given if path.lower() not in {p.lower() for p in paths}]
-    if unknown:
-        raise InputError(f"bounds names {unknown[0]}, which is not fitted; allowed: {', '.join(paths)}")
-    out = np.tile([0.0, math.inf], (len(paths), 1))
-    for i, path in enumerate(paths):
-        if path.lower() in lower:
-            pair = lower[path.lower()]
-            if len(pair) != 2 or not 0.0 <= pair[0] < pair[1]:
-                raise InputError(f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
-            out[i] = pair
-            value = circuit.parameters[path].value
-            moved = min(max(value, pair[0]), pair[1])
-            if moved != value:
-                said = f"{path} is {value:g}, outside its bounds {pair[0]:g} to {pair[1]:g}: it starts at {moved:g}"
-                warnings.warn(said, FingerspiceWarning, stacklevel=4)
-                circuit = circuit.varied({path: moved})
-    return circuit, out
-
-
 def _starts(task: Task, count: int) -> list[FloatArray]:
     """The values given, and the best of others around them (a Sobol sequence, always the same)."""
     from scipy.stats import qmc
@@ -267,19 +258,11 @@ def _starts(task: Task, count: int) -> list[FloatArray]:
     high = np.minimum(task.bounds[:, 1], initial * _SPREAD)
     share = qmc.Sobol(initial.size, scramble=False).random_base2(math.ceil(math.log2(count)))[1:count]
     tried = np.vstack([initial, np.exp(np.log(low) + share * np.log(high / low))])
-    rows, n = task.data.values.size, len(tried)
-    table = {path: np.tile(x, n) for path, x in task.data.conditions.items()}
-    for path in dict.fromkeys(one.path for one in task.unknowns):
-        own = [k for k, one in enumerate(task.unknowns) if one.path == path]
-        table[path] = (tried[:, own] @ task.members[own]).ravel()
-    periodic = task.average == "periodic"
     with warnings.catch_warnings():
         # What there is to say of the data has been said.
         warnings.simplefilter("ignore", FingerspiceWarning)
-        tests = batch(
-            task.circuit, table, outputs=(task.data.name,), rtol=_ROUGH, periodic=periodic, skin=task.skin
-        )  # fmt: skip
-    found = tests[task.data.name].to_numpy().reshape(n, rows)
+        tests = task.scenes(tried, _ROUGH)
+    found = tests[task.data.name].to_numpy().reshape(len(tried), -1)
     off = (((found - task.data.values) / task.scale) ** 2).sum(axis=1)
     order = np.argsort(np.where(np.isfinite(off), off, math.inf), kind="stable")
     return [initial, *(tried[i] for i in order[:_FOLLOWED].tolist() if i > 0)]

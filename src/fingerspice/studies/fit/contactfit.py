@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.studies.contactdata import ContactTask, Given, Relation, relations_of, solved
-from fingerspice.studies.contactresult import ContactFit, contact_result
-from fingerspice.studies.fit import bounds_of, profiled, refuse_twice
-from fingerspice.studies.fittask import REFUSED, profile_of
+from fingerspice.studies.fit.contactdata import ContactTask, Relation, relations_of, solved
+from fingerspice.studies.fit.contactresult import ContactFit, contact_result
+from fingerspice.studies.fit.measured import Given
+from fingerspice.studies.fit.search import Unknown, bounds_of, profile_of, refuse_few
 from fingerspice.waveforms.waveform import require
 
 PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
@@ -75,7 +73,10 @@ def fit_contact(
     gap = _gap(circuit, finger)
     own = circuit[gap].values
     relations = relations_of(data, own["fn"])
-    _look_at_loads(relations)
+    largest = max(float(relation.fn.max()) for relation in relations)
+    heavy = DEVICES["GAP"].parameter("fn").unusual("the data's largest", largest)
+    if heavy is not None:
+        warnings.warn(heavy, FingerspiceWarning, stacklevel=2)
     names = _wanted(parameters, relations)
     # What is fitted in its logarithm cannot start at 0.
     zero = {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default for name in names if own[name] == 0.0}
@@ -84,14 +85,13 @@ def fit_contact(
     least |= {f"{gap}.c2": 0.0} if {one.kind for one in relations} <= {"area", "indentation"} else {}
     start = circuit.varied(least | {path: value for path, value in zero.items() if value is not None})
     paths = tuple(f"{gap}.{name}" for name in names)
-    count = sum(relation.values.size for relation in relations)
-    if count < len(paths):
-        raise InputError(f"{count} data cannot tell {len(paths)} parameters; allowed: at least as many data")
+    scale = np.concatenate([np.full(one.values.size, _SHARE) if one.sigma is None else one.sigma for one in relations])
+    refuse_few(scale.size, paths)
     start, box = bounds_of(start, paths, {_named(gap, path): pair for path, pair in (bounds or {}).items()})
-    wanted = profiles if isinstance(profiles, bool) else [_named(gap, path) for path in profiles]
-    asked = profiled(paths, wanted)
-    task, best, freedom = solved(ContactTask(start, gap, relations, paths, box, (_SHARE,) * len(relations)))
-    if not best.objective < 0.5 * REFUSED**2:
+    task = ContactTask(start, tuple(map(Unknown, paths)), box, scale, gap, relations)
+    wanted = task.profiled(profiles if isinstance(profiles, bool) else [_named(gap, path) for path in profiles])
+    task, best, freedom = solved(task)
+    if not best.found:
         raise InputError(
             f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data; "
             "allowed: values nearer to the data, such as a smaller c2 or a larger alpha"
@@ -108,10 +108,9 @@ def fit_contact(
                 f"the {relation.name} misses the data by {100.0 * misfit:.2g} % rms; its relation may not hold for them"
             )
             warnings.warn(f"{said}, or a column is in another unit", FingerspiceWarning, stacklevel=2)
-    for path in asked:
-        error = math.log(found.estimates[path].high / found.estimates[path].value) / found.reach[path]
-        limit = best.objective + found.reach[path] ** 2
-        found.profiles[path] = profile_of(task, paths, best, path, error, limit)
+    for path in wanted:
+        one, limit = found.estimates[path], best.objective + found.reach[path] ** 2
+        found.profiles[path] = profile_of(task, best, path, one.error / one.value, limit)
     return found
 
 
@@ -126,9 +125,9 @@ def _gap(circuit: Circuit, finger: str | None) -> str:
         raise InputError("this circuit has no GAP; allowed: a circuit with a finger, whose contact is fitted")
     if finger is None and len(gaps) > 1:
         raise InputError(f"this circuit has several GAPs; allowed: finger= one of {', '.join(gaps.values())}")
-    if finger is not None and finger.lower() not in gaps:
+    name = next(iter(gaps.values())) if finger is None else gaps.get(finger.lower(), "")
+    if not name:
         raise InputError(f"finger is {finger!r}; allowed: the name of a GAP, {', '.join(gaps.values())}")
-    name = gaps[finger.lower()] if finger is not None else next(iter(gaps.values()))
     fixed = circuit[name].values["a_fix"]
     require(fixed == 0.0, f"{name}.a_fix", f"{fixed:g} mm^2", "0, as a given area follows no contact")
     return name
@@ -150,13 +149,5 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
     bare = [name.rpartition(".")[2].lower() for name in given]
     for name in bare:
         require(name in PARAMETERS, "parameters", repr(name), ", ".join(PARAMETERS))
-    refuse_twice(bare)
+        require(bare.count(name) == 1, name, "named twice", "once")
     return tuple(name for name in PARAMETERS if name in bare)
-
-
-def _look_at_loads(relations: Sequence[Relation]) -> None:
-    """Warn about loads that no finger bears."""
-    loads: FloatArray = np.concatenate([relation.fn for relation in relations])
-    text = DEVICES["GAP"].parameter("fn").unusual("the data's largest", float(loads.max()))
-    if text is not None:
-        warnings.warn(text, FingerspiceWarning, stacklevel=3)

@@ -1,0 +1,1 @@
+"""Fits of circuits, contacts and materials to measured data, by least squares."""

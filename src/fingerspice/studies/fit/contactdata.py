@@ -1,0 +1,215 @@
+"""Measured areas and friction forces of a finger, and what a contact's parameters predict of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.errors import InputError
+from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
+from fingerspice.numerics.small import AT, derivative
+from fingerspice.physics.contact import Contact, ridge_area
+from fingerspice.studies.fit.measured import SIGMA, Given, measured_of
+from fingerspice.studies.fit.search import Fitted, Problem, followed
+
+#: Measured columns and conditions, with their units.
+MEASURED = {"area": "m^2", "area_sliding": "m^2", "f_t": "N"}
+CONDITIONS = {"fn": "N", "indentation": "m", "u_gap": "V"}
+#: What is measured in words; an area against the indentation is a relation of its own.
+NAMES = {
+    "area": "ridge area at rest", "indentation": "ridge area by indentation",
+    "area_sliding": "ridge area while sliding", "f_t": "friction force",
+}  # fmt: skip
+_ALLOWED = ", ".join([*MEASURED, *CONDITIONS, "sigma"])
+# Step of the differences in a parameter's logarithm, at which those of fourth order are exact to rounding.
+_STEP = 1e-3
+# Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
+# this; they are no smaller than the last.
+_ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
+#: Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
+FEWEST = 0.5
+
+
+@dataclass(frozen=True)
+class Relation:
+    """Measured values of one kind with their conditions, in SI units."""
+
+    kind: str  # A key of `NAMES`
+    values: FloatArray  # (n,)
+    sigma: FloatArray | None  # (n,): Standard deviation of every value; None where it is not known
+    # fn, u_gap, indentation (n,): Normal load, gap voltage and indentation; the last is 0 where it has no meaning
+    fn: FloatArray
+    u_gap: FloatArray
+    indentation: FloatArray
+
+    @property
+    def unit(self) -> str:
+        """Unit of the values."""
+        return MEASURED.get(self.kind, "m^2")
+
+    @property
+    def name(self) -> str:
+        """What was measured, in words."""
+        return NAMES[self.kind]
+
+    def predicted(self, contact: Contact) -> FloatArray:
+        """The values as a contact has them (Eqs. 1 to 6), shape (n,)."""
+        if self.kind == "indentation":
+            return np.asarray(contact.beta * self.indentation**contact.n)
+        resting = self.kind == "area"
+        out = np.empty(self.values.size)
+        for i, (fn, u) in enumerate(zip(self.fn.tolist(), self.u_gap.tolist(), strict=True)):
+            packed = replace(contact, f_n=fn, mu=0.0 if resting else contact.mu).packed
+            out[i] = area = ridge_area(abs(u), packed)
+            if self.kind == "f_t":
+                out[i] = contact.mu * (fn + packed[4] * u * u * area)
+        return out
+
+
+def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, ...]:
+    """The relations in one or several sets of columns; `fn` (N) is the load where no column has it."""
+    several = [given] if isinstance(given, (str, Path, Mapping)) else given
+    if not isinstance(several, Sequence) or not several:
+        raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, a table's path, or a list")
+    found: dict[tuple[str, bool], Relation] = {}
+    for number, one in enumerate(several, 1):
+        place = "the data" if len(several) == 1 else f"data {number}"
+        measured = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
+        for relation in _relations(measured.columns, fn, measured.place):
+            key = relation.kind, relation.sigma is None
+            found[key] = _joined(found[key], relation) if key in found else relation
+    return tuple(found.values())
+
+
+def _meaning(name: str, names: Sequence[str]) -> tuple[str, str, str | None]:
+    key, lower = name.lower(), [one.lower() for one in names]
+    measured = [own for own in MEASURED if own in lower]
+    values = measured[0] if key == SIGMA and len(measured) == 1 else key.removesuffix(f"_{SIGMA}")
+    return key, values, (MEASURED | CONDITIONS).get(values)
+
+
+def _relations(columns: Mapping[str, FloatArray], fn: float, place: str) -> list[Relation]:
+    measured = [name for name in MEASURED if name in columns]
+    if not measured:
+        raise InputError(f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
+    sigmas = {name: f"{name}_{SIGMA}" for name in measured} | ({measured[0]: SIGMA} if len(measured) == 1 else {})
+    sigmas = {name: key if key in columns else f"{name}_{SIGMA}" for name, key in sigmas.items()}
+    unknown = [name for name in columns if name not in (*measured, *CONDITIONS, *sigmas.values())]
+    if unknown:
+        why = ": which of the measured columns it belongs to is not known" if unknown[0] == SIGMA else ""
+        each = ", ".join(f"{name}_{SIGMA}" for name in measured)
+        raise InputError(f"{place} have a column {unknown[0]!r}{why}; allowed: {_ALLOWED}, {each}")
+    for name, x in columns.items():
+        if name != "u_gap" and not np.all(x > 0.0):
+            raise InputError(f"{place}: the smallest {name} is {x.min():g}; allowed: more than 0")
+    size = columns[measured[0]].size
+    at, none = columns.get("fn", np.full(size, fn)), np.zeros(size)
+    u, depth = columns.get("u_gap", none), columns.get("indentation")
+    if depth is not None and np.any(u != 0.0):
+        raise InputError(f"{place} have the columns indentation and u_gap; allowed: indentations without voltage")
+    found = []
+    for name in measured:
+        values, sigma = columns[name], columns.get(sigmas[name])
+        if name == "area" and depth is not None:
+            found.append(Relation("indentation", values, sigma, at, none, depth))
+        if name != "area" or depth is None or "fn" in columns:
+            found.append(Relation(name, values, sigma, at, u, none))
+    return found
+
+
+def _joined(a: Relation, b: Relation) -> Relation:
+    """Two relations of one kind as one; both have sigma, or none of them."""
+    names = ("values", "sigma", "fn", "u_gap", "indentation")
+    pairs = {name: (getattr(a, name), getattr(b, name)) for name in names}
+    joined: dict[str, Any] = {name: np.concatenate(pair) for name, pair in pairs.items() if pair[0] is not None}
+    return replace(a, **joined)
+
+
+@dataclass(frozen=True)
+class ContactTask(Problem):
+    """The fit of a contact; the scale of a relation without sigma is the standard deviation of the logarithms."""
+
+    gap: str  # Name of the GAP
+    relations: tuple[Relation, ...]
+
+    def split(self, x: NDArray[Any]) -> list[NDArray[Any]]:
+        """Each relation's part of a row over all data."""
+        return np.split(x, np.cumsum([one.values.size for one in self.relations])[:-1])
+
+    def predict(self, values: FloatArray) -> list[FloatArray]:
+        """Each relation's values as the contact has them."""
+        paths = [one.path for one in self.unknowns]
+        changed = self.circuit.varied(dict(zip(paths, values.tolist(), strict=True)))
+        own: Contact | None = build_stack(changed).contact if is_stack(changed) else None
+        contact = contact_of(changed[self.gap]) if own is None else own
+        return [relation.predicted(contact) for relation in self.relations]
+
+    def compared(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        middle, by = self._misses(values), np.zeros((self.scale.size, values.size))
+        for k, one in enumerate(np.eye(values.size)):
+            moved = [values * np.exp(at * _STEP * one) for at in AT]
+            by[:, k] = derivative([self._misses(each) for each in moved], _STEP)
+        return middle, by
+
+    def _misses(self, values: FloatArray) -> FloatArray:
+        parts = []
+        for relation, found in zip(self.relations, self.predict(values), strict=True):
+            if relation.sigma is None and not np.all(found > 0.0):
+                raise InputError("friction leaves no area; allowed: a smaller c2")
+            parts.append(found - relation.values if relation.sigma is not None else np.log(found / relation.values))
+        return np.concatenate(parts) / self.scale
+
+
+class Pool(NamedTuple):
+    """Relations whose values have one standard deviation, as they come from the same instrument."""
+
+    name: str  # What was measured, in words
+    at: IntArray  # Places of their values among the residuals
+    estimated: bool  # Whether the standard deviation follows from the residuals, and is not given
+
+
+def pools_of(task: ContactTask) -> list[Pool]:
+    """The relations by what they have been measured with: ridge areas against the load come from one set of images."""
+    places = task.split(np.arange(task.scale.size))
+    members: dict[tuple[str, bool], list[tuple[str, IntArray]]] = {}
+    for relation, at in zip(task.relations, places, strict=True):
+        key = relation.kind.removesuffix("_sliding"), relation.sigma is None
+        members.setdefault(key, []).append((relation.name, at))
+    return [
+        Pool(" and the ".join(name for name, _ in own), np.concatenate([at for _, at in own]), estimated)
+        for (_, estimated), own in members.items()
+    ]
+
+
+def solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[float]]:
+    """Least squares, with the standard deviation of every pool that has none from its own residuals.
+
+    Returns the task with the standard deviations found, the fit, and the degrees of freedom of each pool: its values
+    less what the parameters take up of them; infinity where sigma is given.
+    """
+    begin, pools = task.initial, pools_of(task)
+    for _ in range(_ROUNDS):
+        best = followed(task.residuals, task.bounds, begin)
+        left, scale = _freedoms(best, pools), task.scale.copy()
+        for pool, freedom in zip(pools, left, strict=True):
+            if pool.estimated and freedom >= FEWEST:
+                spread = float(np.sqrt(np.sum(best.residual[pool.at] ** 2) / freedom))
+                scale[pool.at] = np.maximum(scale[pool.at] * spread, _LEAST)
+        if np.abs(np.log(scale / task.scale)).max() < _SETTLED:
+            break
+        task, begin = replace(task, scale=scale), best.values
+    return task, best, left
+
+
+def _freedoms(best: Fitted, pools: Sequence[Pool]) -> list[float]:
+    """Degrees of freedom of each pool: its number of values less the sum of their leverages."""
+    left, singular, _ = np.linalg.svd(best.by_log, full_matrices=False)
+    left = left[:, singular > 1e-9 * max(float(singular.max()), 1e-300)]
+    leverage = np.sum(left**2, axis=1)
+    return [pool.at.size - float(leverage[pool.at].sum()) if pool.estimated else float("inf") for pool in pools]

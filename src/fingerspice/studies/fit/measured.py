@@ -1,0 +1,134 @@
+"""Measured columns, from arrays or a table with names and units, and which measurements belong together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fingerspice.base.arrays import FloatArray, real_numbers
+from fingerspice.base.errors import InputError
+from fingerspice.waveforms.columns import read_labelled_columns, read_text_columns
+from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file
+
+SIGMA = "sigma"
+_PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
+
+#: One set of columns, or the path of a table.
+Given = Mapping[str, ArrayLike] | str | Path
+#: What a name in a header means, with all names of the header beside it: the column's key, the key of the column whose
+#: unit it has (of a standard deviation that of the values, else its own), and this unit, or None where none is known.
+Meaning = Callable[[str, Sequence[str]], tuple[str, str, str | None]]
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The group of every measurement."""
+
+    column: str  # Name of the column that tells it
+    of: tuple[str, ...]  # Name of each measurement's group
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Every group's name, in the order of the data."""
+        return tuple(dict.fromkeys(self.of))
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Columns of measured numbers, (n,) each, in SI units or, of a circuit's parameters, those of the netlist."""
+
+    columns: dict[str, FloatArray]
+    place: str  # Where they come from, as subject of a message
+    groups: Groups | None = None
+
+
+def measured_of(
+    given: Given, meaning: Meaning, example: str, by: str | None = None, place: str = "the data"
+) -> Measured:
+    """The columns that a caller gave, finite numbers; that named `by` tells the group of a measurement.
+
+    `example` shows the header that a table needs, and `place` names columns that come from none.
+    """
+    if isinstance(given, (str, Path)):
+        return _from_table(Path(given), meaning, example, by)
+    if by is None or not isinstance(given, Mapping):
+        return Measured(_number_columns(given), place)
+    if by not in given:
+        raise InputError(f"the data have no column {by!r}, which groups names; they have {', '.join(given)}")
+    groups = _groups_of(by, given[by])
+    found = _number_columns({name: x for name, x in given.items() if name != by})
+    size = next((x.size for x in found.values()), 0)
+    if len(groups.of) != size:
+        raise InputError(f"data column {by!r} has {len(groups.of)} rows, others have {size}; allowed: as many")
+    return Measured(found, place, groups)
+
+
+def _groups_of(column: str, given: ArrayLike) -> Groups:
+    cells = np.asarray(given)
+    if cells.ndim != 1 or cells.dtype.kind not in "iufU":
+        raise InputError(f"data column {column!r} tells the group; allowed: a text or a number for every measurement")
+    return Groups(column, tuple(str(x) if cells.dtype.kind == "U" else f"{x:g}" for x in cells.tolist()))
+
+
+def _number_columns(given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+    """The columns of a mapping as arrays of one length; a number stands for a column of it."""
+    if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
+        raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
+    found = {name: real_numbers(f"data column {name!r}", x, "numbers") for name, x in given.items()}
+    size = max((x.size for x in found.values()), default=0)
+    for name, x in found.items():
+        if x.shape not in ((), (size,)):
+            raise InputError(
+                f"data column {name!r} has the shape {x.shape}, others have {size} rows; allowed: as many, or one "
+                "number for all"
+            )
+        bad = np.flatnonzero(~np.isfinite(x))
+        if bad.size:
+            raise InputError(f"data column {name!r} is {x.flat[bad[0]]} in row {bad[0]}; allowed: finite numbers")
+    return {name: np.broadcast_to(x, size).copy() for name, x in found.items()}
+
+
+def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> Measured:
+    file = checked_file(path, MAX_TEXT_BYTES)
+    table, words = (read_text_columns(file), ()) if by is None else read_labelled_columns(file, by)
+    if not table.names:
+        raise InputError(f"'{path}' has no header; allowed: names with units, such as {example}")
+    found: dict[str, FloatArray] = {}
+    units: dict[str, str] = {}
+    of_share: dict[str, str] = {}
+    groups: Groups | None = None
+    for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
+        if by is not None and name.lower() == by.lower():
+            groups = Groups(by, tuple(words[int(number)] for number in table.numbers(i)))
+            continue
+        key, values, base = meaning(name, table.names)
+        if key in found:
+            raise InputError(f"'{path}' has two columns {name!r}; allowed: one")
+        if key != values and unit == "%":
+            of_share[key], base = values, ""
+        factor = 1.0 if base is None else _unit_factor(unit, base, f"'{path}': the unit of column {name!r}")
+        found[key], units[key] = table.numbers(i) * factor, unit
+    for key, values in of_share.items():
+        # Beside values in % (a friction coefficient), a standard deviation in % is of their unit, and no share of them.
+        if units.get(values, "%") != "%":
+            found[key] = found[key] * np.abs(found[values])
+    return Measured(found, f"the data in '{path}'", groups)
+
+
+def _unit_factor(unit: str, base: str, what: str) -> float:
+    """A header's unit over the unit `base`."""
+    if unit in ("", base):
+        return 1.0
+    if base == "" and unit == "%":
+        return 0.01
+    if base == "m^2" and unit in ("mm2", "mm²"):
+        return 1e-6
+    prefix = unit.removesuffix(base) if base and unit.endswith(base) else None
+    if prefix in _PREFIXES:
+        return _PREFIXES[prefix] ** (2 if base == "m^2" else 1)
+    scaled = ", with k, m, u or n before it where need be" if base else ""
+    raise InputError(f"{what} is {unit!r}; allowed: {base or 'none'}{scaled}")

@@ -1,0 +1,260 @@
+"""Least squares in the logarithms of a circuit's parameters: their bounds, the way from a start, and profiles."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.results.outcome import SolveError
+
+#: What data that cannot be predicted are off by, over their scale.
+REFUSED = 1e6
+# Error of the least squares' last step, relative; and the largest number of evaluations, and of refused ones.
+_CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
+#: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
+FARTHEST = 1e3
+# Growth of the distance from the value, in its logarithm; and the error of an interval's end over that distance.
+_GROWTH, _END = 1.6, 0.01
+# Error of the other parameters on the way.
+_ROUGHLY = 1e-4
+# Ratio of the interval's two parts, in the logarithm, from which on it is called skewed.
+_SKEWED = 1.2
+
+
+class Unknown(NamedTuple):
+    """What is fitted: a parameter in all measurements, or in those of one group."""
+
+    path: str
+    label: str | None = None  # Name of the group
+
+    @property
+    def name(self) -> str:
+        """The path, with the group in brackets."""
+        return self.path if self.label is None else f"{self.path}[{self.label}]"
+
+
+def refuse_few(count: int, unknowns: Sequence[object]) -> None:
+    """Refuse fewer data than there are unknowns."""
+    if count < len(unknowns):
+        raise InputError(f"{count} data cannot tell {len(unknowns)} parameters; allowed: at least as many data")
+
+
+def bounds_of(
+    circuit: Circuit, paths: tuple[str, ...], given: Mapping[str, tuple[float, float]]
+) -> tuple[Circuit, FloatArray]:
+    """The circuit to start from, and smallest and largest values, shape (n_parameter, 2): 0 and infinity by default.
+
+    A start outside its bounds moves to the nearer one, with a warning.
+    """
+    lower = {path.lower(): tuple(pair) for path, pair in given.items()}
+    unknown = [path for path in given if path.lower() not in {p.lower() for p in paths}]
+    if unknown:
+        raise InputError(f"bounds names {unknown[0]}, which is not fitted; allowed: {', '.join(paths)}")
+    out = np.tile([0.0, math.inf], (len(paths), 1))
+    for i, path in enumerate(paths):
+        if path.lower() in lower:
+            pair = lower[path.lower()]
+            if len(pair) != 2 or not 0.0 <= pair[0] < pair[1]:
+                raise InputError(f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
+            out[i] = pair
+            value = circuit.parameters[path].value
+            moved = min(max(value, pair[0]), pair[1])
+            if moved != value:
+                said = f"{path} is {value:g}, outside its bounds {pair[0]:g} to {pair[1]:g}: it starts at {moved:g}"
+                warnings.warn(said, FingerspiceWarning, stacklevel=3)
+                circuit = circuit.varied({path: moved})
+    return circuit, out
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is fitted; its classes compare what the circuit predicts with the data."""
+
+    circuit: Circuit  # With the values to start from
+    unknowns: tuple[Unknown, ...]
+    bounds: FloatArray  # (n_parameter, 2): Smallest and largest values
+    scale: FloatArray  # (n,): By which residuals are divided
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the unknowns."""
+        return tuple(one.name for one in self.unknowns)
+
+    @property
+    def initial(self) -> FloatArray:
+        """Values to start from."""
+        return np.array([self.circuit.parameters[one.path].value for one in self.unknowns])
+
+    def compared(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals over their scale (n,), and their derivatives by the logarithms of the values (n, n_parameter)."""
+        raise NotImplementedError
+
+    def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `compared`; `REFUSED` for all where the circuit with these values cannot be run."""
+        try:
+            with warnings.catch_warnings():
+                # Of values that no user has written.
+                warnings.simplefilter("ignore", FingerspiceWarning)
+                return self.compared(values)
+        except (InputError, SolveError):
+            return np.full(self.scale.size, REFUSED), np.zeros((self.scale.size, values.size))
+
+    def profiled(self, wanted: bool | Sequence[str]) -> list[str]:
+        """The unknowns whose profiles are wanted, in the circuit's own spelling."""
+        if isinstance(wanted, bool):
+            return list(self.names) if wanted else []
+        known = {name.lower(): name for name in self.names}
+        for name in wanted:
+            if not isinstance(name, str) or name.lower() not in known:
+                allowed = ", ".join(self.names)
+                raise InputError(f"profiles names {name!r}, which is not fitted; allowed: True, or {allowed}")
+        return [known[name.lower()] for name in wanted]
+
+
+class Fitted(NamedTuple):
+    """Where least squares have led."""
+
+    values: FloatArray  # (n_parameter,)
+    residual: FloatArray  # (n,): Over their scale
+    by_log: FloatArray  # (n, n_parameter): Their derivatives by the logarithms of the values
+    objective: float  # Sum of their squares
+    evaluations: int
+    closed: bool
+
+    @property
+    def found(self) -> bool:
+        """Whether the data can be predicted with these values."""
+        return self.objective < 0.5 * REFUSED**2
+
+
+def followed(
+    residuals: Callable[[FloatArray], tuple[FloatArray, FloatArray]], bounds: FloatArray, begin: FloatArray,
+    close: float = _CLOSE,
+) -> Fitted:  # fmt: skip
+    """Where least squares lead from a start; `close` is the relative error of the last step."""
+    from scipy.optimize import least_squares
+
+    known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+    refusals = 0
+
+    def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        nonlocal refusals
+        key = x.tobytes()
+        if key not in known:
+            last = next(iter(known.values()), None)
+            known.clear()
+            # At the edge of what can be run, all further steps are refused without a run, so that the search ends.
+            if last is None or refusals < _MOST_REFUSALS:
+                known[key] = residuals(unit * np.exp(x))
+            else:
+                known[key] = np.full_like(last[0], REFUSED), np.zeros_like(last[1])
+            refusals += bool(np.all(known[key][0] == REFUSED))
+        return known[key]
+
+    # The first step is at most as long as the place it starts from: by a factor of e, not by that of the unit.
+    begin = np.clip(begin, *bounds.T)
+    x0 = np.full(begin.size, begin.size**-0.5)
+    unit = begin / np.exp(x0)
+    with np.errstate(divide="ignore"):
+        box = np.log(bounds / unit[:, None]).T
+    found = least_squares(
+        lambda x: at(x)[0], np.clip(x0, *box), lambda x: at(x)[1], bounds=box, xtol=close, ftol=close**1.5,
+        gtol=1e-12, max_nfev=_MOST,
+    )  # fmt: skip
+    ended = refusals < _MOST_REFUSALS
+    values = unit * np.exp(found.x)
+    residual, by = at(found.x) if ended else residuals(values)
+    return Fitted(values, residual, by, float(residual @ residual), int(found.nfev), found.status > 0 and ended)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The best fits with one parameter held at each of several values.
+
+    Attributes
+    ----------
+    path : str
+    values : ndarray, shape (n,)
+        Values of the parameter, ascending.
+    objective : ndarray, shape (n,)
+        Sum of the squared residuals at each, as `Fit.objective`.
+    limit : float
+        The objective at the ends of the 95 % interval.
+    low, high : float
+        The interval; 0 or a bound, and infinity or a bound, where the data set no end.
+    shape : str
+        ``"symmetric"`` (in the logarithm), ``"skewed"``, ``"open below"``, ``"open above"`` or ``"open"``.
+    """
+
+    path: str
+    values: FloatArray
+    objective: FloatArray
+    limit: float
+    low: float
+    high: float
+    shape: str
+
+
+def profile_of(task: Problem, best: Fitted, name: str, error: float, limit: float) -> Profile:
+    """The profile of a parameter with this error of its logarithm; its interval has objectives up to `limit`."""
+    place = task.names.index(name)
+    here = math.log(best.values[place])
+    known = {here: best.objective}
+    ends = [_end(task, best, place, error, limit, side, known) for side in (0, 1)]
+    low, high = (float(task.bounds[place, side]) if end is None else end for side, end in enumerate(ends))
+    shapes = {(True, True): "open", (True, False): "open below", (False, True): "open above"}
+    shape = shapes.get((ends[0] is None, ends[1] is None))
+    if shape is None:
+        reach = here - math.log(low), math.log(high) - here
+        shape = "skewed" if max(reach) > _SKEWED * min(reach) else "symmetric"
+    at = sorted(known)
+    return Profile(name, np.exp(at), np.array([known[x] for x in at]), limit, low, high, shape)
+
+
+def _end(
+    task: Problem, best: Fitted, place: int, error: float, limit: float, side: int, known: dict[float, float]
+) -> float | None:
+    """The end of the interval below (`side` 0) or above (1), or None where it is open.
+
+    Adds the least objectives on the way to `known`, by the parameter's logarithm.
+    """
+    from scipy.optimize import brentq
+
+    here, begin, sign = math.log(best.values[place]), np.delete(best.values, place), 2 * side - 1
+
+    def look(x: float) -> float:
+        nonlocal begin
+
+        def held(others: FloatArray) -> tuple[FloatArray, FloatArray]:
+            residual, by = task.residuals(np.insert(others, place, math.exp(x)))
+            return residual, np.delete(by, place, axis=1)
+
+        if x not in known and begin.size:
+            # From where the last value was fitted, which lies on the way.
+            found = followed(held, np.delete(task.bounds, place, axis=0), begin, _ROUGHLY)
+            known[x], begin = found.objective, found.values
+        elif x not in known:
+            residual, _ = held(begin)
+            known[x] = float(residual @ residual)
+        return known[x]
+
+    def beyond(far: float) -> float:
+        # About linear in the distance, as the objective is about a parabola.
+        return math.sqrt(max(look(here + sign * far) - best.objective, 0.0)) - math.sqrt(limit - best.objective)
+
+    with np.errstate(divide="ignore"):
+        farthest = min(math.log(FARTHEST), abs(float(np.log(task.bounds[place, side])) - here))
+    near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
+    while look(here + sign * far) <= limit:
+        if far >= farthest:
+            return None
+        near, far = far, min(_GROWTH * far, farthest)
+    return math.exp(here + sign * brentq(beyond, near, far, xtol=_END * far, rtol=1e-6))
