@@ -14,7 +14,6 @@ from scipy.optimize import minimize
 import analytic as ref
 import fingerspice as fs
 from commands import Command
-from fingerspice.waveforms.files import read_wav
 from scenes import table1
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
@@ -205,7 +204,7 @@ def test_circuits_without_one_finger_and_one_source_are_refused() -> None:
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     found = fs.inverse_drive(table1(), friction=profile(2, 0.005))
     found.to_wav(tmp_path / "a.wav")
-    read = read_wav(tmp_path / "a.wav")
+    read = fs.Samples.from_wav(tmp_path / "a.wav", 1.0)
     assert read.rate == 48e3
     np.testing.assert_allclose(found.peak * read.values, found.drive.values, atol=1e-9 * found.peak)
     found.to_csv(tmp_path / "a.csv")

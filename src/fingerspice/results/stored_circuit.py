@@ -17,7 +17,7 @@ from fingerspice.circuit.loop import checked
 from fingerspice.waveforms import combinations, periodic, ramps, samples
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
-from fingerspice.waveforms.waveform import Waveform, blank_terms
+from fingerspice.waveforms.waveform import Waveform
 
 #: Largest number of a circuit's samples, points and coefficients that a file keeps (64 MB).
 MOST_NUMBERS = 8_000_000
@@ -138,7 +138,7 @@ def _value(plain: Any, arrays: list[FloatArray]) -> Any:
         made: Any = _WAVEFORMS[plain["kind"]]
         return made(**given)
     series = given["series"]
-    table = SourceTable(given["edges"], blank_terms(len(series), 1), series)
+    table = SourceTable(given["edges"], np.zeros((len(series), 1, 6)), series)
     along = partial(_along, table, given["repeat"])
     # By its name the run's summary shows a function.
     vars(along).update({"__name__": str(plain["name"])} if plain["name"] else {})

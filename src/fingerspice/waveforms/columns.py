@@ -37,25 +37,13 @@ class Columns:
 
     file: Path
     names: tuple[str, ...]  # Without units; empty where the file has no header
-    # (n_row, n_column): Numbers as written in the file, before any conversion of units; NaN for a cell that is no
-    # number
-    data: FloatArray
-    # Unit of every column, an empty text for a column without a unit; an empty tuple if the file has no header
-    units: tuple[str, ...] = ()
-    # (n_row,): Number of each row's line in the file, from 1; None for a file without lines
-    lines: NDArray[np.int64] | None = field(default=None, repr=False)
-
-    # Message about the first cell that is no number, by column
-    faults: dict[int, str] = field(default_factory=dict, repr=False)
+    data: FloatArray  # (n_row, n_column): as written, before any conversion of units; NaN for what is no number
+    units: tuple[str, ...] = ()  # Of every column, an empty text where it has none; empty where there is no header
+    lines: NDArray[np.int64] | None = None  # (n_row,): of each row, from 1; None for a file without lines
+    faults: dict[int, str] = field(default_factory=dict)  # About the first cell that is no number, by column
 
     def numbers(self, column: int) -> FloatArray:
-        """The numbers of a column, shape (n_row,).
-
-        Raises
-        ------
-        InputError
-            If one of them is no number, or not finite; the message names the line.
-        """
+        """The numbers of a column (n_row,), all finite; errors name the line."""
         if column in self.faults:
             raise InputError(self.faults[column])
         found = self.data[:, column]
@@ -77,13 +65,7 @@ class Columns:
         return f"{count} column{'s' if count > 1 else ''} {called}"
 
     def index(self, column: str | int) -> int:
-        """Index of a column given by its name or number.
-
-        Raises
-        ------
-        InputError
-            If there is no such column, or if several columns have this name.
-        """
+        """Index of a column given by its name, of which there has to be one, or by its number."""
         count = self.data.shape[1]
         if isinstance(column, str):
             if not self.names:
@@ -134,30 +116,12 @@ class Columns:
 
 
 def read_text_columns(path: Path) -> Columns:
-    """Columns of a text file.
-
-    Raises
-    ------
-    InputError
-        If there are no rows of numbers, or not the same count of cells in each; the message names the line.
-    """
+    """Columns of a text file, which has rows of numbers with the same count of cells; errors name the line."""
     return _parsed(path, _lines(path))
 
 
 def read_labelled_columns(path: Path, label: str) -> tuple[Columns, tuple[str, ...]]:
-    """Columns of a text file of which the one named `label` holds words; it becomes the number of the word.
-
-    Returns
-    -------
-    Columns
-    tuple of str
-        The words, in the order of the file.
-
-    Raises
-    ------
-    InputError
-        As `read_text_columns`, and if the header has no such column.
-    """
+    """Columns of a text file, and the words of the one named `label`, in which each becomes its number among them."""
     lines, words, place = _lines(path), dict[str, int](), -1
     separator: str | None = None
     for number, line in enumerate(lines):
@@ -206,12 +170,11 @@ def _parsed(path: Path, lines: list[str]) -> Columns:
     _refuse_decimal_commas(path, begin, line)
     separator = "\t" if "\t" in line else "," if "," in line else None
     count = len(_cells(line, separator))
-    names = _header(path, numbered, begin, separator, count)
-    rows = rows[first:]
-    table, faults = _numbers(path, rows, separator, count)
-    units = tuple(_unit(name)[1] for name in names)
-    places = np.array([number for number, _ in rows])
-    return Columns(path, tuple(_unit(name)[0] for name in names), table, units, places, faults)
+    header = [_unit(name) for name in _header(path, numbered, begin, separator, count)]
+    names, units = zip(*header, strict=True) if header else ((), ())
+    table, faults = _numbers(path, rows[first:], separator, count)
+    places = np.array([number for number, _ in rows[first:]])
+    return Columns(path, names, table, units, places, faults)
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
@@ -280,8 +243,7 @@ def _numbers(
     try:
         table = np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None)
     except ValueError:
-        # NumPy reads neither SPICE's scale suffixes nor quoted cells, and its message does not help the user: read the
-        # rows one by one.
+        # NumPy reads neither SPICE's scales nor quoted cells, and its message does not help: read the rows one by one.
         table = np.array([_row(path, number, line, separator, count, faults) for number, line in rows])
     return np.asarray(table, float), faults
 

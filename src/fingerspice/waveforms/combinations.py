@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import ClassVar
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.waveforms.bounds import runs_through, take_numbers
-from fingerspice.waveforms.waveform import DC, Sine, Waveform, as_waveform, blank_terms, require
+from fingerspice.waveforms.waveform import DC, Sine, Waveform, as_waveform, require
 
 #: Most cycles of a part in a common period.
 MOST_CYCLES = 10**6
@@ -88,9 +89,9 @@ class Sum(_Combination):
         return np.concatenate(known, axis=1) if len(known) == len(blocks) else None
 
     def tone(self) -> float | None:
-        if self.period is None or any(part.tone() is None and not isinstance(part, DC) for part in self.parts):
-            return None
         tones = self._tones()
+        if self.period is None or len(tones) < sum(not isinstance(part, DC) for part in self.parts):
+            return None
         lowest = min(tones)
         return lowest if all(abs(t / lowest - round(t / lowest)) < 1e-9 for t in tones) else None
 
@@ -108,13 +109,9 @@ class Product(_Combination):
         return math.prod(max(part.peak(t0, t1), part.cancelling(t0, t1)) for part in self.parts)
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
-        out: FloatArray | None = None
-        for part in self.parts:
-            block = part.terms(start, stop)
-            if block is None:
-                return None
-            out = block if out is None else _multiply(out, block)
-        return out
+        blocks = [part.terms(start, stop) for part in self.parts]
+        known = [block for block in blocks if block is not None]
+        return reduce(_multiply, known) if len(known) == len(blocks) else None
 
     def tone(self) -> float | None:
         tones = self._tones()
@@ -126,18 +123,16 @@ def _multiply(a: FloatArray, b: FloatArray) -> FloatArray:
     a = a[:, np.any(a[:, :, 0] != 0.0, axis=0)]
     b = b[:, np.any(b[:, :, 0] != 0.0, axis=0)]
     columns = []
-    for i in range(a.shape[1]):
-        for j in range(b.shape[1]):
-            x, y = a[:, i], b[:, j]
-            base = x + y
-            base[:, 0] = x[:, 0] * y[:, 0]
-            if np.any(x[:, 3:] != 0.0) and np.any(y[:, 3:] != 0.0):
-                base[:, 0] *= 0.5
-                other = base.copy()
-                other[:, 3:] = x[:, 3:] - y[:, 3:]
-                columns.append(other)
-            columns.append(base)
-    return np.stack(columns, axis=1) if columns else blank_terms(a.shape[0], 1)
+    for x, y in itertools.product(a.swapaxes(0, 1), b.swapaxes(0, 1)):
+        base = x + y
+        base[:, 0] = x[:, 0] * y[:, 0]
+        if np.any(x[:, 3:] != 0.0) and np.any(y[:, 3:] != 0.0):
+            base[:, 0] *= 0.5
+            other = base.copy()
+            other[:, 3:] = x[:, 3:] - y[:, 3:]
+            columns.append(other)
+        columns.append(base)
+    return np.stack(columns, axis=1) if columns else np.zeros((a.shape[0], 1, 6))
 
 
 @dataclass(frozen=True)
@@ -162,12 +157,8 @@ class AM(_Combination):
     depth: float = 1.0
     phase_deg: float = 0.0
     units: ClassVar[dict[str, str]] = {
-        "amplitude": "V",
-        "carrier": "Hz",
-        "modulation": "Hz",
-        "depth": "",
-        "phase_deg": "deg",
-    }
+        "amplitude": "V", "carrier": "Hz", "modulation": "Hz", "depth": "", "phase_deg": "deg"
+    }  # fmt: skip
 
     def __post_init__(self) -> None:
         take_numbers(self)
@@ -193,17 +184,18 @@ class _Shifted(Waveform):
     """A waveform made of copies of the first stretch of another waveform, each shifted to the start of the copy."""
 
     waveform: Waveform
+    _stretch: float  # Length of a stretch, s
 
-    def _stretch(self) -> float:
-        """Length of a stretch, s."""
-        raise NotImplementedError
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "waveform", as_waveform(self.waveform))
+        take_numbers(self)
 
     @cached_property
     def _marks(self) -> FloatArray:
         """Breakpoints of the other waveform within a stretch, and both ends of the stretch, s."""
-        length = self._stretch()
-        inner = self.waveform.breakpoints(0.0, length)
-        return np.concatenate([[0.0], inner[(inner > 0.0) & (inner < length * (1.0 - _ROUNDING_OF_TIMES))], [length]])
+        inner = self.waveform.breakpoints(0.0, self._stretch)
+        inner = inner[(inner > 0.0) & (inner < self._stretch * (1.0 - _ROUNDING_OF_TIMES))]
+        return np.concatenate([[0.0], inner, [self._stretch]])
 
     def _inner(self, t: FloatArray, begin: FloatArray | float) -> FloatArray:
         """Times (s) since the stretch began; a time that differs from a breakpoint only by rounding is set to it."""
@@ -221,7 +213,7 @@ class _Shifted(Waveform):
         return self.waveform.shortest_time()
 
     def cancelling(self, t0: float, t1: float) -> float:
-        return self.waveform.cancelling(0.0, self._stretch())
+        return self.waveform.cancelling(0.0, self._stretch)
 
 
 @dataclass(frozen=True)
@@ -244,12 +236,12 @@ class Burst(_Shifted):
     units: ClassVar[dict[str, str]] = {"duration": "s", "delay": "s"}
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "waveform", as_waveform(self.waveform))
-        take_numbers(self)
+        super().__post_init__()
         require(self.duration > 0.0, "burst duration", f"{self.duration:g} s", "> 0")
         require(self.delay >= 0.0, "burst delay", f"{self.delay:g} s", ">= 0")
 
-    def _stretch(self) -> float:
+    @property
+    def _stretch(self) -> float:  # type: ignore[override]
         return self.duration
 
     @property
@@ -275,7 +267,7 @@ class Burst(_Shifted):
         block = self.waveform.terms(self._inner(start[on], self.delay), self._inner(stop[on], self.delay))
         if block is None:
             return None
-        out = blank_terms(start.size, block.shape[1])
+        out = np.zeros((start.size, *block.shape[1:]))
         out[on] = block
         return out
 
@@ -299,11 +291,11 @@ class Repeat(_Shifted):
     units: ClassVar[dict[str, str]] = {"period": "s"}
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "waveform", as_waveform(self.waveform))
-        take_numbers(self)
+        super().__post_init__()
         require(self.period > 0.0, "repeat period", f"{self.period:g} s", "> 0")
 
-    def _stretch(self) -> float:
+    @property
+    def _stretch(self) -> float:  # type: ignore[override]
         return self.period
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:

@@ -48,27 +48,9 @@ _OTHERS = {
 class Recording:
     """Values against time, either at a rate or at times."""
 
-    values: FloatArray  # (n,): V, or A; for a WAV file fractions of full scale
+    values: FloatArray  # (n,): V, or A
     rate: float | None = None  # Samples per second
     times: FloatArray | None = None  # (n,): s, not decreasing
-
-
-def read_wav(path: str | Path, channel: int | None = None) -> Recording:
-    """One channel of a WAV file of at most `MAX_BYTES`, all samples at once; see `wav_layout`."""
-    layout = wav_layout(path, channel, MAX_BYTES)
-    check_count(str(layout.path), layout.count)
-    return Recording(layout.read(0, layout.count), float(layout.rate))
-
-
-def _shares(data: np.ndarray) -> FloatArray:
-    """Convert stored samples to fractions of full scale."""
-    values = data.astype(float)
-    if data.dtype.kind == "u":
-        # Only 8-bit samples are unsigned.
-        values -= 128.0
-    if data.dtype.kind in "iu":
-        values /= 2.0 ** (8 * data.dtype.itemsize - 1)
-    return values
 
 
 @dataclass(frozen=True)
@@ -76,24 +58,16 @@ class WavLayout:
     """Position and number format of the samples in a WAV file, so that some of them can be read."""
 
     path: Path
-    # rate, channels, channel, count: Sample rate (Hz), number of channels, index of the channel that is read, and
-    # number of samples per channel
-    rate: int
+    rate: int  # Hz
     channels: int
-    channel: int
-    count: int
+    channel: int  # The one that is read
+    count: int  # Samples of each channel
     # Number format as NumPy writes it, such as ``<i2``; NumPy itself does not know those of 3, 5, 6 or 7 bytes
     kind: str
     offset: int  # Position of the first sample, bytes
 
     def read(self, first: int, last: int) -> FloatArray:
-        """Samples number `first` to `last` - 1 as fractions of full scale.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read any more, or has become shorter.
-        """
+        """Samples number `first` to `last` - 1 as fractions of full scale, if the file still has them."""
         width = int(self.kind[2])
         block = self.channels * width
         try:
@@ -105,13 +79,20 @@ class WavLayout:
         if len(raw) < (last - first) * block:
             raise InputError(f"'{self.path}' has become shorter while it was read")
         if width in (1, 2, 4, 8):
-            return _shares(np.frombuffer(raw, self.kind).reshape(-1, self.channels)[:, self.channel])
-        # The sample fills the upper bytes of an integer that NumPy knows.
-        full = 4 if width == 3 else 8
-        wide = np.zeros((last - first, full), np.uint8)
-        low = full - width if self.kind[0] == "<" else 0
-        wide[:, low : low + width] = np.frombuffer(raw, np.uint8).reshape(-1, self.channels, width)[:, self.channel]
-        return _shares(wide.view(f"{self.kind[0]}i{full}")[:, 0])
+            stored = np.frombuffer(raw, self.kind).reshape(-1, self.channels)[:, self.channel]
+        else:
+            # The sample fills the upper bytes of an integer that NumPy knows.
+            full = 4 if width == 3 else 8
+            wide = np.zeros((last - first, full), np.uint8)
+            low = full - width if self.kind[0] == "<" else 0
+            wide[:, low : low + width] = np.frombuffer(raw, np.uint8).reshape(-1, self.channels, width)[:, self.channel]
+            stored = wide.view(f"{self.kind[0]}i{full}")[:, 0]
+        values = stored.astype(float)
+        if width == 1:
+            values -= 128.0  # Only integers of 8 bits have no sign
+        if self.kind[1] != "f":
+            values /= 2.0 ** (8 * stored.dtype.itemsize - 1)
+        return values
 
 
 def wav_layout(path: str | Path, channel: int | None = None, most: int = LARGEST_STREAMED) -> WavLayout:
@@ -121,19 +102,7 @@ def wav_layout(path: str | Path, channel: int | None = None, most: int = LARGEST
     that full scale is -1 to just below 1. A float is taken as it is. The samples of a stream whose header was written
     before its end was known go on to the end of the file.
 
-    Parameters
-    ----------
-    path : str or Path
-    channel : int, optional
-        Counted from 0; needed where there are several.
-    most : int
-        Largest size of the file, bytes.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, too large, not a WAV file, broken, cut short or empty, if its header contradicts itself,
-        or if the channel is missing or wrong.
+    Channels are counted from 0, and one has to be chosen of several; `most` is the largest size of the file in bytes.
     """
     path = checked_file(path, most)
     with path.open("rb") as file:
@@ -216,23 +185,9 @@ def read_table(
     first one, with a header or without. An NPZ file holds one array per column, and may hold a number named ``rate``
     instead of times.
 
-    Parameters
-    ----------
-    path : str or Path
-        A text of at most `MAX_TEXT_BYTES`, or an NPZ file of at most `MAX_BYTES`.
-    time, value : str or int, optional
-        Names of the columns, or their numbers counted from 0; may be left out where only one choice is possible.
-    rate : float, optional
-        Samples per second, for a table without a column of times.
-    pairs : bool
-        Whether one row or column holds alternating times and values, as in a file of SPICE's PWL.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, too large, empty or broken; has semicolons, decimal commas, rows of different length or
-        several runs; has no such column; if cells of the columns asked for are not finite numbers, or times decrease;
-        or if its times and rate contradict each other. The message names the line.
+    Columns are given by name, or by number from 0, where more than one choice is possible, and the rate (Hz) where
+    there are no times. With `pairs` one row or column holds alternating times and values, as in a file of SPICE's PWL.
+    Errors name the line.
     """
     path = checked_file(path, MAX_BYTES)
     with path.open("rb") as file:
@@ -268,41 +223,32 @@ def read_table(
     late = np.abs((t - t[0]) * rate - np.arange(t.size)) > _JITTER
     if late.any():
         i = int(np.argmax(late))
-        problem = (
-            f"{found.place(i)}: the time {t[i]:g} s is not that of sample {i} at {rate:g} Hz, {t[0] + i / rate:g} s"
-        )
-        raise InputError(f"{problem}; allowed: times or a rate, or both that agree")
+        problem = f"the time {t[i]:g} s is not that of sample {i} at {rate:g} Hz, {t[0] + i / rate:g} s"
+        raise InputError(f"{found.place(i)}: {problem}; allowed: times or a rate, or both that agree")
     return Recording(values, rate)
 
 
 def checked_file(path: str | Path, most: int) -> Path:
-    """The path, after a check that it is a readable ordinary file, not empty and not larger than `most` bytes.
-
-    Raises
-    ------
-    InputError
-        If it is not.
-    """
-    path = Path(path)
+    """The path, after a check that it is a readable ordinary file, not empty and not larger than `most` bytes."""
+    path, fault = Path(path), ""
     try:
         if path.is_dir():
-            raise InputError(f"'{path}' is a folder, not a file")
-        if not path.exists():
-            raise InputError(f"'{path}' does not exist")
-        if not path.is_file():
-            raise InputError(f"'{path}' is not an ordinary file")
-        size = path.stat().st_size
-        with path.open("rb"):
-            pass
-    except (OSError, ValueError) as error:  # InputError is a ValueError
-        if isinstance(error, InputError):
-            raise
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise InputError(f"'{path}' cannot be read: {reason}") from None
-    if size == 0:
-        raise InputError(f"'{path}' is empty")
-    if size > most:
-        raise InputError(f"'{path}' has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB")
+            fault = "is a folder, not a file"
+        elif not path.exists():
+            fault = "does not exist"
+        elif not path.is_file():
+            fault = "is not an ordinary file"
+        else:
+            path.open("rb").close()
+            size = path.stat().st_size
+            if size == 0:
+                fault = "is empty"
+            elif size > most:
+                fault = f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB"
+    except (OSError, ValueError) as error:
+        fault = f"cannot be read: {getattr(error, 'strerror', None) or error}"
+    if fault:
+        raise InputError(f"'{path}' {fault}")
     return path
 
 

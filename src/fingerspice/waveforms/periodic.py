@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.waveforms.bounds import runs_through, take_numbers
 from fingerspice.waveforms.ramps import Ramps
-from fingerspice.waveforms.waveform import TAU, Waveform, blank_terms, require
+from fingerspice.waveforms.waveform import TAU, Waveform, require, terms_of
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,8 @@ class _Periodic(Ramps):
     phase_deg: float = 0.0
     delay: float = 0.0
     units: ClassVar[dict[str, str]] = {
-        "amplitude": "V",
-        "frequency": "Hz",
-        "duty": "",
-        "offset": "V",
-        "phase_deg": "deg",
-        "delay": "s",
-    }
+        "amplitude": "V", "frequency": "Hz", "duty": "", "offset": "V", "phase_deg": "deg", "delay": "s"
+    }  # fmt: skip
 
     def __post_init__(self) -> None:
         take_numbers(self)
@@ -39,8 +34,16 @@ class _Periodic(Ramps):
         require(self.frequency > 0.0, f"{kind} frequency", f"{self.frequency:g} Hz", "> 0")
 
     @property
-    def period(self) -> float | None:  # type: ignore[override]
+    def period(self) -> float:  # type: ignore[override]
         return 1.0 / self.frequency
+
+    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Times of the knots in periods, and their values over the offset in amplitudes."""
+        raise NotImplementedError
+
+    def _knots(self) -> tuple[FloatArray, FloatArray]:
+        x, y = map(np.array, self._shape())
+        return x * self.period, self.offset + self.amplitude * y
 
     def _times(self, t0: float, t1: float) -> FloatArray:
         # Computed as (k + x) / f, an edge is rounded to the same double as the time that a user writes for it.
@@ -56,8 +59,7 @@ class _Periodic(Ramps):
         # Begin a whole number of periods earlier, at or before t = 0: the delay only shifts the shape in time, and does
         # not hold the source before it.
         shift = self.delay - self.phase_deg / 360.0 / self.frequency
-        period = 1.0 / self.frequency
-        return shift - math.ceil(shift / period - 1e-12) * period if shift > 0.0 else shift
+        return shift - math.ceil(shift / self.period - 1e-12) * self.period if shift > 0.0 else shift
 
     def breakpoint_rate(self) -> float:
         return 4.0 * self.frequency
@@ -72,36 +74,21 @@ class Square(_Periodic):
 
     duty: float = 0.5
 
+    # Beside the frequency the duty comes first, as in netlists; the fields that all shapes have precede it otherwise.
     def __init__(
-        self,
-        amplitude: float,
-        frequency: float,
-        duty: float = 0.5,
-        offset: float = 0.0,
-        phase_deg: float = 0.0,
+        self, amplitude: float, frequency: float, duty: float = 0.5, offset: float = 0.0, phase_deg: float = 0.0,
         delay: float = 0.0,
-    ) -> None:
-        for name, value in (
-            ("amplitude", amplitude),
-            ("frequency", frequency),
-            ("duty", duty),
-            ("offset", offset),
-            ("phase_deg", phase_deg),
-            ("delay", delay),
-        ):
-            object.__setattr__(self, name, value)
-        self.__post_init__()
+    ) -> None:  # fmt: skip
+        object.__setattr__(self, "duty", duty)
+        super().__init__(amplitude, frequency, offset, phase_deg, delay)
         require(0.0 < self.duty < 1.0, "square duty", f"{self.duty:g}", "between 0 and 1")
 
     @property
     def half_wave(self) -> bool:
         return self.offset == 0.0 and self.duty == 0.5
 
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        period = 1.0 / self.frequency
-        t = np.array([0.0, 0.0, self.duty, self.duty, 1.0]) * period
-        sign = np.array([-1.0, 1.0, 1.0, -1.0, -1.0])
-        return t, self.offset + self.amplitude * sign
+    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        return (0.0, 0.0, self.duty, self.duty, 1.0), (-1.0, 1.0, 1.0, -1.0, -1.0)
 
 
 @dataclass(frozen=True)
@@ -112,20 +99,16 @@ class Triangle(_Periodic):
     def half_wave(self) -> bool:
         return self.offset == 0.0
 
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        period = 1.0 / self.frequency
-        t = np.array([0.0, 0.25, 0.75, 1.0]) * period
-        return t, self.offset + self.amplitude * np.array([0.0, 1.0, -1.0, 0.0])
+    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        return (0.0, 0.25, 0.75, 1.0), (0.0, 1.0, -1.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Sawtooth(_Periodic):
     """Rises from offset - amplitude to offset + amplitude over each period, and jumps back at its end."""
 
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        period = 1.0 / self.frequency
-        t = np.array([0.0, 0.0, 1.0]) * period
-        return t, self.offset + self.amplitude * np.array([1.0, -1.0, 1.0])
+    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        return (0.0, 0.0, 1.0), (1.0, -1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -143,28 +126,16 @@ class Pulse(Ramps):
     width: float = math.inf
     pulse_period: float = math.inf
     units: ClassVar[dict[str, str]] = {
-        "v1": "V",
-        "v2": "V",
-        "delay": "s",
-        "rise": "s",
-        "fall": "s",
-        "width": "s",
-        "pulse_period": "s",
-    }
+        "v1": "V", "v2": "V", "delay": "s", "rise": "s", "fall": "s", "width": "s", "pulse_period": "s"
+    }  # fmt: skip
 
     def __post_init__(self) -> None:
         take_numbers(self, endless=("width", "pulse_period"))
         for name in ("rise", "fall", "width"):
             require(getattr(self, name) >= 0.0, f"pulse {name}", f"{getattr(self, name):g} s", ">= 0")
         require(self.pulse_period > 0.0, "pulse period", f"{self.pulse_period:g} s", "> 0")
-        busy = self.rise + self.width + self.fall
-        if math.isfinite(self.pulse_period):
-            require(
-                busy <= self.pulse_period * (1.0 + 1e-12),
-                "pulse rise + width + fall",
-                f"{busy:g} s",
-                f"at most the period, {self.pulse_period:g} s",
-            )
+        busy, longest = self.rise + self.width + self.fall, f"at most the period, {self.pulse_period:g} s"
+        require(busy <= self.pulse_period * (1.0 + 1e-12), "pulse rise + width + fall", f"{busy:g} s", longest)
 
     @property
     def period(self) -> float | None:  # type: ignore[override]
@@ -176,11 +147,8 @@ class Pulse(Ramps):
 
     @property
     def half_wave(self) -> bool:
-        return (
-            self.v1 == -self.v2
-            and self.rise == self.fall
-            and abs(2.0 * (self.rise + self.width) - self.pulse_period) <= 4e-16 * self.pulse_period
-        )
+        even = abs(2.0 * (self.rise + self.width) - self.pulse_period) <= 4e-16 * self.pulse_period
+        return even and self.v1 == -self.v2 and self.rise == self.fall
 
     @property
     def _first(self) -> float:  # type: ignore[override]
@@ -193,11 +161,9 @@ class Pulse(Ramps):
             return np.array([start, up]), np.array([self.v1, self.v2])
         t = [start, up, up + self.width, up + self.width + self.fall]
         v = [self.v1, self.v2, self.v2, self.v1]
-        if self.period:
-            t.append(max(t[-1], self.pulse_period))
+        if self.period and self.pulse_period > t[-1]:
+            t.append(self.pulse_period)
             v.append(self.v1)
-            if t[-2] >= t[-1]:
-                t, v = t[:-1], v[:-1]
         return np.array(t), np.array(v)
 
 
@@ -226,13 +192,8 @@ class Chirp(Waveform):
     offset: float = 0.0
     phase_deg: float = 0.0
     units: ClassVar[dict[str, str]] = {
-        "amplitude": "V",
-        "f0": "Hz",
-        "f1": "Hz",
-        "duration": "s",
-        "offset": "V",
-        "phase_deg": "deg",
-    }
+        "amplitude": "V", "f0": "Hz", "f1": "Hz", "duration": "s", "offset": "V", "phase_deg": "deg"
+    }  # fmt: skip
 
     def __post_init__(self) -> None:
         take_numbers(self)
@@ -252,16 +213,12 @@ class Chirp(Waveform):
         return np.array([t for t in (0.0, self.duration) if t0 <= t <= t1])
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
-        out = blank_terms(start.size, 2)
-        out[:, 0, 0] = self.offset
-        out[:, 1, 0] = self.amplitude
         rate = (self.f1 - self.f0) / self.duration
         middle = 0.5 * (start + stop)
-        inside = (middle >= 0.0) & (middle < self.duration)
-        out[:, 1, 3] = TAU * (self.f0 + rate * np.clip(start, 0.0, self.duration))
-        out[:, 1, 4] = self._phase(start) - 0.5 * math.pi
-        out[:, 1, 5] = np.where(inside, TAU * rate, 0.0)
-        return out
+        rises = np.where((middle >= 0.0) & (middle < self.duration), TAU * rate, 0.0)
+        omega = TAU * (self.f0 + rate * np.clip(start, 0.0, self.duration))
+        wave = self.amplitude, 0.0, 0.0, omega, self._phase(start) - 0.5 * math.pi, rises
+        return terms_of(start.size, (self.offset,), wave)
 
     def shortest_time(self) -> float:
         return 1.0 / max(self.f0, self.f1)
@@ -280,23 +237,11 @@ class Exp(Waveform):
     tau1: float
     td2: float
     tau2: float
-    units: ClassVar[dict[str, str]] = {
-        "v1": "V",
-        "v2": "V",
-        "td1": "s",
-        "tau1": "s",
-        "td2": "s",
-        "tau2": "s",
-    }
+    units: ClassVar[dict[str, str]] = {"v1": "V", "v2": "V", "td1": "s", "tau1": "s", "td2": "s", "tau2": "s"}
 
     def __post_init__(self) -> None:
         take_numbers(self)
-        require(
-            self.tau1 > 0.0 and self.tau2 > 0.0,
-            "EXP time constants",
-            f"{self.tau1:g}, {self.tau2:g} s",
-            "> 0",
-        )
+        require(self.tau1 > 0.0 and self.tau2 > 0.0, "EXP time constants", f"{self.tau1:g}, {self.tau2:g} s", "> 0")
         require(self.td2 >= self.td1, "EXP td2", f"{self.td2:g} s", f">= td1 = {self.td1:g} s")
 
     @property
@@ -313,16 +258,13 @@ class Exp(Waveform):
         return np.array([t for t in sorted({self.td1, self.td2}) if t0 <= t <= t1])
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
-        out = blank_terms(start.size, 3)
         step = self.v2 - self.v1
         first = 0.5 * (start + stop) >= self.td1
         second = 0.5 * (start + stop) >= self.td2
-        out[:, 0, 0] = self.v1 + step * (first.astype(float) - second.astype(float))
-        out[:, 1, 0] = np.where(first, -step * np.exp(-np.maximum(start - self.td1, 0.0) / self.tau1), 0.0)
-        out[:, 1, 2] = -1.0 / self.tau1
-        out[:, 2, 0] = np.where(second, step * np.exp(-np.maximum(start - self.td2, 0.0) / self.tau2), 0.0)
-        out[:, 2, 2] = -1.0 / self.tau2
-        return out
+        level = self.v1 + step * (first.astype(float) - second.astype(float))
+        rise = np.where(first, -step * np.exp(-np.maximum(start - self.td1, 0.0) / self.tau1), 0.0)
+        fall = np.where(second, step * np.exp(-np.maximum(start - self.td2, 0.0) / self.tau2), 0.0)
+        return terms_of(start.size, (level,), (rise, 0.0, -1.0 / self.tau1), (fall, 0.0, -1.0 / self.tau2))
 
     def shortest_time(self) -> float:
         return min(self.tau1, self.tau2)

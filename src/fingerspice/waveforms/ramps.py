@@ -10,17 +10,15 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray, IntArray, read_only, real_number, real_numbers
-from fingerspice.base.compiled import jit
+from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import check_range, in_windows, runs_through
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.waveform import Waveform, blank_terms, require
+from fingerspice.waveforms.waveform import Waveform, require, terms_of
 
 # A waveform with at most this many knots is not divided into windows, however close together its knots are.
 FEW_KNOTS = 1000
@@ -38,22 +36,14 @@ class Ramps(Waveform):
     _first: float = 0.0
 
     @cached_property
-    def _listed(self) -> tuple[FloatArray, FloatArray]:
-        """Result of `_knots`, cached."""
-        return self._knots()
-
-    @property
     def knots(self) -> tuple[FloatArray, FloatArray]:
         """Times (s, ascending) and values (V) of the knots of one run or period."""
-        return self._listed
+        return self._knots()
 
     @cached_property
     def _distinct(self) -> FloatArray:
         """Times of the knots, each once, s."""
-        return _once(np.unique(self._listed[0]))
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in super().__getstate__().items() if name not in ("_listed", "_distinct")}
+        return _once(np.unique(self.knots[0]))
 
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         """Times (s, ascending) and values (V) of the knots, shape (n,) each."""
@@ -69,7 +59,7 @@ class Ramps(Waveform):
     def _times(self, t0: float, t1: float) -> FloatArray:
         """Times of a periodic waveform's knots (s, ascending) over [t0, t1] and a period beyond; jumps appear twice."""
         assert self.period is not None
-        times, _ = self._listed
+        times, _ = self.knots
         low = max(0.0, np.floor((t0 - self._first) / self.period) - 1.0)
         high = max(low, np.ceil((t1 - self._first) / self.period) + 1.0)
         starts = self._first + runs_through(low, high, times.size, t0, t1) * self.period
@@ -83,7 +73,7 @@ class Ramps(Waveform):
 
     @property
     def course(self) -> tuple[float, float]:
-        times, values = self._listed
+        times, values = self.knots
         changes = np.flatnonzero(np.diff(values))
         if changes.size == 0:
             return math.inf, -math.inf
@@ -106,23 +96,34 @@ class Ramps(Waveform):
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
         """As `value`, at times (n_t,) within one window."""
         if self.period is None:
-            times, values = self._listed
-            index = np.searchsorted(times, flat, side="right" if side == "right" else "left")
-            return _between(times, values, index, read_only(flat))
+            return self._along(flat, side)
         edges = self._edges(flat.min(), flat.max())
-        index = np.searchsorted(edges, flat, side="right" if side == "right" else "left")
+        index = _place(edges, flat, side)
         bounds = np.concatenate([[-math.inf], edges, [math.inf]])
         start, stop = bounds[index], bounds[index + 1]
         v0, slope = self._line(start, stop)
         tau = np.where(np.isfinite(start), flat - np.where(np.isfinite(start), start, 0.0), 0.0)
         return np.asarray(v0 + slope * tau)
 
+    def _along(self, flat: FloatArray, side: str) -> FloatArray:
+        """Values (V) of a waveform without a period at times (n_t,), each from the knot before it."""
+        times, values = self.knots
+        if side == "right":
+            return np.interp(flat, times, values)
+        index = _place(times, flat, side)
+        j = np.clip(index, 1, times.size - 1)
+        # Outside the knots the two nearest may be a jump, between which there is no slope.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slope = (values[j] - values[j - 1]) / (times[j] - times[j - 1])
+            inside = values[j - 1] + slope * (flat - times[j - 1])
+        return np.where(index == 0, values[0], np.where(index == times.size, values[-1], inside))
+
     def _line(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Values (V) at `start` and slopes (V/s) of the straight pieces between `start` and `stop` (s).
 
         A piece is identified by its midpoint, which rounding cannot move into a neighbour.
         """
-        times, values = self._listed
+        times, values = self.knots
         middle = 0.5 * (start + stop)
         run, tau = self._phase(np.where(np.isfinite(middle), middle, 0.0))
         index = np.searchsorted(times, tau, side="right")
@@ -139,21 +140,19 @@ class Ramps(Waveform):
         return v0, slope
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
-        out = blank_terms(start.size, 2)
-        out[:, 0, 0], out[:, 1, 0] = self._line(start, stop)
-        out[:, 1, 1] = 1.0
-        return out
+        value, slope = self._line(start, stop)
+        return terms_of(start.size, (value,), (slope, 1.0))
 
     def peak(self, t0: float, t1: float) -> float:
         if self.period is not None:
             return super().peak(t0, t1)
-        times, values = self._listed
+        times, values = self.knots
         inside = values[times.searchsorted(t0) : times.searchsorted(t1, "right")]
         ends = np.append(self.value([t0, t1]), self.value([t0, t1], "left"))
         return float(max(np.abs(ends).max(), inside.max(initial=0.0), -inside.min(initial=0.0)))
 
     def breakpoint_rate(self) -> float:
-        times, _ = self._listed
+        times, _ = self.knots
         if self.period is None and times.size <= FEW_KNOTS:
             # The rate is only used to divide time into windows; so few breakpoints need none.
             return 0.0
@@ -171,21 +170,9 @@ def _once(times: FloatArray) -> FloatArray:
     return times[keep]
 
 
-@jit
-def _between(times: FloatArray, values: FloatArray, index: IntArray, t: FloatArray) -> FloatArray:
-    """Values (V) at times `t` (s), each of which lies before the knot `index`."""
-    out = np.empty(t.size)
-    last = times.size - 1
-    for i in range(t.size):
-        j = index[i]
-        if j == 0:
-            out[i] = values[0]
-        elif j > last:
-            out[i] = values[last]
-        else:
-            slope = (values[j] - values[j - 1]) / (times[j] - times[j - 1])
-            out[i] = values[j - 1] + slope * (t[i] - times[j - 1])
-    return out
+def _place(edges: FloatArray, t: FloatArray, side: str) -> NDArray[np.intp]:
+    """Number of ascending edges before each time, one at the time itself among them where `side` is right."""
+    return edges.searchsorted(t, "right" if side == "right" else "left")
 
 
 @dataclass(frozen=True)
@@ -229,19 +216,13 @@ class PWL(Ramps):
             raise InputError(f"PWL time {t[i]:g} s stands three times; two equal times are a jump")
         if self.repeat is not None:
             object.__setattr__(self, "repeat", real_number("PWL repeat", self.repeat, "a number in s"))
-            require(
-                t.size > 1 and any(self.repeat == x for x in t[:-1]) and self.repeat < t[-1],
-                "PWL repeat time",
-                f"{self.repeat:g} s",
-                "one of the PWL's own times before the last",
-            )
+            own = t.size > 1 and self.repeat in t[:-1] and self.repeat < t[-1]
+            require(own, "PWL repeat time", f"{self.repeat:g} s", "one of the PWL's own times before the last")
 
     def __repr__(self) -> str:
-        if "repr" not in self.kept:
-            self.kept["repr"] = self._text()
-        text: str = self.kept["repr"]
-        return text
+        return self._text
 
+    @cached_property
     def _text(self) -> str:
         if len(self.times) <= MOST_SHOWN:
             return f"PWL(times={self.times!r}, values={self.values!r}, repeat={self.repeat!r})"

@@ -15,34 +15,13 @@ from fingerspice.base.arrays import FloatArray, read_only, real_number, real_num
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.bounds import RANGES, check_range, take_numbers
-from fingerspice.waveforms.files import WavLayout, check_count, read_table, read_wav, wav_layout
+from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, check_count, read_table, wav_layout
 from fingerspice.waveforms.ramps import FEW_KNOTS, Ramps
 from fingerspice.waveforms.waveform import require
 
 # Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
 # to 0.46 of the rate.
 _WING, _BETA = 32, 8.0
-
-
-def upsample(values: FloatArray, factor: int) -> FloatArray:
-    """Samples (n,) at `factor` times their rate, shape ((n - 1) factor + 1,); constant beyond the ends for the filter.
-
-    Raises
-    ------
-    InputError
-        If the factor is not a whole number from 2 to 64, or the result has too many samples.
-    """
-    from scipy.signal import firwin, upfirdn
-
-    factor = whole_number("factor of upsampling", factor, 2, 64)
-    check_count("the upsampled recording", factor * values.size)
-    wing = _WING * factor
-    taps = factor * firwin(2 * wing + 1, 1.0 / factor, window=("kaiser", _BETA))
-    dense = upfirdn(taps, np.pad(values, _WING, mode="edge"), up=factor)
-    dense = dense[2 * wing :][: (values.size - 1) * factor + 1]
-    # The finite window makes the filter slightly inexact at the given samples: restore them.
-    dense[::factor] = values
-    return np.asarray(dense)
 
 
 # Number of samples of a file that are read at once.
@@ -100,12 +79,7 @@ class Samples(Ramps):
         values = real_numbers("the row of samples", self.values, "two or more numbers in V").copy()
         values.flags.writeable = False
         object.__setattr__(self, "values", values)
-        require(
-            values.ndim == 1 and values.size >= 2,
-            "samples",
-            f"shape {values.shape}",
-            "one row of two or more",
-        )
+        require(values.ndim == 1 and values.size >= 2, "samples", f"shape {values.shape}", "one row of two or more")
         _check_samples(values, 0)
         take_numbers(self)
         require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
@@ -138,11 +112,12 @@ class Samples(Ramps):
         require(math.isfinite(gain), "gain", gain, "a finite number of V at full scale")
         # Samples of a float file that are no numbers, or become too large, are refused below without NumPy's warning.
         with np.errstate(over="ignore", invalid="ignore"):
-            found = read_wav(path, channel) if at_once else wav_layout(path, channel)
+            layout = wav_layout(path, channel, MAX_BYTES if at_once else LARGEST_STREAMED)
+            if at_once:
+                check_count(str(layout.path), layout.count)
+                values = layout.read(0, layout.count)
             try:
-                if isinstance(found, WavLayout):
-                    return _WavFile(found, gain)
-                return cls(gain * found.values, found.rate)  # type: ignore[arg-type]
+                return cls(gain * values, float(layout.rate)) if at_once else _WavFile(layout, gain)
             except InputError as error:
                 raise InputError(f"'{path}': {error}") from None
 
@@ -180,12 +155,23 @@ class Samples(Ramps):
         InputError
             If the factor is not a whole number from 2 to 64, or the result has too many samples.
         """
-        return Samples(upsample(self.values, factor), factor * self.rate, self.start)
+        from scipy.signal import firwin, upfirdn
+
+        factor = whole_number("factor of upsampling", factor, 2, 64)
+        check_count("the upsampled recording", factor * self.count)
+        wing = _WING * factor
+        taps = factor * firwin(2 * wing + 1, 1.0 / factor, window=("kaiser", _BETA))
+        dense = upfirdn(taps, np.pad(self.values, _WING, mode="edge"), up=factor)
+        dense = dense[2 * wing :][: (self.count - 1) * factor + 1]
+        # The finite window makes the filter slightly inexact at the given samples: restore them.
+        dense[::factor] = self.values
+        return Samples(dense, factor * self.rate, self.start)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        # NumPy unpickles every array as writable.
-        self.values.flags.writeable = False
+        if "values" in state:
+            # NumPy unpickles every array as writable.
+            self.values.flags.writeable = False
 
     @property
     def count(self) -> int:
@@ -193,11 +179,12 @@ class Samples(Ramps):
         return self.values.size
 
     def __repr__(self) -> str:
+        return self._text
+
+    @cached_property
+    def _text(self) -> str:
         # Stores of runs that go on are told apart by this text where the samples are part of a sum: it names them all.
-        if "repr" not in self.kept:
-            self.kept["repr"] = f"{str(self)[:-1]}, sha256 {self.digest()[:16]})"
-        text: str = self.kept["repr"]
-        return text
+        return f"{str(self)[:-1]}, sha256 {self.digest()[:16]})"
 
     def __str__(self) -> str:
         return f"Samples({self.count} samples, rate={self.rate!r}, start={self.start!r})"
@@ -207,10 +194,7 @@ class Samples(Ramps):
         return hashlib.sha256(repr((self.rate, self.start)).encode() + self.values.tobytes()).hexdigest()
 
     def between(self, first: int, last: int) -> FloatArray:
-        """Samples number `first` to `last` - 1, V, shape (last - first,); beyond the ends, the first or last sample.
-
-        They may be those of `values` themselves, which are read-only.
-        """
+        """Samples number `first` to `last` - 1, V; beyond the ends, the first or last one; maybe a part of `values`."""
         if first >= 0 and last <= self.count:
             return self.values[first:last]
         return np.asarray(self.values[np.clip(np.arange(first, last), 0, self.count - 1)])
@@ -292,10 +276,10 @@ class _WavFile(Samples):
         for first in range(0, 0 if sure else self.count, AT_ONCE):
             _check_samples(self.between(first, min(first + AT_ONCE, self.count)), first)
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         return f"Samples.from_wav({str(self.layout.path)!r}, {self.gain!r}, {self.layout.channel}, at_once=False)"
 
-    __str__ = __repr__
+    __repr__ = __str__
 
     @cached_property
     def values(self) -> FloatArray:
@@ -332,9 +316,3 @@ class _WavFile(Samples):
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         return self.part(float(start.min()), float(stop.max())).terms(start, stop)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in super().__getstate__().items() if name != "values"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)

@@ -22,7 +22,7 @@ from fingerspice.engine.loopstate import SAME_TIME
 from fingerspice.waveforms.bounds import in_windows, runs_through
 from fingerspice.waveforms.ramps import Ramps
 from fingerspice.waveforms.refining import POINTS, Refiner
-from fingerspice.waveforms.waveform import DOUBLE, Waveform, blank_terms, require
+from fingerspice.waveforms.waveform import DOUBLE, Waveform, require
 
 #: Longest segment of an oscillation, in periods; longer ones are divided, since a phase's rounding error grows with it.
 _PERIODS_PER_SEGMENT = 64.0
@@ -221,33 +221,20 @@ def is_sampled(waveform: Waveform) -> bool:
     """Whether a waveform has no terms and is therefore represented by Chebyshev series."""
     if isinstance(waveform, Ramps):
         return False
-    found = waveform.kept.get("sampled")
-    if found is None:
-        found = waveform.kept["sampled"] = waveform.terms(np.zeros(1), np.ones(1)) is None
-    return bool(found)
+    if "sampled" not in waveform.kept:
+        waveform.kept["sampled"] = waveform.terms(np.zeros(1), np.ones(1)) is None
+    return bool(waveform.kept["sampled"])
 
 
 def source_table(
     waveform: Waveform, t0: float, t1: float, tol: float, step: float, *, no_chirps: bool = False, scale: float = 0.0,
     shortest: float = math.inf,
 ) -> SourceTable:  # fmt: skip
-    """Table of a waveform over [t0, t1].
+    """Table of a waveform over [t0, t1] (s).
 
-    Parameters
-    ----------
-    waveform : Waveform
-    t0, t1 : float
-        Window, s.
-    tol : float
-        Allowed error of a Chebyshev series, relative to the largest |U| seen.
-    step : float
-        Output step, s; a function is sampled at least that finely.
-    no_chirps : bool
-        Whether a term with a changing frequency, which has no closed-form response, is represented by a series too.
-    scale : float
-        Largest |U| (V) seen in earlier windows; it counts in the largest |U| that `tol` refers to.
-    shortest : float
-        Length (s) of the shortest event that the samples of a function have to meet.
+    A Chebyshev series may err by `tol` of the largest |U| seen, here or in earlier windows (`scale`, V). A function is
+    sampled at each output step (s) at least, and meets events as short as `shortest` (s). With `no_chirps` a term with
+    a changing frequency, which has no closed-form response, is represented by a series too.
     """
     inner = waveform.breakpoints(t0, t1)
     # A breakpoint that differs from an end of the window only by rounding is that end, and bounds no extra segment.
@@ -271,7 +258,7 @@ def source_table(
     m = len(pieces.series)
     return SourceTable(
         np.array(pieces.edges) if m else np.array([t0]),
-        blank_terms(m, 1),
+        np.zeros((m, 1, 6)),
         np.array(pieces.series).reshape(m, POINTS),
         pieces.scale,
         pieces.not_finite,

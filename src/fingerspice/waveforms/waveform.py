@@ -67,7 +67,9 @@ class Waveform:
     """Distance of neighbouring numbers of the kind that the values are computed in, relative to their size."""
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in vars(self).items() if key != "kept"}
+        """All but what is computed when it is first asked for."""
+        found = {name: getattr(type(self), name, None) for name in vars(self)}
+        return {name: value for name, value in vars(self).items() if not isinstance(found[name], cached_property)}
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
@@ -129,15 +131,9 @@ class Waveform:
         """Whether each half period after `settled` is the negative of the half period before it."""
         return False
 
-    @property
+    @cached_property
     def fundamental(self) -> Fundamental | None:
         """Fundamental of the periodic part, from the Fourier integral over one period; None where there is none."""
-        if "fundamental" not in self.kept:
-            self.kept["fundamental"] = self._fundamental()
-        found: Fundamental | None = self.kept["fundamental"]
-        return found
-
-    def _fundamental(self) -> Fundamental | None:
         frequency = self.tone()
         if frequency is None:
             return None
@@ -205,13 +201,7 @@ def _combined(kind: str, first: Waveform | float, second: Waveform | float) -> W
 
 
 def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
-    """A waveform from a waveform, a number (a constant voltage) or a function of time.
-
-    Raises
-    ------
-    InputError
-        If the value is of another kind.
-    """
+    """A waveform from a waveform, a number (a constant voltage) or a function of time; anything else is refused."""
     if isinstance(value, Waveform):
         return value
     if callable(value):
@@ -223,13 +213,7 @@ def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
 
 
 def require(condition: bool, what: str, given: Any, allowed: str) -> None:
-    """Refuse an argument that does not meet a condition.
-
-    Raises
-    ------
-    InputError
-        If the condition is false; the message names the given value and the allowed ones.
-    """
+    """Refuse an argument that does not meet a condition: the message names the given value and the allowed ones."""
     if not condition:
         raise InputError(f"{what} is {given}; allowed: {allowed}")
 
@@ -251,9 +235,13 @@ def fourier_integral(waveform: Waveform, frequency: float, t0: float, t1: float)
     return total
 
 
-def blank_terms(m: int, k: int) -> FloatArray:
-    """Terms (m, k, 6), all zero."""
-    return np.zeros((m, k, 6))
+def terms_of(m: int, *terms: tuple[FloatArray | float, ...]) -> FloatArray:
+    """Terms (m, k, 6) of m segments from the first coefficients of each of k terms: numbers, or one a segment."""
+    out = np.zeros((m, len(terms), 6))
+    for k, coefficients in enumerate(terms):
+        for i, coefficient in enumerate(coefficients):
+            out[:, k, i] = coefficient
+    return out
 
 
 @dataclass(frozen=True)
@@ -274,9 +262,7 @@ class DC(Waveform):
         return np.full(real_numbers("t", t, "times in s").shape, self.level)
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
-        out = blank_terms(start.size, 1)
-        out[:, 0, 0] = self.level
-        return out
+        return terms_of(start.size, (self.level,))
 
 
 @dataclass(frozen=True)
@@ -306,13 +292,8 @@ class Sine(Waveform):
     delay: float = 0.0
     damping: float = 0.0
     units: ClassVar[dict[str, str]] = {
-        "amplitude": "V",
-        "frequency": "Hz",
-        "offset": "V",
-        "phase_deg": "deg",
-        "delay": "s",
-        "damping": "1/s",
-    }
+        "amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s", "damping": "1/s"
+    }  # fmt: skip
 
     def __post_init__(self) -> None:
         take_numbers(self)
@@ -354,17 +335,14 @@ class Sine(Waveform):
         return np.array([self.delay]) if t0 <= self.delay <= t1 and self.delay > 0.0 else np.empty(0)
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
-        out = blank_terms(start.size, 2)
         on = 0.5 * (start + stop) >= self.delay if self.delay > 0.0 else np.ones(start.size, bool)
         phase = math.radians(self.phase_deg)
-        out[:, 0, 0] = np.where(on, self.offset, self.offset + self.amplitude * math.sin(phase))
+        level = np.where(on, self.offset, self.offset + self.amplitude * math.sin(phase))
         decay = np.exp(-self.damping * np.maximum(start - self.delay, 0.0))
-        out[:, 1, 0] = np.where(on, self.amplitude * decay, 0.0)
-        out[:, 1, 2] = -self.damping
-        out[:, 1, 3] = TAU * self.frequency
         # Terms are cosines: sin(x) = cos(x - pi/2).
-        out[:, 1, 4] = TAU * self._turns(start) + phase - 0.5 * math.pi
-        return out
+        angle = TAU * self._turns(start) + phase - 0.5 * math.pi
+        wave = np.where(on, self.amplitude * decay, 0.0), 0.0, -self.damping, TAU * self.frequency, angle
+        return terms_of(start.size, (level,), wave)
 
     def shortest_time(self) -> float:
         return 1.0 / self.frequency
