@@ -45,7 +45,7 @@ MANY_PARAMETERS = {
     "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
-    "studies.batch.batch",
+    "studies.batch.batch.batch",
     "studies.fit.fit",
     "studies.populations.sweep",
     "studies.steady.steady_state",

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream
-    from fingerspice.studies.batch import batch as batch
+    from fingerspice.studies.batch.batch import batch as batch
     from fingerspice.studies.capability import Capability as Capability
     from fingerspice.studies.capability import capability as capability
     from fingerspice.studies.comparison import Comparison as Comparison
@@ -88,7 +88,7 @@ _HOMES = {
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Burst", "Product", "Repeat", "Sum"),
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
-    "studies.batch": ("batch",),
+    "studies.batch.batch": ("batch",),
     "studies.capability": ("Capability", "capability"),
     "studies.comparison": ("Comparison", "compare", "large_signal"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),

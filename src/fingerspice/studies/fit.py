@@ -17,7 +17,7 @@ from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.solve.simulation import rtol_given
-from fingerspice.studies.batch import batch
+from fingerspice.studies.batch.batch import batch
 from fingerspice.studies.fitdata import IMPEDANCE, Data, Unknown, data_of, group_column, unknowns_of
 from fingerspice.studies.fitresult import Fit, Fitted, fit_result
 from fingerspice.studies.fittask import FARTHEST, REFUSED, Task, evaluations_shown, followed, limit_of, profile_of

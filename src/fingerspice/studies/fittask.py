@@ -24,9 +24,9 @@ from fingerspice.circuit.topology import driving_sources
 from fingerspice.numerics.small import AT, STEP, derivative
 from fingerspice.results.outcome import SolveError
 from fingerspice.solve.simulation import simulate
-from fingerspice.studies.batch import batch
-from fingerspice.studies.batchgradients import in_lockstep_by
-from fingerspice.studies.batchtask import REFUSED as BATCH_REFUSED
+from fingerspice.studies.batch.batch import batch
+from fingerspice.studies.batch.form import in_lockstep_by
+from fingerspice.studies.batch.task import REFUSED as BATCH_REFUSED
 from fingerspice.studies.fitdata import IMPEDANCE, Data, Unknown, members_of
 from fingerspice.studies.fitestimates import Profile
 from fingerspice.studies.fitresult import Fitted

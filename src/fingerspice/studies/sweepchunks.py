@@ -23,7 +23,7 @@ from fingerspice.base.arrays import FloatArray, keep_freed_memory
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies import sweepplan
-from fingerspice.studies.batch import MESSAGES, batch
+from fingerspice.studies.batch.batch import MESSAGES, batch
 from fingerspice.studies.sweepplan import Plan
 
 if TYPE_CHECKING:

@@ -28,8 +28,8 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import digests
 from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.results.datafiles import CHECKSUM, checksum, fault, zarr_library
-from fingerspice.studies.batch import batch, checked_scenes
-from fingerspice.studies.batchtask import LOCKSTEP, REFUSED, STATUS_NAMES
+from fingerspice.studies.batch.batch import batch
+from fingerspice.studies.batch.task import LOCKSTEP, REFUSED, STATUS_NAMES, checked_scenes
 from fingerspice.studies.sweepchunks import Work, at_work, programs, run_chunks
 from fingerspice.studies.sweepplan import Plan
 from fingerspice.waveforms.waveform import require
