@@ -22,7 +22,7 @@ import fingerspice as fs
 from batch import PERIODS, REFERENCES, population, seconds, single
 from fingerspice.base.card import card_compiler
 from fingerspice.engine import lockcard
-from fingerspice.studies import batchladder
+from fingerspice.studies.batch import ladder
 
 HERE = Path(__file__).resolve().parent
 
@@ -43,13 +43,13 @@ def kernel_seconds(call: Any, repeats: int) -> float:
         spent[-1] += time.perf_counter() - begin
         return out
 
-    batchladder.march_on_card = timed
+    ladder.march_on_card = timed
     try:
         for _ in range(repeats):
             spent.append(0.0)
             call()
     finally:
-        batchladder.march_on_card = lockcard.march_on_card
+        ladder.march_on_card = lockcard.march_on_card
     return float(np.median(spent[1:]))
 
 

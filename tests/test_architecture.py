@@ -45,7 +45,7 @@ MANY_PARAMETERS = {
     "studies.design.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
-    "studies.batch.batch",
+    "studies.batch.batch.batch",
     "studies.fit.circuitfit.fit",
     "studies.sweep.populations.sweep",
     "studies.steady.steady_state",

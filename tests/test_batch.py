@@ -14,7 +14,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.engine.lockstep import marks_of
 from fingerspice.engine.lockweights import moment_integrals, weigh
-from fingerspice.studies.batchscenes import LockstepForm, lockstep_form, table_of
+from fingerspice.studies.batch.form import LockstepForm, lockstep_form, table_of
 from scenes import table1
 
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream
-    from fingerspice.studies.batch import batch as batch
+    from fingerspice.studies.batch.batch import batch as batch
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.comparison import large_signal as large_signal
@@ -88,7 +88,7 @@ _HOMES = {
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Burst", "Product", "Repeat", "Sum"),
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
-    "studies.batch": ("batch",),
+    "studies.batch.batch": ("batch",),
     "studies.design.capability": ("Capability", "capability"),
     "studies.comparison": ("Comparison", "compare", "large_signal"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),

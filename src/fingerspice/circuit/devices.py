@@ -12,16 +12,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.usual import REST_AREA, Usual
 from fingerspice.physics.ladder import SKIN_LADDER
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
 
-#: Function from an element's values (in the netlist's units) to its cells in series, shape (n_cell, 3): capacitance per
-#: area (F/m^2), total leakage (S) and leakage per area (S/m^2). At a frequency (Hz), the second argument, a dispersive
-#: material becomes one cell with its data there; None gives all cells of its ladder.
-Cells = Callable[[Mapping[str, float], float | None], FloatArray]
+Value = float | FloatArray
+#: Function from an element's values (in the netlist's units), or those of several scenes (n,), to its cells in series,
+#: shape (n_cell, 3) or (n_cell, 3, n): capacitance per area (F/m^2), total leakage (S) and leakage per area (S/m^2). At
+#: a frequency (Hz), the second argument, a dispersive material becomes one cell with its data there; None gives all
+#: cells of its ladder.
+Cells = Callable[[Mapping[str, Value], float | None], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -82,26 +85,28 @@ class DeviceSpec:
         return "area" in self.nodes
 
 
-def _slabs(d: float, eps_r: FloatArray, rho: FloatArray) -> FloatArray:
-    return np.column_stack([EPS0 * eps_r / d, np.zeros(eps_r.size), 1.0 / (rho * d)])
+def _cells(c: ArrayLike, g_total: ArrayLike, g_area: ArrayLike) -> FloatArray:
+    return np.stack(np.broadcast_arrays(c, g_total, g_area), axis=1)
 
 
-def _layer_cells(v: Mapping[str, float], at: float | None) -> FloatArray:
-    return np.array([[EPS0 * v["eps_r"] / v["d"], 1.0 / v["r"], 0.0]])
+def _layer_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
+    return _cells(np.array([EPS0 * v["eps_r"] / v["d"]]), np.array([1.0 / v["r"]]), 0.0)
 
 
-def _slab_cells(v: Mapping[str, float], at: float | None) -> FloatArray:
-    return _slabs(v["d"], np.array([v["eps_r"]]), np.array([v["rho"]]))
+def _slab_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
+    return _cells(np.array([EPS0 * v["eps_r"] / v["d"]]), 0.0, np.array([1.0 / (v["rho"] * v["d"])]))
 
 
-def _skin_cells(v: Mapping[str, float], at: float | None) -> FloatArray:
-    return _slabs(v["d"], skin_permittivity([v["f"]]), skin_resistivity([v["f"]]))
+def _skin_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
+    return _slab_cells({"d": v["d"], "eps_r": skin_permittivity(v["f"]), "rho": skin_resistivity(v["f"])}, at)
 
 
-def _dispersive_cells(v: Mapping[str, float], at: float | None) -> FloatArray:
+def _dispersive_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
     if at is None:
-        return _slabs(v["d"], *SKIN_LADDER.cells())
-    return _slabs(v["d"], SKIN_LADDER.permittivity([at]), SKIN_LADDER.resistivity([at]))
+        eps_r, rho = SKIN_LADDER.cells()
+    else:
+        eps_r, rho = SKIN_LADDER.permittivity([at]), SKIN_LADDER.resistivity([at])
+    return _cells(np.divide.outer(EPS0 * eps_r, v["d"]), 0.0, 1.0 / np.multiply.outer(rho, v["d"]))
 
 
 # Usual ranges, each with its source.

@@ -21,9 +21,9 @@ from fingerspice.results.outcome import SolveError
 from fingerspice.results.sensitivity import MEANS, SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import rtol_given, simulate
-from fingerspice.studies.batch import LEAST_RTOL, batch
-from fingerspice.studies.batchgradients import in_lockstep_by
-from fingerspice.studies.batchtask import REFUSED
+from fingerspice.studies.batch.batch import batch
+from fingerspice.studies.batch.form import in_lockstep_by
+from fingerspice.studies.batch.task import LEAST_RTOL, REFUSED
 from fingerspice.studies.steady import SteadyState, steady_state
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require

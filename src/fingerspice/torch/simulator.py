@@ -14,7 +14,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.sensitivity import MEANS
-from fingerspice.studies.batch import own_path
+from fingerspice.studies.batch.task import own_path
 from fingerspice.torch.scenes import Scenes, request, tensor_of
 
 

@@ -16,9 +16,9 @@ from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.numerics.small import AT, STEP, derivative
 from fingerspice.solve.simulation import simulate
-from fingerspice.studies.batch import batch
-from fingerspice.studies.batchgradients import in_lockstep_by
-from fingerspice.studies.batchtask import REFUSED
+from fingerspice.studies.batch.batch import batch
+from fingerspice.studies.batch.form import in_lockstep_by
+from fingerspice.studies.batch.task import REFUSED
 from fingerspice.studies.fit.circuitdata import IMPEDANCE, Data
 from fingerspice.studies.fit.search import Problem
 from fingerspice.studies.phasors import phasor

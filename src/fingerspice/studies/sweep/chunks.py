@@ -21,8 +21,8 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import digests
 from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.results.store import Array
-from fingerspice.studies.batch import batch, checked_scenes
-from fingerspice.studies.batchtask import LOCKSTEP, REFUSED, STATUS_NAMES
+from fingerspice.studies.batch.batch import batch
+from fingerspice.studies.batch.task import LOCKSTEP, REFUSED, STATUS_NAMES, checked_scenes
 from fingerspice.studies.sweep import plan as plans
 from fingerspice.studies.sweep.store import STATUS, SweepStore
 from fingerspice.waveforms.waveform import require

@@ -17,7 +17,7 @@ from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.sets.parameters import parameters
 from fingerspice.sets.reading import KINDS
-from fingerspice.studies.batch import own_path
+from fingerspice.studies.batch.task import own_path
 from fingerspice.waveforms.waveform import Waveform, require
 
 

@@ -22,7 +22,7 @@ from fingerspice.base.arrays import keep_freed_memory, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.store import tidy
-from fingerspice.studies.batch import MESSAGES
+from fingerspice.studies.batch.batch import MESSAGES
 from fingerspice.studies.sweep.chunks import Done, Work, identity_of, make_work, run_chunk
 from fingerspice.studies.sweep.plan import Plan
 from fingerspice.studies.sweep.store import NAMES, identity

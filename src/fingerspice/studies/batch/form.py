@@ -1,49 +1,66 @@
-"""Choice of the scenes of a batch that are integrated in lockstep, and their tables for `engine.lockscenes`."""
+"""Which scenes of a batch go in lockstep, what it gives, and the tables of their values for `engine.lockscenes`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev as powers
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.statespace import build_stack, is_stack
+from fingerspice.circuit.devices import Value
+from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.engine.lockscenes import CELL_ROWS, LARGEST_X, N_OTHERS
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import universal_curve_array
-from fingerspice.physics.ladder import SKIN_LADDER
-from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
+from fingerspice.physics.materials import EPS0
 from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.periodic import Pulse, Square
 from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import DC, Sine, Waveform
+from fingerspice.waveforms.waveform import DC, Sine
 
-Value = float | FloatArray
 Curves = tuple[FloatArray, FloatArray, FloatArray]
-Cell = tuple[Value, Value, Value]
 # Parameters that must be equal in all scenes of a lockstep, because the form of the equations depends on them.
 _FORM = ("m_exp", "n_exp", "a_fix", "tau")
 # Most layers and most tones of a lockstep: code is compiled for each number of cells and of tones.
 _MOST_LAYERS, _MOST_TONES = 4, 4
-_SKIN_CELLS = SKIN_LADDER.cells()[0].size
 _LAYERS = ("LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP")
 # Largest ratio of a tone's frequency to that of the whole source.
 _MOST_PERIODS = 2000
 # Numbers of points tried for the universal curve's Chebyshev series, and the relative error allowed.
 _CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
+# Smallest rtol at which derivatives are taken in lockstep: below it their kinks would take too many steps.
+_LEAST_RTOL_OF_SLOPES = 5e-7
+_Figure = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
+#: For each figure, the indices of the moments that it needs, and the function that gives it from the moments (4, n),
+#: the load, the stress at 1 V and the friction coefficient.
+FIGURES: dict[str, tuple[tuple[int, ...], _Figure]] = {
+    "f_el_mean": ((0,), lambda m, load, stress, mu: stress * m[0]),
+    "f_el_rms": ((1,), lambda m, load, stress, mu: stress * np.sqrt(m[1])),
+    "f_t_mean": ((0,), lambda m, load, stress, mu: mu * (load + stress * m[0])),
+    "f_t_rms": ((0, 1), lambda m, load, stress, mu: mu * _loaded(m, load, stress)),
+    "friction_mean": ((0,), lambda m, load, stress, mu: mu * (load + stress * m[0]) / load),
+    "friction_rms": ((0, 1), lambda m, load, stress, mu: mu * _loaded(m, load, stress) / load),
+    "u_gap_rms": ((2,), lambda m, load, stress, mu: np.sqrt(m[2])),
+}
+
+
+def _loaded(m: FloatArray, load: FloatArray, stress: FloatArray) -> FloatArray:
+    """Root mean square of the sum of load and electroadhesive force, N."""
+    return np.asarray(np.sqrt(load * load + 2.0 * load * stress * m[0] + stress * stress * m[1]))
 
 
 @dataclass(frozen=True)
 class LockstepForm:
     """Properties that all scenes in lockstep have in common."""
 
-    layers: tuple[Element, ...]  # Layers in the order of the loop
-    gap: int  # Index of the gap among them
+    stack: Stack  # With a gap
     # The sources that are on; each with the sign of the gap along the loop times the sign of the source
     sources: tuple[tuple[Element, float], ...]
     multiples: tuple[int, ...]  # Frequency of every tone of the sources' sum, in that of the sum
@@ -51,78 +68,102 @@ class LockstepForm:
     # rate, so that a sample's length is half a period.
     frequency: float | None
     jumping: bool  # Whether the source is a square
-    recording: Samples | None = None  # The samples of the only source, if it is a recording
-
-    @property
-    def layer(self) -> Element:
-        """The gap."""
-        return self.layers[self.gap]
+    recording: Samples | None  # The samples of the only source, if it is a recording
 
     @cached_property
-    def layer_of_cells(self) -> tuple[Element, ...]:
-        """The layer of every cell."""
-        return tuple(e for e in self.layers for _ in range(_SKIN_CELLS if e.device == "SKIN_DISPERSIVE" else 1))
+    def gap(self) -> Element:
+        """The gap."""
+        assert self.stack.gap_layer is not None
+        return self.stack.layers[self.stack.gap_layer]
 
     @property
     def cells(self) -> int:
         """Number of cells of all layers."""
-        return len(self.layer_of_cells)
+        return self.stack.c.size
 
-    @property
-    def gap_cell(self) -> int:
-        """Index of the gap among the cells."""
-        return self.layer_of_cells.index(self.layer)
-
-    @property
-    def leaks(self) -> tuple[int, ...]:
-        """Indices of the cells whose leak has a total resistance."""
-        return tuple(i for i, e in enumerate(self.layer_of_cells) if e.device in ("LAYER", "GAP"))
+    @cached_property
+    def places(self) -> tuple[int, IntArray]:
+        """Index of the gap among the cells, and those of the cells whose leak has a total resistance."""
+        assert self.stack.gap is not None
+        of_cells = [self.stack.layers[self.stack.layer_of[i]].device for i in range(self.cells)]
+        return self.stack.gap, np.array([i for i, device in enumerate(of_cells) if device in ("LAYER", "GAP")])
 
 
-def lockstep_form(circuit: Circuit, varied: Mapping[str, object]) -> LockstepForm | str:
+def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str:
     """The common form of scenes in lockstep, or the reason why there is none; `varied` has the paths that vary."""
     if not is_stack(circuit):
         return "the circuit is no series stack of layers"
     stack = build_stack(circuit)
-    gap = stack.gap_layer
-    if stack.contact is None or gap is None or stack.area_given is not None:
+    if stack.contact is None or stack.gap is None or stack.area_given is not None:
         return "the stack has no contact whose area follows the gap"
     if not {e.device for e in stack.layers} <= set(_LAYERS) or not 2 <= len(stack.layers) <= _MOST_LAYERS:
         return f"the stack has other layers than {', '.join(_LAYERS)}, or not 2 to {_MOST_LAYERS} of them"
     if (circuit.charge_law or "local") != "local" or circuit.work != "gap":
         return "the charge law is mobile, or the total voltage is held"
+    found = _form_of_sources(stack)
+    if isinstance(found, str):
+        return found
+    recording = found.recording
+    charged = found.jumping if recording is None else recording.between(0, 1)[0] != 0.0
+    varied = [path.lower() for path in varied]
+    if not _starts_uncharged(circuit, charged, varied):
+        return "the run does not start uncharged, or its figures start late"
+    may_vary = {e.name.lower(): _varies(e.waveform, found.frequency) for e, _ in found.sources}
+    layers = {e.name.lower() for e in stack.layers}
+    for path in varied:
+        name, _, parameter = path.rpartition(".")
+        if parameter not in may_vary[name] if name in may_vary else parameter in _FORM or name not in layers:
+            return f"{path} varies"
+    return found
+
+
+def _form_of_sources(stack: Stack) -> LockstepForm | str:
+    """The form that the sources of a stack allow, whatever varies; or the reason why there is none."""
+    assert stack.gap is not None
     sources = tuple((e, float(turn * stack.sign[stack.gap])) for e, turn in stack.sources if e.waveform != DC(0.0))
     waves = [e.waveform for e, _ in sources]
-    jumping = len(waves) == 1 and isinstance(waves[0], Square | Pulse)
     recording = as_samples(waves[0]) if len(waves) == 1 and waves[0] is not None else None
-    tones = [] if recording else [hz for wave in waves for hz in _tones(wave)]
-    if recording is not None and recording.start != 0.0:
-        return "the recording does not start at 0 s"
-    if recording is None and not (
-        _plain_square(waves[0]) if jumping else tones and all(tones) and len(tones) <= _MOST_TONES
-    ):
+    if recording is not None:
+        if recording.start != 0.0:
+            return "the recording does not start at 0 s"
+        return LockstepForm(stack, sources, (1,), 0.5 * recording.rate, False, recording)
+    jumping = len(waves) == 1 and isinstance(waves[0], Square | Pulse)
+    tones = [hz for wave in waves for hz in _tones(wave)]
+    if not (_plain_square(waves[0]) if jumping else tones and all(tones) and len(tones) <= _MOST_TONES):
         return (
             f"the sources are not 1 to {_MOST_TONES} plain sines, not a square that starts with its period, and not a "
             "recording"
         )
-    multiples: tuple[int, ...] = (1,)
-    frequency: float | None = None
-    if len(tones) > 1:
-        period = stack.waveform.period
-        if period is None or max(tones) * period > _MOST_PERIODS:
-            return "the sources' tones have no common period, or one of very many of their own"
-        multiples, frequency = tuple(round(hz * period) for hz in tones), 1.0 / period
-    if recording is not None:
-        frequency = 0.5 * recording.rate
-    charged = jumping if recording is None else recording.between(0, 1)[0] != 0.0
-    if not _starts_uncharged(circuit, charged, varied):
-        return "the run does not start uncharged, or its figures start late"
-    layers, on = {e.name.lower() for e in stack.layers}, {e.name.lower(): e.waveform for e, _ in sources}
-    for path in varied:
-        name, _, parameter = path.rpartition(".")
-        if (parameter not in _varies(on[name], frequency)) if name in on else parameter in _FORM or name not in layers:
-            return f"{path} varies"
-    return LockstepForm(stack.layers, gap, sources, multiples, frequency, jumping, recording)
+    if len(tones) == 1:
+        return LockstepForm(stack, sources, (1,), None, jumping, None)
+    period = stack.waveform.period
+    if period is None or max(tones) * period > _MOST_PERIODS:
+        return "the sources' tones have no common period, or one of very many of their own"
+    return LockstepForm(stack, sources, tuple(round(hz * period) for hz in tones), 1.0 / period, False, None)
+
+
+def why_alone(form: LockstepForm | str, outputs: Iterable[str], slopes_at: float | None = None) -> str:
+    """Why outputs, or with `slopes_at` their derivatives at that rtol, need runs of their own; '' in lockstep."""
+    if isinstance(form, str):
+        return form
+    if slopes_at is not None and form.recording is not None:
+        return "the source is a recording"
+    # Of a recording no last period is kept.
+    suffix = "_periodic" if form.recording is None else ""
+    others = [name for name in outputs if name != "u_gap" and name.removesuffix(suffix) not in FIGURES]
+    if others:
+        return f"{', '.join(others)} needs a run of its own"
+    if slopes_at is not None and slopes_at < _LEAST_RTOL_OF_SLOPES:
+        return f"rtol is below {_LEAST_RTOL_OF_SLOPES:g}"
+    return ""
+
+
+def in_lockstep_by(circuit: Circuit, paths: Iterable[str], outputs: Iterable[str], rtol: float) -> bool:
+    """Whether derivatives of outputs by parameters, with the values of all `paths` varying, can be those of lockstep.
+
+    If not, a batch takes the derivatives of single runs, besides a run for every scene's outputs.
+    """
+    return not why_alone(lockstep_form(circuit, paths), outputs, rtol)
 
 
 def _tones(wave: object) -> tuple[float, ...]:
@@ -151,7 +192,7 @@ def _varies(wave: object, frequency: float | None) -> tuple[str, ...]:
     return tuple(name for name, allowed in may_vary.items() if allowed)
 
 
-def _starts_uncharged(circuit: Circuit, charged: bool, varied: Mapping[str, object]) -> bool:
+def _starts_uncharged(circuit: Circuit, charged: bool, varied: Iterable[str]) -> bool:
     """Whether the uncharged state starts all runs; `charged`: whether the source is not 0 V there."""
     tran = circuit.tran
     if circuit.initial or any(e.initial is not None for e in circuit.elements) or (tran and tran.start > 0.0):
@@ -183,70 +224,38 @@ def _tones_of(wave: object, given: Mapping[str, Value]) -> list[tuple[Value, Val
 def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:
     """The table of some scenes as `engine.lockmarch.march` takes it, shape (n_row, n).
 
-    Parameters
-    ----------
-    form : LockstepForm
-    scenes : mapping of str to ndarray, shape (n,)
-        Values by path in lower case, in the netlist's units; all other values are the circuit's.
+    `scenes` has values by path in lower case, in the netlist's units; all others are the circuit's.
     """
 
-    def given(element: Element) -> dict[str, Value]:
+    def values(element: Element) -> dict[str, Any]:
         start = f"{element.name.lower()}."
-        return {path.removeprefix(start): array for path, array in scenes.items() if path.startswith(start)}
+        given = {path.removeprefix(start): array for path, array in scenes.items() if path.startswith(start)}
+        return {**element.values, **given}
 
-    count = form.cells
-    out = np.empty((CELL_ROWS * count + N_OTHERS + 2 * len(form.multiples), next(iter(scenes.values())).size))
-    cell = 0
-    for layer in form.layers:
-        for c, g, g_area in _CELLS_OF[layer.device](dict(layer.values) | given(layer)):
-            out[cell], out[count + cell], out[2 * count + cell] = c, g, g_area
-            cell += 1
+    n = next(iter(scenes.values())).size
+    out = np.empty((CELL_ROWS * form.cells + N_OTHERS + 2 * len(form.multiples), n))
+    of_cells, cell = out[: CELL_ROWS * form.cells].reshape(CELL_ROWS, form.cells, n), 0
+    for layer, count in zip(form.stack.layers, form.stack.cells, strict=True):
+        assert layer.spec.cells is not None
+        cells = layer.spec.cells(values(layer), None)
+        of_cells[:, cell : cell + count] = np.moveaxis(cells.reshape(count, CELL_ROWS, -1), 0, 1)
+        cell += count
     first = form.sources[0][0]
-    frequency = form.frequency or given(first).get("frequency", 1.0 / (_period(first.waveform)))
-    rows = [*_contact_rows(dict(form.layer.values) | given(form.layer)), 2.0 * np.pi * np.asarray(frequency)]
+    period = first.waveform.period if first.waveform is not None else None
+    frequency = form.frequency or values(first).get("frequency", 1.0 / (period or math.nan))
+    rows = [*_contact_rows(values(form.gap)), 2.0 * np.pi * np.asarray(frequency)]
     for element, sign in form.sources:
-        tones = (
-            _tones_of(element.waveform, given(element)) if form.recording is None else [(peak_of(form.recording), 0.0)]
-        )
-        for amplitude, phase in tones:
+        recorded = None if form.recording is None else [(peak_of(form.recording), 0.0)]
+        for amplitude, phase in recorded or _tones_of(element.waveform, values(element)):
             rows += [sign * amplitude * np.cos(phase), sign * amplitude * np.sin(phase)]
     for i, row in enumerate(rows):
-        out[CELL_ROWS * count + i] = row
+        out[CELL_ROWS * form.cells + i] = row
     return out
 
 
 def peak_of(recording: Samples) -> float:
     """Largest sample, V; 1 V if all are 0."""
     return float(np.abs(recording.values).max()) or 1.0
-
-
-def _period(wave: Waveform | None) -> float:
-    assert wave is not None
-    assert wave.period is not None
-    return wave.period
-
-
-def _layer(v: Mapping[str, Value]) -> list[Cell]:
-    return [(EPS0 * v["eps_r"] / v["d"], 1.0 / v["r"], 0.0)]
-
-
-def _slab(v: Mapping[str, Value]) -> list[Cell]:
-    return [(EPS0 * v["eps_r"] / v["d"], 0.0, 1.0 / (v["rho"] * v["d"]))]
-
-
-def _skin(v: Mapping[str, Value]) -> list[Cell]:
-    return _slab({"d": v["d"], "eps_r": skin_permittivity(v["f"]), "rho": skin_resistivity(v["f"])})
-
-
-def _dispersive(v: Mapping[str, Value]) -> list[Cell]:
-    ladder = zip(*SKIN_LADDER.cells(), strict=True)
-    return [cell for eps_r, rho in ladder for cell in _slab({"d": v["d"], "eps_r": eps_r, "rho": rho})]
-
-
-#: As `Element.spec.cells`, for arrays of values: capacitance per area, total leakage and leakage per area of each cell.
-_CELLS_OF: dict[str, Callable[[Mapping[str, Value]], list[Cell]]] = {
-    "LAYER": _layer, "GAP": _layer, "SLAB": _slab, "SKIN": _skin, "SKIN_DISPERSIVE": _dispersive,
-}  # fmt: skip
 
 
 def _contact_rows(v: Mapping[str, Value]) -> tuple[Value, ...]:

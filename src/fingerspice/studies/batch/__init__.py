@@ -1,0 +1,1 @@
+"""Many scenes of one circuit at once: `batch.batch` is the door."""

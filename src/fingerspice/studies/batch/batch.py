@@ -1,0 +1,322 @@
+"""Many scenes of one circuit: scenes of a suitable form in lockstep, all others one by one."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, whole_number
+from fingerspice.base.card import require_card
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.circuit.arguments import require_circuit
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.notices import scenes_warnings
+from fingerspice.results.outcome import SolveError
+from fingerspice.results.signals import SIGNALS
+from fingerspice.solve.simulation import RTOL_RANGE
+from fingerspice.studies.batch.figures import Figures
+from fingerspice.studies.batch.form import LockstepForm, lockstep_form, why_alone
+from fingerspice.studies.batch.ladder import Ladder
+from fingerspice.studies.batch.slopes import Slopes
+from fingerspice.studies.batch.task import (
+    FAILED,
+    LOCKSTEP,
+    ONE_BY_ONE,
+    REFUSED,
+    SIGNALS_OF_BATCH,
+    STATUS_NAMES,
+    Answers,
+    Gradients,
+    Task,
+    checked_scenes,
+    frequencies,
+    gradients_of,
+    task_of,
+)
+from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+# Largest number of failure messages that a Dataset keeps, and of gap voltages (8 GB) that a batch may return.
+MESSAGES, _MOST_VOLTAGES = 16, 1e9
+# Smallest and largest number of scenes in a job, of which there are 8 or more between these limits; the number if gap
+# voltages are wanted, so that these stay in the processor's cache; the limits under a recording, whose scenes take
+# long; and the number on a graphics card, which is slow to start.
+_JOBS, _CHUNKS, _TRACED, _RECORDED, _ON_CARD = 8, (512, 4096), 256, (32, 128), 262_144
+# Relative distance from a whole number within which a number of half periods counts as whole.
+_WHOLE = 1e-9
+# A run's rtol is relative to peaks, and a batch's to the output itself: the first attempt assumes that an output is at
+# least this fraction of its peak.
+_OVER_PEAK = 0.1
+
+
+def batch(
+    circuit: Circuit,
+    parameters: Mapping[str, ArrayLike],
+    *,
+    outputs: Sequence[str] = ("f_el_mean",),
+    rtol: float = 1e-4,
+    t_stop: float | None = None,
+    periods: float | None = None,
+    periodic: bool = False,
+    gradients: Sequence[str] = (),
+    skin: str = "own",
+    points: int = 200,
+    threads: int | None = None,
+    device: str = "cpu",
+) -> Dataset:
+    """Figures of many scenes, which are one circuit with different values of its parameters.
+
+    Series stacks of two to four layers under the local law, driven by sines, an AM carrier, a square or a recording,
+    are integrated in lockstep. Every other scene, and every scene that does not reach `rtol` in lockstep, is run by
+    itself through `simulate` (`steady_state`).
+
+    Parameters
+    ----------
+    circuit : Circuit
+    parameters : mapping of str to array_like, shape (n_scene,) or ()
+        Path to values in the netlist's unit, as in `Circuit.replace`; ``source.`` stands for the only source.
+    outputs : sequence of str
+        Figures ``SIGNAL_KIND`` as in `Solution.summary`, such as ``f_el_mean``, ``f_t_rms`` and ``u_gap_peak``; and
+        ``u_gap``, the gap voltage at `points` times per period. Lockstep gives means, root mean squares and ``u_gap``.
+    rtol : float
+        Error of every output, relative to itself; error of ``u_gap``, relative to its peak.
+    t_stop, periods : float, optional
+        Length of every run in s, or in periods of its own source; the deck's TSTOP by default. Lockstep is possible if
+        the length is a whole number of half periods, or of samples.
+    periodic : bool
+        Find the periodic state; the figures are then those of one period of it.
+    gradients : sequence of str
+        Parameters by which every mean among the outputs is differentiated, as in `simulate`'s `sensitivities`.
+    skin : str
+        ``"own"`` (a SKIN keeps its `f`) or ``"follow"`` (its `f` is the source's frequency).
+    points : int
+        Number of gap voltages per period, even.
+    threads : int, optional
+        Number of threads; all processors by default. The result does not depend on it.
+    device : str
+        ``"cuda"`` does lockstep on an NVIDIA graphics card, but for recordings and ``u_gap``.
+
+    Returns
+    -------
+    xarray.Dataset
+        With dimension ``scene``, the parameters as coordinates, the outputs, ``error`` (stated, relative) and
+        ``status``: 0 in lockstep, 1 one by one, 2 refused, 3 failed; the outputs of the last two are NaN. The attribute
+        `n_ordinary` counts the scenes not in lockstep, `ordinary` gives the reason, `failures` has the messages,
+        `device` says where lockstep was done. With
+        `gradients`, also ``d_f_el_mean`` and the like with dimensions ``scene`` and ``parameter``, per unit of the
+        parameter; ``gradient_error`` (stated, of a change by all of a parameter, relative to the output) and
+        ``gradient_status``; the attributes `n_ordinary_gradients` and `ordinary_gradients`.
+
+    Raises
+    ------
+    InputError
+        If a path or output is unknown, arrays have unequal lengths, a value is NaN or out of range, there are no
+        derivatives by a parameter, or there is no graphics card.
+    """
+    require_circuit(circuit)
+    require(device in ("cpu", "cuda"), "device", repr(device), "'cpu' or 'cuda'")
+    if device == "cuda":
+        require_card()
+    task = task_of(circuit, outputs, rtol, t_stop, periods, periodic, points, device)
+    require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
+    if threads is not None:
+        threads = whole_number("threads", threads, 1)
+    scenes = checked_scenes(circuit, parameters)
+    changed = dict(scenes)
+    if skin == "follow":
+        frequency = frequencies(circuit, scenes, of_skin=True)
+        for element in circuit.by_device("SKIN"):
+            if f"{element.name}.f" in scenes:
+                raise InputError(f"skin='follow' and {element.name}.f are both given; allowed: one of them")
+            changed[f"{element.name}.f"] = frequency
+    for text in scenes_warnings(circuit, task.t_stop, scenes, skin):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    task = replace(task, gradients=gradients_of(task, gradients, scenes, skin))
+    with ThreadPoolExecutor(threads or _processors()) as pool:
+        found, attrs = _figures(task, changed, pool)
+        slopes = None if task.gradients is None else _slopes(task, task.gradients, changed, found, pool, attrs)
+    return _dataset(task, scenes, found, slopes, {"skin": _skin(task, scenes, skin), **attrs})
+
+
+def _processors() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _figures(
+    task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExecutor
+) -> tuple[Answers, dict[str, Any]]:  # fmt: skip
+    """The outputs of all scenes, and attributes that say how they were found."""
+    n = next(iter(scenes.values())).size
+    form = lockstep_form(task.circuit, scenes)
+    recorded = isinstance(form, LockstepForm) and form.recording is not None
+    width = 0
+    if task.traced or (recorded and task.t_stop is None):
+        # Refused for what has no period, such as a recording.
+        count = task.count(frequencies(task.circuit, scenes))
+        width = math.ceil(float(count.max()) * task.points - 1e-9) if task.traced else 0
+    require(n * width <= _MOST_VOLTAGES, "outputs", f"of {n * width:.3g} gap voltages", f"at most {_MOST_VOLTAGES:g}")
+    values = {name: np.empty((n, width)) if name == "u_gap" else np.full(n, np.nan) for name in task.outputs}
+    why, found = why_alone(form, task.outputs), Answers.empty(values, n)
+    reason = _find(Figures, task, scenes, why or form, found, pool)
+    where = task.device if not why and task.on_card(recorded) else "cpu"
+    alone = int(np.count_nonzero(found.status != LOCKSTEP))
+    return found, {"n_ordinary": alone, "ordinary": reason, "device": where}
+
+
+def _slopes(
+    task: Task, wanted: Gradients, scenes: Mapping[str, FloatArray], found: Answers, pool: ThreadPoolExecutor,
+    attrs: dict[str, Any],
+) -> Answers:  # fmt: skip
+    """Derivatives in all scenes that have outputs; attributes that say how they were found go to `attrs`."""
+    n, known = found.error.size, task.circuit.parameters
+    slopes = Answers.empty({name: np.full((n, len(wanted.paths)), np.nan) for name in wanted.outputs}, n)
+    failed = found.status >= REFUSED
+    slopes.status[failed], slopes.done[failed] = found.status[failed], True
+    every = {**scenes, **{path: np.full(n, known[path].value) for path in wanted.paths if path not in scenes}}
+    form = lockstep_form(task.circuit, every)
+    why = why_alone(form, wanted.outputs, task.rtol)
+    if not why and wanted.clock is not None and task.t_stop is not None:
+        why = f"{wanted.clock} changes the number of periods in t_stop"
+    attrs["ordinary_gradients"] = _find(Slopes, task, every, why or form, slopes, pool)
+    attrs["n_ordinary_gradients"] = int(np.count_nonzero(slopes.status != LOCKSTEP))
+    found.messages |= slopes.messages
+    return slopes
+
+
+def _find(
+    ladder: type[Ladder], task: Task, scenes: Mapping[str, FloatArray], form: LockstepForm | str, found: Answers,
+    pool: ThreadPoolExecutor,
+) -> str:  # fmt: skip
+    """Find what a ladder is for in all scenes that are not done; why some were not in lockstep ('' where all were)."""
+    n, reason = found.error.size, form if isinstance(form, str) else ladder.unmet
+    if isinstance(form, LockstepForm):
+        lower = {path.lower(): array for path, array in scenes.items()}
+        clock = (
+            np.full(n, form.frequency or math.nan) if form.recording is not None else frequencies(task.circuit, scenes)
+        )
+
+        def climb(job: tuple[int, IntArray]) -> None:
+            halves, members = job
+            some = {path: array[members] for path, array in lower.items()}
+            ladder(task, form, some, members, found).climb(halves)
+
+        # Jobs have no scene in common, so that threads write to different places.
+        list(pool.map(climb, _jobs(task, task.count(clock), ~found.done, form.recording is not None)))
+    rest = np.flatnonzero(~found.done)
+    if "u_gap" in found.values:
+        found.values["u_gap"][rest] = np.nan
+    if rest.size:
+        _find_alone(ladder, task, scenes, rest, found, pool)
+    return reason if rest.size else ""
+
+
+def _find_alone(
+    ladder: type[Ladder], task: Task, scenes: Mapping[str, FloatArray], rest: IntArray, found: Answers,
+    pool: ThreadPoolExecutor,
+) -> None:  # fmt: skip
+    """Find what a ladder is for in the scenes `rest`, each by itself."""
+    by_period = (task.periods is not None and not task.periodic) or task.traced
+    frequency = frequencies(task.circuit, scenes) if by_period else np.ones(found.error.size)
+    allowed, finest = ladder.limit * task.rtol, RTOL_RANGE[0]
+
+    def alone(i: int) -> tuple[dict[str, FloatArray], float, int, str]:
+        try:
+            circuit = task.circuit.varied({path: float(array[i]) for path, array in scenes.items()})
+            rtol = max(_OVER_PEAK * task.rtol, finest)
+            values, error = ladder.alone(task, circuit, float(frequency[i]), rtol)
+            if error > allowed and rtol > finest:
+                # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
+                closer = max(0.5 * rtol * allowed / error, finest)
+                values, error = ladder.alone(task, circuit, float(frequency[i]), closer)
+        except (InputError, SolveError) as failure:
+            return {}, math.nan, REFUSED if isinstance(failure, InputError) else FAILED, f"{ladder.named}{failure}"
+        return values, error, ONE_BY_ONE, ""
+
+    # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ran = list(pool.map(alone, rest.tolist()))
+    for i, (values, error, status, message) in zip(rest.tolist(), ran, strict=True):
+        found.error[i], found.status[i], found.done[i] = error, status, True
+        if message:
+            found.messages[i] = message
+        for name, value in values.items():
+            if value.ndim == 1 and found.values[name].ndim == 1:
+                # Several gaps have one column each.
+                found.values[name] = np.full((found.error.size, value.size), np.nan)
+            found.values[name][(i, slice(value.size)) if value.ndim == 1 else i] = value
+
+
+def _jobs(task: Task, count: FloatArray, chosen: BoolArray, recorded: bool) -> list[tuple[int, IntArray]]:
+    """Jobs of the `chosen` scenes whose runs last for whole numbers of half periods: that number, and the scenes.
+
+    `count` (n,) is the number of periods in every run. Under a recording (`recorded`) half a period is a sample.
+    """
+    halves = np.round(2.0 * count)
+    good = chosen & (halves >= 1.0) & (np.abs(2.0 * count - halves) <= _WHOLE * halves)
+    if any(name.endswith("_periodic") for name in task.outputs):
+        good &= halves >= 2.0
+    jobs = []
+    for size in np.unique(halves[good]).astype(int).tolist():
+        members = np.flatnonzero(good & (halves == size))
+        chunk = int(np.clip(members.size // _JOBS, *(_RECORDED if recorded else _CHUNKS)))
+        chunk = _TRACED if task.traced and not recorded else _ON_CARD if task.on_card(recorded) else chunk
+        jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
+    return jobs
+
+
+def _dataset(
+    task: Task, scenes: Mapping[str, FloatArray], found: Answers, slopes: Answers | None, attrs: dict[str, Any]
+) -> Dataset:
+    """The answers with their coordinates and units."""
+    from xarray import Dataset
+
+    known = task.circuit.parameters
+    meanings = {"flag_values": list(range(len(STATUS_NAMES))), "flag_meanings": " ".join(STATUS_NAMES)}
+    data: dict[str, Any] = {}
+    for name, values in found.values.items():
+        signal = next(s for s in SIGNALS_OF_BATCH if name == s or name.startswith(f"{s}_"))
+        unit = "deg" if name.endswith("phase_deg") else SIGNALS[signal][0]
+        dims = ("scene",) if values.ndim == 1 else ("scene", "turn" if name == "u_gap" else "gap")
+        data[name] = (dims, values, {"units": unit, "long_name": f"{SIGNALS[signal][1]}{name[len(signal) :]}"})
+    data["error"] = ("scene", found.error, {"units": "1", "long_name": "stated error, relative"})
+    data["status"] = ("scene", found.status, meanings)
+    coords: dict[str, Any] = {path: ("scene", array, {"units": known[path].unit}) for path, array in scenes.items()}
+    if "u_gap" in found.values:
+        turns = np.arange(found.values["u_gap"].shape[1]) / task.points
+        coords["turn"] = ("turn", turns, {"units": "1", "long_name": "time in periods of the source"})
+    if slopes is not None and task.gradients is not None:
+        for name, values in slopes.values.items():
+            unit, text = SIGNALS[name.removesuffix("_mean")][:2]
+            about = {"units": f"{unit} per parameter_unit", "long_name": f"derivative of {text}_mean by each parameter"}
+            data[f"d_{name}"] = (("scene", "parameter"), values, about)
+        told = "stated error of a derivative times its parameter, relative to the output"
+        data["gradient_error"] = ("scene", slopes.error, {"units": "1", "long_name": told})
+        data["gradient_status"] = ("scene", slopes.status, meanings)
+        paths = list(task.gradients.paths)
+        coords |= {"parameter": paths, "parameter_unit": ("parameter", [known[path].unit for path in paths])}
+    length = {"t_stop": task.t_stop} if task.t_stop is not None else {"periods": task.periods}
+    failures = [f"scene {i}: {found.messages[i]}" for i in sorted(found.messages)[:MESSAGES]]
+    attrs |= {"rtol": task.rtol, "periodic": int(task.periodic), **length, "failures": failures}
+    return Dataset(data, coords, attrs)
+
+
+def _skin(task: Task, scenes: Mapping[str, FloatArray], skin: str) -> str:
+    """Text about the frequency at which the skin's data are taken."""
+    skins = task.circuit.by_device("SKIN")
+    if skin == "follow" or not skins:
+        return "the skin's data follow the source's frequency" if skins else "there is no SKIN"
+    held = ", ".join(f"{e.name}.f" for e in skins)
+    varied = any(path.lower().endswith(".frequency") for path in scenes)
+    return f"the skin's data are those at its own {held}{', whatever the source frequency is' if varied else ''}"

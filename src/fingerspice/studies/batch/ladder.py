@@ -1,0 +1,258 @@
+"""Scenes of a batch in lockstep; the number of steps is doubled for the scenes whose error is too large."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.engine.lockcard import march_on_card
+from fingerspice.engine.lockmarch import march, new_stepping
+from fingerspice.engine.locksamples import N_PORTION, march_samples
+from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
+from fingerspice.engine.lockstep import START_TIMES, marks_of
+from fingerspice.studies.batch.form import FIGURES, LockstepForm, curves_of, peak_of, table_of
+from fingerspice.studies.batch.task import LOCKSTEP, Answers, Task
+
+# By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
+# and (of the highest) under several; and initial degree of the area's polynomial, of which each takes the compiler 8 s.
+_RUNGS = ((5e-4, 40, 32, 8), (5e-5, 64, 48, 8), (5e-6, 96, 96, 12), (5e-7, 144, 144, 12), (0.0, 144, 144, 24))
+HIGHEST_DEGREE, _MOST_STEPS = 24, 8192
+# Under a recording: initial number of steps a sample, and the largest.
+_PARTS = (2, 16)
+# Largest gap voltage that the area's polynomial covers, as a ratio to its estimate: the second one for scenes that the
+# first did not cover. It is the same for all numbers of steps, whose results are compared, because the linear part of
+# the equations has the area of its middle, so that the error of a step depends on it.
+_COVERED = 1.2, 1.8
+# Allowed defect of the periodic state relative to rtol, and that of a run from rest that ends when it has settled.
+_CLOSING, _SETTLED = 0.02, 0.05
+# Under sines and below this rtol, where the kinks are most of the error, no scene is accepted before the steps have
+# been doubled once, with a smaller factor by which that may reduce the estimate.
+_DOUBTFUL, _GAIN_IN_DOUBT = 5e-7, 12.0
+# Longest first step after a jump of a square, and longest step at all of a run whose source is not 0 V at its start, in
+# time constants of the fastest cell; and the voltage at the start that counts as 0 V, over all tones. Also from
+# there a leaking gap's voltage jumps, as it leads the source: below this rtol the first step is as short as a square's.
+_LONGEST_STEP, _FROM_ZERO, _LEADING = 1.0, 1e-12, 5e-6
+# Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
+# `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
+_PIECES = ((5e-5, 8), (5e-7, 12), (0.0, 24))
+_PIECE_START, _MOST_PIECES = 2, 20
+#: A scene is accepted if its estimate is at most this fraction of the error allowed.
+ENOUGH = 0.7
+
+
+class Level(NamedTuple):
+    """The steps of an integration."""
+
+    halves: int  # Length of the runs in half periods
+    pieces: int  # Of a half period, each twice as long as the one before; 0 for a source that is no square
+    covered: float  # As `_COVERED`
+    steps: int  # Of a period (sample)
+    degree: int  # Of the area's polynomial
+
+
+class Run(NamedTuple):
+    """Results of `march` with half the steps and with all steps, and the gap voltages of both; a column each."""
+
+    coarse: FloatArray
+    fine: FloatArray
+    trace_coarse: FloatArray
+    trace: FloatArray
+
+
+class Mesh(NamedTuple):
+    """What scenes need of their steps, each of shape (n,)."""
+
+    possible: BoolArray  # Whether there is contact, and lockstep has what is wanted
+    pieces: IntArray  # As in `Level`
+    slowest: FloatArray  # Smallest leakage rate of a cell, in periods over 2 pi
+    decays: FloatArray  # Half a period in time constants of the fastest cell
+    # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
+    least: FloatArray
+
+
+class Ladder(ABC):
+    """Scenes in lockstep: the steps are doubled until what is wanted of a scene has an error that is small enough.
+
+    A scene is integrated `copies` times; the table has the first copies of all scenes, then all second ones, and so on.
+    """
+
+    copies = 1
+    n_moment = 1
+    traced = False  # Whether gap voltages are wanted
+    limit = 1.0  # Error allowed to what is wanted, over rtol
+    stated = ENOUGH  # Estimate over the error that is stated
+    closer = 1.0  # Factor on the tolerance that ends the search for a periodic state
+    # As an estimate may be small by chance, doubling the steps may not reduce it by more than this factor.
+    most_gain: float
+    # By how much the degree of the area's polynomial grows from level to level, and the highest one.
+    more_degree, highest_degree = HIGHEST_DEGREE, HIGHEST_DEGREE
+    gives_up = True  # Whether scenes are given up for which more steps are no help
+    named: str  # What comes before the message of a scene that cannot be run
+    unmet: str  # Why scenes of a form that lockstep takes may have no result from it
+
+    def __init__(
+        self, task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], members: IntArray, found: Answers
+    ) -> None:
+        self.task, self.form = task, form
+        self.scenes = scenes  # Values by path in lower case, (copies n,)
+        self.members, self.found = members, found  # (n,): Places of the scenes among the answers
+        self.table = table_of(form, scenes)  # (n_row, copies n)
+        self.mesh = self._mesh()
+
+    @abstractmethod
+    def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
+        """Estimated errors of what is wanted of the scenes `pending`."""
+
+    @abstractmethod
+    def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
+        """Put what is wanted of the scenes that are `good` among `pending` into the answers."""
+
+    @staticmethod
+    @abstractmethod
+    def alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
+        """What is wanted of one scene from a run of its own, and its stated error; `frequency` (Hz) is of periods."""
+
+    def figure(self, name: str, moments: FloatArray, columns: IntArray) -> FloatArray:
+        """An output of some columns of the table, from their moments."""
+        others, gap = self.table[CELL_ROWS * self.form.cells :], self.form.gap
+        mu = self.scenes.get(f"{gap.name.lower()}.mu")
+        friction = np.full(columns.size, gap.values["mu"]) if mu is None else mu[columns]
+        of_moments = FIGURES[name.removesuffix("_periodic")][1]
+        return of_moments(moments, others[LOAD, columns], others[STRESS, columns], friction)
+
+    def columns(self, some: IntArray) -> IntArray:
+        """Places of all copies of some scenes in the table."""
+        return np.add.outer(np.arange(self.copies) * self.members.size, some).ravel()
+
+    def climb(self, halves: int) -> None:
+        """Find what is wanted in runs of so many half periods; scenes whose error stays too large stay not done."""
+        mesh = self.mesh
+        # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
+        order = np.argsort(mesh.slowest) if halves > 4 else np.arange(self.members.size)
+        for pieces in np.unique(mesh.pieces[mesh.possible]).tolist():
+            pending = order[(mesh.possible & (mesh.pieces == pieces))[order]]
+            for covered in _COVERED:
+                pending = self._climb(self._first(halves, pieces, covered), pending)
+
+    def _climb(self, level: Level, pending: IntArray) -> IntArray:
+        """Find what is wanted of scenes, and return those whose gap voltage the area's polynomial does not serve."""
+        form, found, rtol = self.form, self.found, self.task.rtol
+        most = _MOST_STEPS * max(form.multiples) if form.recording is None else _PARTS[1]
+        doubtful = rtol < _DOUBTFUL and not form.jumping and form.recording is None
+        gain = _GAIN_IN_DOUBT if doubtful else self.most_gain
+        before: Run | None = None
+        last, outside = np.full(pending.size, np.inf), [pending[:0]]
+        while pending.size and level.steps <= most:
+            run = self._run(level, self.columns(pending), before)
+            if run is None:
+                break
+            error, resolved = self.error(level, run, pending), self.mesh.least[pending] <= level.steps
+            error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
+            good = (error <= ENOUGH * self.limit * rtol) & resolved & (before is not None or not doubtful)
+            self.enter(level, run, pending, good)
+            at = self.members[pending[good]]
+            found.error[at], found.status[at], found.done[at] = error[good] / self.stated, LOCKSTEP, True
+            tail = run.fine[-1].reshape(self.copies, -1)
+            beyond, left = np.isinf(tail).any(axis=0), ~good
+            if self.gives_up:
+                # A scene whose estimate grows from twice the steps: the explicit steps may be unstable around that
+                # area. And where the area's polynomial of the highest degree is what limits the error.
+                beyond |= ~good & resolved & (error > last)
+                final = level.degree >= HIGHEST_DEGREE and before is not None
+                left &= (tail <= ENOUGH * rtol).all(axis=0) | (not final)
+            left &= ~beyond
+            outside.append(pending[beyond])
+            kept = np.tile(left, self.copies)
+            before = Run(run.fine[:, kept], run.fine[:, kept], run.trace[kept], run.trace[kept])
+            last, pending = error[left], pending[left]
+            degree = max(level.degree, min(level.degree + self.more_degree, self.highest_degree))
+            level = level._replace(steps=2 * level.steps, degree=degree)
+        return np.concatenate(outside)
+
+    def _first(self, halves: int, pieces: int, covered: float) -> Level:
+        """The level to begin with."""
+        rtol, highest = self.task.rtol, max(self.form.multiples)
+        _, one, several, degree = next(rung for rung in _RUNGS if rtol >= rung[0])
+        steps = one if highest == 1 else several * highest
+        if pieces > 1:
+            steps = 2 * pieces * next(s for least, s in _PIECES if rtol >= least)
+        if self.form.recording is not None:
+            steps = _PARTS[0]
+        if self.traced:
+            steps = self.task.points * -(-steps // self.task.points)
+        return Level(halves, pieces, covered, steps, degree)
+
+    def _mesh(self) -> Mesh:
+        """What the scenes of the table need of their steps."""
+        form, table = self.form, self.table
+        cells, others = form.cells, CELL_ROWS * form.cells
+        possible = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
+        pieces = np.zeros(table.shape[1], int)
+        # Leakage rate of every cell with its area at rest; the largest is an upper bound of the rates of the modes.
+        leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
+        rates = leaks / (table[:cells] * table[others + OMEGA])
+        decays = np.max(rates, axis=0) * np.pi
+        first: FloatArray | float = 0.0
+        if form.jumping:
+            # Gap voltages at equal distances need a single piece.
+            pieces = np.ceil(np.log2(1.0 + _PIECE_START * decays)).clip(1, 1 if self.traced else _MOST_PIECES)
+            pieces = pieces.astype(int)
+            first = pieces / (2.0**pieces - 1.0)
+        elif form.recording is not None and not self.task.periodic:
+            first = 0.5 * (form.recording.between(0, 1)[0] != 0.0)
+        elif not self.task.periodic:
+            sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
+            from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
+            first = np.where(from_zero, START_TIMES[1] if self.task.rtol < _LEADING else 0.0, 1.0)
+        return Mesh(possible, pieces, rates.min(axis=0), decays, 2.0 * first * decays / _LONGEST_STEP)
+
+    def _run(self, level: Level, columns: IntArray, before: Run | None) -> Run | None:
+        """Integrate columns of the table, for half the steps, too, where `before` has no results; None: no curve."""
+        task, form, halves, steps = self.task, self.form, level.halves, level.steps
+        curves = curves_of(form.gap.values["m_exp"], form.gap.values["n_exp"], level.degree)
+        if curves is None:
+            return None
+        sizes = steps // 2 if before is None else 0, steps
+        waves = _waves(sizes[0], form), _waves(sizes[1], form)
+        widths = [halves * n // 2 if self.traced else 0 for n in sizes]
+        traces = np.empty((columns.size, widths[0])), np.empty((columns.size, widths[1]))
+        lengths = form.cells - 1, waves[1].shape[1], form.places[1].size, level.degree + 1, self.n_moment
+        marks, rows = marks_of(*lengths), self.table.shape[0]
+        if form.recording is not None:
+            out = np.empty((2, (1 + N_PORTION) * self.n_moment + 3, columns.size))
+            values = form.recording.between(0, halves + 1) / peak_of(form.recording)
+            how_sampled = sizes, level.covered
+            march_samples(
+                self.table, columns, form.places, curves, values, how_sampled, new_block(rows, marks), out, marks
+            )
+        else:
+            source = np.array(form.multiples, float), waves
+            tol = (_CLOSING if task.periodic else _SETTLED) * (task.rtol * self.closer)
+            how = halves, steps // 2, level.pieces, task.periodic, tol, level.covered
+            if task.on_card(recorded=False):
+                most = _MOST_PIECES if form.jumping else 0
+                out = march_on_card(self.table, columns, form.places, curves, source, how, most, lengths)
+            else:
+                out = np.empty((2, 2 * self.n_moment + 3, columns.size))
+                block, stepping = new_block(rows, marks), new_stepping(level.pieces, marks)
+                march(self.table, columns, form.places, curves, source, how, block, stepping, out, traces, marks)
+        if before is None:
+            return Run(out[0], out[1], traces[0], traces[1])
+        return Run(before.fine, out[1], before.trace, traces[1])
+
+
+def _waves(n: int, form: LockstepForm) -> FloatArray:
+    """Sine and cosine of every tone at the times that `engine.lockstep.run` needs; a square's value in both halves."""
+    if form.recording is not None:
+        return np.empty((0, 1))
+    if n == 0 or form.jumping:
+        return np.array([[1.0], [-1.0]])[: 2 * n]
+    # The phase in turns is reduced before it is multiplied by 2 pi, so that high tones keep their accuracy.
+    times = np.concatenate([np.arange(n), START_TIMES])
+    turns = np.outer(times, form.multiples) % n * (2.0 * np.pi / n)
+    return np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(times.size, -1)
