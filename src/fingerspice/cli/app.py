@@ -168,8 +168,8 @@ def _name_files(
 
     def symbols(file: Path) -> Path:
         # An SVG file knows no names of our own, and keeps all of them as one text.
-        written: Path = results.circuit.draw().write(file, {"Description": json.dumps(results.about)})
-        return written
+        results.circuit.draw().write(file, {"Description": json.dumps(results.about)})
+        return file
 
     if csv:
         results.will_write(".csv", lambda file: solution().to_csv(file))

@@ -172,8 +172,9 @@ def check_store(path: Path) -> dict[str, int]:
 
 def _chunk_size(array: Mapping[str, Any]) -> int:
     """Bytes of a chunk, from the description of its array."""
+    size: int = np.dtype(array["data_type"]).itemsize
     shape: list[int] = array["chunk_grid"]["configuration"]["chunk_shape"]
-    return int(math.prod(shape) * np.dtype(array["data_type"]).itemsize)
+    return size * math.prod(shape)
 
 
 def _fault(file: Path, size: int) -> str | None:
