@@ -27,12 +27,10 @@ class Table:
     def text(self) -> str:
         """The table as text: words aligned to the left, figures to the right."""
         table = [(printable(r[0], LONGEST_LABEL), *r[1:]) for r in (self.head, *self.rows)]
-        widths = [max(len(r[i]) for r in table) for i in range(len(self.head))]
-        lines = []
-        for r in table:
-            pairs = enumerate(zip(r, widths, strict=True))
-            cells = [c.ljust(w) if place < self.left else c.rjust(w) for place, (c, w) in pairs]
-            lines.append("  ".join(cells).rstrip())
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        sides = ["<"] * self.left + [">"] * (len(widths) - self.left)
+        cells = [[f"{c:{side}{w}}" for c, side, w in zip(r, sides, widths, strict=True)] for r in table]
+        lines = ["  ".join(row).rstrip() for row in cells]
         lines.insert(1, "-" * max(map(len, lines)))
         return "\n".join(lines)
 
@@ -51,12 +49,9 @@ class Table:
 
 
 class Page(str):
-    """A report: a text, which has the same report as HTML in `html`.
+    """A report of blocks from top to bottom: a text, which has the same report as HTML in `html`.
 
-    Parameters
-    ----------
-    blocks : sequence of str or Table
-        From top to bottom; empty lines around a table have to be given.
+    Empty lines around a table have to be given.
     """
 
     __slots__ = ("blocks", "html")

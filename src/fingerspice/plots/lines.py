@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -61,8 +60,7 @@ class Drawn(NamedTuple):
     label: str
 
 
-@dataclass(frozen=True)
-class Trace:
+class Trace(NamedTuple):
     """One line of a panel: signal `name` of a run with its values `x`, its label, and matplotlib's line style."""
 
     solution: Solution

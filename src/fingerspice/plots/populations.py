@@ -14,18 +14,18 @@ from fingerspice.plots.picture import Picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from xarray import Dataset
+    from xarray import DataArray, Dataset
 
 # Ratio of the largest to the smallest abscissa from which on the axis is logarithmic.
 _WIDE = 20.0
 
 
 def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> Picture:
-    """An output of `sweep` along its grid, with the band from 5 to 95 %, or its histogram.
+    """An output of `sweep` along its grid of one dimension, with the band from 5 to 95 %, or its histogram.
 
-    More than one dimension beside ``scene`` is refused. With `indices` of `sobol`, for the same parameters, each
-    parameter has a panel with the band and three curves, where it takes low, middle and high values and the others stay
-    at their medians; the last panel has the total indices.
+    With the indices of `sobol`, for the same parameters, each parameter has a panel with the band and three curves,
+    where it takes low, middle and high values and the others stay at their medians; the last panel has the total
+    indices.
     """
     one = found[output]
     dims = [str(dim) for dim in one.dims if dim != "scene"]
@@ -35,22 +35,47 @@ def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> P
     factor, unit = drawing.engineering(drawing.peak_of(np.nan_to_num(values)), one.attrs.get("units", ""), 0.05)
     label = f"{output} [{unit}]" if unit else output
     if dims:
-        x, unit = found[dims[0]].values, found[dims[0]].attrs.get("units", "")
-        x_label = f"{dims[0]} [{unit}]" if unit else dims[0]
-        named = x if x.dtype.kind in "OUT" else None
-        x = np.asarray(x if named is None else np.arange(x.size), float)
-        figure = _along(x, x_label, factor * values, label, indices, factor, output)
-        for ax in figure.axes:
-            if named is not None:
-                _name_places(ax, [str(name) for name in named])
-                continue
-            if x.min() > 0.0 and x.max() > _WIDE * x.min():
-                ax.set_xscale("log")
-            ax.set_xlim(x.min(), x.max() if x.size > 1 else None)
+        figure = _along(found[dims[0]], factor * values, label, indices, factor, output)
     else:
         figure = _at_once(factor * np.ravel(values), label, indices, output)
     if "scene" in one.dims:
         drawing.caption(figure, f"{found.sizes['scene']:,} scenes, seed {found.attrs.get('seed', 0)}")
+    return figure
+
+
+def _along(
+    grid: DataArray, values: FloatArray, label: str, indices: Dataset | None, factor: float, output: str
+) -> Picture:
+    """Band and median along the grid: one panel, or one for each parameter and one for its shares."""
+    unit, named = grid.attrs.get("units", ""), grid.dtype.kind in "OUT"
+    x = np.asarray(np.arange(grid.size) if named else grid.values, float)
+    names = [] if indices is None else [str(name) for name in indices.parameter.values]
+    rows, columns = ((len(names) + 2) // 2, 2) if names else (1, 1)
+    figure, axes = drawing.new_figure(rows, columns, height=2.4 * rows, sharex=True)
+    bands = max(1, len(names))
+    for j, ax in enumerate(axes[:bands]):
+        _band(ax, x, values, indices is None)
+        if indices is not None:
+            _alone(ax, x, factor * indices[f"{output}_alone"].values[:, j], indices, j)
+        ax.set_ylim(bottom=min(0.0, float(np.nanmin(values))))
+        drawing.dress(ax, label if j % columns == 0 else "")
+    told = axes[0].get_legend_handles_labels()
+    if len(told[0]) > 1:
+        figure.legend(*told, loc="outside upper center", ncols=len(told[0]), fontsize=drawing.FONT, frameon=False)
+    if indices is not None:
+        _shares(axes[bands], indices, output, x)
+    for ax in axes[bands + 1 :]:
+        ax.remove()
+    for ax in axes[: bands + 1][-columns:]:
+        drawing.dress(ax, xlabel=f"{grid.name} [{unit}]" if unit else str(grid.name))
+        ax.tick_params(labelbottom=True)
+    for ax in figure.axes:
+        if named:
+            _name_places(ax, [str(name) for name in grid.values])
+            continue
+        if x.min() > 0.0 and x.max() > _WIDE * x.min():
+            ax.set_xscale("log")
+        ax.set_xlim(x.min(), x.max() if x.size > 1 else None)
     return figure
 
 
@@ -61,33 +86,6 @@ def _name_places(ax: Axes, names: list[str]) -> None:
     for line in ax.lines:
         line.set_marker("o")
         line.set_markersize(4.0)
-
-
-def _along(
-    x: FloatArray, x_label: str, values: FloatArray, label: str, indices: Dataset | None, factor: float, output: str
-) -> Picture:
-    """Band and median along the grid: one panel, or one for each parameter and one for its shares."""
-    names = [] if indices is None else [str(name) for name in indices.parameter.values]
-    rows, columns = ((len(names) + 2) // 2, 2) if names else (1, 1)
-    figure, axes = drawing.new_figure(rows, columns, height=2.4 * rows, sharex=True)
-    for j, ax in enumerate(axes[: max(1, len(names))]):
-        _band(ax, x, values, indices is None)
-        if indices is not None:
-            _alone(ax, x, factor * indices[f"{output}_alone"].values[:, j], indices, j)
-        ax.set_ylim(bottom=min(0.0, float(np.nanmin(values))))
-        drawing.dress(ax, label if j % columns == 0 else "", "")
-    told = axes[0].get_legend_handles_labels()
-    if len(told[0]) > 1:
-        figure.legend(*told, loc="outside upper center", ncols=len(told[0]), fontsize=drawing.FONT, frameon=False)
-    if indices is not None:
-        _shares(axes[len(names)], indices, output, x)
-        drawing.dress(axes[len(names)], "share of variance", "")
-    for ax in axes[max(1, len(names) + 1) :]:
-        ax.remove()
-    for ax in axes[: max(1, len(names) + 1)][-columns:]:
-        drawing.dress(ax, ax.get_ylabel(), x_label)
-        ax.tick_params(labelbottom=True)
-    return figure
 
 
 def _alone(ax: Axes, x: FloatArray, values: FloatArray, indices: Dataset, j: int) -> None:
@@ -111,7 +109,6 @@ def _at_once(values: FloatArray, label: str, indices: Dataset | None, output: st
     drawing.dress(axes[0], "scenes", label)
     if indices is not None:
         _shares(axes[1], indices, output, None)
-        drawing.dress(axes[1], "share of variance", "")
     return figure
 
 
@@ -137,6 +134,7 @@ def _shares(ax: Axes, indices: Dataset, output: str, x: FloatArray | None) -> No
         else:
             off = [[max(total[j] - low[j], 0.0)], [max(high[j] - total[j], 0.0)]]
             ax.bar([name], [total[j]], yerr=off, color=color, capsize=2.0)
+    drawing.dress(ax, "share of variance")
     ax.set_ylim(0.0, max(1.05, float(np.max(high))))
     if x is not None:
         drawing.legend_within(ax, 44)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
@@ -62,7 +61,7 @@ def plot_solution(
         for trace in traces:
             lines.draw_line(left[row], trace, factor, start, stop, runs, envelope=marks if dense else None)
             if zoomed is not None:
-                lines.draw_line(right[row], replace(trace, label="_"), factor, *zoomed, runs)
+                lines.draw_line(right[row], trace._replace(label="_"), factor, *zoomed, runs)
         if keys == ["f_el"] and len(traces) == 1:
             lines.draw_mean(left[row], traces[0], factor, unit, told=not beside)
             if beside:

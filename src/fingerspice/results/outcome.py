@@ -176,24 +176,13 @@ class ErrorEstimate:
 
 @dataclass(frozen=True, repr=False)
 class State:
-    """Where a run stopped; another run may start from it.
+    """Where a run stopped; another run may start from it."""
 
-    Attributes
-    ----------
-    t : float
-        s.
-    y : ndarray, shape (n,)
-        Live voltages (V), areas with a time constant (relative to their values at 0 V), and charges delivered (C).
-    s_before : ndarray, shape (n_source,)
-        Source values just before `t`, V or A.
-    sign : ndarray, shape (n_area,)
-        Branch of each area: the sign of its gap's voltage, or 0 if the branch is to be chosen from the voltage.
-    charge_law : str
-    """
-
-    t: float
+    t: float  # s
+    # (n,): Live voltages (V), areas with a time constant (relative to their values at 0 V), charges delivered (C)
     y: FloatArray
-    s_before: FloatArray
+    s_before: FloatArray  # (n_source,): Source values just before `t`, V or A
+    # (n_area,): Branch of each area: the sign of its gap's voltage, or 0 if it is to be chosen from the voltage
     sign: FloatArray
     charge_law: str
 

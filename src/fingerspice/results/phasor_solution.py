@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
-from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import heading
-from fingerspice.results.report import Column, table_of
+from fingerspice.results.report import Column, table_of, write_columns
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -135,6 +134,4 @@ def phasor_tables(results: Sequence[PhasorSolution], circuit: Circuit) -> str:
 
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
     """Write sweeps as CSV, one after the other where there are several amplitudes."""
-    header = [f"{column.key} [{column.unit}]" for column in results[0]._columns()]
-    rows = (row for r in results for row in zip(*(c.values.tolist() for c in r._columns()), strict=True))
-    return write_csv(path, header, rows)
+    return write_columns(path, [r._columns() for r in results])

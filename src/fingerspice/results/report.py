@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines
@@ -31,6 +33,13 @@ def table_of(columns: Sequence[Column], rows: slice) -> Table:
     shown = [column for column in columns if column.head]
     cells = [[f"{c.factor * x:{c.form}}" for x in c.values[rows].tolist()] for c in shown]
     return Table(tuple(column.head for column in shown), [*zip(*cells, strict=True)])
+
+
+def write_columns(path: Path, tables: Sequence[Sequence[Column]]) -> Path:
+    """Write tables of the same columns as CSV, one after the other; errors as of `write_csv`."""
+    header = [f"{column.key} [{column.unit}]" for column in tables[0]]
+    rows = (row for columns in tables for row in zip(*(c.values.tolist() for c in columns), strict=True))
+    return write_csv(path, header, rows)
 
 
 #: Signals that have rows, in their order.

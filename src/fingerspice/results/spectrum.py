@@ -199,7 +199,7 @@ def _density(
     """Welch's density of the outputs from `since` (s) on."""
     from scipy.signal import get_window, welch
 
-    t, x = even_outputs(solution, name, since)
+    t, x = _even_outputs(solution, name, since)
     rate = (t.size - 1) / (t[-1] - t[0])
     size = 2 * t.size // (_SEGMENTS + 1) if resolution is None else round(rate / resolution)
     allowed = f"{rate / t.size:.4g} Hz, one over the length of the run, to {rate / 8:.4g} Hz"
@@ -219,14 +219,8 @@ def _density(
     )  # fmt: skip
 
 
-def even_outputs(solution: Solution, name: str, since: float | None) -> tuple[FloatArray, FloatArray]:
-    """Times (s) and values of a signal's outputs, without the additional outputs at jumps of the source.
-
-    Raises
-    ------
-    InputError
-        Where these outputs are not evenly spaced, or too few.
-    """
+def _even_outputs(solution: Solution, name: str, since: float | None) -> tuple[FloatArray, FloatArray]:
+    """Times (s) and values of a signal's outputs, evenly spaced, without the additional ones at jumps of the source."""
     t, x = solution.t, solution.all_signals.one(name)
     require(since is None or (t.size > 0 and since < t[-1]), "since", since, "a time before the end of the run, s")
     # Of the two rows of a jump keep the right-hand one if the jump is at an even output time, else none.
@@ -252,13 +246,7 @@ def even_outputs(solution: Solution, name: str, since: float | None) -> tuple[Fl
 def equivalent_segments(window: FloatArray, step: int, count: int) -> float:
     """Number of independent segments whose mean density has the same variance as `count` overlapping ones (Welch 1967).
 
-    Parameters
-    ----------
-    window : ndarray, shape (size,)
-    step : int
-        Samples from the start of a segment to the start of the next.
-    count : int
-        Number of overlapping segments.
+    They have a window (size,) and begin `step` samples apart.
     """
     power = float(window @ window)
     shifts = range(1, min(count, -(-window.size // step)))

@@ -232,10 +232,7 @@ class ClosedForm:
     # Function of times (s, ascending), and of whether the left-hand limit is wanted at each, that returns a record
     look: Callable[[FloatArray, BoolArray], Record]
     waveform: Waveform  # Waveform with the breakpoints of all sources
-    # t_start, first, stop: Start of the run, and the interval for figures, s
-    t_start: float
-    first: float
-    stop: float
+    t_start: float  # Start of the run, s
     # Error of the records of `look`, relative to the peaks; the panels' polynomials need not be more accurate
     error: float = 0.0
     rounding: float = 0.0  # Round-off of a voltage, V, below which the polynomials need not be accurate

@@ -61,31 +61,24 @@ class _Writer:
             warnings.simplefilter("ignore")
             table = source_table(wave, 0.0, stop, min(1e-3, max(0.05 * self.rtol, 1e-14)), self.step)
         breaks = wave.breakpoints(0.0, stop)
-        rows = {"edges": self.plain(table.edges), "series": self.plain(table.series)}
-        name = getattr(getattr(wave, "function", None), "__name__", "")
         return {
-            "kind": "Function",
-            "name": name,
-            "repeat": wave.period,
-            "breaks": breaks[breaks < stop].tolist(),
-            **rows,
-        }
+            "kind": "Function", "name": getattr(getattr(wave, "function", None), "__name__", ""), "repeat": wave.period,
+            "breaks": breaks[breaks < stop].tolist(), "edges": self.plain(table.edges),
+            "series": self.plain(table.series),
+        }  # fmt: skip
 
 
 def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str, Any] | str, list[FloatArray]]:
     """A circuit as plain data and arrays, or the reason why it is not kept.
 
-    Parameters
-    ----------
-    circuit : Circuit
-    stop, rtol : float
-        End (s) and tolerance of its run: a function is kept as Chebyshev series up to there.
+    A function is kept as Chebyshev series up to the end of the run, `stop` (s), as exact as its tolerance asks.
     """
     writer = _Writer(stop, rtol, circuit.tran.step if circuit.tran else 1e-3 * stop)
-    given = [{**vars(e), "waveform": writer.plain(e.waveform), "values": dict(e.values)} for e in circuit.elements]
-    elements = [{f.name: one[f.name] for f in fields(Element) if f.name != "where"} for one in given]
-    for one in elements:
-        one["ac"] = one["ac"] and vars(one["ac"])
+    elements = [
+        {f.name: getattr(e, f.name) for f in fields(Element) if f.name != "where"}
+        | {"waveform": writer.plain(e.waveform), "values": dict(e.values), "ac": e.ac and vars(e.ac)}
+        for e in circuit.elements
+    ]
     kept = {name: getattr(circuit, name) for name in _PLAIN}
     kept |= {"tran": circuit.tran and vars(circuit.tran), "ac": circuit.ac and vars(circuit.ac), "elements": elements}
     kept["sets"] = {name: {path: writer.plain(x) for path, x in one.items()} for name, one in circuit.sets.items()}
@@ -96,13 +89,7 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
 
 
 def made_again(kept: Mapping[str, Any], arrays: list[FloatArray]) -> Circuit:
-    """The circuit of `stored_circuit`.
-
-    Raises
-    ------
-    InputError, ValueError, TypeError, KeyError, IndexError or AttributeError
-        If the data are not of a circuit.
-    """
+    """The circuit of `stored_circuit`; data that are not of a circuit raise an error of any of Python's kinds."""
     elements = tuple(
         Element(**{
             **one, "nodes": tuple(map(str, one["nodes"])), "node_names": tuple(map(str, one["node_names"])),

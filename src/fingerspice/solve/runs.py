@@ -125,7 +125,7 @@ def excess_of(gaps: FloatArray, rounding: float) -> float:
 
 def closed_form(problem: Problem, look: Callable[[FloatArray, BoolArray], Record], error: float = 0.0) -> ClosedForm:
     """The run between its outputs, by a method that computes it at any times; see `ClosedForm`."""
-    return ClosedForm(look, problem.waveform, problem.t_start, problem.first, problem.t_stop, error, problem.rounding)
+    return ClosedForm(look, problem.waveform, problem.t_start, error, problem.rounding)
 
 
 class Integration(ABC):
