@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import fingerspice as fs
-from fingerspice.engine import loop
+from fingerspice.engine.collocation import loop
 from timing import median_seconds
 
 HERE = Path(__file__).resolve().parent

@@ -12,8 +12,8 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.statespace import build_stack
-from fingerspice.engine.lockstep import marks_of
-from fingerspice.engine.lockweights import moment_integrals, weigh
+from fingerspice.engine.lockstep.step import marks_of
+from fingerspice.engine.lockstep.weights import moment_integrals, weigh
 from fingerspice.studies.batch.form import LockstepForm, lockstep_form, table_of
 from scenes import table1
 

@@ -11,7 +11,7 @@ import pytest
 
 import fingerspice as fs
 from deck_edits import edited
-from fingerspice.engine import loopstate
+from fingerspice.engine.collocation import loopstate
 from fingerspice.solve.problem import MOST_BYTES
 from fingerspice.waveforms import bounds
 from processes import ended, start

@@ -10,7 +10,7 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 import stress
-from fingerspice.engine.model import branch_area, gap_voltage, ramp, turns_at_zero
+from fingerspice.engine.one_area.model import branch_area, gap_voltage, ramp, turns_at_zero
 from fingerspice.solve.problem import prepare
 
 

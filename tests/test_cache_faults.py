@@ -138,11 +138,11 @@ sweep, compiling = Bar("sweeping"), Compiling()
 sweep.show(0.25)
 for kind in ("Stack", "Mesh"):
     with compiling.around():
-        compiling.begins("engine.loop.march_on", kind, True)
+        compiling.begins("engine.collocation.loop.march_on", kind, True)
         time.sleep(1.3)
     sweep.show(0.5)
 with compiling.around():
-    compiling.begins("engine.loop.march_on", "Mesh", True)
+    compiling.begins("engine.collocation.loop.march_on", "Mesh", True)
 sweep.stop()
 """
 LINES = [
@@ -169,7 +169,7 @@ def test_what_is_said_to_compile_for_long_is_a_function_of_that_kind(name: str, 
     compiled = getattr(importlib.import_module(f"fingerspice.{module}"), function)
     assert compiled.targetoptions["nogil"]
     first = next(iter(inspect.signature(compiled.py_func).parameters.values()))
-    unions = {("engine.loop.march_on", "Circuit"), ("engine.lanes.begin", "Marks")}
+    unions = {("engine.collocation.loop.march_on", "Circuit"), ("engine.lanes.loops.begin", "Marks")}
     assert kind in ("", first.annotation) or (name, first.annotation) in unions
 
 

@@ -11,10 +11,13 @@ import pytest
 from numpy.polynomial import Polynomial
 from scipy.optimize import brentq
 
-from fingerspice.engine import charge, netcharge, netform, readout, rows
-from fingerspice.engine.model import Model
-from fingerspice.engine.netform import Form
-from fingerspice.engine.readout import N_PLACES
+from fingerspice.engine.collocation import readout
+from fingerspice.engine.collocation.readout import N_PLACES
+from fingerspice.engine.many_areas import charge as many_charge
+from fingerspice.engine.many_areas import form as blocks
+from fingerspice.engine.many_areas.form import Form
+from fingerspice.engine.one_area import charge, rows
+from fingerspice.engine.one_area.model import Model
 from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
 
 PLACES = np.array([0, FIRST, FIRST + 1, FIRST + 2, END])
@@ -300,14 +303,14 @@ def engine_charge(
     """What stayed (2,) and `control` after the engine's account of a step."""
     _, u, area = step.at(POINTS, 0.0)
     areas = np.zeros((8, 1, ROWS))
-    areas[netform.AREA], areas[netform.MORE] = area, area - A0
-    areas[netform.SLOPE] = 0.0 if step.slow else slope_at(u[0])
+    areas[blocks.AREA], areas[blocks.MORE] = area, area - A0
+    areas[blocks.SLOPE] = 0.0 if step.slow else slope_at(u[0])
     z = np.array([[step.charge(x, 0.0) for x in POINTS]])
     control, collected = np.zeros(1, readout.CONTROL)[0], np.array([[before], [0.0]])
     form = form_of(step)
-    work = netform.new_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
+    work = blocks.new_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
     work.places[:], work.off[:, : len(places)] = places, missed
-    netcharge.charge_error(
+    many_charge.charge_error(
         form, work, H, step.lost[None, :], step.g, theta, np.ascontiguousarray(u), areas, z, collected, control
     )
     return collected[:, 0], control

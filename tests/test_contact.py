@@ -21,8 +21,8 @@ from analytic import (
     work_factor,
 )
 from fingerspice.circuit.statespace import build_stack
-from fingerspice.engine.rows import polynomial_rows
-from fingerspice.engine.system import area_error, area_missed, area_polynomial
+from fingerspice.engine.one_area.rows import polynomial_rows
+from fingerspice.engine.one_area.system import area_error, area_missed, area_polynomial
 from fingerspice.numerics.lobatto import ROWS
 from fingerspice.physics.contact import Contact, fixed_area_curve, inverse_area, ridge_area, universal_curve
 from fingerspice.physics.ladder import SKIN_LADDER

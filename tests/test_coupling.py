@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from fingerspice.engine.coupling import STIFF, Coupling, fill_coupling, new_coupling
-from fingerspice.engine.currents import Moving, answer_alone, answer_mobile, answer_together, cell_currents
+from fingerspice.engine.many_areas.coupling import STIFF, Coupling, fill_coupling, new_coupling
+from fingerspice.engine.many_areas.currents import Moving, answer_alone, answer_mobile, answer_together, cell_currents
 from fingerspice.numerics.lobatto import ROWS
 from fingerspice.numerics.small import diagonalise
 

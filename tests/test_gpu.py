@@ -14,7 +14,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.base import card
-from fingerspice.engine.lockcard import thread_kernel
+from fingerspice.engine.lockstep.card import thread_kernel
 
 ROOT = Path(__file__).resolve().parents[1]
 

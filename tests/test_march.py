@@ -15,10 +15,10 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 from fingerspice.numerics.lobatto import NODES
+from fingerspice.solve.one_area import Track, prepare_system
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.runs import integrate
 from fingerspice.solve.sources import Tables
-from fingerspice.solve.track import Track, prepare_system
 from scenes import table1
 
 every_law = pytest.mark.parametrize("law", ["local", "mobile"])

@@ -11,7 +11,7 @@ import pytest
 
 import fingerspice as fs
 import recording_errors
-from fingerspice.solve import pieces
+from fingerspice.solve.recordings import pieces
 from network_reference import Floating
 from scenes import COAT, GAP, assignments, deck
 

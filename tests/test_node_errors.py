@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.engine import netassess, rows, stackend
-from fingerspice.engine.readout import N_PLACES
+from fingerspice.engine.collocation.readout import N_PLACES
+from fingerspice.engine.many_areas import error as many_error
+from fingerspice.engine.one_area import end as one_end
+from fingerspice.engine.one_area import rows
 from fingerspice.numerics.lobatto import END, FIRST, MISS, POINTS, ROWS
 
 PLACES = [0, FIRST, FIRST + 1, FIRST + 2, END]
@@ -36,12 +38,12 @@ def test_a_network_s_nodes_are_off_by_what_the_modes_and_the_sources_are(seed: i
     off[:, 0] += node @ missed[4, :n]
     off[:, 1:4] += node_s @ missed[:3, m:].T
     peaks = np.array([0.0, 0.0, 0.1, 0.0])
-    netassess.account_nodes(node, node_s, places, missed, peaks)
-    assert peaks[netassess.ERROR_U] == pytest.approx(np.abs(off).max(), rel=1e-12, abs=0.0)
+    many_error.account_nodes(node, node_s, places, missed, peaks)
+    assert peaks[many_error.ERROR_U] == pytest.approx(np.abs(off).max(), rel=1e-12, abs=0.0)
     # It is the largest of the run.
-    before = peaks[netassess.ERROR_U]
-    netassess.account_nodes(node, node_s, 0.5 * places, 0.5 * missed, peaks)
-    assert peaks[netassess.ERROR_U] == before
+    before = peaks[many_error.ERROR_U]
+    many_error.account_nodes(node, node_s, 0.5 * places, 0.5 * missed, peaks)
+    assert peaks[many_error.ERROR_U] == before
 
 
 @pytest.mark.parametrize("mobile", [False, True], ids=["local", "mobile"])
@@ -67,11 +69,11 @@ def test_a_stack_s_nodes_are_off_by_what_modes_area_and_source_are(mobile: bool)
     r[rows.SOURCE], r[rows.U], r[rows.Q], r[rows.DQ], r[rows.X_GAP] = source, u, q, slope, gap @ w
     at = np.array(PLACES)
     want = (voltages(source[at], w[:, at] + places)[2] - voltages(source[at], w[:, at] - places)[2]) / 2.0
-    found = stackend.node_error(mobile, area0, node, k_node, gap, w, r, places)
+    found = one_end.node_error(mobile, area0, node, k_node, gap, w, r, places)
     assert found == pytest.approx(np.abs(want).max(), rel=1e-5, abs=0.0)
     # What a polynomial through the source's values misses is an error of the nodes too.
     r[rows.SOURCE, FIRST:] += MISS
-    alone = stackend.node_error(False, area0, node, k_node, gap, w, r, 0.0 * places)
+    alone = one_end.node_error(False, area0, node, k_node, gap, w, r, 0.0 * places)
     assert alone == pytest.approx(np.abs(k_node).max() * np.abs(MISS).max(), rel=1e-9, abs=0.0)
 
 

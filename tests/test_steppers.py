@@ -10,8 +10,8 @@ import pytest
 
 import fingerspice as fs
 from analytic import sine_segments, transient
+from fingerspice.engine.implicit.step import dense_polynomial, dense_state, guess, linearise, step
 from fingerspice.engine.network import rates
-from fingerspice.engine.radau import dense_polynomial, dense_state, guess, linearise, step
 from fingerspice.numerics.lobatto import Tableau, radau
 from fingerspice.solve.nodal import STAGES, STAGES_BESIDE, Collocation, radau_scheme
 from fingerspice.solve.problem import prepare

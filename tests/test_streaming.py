@@ -22,7 +22,8 @@ import fingerspice as fs
 import recording_errors
 from commands import Command, tree
 from fingerspice.cli.store import Store
-from fingerspice.solve import pieces, recordings
+from fingerspice.solve.recordings import pieces
+from fingerspice.solve.recordings import run as recordings
 from fingerspice.waveforms import samples
 from processes import ended, no_room, start
 from scenes import table1_deck

@@ -9,9 +9,9 @@ import pytest
 from scipy import integrate
 
 import fingerspice as fs
-from fingerspice.engine.lanerows import INNER, QUICK, Lanes, weighed
-from fingerspice.engine.laneweights import weigh
-from fingerspice.solve.pieces import LEAST_POINTS
+from fingerspice.engine.lanes.rows import INNER, QUICK, Lanes, weighed
+from fingerspice.engine.lanes.weights import weigh
+from fingerspice.solve.recordings.pieces import LEAST_POINTS
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 DISPERSIVE = (CIRCUITS / "fingerpad.cir").read_text().replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE  d=350u")

@@ -13,13 +13,13 @@ _LOG = logging.getLogger("fingerspice")
 #: What takes the compiler more than ten seconds, by function and class of its first argument: what it is, and the time
 #: on one core of an x86-64 server of 2026.
 LONG = {
-    ("engine.loop.march_on", "Stack"): "the steps of a series stack, about 30 s",
-    ("engine.loop.march_on", "Mesh"): "the steps of a network, about 60 s",
-    ("engine.lanes.begin", "StackMarks"): "the steps of a recording, about 20 s",
-    ("engine.lanes.begin", "MobileMarks"): "the steps of a recording, about 20 s",
-    ("engine.lanes.begin", "NetworkMarks"): "the steps of a recording in a network, about 30 s",
-    ("engine.collocation.advance", "Nodal"): "implicit steps, about 15 s",
-    ("engine.lockmarch.march", ""): "scenes in lockstep, about 20 s",
+    ("engine.collocation.loop.march_on", "OneArea"): "the steps of a series stack, about 30 s",
+    ("engine.collocation.loop.march_on", "ManyAreas"): "the steps of a network, about 60 s",
+    ("engine.lanes.loops.begin", "StackMarks"): "the steps of a recording, about 20 s",
+    ("engine.lanes.loops.begin", "MobileMarks"): "the steps of a recording, about 20 s",
+    ("engine.lanes.loops.begin", "NetworkMarks"): "the steps of a recording in a network, about 30 s",
+    ("engine.implicit.run.advance", "Nodal"): "implicit steps, about 15 s",
+    ("engine.lockstep.march.march", ""): "scenes in lockstep, about 20 s",
 }
 _SHORT = "a small part, some seconds"
 _ONCE = "only once: later runs find it on the disk"

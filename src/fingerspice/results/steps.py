@@ -14,7 +14,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.engine.readout import RECORDED, Steps, new_steps
+from fingerspice.engine.collocation.readout import RECORDED, Steps, new_steps
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS, TO_SERIES
 from fingerspice.results.record import Record, bare_record
 from fingerspice.waveforms.sampling import same_time

@@ -1,8 +1,8 @@
 """Derivatives of a number that follows from a run by every sample of its source.
 
-The run is followed in lanes (`solve.laneblock`), by so many steps in each interval between samples. What an interval
-leads to is differentiated by what it starts from and by the source at its ends (`engine.lanes`); back from the end
-of the run, these derivatives are multiplied.
+The run is followed in lanes (`solve.recordings.block`), by so many steps in each interval between samples. What an
+interval leads to is differentiated by what it starts from and by the source at its ends (`engine.lanes.loops`); back
+from the end of the run, these derivatives are multiplied.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.engine.lanes import AREAS, GAP, MORE, SQUARES, slopes_of, sum_back
+from fingerspice.engine.lanes.loops import AREAS, GAP, MORE, SQUARES, slopes_of, sum_back
 from fingerspice.numerics.small import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status
 from fingerspice.results.sensitivity import MEANS, SIGNALS, SampleGradient
 from fingerspice.results.solution import Solution
-from fingerspice.solve.laneblock import Block
-from fingerspice.solve.laneform import PIECES, LaneForm
-from fingerspice.solve.lanes import LEAST_MARGIN
-from fingerspice.solve.netforms import recording_of
-from fingerspice.solve.pieces import driving
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings import ready
+from fingerspice.solve.recordings.block import Block
+from fingerspice.solve.recordings.form import PIECES, LaneForm
+from fingerspice.solve.recordings.march import LEAST_MARGIN
+from fingerspice.solve.recordings.networks import recording_of
+from fingerspice.solve.recordings.pieces import driving
+from fingerspice.solve.recordings.run import ready
 from fingerspice.solve.simulation import asked
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.recorded import as_samples

@@ -12,8 +12,8 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.network import Modes, Network
-from fingerspice.engine.model import follow, source_at
 from fingerspice.engine.network import at_sources
+from fingerspice.engine.one_area.model import follow, source_at
 from fingerspice.numerics import linear
 from fingerspice.numerics.moments import moments
 from fingerspice.results.outcome import State, Status

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.integrate import OdeSolution, solve_ivp
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.engine.network import Segment, source
+from fingerspice.engine.one_area.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.results.outcome import Failure, SolveError, Status, last_tried
 from fingerspice.solve.initial import StackState, from_stack, from_written, model_of, row_width, to_stack
 from fingerspice.solve.marching import solve as solve_marching
@@ -134,7 +134,7 @@ class _Path:
         return self.begin + float(self.solution(self.solution.t_max)[-2] * self.scale[-2])
 
     def rows(self, problem: Problem, t: FloatArray) -> FloatArray:
-        """Rows of `engine.model.write_row` at times (s) on the path."""
+        """Rows of `engine.one_area.model.write_row` at times (s) on the path."""
         low, high = np.zeros(t.size), np.full(t.size, self.solution.t_max)
         # Time rises monotonically in s, but dt/ds tends to 0 at the fold: bisection is safe there, Newton is not.
         for _ in range(64):

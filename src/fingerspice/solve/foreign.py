@@ -16,9 +16,9 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
-from fingerspice.engine import collocation
+from fingerspice.engine.implicit import run as implicit
+from fingerspice.engine.implicit.step import NFEV
 from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_signs, rates
-from fingerspice.engine.radau import NFEV
 from fingerspice.results.outcome import Status
 from fingerspice.results.record import Record
 from fingerspice.solve.nodal import STAGES, Collocation, radau_scheme, solve_coupled
@@ -130,7 +130,7 @@ class Foreign(Collocation):
         edges = np.unique(sources.edges)
         for stop in np.append(edges[(edges > self.t) & (edges < t_end)], t_end):
             after = values_at(sources, self.t)
-            jumps = np.abs(after - self.s_before) > collocation.ROUNDING * np.maximum(abs(after), abs(self.s_before))
+            jumps = np.abs(after - self.s_before) > implicit.ROUNDING * np.maximum(abs(after), abs(self.s_before))
             if np.any(jumps) and not self.jump(after):
                 return self.stuck()
             try:
@@ -150,7 +150,7 @@ class Foreign(Collocation):
         def rate(t: float, y: FloatArray) -> FloatArray:
             return np.asarray(_rate(net, room, sources, index, base, t, np.ascontiguousarray(y), self.sign))
 
-        done = int(self.counters[collocation.OUTPUT])
+        done = int(self.counters[implicit.OUTPUT])
         inside = (self.t_out < stop) | ((self.t_out == stop) & self.left)
         times = self.t_out[done : int(np.count_nonzero(inside))] - base
         every = np.unique(np.concatenate([[0.0], times, [stop - base]]))
@@ -159,14 +159,14 @@ class Foreign(Collocation):
             row[: state.size] = state
             if self.problem.charge:
                 row[state.size :] = rate(float(since), state)[-n_s:]
-        self.counters[collocation.OUTPUT] += len(times)
+        self.counters[implicit.OUTPUT] += len(times)
         self.counters[NFEV] += used
-        self.counters[collocation.ACCEPTED] += 1
+        self.counters[implicit.ACCEPTED] += 1
         self.y[:] = states[-1]
         # The last call leaves the branches as they are at the end.
         rate(stop - base, self.y)
         self.s_before[:] = room.s
-        self.control[collocation.BASE] = stop
+        self.control[implicit.BASE] = stop
 
 
 def solve_foreign(

@@ -2,7 +2,8 @@
 form that a state has in a stack's own equations.
 
 The live voltages along the loop are k U + v. The stack's own state x is v under `local`, and v A / A_0 under `mobile`
-(see `engine.model`). The charge delivered by the source is z under `local`, and z + A U / S - offset under `mobile`.
+(see `engine.one_area.model`). The charge delivered by the source is z under `local`, and z + A U / S - offset under
+`mobile`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.network import Network, build_network
 from fingerspice.circuit.statespace import Stack
-from fingerspice.engine.model import Model, choose_branch, gap_voltage
+from fingerspice.engine.one_area.model import Model, choose_branch, gap_voltage
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
@@ -119,7 +120,7 @@ def as_marched(scene: Scene, rows: FloatArray, by_layer: bool = True) -> FloatAr
 
 
 def from_written(scene: Scene, rows: FloatArray, offset: float, by_layer: bool) -> FloatArray:
-    """Rows as in `Record` from rows of `engine.model.write_row`."""
+    """Rows as in `Record` from rows of `engine.one_area.model.write_row`."""
     model, out = model_of(scene), as_marched(scene, rows, by_layer)
     out[:, :-2] *= (scene.shown if by_layer else scene).turn
     if model.mobile:
@@ -128,7 +129,7 @@ def from_written(scene: Scene, rows: FloatArray, offset: float, by_layer: bool) 
 
 
 def row_width(scene: Scene) -> int:
-    """Number of columns in a row of `engine.model.write_row`."""
+    """Number of columns in a row of `engine.one_area.model.write_row`."""
     return 6 + model_of(scene).gap.size
 
 

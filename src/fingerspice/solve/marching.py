@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.results.outcome import Status
-from fingerspice.solve.netmarching import March
+from fingerspice.solve.many_areas import March
+from fingerspice.solve.one_area import Track, prepare_system, scale_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, integrate
 from fingerspice.solve.sources import Tables
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
-from fingerspice.solve.track import Track, prepare_system, scale_of
 
 ATTEMPTS = 6
 # Voltage scale of a circuit whose sources give none, before any voltage has been computed, V.

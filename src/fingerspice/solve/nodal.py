@@ -12,11 +12,11 @@ import numpy as np
 
 from fingerspice.base.announcing import tell
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import collocation
-from fingerspice.engine.collocation import Passage, advance
+from fingerspice.engine.collocation.readout import TRIED
+from fingerspice.engine.implicit import run as implicit
+from fingerspice.engine.implicit.run import Passage, advance
+from fingerspice.engine.implicit.step import Nodal, Scheme, new_work
 from fingerspice.engine.network import Sources, new_room
-from fingerspice.engine.radau import Nodal, Scheme, new_work
-from fingerspice.engine.readout import TRIED
 from fingerspice.numerics.lobatto import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
@@ -82,7 +82,7 @@ LEAST_SHARE = 1e-3
 
 
 class Collocation(NetworkIntegration):
-    """One integration in progress; see `engine.collocation.advance`."""
+    """One integration in progress; see `engine.implicit.run.advance`."""
 
     def __init__(
         self, problem: Problem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray
@@ -101,21 +101,21 @@ class Collocation(NetworkIntegration):
         # With an infinite scale the error of the charge does not control the steps, unless charge was asked for.
         charge = stored if problem.charge else np.inf
         self.scale = np.concatenate([np.full(self.n, u_scale), np.ones(self.n_slow), np.full(n_s, charge)])
-        self.control = np.zeros(collocation.N_CONTROL)
-        self.control[collocation.BASE] = problem.t_start
-        self.counters = np.zeros(collocation.N_COUNTERS, np.int64)
+        self.control = np.zeros(implicit.N_CONTROL)
+        self.control[implicit.BASE] = problem.t_start
+        self.counters = np.zeros(implicit.N_COUNTERS, np.int64)
         self.peaks = np.zeros(self.net.gap.size)
         self.room = new_room(self.net, self.y.size)
         self.work = new_work(self.net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
 
     @property
     def t(self) -> float:
-        return float(self.control[collocation.BASE] + self.control[collocation.T])
+        return float(self.control[implicit.BASE] + self.control[implicit.T])
 
     @property
     def steps(self) -> int:
         """Number of accepted and rejected steps."""
-        return int(self.counters[collocation.ACCEPTED] + self.counters[collocation.REJECTED])
+        return int(self.counters[implicit.ACCEPTED] + self.counters[implicit.REJECTED])
 
     @property
     def done(self) -> float:
@@ -135,21 +135,19 @@ class Collocation(NetworkIntegration):
                 self.left, self.rows, self.tried,
             )  # fmt: skip
             code = advance(self.nodal(sources), run, t_end)
-            if code == collocation.DONE:
+            if code == implicit.DONE:
                 return Status.SUCCESS
-            if code == collocation.PAUSED:
+            if code == implicit.PAUSED:
                 if self.steps > FIRST_STEPS + self.done * MOST_STEPS:
                     return Status.TOO_MANY_STEPS
                 if self.progress is not None:
                     self.progress(self.done)
                 continue
-            if code == collocation.STEP_UNDERFLOW or (
-                code == collocation.JUMP and not self.jump(values_at(sources, self.t))
-            ):
+            if code == implicit.STEP_UNDERFLOW or (code == implicit.JUMP and not self.jump(values_at(sources, self.t))):
                 return self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
-        control = np.zeros(collocation.N_CONTROL)
+        control = np.zeros(implicit.N_CONTROL)
         run = Passage(
             self.y, self.s_before.copy(), control, self.counters, self.peaks, False, self.t_out[:0], self.left[:0],
             np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
@@ -157,9 +155,9 @@ class Collocation(NetworkIntegration):
         nodal = self.nodal(ramp(self.s_before, after))
         code = advance(nodal._replace(scheme=self.scheme._replace(h_max=1.0), jump=True), run, 1.0)
         self.s_before[:] = after
-        self.control[collocation.H] = self.control[collocation.H_AFTER_JUMP]
-        self.control[collocation.JUMPED] = 1.0
-        return code == collocation.DONE
+        self.control[implicit.H] = self.control[implicit.H_AFTER_JUMP]
+        self.control[implicit.JUMPED] = 1.0
+        return code == implicit.DONE
 
 
 def pass_through(

@@ -16,7 +16,7 @@ from fingerspice.circuit.notices import circuit_warnings, course_warnings
 from fingerspice.circuit.spectrum import spectrum_warning
 from fingerspice.circuit.topology import driving
 from fingerspice.circuit.usual import beyond_fingers
-from fingerspice.engine.model import Model
+from fingerspice.engine.one_area.model import Model
 from fingerspice.physics.contact import inverse_area, inverse_area_range
 from fingerspice.results.outcome import Plan, Status
 from fingerspice.results.record import Record

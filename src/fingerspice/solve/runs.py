@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
+from fingerspice.engine.collocation.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
 from fingerspice.engine.network import Sources, at_sources, new_room, rates
-from fingerspice.engine.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
 from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status, last_tried
 from fingerspice.results.record import Record
 from fingerspice.results.steps import ClosedForm, Recorded
@@ -138,7 +138,7 @@ class Integration(ABC):
     y, sign, s_before : ndarray
         The state reached, as in `State`.
     counters : ndarray of int
-        Counters with the indices of `engine.readout`.
+        Counters with the indices of `engine.collocation.readout`.
     tried : ndarray, shape (TRIED, 4)
         The last attempted steps, see `last_tried`.
     """

@@ -16,9 +16,9 @@ from fingerspice.circuit.network import Modes, Network, network_modes
 from fingerspice.circuit.response import areas_at_rest, mean_areas
 from fingerspice.circuit.spectrum import COUPLING, freezing_error
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
-from fingerspice.engine.model import Model
 from fingerspice.engine.network import Net
-from fingerspice.engine.system import System, build_system
+from fingerspice.engine.one_area.model import Model
+from fingerspice.engine.one_area.system import System, build_system
 from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import fixed_area_curve
 from fingerspice.waveforms.combinations import Sum

@@ -20,8 +20,8 @@ from fingerspice.numerics.small import AT, derivative
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.results.sensitivity import MEANS, SIGNALS, Sensitivity
 from fingerspice.results.solution import Solution
-from fingerspice.solve.pieces import driving
 from fingerspice.solve.problem import Problem
+from fingerspice.solve.recordings.pieces import driving
 from fingerspice.waveforms.combinations import Sum
 
 # Error asked of the runs that are compared, over the run's own, and the least one.

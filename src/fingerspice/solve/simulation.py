@@ -23,7 +23,7 @@ from fingerspice.results.solution import Solution
 from fingerspice.solve.closed_form import solve_algebraic, solve_linear
 from fingerspice.solve.marching import solve as solve_exponential
 from fingerspice.solve.nodal import solve_coupled
-from fingerspice.solve.periodic import close_period
+from fingerspice.solve.periodic.state import close_period
 from fingerspice.solve.planning import make_plan, run_warnings
 from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare, to_ends
 from fingerspice.solve.runs import ROUGH, Progress, Run, run_failure
@@ -334,7 +334,7 @@ def _stepped(
 
         return solve_foreign(problem, method, rtol, t_out, left, progress), method
     if method == "auto":
-        from fingerspice.solve.recordings import solve as solve_recording
+        from fingerspice.solve.recordings.run import solve as solve_recording
 
         recorded = solve_recording(problem, rtol, t_out, left, progress)
         if recorded is not None:

@@ -9,12 +9,12 @@ from functools import partial
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine import loop, loopstate, readout
-from fingerspice.engine.loop import Circuit, Looks
-from fingerspice.engine.loopstate import LoopState
+from fingerspice.engine.collocation import loop, loopstate, readout
+from fingerspice.engine.collocation.loop import Circuit, Looks
+from fingerspice.engine.collocation.loopstate import LoopState
+from fingerspice.engine.collocation.readout import Outputs
+from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Sources
-from fingerspice.engine.pace import Pace
-from fingerspice.engine.readout import Outputs
 from fingerspice.results.outcome import Status
 from fingerspice.results.record import bare_record
 from fingerspice.results.steps import Recorded, Recorder
@@ -106,7 +106,7 @@ class Stepping(Integration):
     pace : Pace
     looks : Looks
     control : record
-        Bookkeeping of the compiled loop, of type `engine.readout.CONTROL`.
+        Bookkeeping of the compiled loop, of type `engine.collocation.readout.CONTROL`.
     out : ndarray, shape (width, n_out)
         Output rows as columns.
     peaks, collected : ndarray

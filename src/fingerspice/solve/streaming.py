@@ -1,6 +1,6 @@
 """Streams: long runs chunk by chunk, in constant memory.
 
-A run is integrated in pieces whose length does not depend on the chunks: one that `solve.recordings` follows in the
+A run is integrated in pieces whose length does not depend on the chunks: one that `solve.recordings.run` follows in the
 pieces that it takes, any other run in windows of a fixed number of outputs, each starting from the final state of the
 window before. Chunks are cut from the outputs of the pieces, so that no bit depends on their length.
 """
@@ -19,7 +19,7 @@ from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem, check_length, check_outputs
-from fingerspice.solve.recordings import BySamples, ByWindows, Mark, Outputs, outputs_of, within
+from fingerspice.solve.recordings.run import BySamples, ByWindows, Mark, Outputs, outputs_of, within
 from fingerspice.solve.simulation import asked, check_arguments, planned, solution_of
 from fingerspice.waveforms.waveform import require
 

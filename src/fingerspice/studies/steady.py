@@ -22,7 +22,7 @@ from fingerspice.results.report import summary_table
 from fingerspice.results.sensitivity import Sensitivity
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Figured, Figures
-from fingerspice.solve.periodic import close_period
+from fingerspice.solve.periodic.state import close_period
 from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.sensitivities import check_request, period_of, sensitivities_of
 from fingerspice.solve.simulation import rtol_given, run_problem

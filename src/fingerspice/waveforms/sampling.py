@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import BoolArray, FloatArray, positive_number, real_numbers
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
-from fingerspice.engine.loopstate import SAME_TIME
+from fingerspice.engine.collocation.loopstate import SAME_TIME
 from fingerspice.waveforms.bounds import in_windows, runs_through
 from fingerspice.waveforms.ramps import Ramps
 from fingerspice.waveforms.refining import POINTS, Refiner

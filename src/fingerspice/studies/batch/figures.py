@@ -9,8 +9,8 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.engine.lockmarch import put_traces, trace_changes
-from fingerspice.engine.lockstep import ALL_MOMENTS
+from fingerspice.engine.lockstep.march import put_traces, trace_changes
+from fingerspice.engine.lockstep.step import ALL_MOMENTS
 from fingerspice.results.outcome import ErrorEstimate
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import simulate

@@ -1,4 +1,4 @@
-"""Which scenes of a batch go in lockstep, what it gives, and the tables of their values for `engine.lockscenes`."""
+"""Which scenes of a batch go in lockstep, what it gives, and the tables of their values for `scenes`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import Value
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
-from fingerspice.engine.lockscenes import CELL_ROWS, LARGEST_X, N_OTHERS
+from fingerspice.engine.lockstep.scenes import CELL_ROWS, LARGEST_X, N_OTHERS
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import universal_curve_array
 from fingerspice.physics.materials import EPS0
@@ -222,7 +222,7 @@ def _tones_of(wave: object, given: Mapping[str, Value]) -> list[tuple[Value, Val
 
 
 def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:
-    """The table of some scenes as `engine.lockmarch.march` takes it, shape (n_row, n).
+    """The table of some scenes as `engine.lockstep.march.march` takes it, shape (n_row, n).
 
     `scenes` has values by path in lower case, in the netlist's units; all others are the circuit's.
     """

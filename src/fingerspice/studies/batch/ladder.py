@@ -10,11 +10,11 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.engine.lockcard import march_on_card
-from fingerspice.engine.lockmarch import march, new_stepping
-from fingerspice.engine.locksamples import N_PORTION, march_samples
-from fingerspice.engine.lockscenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
-from fingerspice.engine.lockstep import START_TIMES, marks_of
+from fingerspice.engine.lockstep.card import march_on_card
+from fingerspice.engine.lockstep.march import march, new_stepping
+from fingerspice.engine.lockstep.samples import N_PORTION, march_samples
+from fingerspice.engine.lockstep.scenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
+from fingerspice.engine.lockstep.step import START_TIMES, marks_of
 from fingerspice.studies.batch.form import FIGURES, LockstepForm, curves_of, peak_of, table_of
 from fingerspice.studies.batch.task import LOCKSTEP, Answers, Task
 
@@ -247,7 +247,7 @@ class Ladder(ABC):
 
 
 def _waves(n: int, form: LockstepForm) -> FloatArray:
-    """Sine and cosine of every tone at the times that `engine.lockstep.run` needs; a square's value in both halves."""
+    """Sine and cosine of every tone at the times that `step.run` needs; a square's value in both halves."""
     if form.recording is not None:
         return np.empty((0, 1))
     if n == 0 or form.jumping:

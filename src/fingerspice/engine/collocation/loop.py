@@ -1,0 +1,275 @@
+"""The loop of exponential steps: it tries lengths until the error of a step is small enough, and goes on to the end.
+
+What a step consists of depends on the circuit: a stack has one area and one source (`engine.one_area.step`), a network
+any number of both (`engine.many_areas.step`). The first functions below stand for those of the circuit at hand.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import borrow, jit, jit_by_kind, jit_within
+from fingerspice.engine.collocation.loopstate import (
+    DONE,
+    EXCESSIVE,
+    GO_ON,
+    LOOKED_AT,
+    RETRY,
+    SAME_TIME,
+    LoopState,
+)  # fmt: skip
+from fingerspice.engine.collocation.readout import ACCEPTED, ERROR_F, ERROR_U, PEAK_F, PEAK_U, REJECTED, note
+from fingerspice.engine.collocation.step_control import NOT_FRESH, Pace, accept, allowed_factor, rung, shorten
+from fingerspice.engine.many_areas.begin import ManyAreas, begin_many, start_many
+from fingerspice.engine.many_areas.step import attempt_many, beyond_many, complete_many, end_many, refuse_many
+from fingerspice.engine.one_area.end import complete_one, end_one
+from fingerspice.engine.one_area.step import (
+    OneArea,
+    attempt_one,
+    begin_one,
+    beyond_one,
+    refuse_one,
+    start_one,
+)  # fmt: skip
+
+# The coupling may make the slowest mode slower than with the area frozen; this fraction of its rate is a safe bound.
+RATE_SHARE = 0.5
+# Part of the largest gap voltage up to which another one is taken for 0.
+_UNNOTICED = 1e-9
+# Looks with finer steps after which the charge counts as settled with the voltages: what is left of it is stated.
+_FINE_LOOKS = 3
+# Entries of `Looks.values`. Times (s): next look; first comparison of the stated error with the one asked for; start,
+# period and end of the run under the periodic source.
+NEXT, TRIAL, START, PERIOD, STOP = range(5)
+# Error of the gap voltage allowed, V; a bound of the slowest rate, 1/s; whether the charge is wanted.
+ALLOWED, RATE, HAS_CHARGE = range(5, 8)
+# Largest ratio of error to peak, as estimated, that the trial accepts.
+ACCEPTABLE = 8
+# Periods until the next look, and until the last one, or -1; periods left after that.
+COUNT, LOOKED, LEFT = range(9, 12)
+# What the last look found: bound of the change of the gap voltage in all later periods, and that enlarged by its effect
+# on the charge, V; whether the run has settled.
+DISTANCE, REMAINING, HAS_SETTLED = range(12, 15)
+# Looks since steps are finer, as the voltages had settled and the charge had not; 0 before that.
+FINE, N_VALUES = 15, 16
+
+
+class Looks(NamedTuple):
+    """When a run looks for its periodic state, and what it has found."""
+
+    values: FloatArray  # (N_VALUES,): The entries are named above
+    before: FloatArray  # (n,): State at the last look, V
+    scale: FloatArray  # (n,): Converts the first n entries of the integration's state to volts
+
+
+def no_looks() -> Looks:
+    """For a run that does not look for a periodic state."""
+    values = np.zeros(N_VALUES)
+    values[NEXT] = values[TRIAL] = math.inf
+    return Looks(values, np.zeros(0), np.zeros(0))
+
+
+@jit_within
+def next_stop(looks: Looks, edges: FloatArray, t_end: float) -> float:
+    """Time (s) of the next look or trial, or the edge of the sources that differs from it by rounding only."""
+    v = looks.values
+    t = float(min(v[NEXT], v[TRIAL]))
+    if t < t_end:
+        for i in range(edges.size):
+            if abs(edges[i] - t) <= SAME_TIME * abs(edges[i]):
+                return float(min(edges[i], t_end))
+    return min(t, t_end)
+
+
+@jit_within
+def look(looks: Looks, s: LoopState) -> bool:
+    """Compare the state with that of the last look; True if the caller has something to do.
+
+    Sets what the look has found, and plans the next one.
+    """
+    v, before = looks.values, looks.before
+    left = max(0.0, float(np.floor((v[STOP] - v[NEXT]) / v[PERIOD] * (1.0 + 1e-12))))
+    v[LEFT] = left
+    if s.kept.times.size > 0:
+        # The period that is to be repeated has passed.
+        return True
+    moved = 0.0
+    for k in range(before.size):
+        now = looks.scale[k] * s.y[k]
+        moved = max(moved, abs(now - before[k]))
+        before[k] = now
+    moved *= s.control[0].magnified
+    v[DISTANCE] = v[REMAINING] = math.inf
+    # Periods in which the slowest mode of the frozen circuit decays to 1/e.
+    memory = RATE_SHARE / (v[RATE] * v[PERIOD])
+    wait = 1.0
+    if v[LOOKED] >= 0.0:
+        passed = v[COUNT] - v[LOOKED]
+        decay = min(v[RATE] * v[PERIOD] * passed, 700.0)
+        # Later changes form a geometric series, or with negligible decay each period changes as much as the last.
+        v[DISTANCE] = v[REMAINING] = moved * min(left / passed, max(1.0 / math.expm1(decay), 1e-3))
+        if v[HAS_CHARGE] > 0.0:
+            # The charge error of the repeated period accumulates in every later period.
+            v[REMAINING] *= max(1.0, left * min(1.0, v[RATE] * v[PERIOD]))
+        # Until the distance has decayed to what is allowed, and long enough that the steps' errors are not most of a
+        # change.
+        wait = 0.8 * memory * max(1.0, math.log(max(v[DISTANCE] / v[ALLOWED], 1e-300)))
+        wait = max(1.0, min(float(np.ceil(wait)), 2.0 * v[COUNT]))
+    near = v[DISTANCE] <= v[ALLOWED]
+    settled = near and (v[FINE] > _FINE_LOOKS or v[REMAINING] <= v[ALLOWED])
+    v[FINE] += 1.0 if v[FINE] > 0.0 else 0.0
+    v[HAS_SETTLED], v[LOOKED] = 1.0 if settled else 0.0, v[COUNT]
+    v[COUNT] += 1.0 if settled else wait
+    v[NEXT] = v[START] + v[COUNT] * v[PERIOD] if v[COUNT] - v[LOOKED] < left else math.inf
+    return bool(settled or (near and v[FINE] == 0.0))
+
+
+Circuit = OneArea | ManyAreas
+
+
+@jit_by_kind(OneArea=start_one, ManyAreas=start_many)
+def start(circuit: Circuit, state: LoopState) -> None:
+    """Begin a call of the loop."""
+
+
+@jit_by_kind(OneArea=begin_one, ManyAreas=begin_many)
+def begin(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
+    """Find where the next step starts, and the length to try first."""
+    raise NotImplementedError
+
+
+@jit_by_kind(OneArea=attempt_one, ManyAreas=attempt_many)
+def attempt(circuit: Circuit, pace: Pace, state: LoopState) -> int:
+    """Solve a step of the length to be tried, and estimate its error."""
+    raise NotImplementedError
+
+
+@jit_by_kind(OneArea=refuse_one, ManyAreas=refuse_many)
+def refuse(circuit: Circuit, state: LoopState) -> int:
+    """Why no shorter step would do after one that was rejected; GO_ON if one may."""
+    raise NotImplementedError
+
+
+@jit_by_kind(OneArea=beyond_one, ManyAreas=beyond_many)
+def beyond(circuit: Circuit, pace: Pace, state: LoopState) -> float:
+    """Fraction of a rejected step at which the next one should end, if it went far beyond a zero; or 2."""
+    raise NotImplementedError
+
+
+@jit_by_kind(OneArea=complete_one, ManyAreas=complete_many)
+def complete(circuit: Circuit, pace: Pace, state: LoopState) -> int:
+    """End an accepted step, write its outputs, account for its errors, and move to its end."""
+    raise NotImplementedError
+
+
+@jit_by_kind(OneArea=end_one, ManyAreas=end_many)
+def end(circuit: Circuit, state: LoopState) -> None:
+    """End a call of the loop."""
+
+
+@jit_within
+def worst(peaks: FloatArray) -> float:
+    """Largest ratio of the estimated error to the peak so far, over the voltages and forces of all gaps."""
+    found, largest = 0.0, 0.0
+    for a in range(peaks.shape[0]):
+        largest = max(largest, peaks[a, PEAK_U])
+    for a in range(peaks.shape[0] - 1):
+        if peaks[a, PEAK_U] > _UNNOTICED * largest:
+            found = max(found, peaks[a, ERROR_U] / peaks[a, PEAK_U])
+            if peaks[a, PEAK_F] > 0.0:
+                found = max(found, peaks[a, ERROR_F] / peaks[a, PEAK_F])
+    return found
+
+
+@jit
+def march_on(circuit: Circuit, pace: Pace, state: LoopState, looks: Looks, t_end: float) -> int:
+    """As `march`, and look for the periodic state on the way.
+
+    Returns with EXCESSIVE where a trial of the error fails, and with LOOKED_AT where a look has found something.
+    """
+    circuit, state, looks = borrow(circuit), borrow(state), borrow(looks)
+    while True:
+        stop = next_stop(looks, circuit.sources.edges, t_end)
+        code = march(circuit, pace, state, stop)
+        if code != DONE:
+            return code
+        slack = SAME_TIME * abs(stop)
+        if stop >= looks.values[TRIAL] - slack:
+            looks.values[TRIAL] = math.inf
+            if worst(state.peaks) > looks.values[ACCEPTABLE]:
+                return EXCESSIVE
+        if stop >= looks.values[NEXT] - slack and look(looks, state):
+            return LOOKED_AT
+        if state.control[0].t >= t_end:
+            return DONE
+
+
+@jit_within
+def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
+    """Step to `t_end` (s) through the source's segments, writing outputs on the way.
+
+    Parameters
+    ----------
+    circuit : OneArea or ManyAreas
+        The circuit, its sources, tables and scratch arrays.
+    pace : Pace
+        Rules for the lengths of the steps.
+    state : LoopState
+        The integration so far, updated.
+    t_end : float
+        Where to stop, s; not past the last edge of the sources.
+
+    Returns
+    -------
+    int
+        A code of `engine.collocation.loopstate`.
+    """
+    # Arrays without a reference count: it would cost an atomic operation at every access to a tuple.
+    circuit, state = borrow(circuit), borrow(state)
+    state.step[0].trusted = 1
+    start(circuit, state)
+    while True:
+        code = begin(circuit, pace, state, t_end)
+        if code == GO_ON:
+            code = _find_length(circuit, pace, state)
+        if code == GO_ON:
+            code = complete(circuit, pace, state)
+        if code >= DONE:
+            end(circuit, state)
+            return code
+
+
+@jit_within
+def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
+    """Solve a step with ever shorter lengths until its error is small enough, and choose the next step's length."""
+    step, control, counters = state.step[0], state.control[0], state.counters
+    step.wanted, step.tries = control.h, 1
+    while True:
+        code = attempt(circuit, pace, state)
+        if code == RETRY:
+            continue
+        if code != GO_ON:
+            return code
+        h, error, converged = step.length, step.step_error, step.converged > 0
+        note(state.tried, counters[ACCEPTED] + counters[REJECTED], control.t, h, error / pace.tol)
+        if converged and not pace.controlled:
+            return GO_ON
+        factor = allowed_factor(error, pace.tol)
+        if error <= pace.tol:
+            accept(h, step.wanted, factor, step.tries, step.fresh, step.trusted > 0, control)
+            step.fresh = NOT_FRESH
+            return GO_ON
+        step.tries += 1
+        counters[REJECTED] += 1
+        code = refuse(circuit, state)
+        if code != GO_ON:
+            return code
+        reach = beyond(circuit, pace, state)
+        if reach < 2.0:
+            step.length = rung(h * min(0.9, reach))
+        else:
+            step.length = step.wanted = shorten(h, factor, control)

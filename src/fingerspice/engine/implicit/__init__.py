@@ -1,0 +1,1 @@
+"""Radau collocation, the last resort."""

@@ -1,0 +1,1 @@
+"""Recordings: their pieces in the lanes of vectors."""

@@ -1,0 +1,1 @@
+"""Batches: scenes in the lanes of vectors."""

@@ -1,0 +1,383 @@
+"""Constants of scenes for `step`: modes, response to the source, area polynomials, weights of the steps."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray, aligned
+from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.engine.lockstep import step as lockstep
+from fingerspice.engine.lockstep.step import Marks, area_row, n_constants
+from fingerspice.numerics.modes import write_modes
+
+# A mode's rate nearer than this (relative) to the rate of a cell, a pole of the characteristic equation, has too few
+# correct digits in the difference of both.
+NEAR_POLE = 1e-5
+
+
+@jit_rows
+def find_rates(
+    k: FloatArray, moved: FloatArray, r: FloatArray, inverse: FloatArray, rates: FloatArray, near: FloatArray,
+    marks: Marks,
+) -> None:  # fmt: skip
+    """Rates of the cells, into `r`, and of the modes of two or three cells; `inverse` is 1/A.
+
+    On entry `r` holds the leakage rates by area. `near` is 1 where a mode's rate is too near to that of a cell, and for
+    more cells, whose modes need an iteration.
+    """
+    m_all, lanes = len(marks[0]), len(marks[5])
+    cells = m_all + 1
+    for i in range(lanes):
+        for j in range(cells):
+            r[j * lanes + i] += inverse[i] * moved[j * lanes + i]
+        unclear = 0.0 if m_all <= 2 else 1.0
+        if m_all == 1:
+            rates[0, i] = k[i] * r[lanes + i] + k[lanes + i] * r[i]
+        if m_all == 2:
+            r0, r1, r2 = r[i], r[lanes + i], r[2 * lanes + i]
+            k0, k1, k2 = k[i], k[lanes + i], k[2 * lanes + i]
+            middle = 0.5 * (k0 * (r1 + r2) + k1 * (r0 + r2) + k2 * (r0 + r1))
+            product = k0 * r1 * r2 + k1 * r0 * r2 + k2 * r0 * r1
+            faster = middle + math.sqrt(max(middle * middle - product, 0.0))
+            rates[0, i], rates[1, i] = product / faster, faster
+        if m_all <= 2:
+            for m in range(m_all):
+                for j in range(cells):
+                    rate = r[j * lanes + i]
+                    apart = abs(rate - rates[m, i]) > NEAR_POLE * max(rate, rates[m, i])
+                    unclear = unclear if apart else 1.0
+        near[i] = unclear
+
+
+@jit_rows
+def _shapes(
+    k: FloatArray, r: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, shape: FloatArray,
+    marks: Marks,
+) -> None:  # fmt: skip
+    """Modes of all lanes with such rates; `feed` and `shape` have a row for every mode of every cell."""
+    m_all, lanes = len(marks[0]), len(marks[5])
+    for i in range(lanes):
+        for m in range(m_all):
+            norm = 0.0
+            for j in range(m_all + 1):
+                inverse = 1.0 / (r[j * lanes + i] - rates[m, i])
+                norm += k[j * lanes + i] * inverse * inverse
+                shape[(j * m_all + m) * lanes + i] = k[j * lanes + i] * inverse
+                feed[(j * m_all + m) * lanes + i] = inverse
+            gain[m * lanes + i] = -1.0 / norm
+            for j in range(m_all + 1):
+                feed[(j * m_all + m) * lanes + i] *= -1.0 / norm
+
+
+class Scratch(NamedTuple):
+    """Arrays for the cells and modes of a block (`find_rates` and the like); and for `write_modes` those of one lane.
+
+    The latter are rates and shares of the cells, rates and gains of the modes, their feeds and shapes, and its scratch.
+    """
+
+    k: FloatArray
+    moved: FloatArray
+    r: FloatArray
+    near: FloatArray
+    gain: FloatArray
+    feed: FloatArray
+    shape: FloatArray
+    values: FloatArray
+    own: FloatArray
+    found: FloatArray
+    forms: NDArray[np.float64]
+    floats: FloatArray
+    whole: NDArray[np.int64]
+
+
+def scratch_shapes(marks: Marks) -> tuple[tuple[int, ...], ...]:
+    """Shapes of the arrays of a `Scratch`."""
+    m, lanes = len(marks[0]), len(marks[5])
+    row, both = ((m + 1) * lanes,), ((m + 1) * m * lanes,)
+    block = (row, row, row, (lanes,), (m * lanes,), both, both, (len(marks[3]) * lanes,))
+    return *block, (2, m + 1), (2, m), (2, m + 1, m), (2, m + 1), (2, m + 1)
+
+
+@jit
+def find_modes(rates: FloatArray, scratch: Scratch, marks: Marks) -> None:
+    """Modes of all lanes: in closed form, and by iteration where this would lose digits or there is none."""
+    k, _, r, near, gain, feed, shape, _, own, found, forms, floats, whole = scratch
+    m_all, lanes = len(marks[0]), len(marks[5])
+    if m_all <= 2:
+        _shapes(k, r, rates, gain, feed, shape, marks)
+    for i in range(lanes):
+        if near[i] > 0.0:
+            for j in range(m_all + 1):
+                own[0, j], own[1, j] = r[j * lanes + i], k[j * lanes + i]
+            write_modes(own[0], own[1], (found[0], found[1], forms[0], forms[1]), floats, whole)
+            for m in range(m_all):
+                rates[m, i], gain[m * lanes + i] = found[0, m], found[1, m]
+                for j in range(m_all + 1):
+                    feed[(j * m_all + m) * lanes + i] = forms[0, j, m]
+                    shape[(j * m_all + m) * lanes + i] = forms[1, j, m]
+
+
+@jit_rows
+def link(
+    gap: int, leaks: NDArray[np.int64], moved: FloatArray, feed: FloatArray, shape: FloatArray, c: FloatArray,
+    marks: Marks,
+) -> None:  # fmt: skip
+    """Constants by which the modes have to do with gap and leaks."""
+    m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
+    of_z = lockstep.SHAPE + m_all + w_all + l_all * w_all
+    of_leak = of_z + l_all * m_all
+    for i in range(lanes):
+        for m in range(m_all):
+            c[(lockstep.SHAPE + m) * lanes + i] = shape[(gap * m_all + m) * lanes + i]
+            for n in range(l_all):
+                c[(of_z + n * m_all + m) * lanes + i] = shape[(leaks[n] * m_all + m) * lanes + i]
+                c[(of_leak + m * l_all + n) * lanes + i] = (
+                    feed[(leaks[n] * m_all + m) * lanes + i] * moved[leaks[n] * lanes + i]
+                )
+
+
+# A table of scenes has three rows for every cell: capacitance (F/m^2), total leakage (S), leakage per area (S/m^2).
+CELL_ROWS = 3
+# Its further rows.
+XI, REST, STRESS, LOAD, LOSS, OMEGA, N_OTHERS = 0, 1, 2, 3, 4, 5, 6
+"""X of Eq. 4 at 1 V, A0 at 0 V (m^2), stress at 1 V (Pa), load (N), c2 mu^2; the source's angular frequency (rad/s).
+After them come the amplitudes (V) of the sine and of the cosine in each of its tones; a square's or recording's is the
+first of both."""
+LARGEST_X = 1.3
+"""Largest X that the series of the universal curve covers."""
+Places = tuple[int, NDArray[np.int64]]
+"""Index of the gap among the cells, and of the cells whose leak has a total resistance."""
+
+
+@jit_rows
+def _divide(
+    t: FloatArray, gap: int, jumping: bool, covered: float, k: FloatArray, moved: FloatArray, own: FloatArray,
+    top: FloatArray, marks: Marks,
+) -> None:  # fmt: skip
+    """Shares of the cells in a voltage step, their leakage rates by total resistance and by area, and the largest u.
+
+    That is an estimate of the largest gap voltage with the area at rest, times `covered`. The gap's share of the source
+    is between the capacitive and the resistive divider's; the jump of a square adds the difference of both, which is
+    left of the half period before.
+    """
+    cells, tones, lanes = len(marks[0]) + 1, (len(marks[1]) + 1) // 2, len(marks[5])
+    others, turned = CELL_ROWS * cells, 1.0 if jumping else 0.0
+    for i in range(lanes):
+        elastance, resistance, area = 0.0, 0.0, t[(others + REST) * lanes + i]
+        for j in range(cells):
+            inverse = 1.0 / t[j * lanes + i]
+            total, per_area = t[(cells + j) * lanes + i], t[(2 * cells + j) * lanes + i]
+            moved[j * lanes + i] = total * inverse
+            own[j * lanes + i] = per_area * inverse
+            k[j * lanes + i] = inverse
+            elastance += inverse
+            resistance += 1.0 / (total + area * per_area + 1e-300)
+        for j in range(cells):
+            k[j * lanes + i] /= elastance
+        amplitude = 0.0
+        for tone in range(tones):
+            along, across = (
+                t[(others + N_OTHERS + 2 * tone) * lanes + i],
+                t[(others + N_OTHERS + 2 * tone + 1) * lanes + i],
+            )
+            amplitude += math.sqrt(along * along + across * across)
+        at_once = 1.0 / (t[gap * lanes + i] * elastance)
+        leak = t[(cells + gap) * lanes + i] + area * t[(2 * cells + gap) * lanes + i]
+        at_last = 1.0 / ((leak + 1e-300) * resistance)
+        share = max(at_once, at_last) + turned * abs(at_once - at_last)
+        top[i] = covered * (amplitude * share) + 1e-12
+
+
+@jit_rows
+def _inverse_areas(
+    at: float, top: FloatArray, b: FloatArray, series: FloatArray, y: FloatArray, out: FloatArray, marks: Marks
+) -> None:  # fmt: skip
+    """1/A at the voltages top (1 + at) / 2 of every lane, by the universal curve and the closed form of Eqs. 1 and 3.
+
+    `b` holds the table's further rows (X, A0, stress, ...) for the lanes of the block; `y` (lanes,) is scratch.
+    """
+    lanes, half = len(marks[5]), 0.5 * (1.0 + at)
+    for i in range(lanes):
+        y[i] = series[0]
+    for d in range(1, series.size):
+        for i in range(lanes):
+            x = b[XI * lanes + i] * (half * top[i]) * (2.0 / LARGEST_X) - 1.0
+            y[i] = y[i] * x + series[d]
+    for i in range(lanes):
+        u, a = half * top[i], b[REST * lanes + i] * y[i]
+        load, loss = b[LOAD * lanes + i], b[LOSS * lanes + i]
+        sigma = b[STRESS * lanes + i] * u * u
+        root = math.sqrt(a * a + 4.0 * loss * sigma * a * (load + sigma * a))
+        out[i] = (a + 2.0 * loss * load * sigma + root) / (2.0 * (a * a - loss * load * load))
+
+
+@jit_rows
+def _polynomials(matrix: FloatArray, values: FloatArray, area: int, c: FloatArray, marks: Marks) -> None:
+    """Coefficients of 1/A of every lane, from row `area` of the constants on, from its values at Chebyshev's points."""
+    count, lanes = len(marks[3]), len(marks[5])
+    for d in range(count):
+        for i in range(lanes):
+            total = matrix[d, 0] * values[i]
+            for j in range(1, count):
+                total += matrix[d, j] * values[j * lanes + i]
+            c[(area + d) * lanes + i] = total
+
+
+@jit_rows
+def _respond(
+    t: FloatArray, tones: FloatArray, k: FloatArray, gain: FloatArray, rates: FloatArray, start: FloatArray,
+    c: FloatArray, gap: int, leaks: NDArray[np.int64], marks: Marks,
+) -> None:  # fmt: skip
+    """Response to the tones, in the constants of the block, and the modes at the start, which are the rest beside it.
+
+    A tone's response in a mode is gain (rate - i omega) / (rate^2 + omega^2) of it.
+    """
+    m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
+    others, of_u = CELL_ROWS * (m_all + 1), lockstep.SHAPE + m_all
+    of_w = of_u + w_all
+    of_z = of_w + l_all * w_all
+    for i in range(lanes):
+        for m in range(m_all):
+            start[m * lanes + i] = 0.0
+        for tone in range(w_all // 2):
+            row = others + N_OTHERS + 2 * tone
+            sine, cosine = t[row * lanes + i], t[(row + 1) * lanes + i]
+            omega = tones[tone] * t[(others + OMEGA) * lanes + i]
+            u_sine, u_cosine = k[gap * lanes + i] * sine, k[gap * lanes + i] * cosine
+            for n in range(l_all):
+                c[(of_w + n * w_all + 2 * tone) * lanes + i] = k[leaks[n] * lanes + i] * sine
+                c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] = k[leaks[n] * lanes + i] * cosine
+            for m in range(m_all):
+                rate = rates[m, i]
+                size = gain[m * lanes + i] / (rate * rate + omega * omega)
+                along, across = size * (rate * sine + omega * cosine), size * (rate * cosine - omega * sine)
+                start[m * lanes + i] -= across
+                u_sine += c[(lockstep.SHAPE + m) * lanes + i] * along
+                u_cosine += c[(lockstep.SHAPE + m) * lanes + i] * across
+                for n in range(l_all):
+                    c[(of_w + n * w_all + 2 * tone) * lanes + i] += c[(of_z + n * m_all + m) * lanes + i] * along
+                    c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] += c[(of_z + n * m_all + m) * lanes + i] * across
+            c[(of_u + 2 * tone) * lanes + i] = u_sine
+            c[(of_u + 2 * tone + 1) * lanes + i] = u_cosine
+
+
+@jit_rows
+def _drive(
+    t: FloatArray, k: FloatArray, gain: FloatArray, start: FloatArray, drive: FloatArray, c: FloatArray, gap: int,
+    leaks: NDArray[np.int64], marks: Marks,
+) -> None:  # fmt: skip
+    """Constants of a source of constant pieces or straight lines: the cells' voltages at once, and the modes' drive."""
+    m_all, l_all, lanes = len(marks[0]), len(marks[2]), len(marks[5])
+    of_u, row = lockstep.SHAPE + m_all, CELL_ROWS * (m_all + 1) + N_OTHERS
+    for i in range(lanes):
+        amplitude = t[row * lanes + i]
+        c[of_u * lanes + i] = k[gap * lanes + i] * amplitude
+        for n in range(l_all):
+            c[(of_u + 1 + n) * lanes + i] = k[leaks[n] * lanes + i] * amplitude
+        for m in range(m_all):
+            start[m * lanes + i] = 0.0
+            drive[m, i] = gain[m * lanes + i] * amplitude
+
+
+@jit
+def put_result(
+    i: int, s: FloatArray, last: FloatArray, closing: float, lengths: tuple[int, int, int], first: int,
+    out: FloatArray, marks: Marks,
+) -> None:  # fmt: skip
+    """Lane i's means over the run and its last period, its peak (V), and the relative error of the periodic state.
+
+    `lengths` are the number of periods that the last period stands for beside itself; that of half periods of the run;
+    and of the steps in each.
+    """
+    own, count, lanes = lockstep.N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
+    ahead, halves, steps = lengths
+    if first + i >= out.shape[1]:
+        return
+    for j in range(count):
+        total = s[(own + lockstep.VALUE + count + j) * lanes + i]
+        if ahead > 0:
+            total += ahead * last[j * lanes + i]
+        out[j, first + i] = total / (halves * steps)
+        out[count + j, first + i] = last[j * lanes + i] / (2 * steps)
+    out[2 * count, first + i] = s[(own + lockstep.PEAK) * lanes + i]
+    out[2 * count + 1, first + i] = closing
+
+
+class Block(NamedTuple):
+    """What `fill_block` finds of a block's scenes, and its scratch."""
+
+    c: FloatArray  # (n_constants * lanes,): Constants, as `engine.lockstep.step` takes them
+    start: FloatArray  # (n_mode * lanes,): Modes at the start, V
+    # rates, drive (n_mode, lanes): Rates (1/s), and drive of a source of constant pieces
+    rates: FloatArray
+    drive: FloatArray
+    t: FloatArray  # (n_row * lanes,): The scenes' columns of the table
+    # top, tail (lanes,): Largest gap voltage that the area's polynomial covers (V), and the relative size of its last
+    # coefficient; infinite where the universal curve does not reach so far
+    top: FloatArray
+    tail: FloatArray
+    scratch: Scratch
+
+
+def block_shapes(rows: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
+    """Shapes of the arrays of a `Block` before its scratch, for a table with so many rows."""
+    m_all, w_all, l_all, d_all, _, lanes = (len(mark) for mark in marks)
+    size = n_constants(m_all, w_all, l_all, d_all - 1) * lanes
+    modes = (m_all, lanes)
+    return (size,), (m_all * lanes,), modes, modes, (rows * lanes,), (lanes,), (lanes,)
+
+
+def new_block(rows: int, marks: Marks) -> Block:
+    """Arrays for blocks of scenes of a table with so many rows."""
+    *floats, whole = scratch_shapes(marks)
+    shapes = block_shapes(rows, marks)
+    arrays = aligned([*shapes, *floats])
+    scratch = Scratch._make([*arrays[len(shapes) :], np.empty(whole, np.int64)])
+    return Block._make([*arrays[: len(shapes)], scratch])
+
+
+@jit
+def fill_block(
+    table: FloatArray, pending: NDArray[np.int64], first: int, places: Places,
+    curves: tuple[FloatArray, FloatArray, FloatArray], source: tuple[FloatArray, bool, float], block: Block,
+    marks: Marks,
+) -> None:  # fmt: skip
+    """Constants of the scenes from number `first` of `pending` on, into `block`.
+
+    `source` has the frequencies of the tones, in that of the source; whether it is of constant pieces, or of straight
+    lines; and the largest gap voltage that the area's polynomial covers, as a ratio to its estimate. The other
+    arguments are those of `march`.
+    """
+    m_all, w_all, l_all, d_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[5])
+    area = area_row(m_all, w_all, l_all)
+    c, start, rates, drive, t, top, tails, scratch = block
+    k, moved, r, near, gain, feed, shape, values, _, _, _, _, _ = scratch
+    gap, leaks = places
+    for i in range(lanes):
+        scene = pending[min(first + i, pending.size - 1)]
+        for row in range(table.shape[0]):
+            t[row * lanes + i] = table[row, scene]
+    _divide(t, gap, source[1], source[2], k, moved, r, top, marks)
+    b = t[CELL_ROWS * (m_all + 1) * lanes :]
+    for j in range(d_all + 1):
+        _inverse_areas(curves[1][j], top, b, curves[0], near, values[j * lanes : (j + 1) * lanes], marks)
+    _polynomials(curves[2], values, area, c, marks)
+    for i in range(lanes):
+        c[lockstep.SCALE * lanes + i] = 2.0 / top[i]
+        # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
+        # These fall to about a third from one to the next; the last one alone may be small by chance.
+        tail = max(abs(c[area * lanes + i]), 2.0 / 3.0 * abs(c[(area + 1) * lanes + i])) / 2.0 ** (d_all - 1)
+        covered = b[XI * lanes + i] * top[i] <= LARGEST_X
+        tails[i] = tail / c[(area + d_all) * lanes + i] if covered else math.inf
+    find_rates(k, moved, r, c[(area + d_all) * lanes : (area + d_all + 1) * lanes], rates, near, marks)
+    find_modes(rates, scratch, marks)
+    link(gap, leaks, moved, feed, shape, c, marks)
+    if source[1]:
+        _drive(t, k, gain, start, drive, c, gap, leaks, marks)
+    else:
+        drive[:] = 0.0
+        _respond(t, source[0], k, gain, rates, start, c, gap, leaks, marks)

@@ -1,0 +1,272 @@
+"""Many series stacks at once, in lockstep: the loop of steps of `fs.batch`.
+
+In the modes of a stack with its area held, the change of the area contributes a few per cent of the modes' rates. An
+exponential Adams method (Hochbruck and Ostermann 2010, section 2.5) solves the linear part exactly:
+z' = -rate z + drive w + n(w, z), with n linear in dq = 1/A - 1/A0 times the voltages of the leaks, which are the cells
+whose leak has a total resistance, and dq a polynomial in |u_gap|. The waves w are sine and cosine of every tone of the
+source, without a drive, as z is then what is left beside the steady response; or the value of a source of constant
+pieces. Each step predicts with order 3, evaluates the nonlinear term once, and corrects with order 4.
+
+A block holds `LANES` scenes, one in each lane, and every quantity is a row with one entry for each lane. The only loop
+over the lanes is in a function of its own, whose loops have constant lengths: those of tuples without content. So it is
+compiled into vector instructions without a branch, and no lane's result depends on the others. On a graphics card a
+block is one scene, in a thread of its own (`engine.lockstep.card`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit, jit_rows
+
+LANES = 32
+"""Scenes of a block on the processor."""
+START_TIMES = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0, 1.5, 2.0)
+"""Times of the shorter steps at the start of a run without jumps, in steps."""
+START = len(START_TIMES) - 1
+
+Mark = tuple[tuple[()], ...]
+"""A tuple of which only the length counts, which compiled code knows as a constant; it is passed without any cost."""
+Marks = tuple[Mark, Mark, Mark, Mark, Mark, Mark]
+"""Marks for the modes, waves, leaks, powers of the polynomial, moments and lanes."""
+
+Weights = tuple[FloatArray, NDArray[np.float64]]
+"""Weights of a step of length 0; and for every piece of a window those of its first and second step and of all others,
+shape (pieces, 3, n)."""
+
+# Rows of the constants: the scale of |u| to [-1, 1]; u by modes, and by waves; the voltages of the leaks by waves, and
+# by modes, leak after leak; n by leaks, mode after mode; and the polynomial of 1/A.
+SCALE, SHAPE = 0, 1
+# Rows of the weights, each for every mode: decay, drive; predictor's weights of the nonlinear term at this step and the
+# two before; corrector's weights at the next step, this one and the two before.
+DECAY, DRIVE, PREDICT, PREDICT_OLD, PREDICT_OLDER = 0, 1, 2, 3, 4
+CORRECT, CORRECT_NOW, CORRECT_OLD, CORRECT_OLDER, N_WEIGHTS = 5, 6, 7, 8, 9
+# Rows of the state for every mode: z, the nonlinear term now, one and two steps before, and two scratch rows of a step.
+Z, RATE, OLD, OLDER, KEPT, GUESS, N_STATE = 0, 1, 2, 3, 4, 5, 6
+# Rows of the state after those: gap voltage, its peak, then the integrands' latest values and their weighted sums, and
+# last dq times the voltage of every leak.
+GAP, PEAK, VALUE = 0, 1, 2
+ALL_MOMENTS = 3
+"""Number of the integrands u^2 A, (u^2 A)^2 and u^2. (A itself has a kink where u is 0: its sum is of order 2 only.)"""
+
+
+def marks_of(modes: int, waves: int, leaks: int, powers: int, moments: int, lanes: int = LANES) -> Marks:
+    """The marks of these lengths."""
+    return ((),) * modes, ((),) * waves, ((),) * leaks, ((),) * powers, ((),) * moments, ((),) * lanes
+
+
+@jit
+def area_row(m: int, w: int, k: int) -> int:
+    """First row of the area's polynomial, with m modes, w waves and k leaks."""
+    return SHAPE + m + w + k * w + 2 * k * m
+
+
+@jit
+def n_constants(m: int, w: int, k: int, d: int) -> int:
+    """Rows of the constants of m modes, w waves, k leaks and a polynomial of degree d."""
+    return area_row(m, w, k) + d + 1
+
+
+@jit
+def n_state(m: int, k: int, moments: int) -> int:
+    """Rows of the state, with m modes and k leaks."""
+    return N_STATE * m + VALUE + 2 * moments + k
+
+
+@jit_rows
+def _step(
+    c: FloatArray, g: FloatArray, s: FloatArray, source: FloatArray, before: float, weight: float, marks: Marks,
+) -> None:  # fmt: skip
+    """One step of every lane; adds `weight` times the integrands at its end to their sums.
+
+    `source` holds the waves at the end of the step, and `before` the first of them at its start.
+    """
+    modes, waves, leaks, powers, moments, scenes = marks
+    m_all, w_all, l_all, d_all, count = len(modes), len(waves), len(leaks), len(powers) - 1, len(moments)
+    lanes = len(scenes)
+    of_u = SHAPE + m_all
+    of_w = of_u + w_all
+    of_z = of_w + l_all * w_all
+    of_leak = of_z + l_all * m_all
+    area = of_leak + m_all * l_all
+    own = N_STATE * m_all
+    value, total = own + VALUE, own + VALUE + count
+    current = total + count
+    for i in range(lanes):
+        wave = c[of_u * lanes + i] * source[0]
+        for w in range(1, w_all):
+            wave += c[(of_u + w) * lanes + i] * source[w]
+        u = wave
+        for m in range(m_all):
+            kept = g[(DECAY * m_all + m) * lanes + i] * s[(Z * m_all + m) * lanes + i]
+            kept += g[(DRIVE * m_all + m) * lanes + i] * before
+            guess = kept + g[(PREDICT * m_all + m) * lanes + i] * s[(RATE * m_all + m) * lanes + i]
+            guess += g[(PREDICT_OLD * m_all + m) * lanes + i] * s[(OLD * m_all + m) * lanes + i]
+            guess += g[(PREDICT_OLDER * m_all + m) * lanes + i] * s[(OLDER * m_all + m) * lanes + i]
+            s[(KEPT * m_all + m) * lanes + i] = kept
+            s[(GUESS * m_all + m) * lanes + i] = guess
+            u += c[(SHAPE + m) * lanes + i] * guess
+        v = abs(u) * c[SCALE * lanes + i] - 1.0
+        q = c[area * lanes + i]
+        for d in range(1, d_all):
+            q = q * v + c[(area + d) * lanes + i]
+        q *= v
+        for k in range(l_all):
+            change = c[(of_w + k * w_all) * lanes + i] * source[0]
+            for w in range(1, w_all):
+                change += c[(of_w + k * w_all + w) * lanes + i] * source[w]
+            for m in range(m_all):
+                change += c[(of_z + k * m_all + m) * lanes + i] * s[(GUESS * m_all + m) * lanes + i]
+            s[(current + k) * lanes + i] = q * change
+        u = wave
+        for m in range(m_all):
+            rate = c[(of_leak + m * l_all) * lanes + i] * s[current * lanes + i]
+            for k in range(1, l_all):
+                rate += c[(of_leak + m * l_all + k) * lanes + i] * s[(current + k) * lanes + i]
+            now, old = s[(RATE * m_all + m) * lanes + i], s[(OLD * m_all + m) * lanes + i]
+            z = s[(KEPT * m_all + m) * lanes + i] + g[(CORRECT * m_all + m) * lanes + i] * rate
+            z += g[(CORRECT_NOW * m_all + m) * lanes + i] * now
+            z += g[(CORRECT_OLD * m_all + m) * lanes + i] * old
+            z += g[(CORRECT_OLDER * m_all + m) * lanes + i] * s[(OLDER * m_all + m) * lanes + i]
+            s[(Z * m_all + m) * lanes + i] = z
+            s[(OLDER * m_all + m) * lanes + i] = old
+            s[(OLD * m_all + m) * lanes + i] = now
+            s[(RATE * m_all + m) * lanes + i] = rate
+            u += c[(SHAPE + m) * lanes + i] * z
+        s[(own + GAP) * lanes + i] = u
+        s[(own + PEAK) * lanes + i] = max(s[(own + PEAK) * lanes + i], abs(u))
+        a = 1.0 / (q + c[(area + d_all) * lanes + i])
+        force = u * u * a
+        s[value * lanes + i] = force
+        s[total * lanes + i] += weight * force
+        if count > 1:
+            s[(value + 1) * lanes + i] = force * force
+            s[(total + 1) * lanes + i] += weight * (force * force)
+            s[(value + 2) * lanes + i] = u * u
+            s[(total + 2) * lanes + i] += weight * (u * u)
+
+
+@jit_rows
+def _add_latest(first: int, count: int, weight: float, s: FloatArray, marks: Marks) -> None:
+    """Add `weight` times the latest values to the sums."""
+    lanes = len(marks[5])
+    for i in range(count * lanes):
+        s[(first + count) * lanes + i] += weight * s[first * lanes + i]
+
+
+@jit
+def quadrature(k: int, steps: int) -> float:
+    """Weight of value k of `steps` + 1 equidistant values in Gregory's quadrature of order 4, in step lengths.
+
+    Simpson's rule, of the same order, serves 2 or 4 steps, where the two ends of Gregory's would overlap.
+    """
+    end = min(k, steps - k)
+    if steps < 5:
+        return (1.0 if end == 0 else 4.0 if k % 2 == 1 else 2.0) / 3.0
+    return 0.375 if end == 0 else 7.0 / 6.0 if end == 1 else 23.0 / 24.0 if end == 2 else 1.0
+
+
+@jit
+def _record(s: FloatArray, gap: int, trace: FloatArray, at: int, marks: Marks) -> None:
+    """Write the gap voltages, row `gap` of the state, into column `at` of the trace, shape (lanes, n)."""
+    if trace.size > 0:
+        lanes = len(marks[5])
+        stride = trace.size // lanes
+        for i in range(lanes):
+            trace[i * stride + at] = s[gap * lanes + i]
+
+
+@jit
+def _window(
+    c: FloatArray, g: NDArray[np.float64], s: FloatArray, wave: FloatArray, places: tuple[int, int, int],
+    steps: tuple[int, int], unit: float, trace: FloatArray, at: int, marks: Marks,
+) -> None:  # fmt: skip
+    """Take steps of one length, a range of Gregory's rule.
+
+    Parameters
+    ----------
+    g : ndarray, shape (3, n)
+        Weights of the first, second and all further steps.
+    places : tuple of int
+        Row of the waves at the start, its change from step to step, and the row after which the first one follows.
+    steps : tuple of int
+        Number of steps, and how many of this length precede them.
+    unit : float
+        Length of a step, in that of the sums.
+    trace : ndarray, shape (lanes * n,) or (0,)
+        Takes the gap voltages before the steps, from `at` on unless that is negative.
+    """
+    count, own = len(marks[4]), N_STATE * len(marks[0])
+    place, stride, period = places
+    _add_latest(own + VALUE, count, unit * quadrature(0, steps[0]), s, marks)
+    for k in range(steps[0]):
+        if at >= 0:
+            _record(s, own + GAP, trace, at + k, marks)
+        before = wave[place, 0]
+        place = place + stride if place + stride != period else 0
+        weight = unit * quadrature(k + 1, steps[0])
+        _step(c, g[min(k + steps[1], 2)], s, wave[place], before, weight, marks)
+
+
+@jit
+def _ease_in(
+    c: FloatArray, g: NDArray[np.float64], s: FloatArray, wave: FloatArray, trace: FloatArray, marks: Marks
+) -> None:  # fmt: skip
+    """The first two steps of a run, in `START` shorter ones, as the first of all has no step before it."""
+    period, gap = wave.shape[0] - START - 1, N_STATE * len(marks[0]) + GAP
+    _record(s, gap, trace, 0, marks)
+    _window(c, g[0], s, wave, (period, 1, period), (4, 0), 0.125, trace, -1, marks)
+    _window(c, g[1], s, wave, (period + 4, 1, period), (2, 0), 0.25, trace, -1, marks)
+    _record(s, gap, trace, 1, marks)
+    _window(c, g[2], s, wave, (period + 6, 1, period), (2, 0), 0.5, trace, -1, marks)
+
+
+@jit
+def run(
+    c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, how: tuple[int, int, int, bool], trace: FloatArray,
+    marks: Marks,
+) -> None:  # fmt: skip
+    """Integrate a block's scenes over some half periods, from the state `s` on.
+
+    Parameters
+    ----------
+    c, g, s : ndarray
+        Constants, weights and state, each flat. At the start of a run the state needs the modes only.
+    wave : ndarray, shape (n + START + 1, len(waves)) or (2, 1)
+        Waves at the n steps of a period, and at the times of the shorter steps at the start (`START_TIMES`); for a
+        turned source its values in both halves of a period.
+    how : tuple
+        Number of half periods that lie behind, 0 at the start of a run; and of those when this ends; number of steps in
+        each; and whether the source is turned: it is constant for a half period, then jumps to its negative, and the
+        method restarts. Such a half period has the pieces that `g` has: of equally many steps, which are twice as long
+        in every piece as in the one before. Without jumps, all of these half periods are a range of Gregory's rule.
+    trace : ndarray, shape (lanes * steps,) or (0,)
+        The gap voltage before each step of the run, V.
+    """
+    done, halves, half, turned = how
+    count, own, pieces, lanes = len(marks[4]), N_STATE * len(marks[0]), g[1].shape[0], len(marks[5])
+    if done == 0:
+        for i in range(count * lanes):
+            s[(own + VALUE + count) * lanes + i] = 0.0
+        for i in range(lanes):
+            s[(own + PEAK) * lanes + i] = 0.0
+    if not turned:
+        begun = 0
+        if done == 0:
+            _step(c, g[0], s, wave[0], 0.0, 0.0, marks)
+            _ease_in(c, g[1], s, wave, trace, marks)
+            begun = 2
+        steps, before = (halves - done) * half - begun, 0 if done == 0 else 2
+        place = (done % 2 * half + begun) % (2 * half)
+        _window(c, g[1][3], s, wave, (place, 1, 2 * half), (steps, before), 1.0, trace, done * half + begun, marks)
+        return
+    for window in range(done, halves):
+        # A step of length 0 evaluates the nonlinear term and the integrands.
+        _step(c, g[0], s, wave[window % 2], 0.0, 0.0, marks)
+        steps, unit = half // pieces, pieces / (2.0**pieces - 1.0)
+        for piece in range(pieces):
+            at = window * half + piece * steps
+            _window(c, g[1][piece], s, wave, (window % 2, 0, -1), (steps, 0), unit, trace, at, marks)
+            unit *= 2.0

@@ -1,0 +1,1 @@
+"""Steps of circuits with any number of areas and sources."""

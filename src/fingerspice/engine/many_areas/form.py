@@ -1,0 +1,238 @@
+"""A network in modal form around reference areas, and the arrays that its steps work in.
+
+With its areas fixed at A0 every network is linear: x = shape v - follow s with v' = -rates v + gain s. The change of an
+area adds a current j in each cell whose area follows a voltage,
+
+    v' = -rates v + gain s + feed j,    j = (A - A0) (c u' + g u)  [mobile: + c u A'],    u = tap v + tap_s s.
+
+j contains the derivatives of the voltages, but linearly and at the same time only, so that each row of a step solves
+for them (see `fingerspice.engine.many_areas.coupling`); the fold is where this equation has no solution. An area with a
+time constant is one more mode, of rate 1 / tau. Within a jump of the sources the independent variable is the fraction
+of the jump, and nothing leaks: all rates are zero.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.engine.collocation.readout import CONTROL, N_PLACES, WRITTEN_AT_ONCE
+from fingerspice.engine.many_areas.coupling import Coupling, new_coupling
+from fingerspice.engine.one_area.rows import N_FLAT
+from fingerspice.numerics.lobatto import NODES, ROWS
+
+# Blocks of the modes' rows.
+W, BASE, LIN, D, PULL, USED, PULL_BEFORE, LEFT_BEFORE = range(8)
+# Blocks of the cells' rows: the parts of eta and chi that follow the sources, eta and chi, rho, shares of A', voltages,
+# currents.
+ETA_S, CHI_S, ETA, CHI, RHO, SHARE, CELL_U, J = range(8)
+# Blocks of the areas' rows: A, dA/du, the part of A' that depends on time, A - A0, A'; gap voltages, their guess, and
+# their part that follows the sources.
+AREA, SLOPE, RATE, MORE, KNOWN, U, GUESS, U_S = range(8)
+
+
+class Form(NamedTuple):
+    """See the module. n live voltages, m modes with those of slow areas behind, n_f cells whose area moves.
+
+    Attributes
+    ----------
+    numbers : ndarray, shape (size,)
+        All numbers that depend on the reference areas; the arrays named in `REFERRED` are views of it, so that a change
+        of the reference areas is one copy.
+    rates : ndarray, shape (m,)
+    gain : ndarray, shape (m, n_s)
+    shape, inverse : ndarray, shape (n, n)
+        v = inverse (x + follow s).
+    follow : ndarray, shape (n, n_s)
+    feed : ndarray, shape (m, n_f)
+    tap, tap_s : ndarray, shape (n_f, n) and (n_f, n_s)
+    c, g : ndarray, shape (n_f,)
+        Capacitance and leak of the cells per area.
+    home : ndarray of int, shape (n_f,)
+        The area of each of these cells, ascending.
+    first : ndarray of int, shape (n_area + 1,)
+        First of these cells of each area.
+    cell : ndarray of int, shape (n_area,)
+        The cell whose voltage the area follows; -1 if the area is fixed.
+    area0, unit : ndarray, shape (n_area,)
+        Reference area, and the area at 0 V, m^2: areas with a time constant are states in units of it.
+    slow : ndarray of int, shape (n_area,)
+        The mode of each area that has a time constant, else -1; `pace` (n_area,) is its rate, 1/s.
+    gap, gap_s : ndarray, shape (n_area, n) and (n_area, n_s)
+        Voltage of each area's GAP from x and s; zero without one.
+    node, node_s : ndarray, shape (n_node, n) and (n_node, n_s)
+        Voltage of each node from the same.
+    size : ndarray, shape (n,)
+        Euclidean norm of the state voltages (V) for one unit of each mode.
+    mobile : bool
+        Charge law.
+    stress : ndarray, shape (n_area,)
+        Force per area and squared gap voltage, Pa/V^2.
+    powers, slopes : ndarray, shape (n_area, DEGREE + 1)
+        1/A as in `engine.one_area.system.System`, with `lo`, `scale` (n_area,); `curves` solve Eq. 4 where these do not
+        reach.
+    stored, stored_s, lost, lost_s : ndarray, shape (n_s, n) and (n_s, n_s)
+        Current that each source delivers at the reference areas: stored v' + stored_s s' + lost v + lost_s s.
+    through : ndarray, shape (n_s, n_f)
+        Share of the current j of each cell that the source delivers in addition.
+    """
+
+    numbers: FloatArray
+    rates: FloatArray
+    gain: FloatArray
+    shape: FloatArray
+    inverse: FloatArray
+    follow: FloatArray
+    feed: FloatArray
+    tap: FloatArray
+    tap_s: FloatArray
+    area0: FloatArray
+    gap: FloatArray
+    gap_s: FloatArray
+    node: FloatArray
+    node_s: FloatArray
+    size: FloatArray
+    stored: FloatArray
+    stored_s: FloatArray
+    lost: FloatArray
+    lost_s: FloatArray
+    mobile: bool
+    c: FloatArray
+    g: FloatArray
+    home: IntArray
+    first: IntArray
+    cell: IntArray
+    unit: FloatArray
+    slow: IntArray
+    pace: FloatArray
+    stress: FloatArray
+    powers: FloatArray
+    slopes: FloatArray
+    lo: FloatArray
+    scale: FloatArray
+    curves: FloatArray
+    through: FloatArray
+
+
+#: The fields of a `Form` that belong to its reference areas, in the order in which they stand in its `numbers`.
+REFERRED = Form._fields[1:19]
+
+
+class Leaks(NamedTuple):
+    """What leaks in a form, by the names that it has there; within a jump of the sources all of these are 0."""
+
+    rates: FloatArray
+    gain: FloatArray
+    g: FloatArray
+    pace: FloatArray
+    lost: FloatArray
+    lost_s: FloatArray
+
+
+class Jump(NamedTuple):
+    """A jump of the sources in progress, and what is put aside for its duration."""
+
+    # before, after (n_s,): Values of the sources before and after it, V or A
+    before: FloatArray
+    after: FloatArray
+    # control (2,), sign: Bookkeeping before the jump and at its start, and branches of the areas before it
+    control: NDArray[Any]
+    sign: FloatArray
+    branch: FloatArray  # (n_area, 2): As `ManyAreas.branch`, by the fraction of the jump
+    leaks: Leaks  # Zeros
+
+
+class Work(NamedTuple):
+    """Arrays that steps work in; those with ROWS behind hold one value for each row of a step.
+
+    `own` is the coupling of the step at hand, and `at` (1,) the number of the reference in use. `segment` (n_s,) is the
+    segment of each source at hand; `now` and `slopes_now` (n_s,) are the sources' values and slopes at the start of the
+    step, `here` (n_area,) are the areas there. `size` (m,) is that of the form, with the voltage scale behind. `gained`
+    (n_s,) are the charges of a step, `run` (n_area, N_PLACES) the errors of the gaps' voltages in it.
+    """
+
+    r: FloatArray
+    s: FloatArray
+    ds: FloatArray
+    modes: FloatArray
+    cells: FloatArray
+    areas: FloatArray
+    matrix: FloatArray
+    mixed: FloatArray
+    own: Coupling
+    at: IntArray
+    w0: FloatArray
+    places: FloatArray
+    weight: FloatArray
+    values: FloatArray
+    coefficients: FloatArray
+    outputs: FloatArray
+    room: FloatArray
+    off: FloatArray
+    slips: FloatArray
+    cell_slips: FloatArray
+    carried: FloatArray
+    spare: FloatArray
+    spare_cells: FloatArray
+    spare_areas: FloatArray
+    segment: IntArray
+    now: FloatArray
+    slopes_now: FloatArray
+    here: FloatArray
+    size: FloatArray
+    gained: FloatArray
+    run: FloatArray
+    basis: FloatArray
+    jump: Jump
+
+
+def _new_jump(n: int, modes: int, cells: int, areas: int, sources: int) -> Jump:
+    leaks = Leaks(
+        np.zeros(modes), np.zeros((modes, sources)), np.zeros(cells), np.zeros(areas), np.zeros((sources, n)),
+        np.zeros((sources, sources)),
+    )  # fmt: skip
+    return Jump(
+        np.zeros(sources), np.zeros(sources), np.zeros(2, CONTROL), np.zeros(areas), np.zeros((areas, 2)), leaks
+    )  # fmt: skip
+
+
+def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: int) -> Work:
+    """Work arrays for so many live voltages, modes, cells whose area moves, areas, sources and output columns."""
+    return Work(
+        np.zeros((sources, N_FLAT, ROWS)),
+        np.zeros((sources, ROWS)),
+        np.zeros((sources, ROWS)),
+        np.zeros((8, modes, ROWS)),
+        np.zeros((8, cells, ROWS)),
+        np.zeros((8, areas, ROWS)),
+        np.zeros((cells, cells + 1, ROWS)),
+        np.zeros((cells, areas + 1, ROWS)),
+        new_coupling(n, cells, sources),
+        np.zeros(1, np.int64),
+        np.zeros(modes),
+        np.zeros((modes, N_PLACES)),
+        np.zeros(modes),
+        np.zeros((columns, ROWS)),
+        np.zeros((columns, ROWS)),
+        np.zeros((2, WRITTEN_AT_ONCE)),
+        np.zeros((4, ROWS)),
+        np.zeros((N_PLACES, modes + sources)),
+        np.zeros((2, modes, N_PLACES)),
+        np.zeros((2, N_PLACES, cells + areas)),
+        np.zeros((modes, N_PLACES - 1)),
+        np.zeros((6, modes, ROWS)),
+        np.zeros((8, cells, ROWS)),
+        np.zeros((8, areas, ROWS)),
+        np.zeros(sources, np.int64),
+        np.zeros(sources),
+        np.zeros(sources),
+        np.zeros(areas),
+        np.zeros(modes),
+        np.zeros(sources),
+        np.zeros((areas, N_PLACES)),
+        np.zeros(NODES),
+        _new_jump(n, modes, cells, areas, sources),
+    )

@@ -1,0 +1,1 @@
+"""Steps of circuits with one area and one source, series stacks."""

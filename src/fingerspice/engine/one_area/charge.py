@@ -1,0 +1,224 @@
+"""Charge through the terminals over a step, and its error: both are computed through the layer that leaks slowest."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit, jit_rows, jit_within
+from fingerspice.engine.collocation.exponential import between
+from fingerspice.engine.collocation.readout import (
+    N_PLACES,
+    Control,
+    row_of,
+)
+from fingerspice.engine.one_area.model import Model
+from fingerspice.engine.one_area.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U, Work
+from fingerspice.engine.one_area.system import System
+from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POINTS
+
+# The interpolation error of a rate changes its sign at every node, so that its integral is at most this fraction of its
+# largest value times the step length. The fraction is 0.03 to 0.14 where the error is a Chebyshev polynomial of degree
+# 13 to 21. Where the area changes tenfold within a step the error is no such polynomial; the fraction is then 0.22 in
+# scene 7391 of tests/stress.py.
+LOBE, _STEEP_LOBE, _STEEP = 0.15, 0.3, 10.0
+# Differentiation matrix for the points between the nodes, shape (3, NODES).
+_DERIVATIVE_BETWEEN = np.ascontiguousarray(BETWEEN.T @ DERIVATIVE)
+
+
+@jit_within
+def charge_step(
+    system: System, work: Work, level: int, integral: FloatArray, h: float, z0: float, theta: float,
+    control: Control, collected: FloatArray, z: FloatArray, current: FloatArray,
+) -> None:  # fmt: skip
+    """Charge z (C) and current (A) at the nodes of a step of length h (s) that starts with the charge z0.
+
+    Both are computed through the layer that leaks slowest: the sum over all leaks would be a small difference of large
+    currents. The charge that this layer stores follows from its voltages, not from the integral of w': for a fast mode
+    that has decayed w' still contains its rate times the error of w, and quadrature over a step much longer than the
+    mode's time constant would turn this into charge. `work.places` holds the error of the modes (see
+    `exponential.assess`), of which the part up to fraction `theta` of the step counts.
+    """
+    model, r, w, pull = system.model, work.r, work.w, work.pull
+    rates, gain, gap, slow_share = system.rates[level], system.gain[level], system.gap[level], system.slow[level]
+    n = rates.size
+    slow = model.slow
+    voltage = np.empty(NODES)
+    for j in range(NODES):
+        dv = 0.0
+        v = 0.0
+        dx_gap = 0.0
+        for k in range(n):
+            dw = -rates[k] * w[k, j] + gain[k] * r[SOURCE, j] + pull[k, j]
+            dv += slow_share[k] * dw
+            v += slow_share[k] * w[k, j]
+            dx_gap += gap[k] * dw
+        q = r[Q, j]
+        scale = model.area0 * q if model.mobile else 1.0
+        lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
+        # The voltage whose change, times the capacitance A_0 c (`mobile`) or A c (`local`), is stored charge.
+        voltage[j] = v if model.mobile else slow[n] * r[SOURCE, j] + v
+        # The leakage current alone; `_integrate` makes charge of it.
+        z[j] = (slow[n + 2] / q + slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
+        if model.mobile:
+            # i = Q' with Q = A U / S + z, and u' from the area equation.
+            margin = 1.0 - r[X_GAP, j] * model.area0 * r[DQ, j]
+            du = (model.k_gap * r[SLOPE, j] + dx_gap * scale) / margin
+            current[j] = lam / q + (r[SLOPE, j] / q - r[DQ, j] * du * r[SOURCE, j] / (q * q)) / model.s
+        else:
+            current[j] = (lam + r[SLOPE, j] / model.s) / q
+    start = model.area0 if model.mobile else 1.0 / r[Q, 0]
+    if not model.mobile and model.coupled:
+        # Charge A c dv: exact with A at the start of the step; the change of A is integrated along the polynomial.
+        _add_moves(slow[n + 1] / h, voltage, r[Q], z)
+    missed, kept = _missed(model, slow_share, w, r, h, voltage, z)
+    _integrate(integral, h, z0, z)
+    for j in range(NODES):
+        z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
+        control.peak_q = max(control.peak_q, abs(z[j]))
+    kept = missed if theta < 1.0 else kept
+    _account(model, gap, slow_share, w, r, h, work.places, theta, missed, kept, control, collected)
+
+
+@jit
+def _lobe(q: FloatArray) -> float:
+    """`LOBE`, or the larger value where the area changes more than tenfold within the step."""
+    lowest, highest = q[0], q[0]
+    for j in range(1, NODES):
+        lowest, highest = min(lowest, q[j]), max(highest, q[j])
+    return _STEEP_LOBE if highest > _STEEP * lowest else LOBE
+
+
+@jit_rows
+def _add_moves(factor: float, voltage: FloatArray, q: FloatArray, rate: FloatArray) -> None:
+    """Add to `rate` factor (A - A at the start) times the slope of the voltage's polynomial, per step length."""
+    for j in range(NODES):
+        slope = 0.0
+        for m in range(NODES):
+            slope += DERIVATIVE[j, m] * voltage[m]
+        rate[j] += factor * (1.0 / q[j] - 1.0 / q[0]) * slope
+
+
+@jit_rows
+def _integrate(integral: FloatArray, h: float, z0: float, z: FloatArray) -> None:
+    """Replace z' at the nodes by z there: its integral from the start of the step, plus z0."""
+    total = np.zeros(NODES)
+    for m in range(NODES):
+        for j in range(NODES):
+            total[j] += integral[m, j] * z[m]
+    for j in range(NODES):
+        z[j] = z0 + h * total[j]
+
+
+@jit
+def _account(
+    model: Model, gap: FloatArray, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, places: FloatArray,
+    theta: float, missed: float, kept: float, control: Control, collected: FloatArray,
+) -> None:  # fmt: skip
+    """Update the largest error of the charge, over the part of a step that counts, from the signed error of the modes.
+
+    Let dv be the error of the slow layer's voltage and dA the error of the area. At a given time the charge has the
+    error c A dv. It also keeps a lasting error: the leakage of dv and, under `local`, the integral of
+    c (dA v' - A' dv), which vanishes where the slow layer is the gap, whose voltage determines the area. The
+    interpolation error of the modes changes its sign at every node: it counts in the former error and is left out of
+    the latter. `missed` is the error of the charge within the step by interpolation of its rate, and `kept` the part of
+    it that lasts, C.
+    """
+    n = gap.size
+    slow = model.slow
+    capacitance, g_area, g_total = slow[n + 1], slow[n + 2], slow[n + 3]
+    last_area, last_voltage, last_gap, last_error, last_gap_error = 0.0, 0.0, 0.0, 0.0, 0.0
+    last_theta = 0.0
+    added = 0.0
+    collected[1, 0] += kept * kept
+    brief, brief_gap = np.zeros(N_PLACES), np.zeros(N_PLACES)
+    for k in range(n):
+        first, second, third = between(w[k])
+        for p, own in ((1, first), (2, second), (3, third)):
+            brief[p] += slow_share[k] * own
+            brief_gap[p] += gap[k] * own
+    for p in range(N_PLACES):
+        row = row_of(p)
+        q = r[Q, row]
+        area = 1.0 / q
+        v = 0.0
+        error = 0.0
+        gap_error = 0.0
+        for k in range(n):
+            v += slow_share[k] * w[k, row]
+            error += slow_share[k] * places[k, p]
+            gap_error += gap[k] * places[k, p]
+        now = capacitance * area * error
+        lasting, lasting_gap = error - brief[p], gap_error - brief_gap[p]
+        if model.mobile:
+            # Q = A U / S + z has the error of A, too, by that of u, which the fold magnifies.
+            scale = model.area0 * q
+            magnified = scale / max(1.0 - model.area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
+            now = capacitance * model.area0 * error - r[DQ, row] * area * area * magnified * gap_error * (
+                r[SOURCE, row] / model.s
+            )
+            lasting_gap *= magnified
+            lasting = scale * lasting + v * scale * r[DQ, row] * area * lasting_gap
+            v *= scale
+        voltage = slow[n] * r[SOURCE, row] + v
+        if p == 0:
+            if not model.mobile and control.last_q > 0.0:
+                # A jump's charge is an integral of A over the gap voltage; the error of the latter shifts both limits.
+                added += (area - 1.0 / control.last_q) * lasting_gap / (model.k_gap * model.s)
+        else:
+            reached = min(POINTS[row], theta)
+            part = (reached - last_theta) / (POINTS[row] - last_theta)
+            mean_error = 0.5 * (lasting + last_error)
+            move = area - last_area
+            slope = move / (r[U, row] - last_gap) if r[U, row] != last_gap else 0.0
+            mean_area_error = 0.5 * slope * (lasting_gap + last_gap_error)
+            leak = (g_total + g_area * area) * mean_error + g_area * 0.5 * (voltage + last_voltage) * mean_area_error
+            stays = h * (POINTS[row] - last_theta) * leak
+            if not model.mobile:
+                stays += capacitance * (mean_area_error * (voltage - last_voltage) - move * mean_error)
+            added += part * stays
+            if reached < POINTS[row]:
+                break
+            last_theta = reached
+        known = now + collected[0, 0] + added
+        # The signs of `missed` and of the shares in `collected[1]` are not known: add squares.
+        control.error_q = max(control.error_q, math.sqrt(known * known + missed * missed + collected[1, 0]))
+        last_area, last_voltage, last_gap = area, voltage, r[U, row]
+        last_error, last_gap_error = lasting, lasting_gap
+    collected[0, 0] += added
+
+
+@jit
+def _missed(
+    model: Model, slow_share: FloatArray, w: FloatArray, r: FloatArray, h: float, voltage: FloatArray, rate: FloatArray
+) -> tuple[float, float]:  # fmt: skip
+    """Error of the charge (C) within a step, and at its end, by interpolation of the charge's rate.
+
+    Where the area falls by decades within a step, this error shows long before the voltages' own interpolation errors.
+    At the end of the step the quadrature has twice the order of the interpolation: there the relative error of the rate
+    counts squared.
+    """
+    n = slow_share.size
+    slow = model.slow
+    worst = 0.0
+    for p in range(3):
+        q = r[Q, FIRST + p]
+        v = 0.0
+        for k in range(n):
+            v += slow_share[k] * w[k, FIRST + p]
+        scale = model.area0 * q if model.mobile else 1.0
+        off = (slow[n + 2] / q + slow[n + 3]) * (slow[n] * r[SOURCE, FIRST + p] + v * scale)
+        slope = 0.0
+        for j in range(NODES):
+            off -= BETWEEN[j, p] * rate[j]
+            slope += _DERIVATIVE_BETWEEN[p, j] * voltage[j]
+        if not model.mobile and model.coupled:
+            off += slow[n + 1] / h * (1.0 / q - 1.0 / r[Q, 0]) * slope
+        worst = max(worst, abs(off))
+    largest = 0.0
+    for j in range(NODES):
+        largest = max(largest, abs(rate[j]))
+    lobe = _lobe(r[Q]) * h * worst
+    return lobe, lobe * worst / largest if worst < largest else lobe

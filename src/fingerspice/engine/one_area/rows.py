@@ -1,0 +1,368 @@
+"""Evaluations of a stack's step at all its rows at once: the source, the area, the nonlinear term; and their arrays."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit, jit_fused, jit_rows, jit_within
+from fingerspice.engine.collocation.readout import N_PLACES, WRITTEN_AT_ONCE
+from fingerspice.engine.one_area.system import DEGREE, System
+from fingerspice.numerics import chebyshev
+from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
+from fingerspice.physics.contact import inverse_area
+
+# Rows of `Work.r`: source (V) and its slope (V/s), k_gap U, gap voltage and its guess (V), gap w, 1/A (1/m^2), its
+# slope by the gap voltage, and two rows of scratch.
+SOURCE, SLOPE, FREE, U, GUESS, X_GAP, Q, DQ, SCRATCH, MORE = range(10)
+N_FLAT = 10
+
+
+class Work(NamedTuple):
+    """Arrays that a stack's steps work in; those with ROWS behind hold one value for each row of a step.
+
+    Attributes
+    ----------
+    r : ndarray, shape (N_FLAT, ROWS)
+        See above.
+    base, w, pull, used, pull_before, left_before : ndarray, shape (n, ROWS)
+        The modes without and with the nonlinear term, this term at them and as it was used for them, and both of the
+        iteration before (see `exponential.converge`).
+    w0, weight : ndarray, shape (n,)
+        The modes at the start of the step; effect of each on the gap voltage (see `exponential.weigh`).
+    places, carried : ndarray, shape (n, N_PLACES) and (n, N_PLACES - 1)
+        Errors of the modes, and those carried over from earlier steps.
+    run : ndarray, shape (N_PLACES,)
+        Errors of the gap voltage, V.
+    values, coefficients : ndarray, shape (n + 2, ROWS)
+        Output columns and their Chebyshev coefficients.
+    tapped : ndarray, shape (n + 1, ROWS)
+        Leaks that do not scale with the area.
+    outputs, sums, basis : ndarray
+        Scratch.
+    """
+
+    r: FloatArray
+    base: FloatArray
+    w: FloatArray
+    pull: FloatArray
+    used: FloatArray
+    pull_before: FloatArray
+    left_before: FloatArray
+    w0: FloatArray
+    places: FloatArray
+    carried: FloatArray
+    run: FloatArray
+    values: FloatArray
+    coefficients: FloatArray
+    outputs: FloatArray
+    sums: FloatArray
+    weight: FloatArray
+    basis: FloatArray
+    tapped: FloatArray
+
+
+def new_work(n: int) -> Work:
+    """Work arrays for n modes."""
+    return Work(
+        np.zeros((N_FLAT, ROWS)),
+        np.zeros((n, ROWS)),
+        np.zeros((n, ROWS)),
+        np.zeros((n, ROWS)),
+        np.zeros((n, ROWS)),
+        np.zeros((n, ROWS)),
+        np.zeros((n, ROWS)),
+        np.zeros(n),
+        np.zeros((n, N_PLACES)),
+        np.zeros((n, N_PLACES - 1)),
+        np.zeros(N_PLACES),
+        np.zeros((n + 2, ROWS)),
+        np.zeros((n + 2, ROWS)),
+        np.zeros((2, WRITTEN_AT_ONCE)),
+        np.zeros((4, 4)),
+        np.zeros(n),
+        np.zeros(NODES),
+        np.zeros((n + 1, ROWS)),
+    )
+
+
+_PI_HIGH = 3.141592653589793
+_PI_LOW = 1.2246467991473532e-16
+_PER_PI = 1.0 / _PI_HIGH
+# Taylor coefficients of cos in x^2, to 1e-17 on |x| <= pi/2.
+_COS = np.array([(-1.0) ** i / math.factorial(2 * i) for i in range(11)])
+_LAST = _COS.size - 1
+
+
+@jit_fused
+def _add_cosines(amplitude: float, phase: FloatArray, out: FloatArray) -> None:
+    """out += amplitude cos(phase), to 2e-16 of the amplitude and of the phase.
+
+    The library's cosine is exact to half a rounding and does not vectorise; this one does.
+    """
+    for i in range(ROWS):
+        turns = np.rint(phase[i] * _PER_PI)
+        x = (phase[i] - turns * _PI_HIGH) - turns * _PI_LOW
+        x *= x
+        value = _COS[_LAST]
+        for d in range(_LAST - 1, -1, -1):
+            value = value * x + _COS[d]
+        half = 0.5 * turns
+        sign = 1.0 - 4.0 * (half - np.floor(half))
+        out[i] += amplitude * sign * value
+
+
+@jit
+def source_rows(
+    terms: FloatArray, series: FloatArray, length: float, t0: float, h: float, want_slope: bool, r: FloatArray
+) -> None:
+    """Fill source, and its slope if wanted, for a step of length h that starts t0 into a segment (see `Segment`)."""
+    out = r[SOURCE]
+    slope = r[SLOPE]
+    phase = r[SCRATCH]
+    for i in range(ROWS):
+        out[i] = 0.0
+        slope[i] = 0.0
+    for m in range(terms.shape[0]):
+        c = terms[m, 0]
+        if c == 0.0:
+            continue
+        omega = terms[m, 3]
+        phi = terms[m, 4]
+        beta = terms[m, 5]
+        waves = omega != 0.0 or phi != 0.0 or beta != 0.0
+        if waves and terms[m, 1] == 0.0 and terms[m, 2] == 0.0:
+            for i in range(ROWS):
+                tau = t0 + POINTS[i] * h
+                phase[i] = phi + (omega + 0.5 * beta * tau) * tau
+            _add_cosines(c, phase, out)
+            if want_slope:
+                rate = r[MORE]
+                for i in range(ROWS):
+                    phase[i] += 0.5 * _PI_HIGH
+                    rate[i] = 0.0
+                _add_cosines(c, phase, rate)
+                for i in range(ROWS):
+                    slope[i] += rate[i] * (omega + beta * (t0 + POINTS[i] * h))
+        elif waves or terms[m, 1] != 0.0 or terms[m, 2] != 0.0:
+            _add_general(terms[m], waves, t0, h, out, slope)
+        else:
+            for i in range(ROWS):
+                out[i] += c
+    if series.size > 0:
+        for i in range(ROWS):
+            tau = t0 + POINTS[i] * h
+            value, rate_here = chebyshev.evaluate(series, 2.0 * tau / length - 1.0)
+            out[i] += value
+            slope[i] += rate_here * 2.0 / length
+
+
+@jit
+def _add_general(term: FloatArray, waves: bool, t0: float, h: float, out: FloatArray, slope: FloatArray) -> None:
+    """Add one term with a power or an exponential in it."""
+    n = term[1]
+    a = term[2]
+    for i in range(ROWS):
+        tau = t0 + POINTS[i] * h
+        value = term[0]
+        rate = 0.0
+        if n == 1.0:
+            rate = value
+            value *= tau
+        elif n > 1.0:
+            rate = value * n * tau ** (n - 1.0)
+            value *= tau**n
+        if a != 0.0:
+            e = math.exp(a * tau)
+            rate = (rate + a * value) * e
+            value *= e
+        if waves:
+            phase = term[4] + (term[3] + 0.5 * term[5] * tau) * tau
+            c = math.cos(phase)
+            rate = rate * c - value * (term[3] + term[5] * tau) * math.sin(phase)
+            value *= c
+        out[i] += value
+        slope[i] += rate
+
+
+@jit_rows
+def _series_rows(series: FloatArray, lo: float, scale: float, u: FloatArray, sign: float, out: FloatArray) -> None:
+    """The Chebyshev series in (sign u - lo) scale - 1 at every row (Clenshaw)."""
+    room = np.zeros((3, ROWS))
+    twice, b1, b2 = room[0], room[1], room[2]
+    for i in range(ROWS):
+        twice[i] = 2.0 * min(max((sign * u[i] - lo) * scale - 1.0, -1.0), 1.0)
+    for d in range(series.size - 1, 0, -1):
+        for i in range(ROWS):
+            b0 = twice[i] * b1[i] + (series[d] - b2[i])
+            b2[i] = b1[i]
+            b1[i] = b0
+    for i in range(ROWS):
+        out[i] = 0.5 * twice[i] * b1[i] + (series[0] - b2[i])
+
+
+@jit_rows
+def _powers_rows(powers: FloatArray, lo: float, scale: float, u: FloatArray, sign: float, out: FloatArray) -> None:
+    """The polynomial in (sign u - lo) scale - 1 at every row."""
+    for i in range(ROWS):
+        x = (sign * u[i] - lo) * scale - 1.0
+        # Outside the range any finite value will do: a step that needs it is rejected.
+        x = min(max(x, -1.0), 1.0)
+        value = powers[DEGREE]
+        for d in range(DEGREE - 1, -1, -1):
+            value = value * x + powers[d]
+        out[i] = value
+
+
+@jit
+def polynomial_rows(powers: FloatArray, lo: float, scale: float, u: FloatArray, sign: float, out: FloatArray) -> None:
+    """The polynomial in (sign u - lo) scale - 1 at every row: of `DEGREE` in powers, longer as a Chebyshev series."""
+    if powers.size == DEGREE + 1:
+        _powers_rows(powers, lo, scale, u, sign, out)
+    else:
+        _series_rows(powers, lo, scale, u, sign, out)
+
+
+@jit
+def _long_area(curve: FloatArray, sign: float, r: FloatArray) -> None:
+    """1/A and its slope from Eq. 4 itself, where no series was found."""
+    for i in range(ROWS):
+        value, slope = inverse_area(max(sign * r[U, i], curve[0]), curve)
+        r[Q, i] = value
+        r[DQ, i] = slope * sign
+
+
+@jit_rows
+def _gap_voltage(
+    k_gap: float, gap: FloatArray, w: FloatArray, source: FloatArray, x: FloatArray, u: FloatArray
+) -> None:
+    """x = gap w and u = k_gap U + gap w."""
+    for i in range(ROWS):
+        x[i] = 0.0
+    for k in range(w.shape[0]):
+        share = gap[k]
+        for i in range(ROWS):
+            x[i] += share * w[k, i]
+    for i in range(ROWS):
+        u[i] = k_gap * source[i] + x[i]
+
+
+@jit_rows
+def _pull(
+    tap: FloatArray, tap_k: FloatArray, feed: FloatArray, q0: float, source: FloatArray, q: FloatArray, w: FloatArray,
+    tapped: FloatArray, pull: FloatArray,
+) -> None:  # fmt: skip
+    """pull = feed (q - q0) (tap w + tap_k U)."""
+    for t in range(tap.shape[0]):
+        share = tap_k[t]
+        for i in range(ROWS):
+            tapped[t, i] = share * source[i]
+        for k in range(w.shape[0]):
+            factor = tap[t, k]
+            for i in range(ROWS):
+                tapped[t, i] += factor * w[k, i]
+        for i in range(ROWS):
+            tapped[t, i] *= q[i] - q0
+    for k in range(pull.shape[0]):
+        for i in range(ROWS):
+            pull[k, i] = 0.0
+        for t in range(tap.shape[0]):
+            factor = feed[k, t]
+            for i in range(ROWS):
+                pull[k, i] += factor * tapped[t, i]
+
+
+@jit_rows
+def _push(push: FloatArray, q0: float, area0: float, source: FloatArray, q: FloatArray, pull: FloatArray) -> None:
+    """pull += (1/q - 1/q0) push U / A0."""
+    for k in range(pull.shape[0]):
+        factor = push[k] / area0
+        for i in range(ROWS):
+            pull[k, i] += (1.0 / q[i] - 1.0 / q0) * factor * source[i]
+
+
+@jit_within
+def evaluate(system: System, work: Work, level: int, sign: float) -> bool:
+    """Gap voltage, 1/A and nonlinear term, into `work.r` and `work.pull`, from the modes `work.w`.
+
+    If `system.scale` is 0 the area comes from Eq. 4, else from the polynomial or series. Under `mobile`, r[GUESS] holds
+    a guess of the gap voltage; False where the area equation was not solved on the branch connected to it.
+    """
+    model, r, w, pull = system.model, work.r, work.w, work.pull
+    mobile, q0 = model.mobile, system.q0[level]
+    _gap_voltage(model.k_gap, system.gap[level], w, r[SOURCE], r[X_GAP], r[U])
+    if mobile:
+        if not _solve_mobile(
+            model.area0, system.powers, system.slopes, system.lo, system.scale, model.curve, sign, r
+        ):  # fmt: skip
+            return False
+    elif system.scale > 0.0:
+        polynomial_rows(system.powers, system.lo, system.scale, r[U], sign, r[Q])
+    else:
+        _long_area(model.curve, sign, r)
+    _pull(system.tap[level], system.tap_k, system.feed[level], q0, r[SOURCE], r[Q], w, work.tapped, pull)
+    if mobile:
+        _push(system.push[level], q0, model.area0, r[SOURCE], r[Q], pull)
+    return True
+
+
+@jit
+def _solve_mobile(
+    area0: float, powers: FloatArray, slopes: FloatArray, lo: float, scale: float, curve: FloatArray, sign: float,
+    r: FloatArray,
+) -> bool:  # fmt: skip
+    """u = k U + b q(u) at all rows at once, by Newton; r[U] holds k U + x on entry."""
+    size = 0.0
+    # A longer series has larger rounding errors.
+    rounding = 1e-15 if powers.size == DEGREE + 1 else 2e-13
+    for i in range(ROWS):
+        r[FREE, i] = r[U, i] - r[X_GAP, i]
+        r[U, i] = r[GUESS, i]
+        size = max(size, abs(r[FREE, i]) + abs(r[X_GAP, i]))
+    for _ in range(30):
+        if scale > 0.0:
+            polynomial_rows(powers, lo, scale, r[U], sign, r[Q])
+            polynomial_rows(slopes, lo, scale, r[U], sign, r[DQ])
+            for i in range(ROWS):
+                r[DQ, i] *= scale * sign
+        else:
+            _long_area(curve, sign, r)
+        worst = 0.0
+        lowest = 1.0
+        for i in range(ROWS):
+            b = r[X_GAP, i] * area0
+            margin = 1.0 - b * r[DQ, i]
+            step = (r[U, i] - r[FREE, i] - b * r[Q, i]) / margin
+            r[U, i] -= step
+            worst = max(worst, abs(step))
+            lowest = min(lowest, margin)
+        # Beyond the fold the slope has changed its sign: such a root is not connected to the uncharged state.
+        if not lowest > 0.0 or not worst < math.inf:
+            return False
+        # Close to the fold the error of the voltage is rounding error over the distance to the fold.
+        if worst * lowest <= rounding * size:
+            return True
+    return False
+
+
+@jit
+def largest_size(values: FloatArray) -> float:
+    """The largest of the sizes of values; NaN counts for nothing."""
+    largest = 0.0
+    for i in range(values.size):
+        largest = max(largest, abs(values[i]))
+    return largest
+
+
+@jit_rows
+def moved(u: FloatArray, before: FloatArray) -> float:
+    """Euclidean norm of u - before; then `before` becomes u."""
+    total = 0.0
+    for i in range(ROWS):
+        change = u[i] - before[i]
+        total += change * change
+        before[i] = u[i]
+    return math.sqrt(total)

@@ -1,0 +1,261 @@
+"""Steps of a series stack, for the loop of exponential steps (`engine.collocation.loop`): one area and one source.
+
+The functions that the loop calls take the run in progress as `s` (see `engine.collocation.loopstate`) and the stack as
+`c`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.base.compiled import jit_within
+from fingerspice.engine.collocation.exponential import Tables, assess, converge, make_tables, weigh
+from fingerspice.engine.collocation.loopstate import (
+    AGAIN,
+    DONE,
+    GO_ON,
+    NO_STEP,
+    OUT_OF_RANGE,
+    PAUSED,
+    RETRY,
+    TOO_MANY,
+    LoopState,
+)
+from fingerspice.engine.collocation.readout import (
+    ACCEPTED,
+    FIRST_PASSES,
+    MOST_PASSES,
+    MOST_STEPS,
+    N_PLACES,
+    NFEV,
+    RECORDED,
+    REJECTED,
+)
+from fingerspice.engine.collocation.step_control import (
+    AFTER_EDGE,
+    NOT_FRESH,
+    Pace,
+    change_level,
+    choose_step,
+    enter,
+    nearest_level,
+    rung,
+    take_branch,
+)
+from fingerspice.engine.collocation.zeros import dip, first_wrong
+from fingerspice.engine.network import Segment, Sources, segment_at, source
+from fingerspice.engine.one_area.growth import SLIGHT, carry, loop_gain
+from fingerspice.engine.one_area.model import branch_area, turns_at_zero
+from fingerspice.engine.one_area.rows import DQ, GUESS, X_GAP, U, Work, largest_size, source_rows
+from fingerspice.engine.one_area.system import System
+from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
+
+# A gap voltage below this fraction of the one at the next node counts as 0.
+_AT_ZERO = 1e-9
+# Distance to the fold below which the iteration converges for very short steps only. Methods that solve the area
+# equation at every evaluation reach the fold sooner and take over.
+_NEAR_FOLD = 0.01
+
+
+class OneArea(NamedTuple):
+    """A stack and its source, as the loop takes it."""
+
+    # system, tables, work: The modal system, its tables of exponentials, and scratch arrays
+    system: System
+    tables: Tables
+    work: Work
+    integral: FloatArray  # `lobatto.integral_table()`
+    sources: Sources  # One alone
+
+
+@jit_within
+def start_one(c: OneArea, s: LoopState) -> None:
+    """Begin a call of the loop: find the segment of the source, unless the run was paused."""
+    step, control, counters = s.step[0], s.control[0], s.counters
+    # Other runs may have used the tables since the last call.
+    step.tabled, step.level, step.flips = 0.0, -1, 0
+    if step.is_paused > 0:
+        step.is_paused = 0
+        return
+    edges = c.sources.edges
+    step.index = segment_at(edges, control.t) - 1 if edges[0] < control.t else -1
+    # The segment is entered at the first step, as its edge is not before the present time.
+    step.start, step.edge, step.since, step.begun = 0.0, control.t, 0.0, control.t
+    step.fresh, step.evaluated = NOT_FRESH, counters[NFEV]
+    step.most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
+
+
+@jit_within
+def begin_one(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
+    """Where the next step starts: after a jump of the source, from the modes of the reference area; and its length."""
+    step, control, counters = s.step[0], s.control[0], s.counters
+    model, t = c.system.model, control.t
+    if not t < t_end:
+        return DONE
+    if counters[RECORDED] >= s.steps.times.shape[0] > 0:
+        step.is_paused = 1
+        return PAUSED
+    evaluated = counters[NFEV] - step.evaluated
+    if counters[ACCEPTED] + counters[REJECTED] > step.most:
+        return TOO_MANY
+    if evaluated > NODES * FIRST_PASSES:
+        longest = (t - step.begun) / pace.h_max
+        if evaluated > NODES * (FIRST_PASSES + MOST_PASSES * longest):
+            return TOO_MANY
+    while t >= step.edge:
+        step.index += 1
+        step.start, step.edge = c.sources.edges[step.index], c.sources.edges[step.index + 1]
+        if step.edge > t and not _enter_segment(c, pace, s):
+            return NO_STEP
+    step.stop = min(step.edge, t_end)
+    _take_level(c, s)
+    project, w0 = c.system.project[step.level], c.work.w0
+    for k in range(w0.size):
+        w0[k] = 0.0
+        for i in range(w0.size):
+            w0[k] += project[k, i] * s.y[i]
+    length = step.stop - step.start
+    step.length = choose_step(
+        pace, model.tau, model.coupled, c.sources.series.shape[1] > 0, t, length - step.since, control
+    )  # fmt: skip
+    return GO_ON
+
+
+@jit_within
+def _enter_segment(c: OneArea, pace: Pace, s: LoopState) -> bool:
+    """Take the jump of the source at the start of a segment; False if it meets a fold."""
+    step, control, model = s.step[0], s.control[0], c.system.model
+    # Time is counted from the edge: a transient after it may be faster than the rounding of t.
+    step.since = control.t - step.start
+    step.begun, step.evaluated = control.t, s.counters[NFEV]
+    u_source = source_voltage(c, s, step.since)
+    if model.mobile or pace.charge:
+        if not enter(model, pace.charge, u_source, s.y, control):
+            return False
+    else:
+        control.u_gap = model.k_gap * u_source
+        for i in range(model.gap.size):
+            control.u_gap += model.gap[i] * s.y[i]
+        take_branch(1.0 if control.u_gap >= 0.0 or not model.coupled else -1.0, control)
+    # Try the step that was right after the edge before: similar jumps often need similar steps.
+    control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
+    step.fresh = AFTER_EDGE
+    return True
+
+
+@jit_within
+def source_voltage(c: OneArea, s: LoopState, tau: float) -> float:
+    """Source voltage (V) `tau` s into the segment at hand."""
+    index, start = s.step[0].index, s.step[0].start
+    u, _ = source(Segment(start, s.step[0].edge - start, c.sources.terms[index], c.sources.series[index]), tau)
+    return u
+
+
+@jit_within
+def _take_level(c: OneArea, s: LoopState) -> None:
+    """Go over to the reference area nearest to the present area; the error of the modes goes along."""
+    system, step, error = c.system, s.step[0], s.error
+    n, now = system.model.gap.size, 0
+    if system.q0.size > 1:
+        q, _ = branch_area(system.model, s.control[0].sign, s.control[0].u_gap)
+        now = nearest_level(system.q0, q)
+    if now == step.level:
+        return
+    if error[n] != now:
+        change_level(system.live, system.project, int(error[n]), now, error)
+        error[n] = now
+    step.level, s.step[0].tabled = now, 0.0
+
+
+@jit_within
+def attempt_one(c: OneArea, pace: Pace, s: LoopState) -> int:
+    """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
+    system, work, step, control, counters = c.system, c.work, s.step[0], s.control[0], s.counters
+    model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.step[0].level, s.control[0].sign
+    h, u_rows = step.length, work.r[U]
+    if h != step.tabled:
+        tables = c.tables
+        step.slot = make_tables(
+            system.rates[level], level, h, tables.h, tables.level, tables.used, tables.decay, tables.phi, tables.miss
+        )  # fmt: skip
+        step.tabled = h
+        weigh(system.rates[level], system.gap[level], tables.decay[step.slot], h, work.weight)
+    source_rows(
+        c.sources.terms[step.index], c.sources.series[step.index], step.edge - step.start, step.since, h, pace.charge, r
+    )  # fmt: skip
+    if model.mobile:
+        for i in range(ROWS):
+            r[GUESS, i] = control.u_gap
+    passes, closed = converge(system, c.tables, work, step.slot, level, sign, 0.3 * tol)
+    counters[NFEV] += passes * NODES
+    step.wrong = first_wrong(u_rows, sign, tol) if model.coupled else 0
+    # Node 1 may be off its branch only because the iteration did not converge: also require a start near 0 V.
+    at_zero = sign * u_rows[0] <= _AT_ZERO * min(abs(u_rows[1]), system.u_top)
+    if step.wrong == 1 and step.flips < 2 and at_zero:
+        # The step starts at a zero, and the gap voltage leaves it to the other side: change the branch.
+        if turns_at_zero(model, r[X_GAP, 0], -sign):
+            control.margin = 0.0
+            return NO_STEP
+        return flip(s)
+    step.below = dip(u_rows, sign, tol, step.wrong, work.coefficients[0]) if model.coupled and closed else 0.0
+    if 0.0 < step.below < POINTS[1] and at_zero:
+        # The gap voltage starts at a zero and soon returns to it: a shorter step resolves this.
+        counters[REJECTED] += 1
+        step.length = rung(2.0 * step.below * h)
+        step.wanted = control.h = step.length
+        step.flips = 0
+        return RETRY
+    step.converged, step.step_error = int(closed), math.inf
+    if closed:
+        _assess(c, s)
+    return GO_ON
+
+
+@jit_within
+def flip(s: LoopState) -> int:
+    """Change the branch of the area, and start again."""
+    s.control[0].sign = -s.control[0].sign
+    s.step[0].flips += 1
+    return AGAIN
+
+
+@jit_within
+def _assess(c: OneArea, s: LoopState) -> None:
+    """Errors of a converged step, and of the run so far."""
+    system, work, step, level, slot = c.system, c.work, s.step[0], s.step[0].level, s.step[0].slot
+    decay = c.tables.decay[slot]
+    for k in range(work.w0.size):
+        for p in range(N_PLACES - 1):
+            work.carried[k, p] = decay[k, NODES + p if p < N_PLACES - 2 else END] * s.error[k]
+    grown = loop_gain(system, work, level)
+    if grown > SLIGHT:
+        carry(system, work, level, decay, step.length, s.control[0].sign, grown, s.error)
+    step.step_error, step.grown = assess(system, c.tables, work, slot, level, s.error)
+
+
+@jit_within
+def refuse_one(c: OneArea, s: LoopState) -> int:
+    """Why no shorter step would do after one that was rejected; GO_ON if one may."""
+    system, step, r = c.system, s.step[0], c.work.r
+    model = system.model
+    # A step rejected beyond the end of the area's polynomial: shorter ones would creep up to the kink there.
+    if model.coupled and abs(s.control[0].u_gap) > 0.9 * system.u_top and largest_size(r[U]) > system.u_top:
+        return OUT_OF_RANGE
+    # A step of the size of the time's rounding is rejected: the solution has a singularity here.
+    if step.length <= 1e-15 * step.since + 1e-25 * (step.edge - step.start):
+        return NO_STEP
+    if model.mobile and 1.0 - model.area0 * r[X_GAP, 0] * r[DQ, 0] < _NEAR_FOLD:
+        return NO_STEP
+    return GO_ON
+
+
+@jit_within
+def beyond_one(c: OneArea, pace: Pace, s: LoopState) -> float:
+    """Fraction of a rejected step at which the next one should end, soon after a zero far beyond which it went; or 2.
+
+    There the branch of the area has no meaning, and the error says nothing.
+    """
+    wrong, u = s.step[0].wrong, c.work.r[U]
+    return 1.1 * POINTS[wrong] if wrong > 1 and s.control[0].sign * u[END] < c.system.lo else 2.0

@@ -1,0 +1,277 @@
+"""One integration of a series stack by exponential steps: as `engine.collocation.loop` takes it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import threading
+from collections.abc import Callable
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.engine.collocation import loopstate, readout
+from fingerspice.engine.collocation.exponential import Tables as StepTables
+from fingerspice.engine.collocation.exponential import forget, new_tables
+from fingerspice.engine.collocation.step_control import end_row
+from fingerspice.engine.network import Segment, Sources, source
+from fingerspice.engine.one_area.model import Model, dot, gap_voltage, write_row_at
+from fingerspice.engine.one_area.rows import Work, new_work
+from fingerspice.engine.one_area.step import OneArea
+from fingerspice.engine.one_area.system import LEVEL_RATIO, System, area_error, area_missed, area_range, build_system
+from fingerspice.numerics.lobatto import integral_table
+from fingerspice.physics.contact import inverse_areas
+from fingerspice.results.outcome import State, Status
+from fingerspice.results.record import Record, sided
+from fingerspice.results.steps import Recorded
+from fingerspice.solve.initial import (
+    StackState,
+    as_marched,
+    from_stack,
+    from_written,
+    model_of,
+    row_width,
+)
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import kept_with
+from fingerspice.solve.scenes import Scene
+from fingerspice.solve.sources import segment_index
+from fingerspice.solve.stepping import OutOfRangeError, Stepping, looks_of
+
+# Number of modal systems cached with a scene: one for each thread and decade of tolerances, of up to 1 MB each.
+MOST_SYSTEMS = 64
+# Stated error of the charge over the estimate. It comes from a stack whose layers all leak fast: compared with a
+# reference, the errors of gap voltage and charge were 1.5 times the estimates, because they peak between the points of
+# the estimate; and from scene 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
+CHARGE_SAFETY = 1.75
+
+
+@dataclasses.dataclass
+class _Scratch:
+    """A thread's step tables and scratch arrays for a number of modes, and the system whose tables they are.
+
+    Fresh arrays would cost a changed circuit some 50 us of its set-up, as the memory has to be mapped anew.
+    """
+
+    tables: StepTables
+    work: Work
+    of: System | None = None
+
+
+class _OfThread(threading.local):
+    """The present thread's scratch by its number of modes."""
+
+    def __init__(self) -> None:
+        self.by_size: dict[int, _Scratch] = {}
+
+    def __getitem__(self, n: int) -> _Scratch:
+        if n not in self.by_size:
+            self.by_size[n] = _Scratch(new_tables(n), new_work(n))
+        return self.by_size[n]
+
+
+_SCRATCH = _OfThread()
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """A scene's modal system with scratch arrays, for one thread."""
+
+    system: System
+    integral: FloatArray
+    # Relative truncation error of the area's polynomial.
+    area_error: float
+    scratch: _Scratch
+
+    @property
+    def tables(self) -> StepTables:
+        """Step tables, for the next call of a compiled loop: another system's run may use them after that."""
+        if self.scratch.of is not self.system:
+            self.scratch.of = self.system
+            forget(self.scratch.tables)
+        return self.scratch.tables
+
+    @property
+    def work(self) -> Work:
+        """Scratch arrays, for the next call of a compiled loop."""
+        return self.scratch.work
+
+
+def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
+    """The modal system of a scene, made on first use; its area curve reaches `u_top` (V) if that is above 0."""
+    # The cache distinguishes tolerances by their decade, so that similar runs share a system.
+    decade = int(np.floor(np.log10(rtol)))
+    # It also distinguishes threads, because compiled code writes into the tables and scratch arrays.
+    key = ("system", decade, u_top, threading.get_ident())
+    found: Prepared = kept_with(scene.prepared, key, MOST_SYSTEMS, lambda: _prepare(scene, decade, u_top))
+    return found
+
+
+def _prepare(scene: Scene, decade: int, u_top: float) -> Prepared:
+    system = system_of(scene, decade, u_top)
+    return Prepared(
+        system, integral_table(), area_missed(system.model.curve, decade), _SCRATCH[system.model.gap.size]
+    )  # fmt: skip
+
+
+def system_of(
+    scene: Scene, decade: int, u_top: float = 0.0, ratio: float = LEVEL_RATIO, u_peak: float = 0.0
+) -> System:  # fmt: skip
+    """The modal system of a scene for tolerances of a decade, with neighbouring reference areas in at most `ratio`.
+
+    The area curve reaches `u_top` (V) and the reference areas `u_peak` (V) if these are above 0.
+    """
+    model, (contact,) = model_of(scene), scene.network.contacts
+    assert scene.stack is not None
+    if u_top > 0.0:
+        assert contact is not None
+        model = model._replace(curve=contact.curve(u_top))
+    stress = 0.0 if contact is None else float(contact.stress(1.0))
+    u_max, n = u_peak or max(scene.u_peak, u_top), model.gap.size
+    nodes = scene.network.nodes[:, : n + 1] * np.append(scene.turn, 1.0)
+    u_range = area_range(model, u_max)
+    return build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress, ratio)
+
+
+class Track(Stepping):
+    """One integration in progress, with an error of the gap voltage of at most `tol` (V) in every step.
+
+    The loop's state is that of `engine.one_area.model`; `state` and the outputs have the form used for all circuits.
+    """
+
+    def __init__(
+        self, problem: Problem, prepared: Prepared, tol: float, t_out: FloatArray, left: BoolArray,
+        repeat: bool = True, h_fixed: float = 0.0,
+    ) -> None:  # fmt: skip
+        scene, start = problem.scene, problem.inner
+        self.prepared, self.start, n = prepared, start, start.y.size - 1
+        self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
+        self.area_error = prepared.area_error if prepared.system.model.coupled else 0.0
+        shown = scene.shown.turn.size
+        super().__init__(problem, tol, t_out, left, shown, shown + 2 if problem.charge else shown, h_fixed)
+        self.y = start.y.copy()
+        self.error = np.zeros(n + 1)
+        self.control["u_before"] = start.u_before
+        self.control["branch_length"] = np.inf
+        self.control["margin"] = 1.0
+        if model_of(scene).mobile and problem.initial.sign[0] != 0.0:
+            self.control["u_gap"], self.control["sign"] = start.u_gap, math.copysign(1.0, start.u_gap)
+        self.looks = looks_of(problem, prepared.system.rates, tol, np.ones(n), repeat and h_fixed == 0.0)
+
+    @property
+    def capacitance(self) -> float:
+        """Capacitance of the layer through which the charge is computed, at the area at 0 V, F."""
+        model = self.prepared.system.model
+        return float(model.slow[-3]) * model.area0
+
+    @property
+    def rounding(self) -> FloatArray:
+        u_size = self.problem.scene.u_size
+        # Of the nodes, the peak is that of the gap.
+        return np.asarray(4e-16 * (self.peaks[0, 0] + u_size * np.array([self.prepared.system.model.k_gap, 1.0])))
+
+    @property
+    def margin(self) -> float:
+        return float(self.control["margin"])
+
+    def circuit(self, sources: Sources) -> OneArea:
+        p = self.prepared
+        return OneArea(p.system, p.tables, p.work, p.integral, sources)
+
+    def _failed(self, code: int, sources: Sources) -> Status:
+        if code == loopstate.OUT_OF_RANGE:
+            raise OutOfRangeError(self.prepared.system.u_top)
+        if self.t > sources.edges[0]:
+            # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
+            self.control["u_before"], _ = source(*_segment(sources, self.t, "left"))
+        return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
+
+    def state(self) -> State:
+        return from_stack(self.problem.scene, self.inner_state())
+
+    def inner_state(self) -> StackState:
+        """The state reached in the engine's form."""
+        c = self.control
+        sign, u_gap = float(c["sign"]), float(c["u_gap"])
+        state = StackState(self.t, self.y.copy(), float(c["u_before"]), u_gap, self.start.offset)
+        return on_branch(self.prepared.system.model, state, sign)
+
+    def written(self) -> FloatArray:
+        n_out = int(self.counters[readout.OUTPUT])
+        model = self.prepared.system.model
+        wanted = self.pace.charge and model.mobile
+        u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out]) if wanted else np.empty(0)
+        return as_recorded(self.problem, model, self.out[:, :n_out].T, u)
+
+    def finish(self, sources: Sources, after: Sources | None) -> None:
+        first = int(self.counters[readout.OUTPUT])
+        row = np.empty(row_width(self.problem.scene))
+        segment, tau = _segment(after or sources, self.problem.t_stop, "right")
+        model = self.prepared.system.model
+        # `end_row` applies a jump at the end to these copies, so that the final state remains the left-hand one.
+        end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.controls.copy(), row)
+        self.out[:, first:] = as_marched(self.problem.scene, row[None, :])[0, : len(self.out), None]
+        self.counters[readout.OUTPUT] = self.t_out.size
+
+    def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
+        # This model's area curve may reach higher voltages than the curve of the scene's model.
+        model, c = self.prepared.system.model, self.control
+        segment, tau = _segment(sources, self.t, side)
+        row = np.empty(row_width(self.problem.scene))
+        u, du = source(segment, tau)
+        found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c["sign"], c["u_gap"])
+        # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
+        write_row_at(model, u, du, self.y, c["sign"], found if found == found else c["u_gap"], row)
+        return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
+
+    def recorded(self) -> Recorded | None:
+        recorded, shown = super().recorded(), self.problem.scene.shown
+        if recorded is None or not shown.is_turned:
+            return recorded
+        return dataclasses.replace(recorded, make=partial(_turned, recorded.make, shown.turn))
+
+
+def on_branch(model: Model, state: StackState, sign: float) -> StackState:
+    """The state with its gap voltage computed anew from the area equation, on the branch with this sign."""
+    if not model.mobile:
+        return state
+    x_gap = dot(model.gap, state.y)
+    found = float(gap_voltage(model, model.k_gap * state.u_before, x_gap, sign or 1.0, state.u_gap))
+    # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
+    return state if found != found else dataclasses.replace(state, u_gap=found)
+
+
+def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray) -> FloatArray:
+    """Convert rows of the compiled loops to rows of `Record`, in place; `mobile` needs the source u (V) for charge."""
+    shown = problem.scene.shown
+    n = int(shown.turn.size)
+    if shown.is_turned:
+        rows[:, :n] *= shown.turn
+    if problem.charge and model.mobile:
+        (cell,), network = shown.measured, shown.network
+        u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
+        rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - problem.inner.offset
+    return rows
+
+
+def _turned(
+    make: Callable[..., Record], turn: FloatArray, t: FloatArray, left: BoolArray, columns: FloatArray
+) -> Record:  # fmt: skip
+    """A record from live voltages counted along the loop."""
+    return make(t, left, turn[:, None] * columns)
+
+
+def _segment(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:
+    """The segment of a single source that contains time t (s), and the time since the segment's start, s."""
+    (i,) = segment_index(sources, t, side).tolist()
+    start = float(sources.edges[i])
+    return Segment(start, float(sources.edges[i + 1]) - start, sources.terms[i], sources.series[i]), t - start
+
+
+def scale_of(problem: Problem, peak: float) -> float:
+    """Largest gap voltage to expect under a source with this peak, V."""
+    start = problem.inner
+    share = peak * model_of(problem.scene).k_gap if np.isfinite(peak) else 0.0
+    return max(share, float(np.abs(start.y[:-1]).max(initial=0.0))) or 1.0

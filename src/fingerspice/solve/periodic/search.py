@@ -1,0 +1,347 @@
+"""The periodic state of any circuit, by Newton's method on the map of one period.
+
+The unknown z consists of the modes of the live voltages, for the areas at 0 V, and of the areas with a time constant,
+relative to their values at 0 V. The first derivative of the map is that of the linear circuit with its areas held at
+their means. Broyden's updates improve it from period to period; finite differences, which cost a period for each slow
+mode, replace it only where these updates do not lead to convergence.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
+from fingerspice.circuit.network import network_modes
+from fingerspice.engine.collocation import readout
+from fingerspice.physics.contact import inverse_area
+from fingerspice.results.outcome import SolveError, Status
+from fingerspice.solve.many_areas import March
+from fingerspice.solve.marching import GUESS
+from fingerspice.solve.nodal import pass_through
+from fingerspice.solve.one_area import Track, prepare_system
+from fingerspice.solve.periodic.period import CHARGING, Found, Period, Stopped
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.runs import period_failure
+from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
+
+# Tolerance of the early passes: relative to the last Newton step, and at most, relative to the voltage scale.
+_CRUDE, _FIRST = 1e-3, 1e-4
+# Finite differences of the map: perturbation relative to the voltage scale, and the tolerance of their passes, usual
+# and least.
+_SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 5e-4, 1e-9, 1e-11
+# A mode that decays by more powers of e than this in a period is not measured: its column is exp(-40) at most.
+_FORGOTTEN = 40.0
+# Passes after which the derivative is measured by finite differences, and after which the search fails.
+_PATIENCE, _MOST = 14, 60
+# The search has stagnated after so many passes in which no step was less than half of the smallest one before.
+# Round-off is accepted as the cause if the steps are below _NOISE times the voltage scale.
+_HELD_UP, _NOISE = 5, 1e-8
+# If the first step is longer than this times the voltage scale, the linear circuit's derivative is not good enough.
+_LONG = 0.1
+# A step longer than this times the voltage scale means that the search diverges.
+_ASTRAY = 1e3
+# Fixed-point iterations for the mean areas of the linear circuit's period.
+_AVERAGES = 3
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """Result of one pass over the period: the image of z, its signed error, and the figures of the pass.
+
+    `met` (n_area, 4) has the columns of `LoopState.peaks`; `rounding` (n_area,) is the round-off of the gap voltages in
+    units of the machine precision times the largest voltage.
+    """
+
+    end: FloatArray
+    error: FloatArray
+    met: FloatArray
+    magnified: float
+    rounding: FloatArray
+
+
+# State and sources at the end of a pass, the error of the state, and the figures of the pass.
+_Made = tuple[FloatArray, FloatArray, FloatArray, _Pass]
+
+
+class Search:
+    """Newton's method on the map of a period."""
+
+    def __init__(self, period: Period, rtol: float) -> None:
+        self.period, self.rtol, self.passes = period, rtol, 0
+        self.implicit = False
+        # The gap voltage that a stack's area curve reaches, V; 0: that of its scene.
+        self.top = 0.0
+        # A conserved charge is no unknown. If half a period is used, all voltages change sign: such a charge is 0.
+        self.free = ~period.neutral if period.parts == 1 else np.ones(period.rates.size, bool)
+        self.slow = np.arange(period.rates.size) >= period.n
+        problem = period.problem
+        self.fingers = list(problem.network.fingers)
+        self.z, slope = self._guess()
+        largest = float(np.abs(period.voltages(self.z)).max(initial=0.0))
+        self.scale = max(problem.scene.u_peak, largest) or GUESS
+        self.solver = self._inverse(slope)
+        self.z = self._holding(self.z)
+        cells = [problem.network.gaps[i] for i in self.fingers]
+        gap = problem.network.p[np.array(cells, int)] @ period.modes.shape
+        # Derivative of every gap's voltage by z; its columns for areas with a time constant are 0.
+        self.gap = np.hstack([gap, np.zeros((gap.shape[0], int(self.slow.sum())))])
+
+    def _guess(self) -> tuple[FloatArray, FloatArray]:
+        """The periodic state with every area held at its mean over the period, and the map's derivative there."""
+        period, problem = self.period, self.period.problem
+        network, net = problem.network, problem.scene.net
+        area, s = problem.scene.area0.copy(), period.sampled()
+        for _ in range(_AVERAGES):
+            modes = network_modes(network, area)
+            start, _, along = period.linear_state(modes)
+            if not np.all(np.isfinite(start)):
+                raise SolveError(period_failure(problem, Status.NOT_PERIODIC, None, CHARGING))
+            x = along @ modes.shape.T - s @ modes.follow.T
+            for i in np.flatnonzero(net.gap >= 0):
+                contact = network.contacts[i]
+                assert contact is not None
+                u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
+                area[i] = float(np.mean(contact.area(np.abs(u))))
+        v = period.modes_of(modes.shape @ start - modes.follow @ period.before)
+        v = np.where(period.neutral[: period.n], period.kept, v)
+        # Transform this decay from the modes at the mean areas to the modes at 0 V.
+        turn = period.modes.inverse @ modes.shape
+        decay = np.exp(-modes.rates * period.span)
+        slope = np.diag(np.exp(-period.rates * period.span))
+        slope[: period.n, : period.n] = turn @ (decay[:, None] * np.linalg.inv(turn))
+        slow = np.flatnonzero(net.slow >= 0)
+        return np.append(v, (area / problem.scene.area0)[slow]), period.turned[:, None] * slope
+
+    def _inverse(self, slope: FloatArray) -> FloatArray:
+        """Inverse of 1 - slope for the entries of z that decay, and zero for the neutral modes."""
+        out = np.zeros_like(slope)
+        free = np.ix_(self.free, self.free)
+        out[free] = np.linalg.inv(np.eye(int(self.free.sum())) - slope[free])
+        return out
+
+    def _largest(self, z: FloatArray) -> float:
+        """Largest voltage in a change of z, V; the relative change of an area counts as that share of the scale."""
+        x = float(np.abs(self.period.modes.shape @ z[~self.slow]).max(initial=0.0))
+        return max(x, self.scale * float(np.abs(z[self.slow]).max(initial=0.0)))
+
+    def passed(self, z: FloatArray, tol: float) -> _Pass:
+        """One pass over the period from z, with an error of `tol` times the voltage scale in every step."""
+        period, n = self.period, self.period.n
+        y = np.concatenate([period.voltages(z), z[n:], np.zeros(period.before.size)])
+        initial = dataclasses.replace(period.problem.initial, y=y)
+        problem = dataclasses.replace(period.problem, initial=initial)
+        self.passes += 1
+        march = self._marched if problem.scene.stack is None else self._tracked
+        made = None if self.implicit else march(problem, tol)
+        if made is None:
+            # The exponential steps failed: the implicit method either succeeds or tells that no solution exists.
+            self.implicit, made = True, self._collocated(problem, tol)
+        x, s, error_x, figures = made
+        # Use the sources at the end of the pass: they equal those at the start only up to the sign and round-off.
+        end = np.append(period.modes.inverse @ (x[:n] + period.modes.follow @ s), x[n : z.size])
+        error = np.append(period.modes.inverse @ error_x[:n], error_x[n : z.size])
+        return dataclasses.replace(figures, end=period.turned * end, error=error)
+
+    def _marched(self, problem: Problem, tol: float) -> _Made | None:
+        """One pass by exponential steps; None where they fail before the end."""
+        none, n = np.zeros(0), self.period.n
+        one = March(problem, max(tol, FINEST), self.rtol, self.scale, none, none.astype(bool), False)
+        if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
+            return None
+        error = np.append(one.form.shape @ one.error[:n], one.error[n:])
+        magnified = max(1.0, float(one.control["magnified"]))
+        return one.y, one.s_before, error, _Pass(none, none, one.peaks.copy(), magnified, one.references.magnified)
+
+    def _tracked(self, problem: Problem, tol: float) -> _Made | None:
+        """One pass of a stack; None where it fails before the end."""
+        none, scene = np.zeros(0), problem.scene
+        while True:
+            prepared = prepare_system(scene, self.rtol, self.top)
+            one = Track(problem, prepared, max(tol, FINEST) * self.scale, none, none.astype(bool), False)
+            try:
+                if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
+                    return None
+                break
+            except OutOfRangeError as left:
+                self.top = 1.5 * left.top
+        end, n, model = one.state(), self.period.n, prepared.system.model
+        error = prepared.system.live[int(one.error[n])] @ one.error[:n]
+        if model.mobile:
+            error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
+        figures = _Pass(none, none, one.peaks, max(1.0, float(one.control["magnified"])), np.array([model.k_gap]))
+        return end.y, end.s_before, scene.turn * error, figures
+
+    def _collocated(self, problem: Problem, tol: float) -> _Made:
+        """One pass by the implicit method, with its error from a coarser pass."""
+        none, scene, network = np.zeros(0), problem.scene, problem.network
+        status, one, error = pass_through(problem, self.period.sources, tol, self.scale)
+        if status is not Status.SUCCESS:
+            raise Stopped(status, one.t)
+        met = np.zeros((one.peaks.size, 4))
+        for i in network.fingers:
+            peak, contact = float(one.peaks[i]), network.contacts[i]
+            assert contact is not None
+            area = float(contact.area(peak)) if scene.net.gap[i] >= 0 else float(scene.area0[i])
+            met[i, :2] = peak, float(contact.stress(peak)) * area
+        gap = np.array([network.p[0 if cell is None else cell] for cell in network.gaps]) @ self.period.modes.shape
+        rounding = (np.abs(gap) @ np.abs(self.period.modes.inverse)).sum(axis=1)
+        return one.y, one.s_before, error, _Pass(none, none, met, 1.0, 10.0 + rounding)
+
+    def close(self) -> tuple[FloatArray, FloatArray, Found]:
+        """The periodic state's live voltages (V) and relative areas, to `rtol` or as far as round-off permits."""
+        period = self.period
+        tol = LOCAL_SHARE * self.rtol
+        while True:
+            last, step, defect = self._newton(tol)
+            errors, memory, excess, rounding = self._errors(last, step)
+            if excess <= 1.0:
+                break
+            if excess > 2.0 * rounding and tol > FINEST:
+                tol = max(tol * min(0.3, 0.5 / excess), FINEST)
+            elif not self.implicit:
+                # The round-off of the modes dominates; the implicit method works without them and has less.
+                self.implicit, tol = True, LOCAL_SHARE * self.rtol
+            else:
+                break
+        slope = self._slope()
+        slope = slope @ slope if period.parts == 2 else slope
+        found = Found(period.parts * defect, slope, memory, errors, self.passes / period.parts)
+        return period.voltages(self.z), self.z[period.n :], found
+
+    def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
+        """Solve for the periodic z; returns the last pass, the last step of z, and the defect of that pass, V."""
+        moved = self.scale * (_FIRST / _CRUDE if self.passes == 0 else 0.0)
+        change_before, before, step = None, _FIRST, np.zeros(self.z.size)
+        here, smallest, since = _FIRST, math.inf, 0
+        for count in range(1, _MOST + 1):
+            # The solver enlarges the error of a pass by up to `memory`, so the pass needs a tolerance smaller by that.
+            memory = self._memory()
+            here = max(tol, min(here, _CRUDE * moved / self.scale / memory, _FIRST / memory))
+            last = self.passed(self.z, here)
+            change = last.end - self.z
+            if change_before is not None:
+                fell = change_before - np.where(self.free, change, 0.0)
+                # Skip the update if the change is within the errors of the two passes.
+                if self._largest(fell) > before * self.scale:
+                    self._update(step, fell)
+            if count % _PATIENCE == 0:
+                self.solver = self._inverse(self._slope())
+            change_before, before = np.where(self.free, change, 0.0), here
+            step = self.solver @ change_before
+            if count == 1 and self._largest(step) > _LONG * self.scale:
+                # For a mode that hardly decays in a period, the effect of the areas' ripple may exceed the decay, and
+                # the derivative of the linear circuit is wrong: measure it.
+                self.solver = self._inverse(self._slope())
+                step = self.solver @ change_before
+            self.z = self._holding(self.z + step)
+            moved = self._largest(step)
+            defect = self._largest(change)
+            if not moved < _ASTRAY * self.scale:
+                break
+            # Round-off may prevent smaller steps; the size of the last step is then part of the stated error.
+            smallest, since = (moved, 0) if moved < 0.5 * smallest or here > tol else (smallest, since + 1)
+            held_up = since >= _HELD_UP and moved <= _NOISE * self.scale
+            closed = moved <= tol * self.scale or self._largest(change_before) <= 1e-15 * self.scale
+            if here == tol and (closed or held_up):
+                self._mind_wandering(last, change, tol)
+                return last, step, defect
+        cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
+        raise SolveError(period_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
+
+    def _memory(self) -> float:
+        """Largest ratio of the periodic state's error to an error of the voltages made in every period; 1 or more."""
+        n, modes = self.period.n, self.period.modes
+        grown = modes.shape @ self.solver[:n, :n] @ modes.inverse
+        return max(1.0, float(np.abs(grown).sum(axis=1).max(initial=0.0)))
+
+    def _update(self, step: FloatArray, fell: FloatArray) -> None:
+        """Broyden's update of the solver from the last step and the reduction `fell` of the map's defect by it."""
+        answered = self.solver @ fell
+        along = float(step @ answered)
+        # A tiny denominator means that round-off dominates the step: such an update would spoil the solver.
+        if abs(along) > 1e-3 * float(step @ step) > 0.0:
+            self.solver = self.solver + np.outer((step - answered) / along, step @ self.solver)
+
+    def _mind_wandering(self, last: _Pass, change: FloatArray, tol: float) -> None:
+        """Refuse a state whose conserved charges change over the period: an area's ripple would pump them for ever.
+
+        Under `local` this happens where an insulating layer has the area of the gap but another voltage waveform.
+        """
+        held = ~self.free
+        allowed = SAFETY * self._largest(np.where(held, np.abs(last.error), 0.0)) + 10.0 * tol * self.scale
+        moved = self._largest(np.where(held, change, 0.0))
+        if moved > allowed:
+            cause = f"a charge that nothing drains moves by {moved:.3g} V in every period"
+            raise SolveError(period_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
+
+    def _holding(self, z: FloatArray) -> FloatArray:
+        """z with its neutral modes adjusted so that the conserved charges have their initial values.
+
+        These modes are the conserved charges themselves only with the areas at 0 V, hence the iteration.
+        """
+        held = np.flatnonzero(~self.free)
+        if not held.size:
+            return z
+        z = z.copy()
+        for _ in range(_MOST):
+            missing = self.period.charges(z, held) - self.period.kept[held]
+            z[held] -= missing
+            if np.abs(missing).max() <= 1e-15 * np.abs(z).max():
+                break
+        return z
+
+    def _slope(self) -> FloatArray:
+        """Derivative of the map by z, to about 1e-5, from one pass for every mode that does not decay in a period."""
+        period = self.period
+        decaying = period.rates[~period.neutral]
+        # A slow mode's 1 - slope is about its rate times the period: the passes' errors must be smaller than that.
+        forgets = min(1.0, float(decaying.min(initial=math.inf)) * period.span)
+        tol = max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL)
+        base = self.passed(self.z, tol).end
+        slope = np.diag(period.turned * np.exp(-period.rates * period.span))
+        for k in np.flatnonzero(period.rates * period.span < _FORGOTTEN):
+            if not self.free[k]:
+                continue
+            unit = np.zeros(self.z.size)
+            unit[k] = 1.0
+            by = _SHIFT * self.scale / max(self._largest(unit), 1e-300)
+            slope[:, k] = (self.passed(self.z + by * unit, tol).end - base) / by
+        return slope
+
+    def _errors(self, last: _Pass, step: FloatArray) -> tuple[FloatArray, float, float, float]:
+        """Errors of the gaps' voltages and forces (n_gap, 2), the memory, and the largest error relative to `rtol`.
+
+        The last figure is the same ratio for round-off alone. An error made in every period leads to an error of the
+        periodic state equal to the solver times it.
+        """
+        period, solver = self.period, np.abs(self.solver)
+        memory = self._memory()
+        grown = solver @ np.abs(last.error)
+        met = last.met[self.fingers]
+        peak, force = met[:, readout.PEAK_U], met[:, readout.PEAK_F]
+        largest = float(peak.max(initial=0.0))
+        gap = np.abs(self.gap)
+        # Add round-off, and the last Newton step as a bound of the error that remains after it.
+        once = np.abs(period.modes.inverse).sum(axis=1)
+        often = solver[: period.n, : period.n] @ once
+        grows = np.maximum(1.0, (gap[:, : period.n] @ often) / (gap[:, : period.n] @ once))
+        floor = 4e-16 * grows * (last.rounding[self.fingers] * (largest + self.scale) + peak)
+        u_error = last.magnified * (SAFETY * (gap @ grown) + gap @ np.abs(step)) + floor
+        f_error = 2.0 * force / np.where(peak > 0.0, peak, math.inf) * u_error
+        slow = period.problem.scene.net.slow[self.fingers]
+        off = (SAFETY * grown + np.abs(step))[period.n :]
+        share = np.array([off[i] if i >= 0 else 0.0 for i in slow])
+        u_error, f_error = u_error + peak * share, f_error + 3.0 * force * share
+        live = peak > 4e-15 * self.scale
+        over = np.append((u_error / np.where(live, peak, 1.0))[live], (f_error / np.where(live, force, 1.0))[live])
+        rounding = float((2.0 * floor / np.where(live, peak, 1.0))[live].max(initial=0.0))
+        return (
+            np.column_stack([u_error, f_error]),
+            memory,
+            float(over.max(initial=0.0)) / self.rtol,
+            rounding / self.rtol,
+        )

@@ -1,0 +1,361 @@
+"""A circuit with one finger prepared for lanes (`engine.lanes.step`): what it has to give, and the form of a stack."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import cast
+
+import numpy as np
+from numpy.polynomial import chebyshev as series_of
+from numpy.polynomial.polynomial import polyder, polyval
+
+from fingerspice.base.arrays import BoolArray, FloatArray, aligned
+from fingerspice.circuit.statespace import Stack
+from fingerspice.engine.lanes.loops import polynomial_of
+from fingerspice.engine.lanes.rows import (
+    Lanes,
+    Marks,
+    MobileMarks,
+    NetworkMarks,
+    StackMarks,
+    Weighed,
+    rows_of,
+    weighed,
+)
+from fingerspice.engine.lanes.weights import weigh
+from fingerspice.engine.one_area.model import dot, ramp
+from fingerspice.engine.one_area.system import System
+from fingerspice.numerics import chebyshev
+from fingerspice.physics.contact import inverse_area_array
+from fingerspice.results.outcome import State
+from fingerspice.solve.initial import StackState, from_stack
+from fingerspice.solve.one_area import as_recorded, on_branch, system_of
+from fingerspice.solve.problem import Problem
+from fingerspice.solve.scenes import BEYOND_PEAK
+
+# Number of lanes, each with a piece of a recording.
+PIECES = 64
+# Relative error from which on steps in a stack have Simpson's nodes, and need two evaluations in the place of three.
+BY_SIMPSON = 1e-5
+# Largest degree of the polynomial for 1/A.
+MOST_DEGREE = 28
+# Truncation error allowed for the polynomial of 1/A, relative to the error asked for or to this one, if that is less:
+# terms cost little.
+_AREA_SHARE, _COARSEST = 0.003, 1e-5
+# Number of Chebyshev points for the area over the gap voltage.
+_POINTS = 64
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Quantities k s + columns z + bends N; under `mobile` k s + columns z / A for voltages, columns z + bends A s."""
+
+    columns: FloatArray  # (C, m)
+    # k, bends (C,)
+    k: FloatArray
+    bends: FloatArray
+    by_area: BoolArray  # (C,): Whether the modes' part has the factor 1/A
+
+    def behind(self, first: int) -> Shown:
+        """The quantities from number `first` on."""
+        return Shown(self.columns[first:], self.k[first:], self.bends[first:], self.by_area[first:])
+
+
+@dataclass(frozen=True)
+class LaneForm(ABC):
+    """A circuit prepared for recordings, for all tolerances of one decade."""
+
+    lanes: Lanes
+    active: int  # Number of modes that are not passive
+    inner: int  # Number of nodes within a step
+    mobile: bool  # Charge law
+    rows: Shown  # What is recorded: voltages, and the charges
+    nodes: Shown
+    flows: int  # Number of charges, whose rates are recorded, too
+    stress: float  # Force per area and squared gap voltage, Pa/V^2
+    gain: float  # Largest gap voltage to expect for a peak of the source of 1, V/V or V/A
+    u_top: float  # Largest gap voltage that the polynomials cover, V
+    # missed, missed_bend: Errors of the polynomials: of 1/A, relative, and of N, V m^2
+    missed: float
+    missed_bend: float
+    held: float  # Capacitance of what stores the charges, F
+
+    @abstractmethod
+    def start(self, problem: Problem) -> tuple[FloatArray, float]:
+        """The modes (m,), behind them under `mobile` the gap voltage, and the source at the start of a run."""
+
+    @abstractmethod
+    def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
+        """The state at modes as in `start` and `t` (s), where the source has the value `u_last`."""
+
+    @abstractmethod
+    def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
+        """Rows of a record from `out` (`width`, n), which begins with those of `rows` and of the charges' rates."""
+
+    def width(self, problem: Problem) -> int:
+        """Number of rows of the outputs."""
+        return self.rows.k.size + self.flows
+
+    def marks(self, own: bool) -> Marks:
+        """The lengths that the compiled code knows; `own` weights are those of each lane."""
+        leaks, kind = self.lanes.tap_s.size, MobileMarks if self.mobile else NetworkMarks if self.bent else StackMarks
+        more = self.lanes.feed.shape[1] - leaks, int(self.mobile), PIECES, int(own)
+        return _marks(kind, self.lanes.rates.size, self.active, self.inner, leaks, *more)
+
+    @property
+    def bent(self) -> bool:
+        """Whether N is a drive, as in a network."""
+        return not self.mobile and self.lanes.feed.shape[1] > self.lanes.tap_s.size
+
+    @property
+    def weighed(self) -> Weighed:
+        """Rows of the weights."""
+        modes, leaks = self.lanes.rates.size, self.lanes.tap_s.size
+        return weighed(modes, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks)
+
+    def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
+        """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
+        state, weights = aligned([(rows_of(self.marks(own)).end * PIECES,), (self.weighed.end, PIECES if own else 1)])
+        state[:], weights[:] = 0.0, 0.0
+        return state, weights
+
+    def weights(self, h: FloatArray) -> FloatArray:
+        """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
+        out = np.empty((self.weighed.end, h.size))
+        weigh(self.lanes, self.active, self.inner, h, out)
+        return out
+
+    def _polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
+        c, flat, out = self.lanes, np.ravel(xi), np.empty(np.size(xi))
+        polynomial_of(powers, c.scale, c.shift, flat, out)
+        return out.reshape(np.shape(xi))
+
+    def inverse_area(self, xi: FloatArray) -> FloatArray:
+        """1/A, 1/m^2."""
+        return np.asarray(self.lanes.q0 + self._polynomial(self.lanes.area, xi))
+
+    def slope(self, xi: FloatArray) -> FloatArray:
+        """Derivative of 1/A by |xi|, 1/m^2/V."""
+        return self._polynomial(self.lanes.slope, xi)
+
+    def bend(self, xi: FloatArray) -> FloatArray:
+        """N, V m^2."""
+        found = self._polynomial(self.lanes.bend, xi)
+        return np.where(xi >= 0.0, found, -found)
+
+    def gap(self, xi: FloatArray) -> FloatArray:
+        """Gap voltages, V."""
+        return np.asarray(xi - self.lanes.kappa * self.bend(xi)) if self.lanes.kappa > 0.0 else xi
+
+    def force(self, xi: FloatArray) -> FloatArray:
+        """Force, N."""
+        u = self.gap(xi)
+        return np.asarray(self.stress * u * u / self.inverse_area(xi))
+
+    def moved(self, xi: FloatArray, source: FloatArray) -> FloatArray:
+        """What `Shown.bends` multiplies: N, or A s (V m^2)."""
+        return np.asarray(source / self.inverse_area(xi)) if self.mobile else self.bend(xi)
+
+    @property
+    def xi(self) -> tuple[float, FloatArray]:
+        """xi as k s + columns z; under `mobile` the gap voltage, which stands behind the modes."""
+        c = self.lanes
+        return (0.0, np.append(0.0 * c.shape, 1.0)) if self.mobile else (c.k, c.shape)
+
+    def xi_at(self, z: FloatArray, source: float) -> float:
+        """xi (V) at modes as in `start`."""
+        k, columns = self.xi
+        return float(k * source + columns @ z)
+
+    def after(self, z: FloatArray, to: float) -> float:
+        """Gap voltage (V) after a jump of the source to `to`; NaN where it meets a fold."""
+        return float(self.gap(np.array(self.xi_at(z, to))))
+
+
+@lru_cache(maxsize=64)
+def _marks(kind: type[Marks], *sizes: int) -> Marks:
+    return kind(*((0,) * size for size in sizes))
+
+
+def slopes(area: FloatArray, scale: float) -> FloatArray:
+    """Derivative by xi of a polynomial in `scale` xi, with as many terms."""
+    return np.append(scale * polyder(area), 0.0)
+
+
+def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
+    """A Chebyshev series in powers, of a degree 4 k, and what that lacks; empty if more than `tol`."""
+    for degree in range(4, MOST_DEGREE + 1, 4):
+        off = float(np.abs(series[degree + 1 :]).sum())
+        if off <= tol:
+            kept = np.zeros(degree + 1)
+            kept[: min(series.size, degree + 1)] = series[: degree + 1]
+            out = np.empty(degree + 1)
+            chebyshev.to_powers(kept, out)
+            return out, off
+    return np.empty(0), 0.0
+
+
+def curves(
+    curve: FloatArray, q0: float, kappa: float, top: float, rtol: float
+) -> tuple[FloatArray, FloatArray, float, float, float] | None:
+    """1/A - q0 and N as polynomials in `scale` xi - 1, the scale, and their errors (of 1/A relative, and V m^2).
+
+    They reach the gap voltage `top` (V). None where no allowed degree is enough for errors of `rtol`.
+    """
+    tol = _AREA_SHARE * min(rtol, _COARSEST)
+    at = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
+    to_series = np.linalg.inv(_chebyshev(at, _POINTS))
+    area = to_series @ (1.0 / inverse_area_array(0.5 * top * (at + 1.0), curve)[0])
+    integral = series_of.chebint(area, lbnd=-1.0) * 0.5 * top
+    # The range of xi ends where the gap voltage reaches `top`.
+    xi_top = float(top + kappa * (integral.sum() - top / q0))
+    xi = 0.5 * xi_top * (at + 1.0)
+    u = xi * top / xi_top
+    for _ in range(50):
+        basis = _chebyshev(2.0 * u / top - 1.0, _POINTS + 1)
+        n, a = basis @ integral - u / q0, basis[:, :-1] @ area
+        step = (u + kappa * n - xi) / (1.0 + kappa * (a - 1.0 / q0))
+        if np.abs(step).max() <= 1e-15 * top:
+            break
+        u = np.clip(u - step, 0.0, top)
+    inverse, bend = to_series @ (1.0 / a), to_series @ n
+    one, off_one = as_powers(inverse, tol * abs(float(inverse[0])))
+    # N acts at full strength, on charges too: compared with the whole integral of A. In a stack no step needs it.
+    of_bend = tol if kappa > 0.0 else max(1e-3 * tol, min(tol, 1e-13))
+    other, off_other = as_powers(bend, of_bend * xi_top / q0)
+    if one.size == 0 or other.size == 0:
+        return None
+    one[0] -= q0
+    other[0] -= polyval(-1.0, other)
+    return one, other, 2.0 / xi_top, off_one / abs(float(inverse[0])), off_other
+
+
+def _chebyshev(x: FloatArray, count: int) -> FloatArray:
+    """The first Chebyshev polynomials at x (n,) from -1 to 1, shape (n, count)."""
+    return np.asarray(np.cos(np.arange(count) * np.arccos(np.clip(x, -1.0, 1.0))[:, None]))
+
+
+# Ratio of reference areas, so large that there is one.
+_ONE_REFERENCE = 1e12
+
+
+@dataclass(frozen=True)
+class StackForm(LaneForm):
+    """A stack prepared for recordings; the charge is its last mode, where it is wanted."""
+
+    system: System
+
+    def _rest(self, z: FloatArray, u_gap: float, source: float) -> float:
+        """The charge (C) but for its mode, and under `mobile` but for A s."""
+        charge = self.rows.columns[-1, : self.active] @ z[: self.active] + self.rows.k[-1] * source
+        return float(charge + (0.0 if self.mobile else self.rows.bends[-1] * self.bend(np.array([u_gap]))[0]))
+
+    def start(self, problem: Problem) -> tuple[FloatArray, float]:
+        start = problem.inner
+        z = self.system.project[0] @ start.y[:-1]
+        if self.flows:
+            z = np.append(z, start.y[-1] - self._rest(z, start.u_gap, start.u_before))
+        return np.append(z, start.u_gap) if self.mobile else np.asarray(z), start.u_before
+
+    def after(self, z: FloatArray, to: float) -> float:
+        if not self.mobile:
+            return super().after(z, to)
+        model, active = self.system.model, self.active
+        return float(ramp(model, model.k_gap * to, dot(self.system.gap[0], z[:active]), float(z[-1])))
+
+    def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
+        start = problem.inner
+        u_gap = self.xi_at(z, u_last)
+        charge = z[self.active] + self._rest(z, u_gap, u_last) if self.flows else start.y[-1]
+        y = np.append(self.system.live[0] @ z[: self.active], charge)
+        found = StackState(t, y, u_last, u_gap, start.offset)
+        return from_stack(problem.scene, on_branch(self.system.model, found, math.copysign(1.0, u_gap)))
+
+    def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
+        rows = as_recorded(replace(problem, charge=False), self.system.model, out.T, np.empty(0))
+        if self.flows and self.mobile:
+            rows[:, self.rows.k.size - 1] -= problem.inner.offset
+        return rows
+
+
+def rounded_peak(peak: float) -> float:
+    """A peak (V) rounded up to one of four values an octave, so that recordings of about the same peak share forms."""
+    return 2.0 ** (math.ceil(4.0 * math.log2(peak)) / 4.0) if peak > 0.0 else 0.0
+
+
+def stack(problem: Problem, rtol: float) -> StackForm | None:
+    """The stack prepared for recordings with about its peak; None where no polynomial represents 1/A well enough."""
+    scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
+    peak = rounded_peak(scene.u_peak)
+    system = system_of(scene, decade, BEYOND_PEAK * peak, _ONE_REFERENCE, peak)
+    model, q0, stack = system.model, float(system.q0[0]), scene.stack
+    found = curves(model.curve, q0, 0.0, system.u_top, rtol)
+    assert stack is not None
+    if found is None or stack.gap is None or (stack.g_area[stack.gap] > 0.0 and not model.mobile):
+        return None
+    area, bend, scale, missed, missed_bend = found
+    slope = slopes(area, scale)
+    rest, steep = float(polyval(-1.0, area)), float(polyval(-1.0, slope))
+    rates, gain, feed, taps, tap_s = system.rates[0], system.gain[0], system.feed[0], system.tap[0], system.tap_k
+    n, area0, shape, kinks, by = rates.size, model.area0, system.gap[0], np.full(tap_s.size, steep), 1.0
+    if model.mobile:
+        # The last drive is A - 1/q0 times the source.
+        feed, kinks = np.column_stack([feed, system.push[0] / area0]), np.append(kinks, -steep / (q0 + rest) ** 2)
+        shape, by, missed_bend = area0 * q0 * shape, area0, missed * peak / q0
+    columns, k, moves, nodes = by * system.shown[0], system.k_shown, np.zeros(system.k_shown.size), by * system.node[0]
+    if problem.charge:
+        column, stored, gain_of, feed_of, moved = _charge(system, stack)
+        rates, gain, feed = np.append(rates, 0.0), np.append(gain, gain_of), np.vstack([feed, feed_of])
+        columns = np.vstack([_wider(columns), np.append(column, 1.0)])
+        k, moves, nodes = np.append(k, stored), np.append(moves, moved), _wider(nodes)
+        taps, shape = _wider(taps), np.append(shape, 0.0)
+    rates, gain, shape, taps, tap_s, feed = map(
+        np.ascontiguousarray, (rates, gain, shape, taps, tap_s, feed)
+    )  # fmt: skip
+    lanes = Lanes(
+        rates, gain, shape, float(model.k_gap), taps, tap_s, np.zeros(tap_s.size), feed, area, slope, bend, scale,
+        -1.0, q0, 0.0, kinks, rest, steep, 0,
+    )  # fmt: skip
+    voltages = np.arange(k.size) < system.k_shown.size
+    return StackForm(
+        lanes, n, 1 if rtol >= BY_SIMPSON else 2, model.mobile, Shown(columns, k, moves, voltages & model.mobile),
+        Shown(nodes, system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile)),
+        int(problem.charge), system.stress, float(model.k_gap), system.u_top, missed, missed_bend,
+        float(model.slow[-3]) * area0, system,
+    )  # fmt: skip
+
+
+def _wider(rows: FloatArray) -> FloatArray:
+    """Rows (n, m) with a column of zeros behind them."""
+    return np.hstack([rows, np.zeros((len(rows), 1))])
+
+
+def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:
+    """The charge as columns z + k s + y + moved N with y' = gain s + feed g, or with A s for N under `mobile`.
+
+    Through the slowest layer, under `local` i = A0 (c v' + g v) + G v + j, where v = share s + own z is its voltage and
+    j the current by the change of the area (`solve.recordings.networks`): c_gap N' + A0 (q - q0) (G v - G_gap u). Under
+    `mobile` i = (c A v)' + (g A + G) v, where v = share s + A0 q own z.
+    """
+    model, q0 = system.model, float(system.q0[0])
+    rates, own, mobile = system.rates[0], system.slow[0], model.mobile
+    share, c, g_area, g_total = cast("list[float]", model.slow[rates.size :].tolist())
+    area0 = model.area0 if mobile else 1.0 / q0
+    leak = (g_area * area0 + g_total * area0 * q0) * own
+    over = np.divide(leak, rates, out=np.zeros_like(leak), where=rates > 0.0)
+    order = np.array(stack.state_order)
+    leaking = order[stack.g_total[order] > 0.0]
+    slow = int(np.argmin(stack.leak_rates(model.area0)))
+    turned = (leaking == slow).astype(float)
+    gain = (g_area / q0 + g_total) * share + float(over @ system.gain[0])
+    if mobile:
+        feed = np.append(
+            over @ system.feed[0] + area0 * stack.g_total[leaking] * turned,
+            over @ system.push[0] / area0 + g_area * share,
+        )  # fmt: skip
+        return area0 * c * own - over, 0.0, gain, feed, c * share
+    feed = over @ system.feed[0] + area0 * stack.g_total[leaking] * (turned - (leaking == stack.gap))
+    return area0 * c * own - over, area0 * c * share, gain, feed, float(stack.c[stack.gap])
