@@ -320,6 +320,14 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_sources_are_made_without_the_compiler() -> None:
+    code = (
+        "import sys, fingerspice as fs; fs.Chirp(9, 20, 2e4, 1); fs.PWL([0, 1], [0, 1]); print('numba' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == "False"
+
+
 def test_every_public_name_is_found_where_the_package_says() -> None:
     import fingerspice
 

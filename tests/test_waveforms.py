@@ -407,3 +407,10 @@ def test_a_recording_turned_over_runs_sample_by_sample_like_the_recording() -> N
     turned = as_samples(-samples)
     assert turned is not None
     np.testing.assert_array_equal(turned.values, -samples.values)
+
+
+@pytest.mark.parametrize("wave", [fs.Triangle(100.0, 50.0), fs.Sawtooth(100.0, 50.0)], ids=["triangle", "sawtooth"])
+def test_only_a_square_has_a_duty(wave: fs.Waveform) -> None:
+    circuit = table1().replace({"Vdrive": wave})
+    with pytest.raises(fs.InputError, match=r"unknown parameter 'Vdrive\.duty'; nearest: 'Vdrive\.\w+'"):
+        circuit.replace({"Vdrive.duty": 0.3})

@@ -25,7 +25,7 @@ class _Periodic(Ramps):
     phase_deg: float = 0.0
     delay: float = 0.0
     units: ClassVar[dict[str, str]] = {
-        "amplitude": "V", "frequency": "Hz", "duty": "", "offset": "V", "phase_deg": "deg", "delay": "s"
+        "amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s"
     }  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -73,6 +73,7 @@ class Square(_Periodic):
     """
 
     duty: float = 0.5
+    units: ClassVar[dict[str, str]] = {"amplitude": "V", "frequency": "Hz", "duty": "", **_Periodic.units}
 
     # Beside the frequency the duty comes first, as in netlists; the fields that all shapes have precede it otherwise.
     def __init__(
