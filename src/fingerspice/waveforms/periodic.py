@@ -56,8 +56,7 @@ class _Periodic(Ramps):
 
     @property
     def _first(self) -> float:  # type: ignore[override]
-        # Begin a whole number of periods earlier, at or before t = 0: the delay only shifts the shape in time, and does
-        # not hold the source before it.
+        # Begin whole periods earlier, at or before t = 0: the delay shifts the shape, and holds nothing before it.
         shift = self.delay - self.phase_deg / 360.0 / self.frequency
         return shift - math.ceil(shift / self.period - 1e-12) * self.period if shift > 0.0 else shift
 
