@@ -9,7 +9,6 @@ import argparse
 import gc
 import os
 import random
-import re
 import resource
 import shutil
 import signal
@@ -48,8 +47,6 @@ class Defect(BaseException):
 class Watch:
     """Says what the interpreter is asked to do while an input is read: a hook for audit events, active on demand."""
 
-    #: Parsing arithmetic into a tree is a `compile` of this and nothing else; running it would be an `exec`.
-    _TREE = re.compile(rb"(?:f_[a-z0-9_]+|n\d+|\d[\d.e+-]*|if|else|and|or|[-+*/<>=!(), .])*")
     _HARMLESS = frozenset({"sys._getframe", "builtins.id"})
 
     def __init__(self) -> None:
@@ -81,10 +78,6 @@ class Watch:
             return
         if event in ("os.listdir", "os.scandir") and self._inside(arguments[0]):
             return
-        if event == "compile" and isinstance(arguments[0], bytes | str):
-            text = arguments[0] if isinstance(arguments[0], bytes) else arguments[0].encode("utf-8", "replace")
-            if arguments[1] == "<unknown>" and self._TREE.fullmatch(text):
-                return
         self.seen.append(f"{event} {str(arguments)[:200]}")
 
     def _inside(self, path: Any) -> bool:
@@ -224,8 +217,7 @@ def judge(error: InputError) -> None:
     """
     said = str(error)
     clear = error.message.strip() and said.isprintable() and len(said) <= LONGEST_MESSAGE
-    # Of the parser of Python's own only the texts it takes are asked.
-    if not clear or "Traceback" in said or re.search(r"is not arithmetic \(\w+Error\)", said):
+    if not clear or "Traceback" in said:
         raise Defect(f"no clear sentence: {said[:300]!r}")
 
 

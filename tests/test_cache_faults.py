@@ -136,13 +136,13 @@ import time
 from fingerspice.base.announcing import Bar, Compiling
 sweep, compiling = Bar("sweeping"), Compiling()
 sweep.show(0.25)
-for kind in ("Stack", "Mesh"):
+for kind in ("OneArea", "ManyAreas"):
     with compiling.around():
         compiling.begins("engine.collocation.loop.march_on", kind, True)
         time.sleep(1.3)
     sweep.show(0.5)
 with compiling.around():
-    compiling.begins("engine.collocation.loop.march_on", "Mesh", True)
+    compiling.begins("engine.collocation.loop.march_on", "ManyAreas", True)
 sweep.stop()
 """
 LINES = [

@@ -53,7 +53,7 @@ def test_a_change_of_a_file_that_nothing_compiled_depends_on_compiles_nothing(tm
     area_at_zero_volt(tmp_path)
     before = {p: p.stat().st_mtime_ns for p in copy.rglob("*.nb[ic]")}
     assert before
-    for name in ("cli.py", "circuit/reader.py"):
+    for name in ("cli/app.py", "netlist/reader.py"):
         with (copy / name).open("a") as source:
             source.write("\n# changed\n")
     area_at_zero_volt(tmp_path)

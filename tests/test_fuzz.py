@@ -99,7 +99,6 @@ DEFECTS: dict[str, tuple[fuzz.Target, str]] = {
     "two lines": (bad_sentence("one\ntwo"), "no clear sentence"),
     "a terminal's commands": (bad_sentence("\x1b[31m"), "no clear sentence"),
     "an endless message": (bad_sentence("x" * 5000), "no clear sentence"),
-    "a message of Python's": (bad_sentence("'1' is not arithmetic (MemoryError)"), "no clear sentence"),
     "a file beside the folder": (touching(lambda folder: (folder / "../outside.lib").read_text()), "open"),
     "a link out of the folder": (touching(lambda folder: (folder / "link.lib").read_text()), "open"),
     "a file written": (touching(lambda folder: (folder / "part.lib").write_text("x")), "open"),

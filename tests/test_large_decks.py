@@ -200,6 +200,13 @@ def test_the_largest_circuits_find_conflicts_and_start_values(monkeypatch: pytes
     assert refusal(f"{areas}V1x d 0 1\nV2x d 0 1\n") == "V1x and V2x are voltage sources in parallel"
 
 
+def test_many_lines_with_start_values_are_read_in_linear_time() -> None:
+    # Each line looked at all before it for a while.
+    assert refusal(lines(lambda i: f".ic v(n{i})=1", 5 * MANY)).startswith(".ic names node 'n0', which")
+    # A name that goes on through brackets ends where names do.
+    assert "never closed" in refusal(f"X1 {'a(' * 20_000} gnd LAYER\n")
+
+
 def test_the_nearest_spelling_is_looked_for_in_bounded_time() -> None:
     assert nearest("thik", ["thick", *map(str, range(10**6))]) == "; did you mean 'thick'?"
     assert nearest("x" * 10**6, ["x" * 10**6]) == nearest("a" * 50, ["a" * 10**6] * 1000) == ""

@@ -7,17 +7,16 @@ from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.devices import DEVICES, layer_devices
-from fingerspice.netlist.lexer import Group, Lexeme, Line, group, lex
+from fingerspice.netlist.lexer import MAX_NAME, Group, Lexeme, Line, group, lex
 from fingerspice.netlist.reader import DIRECTIVES, DirectiveLine, Subcircuit
 from fingerspice.netlist.scope import Bare, Scope
 from fingerspice.netlist.slips import nearest, stray_word
 from fingerspice.netlist.words import Directive, Number, Statement, Value
 
-#: Limits of subcircuit calls: total number of expanded lines and characters, nesting, and characters of a flat name.
+#: Limits of subcircuit calls: total number of expanded lines and characters, and nesting.
 MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
-MAX_NAME = 400
 
 
 class Kind(NamedTuple):
@@ -175,7 +174,7 @@ class Flattener:
             raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
         if len(instance.calls) >= MAX_DEPTH:
             raise InputError(f"subcircuits call each other more than {MAX_DEPTH} deep", where)
-        self._expanded += 1 + len(called.elements) + len(called.params) + len(called.defaults)
+        self._expanded += 1 + sum(map(len, (called.elements, called.params, called.defaults, called.directives)))
         if self._expanded > MAX_EXPANDED:
             raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
         self._expanded_text += called.characters

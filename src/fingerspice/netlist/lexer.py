@@ -21,6 +21,8 @@ _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
 _SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
 _BRACE = re.compile(r"[{}]")
 _MARKS = ("(", ")", "=")
+#: Most characters of a name.
+MAX_NAME = 400
 _KEY = re.compile(r"[A-Za-z_]\w*")
 _NUMERIC = re.compile(r"[+-]?\.?[0-9]")
 
@@ -229,7 +231,7 @@ def _with_brackets(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int]:
     """A word with the brackets and words that touch it, as in KiCad's `Net-(C1-Pad1)`, and the index after it."""
     name, end, depth = lexemes[index].text, index + 1, 0
     closed = name, end
-    while end < len(lexemes) and lexemes[end].kind in ("(", ")", "word"):
+    while end < len(lexemes) and len(name) <= MAX_NAME and lexemes[end].kind in ("(", ")", "word"):
         piece = lexemes[end]
         depth += {"(": 1, ")": -1}.get(piece.kind, 0)
         if depth < 0 or piece.position != lexemes[index].position + len(name):

@@ -121,11 +121,12 @@ def _coarse_outputs(deck: Deck, elements: tuple[Element, ...], tran: Tran | None
     """A warning about each source with a period shorter than TSTEP, unless there is one about its frequency."""
     if tran is None:
         return
+    where = deck.named(".tran")[0].where
     for e in elements:
         period = e.waveform.period if e.waveform is not None else None
         if period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
             yield (
-                f"{deck.named('.tran')[0].where}: {e.name}: TSTEP is {format_si(tran.step, 's')}, longer than this "
+                f"{where}: {e.name}: TSTEP is {format_si(tran.step, 's')}, longer than this "
                 f"source's period of {format_si(period, 's')}: the outputs do not show its course, and the figures of "
                 "a run still do"
             )

@@ -186,7 +186,7 @@ class Reader:
         if here is not self.root and read.name != ".ic":
             opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
             raise InputError(f"{read.name} does not belong inside {opened}?", read.line.place)
-        first = next((one for one in here.directives if one.name == read.name in _ONCE), None)
+        first = next((one for one in here.directives if one.name == read.name), None) if read.name in _ONCE else None
         if first is not None:
             raise InputError(f"{read.name} is given twice, first at {first.line.place}", read.line.place)
         here.directives.append(read._replace(name=".options") if read.name == ".option" else read)

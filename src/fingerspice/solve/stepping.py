@@ -112,7 +112,7 @@ class Stepping(Integration):
     peaks, collected : ndarray
         As in `LoopState`; those of the gaps whose errors are stated are in the rows `gaps`.
     branch : ndarray, shape (n, 2)
-        As in `Mesh`.
+        As in `ManyAreas`.
     largest : float
         Voltage (V) beside the peaks that the round-off of the charge goes with.
     area_error, charge_safety : float

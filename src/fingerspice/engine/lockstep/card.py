@@ -101,21 +101,28 @@ def march_on_card(
     curves: tuple[FloatArray, FloatArray, FloatArray], source: Source, how: How, most_pieces: int,
     lengths: Lengths,
 ) -> FloatArray:  # fmt: skip
-    """Integrate scenes of a table as `lockmarch.march` does, and return its `out`.
+    """Integrate scenes of a table as `march.march` does, and return its `out`.
 
     Parameters
     ----------
     table, pending, places, curves, source, how
-        As `lockmarch.march` takes them.
+        As `march.march` takes them.
     most_pieces : int
         Number of pieces for which the kernel is compiled; 0 for a source without jumps.
     lengths : tuple of int
         `Lengths`.
     """
     kernel = _compiled(lengths, table.shape[0], most_pieces)
-    chosen = table if pending.size == table.shape[1] else np.ascontiguousarray(table[:, pending])
     with _CARD:
-        given = (chosen, np.arange(pending.size), places[1], *curves, source[0], *source[1])
+        # Pending scenes are not always in the order of the table.
+        given = (
+            np.ascontiguousarray(table[:, pending]),
+            np.arange(pending.size),
+            places[1],
+            *curves,
+            source[0],
+            *source[1],
+        )
         columns, order, leaks, series, nodes, matrix, tones, coarse, fine = (cuda.to_device(x) for x in given)
         out = cuda.device_array((2, 2 * lengths[4] + 3, pending.size))
         kernel[-(-pending.size // THREADS), THREADS](

@@ -41,7 +41,7 @@ class Stepping(NamedTuple):
     # (lanes,): Length of the shortest step, s; in a run from rest, then the number of half periods after which it has
     # settled
     length: FloatArray
-    moments: FloatArray  # (11, lanes): Scratch of `lockweights.weigh`
+    moments: FloatArray  # (11, lanes): Scratch of `weights.weigh`
 
 
 def stepping_shapes(pieces: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
@@ -236,7 +236,7 @@ def march(
         state is wanted; its tolerance, relative to the peak gap voltage; and the largest gap voltage that the area's
         polynomial covers, as a ratio to its estimate.
     block, stepping
-        From `lockscenes.new_block` and `new_stepping`.
+        From `scenes.new_block` and `new_stepping`.
     out : ndarray, shape (2, 2 n_moment + 3, n)
         For each run the means over it and over its last period, the peak (V), the relative error of the periodic
         state, and the relative size of the last coefficient of the area's series. The latter is infinite where the

@@ -236,7 +236,7 @@ def march_samples(
     Parameters
     ----------
     table, pending, places, curves, block, marks
-        As for `lockmarch.march`, with one wave, whose amplitude is the recording's peak; the table's frequency is half
+        As for `march.march`, with one wave, whose amplitude is the recording's peak; the table's frequency is half
         that of the samples.
     values : ndarray, shape (n,)
         Samples relative to their peak.
@@ -244,7 +244,7 @@ def march_samples(
         Steps a sample in both runs, 0 for none in the first; and the largest gap voltage that the area's
         polynomial covers, as a ratio to its estimate.
     out : ndarray, shape (2, (1 + N_PORTION) * n_moment + 3, n)
-        As for `lockmarch.march`, with the shares of the run's portions in place of the last period.
+        As for `march.march`, with the shares of the run's portions in place of the last period.
     """
     m_all, l_all, d_all, count, lanes = len(marks[0]), len(marks[2]), len(marks[3]) - 1, len(marks[4]), len(marks[5])
     area, row = area_row(m_all, 1, l_all), N_WEIGHTS * m_all * lanes

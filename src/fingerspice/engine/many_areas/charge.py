@@ -114,7 +114,7 @@ def charge_error(
         Form, length (s) and fraction of the step that counts; `g` (n_f,) are the leaks, which are zero within a jump.
     work : Work
         Its `places` (m, N_PLACES) are the errors of the modes, and `off` (5, m + n_s) the interpolation errors of this
-        step among them; see `netassess.assess`.
+        step among them; see `error.assess`.
     u, areas, z : ndarray
         Rows of the cells' voltages (n_f, ROWS), blocks of the areas', and charges gained (n_s, ROWS).
     collected : ndarray, shape (2, n_s)
