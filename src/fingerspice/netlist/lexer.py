@@ -21,8 +21,7 @@ _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
 _SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
 _BRACE = re.compile(r"[{}]")
 _MARKS = ("(", ")", "=")
-#: Most characters of a name.
-MAX_NAME = 400
+MAX_NAME = 400  # Characters of a name
 _KEY = re.compile(r"[A-Za-z_]\w*")
 _NUMERIC = re.compile(r"[+-]?\.?[0-9]")
 

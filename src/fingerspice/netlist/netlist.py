@@ -126,9 +126,8 @@ def _coarse_outputs(deck: Deck, elements: tuple[Element, ...], tran: Tran | None
         period = e.waveform.period if e.waveform is not None else None
         if period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
             yield (
-                f"{where}: {e.name}: TSTEP is {format_si(tran.step, 's')}, longer than this "
-                f"source's period of {format_si(period, 's')}: the outputs do not show its course, and the figures of "
-                "a run still do"
+                f"{where}: {e.name}: TSTEP is {format_si(tran.step, 's')}, longer than this source's period of "
+                f"{format_si(period, 's')}: the outputs do not show its course, and the figures of a run still do"
             )
 
 

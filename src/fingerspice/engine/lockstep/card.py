@@ -113,16 +113,9 @@ def march_on_card(
         `Lengths`.
     """
     kernel = _compiled(lengths, table.shape[0], most_pieces)
+    chosen = np.ascontiguousarray(table[:, pending])  # Not always in the order of the table
     with _CARD:
-        # Pending scenes are not always in the order of the table.
-        given = (
-            np.ascontiguousarray(table[:, pending]),
-            np.arange(pending.size),
-            places[1],
-            *curves,
-            source[0],
-            *source[1],
-        )
+        given = (chosen, np.arange(pending.size), places[1], *curves, source[0], *source[1])
         columns, order, leaks, series, nodes, matrix, tones, coarse, fine = (cuda.to_device(x) for x in given)
         out = cuda.device_array((2, 2 * lengths[4] + 3, pending.size))
         kernel[-(-pending.size // THREADS), THREADS](
