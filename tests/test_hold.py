@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.signal import cont2discrete, lfilter, ss2tf
 
+from fingerspice.numerics.hold import first_order_hold
 from fingerspice.numerics.linear import respond
-from fingerspice.solve.closed_form import first_order_hold
 
 DT = 1e-6
 # Stretches of the recursion begin after the first sample.

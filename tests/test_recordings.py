@@ -12,7 +12,7 @@ import pytest
 import analytic
 import fingerspice as fs
 import recording_errors
-from fingerspice.numerics.moments import moments
+from fingerspice.numerics.hold import moments
 from fingerspice.waveforms.recorded import as_samples
 from scenes import table1_deck
 

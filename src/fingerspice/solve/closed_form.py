@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -14,8 +13,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.network import Modes, Network
 from fingerspice.engine.network import at_sources
 from fingerspice.engine.one_area.model import follow, source_at
-from fingerspice.numerics import linear
-from fingerspice.numerics.moments import moments
+from fingerspice.numerics import hold, linear
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.solve.initial import StackState, from_stack, from_written, model_of, row_width
@@ -30,8 +28,6 @@ from fingerspice.waveforms.sampling import on_grid, same_time
 ROUNDING, ROUNDING_OF_MATRICES = 1e-13, 1e-12
 # Number of sets of areas whose modes are cached with a scene.
 MOST_MODES = 8
-# Samples in a stretch of `first_order_hold`; a state below counts as zero, before it becomes a (slow) denormal number.
-STRETCH, SMALLEST = 500, 1e-300
 
 
 def solve_linear(
@@ -151,44 +147,9 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
     assert isinstance(wave, Samples)
     count = round((problem.t_stop - wave.start) * wave.rate) + 1
     u, rates, gains = wave.values[:count], modes.rates, np.ascontiguousarray(modes.gains[:, 0])
-    live, end = first_order_hold(u, 1.0 / wave.rate, rates, gains, -modes.follow[:, 0], modes.shape, v0)
+    live, end = hold.first_order_hold(u, 1.0 / wave.rate, rates, gains, -modes.follow[:, 0], modes.shape, v0)
     s = np.array([[float(wave.value(problem.t_stop, "left"))]])
     return live.T, _Answer(end[None], s, np.zeros((1, 1)), np.zeros((1, 1)))
-
-
-@np.errstate(invalid="ignore")  # Samples that are not finite stay in what follows them.
-def first_order_hold(
-    u: FloatArray, dt: float, rates: FloatArray, gains: FloatArray, direct: FloatArray, weights: FloatArray,
-    w0: FloatArray,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Outputs direct U + weights w (n_y, m) of modes w' = -rates w + gains U at samples joined by straight lines.
-
-    In each stretch of samples the modes run from zero, and what they had before decays in closed form beside that. So
-    the state is rounded once in a stretch, with the rounding carried on: a slow mode does not add up that of every
-    sample. The second array is the state at the last sample.
-    """
-    from scipy.signal import lfilter
-
-    steps, y, end, by = u.size - 1, np.multiply.outer(direct, u), w0.astype(float), np.empty(2)
-    count = -(-steps // STRETCH)
-    drive, along, starts = np.zeros((count, STRETCH)), np.arange(1.0, STRETCH + 1.0), np.empty((count, 1))
-    for k, (z, gain) in enumerate(zip(rates * dt, gains * dt, strict=True)):
-        moments(z, by)
-        drive.ravel()[:steps] = gain * ((by[0] - by[1]) * u[:-1] + by[1] * u[1:])
-        from_zero = lfilter([1.0], [1.0, -math.exp(-z)], drive)
-        state, carry, path = float(w0[k]), 0.0, z * STRETCH
-        # A slow mode is what it was and a change; a fast one keeps its digits as it decays.
-        kept, left = (1.0, math.expm1(-path)) if path < 0.5 else (0.0, math.exp(-path))
-        for i, gained in enumerate(from_zero[:, -1].tolist()):
-            starts[i] = state
-            change = gained + (left * state + carry)
-            new = kept * state + change
-            carry, state = (kept * state - new) + change, 0.0 if abs(new) < SMALLEST else new
-        w = (from_zero + starts * np.exp(-z * along)).ravel()[:steps]
-        end[k] = w[-1] if steps else w0[k]
-        y[:, 0] += weights[:, k] * w0[k]
-        y[:, 1:] += weights[:, k, None] * w
-    return y, end
 
 
 @dataclass(frozen=True)
