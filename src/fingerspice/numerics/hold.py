@@ -104,7 +104,7 @@ def first_order_hold(
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Outputs y = direct U + weights w (n_y, m) at samples joined by straight lines, and the state at the last one.
 
-    `u` (m,) are one or more samples, `dt` (s) apart; `rates` (1/s, 0 or more) and `gains` (n,) are those of the modes w,
+    `u` (m,) are one or more samples, `dt` (s) apart; `rates` (1/s, 0 or more) and `gains` (n,) are of the modes w,
     whose state at the first sample is `w0`; `direct` (n_y,) is the share of the input that appears at once.
     """
     n, y = rates.size, np.empty((direct.size, u.size))
