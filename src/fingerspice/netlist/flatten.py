@@ -174,7 +174,7 @@ class Flattener:
             raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
         if len(instance.calls) >= MAX_DEPTH:
             raise InputError(f"subcircuits call each other more than {MAX_DEPTH} deep", where)
-        self._expanded += 1 + sum(map(len, (called.elements, called.params, called.defaults, called.directives)))
+        self._expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
         if self._expanded > MAX_EXPANDED:
             raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
         self._expanded_text += called.characters
