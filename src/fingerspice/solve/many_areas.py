@@ -256,10 +256,11 @@ class March(Stepping, NetworkIntegration):
         self.looks = looks_of(problem, self.form.rates.copy(), self.pace.tol, scale, repeat)
 
     @property
-    def rounding(self) -> FloatArray:
+    def rounding(self) -> list[float]:
         u_peak = self.peaks[:, readout.PEAK_U]
         # Enlarged by the condition of the modes.
-        return np.asarray(4e-16 * (self.references.magnified * (float(u_peak.max()) + self.u_scale) + u_peak))
+        floor = 4e-16 * (self.references.magnified * (float(u_peak.max()) + self.u_scale) + u_peak)
+        return list(map(float, floor))
 
     @property
     def capacitance(self) -> float:

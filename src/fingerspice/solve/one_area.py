@@ -167,10 +167,10 @@ class Track(Stepping):
         return float(model.slow[-3]) * model.area0
 
     @property
-    def rounding(self) -> FloatArray:
-        u_size = self.problem.scene.u_size
+    def rounding(self) -> list[float]:
         # Of the nodes, the peak is that of the gap.
-        return np.asarray(4e-16 * (self.peaks[0, 0] + u_size * np.array([self.prepared.system.model.k_gap, 1.0])))
+        peak, size = float(self.peaks[0, readout.PEAK_U]), self.problem.scene.u_size
+        return [4e-16 * (peak + self.prepared.system.model.k_gap * size), 4e-16 * (peak + size)]
 
     @property
     def margin(self) -> float:

@@ -85,12 +85,6 @@ LONGEST_STEP = 0.6
 KEPT_STEPS = 2000
 
 
-def _steepest(peaks: FloatArray) -> FloatArray:
-    """Largest change of every force (N) for a change of its voltage (V): F ~ u^2 A, and A falls with u."""
-    u = peaks[:, readout.PEAK_U]
-    return np.asarray(2.0 * peaks[:, readout.PEAK_F] / np.where(u > 0.0, u, np.inf))
-
-
 class OutOfRangeError(Exception):
     """A gap voltage left the range of its area's curve, which ends at `top` (V)."""
 
@@ -180,8 +174,8 @@ class Stepping(Integration):
 
     @property
     @abstractmethod
-    def rounding(self) -> FloatArray:
-        """Round-off of the voltage of every area's gap and, last, of the nodes, V, shape (n_area + 1,)."""
+    def rounding(self) -> list[float]:
+        """Round-off of the voltage of every area's gap and, last, of the nodes, V."""
 
     @property
     @abstractmethod
@@ -221,7 +215,8 @@ class Stepping(Integration):
         self.branch[:, 0] += periods * self.period
         self.control["branch_start"] += periods * self.period
         self.peaks[:, readout.ERROR_U] += off
-        self.peaks[:, readout.ERROR_F] += off * _steepest(self.peaks)
+        u = self.peaks[:, readout.PEAK_U]
+        self.peaks[:, readout.ERROR_F] += off * 2.0 * self.peaks[:, readout.PEAK_F] / np.where(u > 0.0, u, np.inf)
         missed, spread = self.collected - collected
         self.collected[0] += periods * missed
         if self.pace.charge:
@@ -230,10 +225,12 @@ class Stepping(Integration):
 
     def stated_peaks(self) -> FloatArray:
         """Peaks so far, of every area's gap and of the nodes, with their stated errors: estimates and round-off."""
-        peaks, floor = self.peaks.copy(), self.rounding
-        peaks[:, readout.ERROR_U] = SAFETY * peaks[:, readout.ERROR_U] + floor
-        peaks[:, readout.ERROR_F] = SAFETY * peaks[:, readout.ERROR_F] + floor * _steepest(peaks)
-        return peaks
+        found = []
+        for (u, f, u_error, f_error), floor in zip(self.peaks.tolist(), self.rounding, strict=True):
+            # F ~ u^2 A, and A falls with u.
+            steepest = 2.0 * f / u if u > 0.0 else 0.0
+            found.append((u, f, SAFETY * u_error + floor, SAFETY * f_error + floor * steepest))
+        return np.array(found)
 
     def stated(self, run: Run) -> None:
         """Write the stated errors and the margin into a run."""
@@ -248,12 +245,12 @@ class Stepping(Integration):
         # Errors of unknown sign are the same in every period: they add up from one to the next, instead of cancelling.
         period, steps = self.problem.waveform.period, 1.0 + float(self.counters[readout.ACCEPTED])
         alike = (self.t - self.problem.t_start) / period - self.repeated if period else 0.0
-        known, spread = float(self.control["error_q"]), float(self.collected[1].max(initial=0.0))
+        known, spread = float(self.control["error_q"]), max(self.collected[1].tolist(), default=0.0)
         estimate = SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
-        held = self.capacitance * (self.largest + float(self.peaks[:, readout.PEAK_U].max()))
-        moved = max(float(self.control["peak_q"]), float(np.abs(self.y[-self.s_before.size :]).max(initial=0.0)))
+        held = self.capacitance * (self.largest + max(self.peaks[:, readout.PEAK_U].tolist()))
+        moved = max(float(self.control["peak_q"]), *map(abs, self.y[-self.s_before.size :].tolist()))
         # The relative error of the areas' polynomials is also a relative error of all charge moved.
-        return self.charge_safety * estimate + 4e-16 * held * steps + self.area_error * (held + moved)
+        return float(self.charge_safety * estimate + 4e-16 * held * steps + self.area_error * (held + moved))
 
     def through(self, sources: Sources, t_end: float) -> Status:
         # A period that has been repeated may have led there already.
