@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import fingerspice as fs
@@ -19,6 +20,11 @@ GAP = {
     "n_exp": 1.41,
     "c2": 5000,
 }
+
+
+def cases(whole: int, few: int) -> int:
+    """How many random cases a statistic takes: `whole` in ``make stress``, which sets STRESS, and `few` in the suite."""
+    return whole if os.environ.get("STRESS") else few
 
 
 def assignments(values: dict[str, Any]) -> str:
