@@ -23,7 +23,7 @@ GAP = {
 
 
 def cases(whole: int, few: int) -> int:
-    """How many random cases a statistic takes: `whole` in ``make stress``, which sets STRESS, and `few` in the suite."""
+    """How many random cases a statistic takes: `whole` in ``make stress``, which sets STRESS, else `few`."""
     return whole if os.environ.get("STRESS") else few
 
 

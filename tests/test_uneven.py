@@ -12,6 +12,7 @@ import fingerspice as fs
 from fingerspice.engine.lanes.rows import INNER, QUICK, Lanes, weighed
 from fingerspice.engine.lanes.weights import weigh
 from fingerspice.solve.recordings.pieces import LEAST_POINTS
+from scenes import cases
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 DISPERSIVE = (CIRCUITS / "fingerpad.cir").read_text().replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE  d=350u")
@@ -48,7 +49,7 @@ def compared(circuit: fs.Circuit, wave: fs.PWL, t: np.ndarray, rtol: float, **ho
 
 @pytest.mark.parametrize("law", ["local", "mobile"])
 @pytest.mark.parametrize("skin", ["SKIN", "SKIN_DISPERSIVE"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(cases(4, 1)))
 def test_points_at_uneven_times_run_one_step_each_with_the_error_stated(skin: str, seed: int, law: str) -> None:
     circuit, (t, v) = circuit_of(skin), points(seed)
     for rtol in (1e-3, 1e-5, 1e-7):
@@ -58,8 +59,8 @@ def test_points_at_uneven_times_run_one_step_each_with_the_error_stated(skin: st
 
 
 def test_the_error_is_covered_and_not_overstated_on_random_points() -> None:
-    covered, within = 0, 0
-    for seed in range(20):
+    covered, within, every = 0, 0, cases(1, 3)
+    for seed in range(0, 20, every):
         t, v = points(100 + seed, 1100)
         circuit = circuit_of("SKIN").replace({"Xgap.d": 2e-6 * 1.1**seed, "Xgap.r": 2e5 * 1.3**seed})
         run, exact = (
@@ -69,8 +70,8 @@ def test_the_error_is_covered_and_not_overstated_on_random_points() -> None:
         assert run.method == "relaxation"
         over = run.error.u_gap / float(np.abs(run.u_gap - exact.u_gap).max())
         covered, within = covered + (over >= 1.0), within + (over <= 30.0)
-    assert covered >= 19
-    assert within >= 18
+    assert covered >= 0.95 * len(range(0, 20, every))
+    assert within >= 0.9 * len(range(0, 20, every))
 
 
 @pytest.mark.parametrize("seed", range(4, 17, 2))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import cast
@@ -38,6 +39,8 @@ from fingerspice.solve.scenes import BEYOND_PEAK
 
 # Number of lanes, each with a piece of a recording.
 PIECES = 64
+# Numbers of active modes that code is compiled for, as a new one takes 15 to 30 s: others get modes that stay at 0.
+SIZES = (1, 2, 3, 4, 7, 10, 14, 20, 28, 40, 56)
 # Relative error from which on steps in a stack have Simpson's nodes, and need two evaluations in the place of three.
 BY_SIMPSON = 1e-5
 # Largest degree of the polynomial for 1/A.
@@ -254,23 +257,23 @@ class StackForm(LaneForm):
         return float(charge + (0.0 if self.mobile else self.rows.bends[-1] * self.bend(np.array([u_gap]))[0]))
 
     def start(self, problem: Problem) -> tuple[FloatArray, float]:
-        start = problem.inner
-        z = self.system.project[0] @ start.y[:-1]
+        start, z = problem.inner, np.zeros(self.lanes.rates.size)
+        z[: start.y.size - 1] = self.system.project[0] @ start.y[:-1]
         if self.flows:
-            z = np.append(z, start.y[-1] - self._rest(z, start.u_gap, start.u_before))
-        return np.append(z, start.u_gap) if self.mobile else np.asarray(z), start.u_before
+            z[self.active] = start.y[-1] - self._rest(z, start.u_gap, start.u_before)
+        return np.append(z, start.u_gap) if self.mobile else z, start.u_before
 
     def after(self, z: FloatArray, to: float) -> float:
         if not self.mobile:
             return super().after(z, to)
-        model, active = self.system.model, self.active
-        return float(ramp(model, model.k_gap * to, dot(self.system.gap[0], z[:active]), float(z[-1])))
+        model = self.system.model
+        return float(ramp(model, model.k_gap * to, dot(self.system.gap[0], z), float(z[-1])))
 
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
         start = problem.inner
         u_gap = self.xi_at(z, u_last)
         charge = z[self.active] + self._rest(z, u_gap, u_last) if self.flows else start.y[-1]
-        y = np.append(self.system.live[0] @ z[: self.active], charge)
+        y = np.append(self.system.live[0] @ z[: start.y.size - 1], charge)
         found = StackState(t, y, u_last, u_gap, start.offset)
         return from_stack(problem.scene, on_branch(self.system.model, found, math.copysign(1.0, u_gap)))
 
@@ -312,20 +315,29 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
         columns = np.vstack([_wider(columns), np.append(column, 1.0)])
         k, moves, nodes = np.append(k, stored), np.append(moves, moved), _wider(nodes)
         taps, shape = _wider(taps), np.append(shape, 0.0)
-    rates, gain, shape, taps, tap_s, feed = map(
-        np.ascontiguousarray, (rates, gain, shape, taps, tap_s, feed)
-    )  # fmt: skip
+    active, wide = roomy(n)
     lanes = Lanes(
-        rates, gain, shape, float(model.k_gap), taps, tap_s, np.zeros(tap_s.size), feed, area, slope, bend, scale,
-        -1.0, q0, 0.0, kinks, rest, steep, 0,
+        wide(rates), wide(gain), wide(shape), float(model.k_gap), wide(taps), tap_s, np.zeros(tap_s.size),
+        wide(feed.T).T.copy(), area, slope, bend, scale, -1.0, q0, 0.0, kinks, rest, steep, 0,
     )  # fmt: skip
-    voltages = np.arange(k.size) < system.k_shown.size
+    voltages, columns, nodes = np.arange(k.size) < system.k_shown.size, wide(columns), wide(nodes)
     return StackForm(
-        lanes, n, 1 if rtol >= BY_SIMPSON else 2, model.mobile, Shown(columns, k, moves, voltages & model.mobile),
+        lanes, active, 1 if rtol >= BY_SIMPSON else 2, model.mobile, Shown(columns, k, moves, voltages & model.mobile),
         Shown(nodes, system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile)),
         int(problem.charge), system.stress, float(model.k_gap), system.u_top, missed, missed_bend,
         float(model.slow[-3]) * area0, system,
     )  # fmt: skip
+
+
+def roomy(n: int, least: int = 1) -> tuple[int, Callable[[FloatArray], FloatArray]]:
+    """The next larger of `SIZES`, and what gives rows (..., m) so many active modes in the place of the first n."""
+    active = next((size for size in SIZES if size >= max(n, least)), n)
+
+    def wide(rows: FloatArray) -> FloatArray:
+        still = np.zeros((*rows.shape[:-1], active - n))
+        return np.concatenate([rows[..., :n], still, rows[..., n:]], axis=-1)
+
+    return active, wide
 
 
 def _wider(rows: FloatArray) -> FloatArray:

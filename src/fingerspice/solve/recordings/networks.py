@@ -32,7 +32,7 @@ from fingerspice.engine.lanes.rows import FADED, Lanes
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.form import LaneForm, Shown, curves, slopes
+from fingerspice.solve.recordings.form import LaneForm, Shown, curves, roomy, slopes
 from fingerspice.solve.scenes import Scene
 from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.samples import Samples
@@ -190,6 +190,8 @@ _FREQUENCIES = 65
 # Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
 # what they leave together is known but for about 1e-8.
 OF_MANY, ACTING = 1e-7, 0.05
+# Fewest active modes and leaks that code is compiled for (`solve.recordings.form`).
+LEAST_MODES, LEAST_LEAKS = 4, 2
 # Reference area: that at this share of the largest gap voltage to expect.
 _TYPICAL = 0.5
 
@@ -244,13 +246,14 @@ class NetworkForm(LaneForm):
         return float(self.bend(np.array(xi)))
 
     def start(self, problem: Problem) -> tuple[FloatArray, float]:
-        start, reduced, n = problem.initial, self.reduced, self.active
+        start, reduced, active = problem.initial, self.reduced, self.active
+        n = reduced.absorbed.size
         x, s, net = start.y[:n], start.s_before, reduced.scene.net
         bend = self._bend_at(float(net.p[reduced.gap] @ x + net.q[reduced.gap] @ s))
         z = np.zeros(self.lanes.rates.size)
         z[:n] = reduced.modes.inverse @ (x + reduced.modes.follow @ s) - reduced.absorbed * bend
         held = self.rows.columns @ z + self.rows.bends * bend + self.rows.k * s[reduced.source]
-        z[n:] = start.y[n : n + self.flows] - held[n:]
+        z[active:] = start.y[n : n + self.flows] - held[n:]
         return z, float(s[reduced.source])
 
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
@@ -267,7 +270,8 @@ class NetworkForm(LaneForm):
 
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
         if not self.flows:
-            out[self.active :] = problem.initial.y[self.active :, None]
+            n = self.reduced.absorbed.size
+            out[n:] = problem.initial.y[n:, None]
         return out.T
 
 
@@ -293,25 +297,25 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
     area, bend, scale, missed, missed_bend = found_curves
     slope, n, m = slopes(area, scale), reduced.absorbed.size, modal.rates.size
     # 1/A - q0 has the kink of 1/A, and N the part N''(0) xi |xi| / 2.
-    kinks = np.full(reduced.leaking.size + 1, polyval(-1.0, slope))
+    active, wide = roomy(n, LEAST_MODES)
+    more = [-1] * max(LEAST_LEAKS - reduced.leaking.size, 0)
+    taps, feed = np.insert(modal.taps[1:], more, 0.0, axis=0), np.insert(modal.drives, more, 0.0, axis=1)
+    tap_s, bent = np.insert(modal.tap_s[1:], more, 0.0)[:-1], (taps[:, :n] @ reduced.absorbed)[:-1]
+    kinks = np.full(tap_s.size + 1, polyval(-1.0, slope))
     kinks[-1] = 0.5 * scale**2 * polyval(-1.0, polyder(bend, 2))
-    rates, gain, shape, taps, tap_s, bent, feed = map(np.ascontiguousarray, (
-        modal.rates, modal.gain, modal.taps[0], modal.taps[1:-1], modal.tap_s[1:-1],
-        modal.taps[1:-1, :n] @ reduced.absorbed, modal.drives,
-    ))  # fmt: skip
     shares = np.abs(modal.taps[0, :n] * reduced.absorbed)
     fading = (reduced.modes.rates > FADED * wave.rate) & (shares > ACTING * reduced.kappa)
     if rtol < OF_MANY and np.count_nonzero(fading) > 1:
         return None
     lanes = Lanes(
-        rates, gain, shape, float(modal.tap_s[0]), taps, tap_s, bent, feed, area, slope, bend, scale, -1.0, reduced.q0,
-        reduced.kappa, kinks, float(polyval(-1.0, area)), float(polyval(-1.0, slope)),
-        int(np.argmax(shares * reduced.modes.rates)),
+        wide(modal.rates), wide(modal.gain), wide(modal.taps[0]), float(modal.tap_s[0]), wide(taps[:-1]), tap_s, bent,
+        wide(feed.T).T.copy(), area, slope, bend, scale, -1.0, reduced.q0, reduced.kappa, kinks,
+        float(polyval(-1.0, area)), float(polyval(-1.0, slope)), int(np.argmax(shares * reduced.modes.rates)),
     )  # fmt: skip
     still, moved = np.zeros(len(modal.nodes)), modal.nodes[:, :n] @ reduced.absorbed
-    nodes = Shown(modal.nodes, still, moved, still > 0.0)
+    rows = Shown(wide(modal.columns), modal.k, modal.bends, np.zeros(modal.k.size, bool))
     return NetworkForm(
-        lanes, n, 2, False, Shown(modal.columns, modal.k, modal.bends, np.zeros(modal.k.size, bool)), nodes, m - n,
+        lanes, active, 2, False, rows, Shown(wide(modal.nodes), still, moved, still > 0.0), m - n,
         float(contact.stress(1.0)), share, scene.u_top, missed, missed_bend,
         float(problem.network.capacitance(reduced.area0).sum()), reduced,
     )  # fmt: skip
