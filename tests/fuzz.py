@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -300,7 +301,7 @@ def run(
             warnings.simplefilter("error")
             warnings.simplefilter("always", FingerspiceWarning)
             warnings.showwarning = judge_warning
-            _warm_up(bench)
+            _warm_up()
             start, early = time.perf_counter(), _taken()
             for number in range(first, first + inputs):
                 name = wheel[number % len(wheel)]
@@ -324,11 +325,13 @@ def run(
     return report
 
 
-def _warm_up(bench: Bench) -> None:
-    """Load what is loaded on first use: reading a file is an event."""
-    table = bench.folder / "table.csv"
-    table.write_text("".join(f"{10.0**k:g},{1000 / k:g},{9999 / k:g}\n" for k in range(1, 6)))
-    fit_material(table, poles=1)
+@cache
+def _warm_up() -> None:
+    """Load, once in a process, what is loaded on first use: reading a file is an event."""
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
+        table = Path(folder) / "table.csv"
+        table.write_text("".join(f"{10.0**k:g},{1000 / k:g},{9999 / k:g}\n" for k in range(1, 6)))
+        fit_material(table, poles=1)
     for path in sorted(make.CIRCUITS.glob("*.cir")):
         fs.read_netlist(path)
     gc.collect()
