@@ -57,13 +57,7 @@ class Watch:
 
     @contextmanager
     def over(self, folder: Path, anywhere: bool = False) -> Iterator[None]:
-        """Watch a block, in which files may be read in a folder only, or anywhere.
-
-        Raises
-        ------
-        Defect
-            With the first event that is not allowed.
-        """
+        """Watch a block, in which files may be read in a folder only, or anywhere; else `Defect` is raised."""
         self.seen, self.folder = [], "" if anywhere else str(folder.resolve()) + os.sep
         try:
             yield
@@ -209,13 +203,7 @@ class Report:
 
 
 def judge(error: InputError) -> None:
-    """Refuse a refusal that is not one clear sentence.
-
-    Raises
-    ------
-    Defect
-        Saying what is wrong with it.
-    """
+    """Raise `Defect` for a refusal that is not one clear sentence."""
     said = str(error)
     clear = error.message.strip() and said.isprintable() and len(said) <= LONGEST_MESSAGE
     if not clear or "Traceback" in said:
@@ -244,10 +232,7 @@ def little_room() -> Iterator[None]:
 def once(target: Target, seed: str, bench: Bench) -> str:
     """Read one input; `taken` or `refused`.
 
-    Raises
-    ------
-    Defect
-        For any other outcome, a warning of numpy's included, and for one that takes too long.
+    Any other outcome is a `Defect`, a warning of numpy's included, and one that takes too long.
     """
 
     def late(signum: int, frame: FrameType | None) -> None:
@@ -280,15 +265,7 @@ def run(
 ) -> Report:
     """Read so many inputs, the target of each and what it holds made from the seed and its number alone.
 
-    Parameters
-    ----------
-    inputs : int
-    seed : str
-    targets : dict of str to (Target, int)
-    first : int
-        Number of the first input.
-    say : callable
-        Is told of every defect at once.
+    `first` is the number of the first input, and `say` is told of every defect at once.
     """
     report = Report()
     wheel = [name for name, (_, share) in targets.items() for _ in range(share)]

@@ -247,18 +247,14 @@ def _line(rng: random.Random) -> str:
 
 
 def _insert(lines: list[str], rng: random.Random) -> list[str]:
-    lines.insert(rng.randint(0, len(lines)), _line(rng))
-    return lines
+    at = rng.randint(0, len(lines))
+    return [*lines[:at], _line(rng), *lines[at:]]
 
 
-def _drop(lines: list[str], rng: random.Random) -> list[str]:
-    del lines[rng.randrange(len(lines))]
-    return lines
-
-
-def _double(lines: list[str], rng: random.Random) -> list[str]:
+def _repeat(lines: list[str], rng: random.Random) -> list[str]:
+    """One line left out, or given several times."""
     at = rng.randrange(len(lines))
-    return [*lines[:at], *[lines[at]] * rng.choice([2, 2, 3, 40]), *lines[at + 1 :]]
+    return [*lines[:at], *[lines[at]] * rng.choice([0, 0, 0, 2, 2, 3, 40]), *lines[at + 1 :]]
 
 
 def _swap(lines: list[str], rng: random.Random) -> list[str]:
@@ -330,6 +326,6 @@ def _vast(lines: list[str], rng: random.Random) -> list[str]:
 
 
 _LINE_EDITS: Sequence[Callable[[list[str], random.Random], list[str]]] = (
-    *(_insert, _insert, _insert, _drop, _double, _swap, _continue, _chain, _nest, _wrap, _splice),
+    *(_insert, _insert, _insert, _repeat, _repeat, _swap, _continue, _chain, _nest, _wrap, _splice),
     *(_title, _start, _start, _vast),
 )

@@ -144,18 +144,13 @@ def start_volts(what: str, number: Number) -> float:
 def unused_starts(initial: Mapping[str, float], elements: tuple[Element, ...], uic: bool) -> tuple[str, ...]:
     """Start values without effect: with ``uic`` where no layer or capacitor without ``IC=`` is, else every ``IC=``."""
     layers = [e for e in elements if e.spec.is_layer]
-    gaps = {e.nodes[2]: e.values for e in layers if e.device == "GAP" and e.values["a_fix"] == 0.0}
-    started = [e for e in elements if e.spec.is_layer or (e.device == "C" and e.initial is None)]
-    taken = {node for e in started for node in e.nodes[:2]}
-    out = []
-    for node in initial:
-        if any(e.nodes[2] == node for e in layers):
-            used = node in gaps and (gaps[node]["tau"] > 0.0 or not uic)
-        else:
-            used = node in taken or not uic
-        if not used:
-            out.append(f".ic v({node})")
-    return (*out, *(f"IC= of {e.name}" for e in elements if e.initial is not None and not uic))
+    gaps = [e for e in layers if e.device == "GAP" and e.values["a_fix"] == 0.0]
+    started = [*layers, *(e for e in elements if e.device == "C" and e.initial is None)]
+    used = {node for e in started for node in e.nodes[:2]} if uic else set(initial)
+    used -= {e.nodes[2] for e in layers}
+    used |= {e.nodes[2] for e in gaps if not uic or e.values["tau"] > 0.0}
+    without = [f".ic v({node})" for node in initial if node not in used]
+    return (*without, *(f"IC= of {e.name}" for e in elements if e.initial is not None and not uic))
 
 
 def read_options(directives: list[Directive]) -> tuple[str, tuple[str, ...]]:

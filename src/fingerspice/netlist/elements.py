@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -31,41 +30,38 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
     device = statement.device or statement.letter
     parasitics = KINDS[device].beside if device in KINDS else ()
     beside = {key: statement.params[key] for key in parasitics if key in statement.params}
-    own = replace(statement, params={k: v for k, v in statement.params.items() if k not in beside})
-    read = READERS[statement.letter](own, context, notes)
-    element = Element(statement.name, device, statement.nodes, statement.node_names, where=statement.where, **read)
+    own = statement._replace(params={k: v for k, v in statement.params.items() if k not in beside})
+    read: dict[str, Any] = {}
+    values: dict[str, float] = {}
+    match statement.letter:
+        case "X":
+            values = _device_values(own, notes)
+        case "R" | "C":
+            values, read["initial"] = _read_passive(own, notes)
+        case _:
+            read["waveform"], read["ac"], differences = source_of(own, context)
+            notes.extend(differences)
+    nodes, names = statement.nodes, statement.node_names
+    element = Element(statement.name, device, nodes, names, MappingProxyType(values), where=statement.where, **read)
     for parameter, text in unusual(element):
         named = statement.params.get(parameter)
         given = statement.body[0] if parameter == "value" and statement.body else named
         # One warning per number is enough.
         if not (isinstance(given, Number) and _doubts(given, element.spec.parameter(parameter))):
             notes.append(f"{statement.where if given is None else given.where}: {text}")
-    return _with_parasitics(element, beside, notes)
-
-
-def _with_parasitics(element: Element, beside: dict[str, Value], notes: list[str]) -> list[Element]:
     out = [element]
-    for key, given in beside.items():
-        if isinstance(given, Number) and given.value == 0.0 and key != "rpar":
+    for key, part in beside.items():
+        if isinstance(part, Number) and part.value == 0.0 and key != "rpar":
             continue
-        written, device = f"{element.name}.{key.capitalize()}", key[0].upper()
-        value = MappingProxyType({"value": _value(written, DEVICES[device].parameter("value"), given, notes)})
-        nodes, names = element.nodes, element.node_names
+        written, kind = f"{element.name}.{key.capitalize()}", key[0].upper()
+        value = MappingProxyType({"value": _value(written, DEVICES[kind].parameter("value"), part, notes)})
+        ends, ends_written = nodes, names
         if key == "rser":
             inner = written.lower()
-            nodes, names = (element.nodes[0], inner), (element.node_names[0], written)
-            out[0] = replace(out[0], nodes=(inner, element.nodes[1]), node_names=(written, element.node_names[1]))
-        out.append(Element(written, device, nodes, names, value, where=element.where))
+            ends, ends_written = (nodes[0], inner), (names[0], written)
+            out[0] = replace(element, nodes=(inner, nodes[1]), node_names=(written, names[1]))
+        out.append(Element(written, kind, ends, ends_written, value, where=element.where))
     return out
-
-
-# How the statements with a letter are read: the fields of their elements
-
-
-def _read_source(statement: Statement, context: Context, notes: list[str]) -> dict[str, Any]:
-    source = source_of(statement, context)
-    notes.extend(source.notes)
-    return {"values": MappingProxyType({}), "waveform": source.waveform, "ac": source.ac}
 
 
 def source_of(statement: Statement, context: Context) -> Source:
@@ -98,7 +94,7 @@ def _ltspice_wavefile(statement: Statement) -> Call:
     return Call("wavefile", (path, Number(1.0, "1", where), channel), {}, where)
 
 
-def _read_device(statement: Statement, context: Context, notes: list[str]) -> dict[str, Any]:
+def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
     name, device, params = statement.name, statement.device or "", statement.params
     if statement.nodes[2] == "0":
         raise InputError(f"{name} has ground as its area; allowed: the area node of a GAP", statement.where)
@@ -118,10 +114,10 @@ def _read_device(statement: Statement, context: Context, notes: list[str]) -> di
         else:
             unit = f" ({spec.unit})" if spec.unit else ""
             raise InputError(f"{name}: {device} needs {key}{unit}, missing here", statement.where)
-    return {"values": MappingProxyType(values)}
+    return values
 
 
-def _read_passive(statement: Statement, context: Context, notes: list[str]) -> dict[str, Any]:
+def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
     """Value of an R or C, and the start voltage (V) of a C."""
     name, letter, params = statement.name, statement.letter, statement.params
     kind, spec = KINDS[letter], DEVICES[letter].parameter("value")
@@ -146,18 +142,7 @@ def _read_passive(statement: Statement, context: Context, notes: list[str]) -> d
     initial = params.get("ic")
     if isinstance(initial, Token):
         raise InputError(f"{name} IC is {initial.text!r}; allowed: a number V", initial.where)
-    start = None if initial is None else start_volts(f"{name} IC", initial)
-    return {"values": MappingProxyType({"value": value}), "initial": start}
-
-
-#: From a statement's letter to what reads it.
-READERS: Mapping[str, Callable[[Statement, Context, list[str]], dict[str, Any]]] = {
-    "X": _read_device,
-    "R": _read_passive,
-    "C": _read_passive,
-    "V": _read_source,
-    "I": _read_source,
-}
+    return {"value": value}, None if initial is None else start_volts(f"{name} IC", initial)
 
 
 def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> float:

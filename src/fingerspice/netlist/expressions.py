@@ -134,12 +134,6 @@ class _Parser:
         self._at = 0
         self._brackets: list[tuple[_Piece, bool]] = []  # open, each with whether it encloses a function's arguments
 
-    def whole(self) -> Term:
-        """The whole text as one expression."""
-        term = self._condition()
-        self._refuse_going_on()
-        return term
-
     def _take(self, *texts: str) -> _Piece | None:
         """The next piece if it is one of these."""
         piece = self.pieces[self._at]
@@ -148,7 +142,7 @@ class _Parser:
         self._at += 1
         return piece
 
-    def _refuse_going_on(self) -> None:
+    def refuse_going_on(self) -> None:
         """Refuse what cannot follow a complete value."""
         kind, text, position = self.pieces[self._at]
         if kind == "end":
@@ -164,7 +158,7 @@ class _Parser:
         elif not (self._brackets and self._brackets[-1][1]):
             raise Problem("',' outside the arguments of a function", position)
 
-    def _condition(self) -> Term:
+    def condition(self) -> Term:
         """`a ? b : c`; conditions after `:` group to the right."""
         test = self._chain(0)
         asked = self._take("?")
@@ -175,9 +169,9 @@ class _Parser:
         if nested is not None:  # ngspice 39 takes 5 as 1?0?5:6:7
             raise Problem("a condition between '?' and ':' has two readings: use brackets", nested.position)
         if self._take(":") is None:
-            self._refuse_going_on()
+            self.refuse_going_on()
             raise Problem("'?' without its ':' (a ? b : c)", asked.position)
-        no = self._condition()
+        no = self.condition()
         return lambda names: yes(names) if test(names) != 0.0 else no(names)
 
     def _chain(self, level: int) -> Term:
@@ -232,12 +226,18 @@ class _Parser:
         if kind == "op":
             raise Problem(f"a value is missing before '{text}'", position)
         if kind == "end":
-            self._refuse_going_on()
+            self.refuse_going_on()
             raise Problem("a value is missing at the end" if self._at else "the expression is empty", position)
         self._at += 1
         name = text.lower()
         if kind == "number":
-            number = _number_of(piece)
+            try:
+                number = parse_number(text)
+            except ValueError as error:
+                raise Problem(str(error), position) from None
+            if name.lstrip("0123456789.e+-").startswith("mil"):
+                written = f"write {spice_text(number)}"
+                raise Problem(f"'{text}' differs between simulators, ngspice 39 reads milli here: {written}", position)
             return lambda names: number
         if kind == "name":
             self.names.setdefault(name, position)
@@ -256,8 +256,8 @@ class _Parser:
         terms: list[Term] = []
         while self.pieces[self._at].text != ")" or not terms:
             self._at += 1  # the opening bracket, or a comma
-            terms.append(self._condition())
-            self._refuse_going_on()
+            terms.append(self.condition())
+            self.refuse_going_on()
         self._at += 1
         self._brackets.pop()
         return terms
@@ -293,18 +293,6 @@ def _called(name: str, arguments: list[Term], text: str, names: Mapping[str, flo
     return float(function(*(argument(names) for argument in arguments)))
 
 
-def _number_of(piece: _Piece) -> float:
-    """Value of a number; refuses mil, which ngspice's arithmetic takes for milli."""
-    try:
-        value = parse_number(piece.text)
-    except ValueError as error:
-        raise Problem(str(error), piece.position) from None
-    if piece.text.lower().lstrip("0123456789.e+-").startswith("mil"):
-        problem = f"'{piece.text}' differs between simulators, ngspice 39 reads milli here: write {spice_text(value)}"
-        raise Problem(problem, piece.position)
-    return value
-
-
 _FAILURES: Mapping[type[Exception], str] = {
     ZeroDivisionError: "divides by zero",
     OverflowError: "is too large for a number (1.8e308)",
@@ -322,17 +310,15 @@ class Expression(NamedTuple):
 
     def evaluate(self, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
         """Value of the expression, given the values of names (lower case); a value that is not finite is refused."""
-        position = 0
         try:
             value = float(self.term(names))
-            if math.isfinite(value):
-                return value
-            message = f"'{self.text}' gives {value:g}, not a finite number"
         except Problem as problem:
-            message, position = problem.message, problem.position
+            raise InputError(problem.message, place(problem.position)) from None
         except (ZeroDivisionError, OverflowError, ValueError) as error:
-            message = f"'{self.text}' {_FAILURES[type(error)]}"
-        raise InputError(message, place(position))
+            raise InputError(f"'{self.text}' {_FAILURES[type(error)]}", place(0)) from None
+        if not math.isfinite(value):
+            raise InputError(f"'{self.text}' gives {value:g}, not a finite number", place(0))
+        return value
 
 
 def compile_expression(text: str, place: Callable[[int], Where]) -> Expression:
@@ -349,6 +335,7 @@ def compiled(text: str) -> Expression:
     if len(text) > MAX_LENGTH:
         raise Problem(f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
     parser = _Parser(text)
-    term = parser.whole()
+    term = parser.condition()
+    parser.refuse_going_on()
     mega = next(((p.text, p.position) for p in parser.pieces if p.kind == "number" and suspicious_mega(p.text)), None)
     return Expression(text, parser.names, mega, term)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from fingerspice.netlist.lexer import MAX_NAME, Group, Lexeme, Line, group, lex
 from fingerspice.netlist.reader import DIRECTIVES, DirectiveLine, Subcircuit
 from fingerspice.netlist.scope import Bare, Scope
 from fingerspice.netlist.slips import nearest, stray_word
-from fingerspice.netlist.words import Directive, Number, Statement, Value
+from fingerspice.netlist.words import Deck, Directive, Number, Statement, Value
 
 #: Limits of subcircuit calls: total number of expanded lines and characters, and nesting.
 MAX_EXPANDED = 100_000
@@ -76,16 +77,12 @@ class _Instance:
                 raise InputError(f"{word.written} stands where a node's name belongs", word.where)
         return [self.node(word.text) for word in words]
 
-    def find(self, name: str) -> tuple[Subcircuit, _Instance] | None:
-        """The definition of that name visible here, and the instance that contains it; None if there is none."""
-        if name in self.definition.inner:
-            return self.definition.inner[name], self
-        return self.outside.find(name) if self.outside is not None else None
-
-    def visible(self) -> list[str]:
-        """Names of the subcircuits that an X line may call from here."""
-        own = [sub.name for sub in self.definition.inner.values()]
-        return own if self.outside is None else [*own, *self.outside.visible()]
+    def around(self) -> Iterator[_Instance]:
+        """This instance, and those around it, whose subcircuits an X line may call, too."""
+        instance: _Instance | None = self
+        while instance is not None:
+            yield instance
+            instance = instance.outside
 
 
 class Flattener:
@@ -94,21 +91,21 @@ class Flattener:
     A call is replaced by the statements of its subcircuit. An `.ic` line has the nodes of the flat circuit.
     """
 
-    def __init__(self) -> None:
-        self.statements: list[Statement] = []
-        self.directives: list[Directive] = []
+    def __init__(self, deck: Deck) -> None:
+        self.deck = deck
         self._names: dict[str, Where] = {}
-        self._expanded = 0
-        self._expanded_text = 0
+        self._expanded = self._expanded_text = 0
 
-    def run(self, root: Subcircuit, scope: Scope) -> None:
-        """Add the statements of a deck, whose parameters have their values."""
+    def run(self, root: Subcircuit) -> None:
+        """Evaluate the deck's parameters and add its statements."""
+        scope = Scope(root.params)
+        self.deck.params = scope.solve()
         self._expand(_Instance(root, scope))
 
     def _expand(self, instance: _Instance) -> None:
         for line in instance.definition.elements:
             self._element(line, instance)
-        self.directives += [_directive(read, instance) for read in instance.definition.directives]
+        self.deck.directives += [_directive(read, instance) for read in instance.definition.directives]
 
     def _element(self, line: Line, instance: _Instance) -> None:
         lexemes = lex(line) or [Lexeme("", ",", line.start, line)]  # a line of commas has none
@@ -127,44 +124,56 @@ class Flattener:
             raise InputError(f"element '{name}' is defined twice, first at {earlier}", where)
         if letter == "X":
             self._call(name, lexemes, instance)
-        else:
-            self.statements.append(_valued(name, lexemes, instance))
+            return
+        kind, scope, words = KINDS[letter], instance.scope, group(lexemes[1:], plain=2)
+        nodes = [word for word in words.words[:2] if isinstance(word, Lexeme)]
+        if len(nodes) < 2 or (len(words.words) == 2 and not words.params):
+            missing = "node" if len(nodes) < 2 else "value"
+            raise InputError(f"missing {missing}: a {kind.what} is written {name} node node value", where)
+        canonical, written = zip(*instance.nodes(nodes), strict=True)
+        body, params = scope.words(words.words[2:], kind.bare), scope.pairs(words, kind.bare)
+        self.deck.statements.append(Statement(name, letter, canonical, written, None, body, params, where))
 
     def _call(self, name: str, lexemes: list[Lexeme], instance: _Instance) -> None:
         """An X line: a native device becomes a statement, and a subcircuit is expanded."""
-        words = group(lexemes[1:], plain=len(lexemes))
-        stray = words.stray
-        if stray is not None:
+        words, scope = group(lexemes[1:], plain=len(lexemes)), instance.scope
+        if words.stray is not None:
+            stray = words.stray
             hint = stray_word(stray.text, stray.line.text[: stray.position])
             problem = f"'{stray.text}' follows the parameters: nodes and the device's name come first{hint}"
             raise InputError(problem, stray.where)
         plain = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
         if not plain:
             raise InputError(f"missing value: {name} needs nodes and a device's name", lexemes[0].where)
-        nodes, device = plain[:-1], plain[-1]
+        *nodes, device = plain
         if device.kind != "word":
             raise InputError(f"{device.written} stands where a device's name belongs", device.where)
-        native = device.text.upper()
+        native, key = device.text.upper(), device.text.lower()
+        outside = next((around for around in instance.around() if key in around.definition.inner), None)
+        called = None if outside is None else outside.definition.inner[key]
         if native in layer_devices():
-            _check_nodes(name, native, len(nodes), DEVICES[native].nodes, device.where)
+            called, shown, wanted = None, native, DEVICES[native].nodes
+        elif called is not None:
+            shown, wanted = called.name, called.ports
+        else:
+            raise InputError(_unknown_device(plain, instance), device.where)
+        if len(nodes) != len(wanted):
+            count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}"
+            names = f" ({' '.join(wanted)})" if wanted else ""
+            raise InputError(f"{name}: {shown} has {count}{names}, {len(nodes)} given", device.where)
+        if called is None:
             canonical, written = zip(*instance.nodes(nodes), strict=True)
-            params = instance.scope.pairs(words, bare="arithmetic")
+            params = scope.pairs(words, bare="arithmetic")
             given = {key: value.value for key, value in params.items() if isinstance(value, Number)}
-            _refuse_captured(native, given, words, instance.scope)
+            _refuse_captured(native, given, words, scope)
             where = lexemes[0].where
-            self.statements.append(Statement(name, "X", canonical, written, native, (), params, where))
+            self.deck.statements.append(Statement(name, "X", canonical, written, native, (), params, where))
             return
-        found = instance.find(device.text.lower())
-        if found is None:
-            raise InputError(_unknown_device(plain, [*layer_devices(), *instance.visible()]), device.where)
-        called, outside = found
-        _check_nodes(name, called.name, len(nodes), called.ports, device.where)
         self._count(called, instance, device.where)
         ports = dict(zip(called.ports, instance.nodes(nodes), strict=True))
-        inner = _Instance(called, Scope(instance.scope), outside, f"{name}.", ports, (*instance.calls, called))
-        _bind(inner, words, instance.scope)
         called.called = True
-        self._expand(inner)
+        inner = _scope_of(called, words, scope)
+        self._expand(_Instance(called, inner, outside, f"{name}.", ports, (*instance.calls, called)))
 
     def _count(self, called: Subcircuit, instance: _Instance, where: Where) -> None:
         """Count what a call expands to; refuse circles, and what is too deep or too much."""
@@ -197,19 +206,17 @@ def _directive(read: DirectiveLine, instance: _Instance) -> Directive:
     return Directive(read.name, args, params, line.place, line.text[line.start :])
 
 
-def _bind(inner: _Instance, words: Group, caller: Scope) -> None:
-    """Evaluate a call's parameters: values on the X line in the caller's scope, defaults in the subcircuit's."""
-    definition = inner.definition
-    for formula in (*definition.defaults, *definition.params):
-        inner.scope.define(formula)
-    allowed = {default.key.text.lower(): default.key.text for default in definition.defaults}
+def _scope_of(called: Subcircuit, words: Group, caller: Scope) -> Scope:
+    """A call's parameters: values on the X line evaluated in the caller's scope, defaults in the subcircuit's."""
+    inner = Scope((*called.defaults, *called.params), caller)
+    allowed = {default.key.text.lower(): default.key.text for default in called.defaults}
     for name, (key, value) in words.params.items():
         if name not in allowed:
             hint = nearest(name, allowed) or f"; it has {' '.join(allowed.values()) or 'none'}"
-            raise InputError(f"subcircuit '{definition.name}' has no parameter '{key.text}'{hint}", key.where)
-        inner.scope.preset(name, caller.number(value))
-    inner.scope.solve()
-    _refuse_captured(definition.name, inner.scope.values, words, caller)
+            raise InputError(f"subcircuit '{called.name}' has no parameter '{key.text}'{hint}", key.where)
+        inner.preset(name, caller.number(value))
+    _refuse_captured(called.name, inner.solve(), words, caller)
+    return inner
 
 
 def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:
@@ -224,30 +231,13 @@ def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: S
                 raise InputError(problem, value.where)
 
 
-def _valued(name: str, lexemes: list[Lexeme], instance: _Instance) -> Statement:
-    """Statement of a line with two nodes and a value."""
-    letter, where = lexemes[0].text[0].upper(), lexemes[0].where
-    kind, scope = KINDS[letter], instance.scope
-    words = group(lexemes[1:], plain=2)
-    nodes = [word for word in words.words[:2] if isinstance(word, Lexeme)]
-    if len(nodes) < 2 or (len(words.words) == 2 and not words.params):
-        missing = "node" if len(nodes) < 2 else "value"
-        raise InputError(f"missing {missing}: a {kind.what} is written {name} node node value", where)
-    canonical, written = zip(*instance.nodes(nodes), strict=True)
-    body, params = scope.words(words.words[2:], kind.bare), scope.pairs(words, kind.bare)
-    return Statement(name, letter, canonical, written, None, body, params, where)
-
-
-def _check_nodes(name: str, device: str, given: int, wanted: tuple[str, ...], where: Where) -> None:
-    if given != len(wanted):
-        plural = "" if len(wanted) == 1 else "s"
-        nodes = f" ({' '.join(wanted)})" if wanted else ""
-        raise InputError(f"{name}: {device} has {len(wanted)} node{plural}{nodes}, {given} given", where)
-
-
-def _unknown_device(words: list[Lexeme], visible: list[str]) -> str:
+def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
     """The message that the last word of an X line is not a device, with a hint."""
     last = words[-1]
+    visible = [
+        *layer_devices(),
+        *(sub.name for around in instance.around() for sub in around.definition.inner.values()),
+    ]
     known = {name.lower() for name in visible}
     for word in words[2:-1]:
         # A device's name after two words or more is probably the device, and the words after it lack their `key=`.

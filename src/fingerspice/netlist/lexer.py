@@ -115,7 +115,10 @@ def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]
     """Logical lines, without comments and blank lines; `first` is the number of the first physical line."""
     pending: list[tuple[int, int, str]] = []
     for number, raw in enumerate(lines, first):
-        body = _without_comment(raw)
+        comment = None
+        if ";" in raw or "$" in raw or "//" in raw:
+            comment = next((match.start() for match in _COMMENT.finditer(raw) if match[1]), None)
+        body = raw[:comment].rstrip()
         bare = body.lstrip()
         if not bare or bare[0] == "*":
             continue
@@ -131,14 +134,6 @@ def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]
         pending = [(number, 0, body)]
     if pending:
         yield Line.joined(file, pending)
-
-
-def _without_comment(raw: str) -> str:
-    if ";" in raw or "$" in raw or "//" in raw:
-        for match in _COMMENT.finditer(raw):
-            if match[1]:
-                return raw[: match.start()].rstrip()
-    return raw.rstrip()
 
 
 def lex(line: Line, start: int = 0) -> list[Lexeme]:
