@@ -190,16 +190,15 @@ class Report:
 
     def text(self) -> str:
         """A line for each target, and one for the whole."""
-        lines = []
-        for name in TARGETS:
-            taken, refused = self.counts[name, "taken"], self.counts[name, "refused"]
-            lines.append(f"{name:12s} {taken:9,} taken {refused:9,} refused {self.counts[name, 'defect']:6,} defects")
+        outcomes = ("taken", "refused", "defect")
+        lines = [
+            "  ".join([f"{name:12s}", *(f"{self.counts[name, outcome]:9,} {outcome}" for outcome in outcomes)])
+            for name in TARGETS
+        ]
         total = sum(self.counts.values())
         rate = total / self.seconds if self.seconds else 0.0
-        lines.append(
-            f"{total:,} inputs in {self.seconds:.0f} s, {rate:,.0f} a second, {self.memory:.0f} MiB more memory"
-        )
-        return "\n".join(lines)
+        whole = f"{total:,} inputs in {self.seconds:.0f} s, {rate:,.0f} a second, {self.memory:.0f} MiB more memory"
+        return "\n".join([*lines, whole])
 
 
 def judge(error: InputError) -> None:

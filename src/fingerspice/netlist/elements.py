@@ -12,8 +12,8 @@ from fingerspice.base.units import exponent_and_scale
 from fingerspice.circuit.circuit import Element
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
 from fingerspice.circuit.usual import is_resistance, mega_note, unit_trap, unusual
+from fingerspice.netlist.deck import KINDS
 from fingerspice.netlist.directives import start_volts
-from fingerspice.netlist.flatten import KINDS
 from fingerspice.netlist.slips import nearest
 from fingerspice.netlist.sources import Context, Source, read_source
 from fingerspice.netlist.words import Call, Number, Statement, Token, Value

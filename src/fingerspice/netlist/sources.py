@@ -244,9 +244,10 @@ def read_source(name: str, body: Sequence[Word], context: Context, where: Where)
             raise InputError(problem, word.where)
         if isinstance(word, Token):
             # A call may also be written without brackets: SIN 0 200 100.
-            numbers = []
+            numbers: list[Number] = []
             while words and isinstance(words[0], Number):
-                numbers.append(words.popleft())
+                numbers.append(words[0])
+                words.popleft()
             word = Call(key, tuple(numbers), {}, word.where)
         if key == "dc":
             if len(word.args) != 1:

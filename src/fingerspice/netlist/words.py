@@ -71,7 +71,7 @@ class Statement(NamedTuple):
 
 @dataclass
 class Deck:
-    """A netlist, into which `reader.Reader` and `flatten.Flattener` enter what they find."""
+    """A netlist, into which `reader.Reader` and `deck.Flattener` enter what they find."""
 
     text: str
     path: Path | None  # Path of the file; None for a text
