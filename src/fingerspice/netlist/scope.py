@@ -34,8 +34,9 @@ class Scope:
 
     def __init__(self, definitions: Iterable[Assignment], parent: Scope | None = None) -> None:
         self.values: dict[str, float] = {}
-        self._visible = ChainMap(self.values, *(parent._visible.maps if parent else ()))
-        self._mega = ChainMap[str, Token | None]({}, *(parent._mega.maps if parent else ()))  # as in `Number`
+        self._visible: ChainMap[str, float] = ChainMap(self.values, *(parent._visible.maps if parent else ()))
+        # As in `Number`
+        self._mega: ChainMap[str, Token | None] = ChainMap({}, *(parent._mega.maps if parent else ()))
         self._definitions: dict[str, Assignment] = {}
         for definition in definitions:
             key, name = definition.key, definition.key.text.lower()
