@@ -98,13 +98,13 @@ _LEX = re.compile(
 
 
 class _Piece(NamedTuple):
-    kind: str  # number, name, call, op or end
+    kind: str  # number, name, op or end
     text: str
     position: int
 
 
 def _pieces(text: str) -> list[_Piece]:
-    """Numbers, names, names before a bracket (calls), operators, and at last the end."""
+    """Numbers, names, operators, and at last the end."""
     pieces: list[_Piece] = []
     position = questions = 0
     while position < len(text):
@@ -116,8 +116,6 @@ def _pieces(text: str) -> list[_Piece]:
         questions += found == "?"
         if questions > MAX_QUESTIONS:
             raise Problem(f"more than {MAX_QUESTIONS} '?' in one expression", position)
-        if found == "(" and pieces and pieces[-1].kind == "name":
-            pieces[-1] = pieces[-1]._replace(kind="call")
         if kind != "space":
             pieces.append(_Piece(kind, found, position))
         position = match.end()
@@ -239,7 +237,7 @@ class _Parser:
                 written = f"write {spice_text(number)}"
                 raise Problem(f"'{text}' differs between simulators, ngspice 39 reads milli here: {written}", position)
             return lambda names: number
-        if kind == "name":
+        if self.pieces[self._at].text != "(":
             self.names.setdefault(name, position)
             return partial(_looked_up, piece)
         if name not in FUNCTIONS:

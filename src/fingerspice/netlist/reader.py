@@ -6,13 +6,14 @@ Included files must be in the netlist's own folder.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.devices import layer_devices
 from fingerspice.netlist.files import LIBRARIES, MAX_BYTES, inside, library_changed, read_text
-from fingerspice.netlist.lexer import Assignment, Lexeme, Line, group, lex, logical_lines, split_lines
+from fingerspice.netlist.lexer import SPLIT, Assignment, Lexeme, Line, group, lex, logical_lines, split_lines
 from fingerspice.netlist.scope import definitions
 from fingerspice.netlist.slips import ELSEWHERE, decimal_comma, greek_mu, nearest
 from fingerspice.netlist.words import Deck
@@ -104,7 +105,7 @@ class Reader:
             if word == ".endc":
                 self._control = None
             return
-        self._words += line.words(MAX_WORDS)
+        self._words += len(line.parts) + sum(1 for _ in islice(SPLIT.finditer(line.text), MAX_WORDS))
         if self._words > MAX_WORDS:
             problem = f"the netlist has more than {MAX_WORDS:,} words and brackets; allowed: no more"
             raise InputError(f"{problem}, samples go in by Python: fs.Samples(values, rate)", line.place)
