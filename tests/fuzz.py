@@ -28,7 +28,7 @@ from typing import Any
 
 import fingerspice as fs
 import fuzz_inputs as make
-from evaluation import evaluate
+from deck_edits import evaluate
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.netlist.deck import LONGEST_TITLE
 from fingerspice.netlist.netlist import source_from_text, sweep_from_text

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import fingerspice as fs
-from evaluation import evaluate
+from deck_edits import evaluate
 from fingerspice.base.errors import InputError, Where
 from ngspice_tools import call_ngspice
 

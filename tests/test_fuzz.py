@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fuzz
-from evaluation import evaluate
+from deck_edits import evaluate
 from fingerspice.base.errors import InputError, Where
 from fingerspice.netlist.expressions import FUNCTIONS, compiled
 from fingerspice.netlist.lexer import group, lex, logical_lines, split_lines

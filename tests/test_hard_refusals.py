@@ -56,7 +56,7 @@ def test_the_reference_fold_is_where_the_table_says_by_two_methods(case: str) ->
 
 @pytest.mark.parametrize("case", FOLDS)
 def test_a_run_past_the_fold_stops_there_and_says_where_how_near_why_and_what_to_change(case: str) -> None:
-    changes, _, _, near = FOLDS[case]
+    changes, params, _, near = FOLDS[case]
     fold = fold_of(case)
     with pytest.raises(fs.SolveError) as caught:
         fs.simulate(table1().replace(changes), charge_law="mobile")
@@ -75,20 +75,13 @@ def test_a_run_past_the_fold_stops_there_and_says_where_how_near_why_and_what_to
     assert kept.t[-1] >= fold.t * (1.0 - 1e-3)
     assert np.all(np.isfinite(kept.u_layer))
     assert kept.stats["steps"] + kept.stats["rejected"] <= 5000
-
-
-@pytest.mark.parametrize("case", FOLDS)
-def test_what_is_kept_of_a_run_past_its_fold_has_the_error_asked_for_and_stated(case: str) -> None:
-    changes, params, *_ = FOLDS[case]
-    kept = fs.simulate(table1().replace(changes), charge_law="mobile", throw=False)
-    # Over nine tenths of the way.
-    before = kept.t < 0.9 * fold_of(case).t
+    # Over nine tenths of the way its error is the one asked for, and the one stated.
+    before = kept.t < 0.9 * fold.t
     assert before.sum() > 10
     whole = dataclasses.replace(ref.TABLE1, **params)
     expected = ref.transient(SINE, kept.t[before], law="mobile", freq=100.0, params=whole, tol=1e-12)
     error = float(np.abs(kept.u_gap[before] - expected.u_gap).max())
-    assert error <= kept.rtol * fold_of(case).u_gap
-    assert error <= kept.error.u_gap
+    assert error <= min(kept.rtol * fold.u_gap, kept.error.u_gap)
 
 
 @pytest.mark.parametrize("case", FOLDS)
