@@ -1,8 +1,8 @@
 """A netlist file as a flat list of evaluated statements: expands subcircuit calls, renames nodes, evaluates values.
 
-A statement has a name, nodes and values; `elements`, `sources` and `directives` give it a meaning. The steps are those
-of `lexer` (from text to words), `reader` (lines by kind, included files), `scope` (parameters and values) and
-`Flattener` (subcircuit calls). Every error has its place in the file.
+A statement has a name, nodes and values; `elements` and `sources` give it a meaning. The steps are those of `lexer`
+(from text to words), `reader` (lines by kind, included files), `scope` (parameters and values) and `Flattener`
+(subcircuit calls). Every error has its place in the file.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
-from fingerspice.netlist.files import MAX_BYTES, is_stream, read_stream, read_text
+from fingerspice.netlist.files import MAX_BYTES, read_stream, read_text
 from fingerspice.netlist.lexer import MAX_NAME, Group, Lexeme, Line, group, lex
 from fingerspice.netlist.reader import DIRECTIVES, DirectiveLine, Reader, Subcircuit
 from fingerspice.netlist.scope import Bare, Scope
@@ -75,8 +75,9 @@ def read_deck(path: str | Path) -> Deck:
 
     Standard input (``-``), a device or a pipe is a deck called ``stdin`` in the working directory.
     """
-    if is_stream(Path(path)):
-        return parse_deck(read_stream(Path(path)), Path("stdin"))
+    streamed = read_stream(Path(path))
+    if streamed is not None:
+        return parse_deck(streamed, Path("stdin"))
     return parse_deck(read_text(Path(path), str(path)), Path(path))
 
 

@@ -85,6 +85,11 @@ _LEVELS: tuple[Mapping[str, Callable[..., float]], ...] = (
     {"+": operator.add, "-": operator.sub},
     {"*": operator.mul, "/": operator.truediv},
 )
+_FAILURES: Mapping[type[Exception], str] = {
+    ZeroDivisionError: "divides by zero",
+    OverflowError: "is too large for a number (1.8e308)",
+    ValueError: "leaves the domain of one of its functions",
+}
 _POWERS = ("^", "**")
 #: After these a minus stands before one value of several.
 _OPERATORS = frozenset(("?", ":", *_POWERS, *(sign for level in _LEVELS for sign in level)))
@@ -122,27 +127,50 @@ def _pieces(text: str) -> list[_Piece]:
     return [*pieces, _Piece("end", "", len(text))]
 
 
-class _Parser:
-    """Recursive descent, only as deep as the brackets are nested: chains such as `a + b - c` are loops."""
+class Expression:
+    """A compiled expression; `Problem` is raised for a text that is not arithmetic.
+
+    The parser is a recursive descent, only as deep as the brackets are nested: chains such as `a + b - c` are loops.
+    """
 
     def __init__(self, text: str) -> None:
+        if len(text) > MAX_LENGTH:
+            raise Problem(f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
         self.text = text
-        self.pieces = _pieces(text)
-        self.names: dict[str, int] = {}
+        self.names: dict[str, int] = {}  # In lower case, constants included, and the position of each one's first use
+        self._pieces = _pieces(text)
         self._at = 0
         self._brackets: list[tuple[_Piece, bool]] = []  # open, each with whether it encloses a function's arguments
+        self._term = self._condition()
+        self._refuse_going_on()
+        numbers = [piece for piece in self._pieces if piece.kind == "number"]
+        # The first number written with a capital M, and its position
+        self.mega = next(((text, position) for _, text, position in numbers if suspicious_mega(text)), None)
+        self._pieces.clear()
+
+    def evaluate(self, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
+        """Value of the expression, given the values of names (lower case); a value that is not finite is refused."""
+        try:
+            value = float(self._term(names))
+        except Problem as problem:
+            raise InputError(problem.message, place(problem.position)) from None
+        except (ZeroDivisionError, OverflowError, ValueError) as error:
+            raise InputError(f"'{self.text}' {_FAILURES[type(error)]}", place(0)) from None
+        if not math.isfinite(value):
+            raise InputError(f"'{self.text}' gives {value:g}, not a finite number", place(0))
+        return value
 
     def _take(self, *texts: str) -> _Piece | None:
         """The next piece if it is one of these."""
-        piece = self.pieces[self._at]
+        piece = self._pieces[self._at]
         if piece.text not in texts:
             return None
         self._at += 1
         return piece
 
-    def refuse_going_on(self) -> None:
+    def _refuse_going_on(self) -> None:
         """Refuse what cannot follow a complete value."""
-        kind, text, position = self.pieces[self._at]
+        kind, text, position = self._pieces[self._at]
         if kind == "end":
             if self._brackets:
                 raise Problem("'(' is never closed", self._brackets[-1][0].position)
@@ -156,7 +184,7 @@ class _Parser:
         elif not (self._brackets and self._brackets[-1][1]):
             raise Problem("',' outside the arguments of a function", position)
 
-    def condition(self) -> Term:
+    def _condition(self) -> Term:
         """`a ? b : c`; conditions after `:` group to the right."""
         test = self._chain(0)
         asked = self._take("?")
@@ -167,9 +195,9 @@ class _Parser:
         if nested is not None:  # ngspice 39 takes 5 as 1?0?5:6:7
             raise Problem("a condition between '?' and ':' has two readings: use brackets", nested.position)
         if self._take(":") is None:
-            self.refuse_going_on()
+            self._refuse_going_on()
             raise Problem("'?' without its ':' (a ? b : c)", asked.position)
-        no = self.condition()
+        no = self._condition()
         return lambda names: yes(names) if test(names) != 0.0 else no(names)
 
     def _chain(self, level: int) -> Term:
@@ -208,7 +236,7 @@ class _Parser:
                 raise Problem("a second '^' in a row has two readings: use brackets", power.position)
             value = partial(_folded, value, [(_power, self._signed(of_power=True))])
         for index in range(max(begin, 1), end):
-            before, sign, number, after = self.pieces[index - 1 : index + 3]
+            before, sign, number, after = self._pieces[index - 1 : index + 3]
             moved = number.kind != "number" or (after.text in _POWERS and before.text not in _POWERS)
             if sign.text == "-" and before.text in _OPERATORS and moved:
                 problem = "a '-' after an operator has two readings here: use brackets, as in 2*(-x)"
@@ -217,14 +245,14 @@ class _Parser:
 
     def _value(self) -> Term:
         """A number, a name, or what is in brackets."""
-        piece = self.pieces[self._at]
+        piece = self._pieces[self._at]
         kind, text, position = piece
         if text == "(":
             return self._in_brackets(False)[0]
         if kind == "op":
             raise Problem(f"a value is missing before '{text}'", position)
         if kind == "end":
-            self.refuse_going_on()
+            self._refuse_going_on()
             raise Problem("a value is missing at the end" if self._at else "the expression is empty", position)
         self._at += 1
         name = text.lower()
@@ -237,7 +265,7 @@ class _Parser:
                 written = f"write {spice_text(number)}"
                 raise Problem(f"'{text}' differs between simulators, ngspice 39 reads milli here: {written}", position)
             return lambda names: number
-        if self.pieces[self._at].text != "(":
+        if self._pieces[self._at].text != "(":
             self.names.setdefault(name, position)
             return partial(_looked_up, piece)
         if name not in FUNCTIONS:
@@ -247,15 +275,15 @@ class _Parser:
 
     def _in_brackets(self, of_call: bool) -> list[Term]:
         """The expressions in brackets: one, or a function's arguments."""
-        opening = self.pieces[self._at]
+        opening = self._pieces[self._at]
         self._brackets.append((opening, of_call))
         if len(self._brackets) > MAX_DEPTH:
             raise Problem(f"brackets nested deeper than {MAX_DEPTH}", opening.position)
         terms: list[Term] = []
-        while self.pieces[self._at].text != ")" or not terms:
+        while self._pieces[self._at].text != ")" or not terms:
             self._at += 1  # the opening bracket, or a comma
-            terms.append(self.condition())
-            self.refuse_going_on()
+            terms.append(self._condition())
+            self._refuse_going_on()
         self._at += 1
         self._brackets.pop()
         return terms
@@ -291,32 +319,8 @@ def _called(name: str, arguments: list[Term], text: str, names: Mapping[str, flo
     return float(function(*(argument(names) for argument in arguments)))
 
 
-_FAILURES: Mapping[type[Exception], str] = {
-    ZeroDivisionError: "divides by zero",
-    OverflowError: "is too large for a number (1.8e308)",
-    ValueError: "leaves the domain of one of its functions",
-}
-
-
-class Expression(NamedTuple):
-    """A compiled expression."""
-
-    text: str
-    names: Mapping[str, int]  # Names in lower case, constants included, and the position of each one's first use
-    mega: tuple[str, int] | None  # The first number written with a capital M, and its position
-    term: Term
-
-    def evaluate(self, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
-        """Value of the expression, given the values of names (lower case); a value that is not finite is refused."""
-        try:
-            value = float(self.term(names))
-        except Problem as problem:
-            raise InputError(problem.message, place(problem.position)) from None
-        except (ZeroDivisionError, OverflowError, ValueError) as error:
-            raise InputError(f"'{self.text}' {_FAILURES[type(error)]}", place(0)) from None
-        if not math.isfinite(value):
-            raise InputError(f"'{self.text}' gives {value:g}, not a finite number", place(0))
-        return value
+#: The expression of a text; raises `Problem` if it is not arithmetic.
+compiled = lru_cache(maxsize=8192)(Expression)
 
 
 def compile_expression(text: str, place: Callable[[int], Where]) -> Expression:
@@ -325,15 +329,3 @@ def compile_expression(text: str, place: Callable[[int], Where]) -> Expression:
         return compiled(text)
     except Problem as problem:
         raise InputError(problem.message, place(problem.position)) from None
-
-
-@lru_cache(maxsize=8192)
-def compiled(text: str) -> Expression:
-    """The expression of a text; raises `Problem` if it is not arithmetic."""
-    if len(text) > MAX_LENGTH:
-        raise Problem(f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
-    parser = _Parser(text)
-    term = parser.condition()
-    parser.refuse_going_on()
-    mega = next(((p.text, p.position) for p in parser.pieces if p.kind == "number" and suspicious_mega(p.text)), None)
-    return Expression(text, parser.names, mega, term)

@@ -60,19 +60,16 @@ def _reason(error: Exception) -> str:
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
-def is_stream(path: Path) -> bool:
-    """Whether a deck's path means standard input (``-``), a device, or a pipe such as bash's ``<(...)``."""
+def read_stream(path: Path) -> str | None:
+    """Text of a deck from standard input (``-``), a device, or a pipe such as bash's ``<(...)``; None for a file."""
+    stream = str(path) in ("-", "/dev/stdin") or path.is_relative_to("/dev/fd")
     with suppress(OSError):
-        named = str(path) in ("-", "/dev/stdin") or path.is_relative_to("/dev/fd")
-        return named or path.is_fifo() or path.is_char_device()
-    return False
-
-
-def read_stream(path: Path) -> str:
-    """Text of a deck from standard input, a device or a pipe."""
+        stream = stream or path.is_fifo() or path.is_char_device()
+    if not stream:
+        return None
     try:
-        with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
+        with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as source:
+            data = source.read(MAX_BYTES + 1)
     except OSError as error:
         raise InputError(f"'{path}' cannot be read: {_reason(error)}") from None
     if len(data) > MAX_BYTES:

@@ -13,8 +13,7 @@ from fingerspice.circuit.circuit import AcSweep, Circuit, Element, Tran
 from fingerspice.circuit.loop import checked
 from fingerspice.circuit.usual import REST_AREA, unusual
 from fingerspice.netlist.deck import parse_deck, read_deck
-from fingerspice.netlist.directives import read_ac, read_initial, read_options, read_tran, unused_starts
-from fingerspice.netlist.elements import read_elements, source_of
+from fingerspice.netlist.elements import read_ac, read_elements, read_initial, read_options, read_tran, source_of
 from fingerspice.netlist.files import SourceFiles
 from fingerspice.netlist.reader import MAX_WARNINGS
 from fingerspice.netlist.slips import decimal_comma, with_comma
@@ -81,7 +80,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     context = Context(tran, SourceFiles(None if deck.path is None else deck.path.parent))
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
     work, unused = read_options(deck.named(".options"))
-    initial = read_initial(deck.named(".ic"), elements)
+    initial, unused_starts = read_initial(deck.named(".ic"), elements, tran is None or tran.uic)
     _warn_of_unusual(deck, elements, tran, initial, notes)
     more = len(notes) - MAX_WARNINGS
     if more > 1:
@@ -99,7 +98,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
         charge_law=next(iter(laws), None),
         work=work,
         warnings=tuple(notes),
-        unused=(*deck.unused, *unused, *unused_starts(initial, elements, tran is None or tran.uic)),
+        unused=(*deck.unused, *unused, *unused_starts),
         text=deck.text,
         path=deck.path,
     )

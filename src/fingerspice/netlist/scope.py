@@ -144,13 +144,15 @@ class Scope:
         return {name: self.value(value, bare)._replace(key=key.where) for name, (key, value) in group.params.items()}
 
     def words(self, words: list[Lexeme | Group], bare: Bare = "nothing") -> tuple[Word, ...]:
-        """Values of the words that belong to no pair."""
-        return tuple(self.value(word, bare) if isinstance(word, Lexeme) else self._call(word) for word in words)
-
-    def _call(self, group: Group) -> Call:
-        assert group.name is not None
-        args = tuple(self.value(word) for word in group.words if isinstance(word, Lexeme))
-        return Call(group.name.text, args, self.pairs(group), group.name.where)
+        """Values of the words that belong to no pair; a group is a call, which has no calls in it."""
+        out: list[Word] = []
+        for word in words:
+            if isinstance(word, Lexeme):
+                out.append(self.value(word, bare))
+            elif word.name is not None:
+                args = tuple(self.value(arg) for arg in word.words if isinstance(arg, Lexeme))
+                out.append(Call(word.name.text, args, self.pairs(word), word.name.where))
+        return tuple(out)
 
 
 def _names_in(text: str) -> Mapping[str, int] | None:
