@@ -203,7 +203,7 @@ def test_many_lines_with_start_values_are_read_in_linear_time() -> None:
     # Each line looked at all before it for a while.
     assert refusal(lines(lambda i: f".ic v(n{i})=1", 2 * MANY)).startswith(".ic names node 'n0', which")
     # A name that goes on through brackets ends where names do.
-    assert "never closed" in refusal(f"X1 {'a(' * 20_000} gnd LAYER\n")
+    assert "never closed" in refusal(f"X1 {'a(' * 10_000} gnd LAYER\n")
 
 
 def test_the_nearest_spelling_is_looked_for_in_bounded_time() -> None:
