@@ -1,6 +1,11 @@
-"""Table 1's deck with one line changed, for tests that refer to its lines."""
+"""Table 1's deck with one line changed, for tests that refer to its lines, and the value of one expression."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+
+from fingerspice.base.errors import Where
+from fingerspice.netlist.expressions import compile_expression
 
 DECK = """\
 Fingerpad
@@ -22,3 +27,12 @@ def edited(*changes: tuple[str, str]) -> str:
         assert text.count(old) == 1, old
         text = text.replace(old, new)
     return text
+
+
+def evaluate(text: str, names: Mapping[str, float], where: Where) -> float:
+    """Value of an expression, whose names are matched without case; `where` is the place of its first character."""
+
+    def place(position: int) -> Where:
+        return Where(where.file, where.line, where.column + position)
+
+    return compile_expression(text, place).evaluate({name.lower(): value for name, value in names.items()}, place)

@@ -21,13 +21,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import fingerspice as fs
 import fuzz_inputs as make
-from evaluation import evaluate
+from deck_edits import evaluate
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.netlist.deck import LONGEST_TITLE
 from fingerspice.netlist.netlist import source_from_text, sweep_from_text
@@ -56,13 +57,7 @@ class Watch:
 
     @contextmanager
     def over(self, folder: Path, anywhere: bool = False) -> Iterator[None]:
-        """Watch a block, in which files may be read in a folder only, or anywhere.
-
-        Raises
-        ------
-        Defect
-            With the first event that is not allowed.
-        """
+        """Watch a block, in which files may be read in a folder only, or anywhere; else `Defect` is raised."""
         self.seen, self.folder = [], "" if anywhere else str(folder.resolve()) + os.sep
         try:
             yield
@@ -195,26 +190,19 @@ class Report:
 
     def text(self) -> str:
         """A line for each target, and one for the whole."""
-        lines = []
-        for name in TARGETS:
-            taken, refused = self.counts[name, "taken"], self.counts[name, "refused"]
-            lines.append(f"{name:12s} {taken:9,} taken {refused:9,} refused {self.counts[name, 'defect']:6,} defects")
+        outcomes = ("taken", "refused", "defect")
+        lines = [
+            "  ".join([f"{name:12s}", *(f"{self.counts[name, outcome]:9,} {outcome}" for outcome in outcomes)])
+            for name in TARGETS
+        ]
         total = sum(self.counts.values())
         rate = total / self.seconds if self.seconds else 0.0
-        lines.append(
-            f"{total:,} inputs in {self.seconds:.0f} s, {rate:,.0f} a second, {self.memory:.0f} MiB more memory"
-        )
-        return "\n".join(lines)
+        whole = f"{total:,} inputs in {self.seconds:.0f} s, {rate:,.0f} a second, {self.memory:.0f} MiB more memory"
+        return "\n".join([*lines, whole])
 
 
 def judge(error: InputError) -> None:
-    """Refuse a refusal that is not one clear sentence.
-
-    Raises
-    ------
-    Defect
-        Saying what is wrong with it.
-    """
+    """Raise `Defect` for a refusal that is not one clear sentence."""
     said = str(error)
     clear = error.message.strip() and said.isprintable() and len(said) <= LONGEST_MESSAGE
     if not clear or "Traceback" in said:
@@ -243,10 +231,7 @@ def little_room() -> Iterator[None]:
 def once(target: Target, seed: str, bench: Bench) -> str:
     """Read one input; `taken` or `refused`.
 
-    Raises
-    ------
-    Defect
-        For any other outcome, a warning of numpy's included, and for one that takes too long.
+    Any other outcome is a `Defect`, a warning of numpy's included, and one that takes too long.
     """
 
     def late(signum: int, frame: FrameType | None) -> None:
@@ -279,15 +264,7 @@ def run(
 ) -> Report:
     """Read so many inputs, the target of each and what it holds made from the seed and its number alone.
 
-    Parameters
-    ----------
-    inputs : int
-    seed : str
-    targets : dict of str to (Target, int)
-    first : int
-        Number of the first input.
-    say : callable
-        Is told of every defect at once.
+    `first` is the number of the first input, and `say` is told of every defect at once.
     """
     report = Report()
     wheel = [name for name, (_, share) in targets.items() for _ in range(share)]
@@ -300,7 +277,7 @@ def run(
             warnings.simplefilter("error")
             warnings.simplefilter("always", FingerspiceWarning)
             warnings.showwarning = judge_warning
-            _warm_up(bench)
+            _warm_up()
             start, early = time.perf_counter(), _taken()
             for number in range(first, first + inputs):
                 name = wheel[number % len(wheel)]
@@ -324,11 +301,13 @@ def run(
     return report
 
 
-def _warm_up(bench: Bench) -> None:
-    """Load what is loaded on first use: reading a file is an event."""
-    table = bench.folder / "table.csv"
-    table.write_text("".join(f"{10.0**k:g},{1000 / k:g},{9999 / k:g}\n" for k in range(1, 6)))
-    fit_material(table, poles=1)
+@cache
+def _warm_up() -> None:
+    """Load, once in a process, what is loaded on first use: reading a file is an event."""
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
+        table = Path(folder) / "table.csv"
+        table.write_text("".join(f"{10.0**k:g},{1000 / k:g},{9999 / k:g}\n" for k in range(1, 6)))
+        fit_material(table, poles=1)
     for path in sorted(make.CIRCUITS.glob("*.cir")):
         fs.read_netlist(path)
     gc.collect()

@@ -11,13 +11,12 @@ CIRCUITS = Path(__file__).parents[1] / "circuits"
 
 # Tables by subject, not one entry a line.
 # fmt: off
+# ruff: noqa: SIM905
 NUMBERS = (
-    *("0", "1", "-1", "2.5", "1e-6", "3.5u", "0.2meg", "0.2M", "1MOhm", "1F", "1N", "2k7", "1x", "1a", "1mil",
-      "µ", "1µ"),
-    *("1e308", "-1e308", "1e-308", "4.9e-324", "1e309", "1e-400", "1e999999999", "9" * 330, "0." + "0" * 330 + "1"),
-    *("1e150", "1e-150", "1e30", "1e-30", "nan", "inf", "-inf", "none", "infinity", "0x10", "1_000", "1e",
-      "1e+", "--1"),
-    *("+", ".", "1..2", "1,5", "٣", "１", "1K", "1ſ", "²", "1e3.5", "9" * 500, "1" * 20 + "u", "-0", "-0.0"),
+    *"0 1 -1 2.5 1e-6 3.5u 0.2meg 0.2M 1MOhm 1F 1N 2k7 1x 1a 1mil µ 1µ -0 -0.0".split(),
+    *"1e308 -1e308 1e-308 4.9e-324 1e309 1e-400 1e999999999 1e150 1e-150 1e30 1e-30 1e3.5".split(),
+    *"nan inf -inf none infinity 0x10 1_000 1e 1e+ --1 + . 1..2 1,5 ٣ １ 1K 1ſ ²".split(),
+    "9" * 330, "0." + "0" * 330 + "1", "9" * 500, "1" * 20 + "u",
 )
 NAMES = (
     *("a", "drive", "top", "skin", "area", "0", "gnd", "GND", "n1", "x.y", "d", "eps_r", "r", "fn", "w", "pi",
@@ -32,12 +31,10 @@ TITLES = (
     *("$\\frac{$", "$x$", "漢字", "😀", "\U000e0041", "\ud800", "e\u0301\u0301", "a" * 5000, "\t", "\x00", "<b>", "%s"),
 )
 FUNCTIONS = (
-    *("sqrt", "exp", "ln", "log", "log10", "sin", "tan", "acos", "atanh", "cosh", "floor", "int", "nint", "sgn", "abs"),
-    *("min", "max", "pow", "pwr", "atan2", "hypot", "ternary_fcn", "sqr", "eval", "open", "exec", "SIN",
-      "sqrtt", "v", "i"),
-)
-SOURCES = ("SIN", "PULSE", "EXP", "PWL", "SQUARE", "AM", "SFFM", "WAVEFILE", "TABLE", "CHIRP", "BURST", "WAV",
-      "DC", "AC", "SINE", "sin", "Pwl", "FOO")
+    "sqrt exp ln log log10 sin tan acos atanh cosh floor int nint sgn abs min max pow pwr atan2 hypot ternary_fcn sqr "
+    "eval open exec SIN sqrtt v i"
+).split()
+SOURCES = "SIN PULSE EXP PWL SQUARE AM SFFM WAVEFILE TABLE CHIRP BURST WAV DC AC SINE sin Pwl FOO".split()
 FILES = (
     *("fingerspice.lib", "fingerspice_mobile.lib", "part.lib", "loop.lib", "ping.lib", "sub/inner.lib", "sub",
       "link.lib"),
@@ -247,18 +244,14 @@ def _line(rng: random.Random) -> str:
 
 
 def _insert(lines: list[str], rng: random.Random) -> list[str]:
-    lines.insert(rng.randint(0, len(lines)), _line(rng))
-    return lines
+    at = rng.randint(0, len(lines))
+    return [*lines[:at], _line(rng), *lines[at:]]
 
 
-def _drop(lines: list[str], rng: random.Random) -> list[str]:
-    del lines[rng.randrange(len(lines))]
-    return lines
-
-
-def _double(lines: list[str], rng: random.Random) -> list[str]:
+def _repeat(lines: list[str], rng: random.Random) -> list[str]:
+    """One line left out, or given several times."""
     at = rng.randrange(len(lines))
-    return [*lines[:at], *[lines[at]] * rng.choice([2, 2, 3, 40]), *lines[at + 1 :]]
+    return [*lines[:at], *[lines[at]] * rng.choice([0, 0, 0, 2, 2, 3, 40]), *lines[at + 1 :]]
 
 
 def _swap(lines: list[str], rng: random.Random) -> list[str]:
@@ -330,6 +323,6 @@ def _vast(lines: list[str], rng: random.Random) -> list[str]:
 
 
 _LINE_EDITS: Sequence[Callable[[list[str], random.Random], list[str]]] = (
-    *(_insert, _insert, _insert, _drop, _double, _swap, _continue, _chain, _nest, _wrap, _splice),
+    *(_insert, _insert, _insert, _repeat, _repeat, _swap, _continue, _chain, _nest, _wrap, _splice),
     *(_title, _start, _start, _vast),
 )

@@ -69,84 +69,40 @@ def with_max_step(deck: str, max_step: float) -> str:
 
 
 def run_ngspice(
-    deck: str | Path,
-    *,
-    signals: Sequence[str] = GAP_SIGNALS,
-    max_step: float | None = None,
-    reltol: float | None = None,
-    options: str = "",
-    charge_law: str | None = None,
-    folder: Path | None = None,
-    timeout: float = 300.0,
+    text: str, signals: Sequence[str] = GAP_SIGNALS, max_step: float | None = None, timeout: float = 300.0
 ) -> dict[str, NDArray[np.float64]]:
-    """Run the `.tran` of a deck in ngspice and return its own time points.
+    """Run the `.tran` of a deck's text in ngspice, in a temporary folder with the libraries of `circuits/`.
 
-    Parameters
-    ----------
-    deck : str or Path
-        Text of a deck (with its title line), or the path of one. A `.control` block in it
-        is left out.
-    signals : sequence of str
-        ngspice expressions of node voltages, for example ``v(top)-v(skin)``.
-    max_step : float, optional
-        Largest time step [s], in place of the deck's TMAX. The error follows it.
-    reltol : float, optional
-        ngspice's RELTOL, in place of the deck's.
-    options : str
-        Further words for an `.options` line, for example ``trtol=100``.
-    charge_law : {'local', 'mobile'}, optional
-        Swaps the included library.
-    folder : Path, optional
-        Where to run and to leave the files; a temporary folder otherwise. The libraries
-        of `circuits/` are copied there.
-    timeout : float
-        Wall-clock limit [s].
-
-    Returns
-    -------
-    dict
-        ``time`` [s] and each signal under its own expression, arrays of shape (points,).
+    A `.control` block in it is left out. `signals` are ngspice's expressions of node voltages, such as
+    ``v(top)-v(skin)``; `max_step` [s], which the error follows, takes the place of the deck's TMAX; `timeout` is in s.
+    Returns ``time`` [s], ngspice's own, and each signal under its own expression, arrays of shape (points,).
 
     Raises
     ------
     NgspiceError
         If ngspice refuses the deck or stops before TSTOP.
     """
-    text = deck.read_text(encoding="utf-8") if isinstance(deck, Path) else deck
-    if charge_law is not None:
-        text = with_charge_law(text, charge_law)
-    if max_step is not None:
-        text = with_max_step(text, max_step)
-    if reltol is not None:
-        options = f"{options} reltol={reltol!r}"
-    text = _with_control(text, signals, options)
-    if folder is not None:
-        return _run(text, signals, folder, timeout)
+    text = _with_control(text if max_step is None else with_max_step(text, max_step), signals)
     with tempfile.TemporaryDirectory(prefix="ngspice-") as temporary:
-        return _run(text, signals, Path(temporary), timeout)
-
-
-def _with_control(deck: str, signals: Sequence[str], options: str) -> str:
-    """Deck that runs, writes `signals` with all digits to `out.txt`, and exits with 0."""
-    deck = re.sub(r"(?ims)^[ \t]*\.control\b.*?^[ \t]*\.endc\b[^\n]*\n?", "", deck)
-    deck = re.sub(r"(?im)^[ \t]*\.end[ \t]*$.*", "", deck)
-    block = [".control", *(f"option {word}" for word in options.split()), "run"]
-    block += [f"let signal{i} = {signal}" for i, signal in enumerate(signals)]
-    block += ["set wr_singlescale", "set numdgt=15"]
-    block += ["wrdata out.txt " + " ".join(f"signal{i}" for i in range(len(signals)))]
-    return "\n".join([deck.rstrip("\n"), *block, "quit 0", ".endc", ".end", ""])
-
-
-def _run(text: str, signals: Sequence[str], folder: Path, timeout: float) -> dict[str, NDArray[np.float64]]:
-    for name in LIBRARIES.values():
-        shutil.copy(CIRCUITS / name, folder / name)
-    out = folder / "out.txt"
-    out.unlink(missing_ok=True)
-    (folder / "deck.cir").write_text(text, encoding="utf-8")
-    done = call_ngspice(folder, "deck.cir", timeout=timeout)
+        folder = Path(temporary)
+        for name in LIBRARIES.values():
+            shutil.copy(CIRCUITS / name, folder / name)
+        (folder / "deck.cir").write_text(text, encoding="utf-8")
+        done = call_ngspice(folder, "deck.cir", timeout=timeout)
+        out = folder / "out.txt"
+        table = np.loadtxt(out, ndmin=2) if out.exists() else np.empty((0, 1 + len(signals)))
     said = f"{done.stderr.strip()}\n{done.stdout.strip()}".strip()
-    table = np.loadtxt(out, ndmin=2) if out.exists() else np.empty((0, 1 + len(signals)))
     if done.returncode != 0 or len(table) == 0 or "aborted" in said:
         reached = f"at t = {table[-1, 0]:.9g} s" if len(table) else "before the first time point"
         raise NgspiceError(f"ngspice stopped {reached} (exit {done.returncode}):\n{said}")
     return {"time": table[:, 0], **{s: table[:, 1 + i] for i, s in enumerate(signals)}}
+
+
+def _with_control(deck: str, signals: Sequence[str]) -> str:
+    """Deck that runs, writes `signals` with all digits to `out.txt`, and exits with 0."""
+    deck = re.sub(r"(?ims)^[ \t]*\.control\b.*?^[ \t]*\.endc\b[^\n]*\n?", "", deck)
+    deck = re.sub(r"(?im)^[ \t]*\.end[ \t]*$.*", "", deck)
+    block = [".control", "run", *(f"let signal{i} = {signal}" for i, signal in enumerate(signals))]
+    block += ["set wr_singlescale", "set numdgt=15"]
+    block += ["wrdata out.txt " + " ".join(f"signal{i}" for i in range(len(signals)))]
+    return "\n".join([deck.rstrip("\n"), *block, "quit 0", ".endc", ".end", ""])

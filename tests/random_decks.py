@@ -109,34 +109,23 @@ def deck(seed: int) -> tuple[str, fs.Circuit, str]:
     uic = rng.random() < 0.6
     step = PERIOD / STEPS
     extra = rng.choice(("", f" {0.5 * PERIOD!r} {step!r}")) if uic else ""
-    text = "\n".join(
-        [
-            f"Random deck {seed}: {network}, {kind}",
-            f".include fingerspice{'_mobile' if law == 'mobile' else ''}.lib",
-            *lines,
-            f".tran {step!r} {1.5 * PERIOD!r}{extra}{' uic' if uic else ''}",
-            rng.choice(("", ".ac dec 5 10 100k", ".options reltol=1e-5")),
-            ".end",
-        ]
-    )
+    head = [f"Random deck {seed}: {network}, {kind}", f".include fingerspice{'_mobile' if law == 'mobile' else ''}.lib"]
+    tran = f".tran {step!r} {1.5 * PERIOD!r}{extra}{' uic' if uic else ''}"
+    text = "\n".join([*head, *lines, tran, rng.choice(("", ".ac dec 5 10 100k", ".options reltol=1e-5")), ".end"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fs.FingerspiceWarning)
         circuit = fs.parse_netlist(text)
     if kind == "python":
-        circuit = _with_python_source(rng, circuit, volts)
+        # A waveform that no netlist has, in place of the first source.
+        first = circuit.by_device("V", "I")[0]
+        a = volts * (1.0 if first.device == "V" else 2e-6)
+        t = PERIOD * rng.uniform(0.1, 0.3)
+        waveforms = (
+            fs.Pulse(0.0, a, t, t, t, 0.0, 4.0 * t),
+            fs.Pulse(-a, a, t, 0.0, 0.0, 3.0 * t, 3.0 * t),
+            fs.Chirp(a, 0.5 / PERIOD, 3.0 / PERIOD, PERIOD),
+            fs.Sine(a, 1.0 / PERIOD) * fs.Triangle(1.0, 0.5 / PERIOD),
+            fs.Sawtooth(a, 2.0 / PERIOD),
+        )
+        circuit = circuit.replace({first.name: rng.choice(waveforms)})
     return f"{network}, {kind}, {law}", circuit, law
-
-
-def _with_python_source(rng: random.Random, circuit: fs.Circuit, scale: float) -> fs.Circuit:
-    """The circuit with a waveform that no netlist has, in place of its first source."""
-    source = circuit.by_device("V", "I")[0]
-    a = scale * (1.0 if source.device == "V" else 2e-6)
-    t = PERIOD * rng.uniform(0.1, 0.3)
-    waveforms = (
-        fs.Pulse(0.0, a, t, t, t, 0.0, 4.0 * t),
-        fs.Pulse(-a, a, t, 0.0, 0.0, 3.0 * t, 3.0 * t),
-        fs.Chirp(a, 0.5 / PERIOD, 3.0 / PERIOD, PERIOD),
-        fs.Sine(a, 1.0 / PERIOD) * fs.Triangle(1.0, 0.5 / PERIOD),
-        fs.Sawtooth(a, 2.0 / PERIOD),
-    )
-    return circuit.replace({source.name: rng.choice(waveforms)})

@@ -20,31 +20,35 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fuzz
-from evaluation import evaluate
+from deck_edits import evaluate
 from fingerspice.base.errors import InputError, Where
 from fingerspice.netlist.expressions import FUNCTIONS, compiled
 from fingerspice.netlist.lexer import group, lex, logical_lines, split_lines
+from scenes import cases
 
 HERE = Where("deck.cir", 1)
 
 
-def test_twenty_thousand_inputs_are_taken_or_refused() -> None:
-    report = fuzz.run(20_000)
+def test_inputs_of_every_kind_are_taken_or_refused() -> None:
+    report = fuzz.run(cases(20_000, 3_000))
     assert report.defects == []
     for name in fuzz.TARGETS:
         # A fuzzer whose inputs are all refused at the door reads nothing.
         assert report.counts[name, "taken"] > 0.1 * report.counts[name, "refused"]
 
 
-def planted(target: fuzz.Target) -> list[str]:
-    return fuzz.run(1, targets={"planted": (target, 1)}).defects
+class Unclear(fuzz.FingerspiceWarning, InputError):
+    """A message of ours that its base has not made clear."""
+
+    def __init__(self, message: str) -> None:
+        self.message = message
+
+    def __str__(self) -> str:
+        return self.message
 
 
-def bad_sentence(message: str) -> fuzz.Target:
+def raising(error: Exception) -> fuzz.Target:
     def target(rng: random.Random, bench: fuzz.Bench) -> None:
-        error = InputError("")
-        error.args = (message,)
-        error.message = message
         raise error
 
     return target
@@ -58,71 +62,45 @@ def touching(do: Callable[[Path], object]) -> fuzz.Target:
     return target
 
 
-def raising(error: Exception) -> fuzz.Target:
-    def target(rng: random.Random, bench: fuzz.Bench) -> None:
-        raise error
-
-    return target
-
-
-def overflowing(rng: random.Random, bench: fuzz.Bench) -> None:
-    np.array([1e308]) * 10.0
-
-
-def greedy(rng: random.Random, bench: fuzz.Bench) -> None:
-    np.zeros(8 * fuzz.ROOM * 2**20, np.uint8)
-
-
-def warning_of(message: str) -> fuzz.Target:
-    def target(rng: random.Random, bench: fuzz.Bench) -> None:
-        warnings.warn(Unclear(message), stacklevel=1)
-
-    return target
-
-
-class Unclear(fuzz.FingerspiceWarning):
-    """One that its base has not made clear."""
-
-    def __str__(self) -> str:
-        return "\x1b[2J"
-
-
-def titled(rng: random.Random, bench: fuzz.Bench) -> None:
-    fuzz._shown_well(dataclasses.replace(bench.circuit, title="\x1b[2J"))
-
-
 CODE = compile("1+1", "<unknown>", "eval")
+CLEAR_SCREEN = "\x1b[2J"
 DEFECTS: dict[str, tuple[fuzz.Target, str]] = {
     "a traceback": (raising(KeyError("x")), "KeyError"),
-    "numpy's own warning": (overflowing, "RuntimeWarning: overflow"),
-    "an empty message": (bad_sentence(" "), "no clear sentence"),
-    "two lines": (bad_sentence("one\ntwo"), "no clear sentence"),
-    "a terminal's commands": (bad_sentence("\x1b[31m"), "no clear sentence"),
-    "an endless message": (bad_sentence("x" * 5000), "no clear sentence"),
+    "numpy's own warning": (lambda rng, bench: np.array([1e308]) * 10.0, "RuntimeWarning: overflow"),
+    "an empty message": (raising(Unclear(" ")), "no clear sentence"),
+    "two lines": (raising(Unclear("one\ntwo")), "no clear sentence"),
+    "a terminal's commands": (raising(Unclear("\x1b[31m")), "no clear sentence"),
+    "an endless message": (raising(Unclear("x" * 5000)), "no clear sentence"),
+    "a message of Python's": (raising(Unclear("Traceback (most recent call last)")), "no clear sentence"),
     "a file beside the folder": (touching(lambda folder: (folder / "../outside.lib").read_text()), "open"),
     "a link out of the folder": (touching(lambda folder: (folder / "link.lib").read_text()), "open"),
     "a file written": (touching(lambda folder: (folder / "part.lib").write_text("x")), "open"),
     "a folder listed": (touching(lambda folder: os.listdir("/")), "os.listdir"),
     "code evaluated": (touching(lambda folder: eval(CODE)), "exec"),
     "code compiled": (touching(lambda folder: compile("import os", "<unknown>", "exec")), "compile"),
-    "a gigabyte": (greedy, "MemoryError"),
-    "a warning that clears the screen": (warning_of("x"), "no clear warning"),
-    "a title that clears the screen": (titled, "not fit to be shown"),
     "a command": (touching(lambda folder: subprocess.run(["true"], check=True)), "subprocess"),
+    "a gigabyte": (lambda rng, bench: np.zeros(8 * fuzz.ROOM * 2**20, np.uint8), "MemoryError"),
+    "a warning that clears the screen": (
+        lambda rng, bench: warnings.warn(Unclear(CLEAR_SCREEN), stacklevel=1),
+        "no clear warning",
+    ),
+    "a title that clears the screen": (
+        lambda rng, bench: fuzz._shown_well(dataclasses.replace(bench.circuit, title=CLEAR_SCREEN)),
+        "not fit to be shown",
+    ),
 }
 
 
-@pytest.mark.parametrize("name", DEFECTS)
-def test_a_planted_defect_is_caught(name: str) -> None:
-    target, says = DEFECTS[name]
-    (defect,) = planted(target)
-    assert defect.startswith("--seed 0 --first 0 --inputs 1: planted: ")
-    assert says in defect
+def test_every_planted_defect_is_caught() -> None:
+    defects = fuzz.run(len(DEFECTS), targets={name: (target, 1) for name, (target, _) in DEFECTS.items()}).defects
+    for number, (defect, (name, (_, says))) in enumerate(zip(defects, DEFECTS.items(), strict=True)):
+        assert defect.startswith(f"--seed 0 --first {number} --inputs 1: {name}: ")
+        assert says in defect
 
 
 def test_an_input_without_an_end_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fuzz, "SECONDS", 0.1)
-    (defect,) = planted(lambda rng, bench: time.sleep(60))
+    (defect,) = fuzz.run(1, targets={"endless": (lambda rng, bench: time.sleep(60), 1)}).defects
     assert "no answer after" in defect
 
 
@@ -194,11 +172,12 @@ def test_the_pieces_of_any_text_have_places_in_it(text: str) -> None:
                 assert lexeme.written[:1] == written[:1]
 
 
-def test_the_fuzzer_runs_from_the_command_line() -> None:
-    command = [sys.executable, "tests/fuzz.py", "--inputs", "100", "--seed", "5"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "100 inputs in" in done.stdout
+def test_the_fuzzer_runs_from_the_command_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["fuzz.py", "--inputs", "100", "--seed", "5"])
+    assert fuzz.main() == 0
+    assert "100 inputs in" in capsys.readouterr().out
 
 
 @pytest.fixture(autouse=True)

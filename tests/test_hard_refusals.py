@@ -56,18 +56,15 @@ def test_the_reference_fold_is_where_the_table_says_by_two_methods(case: str) ->
 
 @pytest.mark.parametrize("case", FOLDS)
 def test_a_run_past_the_fold_stops_there_and_says_where_how_near_why_and_what_to_change(case: str) -> None:
-    changes, _, _, near = FOLDS[case]
+    changes, params, _, near = FOLDS[case]
     fold = fold_of(case)
     with pytest.raises(fs.SolveError) as caught:
         fs.simulate(table1().replace(changes), charge_law="mobile")
     said, kept = str(caught.value), caught.value.solution
     assert said.startswith(f"stopped at t = {fold.t:.6g}"[:-1])
-    for part in (
-        "no solution past this time",
-        "area and gap voltage drive each other on",
-        "use less voltage, more load, or",
-    ):
-        assert part in said
+    assert "no solution past this time" in said
+    assert "area and gap voltage drive each other on" in said
+    assert "use less voltage, more load, or" in said
     assert f"{fold.u_gap:.3f} V across the gap, area {1e6 * fold.area:.4g} mm^2, distance to the fold" in said
     assert kept is not None
     assert kept.status is fs.Status.FOLD
@@ -78,30 +75,13 @@ def test_a_run_past_the_fold_stops_there_and_says_where_how_near_why_and_what_to
     assert kept.t[-1] >= fold.t * (1.0 - 1e-3)
     assert np.all(np.isfinite(kept.u_layer))
     assert kept.stats["steps"] + kept.stats["rejected"] <= 5000
-
-
-@lru_cache(None)
-def kept_before_fold(case: str) -> tuple[fs.Solution, float]:
-    """What is kept of a run past its fold, and its largest error (V) over nine tenths of the way."""
-    changes, params, *_ = FOLDS[case]
-    kept = fs.simulate(table1().replace(changes), charge_law="mobile", throw=False)
-    before = kept.t < 0.9 * fold_of(case).t
+    # Over nine tenths of the way its error is the one asked for, and the one stated.
+    before = kept.t < 0.9 * fold.t
     assert before.sum() > 10
     whole = dataclasses.replace(ref.TABLE1, **params)
     expected = ref.transient(SINE, kept.t[before], law="mobile", freq=100.0, params=whole, tol=1e-12)
-    return kept, float(np.abs(kept.u_gap[before] - expected.u_gap).max())
-
-
-@pytest.mark.parametrize("case", FOLDS)
-def test_what_is_kept_of_a_run_past_its_fold_has_the_error_asked_for(case: str) -> None:
-    kept, error = kept_before_fold(case)
-    assert error <= kept.rtol * fold_of(case).u_gap
-
-
-@pytest.mark.parametrize("case", FOLDS)
-def test_what_is_kept_of_a_run_past_its_fold_has_the_error_stated(case: str) -> None:
-    kept, error = kept_before_fold(case)
-    assert error <= kept.error.u_gap
+    error = float(np.abs(kept.u_gap[before] - expected.u_gap).max())
+    assert error <= min(kept.rtol * fold.u_gap, kept.error.u_gap)
 
 
 @pytest.mark.parametrize("case", FOLDS)
@@ -154,14 +134,10 @@ def test_behind_a_resistor_the_fold_is_where_the_gap_takes_its_largest_charge() 
     assert fold.t < 0.81 * fold_of("gap of 10 nm").t
     runs = [network_past_its_fold(r) for r in (1.0, 0.01)]
     assert all(run.status is fs.Status.FOLD for run in runs)
+    assert "distance to the fold" in runs[0].message
+    assert "at Xgap" in runs[0].message
     late = [run.state.t / fold.t - 1.0 for run in runs]
     assert 0.0 <= late[1] < 0.2 * late[0] < 1e-6
-
-
-def test_a_network_past_its_fold_says_how_near_it_came() -> None:
-    said = network_past_its_fold(1.0).message
-    assert "distance to the fold" in said
-    assert "at Xgap" in said
 
 
 # No contact ---------------------------------------------------------------------------------------------------
@@ -209,18 +185,14 @@ def test_a_source_that_gives_no_number_is_named_with_the_time_and_nothing_after_
 NETWORK = (V, COAT, GAP, SKIN.replace(" 0 ", " body "), "Cbody body 0 200p", ".tran 10u 10m uic")
 
 
-def test_nothing_after_such_a_source_is_returned_of_a_network() -> None:
+def test_such_a_source_of_a_network_is_named_and_nothing_after_it_is_returned() -> None:
     with pytest.raises(fs.SolveError, match=r"t = 0\.003 s: a source gave NaN or inf") as caught:
         fs.simulate(deck(*NETWORK), sources={"Vdrive": until_3_ms(math.nan)})
+    assert "Vdrive" in str(caught.value)
     kept = caught.value.solution
     assert kept.t[-1] == pytest.approx(3e-3, rel=1e-10)
     assert kept.t[-1] <= 3e-3
     assert np.all(np.isfinite(kept.u_gap))
-
-
-def test_such_a_source_of_a_network_is_named() -> None:
-    with pytest.raises(fs.SolveError, match="Vdrive"):
-        fs.simulate(deck(*NETWORK), sources={"Vdrive": until_3_ms(math.nan)})
 
 
 def test_nan_at_one_instant_that_is_an_output_is_not_passed_over() -> None:

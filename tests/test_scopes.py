@@ -13,36 +13,25 @@ from fingerspice.netlist.deck import parse_deck
 from ngspice_tools import call_ngspice
 
 INNER = ".subckt inner a b\nR1 a b {w}\n.ends\n"
+MID = ".subckt mid a b\nX1 a b inner\n.ends\n"
+OUTER = ".subckt outer a b w=5\nX1 a b inner\n.ends\nX1 a 0 outer"
+OWN = ".subckt outer a b\n.param w=5\nX1 a b inner\n.ends\nX1 a 0 outer"
 CASES = {
-    "the caller's default": f".param w=7\n{INNER}.subckt outer a b w=5\nX1 a b inner\n.ends\nX1 a 0 outer",
-    "the caller's given value": f".param w=7\n{INNER}.subckt outer a b w=5\nX1 a b inner\n.ends\nX1 a 0 outer w=3",
-    "the caller's .param": f".param w=7\n{INNER}.subckt outer a b\nX1 a b inner\n.param w=5\n.ends\nX1 a 0 outer",
-    "the caller's caller's": (
-        f".param w=7\n{INNER}.subckt mid a b\nX1 a b inner\n.ends\n"
-        ".subckt outer a b w=5\nX1 a b mid\n.ends\nX1 a 0 outer"
-    ),
-    "nobody's but the caller's": f"{INNER}.subckt outer a b\n.param w=5\nX1 a b inner\n.ends\nX1 a 0 outer",
-    "the deck's from another call": f".param w=7\n{INNER}.subckt outer a b w=5\nX1 a b inner\n.ends\nX1 a 0 inner",
-    "a bare name": f".param w=7\n{INNER.replace('{w}', 'w')}.subckt outer a b w=5\nX1 a b inner\n.ends\nX1 a 0 outer",
-    "a default": (
-        ".param w=7\n.subckt inner a b z={w+1}\nR1 a b {z}\n.ends\n.subckt outer a b w=5\nX1 a b inner\n.ends\n"
-        "X1 a 0 outer"
-    ),
-    "a .param inside": (
-        ".param w=7\n.subckt inner a b\n.param z={w}\nR1 a b {z}\n.ends\n.subckt outer a b w=5\nX1 a b inner\n.ends\n"
-        "X1 a 0 outer"
-    ),
-    "the deck's own formula": (
-        ".param w=7 z={2*w}\n.subckt inner a b\nR1 a b {z}\n.ends\n.subckt outer a b w=5\nX1 a b inner\n.ends\n"
-        "X1 a 0 outer"
-    ),
+    "the caller's default": f".param w=7\n{INNER}{OUTER}",
+    "the caller's given value": f".param w=7\n{INNER}{OUTER} w=3",
+    "the caller's .param": f".param w=7\n{INNER}{OWN}",
+    "the caller's caller's": f".param w=7\n{INNER}{MID}{OUTER.replace('b inner', 'b mid')}",
+    "nobody's but the caller's": f"{INNER}{OWN}",
+    "the deck's from another call": f".param w=7\n{INNER}{OUTER.replace('0 outer', '0 inner')}",
+    "a bare name": f".param w=7\n{INNER.replace('{w}', 'w')}{OUTER}",
+    "a default": f".param w=7\n.subckt inner a b z={{w+1}}\nR1 a b {{z}}\n.ends\n{OUTER}",
+    "a .param inside": f".param w=7\n.subckt inner a b\n.param z={{w}}\nR1 a b {{z}}\n.ends\n{OUTER}",
+    "the deck's own formula": f".param w=7 z={{2*w}}\n{INNER.replace('{w}', '{z}')}{OUTER}",
     "a name handed on": (
-        ".param w=7\n.subckt inner a b w=4\nR1 a b {w}\n.ends\n.subckt outer a b w=5\nX1 a b inner w={2*w}\n.ends\n"
-        "X1 a 0 outer"
+        f".param w=7\n.subckt inner a b w=4\nR1 a b {{w}}\n.ends\n{OUTER.replace('b inner', 'b inner w={2*w}')}"
     ),
     "a definition inside, called from beside it": (
-        f".param w=7\n.subckt outer a b w=5\n{INNER}.subckt mid a b w=9\nX1 a b inner\n.ends\nX1 a b mid\n.ends\n"
-        "X1 a 0 outer"
+        f".param w=7\n.subckt outer a b w=5\n{INNER}{MID.replace('a b', 'a b w=9', 1)}X1 a b mid\n.ends\nX1 a 0 outer"
     ),
     "what two callers hand down": (
         ".subckt inner a b\n.param y={w*2}\nR1 a b {y}\n.ends\n.subckt outer a b\n.param w={q}\nX1 a b inner\n.ends\n"

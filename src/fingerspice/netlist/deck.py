@@ -1,53 +1,73 @@
-"""A netlist file as a flat list of evaluated statements.
+"""A netlist file as a flat list of evaluated statements: expands subcircuit calls, renames nodes, evaluates values.
 
-A statement has a name, nodes and values; `elements`, `sources` and `directives` give it a meaning. The steps are those
-of `lexer` (from text to words), `reader` (lines by kind, included files), `scope` (parameters and values) and `flatten`
+A statement has a name, nodes and values; `elements` and `sources` give it a meaning. The steps are those of `lexer`
+(from text to words), `reader` (lines by kind, included files), `scope` (parameters and values) and `Flattener`
 (subcircuit calls). Every error has its place in the file.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where, printable
-from fingerspice.circuit.devices import layer_devices
-from fingerspice.netlist.files import MAX_BYTES, is_stream, read_stream, read_text
-from fingerspice.netlist.flatten import Flattener
-from fingerspice.netlist.reader import DIRECTIVES, Reader
-from fingerspice.netlist.scope import Scope
-from fingerspice.netlist.slips import with_comma
-from fingerspice.netlist.words import Directive, Statement
+from fingerspice.circuit.devices import DEVICES, layer_devices
+from fingerspice.netlist.files import MAX_BYTES, read_stream, read_text
+from fingerspice.netlist.lexer import MAX_NAME, Group, Lexeme, Line, group, lex
+from fingerspice.netlist.reader import DIRECTIVES, DirectiveLine, Reader, Subcircuit
+from fingerspice.netlist.scope import Bare, Scope
+from fingerspice.netlist.slips import nearest, stray_word, with_comma
+from fingerspice.netlist.words import Deck, Directive, Number, Statement, Value
 
 #: Largest number of characters of a title that are shown; the middle of a longer title is left out.
 LONGEST_TITLE = 200
+#: Limits of subcircuit calls: total number of expanded lines and characters, and nesting.
+MAX_EXPANDED = 100_000
+MAX_EXPANDED_TEXT = 4 * 2**20
+MAX_DEPTH = 32
 
+
+class Kind(NamedTuple):
+    """What is read of the elements with a letter, besides X, which has two nodes."""
+
+    what: str
+    # Kind of text that is evaluated without braces: a word of a resistor or capacitor names a parameter, those of a
+    # source are keywords (DC, SIN)
+    bare: Bare = "nothing"
+    value: tuple[str, ...] = ()  # Other names of the value
+    beside: tuple[str, ...] = ()  # LTspice's parasitics, which become elements: rser in series, all others in parallel
+    data: tuple[str, ...] = ()  # Data of a part that LTspice and Qucs-S write and no calculation uses
+
+
+KINDS = {
+    "R": Kind("resistor", "name", ("r", "resistance"), (), ("tol", "pwr", "tc1", "tc2")),
+    "C": Kind("capacitor", "name", ("c", "capacitance"), ("rser", "rpar", "cpar"),
+              ("tol", "v", "irms", "mfg", "pn", "type", "tc1", "tc2")),
+    "V": Kind("voltage source", beside=("rser", "cpar")),
+    "I": Kind("current source"),
+}  # fmt: skip
+_ELSEWHERE = {
+    "A": "an XSPICE model",
+    "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
+    "D": "a diode",
+    "K": "a coupled inductor",
+    "L": "an inductor",
+    **dict.fromkeys("EFGH", "a controlled source"),
+    **dict.fromkeys("JMQZ", "a transistor"),
+    **dict.fromkeys("OTUY", "a transmission line"),
+    **dict.fromkeys("SW", "a switch"),
+}
 _TITLE = re.compile(r"^\.title\s+", re.IGNORECASE)
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
-_ELEMENT_TITLE = re.compile(rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}", re.IGNORECASE)
-_DEVICE_TITLE = re.compile(rf"x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)", re.IGNORECASE)
-
-
-@dataclass(frozen=True, slots=True)
-class Deck:
-    """A netlist, read and flattened."""
-
-    title: str  # The first line in printable characters (see `errors.printable`); `text` has the line as written
-    statements: tuple[Statement, ...]  # Elements in the order of the file, subcircuit calls expanded
-    directives: tuple[Directive, ...]  # Those with values, as in `Flattener.directives`
-    # Names, without folder, of the included libraries of native devices, whose files are not read
-    includes: tuple[str, ...]
-    files: tuple[Path, ...]  # The other included files, which were read
-    unused: tuple[str, ...]  # Names of the directives that are accepted and have no effect here
-    warnings: tuple[str, ...]  # Warnings about text that is legal but probably not meant, each with its place
-    params: dict[str, float]  # Values of the deck's own `.param` definitions by lower-case name
-    text: str  # The netlist as read
-    path: Path | None  # Path of the file; None for a text
-
-    def named(self, name: str) -> list[Directive]:
-        """The directives of that name."""
-        return [directive for directive in self.directives if directive.name == name]
+#: Titles that are probably the netlist's first statement.
+_STATEMENT = re.compile(
+    rf"[rcvi]\w*\s+\S+\s+\S+\s+{_VALUE}|x\w*(?:\s+\S+){{3}}\s+(?:{'|'.join(layer_devices())})(?:\s|$)"
+    rf"|(?:{'|'.join(map(re.escape, DIRECTIVES))})(?:\s|$)",
+    re.IGNORECASE,
+)
 
 
 def read_deck(path: str | Path) -> Deck:
@@ -55,8 +75,9 @@ def read_deck(path: str | Path) -> Deck:
 
     Standard input (``-``), a device or a pipe is a deck called ``stdin`` in the working directory.
     """
-    if is_stream(Path(path)):
-        return parse_deck(read_stream(Path(path)), Path("stdin"))
+    streamed = read_stream(Path(path))
+    if streamed is not None:
+        return parse_deck(streamed, Path("stdin"))
     return parse_deck(read_text(Path(path), str(path)), Path(path))
 
 
@@ -65,49 +86,233 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
 
     `path` is that of the file with this text; without it only the libraries of native devices can be included.
     """
-    file = str(path) if path is not None else "<netlist>"
+    deck = Deck(text, path)
     if not text.strip("\ufeff \t\r\n"):
-        raise InputError(f"'{file}' is empty: a netlist begins with a title line")
+        raise InputError(f"'{deck.file}' is empty: a netlist begins with a title line")
     if len(text) > MAX_BYTES:
-        raise InputError(f"'{file}' is larger than {MAX_BYTES >> 20} MiB")
+        raise InputError(f"'{deck.file}' is larger than {MAX_BYTES >> 20} MiB")
     if "\0" in text:
-        raise InputError(f"'{file}' is not text (it holds NUL characters)")
-    reader = Reader(file, path)
-    lines = reader.split(text.removeprefix("\ufeff"))
-    title = printable(_TITLE.sub("", lines[0].strip()), LONGEST_TITLE)
-    if _reads_like_a_statement(title):
-        problem = f"the first line is the title, but '{title}' reads like a statement: add a title above"
-        reader.warn(problem, Where(file, 1))
+        raise InputError(f"'{deck.file}' is not text (it holds NUL characters)")
+    reader = Reader(deck)
+    title, *lines = reader.split(text.removeprefix("\ufeff"))
+    deck.title = printable(_TITLE.sub("", title.strip()), LONGEST_TITLE)
+    if _STATEMENT.match(deck.title):
+        problem = f"the first line is the title, but '{deck.title}' reads like a statement: add a title above"
+        reader.warn(problem, Where(deck.file, 1))
     try:
         reader.read_deck(lines)
-        scope = Scope()
-        for definition in reader.root.params:
-            scope.define(definition)
-        scope.solve()
-        flattener = Flattener()
-        flattener.run(reader.root, scope)
+        Flattener(deck).run(reader.root)
     except InputError as error:
-        raise with_comma(error, reader.warnings) from None
+        raise with_comma(error, deck.warnings) from None
     for defined in reader.root.inner.values():
         # In a library it is usual that some subcircuits are never called.
-        if defined.where.file == file and not (defined.called or defined.skipped):
+        if defined.where.file == deck.file and not (defined.called or defined.skipped):
             reader.warn(f"subcircuit '{defined.name}' is never called, and its body was not read", defined.where)
-    return Deck(
-        title=title,
-        statements=tuple(flattener.statements),
-        directives=tuple(flattener.directives),
-        includes=tuple(reader.libraries),
-        files=tuple(reader.files),
-        unused=tuple(reader.unused),
-        warnings=tuple(reader.warnings),
-        params=dict(scope.values),
-        text=text,
-        path=path,
-    )
+    return deck
 
 
-def _reads_like_a_statement(title: str) -> bool:
-    """Whether a title is probably the netlist's first statement."""
-    if title.startswith("."):
-        return title.split(None, 1)[0].lower() in DIRECTIVES
-    return _ELEMENT_TITLE.match(title) is not None or _DEVICE_TITLE.match(title) is not None
+@dataclass(slots=True)
+class _Instance:
+    """A subcircuit call that is being expanded, or the deck itself."""
+
+    definition: Subcircuit
+    scope: Scope
+    outside: _Instance | None = None  # the instance in which the definition stands
+    prefix: str = ""  # as written, ends in a dot
+    ports: dict[str, tuple[str, str]] = field(default_factory=dict)
+    calls: tuple[Subcircuit, ...] = ()  # definitions being expanded, outermost first
+
+    def node(self, name: str) -> tuple[str, str]:
+        """Canonical and written name of a node named in this instance."""
+        lower = name.lower()
+        if lower in ("0", "gnd"):
+            return "0", name
+        return self.ports.get(lower) or (f"{self.prefix}{lower}".lower(), f"{self.prefix}{name}")
+
+    def nodes(self, words: list[Lexeme]) -> list[tuple[str, str]]:
+        """Canonical and written names of nodes."""
+        for word in words:
+            if word.kind != "word":
+                raise InputError(f"{word.written} stands where a node's name belongs", word.where)
+        return [self.node(word.text) for word in words]
+
+    def around(self) -> Iterator[_Instance]:
+        """This instance, and those around it, whose subcircuits an X line may call, too."""
+        instance: _Instance | None = self
+        while instance is not None:
+            yield instance
+            instance = instance.outside
+
+
+class Flattener:
+    """Turns the lines of a deck into statements and directives.
+
+    A call is replaced by the statements of its subcircuit. An `.ic` line has the nodes of the flat circuit.
+    """
+
+    def __init__(self, deck: Deck) -> None:
+        self.deck = deck
+        self._names: dict[str, Where] = {}
+        self._expanded = self._expanded_text = 0
+
+    def run(self, root: Subcircuit) -> None:
+        """Evaluate the deck's parameters and add its statements."""
+        scope = Scope(root.params)
+        self.deck.params = scope.solve()
+        self._expand(_Instance(root, scope))
+
+    def _expand(self, instance: _Instance) -> None:
+        for line in instance.definition.elements:
+            self._element(line, instance)
+        self.deck.directives += [_directive(read, instance) for read in instance.definition.directives]
+
+    def _element(self, line: Line, instance: _Instance) -> None:
+        lexemes = lex(line) or [Lexeme("", ",", line.start, line)]  # a line of commas has none
+        first = lexemes[0]
+        where, letter = first.where, first.text[:1].upper()
+        if first.kind != "word" or not (letter.isascii() and letter.isalpha()):
+            problem = f"'{first.written}' is no element: a line begins with R, C, V, I, X or a dot, a comment with *"
+            raise InputError(problem, where)
+        if letter != "X" and letter not in KINDS:
+            raise InputError(_unknown_element(lexemes), where)
+        name = f"{instance.prefix}{first.text}"
+        if len(name) > MAX_NAME:
+            raise InputError(f"an element's name of {len(name)} characters: at most {MAX_NAME} are allowed", where)
+        earlier = self._names.setdefault(name.lower(), where)
+        if earlier is not where:
+            raise InputError(f"element '{name}' is defined twice, first at {earlier}", where)
+        if letter == "X":
+            self._call(name, lexemes, instance)
+            return
+        kind, scope, words = KINDS[letter], instance.scope, group(lexemes[1:], plain=2)
+        nodes = [word for word in words.words[:2] if isinstance(word, Lexeme)]
+        if len(nodes) < 2 or (len(words.words) == 2 and not words.params):
+            missing = "node" if len(nodes) < 2 else "value"
+            raise InputError(f"missing {missing}: a {kind.what} is written {name} node node value", where)
+        canonical, written = zip(*instance.nodes(nodes), strict=True)
+        body, params = scope.words(words.words[2:], kind.bare), scope.pairs(words, kind.bare)
+        self.deck.statements.append(Statement(name, letter, canonical, written, None, body, params, where))
+
+    def _call(self, name: str, lexemes: list[Lexeme], instance: _Instance) -> None:
+        """An X line: a native device becomes a statement, and a subcircuit is expanded."""
+        words, scope = group(lexemes[1:], plain=len(lexemes)), instance.scope
+        if words.stray is not None:
+            stray = words.stray
+            hint = stray_word(stray.text, stray.line.text[: stray.position])
+            problem = f"'{stray.text}' follows the parameters: nodes and the device's name come first{hint}"
+            raise InputError(problem, stray.where)
+        plain = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
+        if not plain:
+            raise InputError(f"missing value: {name} needs nodes and a device's name", lexemes[0].where)
+        *nodes, device = plain
+        if device.kind != "word":
+            raise InputError(f"{device.written} stands where a device's name belongs", device.where)
+        native, key = device.text.upper(), device.text.lower()
+        outside = next((around for around in instance.around() if key in around.definition.inner), None)
+        called = None if outside is None else outside.definition.inner[key]
+        if native in layer_devices():
+            called, shown, wanted = None, native, DEVICES[native].nodes
+        elif called is not None:
+            shown, wanted = called.name, called.ports
+        else:
+            raise InputError(_unknown_device(plain, instance), device.where)
+        if len(nodes) != len(wanted):
+            count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}"
+            names = f" ({' '.join(wanted)})" if wanted else ""
+            raise InputError(f"{name}: {shown} has {count}{names}, {len(nodes)} given", device.where)
+        if called is None:
+            canonical, written = zip(*instance.nodes(nodes), strict=True)
+            params = scope.pairs(words, bare="arithmetic")
+            given = {key: value.value for key, value in params.items() if isinstance(value, Number)}
+            _refuse_captured(native, given, words, scope)
+            where = lexemes[0].where
+            self.deck.statements.append(Statement(name, "X", canonical, written, native, (), params, where))
+            return
+        self._count(called, instance, device.where)
+        ports = dict(zip(called.ports, instance.nodes(nodes), strict=True))
+        called.called = True
+        inner = _scope_of(called, words, scope)
+        self._expand(_Instance(called, inner, outside, f"{name}.", ports, (*instance.calls, called)))
+
+    def _count(self, called: Subcircuit, instance: _Instance, where: Where) -> None:
+        """Count what a call expands to; refuse circles, and what is too deep or too much."""
+        if any(called is outer for outer in instance.calls):
+            start = next(i for i, outer in enumerate(instance.calls) if outer is called)
+            path = " -> ".join(sub.name for sub in (*instance.calls[start:], called))
+            raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
+        if len(instance.calls) >= MAX_DEPTH:
+            raise InputError(f"subcircuits call each other more than {MAX_DEPTH} deep", where)
+        self._expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
+        if self._expanded > MAX_EXPANDED:
+            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
+        self._expanded_text += called.characters
+        if self._expanded_text > MAX_EXPANDED_TEXT:
+            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
+
+
+def _directive(read: DirectiveLine, instance: _Instance) -> Directive:
+    """An evaluated directive; an `.ic` line has the canonical names of its nodes, which are those of a call."""
+    line, scope = read.line, instance.scope
+    words = group(lex(line, read.rest), probes=True)
+    args, params = scope.words(words.words), scope.pairs(words)
+    if read.name == ".ic":
+        given, params = params, dict[str, Value]()
+        for key, value in given.items():
+            flat = f"v({instance.node(key[2:-1].strip())[0]})" if key.startswith("v(") else key
+            if flat in params:
+                raise InputError(f".ic gives node {flat[2:-1]!r} twice", value.key)
+            params[flat] = value
+    return Directive(read.name, args, params, line.place, line.text[line.start :])
+
+
+def _scope_of(called: Subcircuit, words: Group, caller: Scope) -> Scope:
+    """A call's parameters: values on the X line evaluated in the caller's scope, defaults in the subcircuit's."""
+    inner = Scope((*called.defaults, *called.params), caller)
+    allowed = {default.key.text.lower(): default.key.text for default in called.defaults}
+    for name, (key, value) in words.params.items():
+        if name not in allowed:
+            hint = nearest(name, allowed) or f"; it has {' '.join(allowed.values()) or 'none'}"
+            raise InputError(f"subcircuit '{called.name}' has no parameter '{key.text}'{hint}", key.where)
+        inner.preset(name, caller.number(value))
+    _refuse_captured(called.name, inner.solve(), words, caller)
+    return inner
+
+
+def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:
+    """Refuse a value on an X line with a name that is the caller's parameter here, and the device's own in ngspice."""
+    for given, (key, value) in words.params.items():
+        for name, here in caller.references(value).items():
+            if name != given and own.get(name, here) != here:
+                problem = (
+                    f"{key.text}={value.written} means {name} = {here:g} of the calling netlist here, and in ngspice "
+                    f"{device}'s own {name} = {own[name]:g}; allowed: another name for one of them"
+                )
+                raise InputError(problem, value.where)
+
+
+def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
+    """The message that the last word of an X line is not a device, with a hint."""
+    last = words[-1]
+    visible = [
+        *layer_devices(),
+        *(sub.name for around in instance.around() for sub in around.definition.inner.values()),
+    ]
+    known = {name.lower() for name in visible}
+    for word in words[2:-1]:
+        # A device's name after two words or more is probably the device, and the words after it lack their `key=`.
+        if word.text.lower() in known:
+            return f"{last.written} follows the device {word.text}: its parameters are written key=value"
+    hint = nearest(last.text, visible) or f"; devices are {' '.join(visible[:40])}"
+    return f"'{last.text}' is not a device or a .subckt{hint}"
+
+
+def _unknown_element(lexemes: list[Lexeme]) -> str:
+    """The message that a line with these words is not an element, with a hint."""
+    name = lexemes[0].text
+    if any(lexeme.text.upper() in layer_devices() for lexeme in lexemes[3:]):
+        return f"'{name}': a device's name begins with X, as in X{name}"
+    if f".{name.lower()}" in DIRECTIVES:
+        return f"'{name}': a directive begins with a dot, as in .{name.lower()}"
+    kind = _ELSEWHERE.get(name[0].upper())
+    what = f"'{name}' is {kind}, which is not supported" if kind else f"'{name}' is no known element"
+    return f"{what}; elements are R, C, V, I, and X with {', '.join(layer_devices())} or a .subckt"

@@ -85,6 +85,11 @@ _LEVELS: tuple[Mapping[str, Callable[..., float]], ...] = (
     {"+": operator.add, "-": operator.sub},
     {"*": operator.mul, "/": operator.truediv},
 )
+_FAILURES: Mapping[type[Exception], str] = {
+    ZeroDivisionError: "divides by zero",
+    OverflowError: "is too large for a number (1.8e308)",
+    ValueError: "leaves the domain of one of its functions",
+}
 _POWERS = ("^", "**")
 #: After these a minus stands before one value of several.
 _OPERATORS = frozenset(("?", ":", *_POWERS, *(sign for level in _LEVELS for sign in level)))
@@ -98,13 +103,13 @@ _LEX = re.compile(
 
 
 class _Piece(NamedTuple):
-    kind: str  # number, name, call, op or end
+    kind: str  # number, name, op or end
     text: str
     position: int
 
 
 def _pieces(text: str) -> list[_Piece]:
-    """Numbers, names, names before a bracket (calls), operators, and at last the end."""
+    """Numbers, names, operators, and at last the end."""
     pieces: list[_Piece] = []
     position = questions = 0
     while position < len(text):
@@ -116,33 +121,48 @@ def _pieces(text: str) -> list[_Piece]:
         questions += found == "?"
         if questions > MAX_QUESTIONS:
             raise Problem(f"more than {MAX_QUESTIONS} '?' in one expression", position)
-        if found == "(" and pieces and pieces[-1].kind == "name":
-            pieces[-1] = pieces[-1]._replace(kind="call")
         if kind != "space":
             pieces.append(_Piece(kind, found, position))
         position = match.end()
     return [*pieces, _Piece("end", "", len(text))]
 
 
-class _Parser:
-    """Recursive descent, only as deep as the brackets are nested: chains such as `a + b - c` are loops."""
+class Expression:
+    """A compiled expression; `Problem` is raised for a text that is not arithmetic.
+
+    The parser is a recursive descent, only as deep as the brackets are nested: chains such as `a + b - c` are loops.
+    """
 
     def __init__(self, text: str) -> None:
+        if len(text) > MAX_LENGTH:
+            raise Problem(f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
         self.text = text
-        self.pieces = _pieces(text)
-        self.names: dict[str, int] = {}
+        self.names: dict[str, int] = {}  # In lower case, constants included, and the position of each one's first use
+        self._pieces = _pieces(text)
         self._at = 0
         self._brackets: list[tuple[_Piece, bool]] = []  # open, each with whether it encloses a function's arguments
-
-    def whole(self) -> Term:
-        """The whole text as one expression."""
-        term = self._condition()
+        self._term = self._condition()
         self._refuse_going_on()
-        return term
+        numbers = [piece for piece in self._pieces if piece.kind == "number"]
+        # The first number written with a capital M, and its position
+        self.mega = next(((text, position) for _, text, position in numbers if suspicious_mega(text)), None)
+        self._pieces.clear()
+
+    def evaluate(self, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
+        """Value of the expression, given the values of names (lower case); a value that is not finite is refused."""
+        try:
+            value = float(self._term(names))
+        except Problem as problem:
+            raise InputError(problem.message, place(problem.position)) from None
+        except (ZeroDivisionError, OverflowError, ValueError) as error:
+            raise InputError(f"'{self.text}' {_FAILURES[type(error)]}", place(0)) from None
+        if not math.isfinite(value):
+            raise InputError(f"'{self.text}' gives {value:g}, not a finite number", place(0))
+        return value
 
     def _take(self, *texts: str) -> _Piece | None:
         """The next piece if it is one of these."""
-        piece = self.pieces[self._at]
+        piece = self._pieces[self._at]
         if piece.text not in texts:
             return None
         self._at += 1
@@ -150,7 +170,7 @@ class _Parser:
 
     def _refuse_going_on(self) -> None:
         """Refuse what cannot follow a complete value."""
-        kind, text, position = self.pieces[self._at]
+        kind, text, position = self._pieces[self._at]
         if kind == "end":
             if self._brackets:
                 raise Problem("'(' is never closed", self._brackets[-1][0].position)
@@ -216,7 +236,7 @@ class _Parser:
                 raise Problem("a second '^' in a row has two readings: use brackets", power.position)
             value = partial(_folded, value, [(_power, self._signed(of_power=True))])
         for index in range(max(begin, 1), end):
-            before, sign, number, after = self.pieces[index - 1 : index + 3]
+            before, sign, number, after = self._pieces[index - 1 : index + 3]
             moved = number.kind != "number" or (after.text in _POWERS and before.text not in _POWERS)
             if sign.text == "-" and before.text in _OPERATORS and moved:
                 problem = "a '-' after an operator has two readings here: use brackets, as in 2*(-x)"
@@ -225,7 +245,7 @@ class _Parser:
 
     def _value(self) -> Term:
         """A number, a name, or what is in brackets."""
-        piece = self.pieces[self._at]
+        piece = self._pieces[self._at]
         kind, text, position = piece
         if text == "(":
             return self._in_brackets(False)[0]
@@ -237,9 +257,15 @@ class _Parser:
         self._at += 1
         name = text.lower()
         if kind == "number":
-            number = _number_of(piece)
+            try:
+                number = parse_number(text)
+            except ValueError as error:
+                raise Problem(str(error), position) from None
+            if name.lstrip("0123456789.e+-").startswith("mil"):
+                written = f"write {spice_text(number)}"
+                raise Problem(f"'{text}' differs between simulators, ngspice 39 reads milli here: {written}", position)
             return lambda names: number
-        if kind == "name":
+        if self._pieces[self._at].text != "(":
             self.names.setdefault(name, position)
             return partial(_looked_up, piece)
         if name not in FUNCTIONS:
@@ -249,12 +275,12 @@ class _Parser:
 
     def _in_brackets(self, of_call: bool) -> list[Term]:
         """The expressions in brackets: one, or a function's arguments."""
-        opening = self.pieces[self._at]
+        opening = self._pieces[self._at]
         self._brackets.append((opening, of_call))
         if len(self._brackets) > MAX_DEPTH:
             raise Problem(f"brackets nested deeper than {MAX_DEPTH}", opening.position)
         terms: list[Term] = []
-        while self.pieces[self._at].text != ")" or not terms:
+        while self._pieces[self._at].text != ")" or not terms:
             self._at += 1  # the opening bracket, or a comma
             terms.append(self._condition())
             self._refuse_going_on()
@@ -293,46 +319,8 @@ def _called(name: str, arguments: list[Term], text: str, names: Mapping[str, flo
     return float(function(*(argument(names) for argument in arguments)))
 
 
-def _number_of(piece: _Piece) -> float:
-    """Value of a number; refuses mil, which ngspice's arithmetic takes for milli."""
-    try:
-        value = parse_number(piece.text)
-    except ValueError as error:
-        raise Problem(str(error), piece.position) from None
-    if piece.text.lower().lstrip("0123456789.e+-").startswith("mil"):
-        problem = f"'{piece.text}' differs between simulators, ngspice 39 reads milli here: write {spice_text(value)}"
-        raise Problem(problem, piece.position)
-    return value
-
-
-_FAILURES: Mapping[type[Exception], str] = {
-    ZeroDivisionError: "divides by zero",
-    OverflowError: "is too large for a number (1.8e308)",
-    ValueError: "leaves the domain of one of its functions",
-}
-
-
-class Expression(NamedTuple):
-    """A compiled expression."""
-
-    text: str
-    names: Mapping[str, int]  # Names in lower case, constants included, and the position of each one's first use
-    mega: tuple[str, int] | None  # The first number written with a capital M, and its position
-    term: Term
-
-    def evaluate(self, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
-        """Value of the expression, given the values of names (lower case); a value that is not finite is refused."""
-        position = 0
-        try:
-            value = float(self.term(names))
-            if math.isfinite(value):
-                return value
-            message = f"'{self.text}' gives {value:g}, not a finite number"
-        except Problem as problem:
-            message, position = problem.message, problem.position
-        except (ZeroDivisionError, OverflowError, ValueError) as error:
-            message = f"'{self.text}' {_FAILURES[type(error)]}"
-        raise InputError(message, place(position))
+#: The expression of a text; raises `Problem` if it is not arithmetic.
+compiled = lru_cache(maxsize=8192)(Expression)
 
 
 def compile_expression(text: str, place: Callable[[int], Where]) -> Expression:
@@ -341,14 +329,3 @@ def compile_expression(text: str, place: Callable[[int], Where]) -> Expression:
         return compiled(text)
     except Problem as problem:
         raise InputError(problem.message, place(problem.position)) from None
-
-
-@lru_cache(maxsize=8192)
-def compiled(text: str) -> Expression:
-    """The expression of a text; raises `Problem` if it is not arithmetic."""
-    if len(text) > MAX_LENGTH:
-        raise Problem(f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
-    parser = _Parser(text)
-    term = parser.whole()
-    mega = next(((p.text, p.position) for p in parser.pieces if p.kind == "number" and suspicious_mega(p.text)), None)
-    return Expression(text, parser.names, mega, term)

@@ -16,7 +16,6 @@ from fingerspice.netlist.slips import closest, nearest
 
 #: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
 LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
-NATIVE_LIBRARIES = tuple(LIBRARIES.values())
 
 #: Largest size of a file, and of all the files that a deck's sources name, bytes.
 MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30
@@ -61,19 +60,16 @@ def _reason(error: Exception) -> str:
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
-def is_stream(path: Path) -> bool:
-    """Whether a deck's path means standard input (``-``), a device, or a pipe such as bash's ``<(...)``."""
+def read_stream(path: Path) -> str | None:
+    """Text of a deck from standard input (``-``), a device, or a pipe such as bash's ``<(...)``; None for a file."""
+    stream = str(path) in ("-", "/dev/stdin") or path.is_relative_to("/dev/fd")
     with suppress(OSError):
-        named = str(path) in ("-", "/dev/stdin") or path.is_relative_to("/dev/fd")
-        return named or path.is_fifo() or path.is_char_device()
-    return False
-
-
-def read_stream(path: Path) -> str:
-    """Text of a deck from standard input, a device or a pipe."""
+        stream = stream or path.is_fifo() or path.is_char_device()
+    if not stream:
+        return None
     try:
-        with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
+        with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as source:
+            data = source.read(MAX_BYTES + 1)
     except OSError as error:
         raise InputError(f"'{path}' cannot be read: {_reason(error)}") from None
     if len(data) > MAX_BYTES:
@@ -112,25 +108,23 @@ class SourceFiles:
     def find(self, name: str, where: Where) -> Path:
         """Path of a file named at the place `where`; one outside the folder is refused, and too much in all."""
         try:
-            path = Path(name).expanduser() if self.anywhere else self._below(name, where)
-            size = path.stat().st_size if path.is_file() else None
+            if self.anywhere:
+                path = Path(name).expanduser()
+            elif self.folder is None:
+                raise InputError(f"'{name}' cannot be read: a netlist given as text has no folder to look in", where)
+            else:
+                # The line may stand in an included file, whose name begins with the deck's folder as the user wrote it.
+                folder, root = Path(where.file).parent, self.folder.resolve()
+                path = inside(root, folder, name, where)
+                if not path.exists():
+                    raise InputError(f"'{name}' does not exist{_similar_file(path, name, root)}", where)
+                path = folder / name.replace("\\", "/")
+            self.size += path.stat().st_size if path.is_file() else 0
         except (OSError, RuntimeError) as error:  # a name that is too long, or the folder of an unknown user
             raise InputError(f"'{name}' cannot be read: {_reason(error)}", where) from None
-        if size is not None:
-            self.size += size
-            if self.size > MAX_SOURCE_BYTES:
-                raise InputError(f"the sources' files are larger than {MAX_SOURCE_BYTES >> 20:,} MiB in all", where)
+        if self.size > MAX_SOURCE_BYTES:
+            raise InputError(f"the sources' files are larger than {MAX_SOURCE_BYTES >> 20:,} MiB in all", where)
         return path
-
-    def _below(self, name: str, where: Where) -> Path:
-        if self.folder is None:
-            raise InputError(f"'{name}' cannot be read: a netlist given as text has no folder to look in", where)
-        # The line may stand in an included file, whose name begins with the deck's folder as the user wrote it.
-        folder = Path(where.file).parent
-        path = inside(self.folder.resolve(), folder, name, where)
-        if not path.exists():
-            raise InputError(f"'{name}' does not exist{_similar_file(path, name, self.folder.resolve())}", where)
-        return folder / name.replace("\\", "/")
 
 
 def library_changed(root: Path, folder: Path, name: str) -> bool:
@@ -168,7 +162,7 @@ def _similar_file(path: Path, shown: str, root: Path | None) -> str:
     if found is None and len(below) > 1:
         found = _nearest_path(folder, below[-1:])
     # A library of native devices is built in and need not exist in the folder: propose it, too.
-    names = [*([found[-1]] if found else []), *(NATIVE_LIBRARIES if root is not None else ())]
+    names = [*([found[-1]] if found else []), *(LIBRARIES.values() if root is not None else ())]
     name = closest(path.name, names)
     if found is not None and name in (found[-1], None):
         return f"; did you mean '{PurePath(*written, *found).as_posix()}'?"

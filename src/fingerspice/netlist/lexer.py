@@ -9,7 +9,7 @@ import re
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain
 from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
@@ -18,7 +18,7 @@ from fingerspice.base.errors import InputError, Where
 _COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)//|(?<!\S)\$(?!\S))')
 _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
 #: Pattern of a separator or a mark; their number is an upper bound of the number of words.
-_SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
+SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
 _BRACE = re.compile(r"[{}]")
 _MARKS = ("(", ")", "=")
 MAX_NAME = 400  # Characters of a name
@@ -34,23 +34,10 @@ class Line(NamedTuple):
     # Of each physical line: the position of its text, its number, and what a position in it lacks to its column
     parts: tuple[tuple[int, int, int], ...]
 
-    @classmethod
-    def joined(cls, file: str, parts: list[tuple[int, int, str]]) -> Line:
-        """Line made of (line number, column before the text, text) of each physical line."""
-        places, start = [], 0
-        for number, column, text in parts:
-            places.append((start, number, column + 1 - start))
-            start += len(text) + 1
-        return cls(file, " ".join(text for _, _, text in parts), tuple(places))
-
     def where(self, position: int) -> Where:
         """Place of one character of the text."""
         _, number, shift = self.parts[bisect_right(self.parts, position, key=lambda part: part[0]) - 1]
         return Where(self.file, number, position + shift)
-
-    def words(self, most: int) -> int:
-        """An upper bound of the number of lexemes, counted up to `most`."""
-        return len(self.parts) + sum(1 for _ in islice(_SPLIT.finditer(self.text), most))
 
     @property
     def start(self) -> int:
@@ -113,32 +100,27 @@ def split_lines(text: str) -> list[str]:
 
 def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]:
     """Logical lines, without comments and blank lines; `first` is the number of the first physical line."""
-    pending: list[tuple[int, int, str]] = []
-    for number, raw in enumerate(lines, first):
-        body = _without_comment(raw)
-        bare = body.lstrip()
+    texts, parts, length = list[str](), list[tuple[int, int, int]](), 0
+    for number, raw in enumerate(chain(lines, ("after the last line",)), first):
+        comment = None
+        if ";" in raw or "$" in raw or "//" in raw:
+            comment = next((match.start() for match in _COMMENT.finditer(raw) if match[1]), None)
+        text = raw[:comment].rstrip()
+        bare = text.lstrip()
         if not bare or bare[0] == "*":
             continue
-        column = len(body) - len(bare)
+        column = 1
         if bare[0] == "+":
-            if not pending:
-                problem = "'+' continues the line before, but there is none"
-                raise InputError(problem, Where(file, number, column + 1))
-            pending.append((number, column + 1, bare[1:]))
-            continue
-        if pending:
-            yield Line.joined(file, pending)
-        pending = [(number, 0, body)]
-    if pending:
-        yield Line.joined(file, pending)
-
-
-def _without_comment(raw: str) -> str:
-    if ";" in raw or "$" in raw or "//" in raw:
-        for match in _COMMENT.finditer(raw):
-            if match[1]:
-                return raw[: match.start()].rstrip()
-    return raw.rstrip()
+            column += len(text) - len(bare) + 1
+            if not texts:
+                raise InputError("'+' continues the line before, but there is none", Where(file, number, column - 1))
+            text = bare[1:]
+        elif texts:
+            yield Line(file, " ".join(texts), tuple(parts))
+            texts, parts, length = [], [], 0
+        texts.append(text)
+        parts.append((length, number, column - length))
+        length += len(text) + 1
 
 
 def lex(line: Line, start: int = 0) -> list[Lexeme]:

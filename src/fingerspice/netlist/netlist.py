@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
@@ -13,13 +12,13 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element, Tran
 from fingerspice.circuit.loop import checked
 from fingerspice.circuit.usual import REST_AREA, unusual
-from fingerspice.netlist.deck import Deck, parse_deck, read_deck
-from fingerspice.netlist.directives import read_ac, read_initial, read_options, read_tran, unused_starts
-from fingerspice.netlist.elements import read_elements, source_of
+from fingerspice.netlist.deck import parse_deck, read_deck
+from fingerspice.netlist.elements import read_ac, read_elements, read_initial, read_options, read_tran, source_of
 from fingerspice.netlist.files import SourceFiles
 from fingerspice.netlist.reader import MAX_WARNINGS
 from fingerspice.netlist.slips import decimal_comma, with_comma
 from fingerspice.netlist.sources import Context
+from fingerspice.netlist.words import Deck
 from fingerspice.waveforms.waveform import DC, Waveform
 
 
@@ -68,7 +67,7 @@ def _circuit(deck: Deck) -> Circuit:
         circuit = _read(deck, list(deck.warnings))
     except InputError as error:
         told = with_comma(error, deck.warnings)
-        text = told.message if told.where else f"{deck.path or '<netlist>'}: {told.message}"
+        text = told.message if told.where else f"{deck.file}: {told.message}"
         title = [note for note in deck.warnings if "the first line is the title" in note]
         raise InputError("; note ".join([text, *title]), told.where) from None
     for note in circuit.warnings:
@@ -81,30 +80,35 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     context = Context(tran, SourceFiles(None if deck.path is None else deck.path.parent))
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
     work, unused = read_options(deck.named(".options"))
-    initial = read_initial(deck.named(".ic"), elements)
-    notes.extend(_unusual_areas(elements, initial))
-    notes.extend(_coarse_outputs(deck, elements, tran))
+    initial, unused_starts = read_initial(deck.named(".ic"), elements, tran is None or tran.uic)
+    _warn_of_unusual(deck, elements, tran, initial, notes)
     more = len(notes) - MAX_WARNINGS
     if more > 1:
         notes[MAX_WARNINGS:] = [f"{more} more warnings are not shown"]
+    laws = {"mobile" if "mobile" in name.lower() else "local" for name in deck.libraries}
+    ac = next(map(read_ac, deck.named(".ac")), None)
+    if len(laws) > 1:
+        raise InputError("both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
     circuit = Circuit(
         title=deck.title,
         elements=elements,
         tran=tran,
-        ac=next(map(read_ac, deck.named(".ac")), None),
+        ac=ac,
         initial=initial,
-        charge_law=_charge_law(deck.includes),
+        charge_law=next(iter(laws), None),
         work=work,
         warnings=tuple(notes),
-        unused=(*deck.unused, *unused, *unused_starts(initial, elements, tran is None or tran.uic)),
+        unused=(*deck.unused, *unused, *unused_starts),
         text=deck.text,
         path=deck.path,
     )
     return checked(circuit)
 
 
-def _unusual_areas(elements: tuple[Element, ...], initial: Mapping[str, float]) -> Iterator[str]:
-    """Warnings about unusual areas given by sources or start values."""
+def _warn_of_unusual(
+    deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initial: Mapping[str, float], notes: list[str]
+) -> None:
+    """Warn of unusual areas given by sources or start values, and of outputs too far apart for a source."""
     nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
     given: list[tuple[str, float, Where | None]]
     given = [(f".ic v({node})", value, None) for node, value in initial.items() if node in nodes]
@@ -114,28 +118,16 @@ def _unusual_areas(elements: tuple[Element, ...], initial: Mapping[str, float]) 
     for what, value, where in given:
         text = REST_AREA.warning(what, value, "mm^2")
         if text:
-            yield f"{where}: {text}" if where else text
-
-
-def _coarse_outputs(deck: Deck, elements: tuple[Element, ...], tran: Tran | None) -> Iterator[str]:
-    """A warning about each source with a period shorter than TSTEP, unless there is one about its frequency."""
-    if tran is None:
-        return
-    where = deck.named(".tran")[0].where
-    for e in elements:
+            notes.append(f"{where}: {text}" if where else text)
+    for e in elements if tran is not None else ():
         period = e.waveform.period if e.waveform is not None else None
-        if period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
-            yield (
-                f"{where}: {e.name}: TSTEP is {format_si(tran.step, 's')}, longer than this source's period of "
-                f"{format_si(period, 's')}: the outputs do not show its course, and the figures of a run still do"
+        # A source whose frequency is unusual has a warning already.
+        if tran is not None and period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
+            step, period_text = format_si(tran.step, "s"), format_si(period, "s")
+            notes.append(
+                f"{deck.named('.tran')[0].where}: {e.name}: TSTEP is {step}, longer than this source's period of "
+                f"{period_text}: the outputs do not show its course, and the figures of a run still do"
             )
-
-
-def _charge_law(includes: tuple[str, ...]) -> str | None:
-    laws = {"mobile" if "mobile" in name.lower() else "local" for name in includes}
-    if len(laws) > 1:
-        raise InputError("both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
-    return laws.pop() if laws else None
 
 
 def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Waveform:
@@ -151,7 +143,7 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
         deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
         if len(deck.statements) != 1:
             raise InputError("not one source; allowed: such as SQUARE(200 100)")
-        source = source_of(replace(deck.statements[0], name="source"), context)
+        source = source_of(deck.statements[0]._replace(name="source"), context)
         if source.ac is not None:
             raise InputError("AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
     except InputError as error:

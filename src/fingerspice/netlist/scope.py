@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import ChainMap
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from typing import Literal, TypeAlias
 
 from fingerspice.base.errors import InputError
@@ -33,33 +32,28 @@ class Scope:
     and at last in the deck; the place of the subcircuit's definition does not matter.
     """
 
-    def __init__(self, parent: Scope | None = None) -> None:
+    def __init__(self, definitions: Iterable[Assignment], parent: Scope | None = None) -> None:
         self.values: dict[str, float] = {}
-        self._visible: ChainMap[str, float] = (
-            parent._visible.new_child(self.values) if parent else ChainMap(self.values)
-        )
-        self._mega: ChainMap[str, Token | None] = parent._mega.new_child() if parent else ChainMap()  # as in `Number`
+        self._visible: ChainMap[str, float] = ChainMap(self.values, *(parent._visible.maps if parent else ()))
+        # As in `Number`
+        self._mega: ChainMap[str, Token | None] = ChainMap({}, *(parent._mega.maps if parent else ()))
         self._definitions: dict[str, Assignment] = {}
-
-    def define(self, definition: Assignment) -> None:
-        """Enter a definition. `solve` evaluates it later, so that the order of definitions does not matter."""
-        key = definition.key
-        name = key.text.lower()
-        if name in RESERVED:
-            problem = f"parameter '{key.text}' has the name of a function of ngspice; allowed: another name"
-            raise InputError(problem, key.where)
-        if name in self._definitions:
-            first = self._definitions[name].key.where
-            raise InputError(f"parameter '{key.text}' is defined twice, first at {first}", key.where)
-        self._definitions[name] = definition
+        for definition in definitions:
+            key, name = definition.key, definition.key.text.lower()
+            if name in RESERVED:
+                problem = f"parameter '{key.text}' has the name of a function of ngspice; allowed: another name"
+                raise InputError(problem, key.where)
+            first = self._definitions.setdefault(name, definition)
+            if first is not definition:
+                raise InputError(f"parameter '{key.text}' is defined twice, first at {first.key.where}", key.where)
 
     def preset(self, name: str, number: Number) -> None:
         """Set a parameter to its value in the call, instead of its default."""
         self.values[name] = number.value
         self._mega[name] = number.mega
 
-    def solve(self) -> None:
-        """Evaluate every definition, after the definitions of the parameters in it."""
+    def solve(self) -> dict[str, float]:
+        """The parameters' values; each definition, in any order, is evaluated after those of the parameters in it."""
         known: dict[str, Expression] = {}
         for root in self._definitions:
             stack = [root]
@@ -77,18 +71,17 @@ class Scope:
                 elif any(n in known for n in waiting):
                     raise self._circle(known, name)  # a compiled definition without a value is on the stack: a circle
                 stack.extend(waiting)
+        return self.values
 
     def _circle(self, known: dict[str, Expression], start: str) -> InputError:
         """The error that names the parameters of a circle; following undefined names from `start` leads into it."""
-        order = {start: 0}
-        name = start
-        while True:
+        order, name = dict[str, None](), start
+        while name not in order:
+            order[name] = None
             name = next(n for n in known[name].names if n in known and n not in self.values)
-            if name in order:
-                break
-            order[name] = len(order)
-        path = list(order)[order[name] :]
-        shown = [self._definitions[name].key.text for name in [*path, path[0]]]
+        path = list(order)
+        path = [*path[path.index(name) :], name]
+        shown = [self._definitions[name].key.text for name in path]
         if len(shown) > 12:
             shown[6:-5] = ["..."]
         problem = f"parameters refer to each other in a circle: {' -> '.join(shown)}"
@@ -148,16 +141,18 @@ class Scope:
 
     def pairs(self, group: Group, bare: Bare = "nothing") -> dict[str, Value]:
         """Values of `key=value` pairs, each with the place of its key."""
-        return {name: replace(self.value(value, bare), key=key.where) for name, (key, value) in group.params.items()}
+        return {name: self.value(value, bare)._replace(key=key.where) for name, (key, value) in group.params.items()}
 
     def words(self, words: list[Lexeme | Group], bare: Bare = "nothing") -> tuple[Word, ...]:
-        """Values of the words that belong to no pair."""
-        return tuple(self.value(word, bare) if isinstance(word, Lexeme) else self._call(word) for word in words)
-
-    def _call(self, group: Group) -> Call:
-        assert group.name is not None
-        args = tuple(self.value(word) for word in group.words if isinstance(word, Lexeme))
-        return Call(group.name.text, args, self.pairs(group), group.name.where)
+        """Values of the words that belong to no pair; a group is a call, which has no calls in it."""
+        out: list[Word] = []
+        for word in words:
+            if isinstance(word, Lexeme):
+                out.append(self.value(word, bare))
+            elif word.name is not None:
+                args = tuple(self.value(arg) for arg in word.words if isinstance(arg, Lexeme))
+                out.append(Call(word.name.text, args, self.pairs(word), word.name.where))
+        return tuple(out)
 
 
 def _names_in(text: str) -> Mapping[str, int] | None:
@@ -185,21 +180,19 @@ def definitions(line: Line, start: int) -> list[Assignment]:
     if before or not keys:
         given = f"'{before}'" if before else "nothing"
         raise InputError(f".param is followed by {given}: write .param name=value", line.where(start))
-    return [_definition(key, begin, end) for (key, begin), end in zip(keys, ends[1:], strict=True)]
-
-
-def _definition(key: Lexeme, begin: int, end: int) -> Assignment:
-    """The definition of a parameter whose right side is between two positions."""
-    raw = key.line.text[begin:end]
-    text = raw.strip(" \t,")
-    if not text:
-        raise InputError(f"missing value of '{key.text}'", key.where)
-    value = Lexeme("word", text, begin + len(raw) - len(raw.lstrip(" \t,")), key.line)
-    if text[0] in "{'":
-        closing = "}" if text[0] == "{" else "'"
-        if len(text) < 2 or text[-1] != closing:
-            known = closing in text[1:]
-            problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
-            raise InputError(problem, value.where)
-        value = value._replace(kind="expression", text=text[1:-1])
-    return Assignment(key, value)
+    out = []
+    for (key, begin), end in zip(keys, ends[1:], strict=True):
+        raw = line.text[begin:end]
+        text = raw.strip(" \t,")
+        if not text:
+            raise InputError(f"missing value of '{key.text}'", key.where)
+        value = Lexeme("word", text, begin + len(raw) - len(raw.lstrip(" \t,")), line)
+        if text[0] in "{'":
+            closing = "}" if text[0] == "{" else "'"
+            if len(text) < 2 or text[-1] != closing:
+                known = closing in text[1:]
+                problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
+                raise InputError(problem, value.where)
+            value = value._replace(kind="expression", text=text[1:-1])
+        out.append(Assignment(key, value))
+    return out

@@ -20,22 +20,16 @@ ELSEWHERE = {
     ".op": "a .tran without uic starts from the operating point, fs.simulate(circuit, start='dc') too",
     ".dc": "run once per value by --set, such as --set Vdrive.level=5",
     ".noise": "there is no noise analysis",
-    ".tf": "gains against frequency are given by fingerspice ac",
-    ".pz": "gains against frequency are given by fingerspice ac",
-    ".sens": "run once per value by --set",
-    ".data": "run once per value by --set",
-    ".alter": "run once per value by --set",
     ".wave": "run writes every signal as NetCDF, or as CSV with --csv",
-    ".net": "gains against frequency are given by fingerspice ac",
-    ".savebias": "a run goes on from another in Python, fs.simulate(circuit, start=solution)",
-    ".loadbias": "a run goes on from another in Python, fs.simulate(circuit, start=solution)",
     ".csparam": "write .param",
-    ".if": "write the case that is meant",
-    ".elseif": "write the case that is meant",
-    ".else": "write the case that is meant",
-    ".endif": "write the case that is meant",
     ".endl": "put the section of the library into a file and .include it",
     ".width": "leave it out",
+    **dict.fromkeys((".tf", ".pz", ".net"), "gains against frequency are given by fingerspice ac"),
+    **dict.fromkeys((".sens", ".data", ".alter"), "run once per value by --set"),
+    **dict.fromkeys((".if", ".elseif", ".else", ".endif"), "write the case that is meant"),
+    **dict.fromkeys(
+        (".savebias", ".loadbias"), "a run goes on from another in Python, fs.simulate(circuit, start=solution)"
+    ),
 }
 
 _LISTS = re.compile(r"\{[^{}]*\}|'[^']*'|\"[^\"]*\"")

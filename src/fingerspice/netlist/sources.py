@@ -32,9 +32,9 @@ class Context(NamedTuple):
 
 
 def _number(word: Word, what: str) -> float:
-    if isinstance(word, Number):
-        return word.value
-    raise InputError(f"{what} is {word.text!r}; allowed: a number or {{expression}}", word.where)
+    if not isinstance(word, Number):
+        raise InputError(f"{what} is {word.text!r}; allowed: a number or {{expression}}", word.where)
+    return word.value
 
 
 class _Arguments:
@@ -69,15 +69,11 @@ class _Arguments:
 
     def step_or(self, name: str) -> float:
         """An argument whose SPICE default is TSTEP."""
-        if name in self.words:
-            return self.get(name)
-        if self.context.tran is None:
-            raise InputError(
-                f"{self.name} leaves out {name}, which defaults to TSTEP, and there is no .tran line; allowed: give "
-                f"{name}",
-                self.call.where,
-            )
-        return self.context.tran.step
+        tran = self.context.tran
+        if name not in self.words and tran is None:
+            default = "which defaults to TSTEP, and there is no .tran line"
+            raise InputError(f"{self.name} leaves out {name}, {default}; allowed: give {name}", self.call.where)
+        return self.get(name, tran.step if tran else math.nan)
 
     def whole(self, name: str) -> int | None:
         """A whole number by its name; None if it is left out."""
@@ -210,6 +206,7 @@ SOURCES: Mapping[str, Function] = {
         usage="TABLE(path [time_column value_column]) or TABLE(path rate=RATE)",
     ),
 }  # fmt: skip
+_KNOWN = ", ".join(name.upper() for name, function in SOURCES.items() if not function.refused)
 _SFFM = "SFFM changed its argument order between ngspice versions; write the waveform as PWL"
 #: Names in LTspice, and a short one for the command line.
 _ALIASES = {"sine": "sin", "wav": "wavefile"}
@@ -245,41 +242,33 @@ def read_source(name: str, body: Sequence[Word], context: Context, where: Where)
         if isinstance(word, Token) and is_unit(key) and (level is not None or waveform is not None):
             problem = f"{name}: {word.text!r} stands apart; a unit joins its number, such as 5{word.text}"
             raise InputError(problem, word.where)
-        # A call may also be written without brackets: SIN 0 200 100.
-        call = word if isinstance(word, Call) else Call(key, tuple(_leading_numbers(words)), {}, word.where)
+        if isinstance(word, Token):
+            # A call may also be written without brackets: SIN 0 200 100.
+            numbers: list[Number] = []
+            while words and isinstance(words[0], Number):
+                numbers.append(words[0])
+                words.popleft()
+            word = Call(key, tuple(numbers), {}, word.where)
         if key == "dc":
-            if len(call.args) != 1:
+            if len(word.args) != 1:
                 raise InputError(f"{name}: DC needs one value", word.where)
-            level = _number(call.args[0], f"{name} DC")
+            level = _number(word.args[0], f"{name} DC")
         elif key == "ac":
             if ac is not None:
                 raise InputError(f"{name} has AC twice; allowed: AC [magnitude [phase]] once", word.where)
-            ac = _small_signal(name, call)
+            given = [_number(arg, f"{name} AC") for arg in word.args]
+            if len(given) > 2:
+                problem = f"{name}: AC takes at most 2 values, {len(given)} given; allowed: AC [magnitude [phase]]"
+                raise InputError(problem, word.where)
+            ac = SmallSignal(*given)
         elif waveform is not None:
             raise InputError(f"{name} has two source functions, the second is {key.upper()}", word.where)
         else:
-            waveform = _read_call(name, key, call, context)
-            notes = tuple(f"{call.where}: {name}: {note}" for note in _differences(key, waveform, call))
+            waveform = _read_call(name, key, word, context)
+            notes = tuple(f"{word.where}: {name}: {note}" for note in _differences(key, waveform, word))
     if waveform is None and level is None and ac is None:
-        raise InputError(f"{name} has no value; allowed: a number or one of {_known()}", where)
+        raise InputError(f"{name} has no value; allowed: a number or one of {_KNOWN}", where)
     return Source(waveform if waveform is not None else DC(level or 0.0), ac, notes)
-
-
-def _leading_numbers(words: deque[Word]) -> list[Number]:
-    out = []
-    while words and isinstance(words[0], Number):
-        out.append(words[0])
-        words.popleft()
-    return out
-
-
-def _small_signal(name: str, call: Call) -> SmallSignal:
-    """``AC [magnitude [phase]]``, by default 1 and 0 degrees."""
-    numbers = [_number(arg, f"{name} AC") for arg in call.args]
-    if len(numbers) > 2:
-        problem = f"{name}: AC takes at most 2 values, {len(numbers)} given; allowed: AC [magnitude [phase]]"
-        raise InputError(problem, call.where)
-    return SmallSignal(*numbers)
 
 
 def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
@@ -289,7 +278,7 @@ def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
         raise InputError(f"{name}: {refused}", call.where)
     if function is None:
         hint = nearest(key, SOURCES)
-        raise InputError(f"{name}: unknown source {key.upper()!r}{hint}; allowed: {_known()}", call.where)
+        raise InputError(f"{name}: unknown source {key.upper()!r}{hint}; allowed: {_KNOWN}", call.where)
     try:
         return function.make(_Arguments(call, function, context))
     except InputError as error:
@@ -313,7 +302,3 @@ def _differences(key: str, waveform: Waveform, call: Call) -> list[str]:
     if key == "pwl" and later:
         return [f"the time {later[0]} is counted from 0, as in ngspice; LTspice counts it from the point before"]
     return []
-
-
-def _known() -> str:
-    return ", ".join(name.upper() for name, function in SOURCES.items() if not function.refused)
