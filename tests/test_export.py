@@ -20,7 +20,7 @@ LAWS = ["local", "mobile"]
 SEEDS = range(50)
 DECKS = sorted(Path(CIRCUITS).glob("*.cir"))
 # Exported as a hundred thousand points and more, among which ngspice searches at every step: their beginnings, s.
-BEGINNINGS = {"burst": 2.5e-3, "chirp": 8e-3}
+BEGINNINGS = {"burst": 2.5e-3, "chirp": 4e-3}
 JUMPS = ("jump", "pwl", "repeat", "square", "pulse")
 
 NESTED = """\

@@ -117,10 +117,6 @@ class Network:
         """Leakage conductance of every cell at areas (n_area,) in m^2, S, shape (n_cell,)."""
         return np.array([c.g_total + (0.0 if c.area is None else c.g_area * area[c.area]) for c in self.cells])
 
-    def mass(self, area: FloatArray) -> FloatArray:
-        """Mass matrix p^T C p, F, shape (n, n), positive definite."""
-        return np.asarray(self.p.T @ (self.capacitance(area)[:, None] * self.p))
-
     def stiffness(self, area: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Matrices of the currents into the cuts from x (n, n) and from s (n, n_s), S, the leaks included."""
         leak = self.leak(area)[:, None]
@@ -316,7 +312,7 @@ def network_modes(network: Network, area: FloatArray) -> Modes:
     """
     capacitance, leak = network.capacitance(area), network.leak(area)
     n, n_v = network.k.shape[0], network.n_voltage
-    lower = np.linalg.cholesky(network.mass(area))
+    lower = np.linalg.cholesky(network.p.T @ (capacitance[:, None] * network.p))
     weight = np.sqrt(leak)[:, None]
     factor = np.vstack([network.resistor_factor, weight * network.p])
     factor_s = np.vstack([network.resistor_factor_s, weight * network.q])

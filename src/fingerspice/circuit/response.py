@@ -13,7 +13,6 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.network import Network
-from fingerspice.circuit.statespace import Stack
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
@@ -61,7 +60,7 @@ class LinearScene:
         network, stack = self.network, self.network.stack
         if stack is None:
             return np.asarray(network.grouping @ network.phasors(f, areas, np.ones(1, complex)))
-        return np.asarray(_stack_gains(stack, f, areas) * stack.sign[stack.first_cell])
+        return np.asarray(layer_gains(stack.admittance(f, areas))[0] * stack.sign[stack.first_cell])
 
 
 def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
@@ -120,11 +119,6 @@ def areas_at_rest(network: Network) -> FloatArray:
     return np.array([float(c.area(0.0)) if c is not None and a.given is None else a.given for a, c in pairs])
 
 
-def _stack_gains(stack: Stack, f: float, areas: FloatArray) -> ComplexArray:
-    """Complex ratio of each layer's voltage to the source's at a frequency (Hz) and an area (m^2), shape (n_layer,)."""
-    return np.asarray(layer_gains(stack.admittance(np.array([f]), areas))[0])
-
-
 def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
     """Areas under one source's amplitude (V or A) at one frequency (Hz), each at its gap's rms voltage."""
     area = areas_at_rest(network)
@@ -134,7 +128,7 @@ def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
     if stack is not None and finger is not None:
 
         def gain(area: float) -> float:
-            return float(np.abs(_stack_gains(stack, f, np.array([area]))[stack.gap_layer]))
+            return float(np.abs(layer_gains(stack.admittance(f, area))[0, stack.gap_layer]))
 
         return np.array([coupled_area(lambda u: float(finger.area(u)), gain, amplitude)])
     s = np.array([complex(amplitude)])

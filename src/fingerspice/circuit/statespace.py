@@ -17,7 +17,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
@@ -133,7 +133,7 @@ class Stack:
         """Leak rate of each cell, g/c, at an area (m^2), 1/s, shape (n_cell,)."""
         return np.asarray((self.g_total / area + self.g_area) / self.c)
 
-    def admittance(self, frequency: FloatArray, area: FloatArray) -> ComplexArray:
+    def admittance(self, frequency: ArrayLike, area: ArrayLike) -> ComplexArray:
         """Complex layer admittances (n_frequency, n_layer), S; SKIN has data at each frequency (Eqs. 9, 16 to 19)."""
         f = np.atleast_1d(np.asarray(frequency, float))[:, None]
         a = np.broadcast_to(np.asarray(area, float), (f.shape[0],))[:, None]

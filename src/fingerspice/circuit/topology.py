@@ -120,15 +120,12 @@ def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
     """The loop in the direction in which the n node of the first source comes before its p node."""
     areas, branches = find_branches(circuit)
     at = _incidence(branches)
-    if (
-        len(areas) != 1
-        or any(e.device != "V" and not e.spec.is_layer for e in branches)
-        or max(map(len, at.values())) > 2
-    ):
+    of_stacks = all(e.device == "V" or e.spec.is_layer for e in branches)
+    if len(areas) != 1 or not of_stacks or max(map(len, at.values())) > 2:
         return None
     walks = []
-    for element in at["0"]:
-        hops, node = list[Hop](), "0"
+    for start in at["0"]:
+        hops, node, element = list[Hop](), "0", start
         while not hops or node != "0":
             if hops:
                 element = next(e for e in at[node] if e is not element)
