@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import fingerspice as fs
-from fingerspice.sets.parameters import quantity
-from fingerspice.sets.reading import references, tables
+from fingerspice.sets.parameters import quantity, references, tables
 
 PAGE = Path(__file__).parents[1] / "docs" / "sets.md"
 
@@ -17,10 +16,9 @@ def _row(*cells: str) -> str:
 
 def sets_table() -> str:
     """Every set: its name, kind, title, and what it does not claim."""
-    rows = [_row("set", "kind", "what it is", "what it does not claim"), "|---|---|---|---|"]
-    for one in fs.parameters().values():
-        rows.append(_row(f"`{one.name}`", one.kind, one.title, one.not_claimed))
-    return "\n".join(rows)
+    head = _row("set", "kind", "what it is", "what it does not claim"), "|---|---|---|---|"
+    sets = fs.parameters().values()
+    return "\n".join([*head, *(_row(f"`{one.name}`", one.kind, one.title, one.not_claimed) for one in sets)])
 
 
 def values_table() -> str:
@@ -36,10 +34,8 @@ def values_table() -> str:
         for path, v in one.values.items():
             if path not in own:
                 continue
-            ends = [quantity(v.low, v.unit), quantity(v.high, v.unit)]
-            ends = ends[:1] if ends[0] == ends[1] else ends
-            cells = (f"`{path}`", quantity(v.value, v.unit), " to ".join(ends), v.source, v.range)
-            rows.append(_row(first, *cells))
+            ends = dict.fromkeys((quantity(v.low, v.unit), quantity(v.high, v.unit)))
+            rows.append(_row(first, f"`{path}`", quantity(v.value, v.unit), " to ".join(ends), v.source, v.range))
             first = ""
     return "\n".join(rows)
 

@@ -1,85 +1,258 @@
-"""The cache of compiled code: a change of any source empties it."""
+"""Compiled code and its cache: full disks, killed processes, changed sources; and tuples passed by their address."""
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import os
+import re
 import shutil
+import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
-import fingerspice
+import numpy as np
+import pytest
+from numba import njit
+from numba.core.errors import TypingError
 
-PACKAGE = Path(fingerspice.__file__).parent
+import fingerspice as fs
+from fingerspice.base.announcing import LONG
+from fingerspice.base.compiled import borrow, jit, jit_by_kind
+from processes import ended, no_room, start
+
+faults = pytest.mark.skipif(sys.platform != "linux", reason="faults are made by Linux's means")
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+
+AREA = """
+from fingerspice.physics.contact import ridge_area, universal_curve, Contact
+universal_curve(0.0, 1.9, 1.1)
+c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)
+print(repr(ridge_area(0.0, c.packed)))
+"""
+# Each of the two functions that Python calls has two files.
+# numba ends with the N-th file of its cache ready, but for its name.
+KILLED = """
+import os, sys
+from numba.core import caching
+calls, replace = [], os.replace
+def strike(*names):
+    calls.append(names)
+    if len(calls) == int(sys.argv[1]):
+        os.kill(os.getpid(), 9)
+    replace(*names)
+caching.os.replace = strike
+"""
 
 
-def printed(code, folder, **more):
-    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"PYTHONPATH": str(folder)} | more
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
-    return float(done.stdout)
+# No folder can be written, the package's neither, as for one that others installed.
+SHUT = """
+import tempfile
+def refuse(*_, **__):
+    raise PermissionError(13, "Permission denied")
+tempfile.TemporaryFile = refuse
+"""
+# What the package logs, as the command line shows it.
+LOGGED = "import logging; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
+ONCE = "compiling a small part, some seconds, only once: later runs find it on the disk"
 
 
-def area_at_zero_volt(folder):
-    # numba would look in the user's own cache where the package's cannot be written; here it can.
-    code = (
-        "from fingerspice.physics.contact import ridge_area, Contact\n"
-        "c = Contact(3.5e-6, 1.0, 0.5, 0.3, 54.4e-6, 0.52, 32e-6 * 1e3**1.41, 1.41, 5e-9)\n"
-        "print(repr(ridge_area(0.0, c.packed)))"
-    )
-    return printed(code, folder)
+@pytest.fixture
+def copy(tmp_path: Path) -> Iterator[Path]:
+    """The package where nothing is compiled yet."""
+    package = tmp_path / "src" / "fingerspice"
+    shutil.copytree(Path(fs.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    yield package
+    shutil.rmtree(package)
 
 
-def test_a_change_of_one_source_reaches_the_compiled_code_of_another(tmp_path):
-    copy = tmp_path / "fingerspice"
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    before = area_at_zero_volt(tmp_path)
-    assert list(copy.rglob("*.nbc")), "nothing was cached, so this test would prove nothing"
-    # `ridge_area` stays as it is; only the decorator's module changes, as any other might.
+def begun(
+    copy: Path, *arguments: str, code: str = AREA, cache: str | None = None, **options: Any
+) -> subprocess.Popen[str]:
+    """The code in a process that finds the package there; the user has no folder for a cache but `cache`."""
+    home = str(copy / "__init__.py" / "no")
+    hidden = {"PYTHONPATH": str(copy.parent), "HOME": home, "XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | hidden
+    environment |= {} if cache is None else {"NUMBA_CACHE_DIR": cache}
+    return start(copy, *arguments, entry=[sys.executable, "-c", code], env=environment, **options)
+
+
+def area(copy: Path, *arguments: str, **options: Any) -> tuple[int, list[str], str]:
+    return ended(begun(copy, *arguments, **options))
+
+
+def compiled(copy: Path) -> dict[Path, int]:
+    """The files of compiled code, each with the time when it was written."""
+    found = {p: p.stat().st_mtime_ns for p in copy.rglob("*.nb[ic]")}
+    assert found, "nothing was cached, so this test would prove nothing"
+    return found
+
+
+@faults
+def test_no_room_for_compiled_code_means_compiling_again(copy: Path) -> None:
+    expected = (0, [], area(copy)[2])
+    assert float(expected[2]) > 0.0
+    for path in compiled(copy):
+        path.unlink()
+    assert area(copy, preexec_fn=no_room(0)) == expected
+    assert not list(copy.rglob("*.nb?*"))
+    # Nowhere at all, not even for root.
+    for folder in [copy, *(p for p in copy.iterdir() if p.is_dir() and p.name != "__pycache__")]:
+        shutil.rmtree(folder / "__pycache__", ignore_errors=True)
+        (folder / "__pycache__").write_text("")
+    assert area(copy) == expected
+
+
+def test_compiled_code_that_came_with_the_package_is_used_where_nothing_can_be_written(copy: Path) -> None:
+    first = area(copy, code=LOGGED + AREA)
+    assert first[:2] == (0, [ONCE])
+    # Copied, or unpacked from an archive: the times of its files are others.
+    for path in copy.rglob("*.py"):
+        os.utime(path, (1e9, 1e9))
+    assert area(copy, code=SHUT + LOGGED + AREA) == (0, [], first[2])
+
+
+def test_compiling_is_announced_in_python_too_by_one_line_and_only_once(copy: Path) -> None:
+    out, err = begun(copy).communicate(timeout=120)
+    assert err == f"fingerspice: note: {ONCE}\n"
+    assert begun(copy).communicate(timeout=120) == (out, "")
+
+
+@faults
+def test_on_a_terminal_compiling_shows_a_bar_that_goes_away(copy: Path) -> None:
+    seen, out = on_a_terminal(partial(begun, copy))
+    assert float(out) > 0.0
+    assert "compiling a small part, some seconds, only once" in seen
+    assert "\x1b[?25h" in seen.rpartition("compiling")[2]
+
+
+def on_a_terminal(program: Callable[..., subprocess.Popen[str]]) -> tuple[str, str]:
+    """What a program that succeeds writes to a terminal of 80 columns, and to stdout."""
+    ours, theirs = os.openpty()
+    process = program(stderr=theirs)
+    os.close(theirs)
+    seen = b""
+    with suppress(OSError):
+        while piece := os.read(ours, 4096):
+            seen += piece
+    os.close(ours)
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode == 0
+    return seen.decode(), out
+
+
+WAITS = """
+import time
+from fingerspice.base.announcing import Bar, Compiling
+sweep, compiling = Bar("sweeping"), Compiling()
+sweep.show(0.25)
+for kind in ("OneArea", "ManyAreas"):
+    with compiling.around():
+        compiling.begins("engine.collocation.loop.march_on", kind, True)
+        time.sleep(1.3)
+    sweep.show(0.5)
+with compiling.around():
+    compiling.begins("engine.collocation.loop.march_on", "ManyAreas", True)
+sweep.stop()
+"""
+LINES = [
+    "fingerspice: note: compiling the steps of a series stack, about 30 s, only once: later runs find it on the disk",
+    "fingerspice: note: compiling the steps of a network, about 60 s, only once: later runs find it on the disk",
+]
+
+
+@faults
+def test_every_wait_is_announced_with_its_own_length_also_behind_another_bar() -> None:
+    program = partial(start, Path.cwd(), entry=[sys.executable, "-c", WAITS], env={**os.environ, "COLUMNS": "80"})
+    _, err = program().communicate(timeout=120)
+    assert err.splitlines() == LINES
+    seen, _ = on_a_terminal(program)
+    seen = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", seen)
+    for line in LINES:
+        assert re.search(re.escape(line[19:].partition(":")[0]) + r"\s+\S+\s+0:00:01", seen)
+    assert " 25 %" in seen
+    assert " 50 %" in seen
+
+
+@pytest.mark.parametrize(("name", "kind"), LONG)
+def test_what_is_said_to_compile_for_long_is_a_function_of_that_kind(name: str, kind: str) -> None:
+    module, _, function = name.rpartition(".")
+    compiled = getattr(importlib.import_module(f"fingerspice.{module}"), function)
+    assert compiled.targetoptions["nogil"]
+    first = next(iter(inspect.signature(compiled.py_func).parameters.values()))
+    unions = {("engine.collocation.loop.march_on", "Circuit"), ("engine.lanes.loops.begin", "Marks")}
+    assert kind in ("", first.annotation) or (name, first.annotation) in unions
+
+
+def test_where_compiled_code_cannot_be_kept_it_is_said_what_to_set(copy: Path) -> None:
+    code, (said,), out = area(copy, code=SHUT + LOGGED + AREA)
+    assert code == 0
+    assert float(out) > 0.0
+    said_first = "compiling a small part, some seconds, at every run: no folder for compiled code can be written"
+    assert said.startswith(said_first)
+    assert said.endswith("set NUMBA_CACHE_DIR to one that can")
+
+
+@faults
+def test_killed_while_it_keeps_compiled_code_it_works_the_next_time(copy: Path) -> None:
+    # An index without its data, data without a name, and in the middle.
+    for count in ("1", "2", "3"):
+        assert area(copy, count, code=KILLED + AREA)[0] == -signal.SIGKILL
+    code, lines, out = area(copy)
+    assert (code, lines) == (0, [])
+    assert area(copy) == (0, [], out)
+
+
+# A change of any source ---------------------------------------------------------------------------------------------
+
+
+def test_a_change_of_one_source_reaches_the_compiled_code_of_another(copy: Path) -> None:
+    before = area(copy)
     stamp = copy / "__pycache__" / "compiled.stamp"
+    compiled(copy)
+    # `ridge_area` stays as it is; only another module changes.
     with (copy / "numerics" / "small.py").open("a") as source:
         source.write("\n# changed\n")
     written = stamp.stat().st_mtime_ns
-    assert area_at_zero_volt(tmp_path) == before
+    assert area(copy) == before
     assert stamp.stat().st_mtime_ns > written
-    newest = max(p.stat().st_mtime_ns for p in copy.rglob("*.nbc"))
-    oldest = min(p.stat().st_mtime_ns for p in copy.rglob("*.nbc"))
-    assert oldest > written, "a cache file from before the change is still there"
-    assert newest >= oldest
+    assert min(compiled(copy).values()) > written, "a cache file from before the change is still there"
 
 
-def test_a_change_of_a_file_that_nothing_compiled_depends_on_compiles_nothing(tmp_path):
-    copy = tmp_path / "fingerspice"
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    area_at_zero_volt(tmp_path)
-    before = {p: p.stat().st_mtime_ns for p in copy.rglob("*.nb[ic]")}
-    assert before
+def test_a_change_of_a_file_that_nothing_compiled_depends_on_compiles_nothing(copy: Path) -> None:
+    area(copy)
+    before = compiled(copy)
     for name in ("cli/app.py", "netlist/reader.py"):
         with (copy / name).open("a") as source:
             source.write("\n# changed\n")
-    area_at_zero_volt(tmp_path)
-    assert {p: p.stat().st_mtime_ns for p in copy.rglob("*.nb[ic]")} == before
+    area(copy)
+    assert compiled(copy) == before
 
 
-def test_a_change_reaches_code_that_is_cached_elsewhere(tmp_path):
-    copy = tmp_path / "fingerspice"
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    # `source` calls `chebyshev.evaluate`, which stands in another file.
-    code = (
-        "import numpy as np\n"
-        "from fingerspice.engine.network import Segment, source\n"
-        "print(repr(source(Segment(0.0, 1.0, np.zeros((1, 6)), np.array([3.0, 0.0])), 0.5)[0]))"
-    )
+# `source` calls `chebyshev.evaluate`, which stands in another file.
+ELSEWHERE = """
+import numpy as np
+from fingerspice.engine.network import Segment, source
+print(repr(source(Segment(0.0, 1.0, np.zeros((1, 6)), np.array([3.0, 0.0])), 0.5)[0]))
+"""
+
+
+def test_a_change_reaches_code_that_is_cached_elsewhere(copy: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache"
-    assert printed(code, tmp_path, NUMBA_CACHE_DIR=str(cache)) == 3.0
-    assert list(cache.rglob("*.nbc")), "nothing was cached there, so this test would prove nothing"
+    assert area(copy, code=ELSEWHERE, cache=str(cache))[2] == "3.0\n"
+    compiled(cache)
     with (copy / "numerics" / "chebyshev.py").open("a") as module:
         module.write("\n\n@jit\ndef evaluate(series, x):\n    return 7.0, 0.0\n")
-    assert printed(code, tmp_path, NUMBA_CACHE_DIR=str(cache)) == 7.0
+    assert area(copy, code=ELSEWHERE, cache=str(cache))[2] == "7.0\n"
 
 
-def test_an_engine_that_is_not_to_be_compiled_is_refused_in_one_sentence(tmp_path):
-    deck = Path(__file__).parents[1] / "circuits" / "fingerpad.cir"
-    command = [sys.executable, "-m", "fingerspice", "run", str(deck), "--out", str(tmp_path)]
+def test_an_engine_that_is_not_to_be_compiled_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "fingerspice", "run", str(CIRCUITS / "fingerpad.cir"), "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "NUMBA_DISABLE_JIT": "1"})
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("fingerspice: NUMBA_DISABLE_JIT is set: ")
@@ -119,9 +292,8 @@ print(twice)
 """
 
 
-def test_nothing_is_compiled_twice_for_arrays_that_can_and_cannot_be_written():
-    circuits = str(Path(__file__).parents[1] / "circuits")
-    done = subprocess.run([sys.executable, "-c", RUNS, circuits], capture_output=True, text=True, check=False)
+def test_nothing_is_compiled_twice_for_arrays_that_can_and_cannot_be_written() -> None:
+    done = subprocess.run([sys.executable, "-c", RUNS, str(CIRCUITS)], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "0\n"), done.stderr
 
 
@@ -149,13 +321,130 @@ def outer(x):
 """
 
 
-def test_what_is_built_on_private_classes_of_numba_does_what_it_is_for(tmp_path):
+def test_what_is_built_on_private_classes_of_numba_does_what_it_is_for(tmp_path: Path) -> None:
     (tmp_path / "made.py").write_text(PRIVATE)
     code = (
-        "import sys; sys.path.insert(0, sys.argv[0]); import numpy as np, made\n"
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import numpy as np, made\n"
         "assert made.outer(np.arange(4.0)) == 12.0\n"
         # What compiled code calls has no machine code of its own, and the rest is found on the disk.
         "assert not made.inner.signatures and not made.row.signatures\n"
         "print(sum(made.outer.stats.cache_hits.values()))"
-    ).replace("sys.argv[0]", repr(str(tmp_path)))
-    assert [printed(code, PACKAGE.parent) for _ in range(2)] == [0.0, 1.0]
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(Path(fs.__file__).parents[1])
+    command = [sys.executable, "-c", code]
+    found = [subprocess.check_output(command, text=True, env=environment) for _ in range(2)]
+    assert found == ["0\n", "1\n"]
+
+
+# Tuples passed by their address, and functions chosen by the class of such a tuple -----------------------------------
+
+
+class Inner(NamedTuple):
+    x: np.ndarray
+    n: int
+
+
+class Outer(NamedTuple):
+    inner: Inner
+    pair: tuple[np.ndarray, np.ndarray]
+    y: np.ndarray
+    on: bool
+    scale: float
+
+
+class Alike(NamedTuple):
+    """All of one type: numba knows such tuples as another kind."""
+
+    x: np.ndarray
+    y: np.ndarray
+
+
+def outer() -> Outer:
+    return Outer(Inner(np.arange(3.0), 7), (np.ones(2), np.full(2, 5.0)), np.zeros((2, 3)), True, 0.5)
+
+
+@njit
+def _fill(c: Outer) -> float:
+    c.y[1] = c.scale * c.inner.x
+    return c.inner.n + c.pair[1][0] + (100.0 if c.on else 0.0)
+
+
+@njit
+def _filled(c: Outer) -> float:
+    c = borrow(c)
+    return _fill(c)
+
+
+@njit
+def _sum_inner(c: Outer) -> float:
+    inner = borrow(borrow(c)).inner
+    return inner.x.sum()
+
+
+@njit
+def _swapped(c: Alike) -> None:
+    c = borrow(c)
+    for i in range(c.x.size):
+        c.x[i], c.y[i] = c.y[i], c.x[i]
+
+
+def test_a_borrowed_tuple_is_read_and_its_arrays_are_written_as_those_of_the_tuple_itself() -> None:
+    c = outer()
+    assert _filled(c) == 7 + 5.0 + 100.0
+    assert _filled(c._replace(on=False)) == 7 + 5.0
+    np.testing.assert_array_equal(c.y, [[0.0, 0.0, 0.0], [0.0, 0.5, 1.0]])
+
+
+def test_a_borrowed_one_borrowed_again_and_a_tuple_of_alike_arrays_are_the_same() -> None:
+    assert _sum_inner(outer()) == 3.0
+    c = Alike(np.arange(3.0), np.full(3, 9.0))
+    _swapped(c)
+    np.testing.assert_array_equal(c.x, 9.0)
+    np.testing.assert_array_equal(c.y, np.arange(3.0))
+
+
+def test_borrowing_leaves_every_reference_count_as_it_was() -> None:
+    c = outer()
+    arrays = (c.inner.x, *c.pair, c.y)
+    before = [sys.getrefcount(x) for x in arrays]
+    for _ in range(100):
+        _filled(c)
+    assert [sys.getrefcount(x) for x in arrays] == before
+
+
+def test_a_name_that_the_tuple_does_not_have_is_refused_when_it_is_compiled() -> None:
+    @njit
+    def wrong(c: Outer) -> float:
+        return borrow(c).missing
+
+    with pytest.raises(TypingError, match="missing"):
+        wrong(outer())
+
+
+@jit
+def _of_outer(c: Outer, factor: float) -> float:
+    return factor * c.scale
+
+
+@jit
+def _of_alike(c: Alike, factor: float) -> float:
+    return factor * c.x.sum()
+
+
+@jit_by_kind(Outer=_of_outer, Alike=_of_alike)
+def _chosen(c: Outer | Alike, factor: float) -> float:
+    raise NotImplementedError
+
+
+@njit
+def _either(c: Outer | Alike, is_borrowed: bool) -> float:
+    return _chosen(borrow(c), 2.0) if is_borrowed else _chosen(c, 3.0)
+
+
+def test_a_function_by_kind_is_that_of_the_tuples_class_borrowed_or_not() -> None:
+    alike = Alike(np.arange(3.0), np.zeros(3))
+    assert _either(outer(), True) == 2.0 * 0.5
+    assert _either(outer(), False) == 3.0 * 0.5
+    assert _either(alike, True) == 2.0 * 3.0
+    assert _either(alike, False) == 3.0 * 3.0

@@ -65,8 +65,7 @@ def test_a_layer_has_cells_of_positive_numbers(name: str) -> None:
     circuit = fs.parse_netlist(f"t\nV1 p 0 DC 5\n{line_of(name)}\n" + ("" if name == "GAP" else "Va area 0 35\n"))
     element = circuit["X1"]
     cells = layer_constants(element)
-    assert cells.ndim == 2
-    assert cells.shape[1] == 3
+    assert cells.shape == (len(cells), 3)
     assert np.all(np.isfinite(cells))
     assert np.all(cells[:, 0] > 0.0)
     assert np.all(cells[:, 1:] >= 0.0)
@@ -103,18 +102,12 @@ def test_a_new_device_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
         d, rho = v["d"], v["rho"]  # type: ignore[index]
         return np.array([[EPS0 * 10.0 / d, 0.0, 1.0 / (rho * d)], [EPS0 * 20.0 / d, 0.0, 0.0]])
 
-    spec = DeviceSpec(
-        "GEL",
-        ("p", "n", "area"),
-        (ParameterSpec("d", "m", usual=usual), ParameterSpec("rho", "ohm m", 1e4, usual)),
-        cells,
-    )
-    monkeypatch.setitem(DEVICES, "GEL", spec)
+    parameters = ParameterSpec("d", "m", usual=usual), ParameterSpec("rho", "ohm m", 1e4, usual)
+    monkeypatch.setitem(DEVICES, "GEL", DeviceSpec("GEL", ("p", "n", "area"), parameters, cells))
     head = "t\nV1 a 0 SIN(0 20 1k)\nVa area 0 35\n.tran 10u 5m uic\n"
     gel = fs.parse_netlist(head + "X1 a 0 area gel d=100u\n")
-    two = fs.parse_netlist(
-        head + "X1 a b area SLAB d=100u eps_r=10 rho=1e4\nX2 b 0 area SLAB d=100u eps_r=20 rho=inf\n"
-    )
+    slabs = "X1 a b area SLAB d=100u eps_r=10 rho=1e4\nX2 b 0 area SLAB d=100u eps_r=20 rho=inf\n"
+    two = fs.parse_netlist(head + slabs)
     one, other = fs.simulate(gel), fs.simulate(two)
     np.testing.assert_allclose(one.i_source, other.i_source, rtol=0, atol=1e-12 * np.abs(other.i_source).max())
     assert gel["X1"].values == {"d": 1e-4, "rho": 1e4}
@@ -123,8 +116,6 @@ def test_a_new_device_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
         fs.parse_netlist(head + "X1 a 0 area QQQQ d=100u\n")
     with pytest.warns(fs.FingerspiceWarning, match="X1 d is 100 nm, outside 1 um to 10 mm"):
         gel.replace({"X1.d": "100n"})
-
-
-def test_an_entry_without_its_cells_is_refused_when_it_is_written() -> None:
+    # An entry without its cells is refused when it is written.
     with pytest.raises(TypeError, match="device GEL: an area node and cells belong together; give both, or neither"):
         DeviceSpec("GEL", ("p", "n", "area"), ())

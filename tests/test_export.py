@@ -1,4 +1,4 @@
-"""Exported decks: ngspice 39 runs them without other files, and its voltages agree with this package's."""
+"""Exported decks, shipped ones and fifty random ones: ngspice 39 runs them alone, with the voltages found here."""
 
 from __future__ import annotations
 
@@ -12,10 +12,16 @@ import pytest
 import fingerspice as fs
 from fingerspice.netlist.files import LIBRARIES, library_text
 from ngspice_tools import CIRCUITS, call_ngspice, run_ngspice
+from random_decks import NETWORKS, SOURCES
+from random_decks import deck as random_deck
 from scenes import deck, table1
 
 LAWS = ["local", "mobile"]
-SHIPPED = ["fingerpad", "fingerpad_5khz", "fingerpad_square", "fingerpad_square_5khz"]
+SEEDS = range(50)
+DECKS = sorted(Path(CIRCUITS).glob("*.cir"))
+# Exported as a hundred thousand points and more, among which ngspice searches at every step: their beginnings, s.
+BEGINNINGS = {"burst": 2.5e-3, "chirp": 4e-3}
+JUMPS = ("jump", "pwl", "repeat", "square", "pulse")
 
 NESTED = """\
 A finger as a subcircuit, and a source in another
@@ -35,53 +41,68 @@ Xf top 0 area finger gap={7u/2}
 """
 
 
-def deviation(circuit: fs.Circuit, law: str | None = None) -> float:
-    """Largest difference of the gap voltage over its peak, at ngspice's own times."""
-    p, n = (name.replace(".", "_") for name in circuit.by_device("GAP")[0].node_names[:2])
-    theirs = run_ngspice(fs.export_netlist(circuit, charge_law=law), signals=[f"v({p})-v({n})"], timeout=20.0)
-    t, first = np.unique(np.minimum(theirs["time"], circuit.tran.stop), return_index=True)  # type: ignore[union-attr]
-    # An ideal edge takes 1 ns there.
-    edges = np.concatenate(
-        [
-            e.waveform.breakpoints(0.0, t[-1])
-            for e in circuit.by_device("V")
-            if e.waveform is not None and not isinstance(e.waveform, fs.Sine)
-        ]
-        + [np.zeros(1)]
-    )
+def deviation(circuit: fs.Circuit, law: str | None = None) -> tuple[float, float]:
+    """Largest differences from ngspice at its own times, beside the edges, which take up to 1 ns there.
+
+    That of the gap voltage (of node voltages without a GAP) over its peak; and that of a node's voltage over the
+    largest of all, or of an area over 35 mm^2.
+    """
+    assert circuit.tran is not None
+    layers = [e for e in circuit.elements if e.spec.is_layer]
+    areas = {e.node_names[2]: e for e in layers}
+    named = {name: node for e in circuit.elements for node, name in zip(e.nodes[:2], e.node_names[:2], strict=True)}
+    nodes = [name for name, node in named.items() if node != "0" and name not in areas]
+    shown = {name: f"v({name.replace('.', '_')})" for name in (*nodes, *areas)}
+    text = fs.export_netlist(circuit, charge_law=law)
+    theirs = run_ngspice(text, signals=list(shown.values()), timeout=60.0)
+    t, first = np.unique(np.minimum(theirs["time"], circuit.tran.stop), return_index=True)
+    waves = [e.waveform for e in circuit.by_device("V", "I") if e.waveform is not None]
+    edges = np.concatenate([np.zeros(1), *(wave.breakpoints(0.0, t[-1]) for wave in waves)])
     away = np.abs(t[:, None] - edges[None, :]).min(axis=1) > 3e-9
     assert away.sum() > 900
-    ours = fs.simulate(circuit, charge_law=law, t_eval=t[away], rtol=1e-9).u_gap
-    assert ours is not None
-    return float(np.abs(ours - theirs[f"v({p})-v({n})"][first][away]).max() / np.abs(ours).max())
+    ours = fs.simulate(circuit, charge_law=law, t_eval=t[away], rtol=1e-9)
+    voltages = {name.lower(): v for name, v in ours.node_voltages.items()}
+    there = {name: theirs[signal][first][away] for name, signal in shown.items()} | {"0": 0.0}
+    peak = max(np.abs(v).max() for v in voltages.values())
+    worst = max(float(np.abs(voltages[name.lower()] - there[name]).max() / peak) for name in nodes)
+    if ours.u_gap is None:
+        return worst, worst
+    gaps = circuit.by_device("GAP")
+    for gap, area in zip(gaps, np.atleast_2d(np.transpose(ours.area)), strict=False):
+        worst = max(worst, float(np.abs(1e6 * area - there[gap.node_names[2]]).max() / 35.0))
+    p, n = ("0" if node == "0" else name for node, name in zip(gaps[0].nodes[:2], gaps[0].node_names[:2], strict=True))
+    own = ours.u_gap.reshape(t[away].size, -1)[:, 0]
+    return float(np.abs(own - (there[p] - there[n])).max() / np.abs(own).max()), worst
 
 
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("name", SHIPPED)
-def test_every_shipped_deck_runs_in_ngspice_as_exported(name: str, law: str) -> None:
+@pytest.mark.parametrize("path", DECKS, ids=lambda path: path.stem)
+def test_every_shipped_deck_agrees_as_exported(path: Path, law: str) -> None:
+    circuit = dataclasses.replace(fs.read_netlist(path), charge_law=law)
+    if path.stem in BEGINNINGS and circuit.tran is not None:
+        stop = BEGINNINGS[path.stem]
+        circuit = dataclasses.replace(circuit, tran=dataclasses.replace(circuit.tran, stop=stop, step=stop / 2000.0))
+    gap, worst = deviation(circuit)
+    # 400 to 1000 steps in a period; the largest, 1e-4, are those of the area at its kink.
+    assert worst <= 1.5e-4
     # 1000 steps a period: about 1e-6 on sines; an edge of 1 ns in place of an ideal one costs more.
-    assert deviation(fs.read_netlist(CIRCUITS / f"{name}.cir"), law) <= (5e-5 if "square" in name else 5e-6)
+    assert gap <= {"fingerpad": 5e-6, "fingerpad_5khz": 5e-6, "click": 5e-5, "am_bump": 5e-5, "burst": 5e-5}.get(
+        path.stem, 5e-5 if "square" in path.stem else 1.5e-4
+    )
 
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(
     "source",
     [
-        "SQUARE(200 100)",
-        "SQUARE(150 100 0.2)",
-        "PULSE(0 100 1m 0 0 3m 8m)",
-        "PULSE(20 100 1m 1m 1m 3m)",
-        "PWL(0 0 1m 100 1m -100 4m 50)",
-        "PWL(0 0 1m 100 4m -50)",
-        "PWL(0 0 1m 100 4m -50 5m 0 r=0)",
-        "EXP(0 100 1m 1m 10m 2m)",
-        "SIN(50 100 100 5m 20 30)",
-        "DC 100",
+        *("SQUARE(200 100)", "SQUARE(150 100 0.2)", "PULSE(0 100 1m 0 0 3m 8m)", "PULSE(20 100 1m 1m 1m 3m)"),
+        *("PWL(0 0 1m 100 1m -100 4m 50)", "PWL(0 0 1m 100 4m -50)", "PWL(0 0 1m 100 4m -50 5m 0 r=0)"),
+        *("EXP(0 100 1m 1m 10m 2m)", "SIN(50 100 100 5m 20 30)", "DC 100"),
     ],
 )
 def test_every_source_runs_in_ngspice_as_exported(source: str, law: str) -> None:
     # Constant stretches are the hard part: ngspice's usual options stop there, or never end.
-    assert deviation(table1(source, tran="10u 30m uic"), law) <= 5e-5
+    assert deviation(table1(source, tran="10u 30m uic"), law)[0] <= 5e-5
 
 
 @pytest.mark.filterwarnings("ignore:Vdrive. the recording ends")
@@ -98,26 +119,18 @@ def test_a_recording_is_exported_as_its_own_points(start: float, law: str) -> No
     inside = (at > 1e-12) & (at < 0.03002 + 1.0 / 4000.0)
     np.testing.assert_array_equal(t[-inside.sum() :], at[inside])
     np.testing.assert_array_equal(v[-inside.sum() :], values[inside])
-    assert deviation(circuit, law) <= 5e-5
-
-
-@pytest.mark.parametrize("name", ["click", "burst", "am_bump"])
-def test_decks_of_the_gallery_run_in_ngspice_as_exported(name: str) -> None:
-    circuit = fs.read_netlist(CIRCUITS / f"{name}.cir")
-    if name != "click":
-        circuit = dataclasses.replace(circuit, tran=fs.read_netlist(CIRCUITS / "fingerpad_5khz.cir").tran)
-    assert deviation(circuit) <= 5e-5
+    assert deviation(circuit, law)[0] <= 5e-5
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_a_start_from_the_operating_point_is_the_same_there(law: str) -> None:
-    assert deviation(table1("PULSE(20 100 1m 1u 1u 5m 20m)", tran="10u 30m"), law) <= 5e-5
+    assert deviation(table1("PULSE(20 100 1m 1u 1u 5m 20m)", tran="10u 30m"), law)[0] <= 5e-5
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_the_other_reading_of_eq_7_is_exported(law: str) -> None:
     circuit = table1(extra=".options work=total")
-    assert deviation(circuit, law) <= 5e-6
+    assert deviation(circuit, law)[0] <= 5e-6
     text = fs.export_netlist(circuit)
     ratio = float(re.search(r"^Xgap .*wk=(\S+)", text.replace("\n+", ""), re.MULTILINE)[1])  # type: ignore[index]
     assert ratio != 1.0
@@ -132,7 +145,7 @@ def test_subcircuits_are_flat_and_parameters_are_folded_in() -> None:
     assert ".subckt" not in own
     assert re.search(r"^VXdrive_Vac plate Xdrive_mid SIN\(0\.0 150\.0 100\.0 ", own, re.MULTILINE)
     assert re.search(r"^Xf_Xgap top Xf_inner area GAP d=3\.5e-06 ", own, re.MULTILINE)
-    assert deviation(circuit) <= 5e-6
+    assert deviation(circuit)[0] <= 5e-6
 
 
 def test_a_changed_circuit_is_exported_as_changed() -> None:
@@ -143,21 +156,12 @@ def test_a_changed_circuit_is_exported_as_changed() -> None:
     assert "* Changed from the deck: Xgap.d = 5e-06, Vdrive = Chirp(" in text
     assert re.search(r"^Xgap .* d=5e-06 ", text, re.MULTILINE)
     assert re.search(r"^Xcoat .* r=1e30$", text, re.MULTILINE)
-    assert deviation(circuit) <= 5e-5
+    assert deviation(circuit)[0] <= 5e-5
 
 
 def test_a_deck_without_gap_runs_in_ngspice_as_exported() -> None:
-    circuit = deck(
-        "V1 a 0 SIN(0 10 100)",
-        "X1 a b area LAYER d=1u eps_r=2 r=1meg",
-        "X2 b 0 area SLAB d=2u eps_r=3 rho=1e9",
-        "Varea area 0 35",
-        ".tran 10u 20m uic",
-    )
-    theirs = run_ngspice(fs.export_netlist(circuit), signals=["v(b)"], timeout=20.0)
-    t, first = np.unique(np.minimum(theirs["time"], 0.02), return_index=True)
-    ours = fs.simulate(circuit, t_eval=t).node_voltages["b"]
-    assert np.abs(ours - theirs["v(b)"][first])[t > 0.0].max() <= 5e-6 * np.abs(ours).max()
+    lines = ("V1 a 0 SIN(0 10 100)", "X1 a b area LAYER d=1u eps_r=2 r=1meg", "X2 b 0 area SLAB d=2u eps_r=3 rho=1e9")
+    assert deviation(deck(*lines, "Varea area 0 35", ".tran 10u 20m uic"))[0] <= 5e-6
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -209,4 +213,82 @@ def test_points_of_a_source_need_a_tran_line_and_a_bound() -> None:
 def test_names_that_would_become_one_are_refused() -> None:
     text = NESTED.replace("plate", "Xf_inner")
     with pytest.raises(fs.InputError, match=r"Xf\.inner and Xf_inner would be one name in the export"):
+        fs.export_netlist(fs.parse_netlist(text))
+
+
+@pytest.mark.filterwarnings("ignore:of the source's energy")
+@pytest.mark.parametrize("seed", SEEDS)
+def test_random_decks_agree_as_exported(seed: int) -> None:
+    what, circuit, law = random_deck(seed)
+    assert circuit.charge_law == law
+    # A thousand steps in a period: what a jump sets going is met to h, all else to h^2.
+    assert deviation(circuit)[1] <= (1e-3 if any(kind in what for kind in JUMPS) else 1.5e-4), what
+
+
+def test_the_random_decks_hold_every_device_source_and_directive() -> None:
+    decks = [random_deck(seed) for seed in SEEDS]
+    circuits = [circuit for _, circuit, _ in decks]
+    elements = [e for c in circuits for e in c.elements]
+    assert {e.device for e in elements} == {"LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP", "R", "C", "V", "I"}
+    waves = {type(e.waveform).__name__ for e in elements if e.waveform is not None}
+    assert waves >= {"DC", "Sine", "Pulse", "Exp", "PWL", "Square"}
+    assert waves & {"Chirp", "Product", "Sawtooth"}
+    for key in ("a_fix", "tau"):
+        assert {e.values[key] > 0.0 for e in elements if e.device == "GAP"} == {True, False}
+    assert {c.charge_law for c in circuits} == {"local", "mobile"}
+    assert {c.tran.uic for c in circuits if c.tran} == {True, False}
+    assert {c.tran.start > 0.0 for c in circuits if c.tran} == {True, False}
+    assert any(c.ac for c in circuits)
+    assert any("." in e.name for e in elements)
+    assert {what.split(",")[0] for what, _, _ in decks} == set(NETWORKS)
+    assert {what.split(", ")[1] for what, _, _ in decks} == set(SOURCES)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        fs.Pulse(0.0, 100.0, 1e-3, 1e-3, 1e-3, 0.0, 4e-3),
+        fs.Pulse(0.0, 100.0, 1e-3, 1e-3, 1e-3, 0.0),
+        fs.Pulse(-50.0, 100.0, 1e-3, 0.0, 0.0, 4e-3, 4e-3),
+        fs.Pulse(20.0, 100.0, -3e-3, 1e-3, 1e-3, 2e-3, 8e-3),
+        fs.Exp(0.0, 100.0, 0.0, 1e-3, 5e-3, 2e-3),
+        fs.Exp(20.0, 100.0, 0.0, 1e-3, 0.0, 2e-3),
+        fs.Exp(0.0, 100.0, -1e-3, 1e-3, 5e-3, 2e-3),
+    ],
+    ids=lambda source: repr(source)[:60],
+)
+@pytest.mark.parametrize("start", ["", " uic"])
+def test_times_of_zero_and_before_the_start_are_the_same_there(source: fs.Waveform, start: str) -> None:
+    # ngspice takes PW = 0 for TSTOP, TD1 = 0 for TSTEP and TD2 = 0 for TD1 + TSTEP: by 90 %, and by up to 9.5 %.
+    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    text = circuit.text.replace("50m uic", f"12m{start}")
+    assert deviation(fs.parse_netlist(text).replace({"Vdrive": source}))[1] <= 5e-5
+
+
+def test_an_exp_from_zero_is_said_to_be_another_in_ngspice() -> None:
+    text = (CIRCUITS / "fingerpad.cir").read_text().replace("SIN(0 200 100)", "EXP(0 100 0 1m 10m 2m)")
+    with pytest.warns(fs.FingerspiceWarning, match=r"Vdrive: EXP has TD1 = 0, .* ngspice 39, which takes TSTEP"):
+        circuit = fs.parse_netlist(text)
+    theirs = run_ngspice(text, signals=["v(drive)"])
+    late = np.interp([1e-3, 5e-3], theirs["time"], theirs["v(drive)"])
+    wave = circuit["Vdrive"].waveform
+    assert wave is not None
+    np.testing.assert_allclose(late, wave.value(np.array([1e-3, 5e-3]) - 10e-6), rtol=1e-4)
+
+
+# ngspice 39 stops at a node called temper, and at brackets in the formulas of a layer.
+@pytest.mark.parametrize(("name", "exported"), [("temper", "temper_"), ("Net-(V1-Pad1)", "Net__V1_Pad1_")])
+def test_names_that_ngspice_does_not_take_are_changed(name: str, exported: str) -> None:
+    text = (CIRCUITS / "amplifier.cir").read_text()
+    circuit = fs.parse_netlist(text.replace(" drive ", f" {name} "))
+    signal = f"v({exported})"
+    theirs = run_ngspice(fs.export_netlist(circuit), signals=[signal])
+    ours = fs.simulate(circuit, t_eval=np.array([0.3e-3, 0.7e-3])).node_voltages[name]
+    np.testing.assert_allclose(np.interp([0.3e-3, 0.7e-3], theirs["time"], theirs[signal]), ours, atol=0.02)
+
+
+def test_names_that_become_one_with_their_letter_are_refused() -> None:
+    text = (CIRCUITS / "amplifier.cir").read_text().replace("Ccable  drive 0          150p", "Xa drive 0 part")
+    text = text.replace(".tran", "RXa_R1 drive 0 1meg\n.subckt part p n\nR1 p n 1meg\nC1 p n 150p\n.ends\n.tran", 1)
+    with pytest.raises(fs.InputError, match=r"RXa_R1 and Xa\.R1 would be one name in the export"):
         fs.export_netlist(fs.parse_netlist(text))

@@ -43,55 +43,43 @@ def floating(
 def networks(draw: st.DrawFn) -> Nodal:
     """Connected networks of 2 to 6 nodes: every node has a path of R or C to ground, some have no capacitor."""
     count = draw(st.integers(2, 6))
-    decade = st.floats(0.0, 3.0)
+    farads, ohms = (st.floats(0.0, 3.0).map(lambda x, unit=unit: unit * 10.0**x) for unit in (1e-11, 1e3))
+    any_node = st.integers(0, count)
     capacitors, resistors = [], []
     for node in range(1, count + 1):
         to = draw(st.integers(0, node - 1))
         if node == 1 or draw(st.booleans()):
-            capacitors.append((node, to, 1e-11 * 10.0 ** draw(decade)))
+            capacitors.append((node, to, draw(farads)))
         else:
-            resistors.append((node, to, 1e3 * 10.0 ** draw(decade)))
-    for _ in range(draw(st.integers(1, 5))):
-        a, b = draw(st.integers(0, count)), draw(st.integers(0, count))
-        if a != b:
-            resistors.append((a, b, 1e3 * 10.0 ** draw(decade)))
-    for _ in range(draw(st.integers(0, 2))):
-        a, b = draw(st.integers(0, count)), draw(st.integers(0, count))
-        if a != b:
-            capacitors.append((a, b, 1e-11 * 10.0 ** draw(decade)))
+            resistors.append((node, to, draw(ohms)))
+    for branches, values, least, most in ((resistors, ohms, 1, 5), (capacitors, farads, 0, 2)):
+        for _ in range(draw(st.integers(least, most))):
+            a, b = draw(any_node), draw(any_node)
+            if a != b:
+                branches.append((a, b, draw(values)))
     tone = st.builds(Tone, st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.sampled_from((1e3, 7e4)))
-    driven = draw(st.integers(1, count))
-    pushed = draw(st.integers(1, count))
-    current = draw(tone)
+    driven, pushed, current = draw(st.integers(1, count)), draw(st.integers(1, count)), draw(tone)
     scaled = Tone(1e-4 * current.offset, 1e-4 * current.amplitude, current.frequency)
-    return Nodal(count, resistors, capacitors, {driven: draw(tone)}, {pushed: scaled} if draw(st.booleans()) else {})
+    voltages, currents = {driven: draw(tone)}, {pushed: scaled} if draw(st.booleans()) else {}
+    # A node that one element alone touches dangles: a large resistor changes nothing there.
+    ends = [n for branch in (*resistors, *capacitors) for n in branch[:2]] + [*voltages, *currents]
+    resistors += [(n, 0, 1e9) for n in range(1, count + 1) if ends.count(n) == 1]
+    return Nodal(count, resistors, capacitors, voltages, currents)
 
 
 def circuit_of(network: Nodal) -> fs.Circuit:
     lines = [f"R{i} n{a} n{b} {r!r}" for i, (a, b, r) in enumerate(network.resistors)]
     lines += [f"C{i} n{a} n{b} {c!r}" for i, (a, b, c) in enumerate(network.capacitors)]
-    for node, t in network.voltages.items():
-        lines.append(f"Vs{node} n{node} 0 SIN({t.offset!r} {t.amplitude!r} {t.frequency!r})")
-    for node, t in network.currents.items():
-        lines.append(f"Is{node} 0 n{node} SIN({t.offset!r} {t.amplitude!r} {t.frequency!r})")
-    # A node that one element alone touches dangles: a large resistor changes nothing there.
-    touched = [n for line in lines for n in line.split()[1:3]]
-    lines += [f"Rx{n} n{n} 0 1e9" for n in range(1, network.nodes + 1) if touched.count(f"n{n}") == 1]
+    for kind, sources in (("V{0} n{0} 0", network.voltages), ("I{0} 0 n{0}", network.currents)):
+        lines += [f"{kind.format(n)} SIN({s.offset!r} {s.amplitude!r} {s.frequency!r})" for n, s in sources.items()]
     return deck(*(line.replace(" n0", " 0") for line in lines))
-
-
-def with_loose_ends(network: Nodal) -> Nodal:
-    ends = [n for branch in (*network.resistors, *network.capacitors) for n in branch[:2]]
-    ends += [*network.voltages, *network.currents]
-    extra = [(n, 0, 1e9) for n in range(1, network.nodes + 1) if ends.count(n) == 1]
-    return Nodal(network.nodes, [*network.resistors, *extra], network.capacitors, network.voltages, network.currents)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(networks())
 def test_random_networks_equal_a_dense_exponential_of_the_nodal_equations(network: Nodal) -> None:
     times = np.array([1e-8, 3e-7, 1e-5, 1.3e-4, 2e-3])
-    expected = with_loose_ends(network).response(times)
+    expected = network.response(times)
     s = fs.simulate(circuit_of(network), t_stop=2e-3, t_eval=times)
     assert s.plan.tier == "linear"
     got = np.column_stack([s.node_voltages[f"n{i}"] for i in range(1, network.nodes + 1)])
@@ -115,37 +103,30 @@ def test_the_stepped_tier_agrees_with_the_closed_form(network: Nodal) -> None:
     assert np.abs(stepped.q_source - exact.q_source).max() <= 1e-6 * scale
 
 
-def test_a_divider_of_resistors_follows_at_once() -> None:
+def test_dividers_follow_at_once_and_give_back_their_charge() -> None:
     s = fs.simulate(deck("V1 a 0 SIN(0 10 1k)", "R1 a b 1k", "R2 b 0 3k", ".tran 1u 1m"))
     assert np.abs(s.node_voltages["b"] - 0.75 * s.node_voltages["a"]).max() <= 1e-13
     assert np.abs(s.i_source - s.u_source / 4e3).max() <= 1e-16
-    assert s.u_gap is None
-    assert s.area is None
-
-
-def test_a_divider_of_capacitors_follows_at_once_and_gives_back_its_charge() -> None:
+    assert s.u_gap is s.area is None
     s = fs.simulate(deck("V1 a 0 SIN(0 10 1k)", "C1 a b 1n", "C2 b 0 3n", ".tran 1u 2m uic"))
     assert np.abs(s.node_voltages["b"] - 0.25 * s.node_voltages["a"]).max() <= 1e-12
     assert np.abs(s.q_source - 0.75e-9 * s.u_source).max() <= 1e-20
 
 
-def test_initial_conditions_are_kept_through_a_floating_capacitor() -> None:
-    circuit = deck("V1 a 0 0", "R1 a b 1k", "C1 b c 1n IC=5", "R2 c 0 1k", ".tran 1u 10u uic")
-    s = fs.simulate(circuit)
+def test_a_run_starts_from_ic_or_from_the_operating_point() -> None:
+    s = fs.simulate(deck("V1 a 0 0", "R1 a b 1k", "C1 b c 1n IC=5", "R2 c 0 1k", ".tran 1u 10u uic"))
     expected = 5.0 * np.exp(-s.t / 2e-6)
     assert np.abs(s.node_voltages["b"] - s.node_voltages["c"] - expected).max() <= 1e-12
-
-
-def test_the_operating_point_is_where_a_run_without_uic_starts() -> None:
     s = fs.simulate(deck("V1 a 0 SIN(4 0 1k)", "R1 a b 1k", "R2 b 0 3k", "C1 b 0 1n", ".tran 1u 10u"))
     assert np.abs(s.node_voltages["b"] - 3.0).max() <= 1e-14
 
 
 def test_two_sources_in_two_branches_superpose() -> None:
     lines = ["R1 a c 1k", "R2 b c 2k", "C1 c 0 1n", "R3 c 0 5k", ".tran 1u 2m uic"]
-    both = fs.simulate(deck("V1 a 0 SIN(0 3 1k)", "V2 b 0 PULSE(0 2 0.3m 0 0 0.5m 1m)", *lines))
-    one = fs.simulate(deck("V1 a 0 SIN(0 3 1k)", "V2 b 0 0", *lines), t_eval=both.t)
-    other = fs.simulate(deck("V1 a 0 0", "V2 b 0 PULSE(0 2 0.3m 0 0 0.5m 1m)", *lines), t_eval=both.t)
+    sine, pulse = "V1 a 0 SIN(0 3 1k)", "V2 b 0 PULSE(0 2 0.3m 0 0 0.5m 1m)"
+    both = fs.simulate(deck(sine, pulse, *lines))
+    one = fs.simulate(deck(sine, "V2 b 0 0", *lines), t_eval=both.t)
+    other = fs.simulate(deck("V1 a 0 0", pulse, *lines), t_eval=both.t)
     total = one.node_voltages["c"] + other.node_voltages["c"]
     assert np.abs(both.node_voltages["c"] - total).max() <= 1e-12
     assert both.sources == ("V1", "V2")
@@ -161,11 +142,9 @@ def test_two_sources_in_two_branches_superpose() -> None:
 def test_a_stack_beside_a_load_is_the_stack(source: str, law: str) -> None:
     f = 5000.0 if "5k" in source else 100.0
     tran = f".tran {0.005 / f} {2.5 / f} uic"
-    plain = deck(f"Vdrive drive 0 {source}", *finger("drive", "0", f=f), tran)
-    beside = deck(
-        f"Vdrive drive 0 {source}", *finger("drive", "0", f=f), "Rload drive far 1meg", "Cload far 0 1n", tran
-    )
-    a = fs.simulate(plain, charge_law=law, rtol=1e-10)
+    lines = (f"Vdrive drive 0 {source}", *finger("drive", "0", f=f), tran)
+    a = fs.simulate(deck(*lines), charge_law=law, rtol=1e-10)
+    beside = deck("Rload drive far 1meg", "Cload far 0 1n", *lines)
     b = fs.simulate(beside, t_eval=a.t[1:], charge_law=law, rtol=1e-8)
     keep = np.diff(a.t, append=np.inf) > 0.0
     keep[0] = False
@@ -197,9 +176,8 @@ def test_a_small_resistor_in_the_way_changes_nothing_and_costs_little(source: st
 
 def test_a_dispersive_skin_in_a_network_is_the_same_ladder() -> None:
     lines = [line.replace("SKIN d=350u f=5000.0", "SKIN_DISPERSIVE d=350u") for line in finger("drive", "0")]
-    plain = deck("Vdrive drive 0 SIN(0 200 5k)", *lines, ".tran 1u 0.5m uic")
-    beside = deck("Vdrive drive 0 SIN(0 200 5k)", *lines, "Rload drive 0 1meg", ".tran 1u 0.5m uic")
-    a, b = fs.simulate(plain, rtol=1e-9), fs.simulate(beside, rtol=1e-8)
+    lines += ["Vdrive drive 0 SIN(0 200 5k)", ".tran 1u 0.5m uic"]
+    a, b = fs.simulate(deck(*lines), rtol=1e-9), fs.simulate(deck(*lines, "Rload drive 0 1meg"), rtol=1e-8)
     assert np.abs(a.u_gap - b.u_gap).max() <= 1e-8 * np.abs(a.u_gap).max()
     assert np.abs(a.u_layer - b.u_layer).max() <= 3e-8 * np.abs(a.u_layer).max()
 
@@ -339,15 +317,8 @@ def test_under_a_current_the_force_is_free_of_the_height_of_the_gap() -> None:
 def test_two_equal_fingers_each_feel_what_one_feels() -> None:
     source = "Vdrive drive 0 SIN(0 200 5k)"
     one = fs.simulate(deck(source, "Rs drive screen 1k", *finger("screen", "0"), ".tran 1u 0.6m uic"))
-    two = fs.simulate(
-        deck(
-            source,
-            "Rs drive screen 0.5k",
-            *finger("screen", "0", "left", "1"),
-            *finger("screen", "0", "right", "2"),
-            ".tran 1u 0.6m uic",
-        )
-    )
+    both = (*finger("screen", "0", "left", "1"), *finger("screen", "0", "right", "2"))
+    two = fs.simulate(deck(source, "Rs drive screen 0.5k", *both, ".tran 1u 0.6m uic"))
     assert two.gaps == ("Xgap1", "Xgap2")
     assert two.u_gap is not None
     assert two.u_gap.shape == (two.t.size, 2)
@@ -400,21 +371,20 @@ def test_a_slow_area_stays_where_it_began() -> None:
 
 
 def test_with_kinetics_the_mobile_law_has_no_fold() -> None:
-    gap = {"fn": 1e-4}
-    algebraic = deck("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0, **gap), ".tran 20u 10m uic")
-    stopped = fs.simulate(algebraic, charge_law="mobile", throw=False)
-    assert stopped.status is fs.Status.FOLD
-    slow = deck("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0, tau=2e-3, **gap), ".tran 20u 10m uic")
+    algebraic, slow = (
+        deck("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0, fn=1e-4, tau=tau), ".tran 20u 10m uic")
+        for tau in (0.0, 2e-3)
+    )
+    assert fs.simulate(algebraic, charge_law="mobile", throw=False).status is fs.Status.FOLD
     s, exact = agreeing(slow, charge_law="mobile")
     assert s.t[-1] == exact.t[-1] == 0.01
     assert np.all(s.fold_margin == 1.0)
 
 
 def test_a_network_stops_at_its_fold_and_keeps_what_came_before() -> None:
-    lines = finger("drive", "0", f=100.0, fn=1e-4)
-    plain = deck("Vdrive drive 0 SIN(0 200 100)", *lines, ".tran 20u 10m uic")
-    beside = deck("Vdrive drive 0 SIN(0 200 100)", "Rload drive 0 1meg", *lines, ".tran 20u 10m uic")
-    a, b = (fs.simulate(c, charge_law="mobile", throw=False, rtol=1e-9) for c in (plain, beside))
+    lines = ("Vdrive drive 0 SIN(0 200 100)", *finger("drive", "0", f=100.0, fn=1e-4), ".tran 20u 10m uic")
+    circuits = deck(*lines), deck(*lines, "Rload drive 0 1meg")
+    a, b = (fs.simulate(c, charge_law="mobile", throw=False, rtol=1e-9) for c in circuits)
     assert a.status is b.status is fs.Status.FOLD
     assert b.state.t == pytest.approx(a.state.t, rel=1e-7)
     assert b.t.size > 30

@@ -15,8 +15,8 @@ from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
-from fingerspice.circuit.usual import REST_AREA, SOURCES, Usual
-from scenes import table1, table1_deck
+from fingerspice.circuit.usual import REST_AREA, SOURCES
+from scenes import deck, table1
 
 
 def said_by(make: Callable[[], object]) -> list[str]:
@@ -95,9 +95,9 @@ def test_a_number_with_a_trap_in_it_gets_one_word() -> None:
     assert "1e-4\u00b5 is 1e-10: exponent and scale both count" in said
 
 
-@pytest.mark.parametrize("source", ["SIN(0 200 1)", "SIN(0 200 100k)", "DC 0", "PULSE(-150 150 0 1n 1n 4m 10m)"])
-def test_sources_of_screens_are_usual(source: str) -> None:
-    assert said_by(lambda: fs.parse_netlist(edited(("SIN(0 200 100)", source)))) == []
+def test_sources_of_screens_are_usual() -> None:
+    for source in ("SIN(0 200 1)", "SIN(0 200 100k)", "DC 0", "PULSE(-150 150 0 1n 1n 4m 10m)"):
+        assert said_by(lambda s=source: fs.parse_netlist(edited(("SIN(0 200 100)", s)))) == []  # type: ignore[misc]
 
 
 def test_a_deck_that_is_wholly_unusual_does_not_flood() -> None:
@@ -135,6 +135,8 @@ def test_a_load_that_leaves_no_contact_is_refused_with_the_likely_slip() -> None
 def test_results_out_of_this_world_are_warned_about() -> None:
     with pytest.warns(fs.FingerspiceWarning):
         circuit = table1(gap={"alpha": "54.4meg"}, tran="50u 10m uic")
+    said = said_by(lambda: fs.large_signal(circuit, [1e3], rtol=1e-4))
+    assert sum("force reaches" in text or "area reaches" in text for text in said) == 2
     for said in (said_by(lambda: fs.simulate(circuit)), said_by(lambda: fs.phasor(circuit))):
         force, ridges = (text.partition(": ") for text in said if "reaches" in text)
         assert force[0].startswith("the electroadhesive force reaches ")
@@ -146,25 +148,16 @@ def test_results_out_of_this_world_are_warned_about() -> None:
         assert force[2] == ridges[2] == "some value is probably in another unit"
 
 
-@pytest.mark.parametrize("beside", ["", "Rbeside drive 0 1meg"], ids=["stack", "network"])
+@pytest.mark.parametrize("beside", ["", "Rbeside a 0 1meg"], ids=["stack", "network"])
 def test_a_pressure_that_no_layer_bears_is_warned_about_from_10_mpa_on(beside: str) -> None:
     # eps0 (u/d)^2 / 2 = 10 MPa at 1.503 GV/m; the gap alone takes the source's voltage.
     limit = math.sqrt(2.0 * 10e6 / 8.854e-12) * 50e-9
     for factor, expected in ((0.999, 0), (1.001, 1)):
-        text = "\n".join(
-            ("t", f"V1 a 0 {factor * limit!r}", "Xgap a 0 area GAP d=50n a_fix=1", ".tran 10u 100u uic", beside, "")
-        ).replace("Rbeside drive", "Rbeside a")
-        said = said_by(lambda t=text: fs.simulate(fs.parse_netlist(t)))  # type: ignore[misc]
+        lines = (f"V1 a 0 {factor * limit!r}", "Xgap a 0 area GAP d=50n a_fix=1", ".tran 10u 100u uic", beside)
+        said = said_by(lambda lines=lines: fs.simulate(deck(*lines)))  # type: ignore[misc]
         (*pressure,) = (text for text in said if "electric pressure" in text)
         assert len(pressure) == expected
         assert all(text.startswith("the electric pressure reaches 10.02 MPa, over 10 MPa (") for text in pressure)
-
-
-def test_a_large_signal_out_of_this_world_is_warned_about() -> None:
-    with pytest.warns(fs.FingerspiceWarning):
-        circuit = table1(gap={"alpha": "54.4meg"})
-    said = said_by(lambda: fs.large_signal(circuit, [1e3], rtol=1e-4))
-    assert sum("force reaches" in text or "area reaches" in text for text in said) == 2
 
 
 def test_a_batch_of_gaps_in_the_wrong_unit_is_warned_about_once() -> None:
@@ -181,8 +174,8 @@ def test_an_area_given_in_mm2_in_python_is_warned_about() -> None:
 
 
 def test_shipped_decks_are_usual() -> None:
-    for deck in sorted((Path(__file__).parents[1] / "circuits").glob("*.cir")):
-        said = said_by(lambda d=deck: fs.simulate(fs.read_netlist(d), t_stop=2e-4))  # type: ignore[misc]
+    for path in sorted((Path(__file__).parents[1] / "circuits").glob("*.cir")):
+        said = said_by(lambda d=path: fs.simulate(fs.read_netlist(d), t_stop=2e-4))  # type: ignore[misc]
         # Some begin with a rest, which is all of so short a run.
         assert [text for text in said if "covers nothing of the run" not in text] == []
 
@@ -215,43 +208,11 @@ def test_every_parameter_has_a_usual_range_with_its_source_inside_the_legal_one(
         assert f"X {spec.name} is " in (spec.unusual("X", outside) or "")
 
 
-@pytest.mark.parametrize("usual", [REST_AREA, *SOURCES.values()])
-def test_none_and_endless_are_not_unusual(usual: Usual) -> None:
-    assert usual.warning("X", 0.0, "V") is usual.warning("X", math.inf, "V") is None
+def test_none_and_endless_are_not_unusual() -> None:
+    for usual in (REST_AREA, *SOURCES.values()):
+        assert usual.warning("X", 0.0, "V") is usual.warning("X", math.inf, "V") is None
 
 
-@pytest.mark.parametrize("value", [3.5e-6, 2e5, 54.4, 1e-3, 999.9, 1e-15, 4e9, 7e12, 123456.0])
-def test_a_number_as_spice_writes_it_reads_as_itself(value: float) -> None:
-    assert parse_number(spice_text(value)) == value
-
-
-def test_a_deck_of_usual_values_is_read_without_a_word() -> None:
-    assert said_by(lambda: fs.parse_netlist(table1_deck())) == []
-
-
-def test_a_change_on_the_command_line_silences_the_warning_of_the_value_it_replaces(command: Command) -> None:
-    Path("slip.cir").write_text(edited(("d=3.5u", "d=3.5"), ("r=0.2meg", "r=0.2M"), (".tran 10u", ".tran 20m")))
-    said = command("plan", "slip.cir").lines
-    assert [line.partition(" is ")[0].partition(": ")[2] for line in said] == [
-        "warning: slip.cir:4:45: Xcoat r: '0.2M'",
-        "warning: slip.cir:5:26: Xgap d",
-        "warning: slip.cir:7:1: Vdrive: TSTEP",
-    ]
-    for change, gone in (
-        (("--set", "Xgap.d=3.5u"), "Xgap d"),
-        (("--set", "Xcoat.r=0.2meg"), "Xcoat r"),
-        (("--set", "Vdrive.frequency=10", "--set", "Xskin.f=10"), "TSTEP"),
-        (("--source", "DC 5"), "TSTEP"),
-    ):
-        left = [line for line in command("plan", "slip.cir", *change).lines if "slip.cir:" in line]
-        assert left == [line for line in said if gone not in line]
-    # A change that is refused may have its cause in the deck.
-    assert command("plan", "slip.cir", "--set", "Xgap.d=-1").lines[:-1] == said
-
-
-def test_a_tstep_longer_than_the_sources_period_is_warned_about() -> None:
-    for change in ((".tran 10u", ".tran 10.01m"), ("SIN(0 200 100)", "SIN(0 200 101k)")):
-        (said,) = said_by(lambda c=change: fs.parse_netlist(edited(c), "deck.cir"))  # type: ignore[misc]
-        assert said.startswith("deck.cir:7:1: Vdrive: TSTEP is ")
-        assert "longer than this source's period" in said
-    assert said_by(lambda: fs.parse_netlist(edited((".tran 10u", ".tran 10m")))) == []
+def test_a_number_as_spice_writes_it_reads_as_itself() -> None:
+    for value in (3.5e-6, 2e5, 54.4, 1e-3, 999.9, 1e-15, 4e9, 7e12, 123456.0):
+        assert parse_number(spice_text(value)) == value

@@ -21,25 +21,20 @@ LONG = {
     ("engine.implicit.run.advance", "Nodal"): "implicit steps, about 15 s",
     ("engine.lockstep.march.march", ""): "scenes in lockstep, about 20 s",
 }
-_SHORT = "a small part, some seconds"
-_ONCE = "only once: later runs find it on the disk"
-_EVERY_TIME = (
-    "at every run: no folder for compiled code can be written, neither the package's nor the user's; set "
-    "NUMBA_CACHE_DIR to one that can"
-)
+_KEPT = {
+    True: "only once: later runs find it on the disk",
+    False: (
+        "at every run: no folder for compiled code can be written, neither the package's nor the user's; set "
+        "NUMBA_CACHE_DIR to one that can"
+    ),
+}
 
 
 class Bar:
     """A progress bar on stderr, removed when stopped; none where stderr is no terminal.
 
-    There is one bar at a time: an endless one takes the place of any other, which comes back when it is shown next.
-
-    Parameters
-    ----------
-    what : str
-        Description of the work.
-    endless : bool
-        Whether the amount of work is unknown, so that the bar shows the time taken.
+    There is one bar at a time: an endless one, for an unknown amount of work, shows the time taken. It takes the place
+    of any other, which comes back when it is shown next.
     """
 
     _standing: ClassVar[Bar | None] = None
@@ -118,8 +113,7 @@ class Compiling:
 
     def begins(self, function: str, kind: str, kept: bool) -> None:
         """Announce that a function is compiled, whose first argument is of this kind, and whether that is kept."""
-        what = LONG.get((function, kind), _SHORT)
-        text = f"compiling {what}, {_ONCE if kept else _EVERY_TIME}"
+        text = f"compiling {LONG.get((function, kind), 'a small part, some seconds')}, {_KEPT[kept]}"
         wanted = _LOG.level in (logging.NOTSET, logging.INFO)
         if wanted and self._bar is None and sys.stderr is not None and sys.stderr.isatty():
             self._bar = Bar(text.partition(":")[0], endless=True)

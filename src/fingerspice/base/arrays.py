@@ -50,16 +50,8 @@ def read_only(x: Array) -> Array:
 def real_numbers(what: str, given: object, allowed: str) -> FloatArray:
     """Numbers that a user gives as doubles, of any shape; they may be the given array itself.
 
-    Parameters
-    ----------
-    what, allowed : str
-        Name of the numbers and what they may be, for the message.
-    given : array_like
-
-    Raises
-    ------
-    InputError
-        If they are complex, masked, or no numbers (texts, booleans, dates, other objects, rows of unequal length).
+    Refused are complex and masked ones, and what is no number (texts, booleans, dates, other objects, rows of unequal
+    length); for the message, `what` names the numbers and `allowed` says what they may be.
     """
     kind = f", a {type(given).__name__}"
     # Of tensors that need gradients or are on a card, NumPy makes no array.
@@ -75,10 +67,7 @@ def real_numbers(what: str, given: object, allowed: str) -> FloatArray:
 
 
 def real_number(what: str, given: object, allowed: str) -> float:
-    """A number that a user gives, of any type (also an array or a tensor of no dimension), as a double.
-
-    Parameters and errors as of `real_numbers`.
-    """
+    """As `real_numbers`, of one number of any type, also an array or a tensor of no dimension."""
     if isinstance(given, Real) and not isinstance(given, (bool, np.timedelta64)):
         with suppress(OverflowError):
             return float(given)
@@ -89,7 +78,7 @@ def real_number(what: str, given: object, allowed: str) -> float:
 
 
 def whole_number(what: str, given: object, least: int, most: float = math.inf) -> int:
-    """A whole number that a user gives, from `least` to `most`; errors as of `real_numbers`."""
+    """As `real_number`, of a whole number from `least` to `most`."""
     allowed = f"{least} to {most:g}, a whole number" if most < math.inf else f"a whole number, {least} or more"
     number = real_number(what, given, allowed)
     if not (number.is_integer() and least <= number <= most):
@@ -98,7 +87,7 @@ def whole_number(what: str, given: object, least: int, most: float = math.inf) -
 
 
 def positive_number(what: str, given: object, unit: str = "") -> float:
-    """A finite number above 0 that a user gives; errors as of `real_numbers`."""
+    """As `real_number`, of a finite number above 0."""
     allowed = f"a number{f' of {unit}' if unit else ''}, > 0"
     number = real_number(what, given, allowed)
     if not 0.0 < number < math.inf:
@@ -107,7 +96,7 @@ def positive_number(what: str, given: object, unit: str = "") -> float:
 
 
 def positive_row(what: str, given: object, unit: str) -> FloatArray:
-    """Finite numbers above 0 that a user gives, one or a row of them, as a row; errors as of `real_numbers`."""
+    """As `real_numbers`, of finite numbers above 0, one or a row of them, as a row."""
     row = np.atleast_1d(real_numbers(what, given, f"positive numbers of {unit}"))
     if row.ndim > 1 or not np.all((row > 0.0) & (row < np.inf)):
         raise InputError(f"{what} is {reprlib.repr(given)} {unit}; allowed: positive numbers")
@@ -116,18 +105,9 @@ def positive_row(what: str, given: object, unit: str) -> FloatArray:
 
 def views_of(shapes: Sequence[tuple[int, ...]]) -> tuple[FloatArray, list[FloatArray]]:
     """One row of zeros, and arrays of these shapes that are views of it, one after the other."""
-    sizes = [math.prod(shape) for shape in shapes]
-    numbers = np.zeros(sum(sizes))
-    ends = np.cumsum(sizes)
-    return numbers, [
-        numbers[end - size : end].reshape(shape) for shape, size, end in zip(shapes, sizes, ends, strict=True)
-    ]
-
-
-# As in malloc.h of glibc: parameters of mallopt. Blocks below the second threshold come from the heap, of which so much
-# may be free at the top before it is given back.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-_KEPT = 128 << 20
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    numbers = np.zeros(ends[-1] if len(ends) else 0)
+    return numbers, [part.reshape(shape) for part, shape in zip(np.split(numbers, ends)[:-1], shapes, strict=True)]
 
 
 @cache
@@ -137,9 +117,9 @@ def keep_freed_memory() -> None:
     Dask's workers start with MALLOC_TRIM_THRESHOLD_=65536, so that every array of a batch is memory that the system
     fetches and clears anew: a third of the time of fast scenes. Other C libraries have no such parameters.
     """
-    if "MALLOC_TRIM_THRESHOLD_" not in os.environ:
-        return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if "MALLOC_TRIM_THRESHOLD_" in os.environ else None
     if mallopt is not None:
-        mallopt(_TRIM_THRESHOLD, _KEPT)
-        mallopt(_MMAP_THRESHOLD, _KEPT)
+        # As in malloc.h: M_TRIM_THRESHOLD, what may be free at the top of the heap, and M_MMAP_THRESHOLD, the size
+        # below which blocks come from the heap.
+        for parameter in (-1, -3):
+            mallopt(parameter, 128 << 20)

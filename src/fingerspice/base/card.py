@@ -18,13 +18,7 @@ _HINT = "allowed: 'cpu', or 'cuda' on a machine with an NVIDIA card, its driver 
 
 @cache
 def card_compiler() -> Any:
-    """The module with `jit`, `grid`, `local` and `to_device`; numba's simulator where NUMBA_ENABLE_CUDASIM is 1.
-
-    Raises
-    ------
-    InputError
-        If neither package is installed.
-    """
+    """The module with `jit`, `grid`, `local` and `to_device`; numba's simulator where NUMBA_ENABLE_CUDASIM is 1."""
     simulated = os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"
     for package, module in _COMPILERS:
         if simulated or find_spec(package):

@@ -7,6 +7,7 @@ import io
 import os
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,47 +22,33 @@ _PIECE = 64 * 2**20
 def write_aside(path: Path, write: Callable[[Path], object]) -> Path:
     """Call `write` with a temporary path in the same folder, then rename that file to `path`.
 
-    Where `path` is a link the file that it names is replaced; a device is written directly.
-
-    Raises
-    ------
-    InputError
-        Where the folder does not exist or cannot be written, or the disk is full.
+    Where `path` is a link the file that it names is replaced; a device is written directly. Refused are folders that
+    cannot be written and full disks.
     """
-    if path.exists() and not path.is_file():
-        try:
-            write(path)
-        except OSError as error:
-            raise InputError(f"cannot write {path}: {error.strerror or error}") from None
-        return path
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f"{UNFINISHED}{os.urandom(6).hex()}")
-    # Entered before the file exists, so that `discard_unfinished` finds it whenever a signal comes.
-    _UNFINISHED.add(temporary)
+    temporary = target.parent / f"{UNFINISHED}{os.urandom(6).hex()}"
+    hint = ""
     try:
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            temporary.touch(exist_ok=False)
-        except OSError as error:
-            raise InputError(f"cannot write {path}: {error.strerror}; allowed: a folder that can be written") from None
-        try:
-            write(temporary)
-            temporary.replace(target)
-        except OSError as error:
-            raise InputError(f"cannot write {path}: {error.strerror or error}") from None
+        if path.exists() and not path.is_file():
+            write(path)
+            return path
+        # Entered before the file exists, so that `discard_unfinished` finds it whenever a signal comes.
+        _UNFINISHED.add(temporary)
+        hint = "; allowed: a folder that can be written"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch(exist_ok=False)
+        hint = ""
+        write(temporary)
+        temporary.replace(target)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}{hint}") from None
     finally:
         _discard(temporary)
     return path
 
 
 def write_csv(path: str | Path, header: Iterable[str], rows: Iterable[Iterable[object]]) -> Path:
-    """Write a table as CSV; numbers have as many digits as it takes to read the same ones back.
-
-    Raises
-    ------
-    InputError
-        As `write_aside`.
-    """
+    """As `write_aside`, a table as CSV; numbers have as many digits as it takes to read the same ones back."""
 
     def write(target: Path) -> None:
         with target.open("w", newline="", encoding="utf-8") as stream:
@@ -108,13 +95,10 @@ def discard_unfinished() -> None:
 
 
 def _discard(temporary: Path) -> None:
-    try:
+    # Where the folder is gone, or is none, there is nothing to remove.
+    with suppress(OSError):
         temporary.unlink(missing_ok=True)
-    except OSError:
-        # Where the folder is gone, or is none, there is nothing to remove.
-        return
-    finally:
-        _UNFINISHED.discard(temporary)
+    _UNFINISHED.discard(temporary)
 
 
 class _Raw(io.FileIO):

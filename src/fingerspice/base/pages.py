@@ -39,11 +39,11 @@ class Table:
         lines = ["<table>"]
         for number, row in enumerate((self.head, *self.rows)):
             kind = "td" if number else "th"
-            cells = []
-            for place, cell in enumerate(row):
-                align = "left" if place < self.left else "right"
-                text = html.escape(printable(cell, LONGEST_LABEL))
-                cells.append(f'<{kind} style="text-align: {align}; {_CELL}">{text}</{kind}>')
+            cells = [
+                f'<{kind} style="text-align: {"left" if place < self.left else "right"}; {_CELL}">'
+                f"{html.escape(printable(cell, LONGEST_LABEL))}</{kind}>"
+                for place, cell in enumerate(row)
+            ]
             lines.append(f"<tr>{''.join(cells)}</tr>")
         return "\n".join([*lines, "</table>"])
 
@@ -60,19 +60,17 @@ class Page(str):
 
     def __new__(cls, blocks: Sequence[str | Table]) -> Page:
         page = super().__new__(cls, "\n".join(b.text() if isinstance(b, Table) else b for b in blocks))
-        parts = []
-        for block in blocks:
-            if isinstance(block, Table):
-                parts.append(block.html())
-                continue
-            # Text of several lines may be set in columns, which <pre> keeps.
-            lines = [html.escape(printable(line)) for line in block.split("\n")]
-            parts.append(
-                f"<pre>{chr(10).join(lines)}</pre>" if len(lines) > 1 else f"<div>{lines[0] or '&nbsp;'}</div>"
-            )
         page.blocks = tuple(blocks)
-        page.html = "\n".join(["<div>", *parts, "</div>"])
+        page.html = "\n".join(
+            ["<div>", *(b.html() if isinstance(b, Table) else _text_html(b) for b in blocks), "</div>"]
+        )
         return page
+
+
+def _text_html(text: str) -> str:
+    # Text of several lines may be set in columns, which <pre> keeps.
+    lines = [html.escape(printable(line)) for line in text.split("\n")]
+    return f"<pre>{chr(10).join(lines)}</pre>" if len(lines) > 1 else f"<div>{lines[0] or '&nbsp;'}</div>"
 
 
 class Shown:
@@ -86,9 +84,9 @@ class Shown:
 
     def __repr__(self) -> str:
         lines = str(self).split("\n")
-        if len(lines) <= SCREEN:
-            return "\n".join(lines)
-        return "\n".join([*lines[: SCREEN - 1], f"... and {len(lines) - SCREEN + 1} lines more: print() shows them"])
+        if len(lines) > SCREEN:
+            lines[SCREEN - 1 :] = [f"... and {len(lines) - SCREEN + 1} lines more: print() shows them"]
+        return "\n".join(lines)
 
     def _repr_html_(self) -> str:
         return self._page().html

@@ -23,8 +23,7 @@ PLAIN_UNITS = frozenset(
 _MISREAD = {
     "milli": ("mil (25.4e-6)", "m"),
     "micro": ("m (milli)", "u"),
-    "met": ("m (milli)", ""),
-    "min": ("m (milli)", ""),
+    **dict.fromkeys(("met", "min"), ("m (milli)", "")),
 }
 _LETTERS = "a-zµμωΩ"
 _NUMBER = re.compile(rf"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:e([+-]?[0-9]+))?(°c|[{_LETTERS}]*)", re.IGNORECASE)
@@ -36,23 +35,10 @@ _PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M
 
 
 def parse_number(text: str) -> float:
-    """Value of one SPICE number such as ``3.5u``, ``1meg``, ``200Hz`` or ``1e-6``.
+    """Value of one SPICE number such as ``3.5u``, ``1meg``, ``200Hz`` or ``1e-6``, correctly rounded.
 
-    Parameters
-    ----------
-    text : str
-        The number, with nothing before or after it.
-
-    Returns
-    -------
-    float
-        The correctly rounded value: ``3.5u`` gives ``3.5e-6``.
-
-    Raises
-    ------
-    ValueError
-        When the text is not a number, when simulators read it differently (``2k7``, ``1x``, ``1a``), or when
-        it lies outside the range of a double; the message says what to write instead.
+    Raises ValueError for another text, one that simulators read differently (``2k7``, ``1x``, ``1a``), and one outside
+    the range of a double; the message says what to write instead.
     """
     if len(text) > _MAX_LENGTH:
         raise ValueError(f"a number of {len(text)} characters: at most {_MAX_LENGTH} are allowed")
@@ -87,35 +73,16 @@ def suggest_mega(text: str) -> str:
 
 
 def unit_read_as_scale(text: str, unit: str, word: str = "") -> bool:
-    """Whether a number is followed by nothing but a unit that SPICE takes for a scale.
+    """Whether a number is followed by nothing but a unit that SPICE takes for a scale, such as ``1F`` or ``1farads``.
 
-    Parameters
-    ----------
-    text : str
-        A number as written, such as ``1F``.
-    unit : str
-        The unit's symbol; its case counts, as ``1F`` is suspicious and ``1f`` an ordinary femto.
-    word : str
-        The unit's name, in any case and with or without a plural s, as in ``1farad``.
+    The case of the unit's symbol counts, as ``1f`` is an ordinary femto; that of its name, in lower case, does not.
     """
     match = _NUMBER.fullmatch(text)
-    if match is None:
-        return False
-    return match[3] == unit or (word != "" and match[3].lower() in (word.lower(), f"{word.lower()}s"))
+    return match is not None and (match[3] == unit or (word != "" and match[3].lower() in (word, f"{word}s")))
 
 
 def format_si(value: float, unit: str, digits: int = 4) -> str:
-    """A value in engineering notation: ``format_si(3.5e-6, "m")`` gives ``3.5 um``.
-
-    Parameters
-    ----------
-    value : float
-        The value in the unit without prefix; nan and infinities are written as such.
-    unit : str
-        The unit's symbol, or an empty string.
-    digits : int
-        Number of significant digits, of which trailing zeros are not written.
-    """
+    """A value in engineering notation, without trailing zeros: ``format_si(3.5e-6, "m")`` gives ``3.5 um``."""
     if not math.isfinite(value) or value == 0.0:
         return f"{value + 0.0:g} {unit}".rstrip()
     # Rounded first, as 999.96 to four digits is 1 k and not 1000.

@@ -28,19 +28,16 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
     """
     require_circuit(circuit)
     if parameters:
-        if not isinstance(parameters, Mapping):
-            raise InputError(
-                f"parameters is a {type(parameters).__name__}; allowed: a mapping such as {{'Xgap.d': 3e-6}}"
-            )
+        given = f"a {type(parameters).__name__}"
+        require(isinstance(parameters, Mapping), "parameters", given, "a mapping such as {'Xgap.d': 3e-6}")
         circuit = circuit.replace(parameters)
     if sources is None or (isinstance(sources, Mapping) and not sources):
         return circuit
     driving = driving_sources(circuit)
     if not isinstance(sources, Mapping):
-        if len(driving) != 1:
-            names = ", ".join(e.name for e in driving)
-            allowed = f"a mapping such as {{{driving[0].name!r}: ...}}" if driving else "no sources"
-            raise InputError(f"sources is one source, and the circuit has {names or 'none'}; allowed: {allowed}")
+        has = f"one source, and the circuit has {', '.join(e.name for e in driving) or 'none'}"
+        allowed = f"a mapping such as {{{driving[0].name!r}: ...}}" if driving else "no sources"
+        require(len(driving) == 1, "sources", has, allowed)
         sources = {driving[0].name: sources}
     for name in sources:
         if not isinstance(name, str):

@@ -7,7 +7,7 @@ import dataclasses
 import math
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
@@ -50,37 +50,18 @@ class SmallSignal:
 
 @dataclass(frozen=True, repr=False)
 class Element:
-    """One device of a circuit.
+    """One device of a circuit."""
 
-    Attributes
-    ----------
-    name : str
-        Name as written; for an element of a subcircuit with its path, as in ``Xfinger.Xgap``.
-    device : str
-        Entry of `DEVICES`.
-    nodes, node_names : tuple of str
-        Nodes in lower case with ground as ``0``, and the same nodes as written.
-    values : mapping of str to float
-        Value of every parameter of the device, in the netlist's unit.
-    waveform : Waveform or None
-        Waveform of a source.
-    ac : SmallSignal or None
-        ``AC`` magnitude and phase of a source; None without them.
-    initial : float or None
-        ``IC=`` of a capacitor, V.
-    where : Where or None
-        Place in the netlist.
-    """
-
-    name: str
-    device: str
+    name: str  # As written; of an element of a subcircuit with its path, as in ``Xfinger.Xgap``
+    device: str  # Entry of `DEVICES`
+    # nodes, node_names: Nodes in lower case with ground as ``0``, and the same nodes as written
     nodes: tuple[str, ...]
     node_names: tuple[str, ...]
-    values: Mapping[str, float]
-    waveform: Waveform | None = None
-    initial: float | None = None
-    where: Where | None = None
-    ac: SmallSignal | None = None
+    values: Mapping[str, float]  # Value of every parameter of the device, in the netlist's unit
+    waveform: Waveform | None = None  # Of a source
+    initial: float | None = None  # ``IC=`` of a capacitor, V
+    where: Where | None = None  # Place in the netlist
+    ac: SmallSignal | None = None  # Of a source that has one
 
     def __repr__(self) -> str:
         from fingerspice.circuit.describe import values_text
@@ -217,37 +198,25 @@ class Circuit(Shown):
         InputError
             If there is none; the message gives the nearest name.
         """
-        for element in self.elements:
-            if element.name.lower() == name.lower():
-                return element
-        raise InputError(_unknown("element", name, [e.name for e in self.elements]))
+        found = next((e for e in self.elements if e.name.lower() == name.lower()), None)
+        if found is None:
+            raise InputError(_unknown("element", name, [e.name for e in self.elements]))
+        return found
 
     def by_device(self, *devices: str) -> tuple[Element, ...]:
         """Elements of the given devices, in deck order."""
-        if len(devices) == 1:
-            return self._by_device.get(devices[0], ())
         return tuple(e for e in self.elements if e.device in devices)
-
-    @cached_property
-    def _by_device(self) -> dict[str, tuple[Element, ...]]:
-        found: dict[str, tuple[Element, ...]] = {}
-        for e in self.elements:
-            found[e.device] = (*found.get(e.device, ()), e)
-        return found
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
         """Every parameter by path (``Xgap.d``, ``Vdrive.amplitude``), with its value and unit as in the netlist."""
-        return MappingProxyType(dict(self._parameters()))
-
-    def _parameters(self) -> Iterator[tuple[str, Parameter]]:
-        for element in self.elements:
-            for spec in element.spec.parameters:
-                yield f"{element.name}.{spec.name}", Parameter(element.values[spec.name], spec.unit)
-            if element.waveform is not None:
-                for name, unit in type(element.waveform).units.items():
-                    if hasattr(element.waveform, name):
-                        yield f"{element.name}.{name}", Parameter(getattr(element.waveform, name), unit)
+        found: dict[str, Parameter] = {}
+        for e in self.elements:
+            found |= {f"{e.name}.{p.name}": Parameter(e.values[p.name], p.unit) for p in e.spec.parameters}
+            units = {} if e.waveform is None else type(e.waveform).units
+            given = {name: Parameter(getattr(e.waveform, name, math.nan), unit) for name, unit in units.items()}
+            found |= {f"{e.name}.{name}": p for name, p in given.items() if hasattr(e.waveform, name)}
+        return MappingProxyType(found)
 
     def draw(self, path: str | Path | None = None) -> Any:
         """Draw the schematic: a notebook shows it as SVG, and from a script ``draw().show()`` opens a window.
@@ -306,13 +275,11 @@ class Circuit(Shown):
             About a value outside the usual range, which was probably meant in another unit.
         """
         changed, notes, gone = self._replaced(changes)
-        if not self.warnings and not notes:
-            return changed
         # The reader's warnings begin with a place in the deck.
         kept = [text for text in self.warnings if not text.endswith(gone) and not concerns(text, changes)]
         for text in notes:
             warnings.warn(text, FingerspiceWarning, stacklevel=2)
-        return changed._with(warnings=(*kept, *notes))
+        return changed._with(warnings=(*kept, *notes)) if self.warnings or notes else changed
 
     def varied(self, changes: Changes) -> Circuit:
         """As `replace`, without warnings: for values that this package's sweeps choose, and not the user."""
@@ -359,8 +326,7 @@ class Circuit(Shown):
                 f"unknown parameter {path!r}: {name} is a subcircuit, whose own parameters got their values when "
                 f"the deck was read; allowed: a parameter of an element inside it ({shown})"
             )
-        known = [*self.parameters, *(e.name for e in self.by_device("V", "I"))]
-        return _unknown("parameter", path, known)
+        return _unknown("parameter", path, [*self.parameters, *(e.name for e in self.by_device("V", "I"))])
 
     def _waveform(self, given: Change) -> Waveform:
         if not isinstance(given, str):
@@ -372,17 +338,17 @@ class Circuit(Shown):
 
 def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:
     """An element with a new value, and a warning about the value's notation, or None."""
+    units = {} if element.waveform is None else type(element.waveform).units
     if parameter in element.values:
         spec = element.spec.parameter(parameter)
         value, note = value_of(path, given, spec, spec.unit)
-        values = {**element.values, parameter: value}
-        return dataclasses.replace(element, values=MappingProxyType(values)), note
-    if element.waveform is not None and parameter in type(element.waveform).units:
-        value, note = value_of(path, given, None, type(element.waveform).units[parameter])
+        values = MappingProxyType({**element.values, parameter: value})
+        return dataclasses.replace(element, values=values), note
+    if parameter in units:
+        value, note = value_of(path, given, None, units[parameter])
         waveform = dataclasses.replace(element.waveform, **{parameter: value})  # type: ignore[type-var]
         return dataclasses.replace(element, waveform=waveform), note
-    known = [*element.values, *(type(element.waveform).units if element.waveform else ())]
-    raise InputError(_unknown("parameter", path, [f"{element.name}.{name}" for name in known]))
+    raise InputError(_unknown("parameter", path, [f"{element.name}.{name}" for name in (*element.values, *units)]))
 
 
 def _unknown(kind: str, given: str, known: list[str]) -> str:

@@ -62,7 +62,7 @@ MEANINGS_OF_WAVEFORMS = {
 #: Largest number of changes, or of sources, that one line names; the number of the others is added.
 _MOST = 8
 #: Largest number of elements that a circuit's page lists.
-MOST_ELEMENTS = 25
+_MOST_ELEMENTS = 25
 
 
 def meaning_of(circuit: Circuit, path: str) -> str:
@@ -81,22 +81,22 @@ def waveform_text(waveform: Waveform, unit: str = "V") -> str:
         return f"({sign.join(waveform_text(part, unit) for part in waveform.parts)})"
     if isinstance(waveform, Function):
         return f"function {getattr(waveform.function, '__name__', 'of time')}"
-    said = []
-    if isinstance(waveform, PWL):
-        said.append(f"{len(waveform.times)} points")
-    if isinstance(waveform, Samples):
-        said.append(f"{waveform.count} values")
-    if isinstance(waveform, Burst | Repeat):
-        said.append(waveform_text(waveform.waveform, unit))
+    said = [f"{len(waveform.times)} points"] if isinstance(waveform, PWL) else []
+    said += [f"{waveform.count} values"] if isinstance(waveform, Samples) else []
+    said += [waveform_text(waveform.waveform, unit)] if isinstance(waveform, Burst | Repeat) else []
     for field in dataclasses.fields(waveform):  # type: ignore[arg-type]
         value = getattr(waveform, field.name)
         if field.name not in waveform.units or value == field.default:
             continue
-        own = waveform.units[field.name].replace("V", unit)
-        text = shown(value, own)
+        text = shown(value, waveform.units[field.name].replace("V", unit))
         # A required figure is known by its position; one that has a default needs its name.
         said.append(text if field.default is dataclasses.MISSING else f"{field.name} {text}")
     return f"{type(waveform).__name__}({', '.join(said)})"
+
+
+def _own_text(source: Element) -> str:
+    """The waveform of a source, in volt or ampere; empty for another element."""
+    return "" if source.waveform is None else waveform_text(source.waveform, "A" if source.device == "I" else "V")
 
 
 def drive_text(circuit: Circuit) -> str:
@@ -104,14 +104,12 @@ def drive_text(circuit: Circuit) -> str:
 
     Sources that were replaced are left out, since `changes_text` lists them.
     """
-    said = []
     replaced = {path.lower() for path in circuit.overrides} - _given_by_sets(circuit)
-    for element in driving(circuit):
-        wave = element.waveform
-        if wave is None or wave == DC(0.0) or element.name.lower() in replaced:
-            continue
-        said.append(f"{element.name}: {waveform_text(wave, 'A' if element.device == 'I' else 'V')}")
-    return _joined(said)
+    return _joined([
+        f"{e.name}: {_own_text(e)}"
+        for e in driving(circuit)
+        if e.waveform not in (None, DC(0.0)) and e.name.lower() not in replaced
+    ])  # fmt: skip
 
 
 def changes_text(circuit: Circuit) -> str:
@@ -119,23 +117,13 @@ def changes_text(circuit: Circuit) -> str:
 
     Values that a set of parameters gave, and that still hold, are named by the set: ``set moist``.
     """
-    known = {path.lower(): (path, parameter) for path, parameter in circuit.parameters.items()}
     said = [f"set {name}" for name, (kept, _) in in_force(circuit).items() if kept]
+    now = {e.name.lower(): f"{e.name} = {_own_text(e)}" for e in circuit.elements if e.waveform is not None}
+    now |= {path.lower(): f"{path} = {shown(p.value, p.unit)}" for path, p in circuit.parameters.items()}
+    # A path may have been changed twice, in two spellings; of one that is unknown the last text counts.
+    last = {path.lower(): f"{path} = {_as_given(text)}" for path, text in circuit.overrides.items()}
     given = _given_by_sets(circuit)
-    # A path may have been changed twice, in two spellings.
-    for path in dict.fromkeys(path.lower() for path in circuit.overrides):
-        if path in given:
-            continue
-        if path in known:
-            name, parameter = known[path]
-            said.append(f"{name} = {shown(parameter.value, parameter.unit)}")
-            continue
-        said += [
-            f"{element.name} = {waveform_text(element.waveform, 'A' if element.device == 'I' else 'V')}"
-            for element in circuit.elements
-            if element.name.lower() == path and element.waveform is not None
-        ] or [f"{name} = {_as_given(text)}" for name, text in circuit.overrides.items() if name.lower() == path][-1:]
-    return _joined(said)
+    return _joined([*said, *(now.get(path, text) for path, text in last.items() if path not in given)])
 
 
 def _given_by_sets(circuit: Circuit) -> set[str]:
@@ -163,44 +151,34 @@ def head_lines(circuit: Circuit) -> list[str]:
 
 def circuit_page(circuit: Circuit) -> Page:
     """The elements of a circuit and the analyses of its deck."""
-    rows = [
-        (e.name, e.device, " ".join(e.node_names), _cut(values_text(e), 96)) for e in circuit.elements[:MOST_ELEMENTS]
-    ]
+    rows = []
+    for e in circuit.elements[:_MOST_ELEMENTS]:
+        text = values_text(e)
+        rows.append((e.name, e.device, " ".join(e.node_names), text if len(text) <= 96 else f"{text[:92]} ..."))
     table = Table(("", "device", "nodes", "values, in the units of the netlist"), rows, left=4)
-    lines: list[str | Table] = [heading(circuit), "", table]
-    if len(circuit.elements) > MOST_ELEMENTS:
-        lines.append(f"... and {len(circuit.elements) - MOST_ELEMENTS} more elements")
-    lines.append("")
-    if circuit.tran is not None:
-        since = f" from {format_si(circuit.tran.start, 's')} on" if circuit.tran.start else ""
-        lines.append(
-            f".tran: {format_si(circuit.tran.stop, 's')}, an output every {format_si(circuit.tran.step, 's')}{since}"
-        )
-    if circuit.ac is not None:
-        lines.append(f".ac: {format_si(circuit.ac.start, 'Hz')} to {format_si(circuit.ac.stop, 'Hz')}")
-    lines.append(f"charge law: {circuit.charge_law or 'local (the deck names none)'}")
-    return Page(lines)
+    more, tran, ac = len(circuit.elements) - len(rows), circuit.tran, circuit.ac
+    lines: list[str | Table] = [heading(circuit), "", table, *([f"... and {more} more elements"] if more else []), ""]
+    if tran is not None:
+        since = f" from {format_si(tran.start, 's')} on" if tran.start else ""
+        lines.append(f".tran: {format_si(tran.stop, 's')}, an output every {format_si(tran.step, 's')}{since}")
+    if ac is not None:
+        lines.append(f".ac: {format_si(ac.start, 'Hz')} to {format_si(ac.stop, 'Hz')}")
+    return Page([*lines, f"charge law: {circuit.charge_law or 'local (the deck names none)'}"])
 
 
 def values_text(element: Element) -> str:
     """Values of an element in the units of the netlist, without those that are infinite, and its waveform."""
     said = [f"{name}={_deck_value(value)}" for name, value in element.values.items() if math.isfinite(value)]
-    if element.waveform is not None:
-        said.append(waveform_text(element.waveform, "A" if element.device == "I" else "V"))
-    return " ".join(said)
+    return " ".join(said if element.waveform is None else [*said, _own_text(element)])
 
 
 def _deck_value(value: float) -> str:
     """A number as written in decks: ``3.5u``, ``0.2meg``, ``0.3``."""
-    if 0.01 <= abs(value) < 1e4:
-        return f"{value:.4g}"
     text = format_si(value, "").replace(" ", "")
     # SPICE reads M as milli, and does not know P and E.
-    return f"{text[:-1]}meg" if text.endswith("M") else f"{value:.4g}" if text[-1:] in "PEZY" else text
-
-
-def _cut(text: str, longest: int) -> str:
-    return text if len(text) <= longest else f"{text[: longest - 4]} ..."
+    if 0.01 <= abs(value) < 1e4 or text[-1:] in "PEZY":
+        return f"{value:.4g}"
+    return f"{text[:-1]}meg" if text.endswith("M") else text
 
 
 def _joined(said: list[str]) -> str:

@@ -37,7 +37,6 @@ class ParameterSpec:
     usual: Usual | None = None  # Range outside which a warning is given
     meaning: str = ""  # What it is, in few words, beside its slider
     first: bool = False  # Whether the explorer's page shows it at once: the paper varies it, or Table 1 gives it
-    # may_be_zero, may_be_infinite: Whether 0, or infinity, is allowed besides positive numbers
     may_be_zero: bool = False
     may_be_infinite: bool = False
     # least, most: Range of all other numbers: wide enough for any device, and so narrow that products and quotients do
@@ -52,9 +51,8 @@ class ParameterSpec:
 
     def accepts(self, value: float) -> bool:
         """Whether a value is in range."""
-        if value == 0.0 or math.isinf(value):
-            return value >= 0.0 and (self.may_be_zero if value == 0.0 else self.may_be_infinite)
-        return self.least <= value <= self.most
+        special = {0.0: self.may_be_zero, math.inf: self.may_be_infinite}
+        return special.get(value, self.least <= value <= self.most)
 
     def unusual(self, element: str, value: float) -> str | None:
         """The warning about a value outside the usual range, or None."""
@@ -118,7 +116,6 @@ _SKIN = Usual(1e-6, 2e-3, "skin has 10 um, a fingertip 0.2 to 0.6 mm, callus ove
 # The air between rough skin and a screen: 3.5 um in Table 1; below 10 nm surfaces attract each other, and above 100 um
 # the ridges (some 60 um high) do not touch the screen.
 _AIR = Usual(10e-9, 100e-6, "from van der Waals contact to ridges off the screen; 3.5 um in Table 1")
-# Air has 1, polymers 2 to 10, ceramics up to some thousand.
 _EPS_R = Usual(1.0, 1e4, "air has 1, polymers 2 to 10, ceramics up to some thousand")
 # Weak conductors, such as skin at low frequencies (the first slab of its ladder), have up to 1e5.
 _EPS_R_MATERIAL = Usual(1.0, 1e6, "polymers have 2 to 10, skin at low frequencies up to 1e5")
@@ -131,18 +128,15 @@ _RHO = Usual(0.1, 1e17, "sweat has 1 ohm m, skin 1e4, good polymers 1e14 to 1e16
 _STRENGTH = Usual(1e5, 1e10, "air has 3 MV/m, thin oxides 1 GV/m", "V/m, not V/um")
 # Fingers touch with 0.1 to 5 N and press with less than 50 N; a value of 50 is probably meant in millinewton.
 _LOAD = Usual(1e-3, 49.9, "a finger touches with 0.1 to 5 N", "newton, not millinewton")
-# Dry skin on glass has 0.1 to 1, moist skin up to 3 and more.
 _FRICTION = Usual(0.01, 5.0, "dry skin on glass has 0.1 to 1, moist skin up to 3")
 # The ridge area at 1 N (Eq. 5), from a pencil's tip to a palm; Table 1 has 54.4.
 _ALPHA = Usual(1.0, 2000.0, "the ridge area at 1 N; 54.4 in Table 1", "mm^2 and N")
 # A smooth ball has 2/3 (Hertz), a rough plane up to 1; measured fingers have 0.2 to 0.8, Table 1 has 0.52.
 _M_EXP = Usual(0.1, 1.0, "2/3 for a ball, 1 for a rough plane, 0.52 in Table 1")
-# Table 1 has 32 and 1.41; a disc that is wholly in contact has pi and 2.
 _BETA = Usual(0.3, 1e4, "pi for a full disc, 32 in Table 1", "mm")
 _N_EXP = Usual(0.5, 3.0, "2 for a full disc, 1.41 in Table 1")
 # Table 1 has 5000: at a friction force of 0.15 N, c2 F_T^2 is then a tenth of the square of a fingertip's area.
 _C2 = Usual(1.0, 1e6, "5000 in Table 1", "mm^4/N^2")
-# Skin creeps within 1 ms to some seconds.
 _TAU = Usual(1e-5, 60.0, "skin creeps within 1 ms to some seconds")
 _BAND = Usual(*SKIN_BAND, "where the data of Eqs. 18 and 19 were measured")
 # Resistances from leads to insulators; capacitances from a fraction of a picofarad between leads to a power supply's.
@@ -152,35 +146,15 @@ _FARAD = Usual(1e-16, 1e-2, "a body has 150 pF to ground, a supply's capacitor s
 _P = ParameterSpec
 _LAYER_NODES, _ENDS = ("p", "n", "area"), ("p", "n")
 _THICKNESS, _SKIN_THICKNESS = (_P("d", "m", None, usual, "thickness", first=True) for usual in (_COATING, _SKIN))
+_EPS = [_P("eps_r", "", None, usual, "permittivity", first=True) for usual in (_EPS_R, _EPS_R_MATERIAL)]
+_RESISTIVITY = _P("rho", "ohm m", None, _RHO, "resistivity", first=True, may_be_infinite=True)
+_TAKEN_AT = _P("f", "Hz", None, _BAND, "data taken at", first=True, least=1e-3, most=1e9)
 _R = _P("r", "ohm", math.inf, _LEAK, "leak resistance", first=True, may_be_infinite=True)
 _E_MAX = _P("e_max", "V/m", math.inf, _STRENGTH, "dielectric strength", may_be_infinite=True)
 _DEVICES = (
-    DeviceSpec(
-        "LAYER",
-        _LAYER_NODES,
-        (_THICKNESS, _P("eps_r", "", None, _EPS_R, "permittivity", first=True), _R, _E_MAX),
-        _layer_cells,
-        "layer",
-    ),
-    DeviceSpec(
-        "SLAB",
-        _LAYER_NODES,
-        (
-            _THICKNESS,
-            _P("eps_r", "", None, _EPS_R_MATERIAL, "permittivity", first=True),
-            _P("rho", "ohm m", None, _RHO, "resistivity", first=True, may_be_infinite=True),
-            _E_MAX,
-        ),
-        _slab_cells,
-        "layer",
-    ),
-    DeviceSpec(
-        "SKIN",
-        _LAYER_NODES,
-        (_SKIN_THICKNESS, _P("f", "Hz", None, _BAND, "data taken at", first=True, least=1e-3, most=1e9)),
-        _skin_cells,
-        "skin",
-    ),
+    DeviceSpec("LAYER", _LAYER_NODES, (_THICKNESS, _EPS[0], _R, _E_MAX), _layer_cells, "layer"),
+    DeviceSpec("SLAB", _LAYER_NODES, (_THICKNESS, _EPS[1], _RESISTIVITY, _E_MAX), _slab_cells, "layer"),
+    DeviceSpec("SKIN", _LAYER_NODES, (_SKIN_THICKNESS, _TAKEN_AT), _skin_cells, "skin"),
     DeviceSpec("SKIN_DISPERSIVE", _LAYER_NODES, (_SKIN_THICKNESS,), _dispersive_cells, "skin, dispersive"),
     DeviceSpec(
         "GAP",
@@ -210,7 +184,7 @@ _DEVICES = (
 )
 
 #: Every device that the reader knows, by name.
-DEVICES: dict[str, DeviceSpec] = {spec.name: spec for spec in _DEVICES}
+DEVICES = {spec.name: spec for spec in _DEVICES}
 
 
 def layer_devices() -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
 
@@ -15,14 +15,18 @@ from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.circuit.topology import Area, shared
 from fingerspice.circuit.usual import check
 
-_NOTHING: MappingProxyType[str, float] = MappingProxyType({})
-
 
 def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
     """The network of a circuit; with `skin_at`, dispersive skins of a stack have their data at that frequency (Hz)."""
     if is_stack(circuit):
         return circuit.remember(("network", skin_at), lambda: _of_stack(circuit, skin_at))
-    return circuit.remember("network", lambda: _network(circuit))
+
+    def make() -> Network:
+        network = shared(circuit, "network", lambda: build_network(circuit))
+        now = {e.name: e for e in circuit.elements}
+        return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
+
+    return circuit.remember("network", make)
 
 
 def checked(circuit: Circuit) -> Circuit:
@@ -32,51 +36,46 @@ def checked(circuit: Circuit) -> Circuit:
     return circuit
 
 
-def _network(circuit: Circuit) -> Network:
-    network = shared(circuit, "network", lambda: build_network(circuit))
-    now = {e.name: e for e in circuit.elements}
-    return dataclasses.replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
-
-
 def _of_stack(circuit: Circuit, skin_at: float | None) -> Network:
     stack = build_stack(circuit, skin_at)
     network = shared(circuit, ("loop network", skin_at), lambda: loop_network(stack))
-    return network if network.stack is stack else dataclasses.replace(network, sources=(_source(stack),), stack=stack)
+    return network if network.stack is stack else replace(network, sources=(_source(stack),), stack=stack)
 
 
 def _source(stack: Stack) -> Element:
     """The voltage around a stack's loop."""
-    return Element("loop", "V", ("1", "0"), ("1", "0"), _NOTHING, stack.waveform)
+    return Element("loop", "V", ("1", "0"), ("1", "0"), MappingProxyType({}), stack.waveform)
 
 
 def loop_network(stack: Stack) -> Network:
     """The network of a stack, its cells in the order of `Stack.state_order`, with voltages from p to n."""
-    ends, order = ("1", "0"), stack.state_order
-    layer_of = tuple(stack.layer_of[list(order)].tolist())
-    n, sign = len(order) - 1, tuple(stack.sign.tolist())
-    layers = [stack.layers[i] for i in layer_of]
-    constants = list(zip(stack.c.tolist(), stack.g_total.tolist(), stack.g_area.tolist(), strict=True))
+    order, n = list(stack.state_order), stack.c.size - 1
+    of_layer, sign = stack.layer_of[order], stack.sign[order]
+    constants = np.stack([stack.c, stack.g_total, stack.g_area], axis=1)[order].tolist()
     area = stack.area_given if stack.contact is None or stack.area_given else stack.contact.area_at_rest
     assert area is not None
     # The delivered charge is computed at the cell that leaks most slowly, where cancellation costs fewest digits.
-    slowest = int(np.argmin(stack.leak_rates(area)))
+    slowest = np.array(order) == np.argmin(stack.leak_rates(area))
     hops = tuple((hop.element.device == "V", hop.sign) for hop in stack.hops)
-    p, q, nodes = _voltages(hops, layer_of, tuple(sign[i] for i in order))
+    p, q, nodes = _voltages(hops, tuple(of_layer.tolist()), tuple(sign.tolist()))
     gap = None if stack.gap_layer is None else stack.layers[stack.gap_layer]
     return Network(
         sources=(_source(stack),),
         n_voltage=1,
-        cells=tuple(Cell(layer, ends, *constants[i], 0) for layer, i in zip(layers, order, strict=True)),
+        cells=tuple(
+            Cell(stack.layers[i], ("1", "0"), c, g_total, g_area, 0)
+            for i, (c, g_total, g_area) in zip(of_layer, constants, strict=True)
+        ),
         layers=stack.layers,
         live=tuple(range(n)),
-        areas=(Area(layers[0].nodes[2], gap, stack.area_given),),
+        areas=(Area(stack.layers[0].nodes[2], gap, stack.area_given),),
         contacts=(stack.contact,),
         gaps=(None if stack.gap is None else order.index(stack.gap),),
         p=p,
         q=q,
         k=np.zeros((n, n)),
         b=np.zeros((n, 1)),
-        through=np.array([[sign[i] * (i == slowest) for i in order]]),
+        through=(sign * slowest)[None],
         delivered=np.zeros((1, n + 1)),
         resistor_factor=np.zeros((0, n)),
         resistor_factor_s=np.zeros((0, 1)),

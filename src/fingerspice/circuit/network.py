@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -116,10 +117,6 @@ class Network:
         """Leakage conductance of every cell at areas (n_area,) in m^2, S, shape (n_cell,)."""
         return np.array([c.g_total + (0.0 if c.area is None else c.g_area * area[c.area]) for c in self.cells])
 
-    def mass(self, area: FloatArray) -> FloatArray:
-        """Mass matrix p^T C p, F, shape (n, n), positive definite."""
-        return np.asarray(self.p.T @ (self.capacitance(area)[:, None] * self.p))
-
     def stiffness(self, area: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Matrices of the currents into the cuts from x (n, n) and from s (n, n_s), S, the leaks included."""
         leak = self.leak(area)[:, None]
@@ -197,8 +194,8 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     across = rows([cell.nodes for cell in cells])
     conductance = np.array([1.0 / e.values["value"] for e in resistors])
     found = eliminate(rows([e.nodes for e in resistors]), rows([e.nodes for e in currents]), conductance, n_e)
-    delivered, together = source_currents(found, n_v)
-    s, x = slice(0, n_v), slice(n_v, n_e)
+    delivered, together = found.source_currents(n_v)
+    s, x, order = slice(0, n_v), slice(n_v, n_e), [*range(n_v, n_e), *range(n_v)]
     through = np.zeros((n_v + n_i, len(cells)))
     through[:n_v] = across[:, s].T + together @ across[:, x].T
     names = tree.names
@@ -224,24 +221,20 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
         resistor_factor=found.factor[:, x],
         resistor_factor_s=np.hstack([found.factor[:, s], np.zeros((len(resistors), n_i))]),
         node_names=tuple(written[names[i]] for i in shown),
-        nodes=np.hstack([whole[shown][:, x], whole[shown][:, s], (at_node[:, n_e:] @ found.from_i)[shown]]),
+        nodes=np.hstack([whole[shown][:, order], (at_node[:, n_e:] @ found.from_i)[shown]]),
     )
 
 
 def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
-    a, b = element.nodes[:2]
+    a, b, *area = element.nodes
     if element.device == "C":
         return [Cell(element, (a, b), element.values["value"], 0.0, 0.0, None)]
-    if not element.spec.is_layer:
-        return []
-    constants = layer_constants(element)
+    constants = layer_constants(element).tolist() if area else []
     # The nodes between the slabs of a dispersive layer have names that no netlist can write.
-    inner = [f"{element.name.lower()} {i}" for i in range(1, len(constants))]
-    path = [a, *inner, b]
-    area = place[element.nodes[2]]
+    path = [a, *(f"{element.name.lower()} {i}" for i in range(1, len(constants))), b]
     return [
-        Cell(element, (path[i], path[i + 1]), float(c), float(g), float(g_area), area)
-        for i, (c, g, g_area) in enumerate(constants)
+        Cell(element, ends, c, g_total, g_area, place[area[0]])
+        for (c, g_total, g_area), ends in zip(constants, pairwise(path), strict=False)
     ]
 
 
@@ -259,6 +252,28 @@ class Resistors(NamedTuple):
     into_i: FloatArray
     factor: FloatArray  # (n_resistor, n_e): Square roots of the power in each resistor, by e: into_e = factor' factor
 
+    def source_currents(self, n_v: int) -> tuple[FloatArray, FloatArray]:
+        """What the sources deliver to resistors, and the cuts of capacitors that are added to their own.
+
+        The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
+        capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
+
+        The first is (n_v + n_i, n + n_v + n_i), the current of each source (A) by the voltages of the capacitors and of
+        the n_v voltage sources and the currents of the others; the second (n_v, n), shares of the capacitors' cuts.
+        """
+        (n_e, n_i), factor = self.into_i.shape, self.factor
+        # The order of the result's columns: capacitors, voltage sources.
+        order = [*range(n_v, n_e), *range(n_v)]
+        together: FloatArray = np.zeros((n_v, n_e - n_v))
+        if factor.size:
+            together = np.asarray(-np.linalg.lstsq(factor[:, n_v:], factor[:, :n_v], rcond=None)[0].T, float)
+        into = np.hstack([self.into_e[:, order], self.into_i])
+        delivered: FloatArray = np.vstack([into[:n_v] + together @ into[n_v:], np.eye(n_i, n_e + n_i, n_e)])
+        size = np.linalg.norm(factor, axis=0)
+        rounding = np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.outer(size[:n_v], size[order])
+        delivered[:n_v, :n_e][rounding] = 0.0
+        return delivered, together
+
 
 def eliminate(over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_e: int) -> Resistors:
     """Eliminate the voltages of the tree's resistors: given e, they minimise the dissipated power.
@@ -266,41 +281,13 @@ def eliminate(over_resistors: FloatArray, over_currents: FloatArray, conductance
     `over_resistors` (n_resistor, n_e + n_r) and `over_currents` (n_i, n_e + n_r) are the voltages of all resistors and
     current sources by those of the tree's branches, its own resistors last; `conductance` (n_resistor,) is in S.
     """
-    e, r = slice(0, n_e), slice(n_e, None)
-    weight = np.sqrt(conductance)[:, None]
-    orthogonal, upper = np.linalg.qr(weight * over_resistors[:, r])
-    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_resistors[:, e]))
-    from_i = -np.linalg.solve(upper, np.linalg.solve(upper.T, over_currents[:, r].T))
-    by_e = over_resistors[:, e] + over_resistors[:, r] @ from_e
-    by_i = over_resistors[:, r] @ from_i
-    into_e = by_e.T @ (conductance[:, None] * by_e)
-    into_i = over_resistors[:, e].T @ (conductance[:, None] * by_i) + over_currents[:, e].T
-    return Resistors(from_e, from_i, into_e, into_i, weight * by_e)
-
-
-def source_currents(found: Resistors, n_v: int) -> tuple[FloatArray, FloatArray]:
-    """What the sources deliver to resistors, and the cuts of capacitors that are added to their own.
-
-    The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
-    capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
-
-    The first is (n_v + n_i, n + n_v + n_i), the current of each source (A) by the voltages of the capacitors and of
-    the n_v voltage sources and the currents of the others; the second (n_v, n), shares of the capacitors' cuts.
-    """
-    n_e, n_i = found.into_i.shape
-    s, x, n, factor = slice(0, n_v), slice(n_v, n_e), n_e - n_v, found.factor
-    into_e, into_i = found.into_e, found.into_i
-    together: FloatArray = np.zeros((n_v, n))
-    if factor.size:
-        together = np.asarray(-np.linalg.lstsq(factor[:, x], factor[:, s], rcond=None)[0].T, float)
-    delivered: FloatArray = np.zeros((n_v + n_i, n_e + n_i))
-    delivered[:n_v] = np.hstack([into_e[s, x], into_e[s, s], into_i[s]])
-    delivered[:n_v] += together @ np.hstack([into_e[x, x], into_e[x, s], into_i[x]])
-    largest = np.linalg.norm(factor[:, s], axis=0)[:, None] * np.linalg.norm(factor, axis=0)
-    rounding = np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.hstack([largest[:, x], largest[:, s]])
-    delivered[:n_v, :n_e][rounding] = 0.0
-    delivered[n_v:, n_e:] = np.eye(n_i)
-    return delivered, together
+    weight, (over_e, over_r) = np.sqrt(conductance)[:, None], np.hsplit(over_resistors, [n_e])
+    orthogonal, upper = np.linalg.qr(weight * over_r)
+    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_e))
+    from_i = -np.linalg.solve(upper, np.linalg.solve(upper.T, over_currents[:, n_e:].T))
+    by_e, by_i = over_e + over_r @ from_e, over_r @ from_i
+    into_i = over_e.T @ (conductance[:, None] * by_i) + over_currents[:, :n_e].T
+    return Resistors(from_e, from_i, by_e.T @ (conductance[:, None] * by_e), into_i, weight * by_e)
 
 
 @dataclass(frozen=True)
@@ -325,7 +312,7 @@ def network_modes(network: Network, area: FloatArray) -> Modes:
     """
     capacitance, leak = network.capacitance(area), network.leak(area)
     n, n_v = network.k.shape[0], network.n_voltage
-    lower = np.linalg.cholesky(network.mass(area))
+    lower = np.linalg.cholesky(network.p.T @ (capacitance[:, None] * network.p))
     weight = np.sqrt(leak)[:, None]
     factor = np.vstack([network.resistor_factor, weight * network.p])
     factor_s = np.vstack([network.resistor_factor_s, weight * network.q])

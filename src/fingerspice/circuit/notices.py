@@ -13,16 +13,13 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
-from fingerspice.circuit.spectrum import energy_outside, skin_error, surely_wide
+from fingerspice.circuit.spectrum import is_near, skin_error
 from fingerspice.circuit.topology import driving, driving_sources
 from fingerspice.circuit.usual import unusual_of_changed
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.recorded import as_samples
 from fingerspice.waveforms.waveform import Waveform
 
-# Half-width of a band around a frequency, relative to the frequency, in which the skin's data change by 3 %; and the
-# fraction of the source's energy that may lie outside the band.
-_BAND, _OUTSIDE = 0.05, 0.01
 # Largest relative difference of frequencies that are the same; and the words by which a warning about a SKIN begins.
 _SAME, _TAKES = 1e-9, "takes its data at f ="
 # Text about the mean force if its error cannot be computed, and the smallest relative error that is given as a number.
@@ -138,28 +135,17 @@ def _span(f: FloatArray) -> str:
     return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
 
 
-def _is_near(wave: Waveform, stop: float, f: float) -> bool:
-    """Whether nearly all of a source's energy is close to a frequency (Hz), as for a carrier with a slow envelope."""
-    if surely_wide(wave, stop, f):
-        return False
-    band = f * (1.0 - _BAND), f * (1.0 + _BAND)
-    return sum(energy_outside(wave, stop, band)) < _OUTSIDE
-
-
 def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
     skins = circuit.by_device("SKIN")
-    if not skins:
+    waves = network_of(circuit).waveforms if skins else ()
+    # With several sources only the user can know at which frequency the skin data should be taken.
+    if len(waves) != 1:
         return
-    waves = network_of(circuit).waveforms
-    if len(waves) > 1:
-        # With several sources only the user can know at which frequency the skin data should be taken.
-        return
-    (wave,), fundamental = waves, waves[0].fundamental
-    known = 0.0 < stop < math.inf
+    (wave,), fundamental, known = waves, waves[0].fundamental, 0.0 < stop < math.inf
     for skin in skins:
         f = skin.values["f"]
         if fundamental is None:
-            if not (known and circuit.remember(("near", f, stop), partial(_is_near, wave, stop, f))):
+            if not (known and circuit.remember(("near", f, stop), partial(is_near, wave, stop, f))):
                 yield (
                     f"{skin.name} {_TAKES} {f:g} Hz, and the source has no fundamental: the mean force "
                     f"{_how_far(circuit, wave, stop) if known else _UNKNOWN}; SKIN_DISPERSIVE "

@@ -13,7 +13,6 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.network import Network
-from fingerspice.circuit.statespace import Stack
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
@@ -61,11 +60,7 @@ class LinearScene:
         network, stack = self.network, self.network.stack
         if stack is None:
             return np.asarray(network.grouping @ network.phasors(f, areas, np.ones(1, complex)))
-        return np.asarray(_stack_gains(stack, f, areas) * stack.sign[stack.first_cell])
-
-    def impedance(self, f: float, areas: FloatArray) -> complex:
-        """What the source sees at one frequency (Hz): its voltage over the current that it delivers, ohm."""
-        return self.network.impedance(f, areas)
+        return np.asarray(layer_gains(stack.admittance(f, areas))[0] * stack.sign[stack.first_cell])
 
 
 def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
@@ -86,12 +81,11 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     if finger is None and len(gaps) > 1:
         raise InputError(f"this circuit has several GAPs; allowed: finger= one of {', '.join(gaps.values())}")
     name = next(iter(gaps.values())) if finger is None else gaps[finger.lower()]
-    for place in network.fingers:
-        contact, gap = network.contacts[place], network.areas[place].gap
-        if gap is not None and gap.name == name and contact is not None:
-            break
-    else:
-        raise InputError(f"{name} drives no area; allowed: a GAP with an area of its own")
+    # Every GAP drives an area: `topology` refuses two on one.
+    place = next(i for i, area in enumerate(network.areas) if area.gap is not None and area.gap.name == name)
+    contact, gap = network.contacts[place], network.areas[place].gap
+    assert contact is not None
+    assert gap is not None
     note = f"of several GAPs, {name}" if len(gaps) > 1 else ""
     return LinearScene(network, contact, network.layers.index(gap), place, note)
 
@@ -101,9 +95,8 @@ def with_skin_held(circuit: Circuit) -> Circuit:
 
     def held(skin: Element) -> Element:
         d, f = skin.values["d"], skin.values["f"]
-        eps_r, rho = float(skin_permittivity(f)), float(skin_resistivity(f))
-        values = MappingProxyType({"d": d, "eps_r": eps_r, "rho": rho, "e_max": math.inf})
-        return replace(skin, device="SLAB", values=values)
+        values = {"d": d, "eps_r": float(skin_permittivity(f)), "rho": float(skin_resistivity(f)), "e_max": math.inf}
+        return replace(skin, device="SLAB", values=MappingProxyType(values))
 
     return replace(circuit, elements=tuple(held(e) if e.device == "SKIN" else e for e in circuit.elements))
 
@@ -112,25 +105,18 @@ def mean_areas(network: Network) -> FloatArray:
     """Areas of a coupled phasor at its source's fundamental, m^2, shape (n_area,); refused if there is none."""
     several = len(network.sources) > 1
     fundamental = None if several else network.waveforms[0].fundamental
-    if fundamental is None:
-        what = "at the source's fundamental, and this source has none"
-        if several:
-            what = "of one source at its fundamental, and this circuit has several sources"
-        raise InputError(
-            f"area='mean' is the area of the phasor {what}; allowed: 'coupled', 'frozen' or an area in m^2"
-        )
-    return coupled_areas(network, fundamental.frequency, fundamental.amplitude)
+    if fundamental is not None:
+        return coupled_areas(network, fundamental.frequency, fundamental.amplitude)
+    what = "at the source's fundamental, and this source has none"
+    if several:
+        what = "of one source at its fundamental, and this circuit has several sources"
+    raise InputError(f"area='mean' is the area of the phasor {what}; allowed: 'coupled', 'frozen' or an area in m^2")
 
 
 def areas_at_rest(network: Network) -> FloatArray:
     """Areas at 0 V, or as the deck gives them, m^2, shape (n_area,)."""
     pairs = zip(network.areas, network.contacts, strict=True)
     return np.array([float(c.area(0.0)) if c is not None and a.given is None else a.given for a, c in pairs])
-
-
-def _stack_gains(stack: Stack, f: float, areas: FloatArray) -> ComplexArray:
-    """Complex ratio of each layer's voltage to the source's at a frequency (Hz) and an area (m^2), shape (n_layer,)."""
-    return np.asarray(layer_gains(stack.admittance(np.array([f]), areas))[0])
 
 
 def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
@@ -142,15 +128,13 @@ def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
     if stack is not None and finger is not None:
 
         def gain(area: float) -> float:
-            return float(np.abs(_stack_gains(stack, f, np.array([area]))[stack.gap_layer]))
+            return float(np.abs(layer_gains(stack.admittance(f, area))[0, stack.gap_layer]))
 
         return np.array([coupled_area(lambda u: float(finger.area(u)), gain, amplitude)])
     s = np.array([complex(amplitude)])
     for attempt in range(500):
-        u = np.abs(network.phasors(f, area, s))
-        new = area.copy()
-        for i in network.fingers:
-            contact, gap = network.contacts[i], network.gaps[i]
+        u, new = np.abs(network.phasors(f, area, s)), area.copy()
+        for i, (contact, gap) in enumerate(zip(network.contacts, network.gaps, strict=True)):
             if network.areas[i].given is None and contact is not None and gap is not None:
                 new[i] = float(contact.area(float(u[gap]) / math.sqrt(2.0)))
         # NaN and inf cannot converge: return them, for the caller to refuse.

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.circuit import Circuit, T
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.response import areas_at_rest, with_skin_held
 from fingerspice.circuit.statespace import build_stack
@@ -28,7 +29,7 @@ _PIECES, _GRID = 4, 49
 _LEAST = 2.0 / SKIN_BAND[0]
 # Number of samples of a recording up to which straight lines between them are looked at instead.
 _FEW = 4096
-# A warning is given if more than this fraction of the source's energy is outside the band of the skin's data.
+# A source is in a band if no more than this fraction of its energy is outside.
 NOTABLE = 0.01
 # The area's harmonics also drive currents through the skin. Skin data held at the fundamental cause an additional
 # relative error of at most COUPLING times the relative change of the area: 0.004 was found where the area changes by a
@@ -79,28 +80,35 @@ def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatA
     return np.arange(total.size) / length, total
 
 
+def _kept(wave: Waveform, name: str, t_stop: float, make: Callable[[], T]) -> T:
+    """The result of `make` for a run to `t_stop` (s), which the waveform keeps until it is asked about another end."""
+    # End and result are one entry, because another thread may replace it at any time.
+    end, found = wave.kept.get(name, (None, None))
+    if end != t_stop:
+        found = make()
+        wave.kept[name] = t_stop, found
+    result: T = found
+    return result
+
+
 def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | None:
     """As `_energies`, from the samples themselves: pieces spread over the run to `t_stop` (s); None for few samples."""
     if not isinstance(wave, Samples):
         return None
     last = min(wave.count, math.floor((t_stop - wave.start) * wave.rate) + 1)
-    if last < _FEW:
-        return None
-    # Key and value are one entry, because another thread may replace it at any time.
-    kept: tuple[float, tuple[FloatArray, FloatArray]] | None = wave.kept.get("spectrum")
-    if kept is not None and kept[0] == t_stop:
-        return kept[1]
-    # A power of two, as the Fourier transform of a number with a large prime factor takes many times as long.
-    count = min(2 ** int(math.log2(last)), 2 ** math.ceil(math.log2(_LEAST * wave.rate)), _MOST_SAMPLES)
-    starts = np.unique(np.linspace(0, last - count, min(_PIECES, math.ceil(last / count))).astype(int))
-    total = np.zeros(count // 2 + 1)
-    for i in starts.tolist():
-        lines = np.fft.rfft(wave.between(i, i + count) * _window(count))
-        total += lines.real**2 + lines.imag**2
-    total[1:] *= 2.0
-    found = np.arange(total.size) * (wave.rate / count), np.asarray(total)
-    wave.kept["spectrum"] = t_stop, found
-    return found
+
+    def make() -> tuple[FloatArray, FloatArray]:
+        # A power of two, as the Fourier transform of a number with a large prime factor takes many times as long.
+        count = min(2 ** int(math.log2(last)), 2 ** math.ceil(math.log2(_LEAST * wave.rate)), _MOST_SAMPLES)
+        starts = np.unique(np.linspace(0, last - count, min(_PIECES, math.ceil(last / count))).astype(int))
+        total = np.zeros(count // 2 + 1)
+        for i in starts.tolist():
+            lines = np.fft.rfft(wave.between(i, i + count) * _window(count))
+            total += lines.real**2 + lines.imag**2
+        total[1:] *= 2.0
+        return np.arange(total.size) * (wave.rate / count), total
+
+    return None if last < _FEW else _kept(wave, "spectrum", t_stop, make)
 
 
 def energy_outside(waveform: Waveform, t_stop: float, band: tuple[float, float] = SKIN_BAND) -> tuple[float, float]:
@@ -115,15 +123,19 @@ def energy_outside(waveform: Waveform, t_stop: float, band: tuple[float, float] 
     return (float(energy[below].sum() / total), float(energy[f > high].sum() / total)) if total > 0.0 else (0.0, 0.0)
 
 
-def surely_wide(waveform: Waveform, t_stop: float, frequency: float) -> bool:
-    """Whether a fifth of a recording's energy is more than half an octave from a frequency (Hz), at a coarse look."""
+def is_near(waveform: Waveform, t_stop: float, frequency: float) -> bool:
+    """Whether 99 % of a source's energy is within 5 % of a frequency (Hz), as of a carrier with a slow envelope.
+
+    In that band the skin's data change by 3 %.
+    """
     found = _recorded(waveform, t_stop)
-    if found is None:
-        return False
-    f, energy = found
-    blurred = 2.0 * f[1]
-    far = (f < frequency / 1.4 - blurred) | (f > 1.4 * frequency + blurred)
-    return bool(energy[far].sum() > 0.2 * energy.sum() > 0.0)
+    if found is not None:
+        # A coarse look at a recording suffices if it finds a fifth of the energy more than half an octave away.
+        (f, energy), blurred = found, 2.0 * found[0][1]
+        far = (f < frequency / 1.4 - blurred) | (f > 1.4 * frequency + blurred)
+        if energy[far].sum() > 0.2 * energy.sum() > 0.0:
+            return False
+    return sum(energy_outside(waveform, t_stop, (0.95 * frequency, 1.05 * frequency))) < NOTABLE
 
 
 @lru_cache(maxsize=4)
@@ -140,32 +152,17 @@ def _places(step: float, count: int) -> tuple[IntArray, FloatArray, IntArray]:
     return cells, place - below, first
 
 
-def _shared_out(step: float, energy: FloatArray) -> FloatArray:
-    """Energy at the frequencies of the gains: each line, at a multiple of `step` (Hz), is divided between its two
-    neighbours by linear weights in log f."""
-    cells, above, first = _places(step, energy.size)
-    out = np.zeros(_GRID)
-    high = np.add.reduceat(energy * above, first)
-    out[cells] = np.add.reduceat(energy, first) - high
-    out[cells + 1] += high
-    return out
-
-
 def _squared_gains(circuit: Circuit) -> tuple[FloatArray, FloatArray] | None:
     """Squared gains from the one source to each gap (_GRID, n_gap), with the skin's own data at each frequency and with
-    those held at one; None if they cannot be computed. Circuits that differ in their sources only share them."""
-
-    def make() -> tuple[FloatArray, FloatArray] | None:
-        networks = network_of(circuit), network_of(with_skin_held(circuit))
-        gaps = [gap for gap in networks[0].gaps if gap is not None]
-        grid, areas = np.geomspace(*SKIN_BAND, _GRID), areas_at_rest(networks[0])
-        try:
-            own, held = (np.abs(n.phasors(grid, areas, np.ones(1, complex))[:, gaps]) ** 2 for n in networks)
-        except np.linalg.LinAlgError:
-            return None
-        return own, held
-
-    return shared(circuit, "squared gains", make)
+    those held at one; None if they cannot be computed."""
+    networks = network_of(circuit), network_of(with_skin_held(circuit))
+    gaps = [gap for gap in networks[0].gaps if gap is not None]
+    grid, areas = np.geomspace(*SKIN_BAND, _GRID), areas_at_rest(networks[0])
+    try:
+        own, held = (np.abs(n.phasors(grid, areas, np.ones(1, complex))[:, gaps]) ** 2 for n in networks)
+    except np.linalg.LinAlgError:
+        return None
+    return own, held
 
 
 def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
@@ -175,11 +172,15 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     at rest and the source's spectrum over the run to `t_stop` (s); of several fingers the largest error counts. Outside
     the band of the skin's data the response at the band's ends is used. None if the response cannot be computed.
     """
-    squares = _squared_gains(circuit)
+    squares = shared(circuit, "squared gains", lambda: _squared_gains(circuit))
     f, energy = _recorded(waveform, t_stop) or _energies(waveform, t_stop, SKIN_BAND[1])
     if squares is None or f.size < 2:
         return None
-    near = _shared_out(float(f[1]), energy)
+    # Each line is divided between its two neighbours in the grid by linear weights in log f.
+    cells, above, first = _places(float(f[1]), energy.size)
+    near, high = np.zeros(_GRID), np.add.reduceat(energy * above, first)
+    near[cells] = np.add.reduceat(energy, first) - high
+    near[cells + 1] += high
     right, held = (near @ square for square in squares)
     if not (right.size and np.all(right > 0.0) and np.all(np.isfinite(held / right))):
         return None
@@ -192,20 +193,14 @@ def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str
     skins = circuit.by_device("SKIN_DISPERSIVE")
     if not skins or not (math.isfinite(t_stop) and t_stop > 0.0):
         return None
-    # Key and result are one entry, so that they stay consistent when another thread replaces it.
-    kept, shares = waveform.kept.get("outside", (None, (0.0, 0.0)))
-    if kept != t_stop:
-        shares = energy_outside(waveform, t_stop)
-        waveform.kept["outside"] = t_stop, shares
-    below, above = shares
+    below, above = _kept(waveform, "outside", t_stop, lambda: energy_outside(waveform, t_stop))
     parts = [
         f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}"
         for share, where in ((below, f"below {SKIN_BAND[0]:g} Hz"), (above, f"above {SKIN_BAND[1] / 1e3:g} kHz"))
         if share > NOTABLE
     ]
-    if not parts:
-        return None
-    return f"of the source's energy {' and '.join(parts)} lie outside the band of the data behind {skins[0].name}"
+    where = f"lie outside the band of the data behind {skins[0].name}"
+    return f"of the source's energy {' and '.join(parts)} {where}" if parts else None
 
 
 def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity: float, t_stop: float) -> float:

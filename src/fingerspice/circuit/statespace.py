@@ -11,17 +11,18 @@ sum v_x = 0 fixes the neutral gauge of the leaked charges. So N layers have N - 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.topology import Hop, Loop, loop_of, shared
+from fingerspice.circuit.topology import Area, Hop, loop_of, shared
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
 from fingerspice.waveforms.combinations import Product, Sum
@@ -83,13 +84,10 @@ class Stack:
     @cached_property
     def waveform(self) -> Waveform:
         """Voltage around the loop: the sum of the sources with their signs."""
-        parts: list[Waveform] = []
-        for element, sign in self.sources:
-            assert element.waveform is not None
-            # A source of 0 V only serves to measure a current.
-            if element.waveform != DC(0.0):
-                parts.append(element.waveform if sign > 0 else Product((DC(-1.0), element.waveform)))
-        return Sum(tuple(parts)) if len(parts) > 1 else parts[0] if parts else DC(0.0)
+        # A source of 0 V only serves to measure a current.
+        waves = [(e.waveform, sign) for e, sign in self.sources if e.waveform not in (None, DC(0.0))]
+        parts = tuple(wave if sign > 0 else Product((DC(-1.0), wave)) for wave, sign in waves if wave is not None)
+        return Sum(parts) if len(parts) > 1 else parts[0] if parts else DC(0.0)
 
     @property
     def state_order(self) -> tuple[int, ...]:
@@ -135,7 +133,7 @@ class Stack:
         """Leak rate of each cell, g/c, at an area (m^2), 1/s, shape (n_cell,)."""
         return np.asarray((self.g_total / area + self.g_area) / self.c)
 
-    def admittance(self, frequency: FloatArray, area: FloatArray) -> ComplexArray:
+    def admittance(self, frequency: ArrayLike, area: ArrayLike) -> ComplexArray:
         """Complex layer admittances (n_frequency, n_layer), S; SKIN has data at each frequency (Eqs. 9, 16 to 19)."""
         f = np.atleast_1d(np.asarray(frequency, float))[:, None]
         a = np.broadcast_to(np.asarray(area, float), (f.shape[0],))[:, None]
@@ -167,33 +165,22 @@ def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
 
 def contact_of(gap: Element) -> Contact:
     """The contact of a GAP; here, and nowhere else, the paper's mm are converted to m."""
-    return gap.remember("contact", lambda: _contact_of(gap))
 
-
-def _contact_of(gap: Element) -> Contact:
-    v = gap.values
-    try:
-        contact = Contact(
-            d=v["d"],
-            eps_r=v["eps_r"],
-            f_n=v["fn"],
-            mu=v["mu"],
-            alpha=v["alpha"] * 1e-6,
-            m=v["m_exp"],
-            beta=v["beta"] * 1e-6 * 1e3 ** v["n_exp"],
-            n=v["n_exp"],
-            c2=v["c2"] * 1e-12,
-        )
-        possible = bool(np.all(np.isfinite(contact.packed)))
-    except (ArithmeticError, ValueError):  # a product overflows, or a logarithm is taken of one that underflows
-        possible = False
-    if not possible:
+    def make() -> Contact:
+        v = gap.values
+        # A product may overflow, or a logarithm be taken of one that underflows.
+        with suppress(ArithmeticError, ValueError):
+            alpha, beta, c2 = v["alpha"] * 1e-6, v["beta"] * 1e-6 * 1e3 ** v["n_exp"], v["c2"] * 1e-12
+            contact = Contact(v["d"], v["eps_r"], v["fn"], v["mu"], alpha, v["m_exp"], beta, v["n_exp"], c2)
+            if np.all(np.isfinite(contact.packed)):
+                return contact
         raise InputError(
             f"{gap.name} has a contact whose constants are beyond the range of numbers; allowed: fn, alpha, m_exp, "
             "beta, n_exp nearer to Table 1's",
             gap.where,
         )
-    return contact
+
+    return gap.remember("contact", make)
 
 
 def is_stack(circuit: Circuit) -> bool:
@@ -219,31 +206,22 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
                 "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is "
                 "another network; allowed for any network: simulate (run), plan, phasor (ac) and export"
             )
-        key = ("stack", skin_at, circuit.work)
-        found = shared(circuit, key, lambda: _build(circuit, loop, skin_at))
-        return found if found.hops is loop.hops else found.between(loop.hops)
+        hops, area = loop
+        found = shared(circuit, ("stack", skin_at, circuit.work), lambda: _build(hops, area, skin_at, circuit.work))
+        return found if found.hops is hops else found.between(hops)
 
     return circuit.remember(("stack", skin_at), make)
 
 
-def _build(circuit: Circuit, loop: Loop, skin_at: float | None) -> Stack:
-    layers = loop.layers
+def _build(hops: tuple[Hop, ...], area: Area, skin_at: float | None, work: str) -> Stack:
+    layers = tuple(hop.element for hop in hops if hop.element.spec.is_layer)
     parts = [layer_constants(e, skin_at) for e in layers]
     cells = tuple(len(part) for part in parts)
-    constants = np.concatenate(parts)
-    contact = None if loop.gap is None else contact_of(loop.gap)
-    if contact is not None and circuit.work == "total":
+    c, g_total, g_area = np.concatenate(parts).T
+    contact = None if area.gap is None else contact_of(area.gap)
+    if contact is not None and work == "total":
         d = np.repeat([e.values["d"] for e in layers], cells)
-        contact = contact.with_total_voltage_held(d, constants[:, 0] * d / EPS0)
-    return Stack(
-        layers=tuple(layers),
-        cells=cells,
-        sign=np.repeat([h.sign for h in loop.hops if h.element.spec.is_layer], cells),
-        c=constants[:, 0],
-        g_total=constants[:, 1],
-        g_area=constants[:, 2],
-        gap=None if loop.gap is None else sum(cells[: layers.index(loop.gap)]),
-        contact=contact,
-        area_given=loop.area_given,
-        hops=loop.hops,
-    )
+        contact = contact.with_total_voltage_held(d, c * d / EPS0)
+    sign = np.repeat([hop.sign for hop in hops if hop.element.spec.is_layer], cells)
+    gap = None if area.gap is None else sum(cells[: layers.index(area.gap)])
+    return Stack(layers, cells, sign, c, g_total, g_area, gap, contact, area.given, hops)

@@ -43,23 +43,12 @@ class Area:
     given: float | None  # m^2, from a DC source on the node or the gap's a_fix
 
 
-@dataclass(frozen=True)
-class Loop:
-    """A series loop of sources and layers from ground back to ground, with the GAP or the value that gives its area."""
-
-    hops: tuple[Hop, ...]
-    gap: Element | None
-    area_given: float | None  # m^2, from a DC source on the area node or the gap's a_fix
-
-    @property
-    def layers(self) -> list[Element]:
-        """Its layers in its order."""
-        return [h.element for h in self.hops if h.element.spec.is_layer]
-
-
 def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
     """Areas of a circuit, and the elements that carry current; a circuit that has no solution is refused."""
-    _refuse_large(circuit)
+    count = count_of(circuit)
+    if count > MAX_ELEMENTS:
+        counted = f", a SKIN_DISPERSIVE counted as its {SLABS} slabs" if count > len(circuit.elements) else ""
+        raise InputError(f"the circuit has {count:,} elements{counted}; allowed: at most {MAX_ELEMENTS:,}")
     areas, drives = _areas(circuit), {e.name for e in driving(circuit)}
     branches = [e for e in circuit.elements if e.device not in "VI" or e.name in drives]
     if not drives:
@@ -68,16 +57,13 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
                 "the circuit has no source; allowed: a V element that drives the stack, such as V1 drive 0 "
                 "SIN(0 200 100), or a start, IC= of a capacitor or .ic v(node)="
             )
-        branches.append(_no_source(branches[0]))
+        # In place of a source, one of 0 A.
+        nodes, names = branches[0].nodes[1::-1], branches[0].node_names[1::-1]
+        branches.append(Element("none", "I", nodes, names, MappingProxyType({}), DC(0.0)))
     _refuse_floating(branches)
     _refuse_source_conflicts(branches)
     _refuse_current_without_path(branches)
     return areas, branches
-
-
-def _no_source(beside: Element) -> Element:
-    """A source of 0 A, which a circuit that only its start drives has in place of a source."""
-    return Element("none", "I", beside.nodes[1::-1], beside.node_names[1::-1], MappingProxyType({}), DC(0.0))
 
 
 def driving(circuit: Circuit) -> list[Element]:
@@ -108,13 +94,14 @@ def shared(circuit: Circuit, key: Any, make: Callable[[], T]) -> T:
     return kept
 
 
-def loop_of(circuit: Circuit) -> Loop | None:
-    """The loop of a circuit that is one series loop with one area that follows without delay; None for any other.
+def loop_of(circuit: Circuit) -> tuple[tuple[Hop, ...], Area] | None:
+    """The hops and the area of a circuit that is one series loop of sources and layers, from ground back to ground.
 
-    All circuits that `Circuit.replace` derives from one another share the way round the loop.
+    None for any other circuit, and for an area that follows with delay. All circuits that `Circuit.replace` derives
+    from one another share the way round the loop.
     """
 
-    def make() -> Loop | None:
+    def make() -> tuple[tuple[Hop, ...], Area] | None:
         if "hops" not in circuit.related:
             circuit.related["hops"] = _find_hops(circuit)
         walked: tuple[Hop, ...] | None = circuit.related["hops"]
@@ -124,30 +111,40 @@ def loop_of(circuit: Circuit) -> Loop | None:
         if area.gap is not None and area.gap.values["tau"] > 0.0 and area.given is None:
             return None
         now = {e.name: e for e in circuit.elements}
-        return Loop(tuple(Hop(now[hop.element.name], hop.sign, hop.node) for hop in walked), area.gap, area.given)
+        return tuple(Hop(now[hop.element.name], hop.sign, hop.node) for hop in walked), area
 
     return circuit.remember("loop", make)
 
 
 def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
+    """The loop in the direction in which the n node of the first source comes before its p node."""
     areas, branches = find_branches(circuit)
-    if len(areas) != 1 or any(e.device != "V" and not e.spec.is_layer for e in branches):
+    at = _incidence(branches)
+    of_stacks = all(e.device == "V" or e.spec.is_layer for e in branches)
+    if len(areas) != 1 or not of_stacks or max(map(len, at.values())) > 2:
         return None
-    if any(len(elements) > 2 for elements in _incidence(branches).values()):
-        return None
-    return _walk(branches)
+    walks = []
+    for start in at["0"]:
+        hops, node, element = list[Hop](), "0", start
+        while not hops or node != "0":
+            if hops:
+                element = next(e for e in at[node] if e is not element)
+            end = 1 if element.nodes[0] == node else 0
+            node = element.nodes[end]
+            hops.append(Hop(element, 1.0 if end else -1.0, element.node_names[end]))
+        walks.append(tuple(hops))
+    for walk in walks:
+        if next(hop for hop in walk if hop.element.device == "V").sign < 0.0:
+            return walk
+    # With opposed sources, the p node of the first source may come first in both directions: the deck's first source
+    # then decides.
+    deciding = next(e for e in branches if e.device == "V")
+    return next(walk for walk in walks if any(hop.element is deciding and hop.sign < 0.0 for hop in walk))
 
 
 def count_of(circuit: Circuit) -> int:
     """Number of elements of a circuit, each dispersive skin counted as its slabs."""
     return len(circuit.elements) + (SLABS - 1) * len(circuit.by_device("SKIN_DISPERSIVE"))
-
-
-def _refuse_large(circuit: Circuit) -> None:
-    count = count_of(circuit)
-    if count > MAX_ELEMENTS:
-        counted = f", a SKIN_DISPERSIVE counted as its {SLABS} slabs" if count > len(circuit.elements) else ""
-        raise InputError(f"the circuit has {count:,} elements{counted}; allowed: at most {MAX_ELEMENTS:,}")
 
 
 def _areas(circuit: Circuit) -> tuple[Area, ...]:
@@ -335,29 +332,3 @@ def _refuse_current_without_path(branches: list[Element]) -> None:
                     "reached through current sources only; allowed: an R, C or layer that takes the current to ground",
                     element.where,
                 )
-
-
-def _walk(branches: list[Element]) -> tuple[Hop, ...]:
-    """The loop from ground, in the direction in which the n node of the first source comes before its p node."""
-    at = _incidence(branches)
-    walks = [_walk_from(start, at) for start in at["0"]]
-    for hops in walks:
-        if next(h for h in hops if h.element.device == "V").sign < 0.0:
-            return hops
-    # With opposed sources, the p node of the first source may come first in both directions: the deck's first source
-    # then decides.
-    deciding = next(e for e in branches if e.device == "V")
-    return next(hops for hops in walks if any(h.element is deciding and h.sign < 0.0 for h in hops))
-
-
-def _walk_from(start: Element, at: dict[str, list[Element]]) -> tuple[Hop, ...]:
-    """The loop from ground, beginning with the given one of the two elements at ground."""
-    hops: list[Hop] = []
-    node, element = "0", start
-    while True:
-        forward = element.nodes[0] == node
-        node = element.nodes[1] if forward else element.nodes[0]
-        hops.append(Hop(element, 1.0 if forward else -1.0, element.node_names[1 if forward else 0]))
-        if node == "0":
-            return tuple(hops)
-        element = next(e for e in at[node] if e is not element)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from fingerspice.base.arrays import real_number
@@ -46,17 +47,13 @@ class Usual:
             return None
         ends = f"{shown(self.least, unit if unit in _PREFIXED else '')} to {shown(self.most, unit)}"
         said = f"{what} is {shown(value, unit)}, outside {ends}, the usual range ({self.source})"
-        if self.slip:
-            said += f": it is in {self.slip}"
-        meant = self._meant(value, unit)
-        return f"{said}; was {meant} meant?" if meant else said
-
-    def _meant(self, value: float, unit: str) -> str:
-        """Usual values with the same digits and another prefix: at most three, the nearest first."""
+        said += f": it is in {self.slip}" if self.slip else ""
+        # Usual values with the same digits and another prefix: at most three, the nearest first.
         powers = _THOUSANDS if unit in _PREFIXED else _MILLIONS.get(unit, ())
         found = [float(f"{value:.12g}") * 10.0**power for power in powers]
-        texts = [spice_text(x) for x in found if self.least <= abs(x) <= self.most][:3]
-        return " or ".join([", ".join(texts[:-1]), texts[-1]] if len(texts) > 1 else texts)
+        meant = [spice_text(x) for x in found if self.least <= abs(x) <= self.most][:3]
+        most = " or ".join([", ".join(meant[:-1]), meant[-1]] if len(meant) > 1 else meant)
+        return f"{said}; was {most} meant?" if meant else said
 
 
 def shown(value: float, unit: str) -> str:
@@ -114,17 +111,11 @@ def unit_trap(spec: ParameterSpec, text: str) -> str | None:
     return f"is {text!r}: SPICE reads {spec.unit} as {prefix}; write the number alone, in {word}"
 
 
-def is_resistance(spec: ParameterSpec) -> bool:
-    """Whether the parameter is a resistance, in which a capital M is probably meant as mega."""
-    return spec.unit in ("ohm", "ohm m")
-
-
-def mega_note(text: str, value: float, spec: ParameterSpec) -> str:
-    """The warning about a capital M in a resistance, which SPICE reads as milli."""
-    return (
-        f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for mega{spec.unit.partition(' ')[0]} "
-        f"write {suggest_mega(text)}"
-    ).replace("megaohm", "megohm")
+def mega_note(text: str, value: float, spec: ParameterSpec) -> str | None:
+    """The warning about a number with a capital M, which SPICE reads as milli, if the parameter is a resistance."""
+    if spec.unit not in ("ohm", "ohm m"):
+        return None
+    return f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for megohm write {suggest_mega(text)}"
 
 
 def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tuple[float, str | None]:
@@ -143,28 +134,27 @@ def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tu
         raise InputError(f"{path}: {error}") from None
     if spec is None:
         return value, None
-    trap = unit_trap(spec, text)
-    if trap:
+    if trap := unit_trap(spec, text):
         raise InputError(f"{path} {trap}")
-    mega = is_resistance(spec) and suspicious_mega(text)
-    return value, f"{path}: {mega_note(text, value, spec)}" if mega else None
+    note = mega_note(text, value, spec) if suspicious_mega(text) else None
+    return value, f"{path}: {note}" if note else None
 
 
 def unusual(element: Element) -> Iterator[tuple[str, str]]:
     """Warnings about an element's unusual values, each with the parameter's name (empty for the area at 0 V)."""
-    found = [(p.name, p.unusual(element.name, element.values[p.name])) for p in element.spec.parameters]
-    if element.waveform is not None:
+    wave, v = element.waveform, element.values
+    found = [(p.name, p.unusual(element.name, v[p.name])) for p in element.spec.parameters]
+    if wave is not None:
         found = [
-            (name, SOURCES[unit].warning(f"{element.name} {name}", getattr(element.waveform, name), unit))
-            for name, unit in type(element.waveform).units.items()
-            if unit in SOURCES and hasattr(element.waveform, name)
+            (name, SOURCES[unit].warning(f"{element.name} {name}", getattr(wave, name), unit))
+            for name, unit in type(wave).units.items()
+            if unit in SOURCES and hasattr(wave, name)
         ]
-    if element.device == "GAP" and not any(text for _, text in found):
-        v = element.values
-        area = (v["alpha"] * v["fn"] ** v["m_exp"]) ** 2 - v["c2"] * (v["mu"] * v["fn"]) ** 2
-        if v["a_fix"] == 0.0 and area > 0.0:
-            at_rest = area / (v["alpha"] * v["fn"] ** v["m_exp"])
-            found.append(("", REST_AREA.warning(f"{element.name} area at 0 V", at_rest, "mm^2")))
+    if element.device == "GAP" and v["a_fix"] == 0.0 and not any(text for _, text in found):
+        adhesive = v["alpha"] * v["fn"] ** v["m_exp"]
+        area = adhesive**2 - v["c2"] * (v["mu"] * v["fn"]) ** 2
+        if area > 0.0:
+            found.append(("", REST_AREA.warning(f"{element.name} area at 0 V", area / adhesive, "mm^2")))
     yield from ((name, text) for name, text in found if text is not None)
 
 
@@ -197,39 +187,34 @@ def concerns(warning: str, changes: Mapping[str, Any]) -> bool:
 def check(circuit: Circuit) -> None:
     """Refuse values out of range and contacts that cannot exist."""
     for element in circuit.elements:
-        if "checked" in element.kept:
-            continue
-        for spec in element.spec.parameters:
-            value: Any = element.values[spec.name]
-            if not spec.accepts(value):
-                unit = f" {spec.unit}" if spec.unit else ""
-                raise InputError(
-                    f"{element.name} {spec.name} is {value:g}{unit}; allowed: {spec.allowed()}", element.where
-                )
-        if element.device == "GAP":
-            _check_contact(element)
-        element.kept["checked"] = True
+        element.remember("checked", partial(_check_element, element))
     if circuit.tran is not None and not circuit.tran.stop > 0.0:
         raise InputError(f"t_stop is {circuit.tran.stop:g} s; allowed: more than 0")
 
 
-def _check_contact(gap: Element) -> None:
-    m, n = gap.values["m_exp"], gap.values["n_exp"]
+def _check_element(element: Element) -> None:
+    v = element.values
+    for spec in element.spec.parameters:
+        if not spec.accepts(v[spec.name]):
+            given = f"{v[spec.name]:g} {spec.unit}".rstrip()
+            raise InputError(f"{element.name} {spec.name} is {given}; allowed: {spec.allowed()}", element.where)
+    if element.device != "GAP":
+        return
+    m, n, fault = v["m_exp"], v["n_exp"], ""
+    loss = math.sqrt(v["c2"]) * v["mu"] * v["fn"]
     if not 0.0 < m < n:
-        raise InputError(f"{gap.name} exponents are m_exp={m:g}, n_exp={n:g}; allowed: 0 < m_exp < n_exp", gap.where)
-    if not 1.0 / m + 1.0 / n > 1.0:
-        raise InputError(
-            f"{gap.name} exponents m_exp={m:g}, n_exp={n:g} give 1/m + 1/n = {1 / m + 1 / n:.4g}; allowed: more "
-            "than 1 (else Eq. 4 has no single root)",
-            gap.where,
+        fault = f"exponents are m_exp={m:g}, n_exp={n:g}; allowed: 0 < m_exp < n_exp"
+    elif not 1.0 / m + 1.0 / n > 1.0:
+        fault = (
+            f"exponents m_exp={m:g}, n_exp={n:g} give 1/m + 1/n = {1 / m + 1 / n:.4g}; allowed: more than 1 (else Eq. "
+            "4 has no single root)"
         )
-    area = gap.values["alpha"] * gap.values["fn"] ** m
-    loss = math.sqrt(gap.values["c2"]) * gap.values["mu"] * gap.values["fn"]
-    if gap.values["a_fix"] == 0.0 and not area > loss:
-        hint = "".join(f"; note {text}" for _, text in unusual(gap))
-        raise InputError(
-            f"{gap.name} has no contact: friction takes the whole ridge area at 0 V "
-            f"(A0 = alpha fn^m_exp = {area:.4g} mm^2, sqrt(c2) mu fn = {loss:.4g} mm^2); allowed: "
-            f"A0^2 > c2 mu^2 fn^2, so less load fn, less friction mu or less c2{hint}",
-            gap.where,
+    elif v["a_fix"] == 0.0 and not (area := v["alpha"] * v["fn"] ** m) > loss:
+        hint = "".join(f"; note {text}" for _, text in unusual(element))
+        fault = (
+            f"has no contact: friction takes the whole ridge area at 0 V (A0 = alpha fn^m_exp = {area:.4g} mm^2, "
+            f"sqrt(c2) mu fn = {loss:.4g} mm^2); allowed: A0^2 > c2 mu^2 fn^2, so less load fn, less friction mu or "
+            f"less c2{hint}"
         )
+    if fault:
+        raise InputError(f"{element.name} {fault}", element.where)

@@ -11,7 +11,7 @@ from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import exponent_and_scale
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
-from fingerspice.circuit.usual import is_resistance, mega_note, unit_trap, unusual
+from fingerspice.circuit.usual import mega_note, unit_trap, unusual
 from fingerspice.netlist.deck import KINDS
 from fingerspice.netlist.slips import is_unit, nearest
 from fingerspice.netlist.sources import Context, Source, read_source
@@ -186,8 +186,8 @@ def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> fl
 def _doubts(given: Number, spec: ParameterSpec) -> list[tuple[Where, str]]:
     """Warnings about the notation of a number, each with the place that it is about."""
     found = []
-    if given.mega is not None and is_resistance(spec):
-        found.append((given.mega.where, mega_note(given.mega.text, given.value, spec)))
+    if given.mega is not None and (note := mega_note(given.mega.text, given.value, spec)):
+        found.append((given.mega.where, note))
     if exponent_and_scale(given.text):
         found.append((given.where, f"{given.text} is {given.value:g}: exponent and scale both count"))
     return found

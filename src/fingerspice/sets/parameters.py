@@ -1,13 +1,16 @@
-"""The named sets: looking them up, showing them, applying them to a circuit, and what to cite for a run."""
+"""The named sets: reading their files, looking them up, applying them to a circuit, and what to cite for a run."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
+import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, overload
 
@@ -18,17 +21,117 @@ from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import in_force, remembering
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.sets.reading import ELEMENTS, KINDS, Reference, SetValue, keys_in, references, tables, values_of
 from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import Sine, Waveform
 
 #: Waveforms of drives, by the name that a set gives.
 WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM}
-
-
 #: Units that take a prefix in tables.
 _PREFIXED = ("m", "ohm", "V", "Hz", "N")
+DATA = Path(__file__).with_name("data")
+#: Kinds of sets, in the order in which they are listed.
+KINDS = ("scene", "finger", "load", "coating", "drive")
+#: Elements of a value, with the devices to which it is given; a source is a V element that drives.
+ELEMENTS = {"gap": ("GAP",), "skin": ("SKIN", "SKIN_DISPERSIVE"), "coating": ("LAYER",), "source": ("V",)}
+
+
+@dataclass(frozen=True)
+class SetValue:
+    """One value of a set."""
+
+    element: str  # A key of `ELEMENTS`
+    parameter: str  # As in the netlist, or a parameter of the set's waveform
+    value: float
+    unit: str
+    # low, high: The range of the value, in `unit`
+    low: float
+    high: float
+    source: str  # Where the value comes from, with keys of references in brackets; "assumed ..." if not published
+    range: str  # Where the range comes from
+    optional: bool = False  # Whether a circuit may lack the parameter
+
+    @property
+    def path(self) -> str:
+        """Element and parameter: ``gap.r``."""
+        return f"{self.element}.{self.parameter}"
+
+    @property
+    def assumed(self) -> bool:
+        """Whether no reference has this value."""
+        return self.source.startswith("assumed")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A work to cite; `doi` is empty where none is known."""
+
+    key: str
+    kind: str  # BibTeX's
+    title: str
+    authors: tuple[str, ...]  # ``Family, Given``; an institution is in braces
+    year: int | None
+    where: Mapping[str, str]  # Journal or book title, volume, number, pages, as BibTeX names them
+    doi: str
+    url: str
+
+    def text(self) -> str:
+        """The reference in one sentence."""
+        names = [a.strip("{}") if a[0] == "{" else " ".join(reversed(a.split(", ", 1))) for a in self.authors]
+        who = ", ".join(names).replace(", others", " et al.")
+        said = [f"{who}, “{self.title}”"]
+        for key, word in _SAID:
+            if key in self.where:
+                # An article's number, in place of pages, needs no word.
+                bare = key == "pages" and "-" not in self.where[key]
+                said.append(self.where[key] if bare else f"{word} {self.where[key]}".strip())
+        said += [str(self.year or ""), f"doi:{self.doi}" if self.doi else self.url]
+        return f"{', '.join(filter(None, said))}."
+
+    def bibtex(self) -> str:
+        """The reference as a BibTeX entry, in UTF-8."""
+        fields = {"author": " and ".join(self.authors), "title": f"{{{self.title}}}", **self.where}
+        fields |= {"pages": self.where["pages"].replace("-", "--")} if "pages" in self.where else {}
+        fields |= {"year": str(self.year or ""), "doi": self.doi, "url": self.url}
+        lines = [f"  {name} = {{{value.replace('&', chr(92) + '&')}}}," for name, value in fields.items() if value]
+        return "\n".join([f"@{self.kind}{{{self.key},", *lines, "}"])
+
+
+_SAID = (("journal", ""), ("booktitle", ""), ("volume", "vol."), ("number", "no."), ("pages", "pp."), ("note", ""))
+
+
+def keys_in(text: str) -> list[str]:
+    """The keys of references that a text names in brackets."""
+    return re.findall(r"\[(\w+)\]", text)
+
+
+@cache
+def references() -> Mapping[str, Reference]:
+    """Every reference by its key."""
+    found = tomllib.loads((DATA / "references.toml").read_text(encoding="utf-8"))
+    for key, data in found.items():
+        where = MappingProxyType({name: str(data.pop(name)) for name, _ in _SAID if name in data})
+        rest = {"year": None, "doi": "", "url": ""} | data | {"authors": tuple(data["authors"])}
+        found[key] = Reference(key=key, where=where, **rest)
+    return MappingProxyType(found)
+
+
+@cache
+def tables() -> Mapping[str, Mapping[str, Any]]:
+    """The table of every set by its name, as its file has it."""
+    files = sorted(DATA.glob("*.toml"), key=lambda file: file.stem.lower())
+    found = [tomllib.loads(file.read_text(encoding="utf-8")) for file in files if file.stem != "references"]
+    found.sort(key=lambda one: KINDS.index(one["kind"]))
+    return MappingProxyType({one["name"]: one for one in found})
+
+
+def _values_of(name: str) -> dict[str, SetValue]:
+    """The values of a set by path: those of the sets that it includes, and its own in their place."""
+    found: dict[str, SetValue] = {}
+    for other in tables()[name].get("includes", ()):
+        found |= _values_of(other)
+    own = (SetValue(**{**one, "value": float(one["value"])}) for one in tables()[name]["values"])
+    return found | {value.path: value for value in own}
 
 
 @dataclass(frozen=True, repr=False)
@@ -93,25 +196,18 @@ class ParameterSet(Shown):
         changes: dict[str, float | Waveform] = {}
         for kind in dict.fromkeys(value.element for value in self.values.values()):
             own = [value for value in self.values.values() if value.element == kind]
-            elements = self._elements(kind, circuit, to, needed=not all(value.optional for value in own))
-            if kind == "source":
-                assert self.waveform is not None
-                figures = {value.parameter: value.value for value in own}
-                changes[elements[0].name] = WAVEFORMS[self.waveform](**figures)
-                continue
-            changes |= {
-                f"{element.name}.{value.parameter}": value.value
-                for element in elements
-                for value in own
-                if value.parameter in element.values
-            }
+            figures = {value.parameter: value.value for value in own}
+            for e in self._elements(kind, circuit, to, needed=not all(value.optional for value in own)):
+                if kind == "source":
+                    changes[e.name] = WAVEFORMS[str(self.waveform)](**figures)
+                else:
+                    changes |= {f"{e.name}.{name}": value for name, value in figures.items() if name in e.values}
         return remembering(circuit.replace(changes), self.name, changes)
 
     def _elements(self, kind: str, circuit: Circuit, to: str | None, needed: bool) -> list[Element]:
         """The elements that the values for a kind of element go to, refused if it is not clear which are meant."""
         devices, name = ELEMENTS[kind], self.name
-        known = driving_sources(circuit) if kind == "source" else list(circuit.elements)
-        known = [e for e in known if e.device in devices]
+        known = [e for e in (driving_sources(circuit) if kind == "source" else circuit.elements) if e.device in devices]
         found = [e for e in known if to is None or f"{e.name}.".lower().startswith(f"{to}.".lower())]
         what = "driving V source" if kind == "source" else " or ".join(devices)
         if not found and needed:
@@ -142,13 +238,14 @@ class ParameterSet(Shown):
             ends = "this value" if v.low == v.high else f"{quantity(v.low, v.unit)} to {quantity(v.high, v.unit)}"
             origin = "assumed" if v.assumed else ", ".join(keys_in(v.source))
             rows.append((v.path, quantity(v.value, v.unit), ends, origin))
-        drive = [f"waveform of the source: {self.waveform}"] if self.waveform else []
-        said = [f"claims: {self.claims}", f"does not claim: {self.not_claimed}"]
-        origins = [f"{v.path}: {v.source}; range: {v.range}" for v in self.values.values()]
-        cited = [f"[{r.key}] {r.text()}" for r in self.references]
-        table = Table(("", "value", "range", "source"), rows, left=4)
-        head = f"{self.name} ({self.kind}): {self.title}"
-        return Page([head, *drive, "", table, "", *said, "", *origins, "", *cited])
+        return Page([
+            f"{self.name} ({self.kind}): {self.title}",
+            *([f"waveform of the source: {self.waveform}"] if self.waveform else []),
+            *("", Table(("", "value", "range", "source"), rows, left=4), ""),
+            *(f"claims: {self.claims}", f"does not claim: {self.not_claimed}", ""),
+            *(f"{v.path}: {v.source}; range: {v.range}" for v in self.values.values()),
+            *("", *(f"[{r.key}] {r.text()}" for r in self.references)),
+        ])  # fmt: skip
 
 
 class ParameterSets(Shown, Mapping[str, ParameterSet]):
@@ -164,10 +261,8 @@ class ParameterSets(Shown, Mapping[str, ParameterSet]):
         return len(_sets())
 
     def _page(self) -> Page:
-        rows = []
-        for one in self.values():
-            assumed = f", {len(one.assumed)} assumed" if one.assumed else ""
-            rows.append((one.name, one.kind, one.title, f"{len(one.values)}{assumed}"))
+        assumed = {one.name: f", {len(one.assumed)} assumed" if one.assumed else "" for one in self.values()}
+        rows = [(one.name, one.kind, one.title, f"{len(one.values)}{assumed[one.name]}") for one in self.values()]
         return Page([Table(("name", "kind", "what it is", "values"), rows, left=4)])
 
 
@@ -176,14 +271,12 @@ def _sets() -> dict[str, ParameterSet]:
     found = {}
     for name, table in tables().items():
         own = {key: table[key] for key in ("name", "title", "kind", "claims", "not_claimed")}
-        found[name] = ParameterSet(**own, values=MappingProxyType(values_of(name)), waveform=table.get("waveform"))
+        found[name] = ParameterSet(**own, values=MappingProxyType(_values_of(name)), waveform=table.get("waveform"))
     return found
 
 
 @overload
 def parameters() -> ParameterSets: ...
-
-
 @overload
 def parameters(name: str, kind: str | None = None) -> ParameterSet: ...
 
@@ -228,7 +321,7 @@ def quantity(value: float, unit: str) -> str:
 
 
 #: The paper whose model is simulated.
-MODEL = "Forsbach2021"
+_MODEL = "Forsbach2021"
 #: Programs that integrated the run, by the part of the method's name before the colon.
 _METHODS = {"scipy": "SciPy", "torchdiffeq": "torchdiffeq"}
 
@@ -254,8 +347,7 @@ class Citation(Shown):
         return "\n\n".join(reference.bibtex() for reference in self.references)
 
     def _page(self) -> Page:
-        cited = [f"[{r.key}] {r.text()}" for r in self.references]
-        return Page([*self.statements, "", *cited, "", self.bibtex])
+        return Page([*self.statements, "", *(f"[{r.key}] {r.text()}" for r in self.references), "", self.bibtex])
 
 
 def cite(circuit: Circuit, method: str) -> Citation:
@@ -264,8 +356,8 @@ def cite(circuit: Circuit, method: str) -> Citation:
 
     known = references()
     program = dataclasses.replace(known["fingerspice"], where={"note": f"version {__version__}"})
-    found: dict[str, Reference] = {MODEL: known[MODEL], program.key: program}
-    said = [f"The model is that of [{MODEL}], simulated with fingerspice {__version__} [{program.key}]."]
+    found: dict[str, Reference] = {_MODEL: known[_MODEL], program.key: program}
+    said = [f"The model is that of [{_MODEL}], simulated with fingerspice {__version__} [{program.key}]."]
     for name, (kept, changed) in in_force(circuit).items():
         one = parameters(name)
         given = {path: _given(one, circuit, path) for path in kept}
@@ -273,14 +365,12 @@ def cite(circuit: Circuit, method: str) -> Citation:
         # The works behind the values that were used; those that only say how far a value may vary are not cited.
         texts = [one.claims, *(value.source for values in given.values() for value in values)] if kept else []
         found |= {key: known[key] for text in texts for key in keys_in(text)}
-    if not circuit.sets:
-        said.append("No set of parameters was applied.")
+    said += [] if circuit.sets else ["No set of parameters was applied."]
     said.append(
         f"All other values are those of the deck “{circuit.title}” and of changes made to it; cite their sources, "
         "which the program does not know."
     )
-    key = _METHODS.get(method.partition(":")[0])
-    if key is not None:
+    if (key := _METHODS.get(method.partition(":")[0])) is not None:
         said.append(f"The method {method} is that of [{key}].")
         found[key] = known[key]
     return Citation(tuple(said), tuple(found.values()))

@@ -165,7 +165,7 @@ def phasor(
     with np.errstate(all="ignore"):
         areas = np.array([scene.areas(float(x), area, drive.amplitude) for x in f])
         layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
-        impedance = np.array([scene.impedance(float(x), a) for x, a in zip(f, areas, strict=True)])
+        impedance = np.array([scene.network.impedance(float(x), a) for x, a in zip(f, areas, strict=True)])
         gain, own = layers[:, scene.gap], areas[:, scene.finger].copy()
         u_gap = gain * drive.amplitude * np.exp(1j * drive.phase)
         # At a constant area the mean force over a period of a sine is half its peak.

@@ -15,8 +15,7 @@ from fingerspice.base.arrays import FloatArray, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.sets.parameters import parameters
-from fingerspice.sets.reading import KINDS
+from fingerspice.sets.parameters import KINDS, parameters
 from fingerspice.studies.batch.task import own_path
 from fingerspice.waveforms.waveform import Waveform, require
 
