@@ -207,11 +207,12 @@ def read_table(
         raise InputError(f"'{path}' has one column and no rate; allowed: a column of times too, or rate= in Hz; "
                          "PWL FILE= takes alternating times and values")  # fmt: skip
     # A column that is named as times is one even beside a rate, which it may contradict.
-    named = columns > 1 and any(name.lower() in _TIME_NAMES for name in found.names)
-    if rate is not None and not (named or (columns == 2 and value is None)):
-        return Recording(found.volts(_only(found, value, "value", 1)), rate)
-    t = found.seconds(_chosen_time(found, time))
-    values = found.volts(_only(found, value, "value", 2, other=_chosen_time(found, time)))
+    named = [i for i, name in enumerate(found.names) if name.lower() in _TIME_NAMES]
+    if rate is not None and not (columns > 1 and (named or (columns == 2 and value is None))):
+        return Recording(found.scaled(_chosen(found, value, "value", 1, 0), "V"), rate)
+    at = named[0] if time is None and len(named) == 1 else _chosen(found, time, "time", 2, 0)
+    t = found.scaled(at, "s")
+    values = found.scaled(_chosen(found, value, "value", 2, 1 - at, other=at), "V")
     back = np.flatnonzero(t[1:] < t[:-1])
     if back.size:
         i = int(back[0])
@@ -258,16 +259,10 @@ def check_count(what: str, count: int) -> None:
         raise InputError(f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
 
 
-def _chosen_time(found: Columns, time: str | int | None) -> int:
-    """Index of the column of times: as given, else the only one named ``t`` or ``time``, else the first of two."""
-    if time is None:
-        named = [i for i, name in enumerate(found.names) if name.lower() in _TIME_NAMES]
-        return named[0] if len(named) == 1 else _only(found, None, "time", 2)
-    return _only(found, time, "time", 2)
-
-
-def _only(found: Columns, column: str | int | None, role: str, most: int, other: int | None = None) -> int:
-    """Index of a column; if none is given, the only one (`most` is 1), or the first of two, or the one not `other`."""
+def _chosen(
+    found: Columns, column: str | int | None, role: str, most: int, default: int, other: int | None = None
+) -> int:  # fmt: skip
+    """Index of a column, which is not `other`; if none is given, the default in a table of at most `most` columns."""
     if column is not None:
         index = found.index(column)
         if index == other:
@@ -276,7 +271,7 @@ def _only(found: Columns, column: str | int | None, role: str, most: int, other:
     if found.data.shape[1] > most:
         way = "name the column" if found.names else "the number of the column"
         raise InputError(f"'{found.file}' has {found.listed()}; allowed: {way} of the {role}")
-    return 0 if other is None else 1 - other
+    return default
 
 
 def _npz_columns(path: Path) -> tuple[Columns, float | None]:

@@ -22,8 +22,6 @@ from fingerspice.waveforms.waveform import require
 # Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
 # to 0.46 of the rate.
 _WING, _BETA = 32, 8.0
-
-
 # Number of samples of a file that are read at once.
 AT_ONCE = 1 << 20
 
@@ -201,9 +199,7 @@ class Samples(Ramps):
 
     def part(self, t0: float, t1: float) -> Samples:
         """The samples that determine the values between two times (s), as a waveform that needs no other samples."""
-        first, last = ((t - self.start) * self.rate for t in (t0, t1))
-        low = min(max(math.floor(first) - 2, 0), self.count - 2)
-        high = min(max(math.ceil(last) + 3, low + 2), self.count)
+        low, high = self._around(t0, t1)
         values = self.between(low, high)
         values.flags.writeable = False
         out = object.__new__(Samples)
@@ -217,19 +213,22 @@ class Samples(Ramps):
     def _times_of(self, low: int, high: int) -> FloatArray:
         return np.asarray(self.start + np.arange(self._number + low, self._number + high) / self.rate)
 
+    def _around(self, t0: float, t1: float) -> tuple[int, int]:
+        """First index into `values`, and the one after the last, of two samples or more that determine a span (s)."""
+        low = min(max(math.floor(self._number_of(t0)) - 2, 0), self.count - 2)
+        return low, min(max(math.ceil(self._number_of(t1)) + 3, low + 2), self.count)
+
     @property
-    def course(self) -> tuple[float, float]:
+    def course(self) -> tuple[float, float]:  # type: ignore[override]
         # Not from the values, which may lie in a file of an hour.
         return self.start, self.start + (self.count - 1) / self.rate
 
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def knots(self) -> tuple[FloatArray, FloatArray]:
         return self._times_of(0, self.count), self.values
 
     def _edges(self, t0: float, t1: float) -> FloatArray:
-        low = min(max(math.floor(self._number_of(t0)) - 2, 0), self.count - 1)
-        high = min(max(math.ceil(self._number_of(t1)) + 3, low + 1), self.count)
-        times = self._times_of(low, high)
-        return times[max(0, times.searchsorted(t0) - 1) : times.searchsorted(t1, "right") + 1]
+        return self._times_of(*self._around(t0, t1))
 
     def peak(self, t0: float, t1: float) -> float:
         low = max(math.ceil(self._number_of(t0) - 1e-6), 0)

@@ -56,14 +56,10 @@ class Function(Waveform):
         require(callable(self.function), "source function", repr(self.function), "a function of time in s")
         breaks = set(real_numbers("function breaks", self.breaks, "times in s").ravel().tolist())
         if self.repeat is not None:
-            object.__setattr__(self, "repeat", positive_number("function period", self.repeat, "s"))
+            self._declare(repeat=positive_number("function period", self.repeat, "s"))
             # The end of a period is the start of the next one.
             breaks = {math.fmod(b, self.repeat) if b >= self.repeat else b for b in breaks}
-        object.__setattr__(self, "breaks", tuple(sorted(breaks)))
-
-    @property
-    def period(self) -> float | None:  # type: ignore[override]
-        return self.repeat
+        self._declare(breaks=tuple(sorted(breaks)), period=self.repeat)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = real_numbers("t", t, "times in s")
@@ -110,12 +106,11 @@ class Function(Waveform):
     def precision(self) -> float:  # type: ignore[override]
         return self.kept.get("precision", DOUBLE)  # type: ignore[no-any-return]
 
-    def breakpoints(self, t0: float, t1: float) -> FloatArray:
-        times = np.asarray(self.breaks, float)
-        if self.repeat is not None and times.size:
-            runs = runs_through(np.floor(t0 / self.repeat) - 1.0, np.ceil(t1 / self.repeat), times.size, t0, t1)
-            times = np.unique((runs[:, None] * self.repeat + times).ravel())
-        return times[(times >= t0) & (times <= t1)]
+    def _edges(self, t0: float, t1: float) -> FloatArray:
+        if self.repeat is None or not self.breaks:
+            return np.array(self.breaks)
+        runs = runs_through(np.floor(t0 / self.repeat) - 1.0, np.ceil(t1 / self.repeat), len(self.breaks), t0, t1)
+        return np.unique((runs[:, None] * self.repeat + np.array(self.breaks)).ravel())
 
     def breakpoint_rate(self) -> float:
         return len(self.breaks) / self.repeat if self.repeat else 0.0

@@ -54,7 +54,8 @@ class Waveform:
     """A voltage against time, defined for all times.
 
     Subclasses implement `value`, `breakpoints` and, where the waveform has that form, `terms`; periodic ones also
-    `period` and, where the fundamental is not 1 / period, `tone`.
+    `period` and, where the fundamental is not 1 / period, `tone`. Those of this package declare what follows from their
+    numbers, under the names of the attributes below, when they are made.
     """
 
     units: ClassVar[dict[str, str]] = {}
@@ -65,6 +66,22 @@ class Waveform:
 
     precision: float = DOUBLE
     """Distance of neighbouring numbers of the kind that the values are computed in, relative to their size."""
+
+    settled: float = 0.0
+    """Time (s) from which the waveform is periodic."""
+
+    course: tuple[float, float] = (-math.inf, math.inf)
+    """Times (s) before the first and after the second of which the waveform is constant."""
+
+    half_wave: bool = False
+    """Whether each half period after `settled` is the negative of the half period before it."""
+
+    # Times (s, ascending) at which the waveform is not smooth, and the shortest time scale (s) between them.
+    _breaks: tuple[float, ...] = ()
+    _quick: float = math.inf
+
+    def _declare(self, **facts: Any) -> None:
+        self.__dict__.update(facts)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is computed when it is first asked for."""
@@ -86,7 +103,12 @@ class Waveform:
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         """Times in [t0, t1] (s, ascending) at which the waveform is not smooth."""
-        return np.empty(0)
+        times = self._edges(t0, t1)
+        return times[(times >= t0) & (times <= t1)]
+
+    def _edges(self, t0: float, t1: float) -> FloatArray:
+        """The breakpoints in [t0, t1] (s), and maybe others."""
+        return np.array(self._breaks)
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
         """Coefficients of the waveform's terms on segments that contain no breakpoint in their interior.
@@ -110,26 +132,11 @@ class Waveform:
 
     def shortest_time(self) -> float:
         """Shortest time scale (s) on which the waveform varies between breakpoints; inf for constants and ramps."""
-        return math.inf
+        return self._quick
 
     def breakpoint_rate(self) -> float:
         """Upper bound of the number of breakpoints per second; it sets the windows into which long runs are divided."""
         return 0.0
-
-    @property
-    def settled(self) -> float:
-        """Time (s) from which the waveform is periodic."""
-        return 0.0
-
-    @property
-    def course(self) -> tuple[float, float]:
-        """Times (s) before the first and after the second of which the waveform is constant."""
-        return -math.inf, math.inf
-
-    @property
-    def half_wave(self) -> bool:
-        """Whether each half period after `settled` is the negative of the half period before it."""
-        return False
 
     @cached_property
     def fundamental(self) -> Fundamental | None:
@@ -253,10 +260,7 @@ class DC(Waveform):
 
     def __post_init__(self) -> None:
         take_numbers(self)
-
-    @property
-    def course(self) -> tuple[float, float]:
-        return math.inf, -math.inf
+        self._declare(course=(math.inf, -math.inf))
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.full(real_numbers("t", t, "times in s").shape, self.level)
@@ -298,22 +302,14 @@ class Sine(Waveform):
     def __post_init__(self) -> None:
         take_numbers(self)
         require(self.frequency > 0.0, "sine frequency", f"{self.frequency:g} Hz", "> 0")
-
-    @property
-    def period(self) -> float | None:  # type: ignore[override]
-        return 1.0 / self.frequency if self.damping == 0.0 else None
-
-    @property
-    def settled(self) -> float:
-        return max(0.0, self.delay)
-
-    @property
-    def course(self) -> tuple[float, float]:
-        return self.delay, math.inf
-
-    @property
-    def half_wave(self) -> bool:
-        return self.offset == 0.0 and self.damping == 0.0
+        self._declare(
+            period=1.0 / self.frequency if self.damping == 0.0 else None,
+            settled=max(0.0, self.delay),
+            course=(self.delay, math.inf),
+            half_wave=self.offset == 0.0 and self.damping == 0.0,
+            _breaks=(self.delay,) if self.delay > 0.0 else (),
+            _quick=1.0 / self.frequency,
+        )
 
     def peak(self, t0: float, t1: float) -> float:
         if self.damping or t1 - max(t0, self.delay) < (1.0 - 1e-9) / self.frequency:
@@ -331,9 +327,6 @@ class Sine(Waveform):
             wave = wave * np.exp(-self.damping * (since - self.delay))
         return np.asarray(self.offset + self.amplitude * wave)
 
-    def breakpoints(self, t0: float, t1: float) -> FloatArray:
-        return np.array([self.delay]) if t0 <= self.delay <= t1 and self.delay > 0.0 else np.empty(0)
-
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         on = 0.5 * (start + stop) >= self.delay if self.delay > 0.0 else np.ones(start.size, bool)
         phase = math.radians(self.phase_deg)
@@ -343,9 +336,6 @@ class Sine(Waveform):
         angle = TAU * self._turns(start) + phase - 0.5 * math.pi
         wave = np.where(on, self.amplitude * decay, 0.0), 0.0, -self.damping, TAU * self.frequency, angle
         return terms_of(start.size, (level,), wave)
-
-    def shortest_time(self) -> float:
-        return 1.0 / self.frequency
 
     @property
     def fundamental(self) -> Fundamental | None:
