@@ -12,38 +12,11 @@ from hypothesis import strategies as st
 from fingerspice.base.units import format_si, parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
 
 VALUES = {
-    "10": 10.0,
-    ".5": 0.5,
-    "5.": 5.0,
-    "-3": -3.0,
-    "+3": 3.0,
-    "1e-6": 1e-6,
-    "1E3": 1e3,
-    "1e3k": 1e6,
-    "1t": 1e12,
-    "1g": 1e9,
-    "0.2meg": 2e5,
-    "1MEG": 1e6,
-    "1MegOhm": 1e6,
-    "200k": 2e5,
-    "1m": 1e-3,
-    "1M": 1e-3,
-    "1mil": 25.4e-6,
-    "350u": 350e-6,
-    "1µ": 1e-6,
-    "1μF": 1e-6,
-    "10uF": 1e-5,
-    "1n": 1e-9,
-    "1p": 1e-12,
-    "1f": 1e-15,
-    "1F": 1e-15,
-    "5V": 5.0,
-    "200Hz": 200.0,
-    "1Ohm": 1.0,
-    "1kΩ": 1e3,
-    "90deg": 90.0,
-    "0e-999": 0.0,
-}
+    "10": 10.0, ".5": 0.5, "5.": 5.0, "-3": -3.0, "+3": 3.0, "1e-6": 1e-6, "1E3": 1e3, "1e3k": 1e6, "0e-999": 0.0,
+    "1t": 1e12, "1g": 1e9, "0.2meg": 2e5, "1MEG": 1e6, "1MegOhm": 1e6, "200k": 2e5, "1m": 1e-3, "1M": 1e-3,
+    "1mil": 25.4e-6, "350u": 350e-6, "1µ": 1e-6, "1μF": 1e-6, "10uF": 1e-5, "1n": 1e-9, "1p": 1e-12, "1f": 1e-15,
+    "1F": 1e-15, "5V": 5.0, "200Hz": 200.0, "1Ohm": 1.0, "1kΩ": 1e3, "90deg": 90.0,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "value"), VALUES.items())
@@ -56,25 +29,14 @@ def test_a_suffix_costs_no_rounding() -> None:
     assert [i for i in range(1000) if parse_number(f"{i}.1u") != float(f"{i}.1e-6")] == []
 
 
-@pytest.mark.parametrize(
-    ("text", "hint"),
-    [
-        ("2k7", "write 2.7k"),
-        ("4R7", "write 4.7"),
-        ("1x", "write 1meg"),
-        ("1a", "write 1"),
-        ("1A", "write 1"),
-        ("1milli", "write 1m"),
-        ("5micro", "write 5u"),
-        ("5meter", "write 5"),
-        ("1q", "neither a scale"),
-        ("1e", "neither a scale"),
-        ("1e999", "larger than"),
-        ("1e308k", "larger than"),
-        ("1e-999", "smaller than"),
-        ("9" * 500, "characters"),
-    ],
-)
+REMEDIES = {
+    "2k7": "write 2.7k", "4R7": "write 4.7", "1x": "write 1meg", "1a": "write 1", "1A": "write 1",
+    "1milli": "write 1m", "5micro": "write 5u", "5meter": "write 5", "1q": "neither a scale", "1e": "neither a scale",
+    "1e999": "larger than", "1e308k": "larger than", "1e-999": "smaller than", "9" * 500: "characters",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "hint"), REMEDIES.items())
 def test_numbers_that_readers_differ_on_are_refused_with_a_remedy(text: str, hint: str) -> None:
     with pytest.raises(ValueError, match=hint):
         parse_number(text)
@@ -100,23 +62,13 @@ def test_a_unit_that_spice_takes_for_a_scale_is_recognised() -> None:
     assert not unit_read_as_scale("1uF", "F", "farad")
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (3.5e-6, "3.5 um"),
-        (2e5, "200 km"),
-        (0.0, "0 m"),
-        (-0.0, "0 m"),
-        (999.96, "1 km"),
-        (999.94, "999.9 m"),
-        (-1500.0, "-1.5 km"),
-        (1e-20, "1e-20 m"),
-        (1e17, "1e+17 m"),
-        (math.inf, "inf m"),
-        (-math.inf, "-inf m"),
-        (math.nan, "nan m"),
-    ],
-)
+WRITTEN = {
+    3.5e-6: "3.5 um", 2e5: "200 km", 0.0: "0 m", 999.96: "1 km", 999.94: "999.9 m", -1500.0: "-1.5 km",
+    1e-20: "1e-20 m", 1e17: "1e+17 m", math.inf: "inf m", -math.inf: "-inf m", math.nan: "nan m",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("value", "text"), [*WRITTEN.items(), (-0.0, "0 m")])
 def test_engineering_notation(value: float, text: str) -> None:
     assert format_si(value, "m") == text
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_numbers
-from fingerspice.waveforms.bounds import runs_through, take_numbers
+from fingerspice.waveforms.bounds import runs_through
 from fingerspice.waveforms.waveform import DC, Sine, Waveform, as_waveform, require
 
 #: Most cycles of a part in a common period.
@@ -166,7 +166,7 @@ class AM(_OfFactors):
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         require(0.0 <= self.depth <= 1.0, "AM depth", f"{self.depth:g}", "0 to 1")
 
     @cached_property
@@ -188,7 +188,7 @@ class _Shifted(Waveform):
 
     def __post_init__(self) -> None:
         self._declare(waveform=as_waveform(self.waveform))
-        take_numbers(self)
+        super().__post_init__()
 
     @cached_property
     def _marks(self) -> FloatArray:

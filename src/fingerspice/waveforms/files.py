@@ -33,14 +33,8 @@ _MOST_CHUNKS = 10_000
 _FORMATS = {2: "ADPCM", 6: "ALAW", 7: "MULAW", 17: "DVI_ADPCM", 85: "MPEGLAYER3"}
 # First bytes of other file formats, to name the format in the message.
 _OTHERS = {
-    b"ID3": "MP3",
-    b"\xff\xfb": "MP3",
-    b"\xff\xf3": "MP3",
-    b"OggS": "Ogg",
-    b"fLaC": "FLAC",
-    b"FORM": "AIFF",
-    b"caff": "CAF",
-    b"PK": "ZIP or NPZ",
+    b"ID3": "MP3", b"\xff\xfb": "MP3", b"\xff\xf3": "MP3", b"OggS": "Ogg", b"fLaC": "FLAC", b"FORM": "AIFF",
+    b"caff": "CAF", b"PK": "ZIP or NPZ",
 }  # fmt: skip
 
 
@@ -67,7 +61,10 @@ class WavLayout:
     offset: int  # Position of the first sample, bytes
 
     def read(self, first: int, last: int) -> FloatArray:
-        """Samples number `first` to `last` - 1 as fractions of full scale, if the file still has them."""
+        """Samples number `first` to `last` - 1 as fractions of full scale, if the file still has them.
+
+        Integers are divided by half the range of their type, so that full scale is -1 to just below 1.
+        """
         width = int(self.kind[2])
         block = self.channels * width
         try:
@@ -96,14 +93,7 @@ class WavLayout:
 
 
 def wav_layout(path: str | Path, channel: int | None = None, most: int = LARGEST_STREAMED) -> WavLayout:
-    """Position of the samples of one channel of a WAV file, which are read as fractions of full scale.
-
-    An integer is divided by half the range of its type (from 8-bit integers their middle, 128, is subtracted first), so
-    that full scale is -1 to just below 1. A float is taken as it is. The samples of a stream whose header was written
-    before its end was known go on to the end of the file.
-
-    Channels are counted from 0, and one has to be chosen of several; `most` is the largest size of the file in bytes.
-    """
+    """Position of the samples of one channel, counted from 0, of a WAV file of at most `most` bytes."""
     path = checked_file(path, most)
     with path.open("rb") as file:
         order, form, offset, length = _wav_chunks(path, file)
@@ -233,19 +223,14 @@ def checked_file(path: str | Path, most: int) -> Path:
     """The path, after a check that it is a readable ordinary file, not empty and not larger than `most` bytes."""
     path, fault = Path(path), ""
     try:
-        if path.is_dir():
-            fault = "is a folder, not a file"
-        elif not path.exists():
-            fault = "does not exist"
-        elif not path.is_file():
-            fault = "is not an ordinary file"
+        if not path.is_file():
+            there = "is not an ordinary file" if path.exists() else "does not exist"
+            fault = "is a folder, not a file" if path.is_dir() else there
         else:
             path.open("rb").close()
             size = path.stat().st_size
-            if size == 0:
-                fault = "is empty"
-            elif size > most:
-                fault = f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB"
+            too_large = f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB" if size > most else ""
+            fault = too_large if size else "is empty"
     except (OSError, ValueError) as error:
         fault = f"cannot be read: {getattr(error, 'strerror', None) or error}"
     if fault:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_numbers
-from fingerspice.waveforms.bounds import runs_through, take_numbers
+from fingerspice.waveforms.bounds import runs_through
 from fingerspice.waveforms.ramps import Ramps
 from fingerspice.waveforms.waveform import TAU, Waveform, require, terms_of
 
@@ -31,7 +31,7 @@ class _Periodic(Ramps):
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         kind = type(self).__name__.lower()
         require(self.frequency > 0.0, f"{kind} frequency", f"{self.frequency:g} Hz", "> 0")
         period = 1.0 / self.frequency
@@ -119,9 +119,10 @@ class Pulse(Ramps):
     units: ClassVar[dict[str, str]] = {
         "v1": "V", "v2": "V", "delay": "s", "rise": "s", "fall": "s", "width": "s", "pulse_period": "s"
     }  # fmt: skip
+    _endless = ("width", "pulse_period")
 
     def __post_init__(self) -> None:
-        take_numbers(self, endless=("width", "pulse_period"))
+        super().__post_init__()
         for name in ("rise", "fall", "width"):
             require(getattr(self, name) >= 0.0, f"pulse {name}", f"{getattr(self, name):g} s", ">= 0")
         require(self.pulse_period > 0.0, "pulse period", f"{self.pulse_period:g} s", "> 0")
@@ -179,7 +180,7 @@ class Chirp(Waveform):
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         require(self.f0 > 0.0 and self.f1 > 0.0, "chirp frequencies", f"{self.f0:g}, {self.f1:g} Hz", "> 0")
         require(self.duration > 0.0, "chirp duration", f"{self.duration:g} s", "> 0")
         self._declare(_breaks=(0.0, self.duration), _quick=1.0 / max(self.f0, self.f1))
@@ -218,7 +219,7 @@ class Exp(Waveform):
     units: ClassVar[dict[str, str]] = {"v1": "V", "v2": "V", "td1": "s", "tau1": "s", "td2": "s", "tau2": "s"}
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         require(self.tau1 > 0.0 and self.tau2 > 0.0, "EXP time constants", f"{self.tau1:g}, {self.tau2:g} s", "> 0")
         require(self.td2 >= self.td1, "EXP td2", f"{self.td2:g} s", f">= td1 = {self.td1:g} s")
         breaks = tuple(sorted({self.td1, self.td2}))

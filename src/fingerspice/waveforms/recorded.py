@@ -24,16 +24,13 @@ def as_samples(wave: Waveform) -> Samples | None:
     if isinstance(wave, Samples):
         return wave
     if "samples" not in wave.kept:
-        wave.kept["samples"] = _found(wave)
+        of_parts = _of_parts(wave) if isinstance(wave, Sum | Product) else None
+        wave.kept["samples"] = _of_points(wave) if isinstance(wave, PWL) else of_parts
     found: Samples | None = wave.kept["samples"]
     return found
 
 
-def _found(wave: Waveform) -> Samples | None:
-    if isinstance(wave, PWL):
-        return _of_points(wave)
-    if not isinstance(wave, Sum | Product):
-        return None
+def _of_parts(wave: Sum | Product) -> Samples | None:
     constants = [part.level for part in wave.parts if isinstance(part, DC)]
     others = [as_samples(part) for part in wave.parts if not isinstance(part, DC)]
     known = [part for part in others if part is not None]
@@ -41,10 +38,8 @@ def _found(wave: Waveform) -> Samples | None:
         return None
     if isinstance(wave, Sum):
         return _added(known, float(sum(constants)))
-    if len(known) > 1:
-        return None
     only = known[0]
-    return Samples(float(np.prod(constants)) * only.values, only.rate, only.start)
+    return Samples(float(np.prod(constants)) * only.values, only.rate, only.start) if len(known) == 1 else None
 
 
 def _of_points(wave: PWL) -> Samples | None:

@@ -14,7 +14,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, read_only, real_number, real_numbers, whole_number
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import RANGES, check_range, take_numbers
+from fingerspice.waveforms.bounds import RANGES, check_range
 from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, check_count, read_table, wav_layout
 from fingerspice.waveforms.ramps import FEW_KNOTS, Ramps
 from fingerspice.waveforms.waveform import require
@@ -74,12 +74,11 @@ class Samples(Ramps):
     _number: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        values = real_numbers("the row of samples", self.values, "two or more numbers in V").copy()
-        values.flags.writeable = False
-        object.__setattr__(self, "values", values)
+        values = read_only(real_numbers("the row of samples", self.values, "two or more numbers in V").copy())
+        self._declare(values=values)
         require(values.ndim == 1 and values.size >= 2, "samples", f"shape {values.shape}", "one row of two or more")
         _check_samples(values, 0)
-        take_numbers(self)
+        super().__post_init__()
         require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
 
     @classmethod
@@ -193,17 +192,20 @@ class Samples(Ramps):
 
     def between(self, first: int, last: int) -> FloatArray:
         """Samples number `first` to `last` - 1, V; beyond the ends, the first or last one; maybe a part of `values`."""
-        if first >= 0 and last <= self.count:
-            return self.values[first:last]
-        return np.asarray(self.values[np.clip(np.arange(first, last), 0, self.count - 1)])
+        low, high = (min(max(n, 0), self.count - 1) for n in (first, last - 1))
+        values = self._read(low, high + 1)
+        return values if (low, high) == (first, last - 1) else values[np.clip(np.arange(first, last), low, high) - low]
+
+    def _read(self, first: int, last: int) -> FloatArray:
+        return self.values[first:last]
 
     def part(self, t0: float, t1: float) -> Samples:
         """The samples that determine the values between two times (s), as a waveform that needs no other samples."""
         low, high = self._around(t0, t1)
-        values = self.between(low, high)
-        values.flags.writeable = False
         out = object.__new__(Samples)
-        out.__dict__.update(values=values, rate=self.rate, start=self.start, _number=self._number + low)
+        out._declare(
+            values=read_only(self.between(low, high)), rate=self.rate, start=self.start, _number=self._number + low
+        )
         return out
 
     def _number_of(self, t: float) -> float:
@@ -268,7 +270,7 @@ class _WavFile(Samples):
     gain: float
 
     def __init__(self, layout: WavLayout, gain: float) -> None:
-        self.__dict__.update(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
+        self._declare(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
         require(self.count >= 2, "samples", f"shape ({self.count},)", "one row of two or more")
         # Integers are finite, and within full scale.
         sure = layout.kind[1] != "f" and abs(gain) <= RANGES["V"][0]
@@ -282,9 +284,7 @@ class _WavFile(Samples):
 
     @cached_property
     def values(self) -> FloatArray:
-        values = self.between(0, self.count)
-        values.flags.writeable = False
-        return values
+        return read_only(self.between(0, self.count))
 
     @property
     def count(self) -> int:
@@ -296,12 +296,10 @@ class _WavFile(Samples):
         found.update(repr((self.gain, self.layout.channel)).encode())
         return found.hexdigest()
 
-    def between(self, first: int, last: int) -> FloatArray:
+    def _read(self, first: int, last: int) -> FloatArray:
         if "values" in self.__dict__:
-            return super().between(first, last)
-        low, high = (min(max(n, 0), self.count - 1) for n in (first, last - 1))
-        values: FloatArray = self.gain * self.layout.read(low, high + 1)
-        return values if (low, high) == (first, last - 1) else values[np.clip(np.arange(first, last), low, high) - low]
+            return super()._read(first, last)
+        return np.asarray(self.gain * self.layout.read(first, last))
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
         if "values" in self.__dict__:

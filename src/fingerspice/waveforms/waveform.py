@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import take_numbers
+from fingerspice.waveforms.bounds import ANY_RANGE, RANGES, check_range
 
 TAU = 2.0 * math.pi
 # Places in [0, 1], both ends among them, one in each of 512 equal parts: so irregular that no carrier is 0 at all.
@@ -79,6 +79,20 @@ class Waveform:
     # Times (s, ascending) at which the waveform is not smooth, and the shortest time scale (s) between them.
     _breaks: tuple[float, ...] = ()
     _quick: float = math.inf
+    # Names of fields that may be infinite.
+    _endless: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        """Make doubles of the fields that have a unit, and refuse what is no number of it."""
+        for name in (field.name for field in fields(self) if field.name in self.units):  # type: ignore[arg-type]
+            what, unit = f"{type(self).__name__} {name}", self.units[name]
+            value = real_number(what, getattr(self, name), f"a number of {unit}" if unit else "a number")
+            if not (math.isfinite(value) or (value == math.inf and name in self._endless)):
+                raise InputError(f"{what} is {value}; allowed: a finite number")
+            largest, smallest = RANGES.get(unit, ANY_RANGE)
+            if value != 0.0 and not smallest <= abs(value) <= largest:
+                check_range(what, value, unit)
+            self._declare(**{name: value})
 
     def _declare(self, **facts: Any) -> None:
         self.__dict__.update(facts)
@@ -259,7 +273,7 @@ class DC(Waveform):
     units: ClassVar[dict[str, str]] = {"level": "V"}
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         self._declare(course=(math.inf, -math.inf))
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
@@ -300,7 +314,7 @@ class Sine(Waveform):
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         require(self.frequency > 0.0, "sine frequency", f"{self.frequency:g} Hz", "> 0")
         self._declare(
             period=1.0 / self.frequency if self.damping == 0.0 else None,
