@@ -32,23 +32,22 @@ def chunk(name: bytes, data: bytes, order: str = "<", size: int | None = None, p
 
 
 def wav(
-    data: bytes, kind: str = "i2", channels: int = 1, *, rate: int = 8000, tag: int | None = None,
-    extensible: bool = False, head: bytes = b"RIFF", size: int | None = None, long: int | None = None,
-    whole: int | None = None, before: bytes = b"", after: bytes = b"", pace: int | None = None,
+    data: bytes, bits: int = 16, *, kind: int = 1, channels: int = 1, rate: int = 8000, extensible: bool = False,
+    head: bytes = b"RIFF", size: int | None = None, long: int | None = None, whole: int | None = None,
+    before: bytes = b"", after: bytes = b"", pace: int | None = None,
 ) -> bytes:  # fmt: skip
-    """A WAV file written from its specification, of samples such as ``i3``, whose header may lie.
+    """A WAV file written from its specification, whose header may lie: `kind` is 1 for integers and 3 for floats.
 
-    `size` and `long` are the sizes of its samples in their chunk and in RF64's header, `whole` that of the file, `pace`
-    the bytes a second, and `tag` the number of its format, by itself 1 for integers and 3 for floats.
+    `size` and `long` are the sizes of its samples in their chunk and in RF64's header, `whole` that of the file, and
+    `pace` the bytes a second.
     """
-    order, width = ">" if head == b"RIFX" else "<", int(kind[1])
-    tag, block = tag or (3 if kind[0] == "f" else 1), channels * width
+    order, block = ">" if head == b"RIFX" else "<", channels * bits // 8
     form = struct.pack(
-        f"{order}HHIIHH", 0xFFFE if extensible else tag, channels, rate, rate * block if pace is None else pace, block,
-        8 * width,
+        f"{order}HHIIHH", 0xFFFE if extensible else kind, channels, rate, rate * block if pace is None else pace, block,
+        bits,
     )  # fmt: skip
     if extensible:
-        form += struct.pack(f"{order}HHIIHH", 22, 8 * width, 0, tag, 0, 16) + GUID
+        form += struct.pack(f"{order}HHIIHH", 22, bits, 0, kind, 0, 16) + GUID
     body = before + chunk(b"fmt ", form, order) + chunk(b"data", data, order, size) + after
     if head == b"RF64":
         sizes = struct.pack("<QQQI", len(body) + 40, len(data) if long is None else long, len(data) // block, 0)
@@ -57,13 +56,14 @@ def wav(
 
 
 def pieced(kind: str, count: int = 12, channels: int = 1, *, head: bytes = b"RIFF", **header: Any) -> bytes:
-    """A WAV file of random samples."""
-    random = np.random.default_rng(int(kind[1]))
+    """A WAV file of random samples, such as of ``i3``."""
+    width = int(kind[1])
+    random = np.random.default_rng(width)
     if kind[0] == "f":
         data = random.normal(size=count * channels).astype(f"{'>' if head == b'RIFX' else '<'}{kind}").tobytes()
     else:
-        data = random.bytes(count * channels * int(kind[1]))
-    return wav(data, kind, channels, head=head, **header)
+        data = random.bytes(count * channels * width)
+    return wav(data, 8 * width, kind=3 if kind[0] == "f" else 1, channels=channels, head=head, **header)
 
 
 def packed(values: np.ndarray, width: int = 2) -> bytes:
@@ -105,7 +105,7 @@ def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_integers_are_scaled_by_their_type_exactly(width: int, tmp_path: Path) -> None:
     full = 2 ** (8 * width - 1)
     whole = np.array([-full, full - 1, 0, 1, -1, full // 2, -full // 3])
-    (tmp_path / "a.wav").write_bytes(wav(packed(whole, width), f"i{width}", rate=44100))
+    (tmp_path / "a.wav").write_bytes(wav(packed(whole, width), 8 * width, rate=44100))
     wave = fs.Samples.from_wav(str(tmp_path / "a.wav"), 150.0)
     np.testing.assert_array_equal(wave.values, 150.0 * (whole / full))
     assert (wave.rate, wave.start) == (44100.0, 0.0)
@@ -146,8 +146,11 @@ BAD_WAV: list[tuple[bytes, str]] = [
     (MONO[:22] + b"\0\0" + MONO[24:], "'a.wav' is broken"),
     (wav(bytes(8), rate=0), "'a.wav' is broken: its header gives a rate of 0 Hz"),
     (wav(b""), "'a.wav' holds no samples"),
-    (wav(bytes(9), "i1", tag=6), "'a.wav' holds samples as ALAW; allowed: PCM or float (convert it)"),
-    (wav(np.array([0, np.nan], "<f4").tobytes(), "f4"), "'a.wav': sample number 1 is nan; allowed: finite numbers"),
+    (wav(bytes(9), 8, kind=6), "'a.wav' holds samples as ALAW; allowed: PCM or float (convert it)"),
+    (
+        wav(np.array([0, np.nan], "<f4").tobytes(), 32, kind=3),
+        "'a.wav': sample number 1 is nan; allowed: finite numbers",
+    ),
     (wav(b"\0\0"), "samples is shape (1,); allowed: one row of two or more"),
     (pieced("i2", after=chunk(b"data", bytes(24))), "holds two 'data' chunks; allowed: one"),
     (pieced("i2", size=60, whole=36 + 24), "is cut short: it ends before the samples that its header promises"),
@@ -234,7 +237,7 @@ def test_broken_headers_are_refused_in_one_sentence(tmp_path: Path) -> None:
     random = np.random.default_rng(1)
     path = tmp_path / "a.wav"
     for _ in range(cases(300, 100)):
-        data = bytearray(STEREO if random.random() < 0.5 else wav(packed(np.arange(9), 3), "i3", extensible=True))
+        data = bytearray(STEREO if random.random() < 0.5 else wav(packed(np.arange(9), 3), 24, extensible=True))
         for place in random.integers(0, 60, random.integers(1, 4)):
             data[place] = random.integers(256)
         path.write_bytes(data)

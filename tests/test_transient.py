@@ -15,7 +15,7 @@ from scenes import table1
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 
-CHIRP_T = 0.02
+CHIRP_T = 0.01
 
 
 def chirp_segments():
@@ -36,7 +36,7 @@ SCENES = {
     "sine 100 Hz": (fs.Sine(200.0, 100.0), ref.sine_segments(200.0, 100.0, 0.03), 100.0),
     "sine 5 kHz with offset": (BIASED, ref.sine_segments(150.0, 5000.0, 2e-3, phase=math.pi / 6, offset=40.0), 5000.0),
     "square 100 Hz": (fs.Square(200.0, 100.0), ref.square_segments(200.0, 100.0, 3), 100.0),
-    "square 5 kHz, duty 0.3": (fs.Square(200.0, 5000.0, 0.3), ref.square_segments(200.0, 5000.0, 8, duty=0.3), 5000.0),
+    "square 5 kHz, duty 0.3": (fs.Square(200.0, 5000.0, 0.3), ref.square_segments(200.0, 5000.0, 4, duty=0.3), 5000.0),
     "chirp 50 Hz to 2 kHz": (fs.Chirp(150.0, 50.0, 2000.0, CHIRP_T), chirp_segments(), 500.0),
     "PWL with a jump": (fs.PWL(*zip(*POINTS, strict=True)), ref.pwl_segments(POINTS), 100.0),
 }

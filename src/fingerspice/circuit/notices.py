@@ -17,7 +17,7 @@ from fingerspice.circuit.spectrum import energy_outside, skin_error, surely_wide
 from fingerspice.circuit.topology import driving, driving_sources
 from fingerspice.circuit.usual import unusual_of_changed
 from fingerspice.waveforms.ramps import PWL
-from fingerspice.waveforms.recorded import as_samples
+from fingerspice.waveforms.samples import as_samples
 from fingerspice.waveforms.waveform import Waveform
 
 # Half-width of a band around a frequency, relative to the frequency, in which the skin's data change by 3 %; and the

@@ -227,31 +227,26 @@ def _numbers(
     """The numbers, shape (n_row, count), and the message about the first cell of each column that is none."""
     faults: dict[int, str] = {}
     try:
-        table = np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None)
+        return np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None), faults
     except ValueError:
         # NumPy reads neither SPICE's scales nor quoted cells, and its message does not help: read the rows one by one.
-        table = np.array([_row(path, number, line, separator, count, faults) for number, line in rows])
-    return np.asarray(table, float), faults
+        table = np.full((len(rows), count), np.nan)
+    for (number, line), found in zip(rows, table, strict=True):
+        _refuse_semicolons(path, number, line)
+        cells = _cells(line, separator)
+        if len(cells) != count:
+            raise InputError(f"'{path}', line {number} has {len(cells)} cells; allowed: {count}, as in the first row")
+        for column, cell in enumerate(cells):
+            try:
+                found[column] = _number(cell)
+            except ValueError as error:
+                reason = str(error) if cell else f"the cell in column {column} is empty; allowed: numbers"
+                faults.setdefault(column, f"'{path}', line {number}: {reason}")
+    return table, faults
 
 
-def _row(
-    path: Path, number: int, line: str, separator: str | None, count: int, faults: dict[int, str]
-) -> list[float]:  # fmt: skip
-    _refuse_semicolons(path, number, line)
-    cells = _cells(line, separator)
-    if len(cells) != count:
-        raise InputError(f"'{path}', line {number} has {len(cells)} cells; allowed: {count}, as in the first row")
-    found = []
-    for column, cell in enumerate(cells):
-        try:
-            found.append(float(cell))
-            continue
-        except ValueError:
-            pass
-        try:
-            found.append(parse_number(cell))
-        except ValueError as error:
-            reason = str(error) if cell else f"the cell in column {column} is empty; allowed: numbers"
-            faults.setdefault(column, f"'{path}', line {number}: {reason}")
-            found.append(np.nan)
-    return found
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return parse_number(cell)
