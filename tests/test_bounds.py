@@ -14,8 +14,10 @@ from deck_edits import edited
 from fingerspice.engine.collocation import loopstate
 from fingerspice.solve.problem import MOST_BYTES
 from fingerspice.waveforms import bounds
+from fingerspice.waveforms.ramps import Ramps
 from processes import ended, start
 from scenes import table1
+from waveform_cases import CASES, Case
 
 GIB = 2**30
 #: What the engine, compiled, and the libraries take; not a tenth of what these requests would.
@@ -71,18 +73,9 @@ def test_ten_values_in_a_year_of_squares_need_no_list_of_its_edges() -> None:
     np.testing.assert_array_equal(square.value(edges, "left") - square.value(edges), [400.0, 400.0])
 
 
-@pytest.mark.parametrize(
-    "wave",
-    [
-        fs.Square(200.0, 100.0, 0.3, delay=1e-3),
-        fs.Pulse(-1.0, 2.0, 1e-3, 1e-4, 0.0, 2e-3, 0.01),
-        fs.PWL((0.0, 1e-3, 1e-3, 4e-3), (0.0, 1.0, -1.0, 0.5), repeat=1e-3),
-    ],
-    ids=lambda w: type(w).__name__,
-)
-def test_values_do_not_depend_on_the_windows_they_are_looked_up_in(
-    wave: fs.Waveform, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("case", [c for c in CASES if c.period and isinstance(c.waveform, Ramps)], ids=lambda c: c.name)
+def test_values_do_not_depend_on_the_windows_they_are_looked_up_in(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    wave = case.waveform
     rng = np.random.default_rng(7)
     t = np.concatenate([rng.uniform(-0.01, 0.5, 300), wave.breakpoints(0.0, 0.5)]).reshape(-1, 1)
     whole = [wave.value(t, side) for side in ("left", "right")]

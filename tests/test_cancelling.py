@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
-from scenes import table1
+from scenes import cases, table1
 
 THREE_PHASES = """Three sources of 50 V, 120 degrees apart
 .include fingerspice.lib
@@ -46,7 +46,7 @@ def test_a_balanced_drive_is_0_v_and_no_trouble(law: str, beside: str) -> None:
         assert any("as good as 0" in text for text in run.warnings)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=cases(30, 6))
 @given(
     st.integers(2, 7), st.floats(0.0, 360.0), st.sampled_from([0.3, 50.0, 1e3 / 3, 5e3]), st.sampled_from([1e-3, 1e-6])
 )
@@ -121,9 +121,8 @@ def test_a_run_that_implicit_steps_take_over_says_so_and_why(monkeypatch: pytest
     monkeypatch.setattr(simulation, "solve_exponential", gives_up)
     monkeypatch.setattr(nodal, "TELL_AFTER", 0.0)
     monkeypatch.setattr(nodal, "tell", told.append)
-    with pytest.warns(
-        fs.FingerspiceWarning, match=r"exponential steps gave up at t = 0.05 s.*implicit steps took over"
-    ):
+    said = r"exponential steps gave up at t = 0.05 s.*implicit steps took over"
+    with pytest.warns(fs.FingerspiceWarning, match=said):
         run = fs.simulate(table1(), t_stop=0.05, rtol=1e-11)
     assert run.method == "radau"
     assert len(told) == 1

@@ -115,35 +115,32 @@ def test_ltspices_tran_needs_no_step(line: str, tran: Tran, noted: bool) -> None
     assert said == ([expected] if noted else [])
 
 
-def test_sine_is_sin() -> None:
-    circuit, said = read(("SIN(0 200 100)", "SINE(1 200 100 1m 2 30)"))
-    assert circuit["Vdrive"].waveform == fs.Sine(200.0, 100.0, 1.0, 30.0, 1e-3, 2.0)
-    assert said == []
-
-
-def test_relative_times_of_ltspices_pwl_are_named() -> None:
-    circuit, said = read(("SIN(0 200 100)", "PWL(0 0 1m 5 +2m 0)"))
-    assert circuit["Vdrive"].waveform == fs.PWL((0.0, 1e-3, 2e-3), (0.0, 5.0, 0.0))
-    assert said == [
-        "deck.cir:3:16: Vdrive: the time +2m is counted from 0, as in ngspice; LTspice counts it from the point before"
-    ]
-
-
-def test_a_sine_without_its_frequency_is_named() -> None:
-    circuit, said = read(("SIN(0 200 100)", "SIN(200 100)"))
-    assert circuit["Vdrive"].waveform == fs.Sine(100.0, 20.0, 200.0)
-    assert said == [
-        "deck.cir:3:16: Vdrive: SIN leaves out FREQ, which is 1/TSTOP then, 20 Hz; its values are VO VA FREQ"
-    ]
+@pytest.mark.parametrize(
+    ("source", "wave", "expected"),
+    [
+        ("SINE(1 200 100 1m 2 30)", fs.Sine(200.0, 100.0, 1.0, 30.0, 1e-3, 2.0), ""),
+        (
+            "PWL(0 0 1m 5 +2m 0)", fs.PWL((0.0, 1e-3, 2e-3), (0.0, 5.0, 0.0)),
+            "the time +2m is counted from 0, as in ngspice; LTspice counts it from the point before",
+        ),
+        (
+            "SIN(200 100)", fs.Sine(100.0, 20.0, 200.0),
+            "SIN leaves out FREQ, which is 1/TSTOP then, 20 Hz; its values are VO VA FREQ",
+        ),
+    ],
+)  # fmt: skip
+def test_what_ltspice_reads_in_another_way_is_named(source: str, wave: fs.Waveform, expected: str) -> None:
+    circuit, said = read(("SIN(0 200 100)", source))
+    assert circuit["Vdrive"].waveform == wave
+    assert said == ([f"deck.cir:3:16: Vdrive: {expected}"] if expected else [])
 
 
 @pytest.mark.parametrize("beside", ["", "R9 drive 0 1k\n"], ids=["stack", "network"])
 def test_a_run_whose_source_has_ac_alone_is_warned_about(beside: str) -> None:
     circuit, said = read(("SIN(0 200 100)", "AC 200 100"), (".end", f"{beside}.end"))
     assert said == []
-    with pytest.warns(
-        fs.FingerspiceWarning, match=r"0 all the time: Vdrive has AC alone, which drives sweeps .* SIN\("
-    ):
+    expected = r"0 all the time: Vdrive has AC alone, which drives sweeps .* SIN\("
+    with pytest.warns(fs.FingerspiceWarning, match=expected):
         fs.simulate(circuit, t_stop=1e-4)
 
 
@@ -152,12 +149,6 @@ def test_a_misspelt_library_is_told_of_ours(tmp_path: Path) -> None:
     path.write_text(edited(("fingerspice.lib", "finger_spice.lib")))
     with pytest.raises(fs.InputError, match=r"'finger_spice.lib' does not exist; did you mean 'fingerspice.lib'\?"):
         fs.read_netlist(path)
-
-
-def test_params_is_param() -> None:
-    circuit, said = read(("d=3.5u", "d={g}"), (".end", ".params g=3u\n.end"))
-    assert circuit["Xgap"].values["d"] == 3e-6
-    assert said == []
 
 
 def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
@@ -173,6 +164,7 @@ def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
     ("line", "value"),
     [
         ("R9 drive 0 r=10k", 1e4),
+        ("R9 drive 0 r={g}", 1e4),
         ("R9 drive 0 R={2*5k}", 1e4),
         ("R9 drive 0 10k m=4", 2.5e3),
         ("R9 drive 0 r=10k m=0.5", 2e4),
@@ -183,7 +175,7 @@ def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
     ],
 )
 def test_values_of_r_and_c_by_name_and_by_number_of_parts(line: str, value: float) -> None:
-    circuit, said = read((".end", f"{line}\n.end"))
+    circuit, said = read((".end", f".params g=10k\n{line}\n.end"))
     assert circuit[line[:2]].values["value"] == pytest.approx(value, rel=1e-15)
     assert said == []
 
@@ -242,19 +234,14 @@ DOUBTFUL = {
 RIGHT = [
     *("V1 a 0 SIN(0,200,100)", "V1 a 0 SIN(0, 200, 100)", "V1 a 0 PWL(0,0 1m,5 2m,0)", "V1 a 0 PWL(0 0, 1m 5, 2m 0)"),
     *("R1 1,2 10k", "R1 a b {max(1,2)*1k}", "R1 a b '1k*max(1,2)'", ".param w={min(3,5)}", ".ic v(a)=1, v(b)=2"),
-    *("X1 a,b,c LAYER d=1u,eps_r=2", ".tran 1u,50m", "V1 a 0 SIN 0,200,100", "V1 a 0 PWL(0,0,1m,5)", ".title a 1,5"),
+    *("X1 a,b,c LAYER d=1u,eps_r=2", ".tran 1u,50m", "V1 a 0 SIN 0,200,100", "V1 a 0 PWL(0,0,1m,5)"),
 ]
 
 
-@pytest.mark.parametrize("line", DOUBTFUL)
-def test_a_decimal_comma_is_named(line: str) -> None:
-    assert (decimal_comma(line) or "").endswith(DOUBTFUL[line])
-
-
-@pytest.mark.parametrize("line", RIGHT)
-def test_a_comma_that_separates_is_right(line: str) -> None:
-    if not line.startswith(".title"):
-        assert decimal_comma(line) is None
+@pytest.mark.parametrize(("line", "said"), [*DOUBTFUL.items(), *((line, None) for line in RIGHT)])
+def test_a_decimal_comma_is_named_and_a_comma_that_separates_is_right(line: str, said: str | None) -> None:
+    found = decimal_comma(line)
+    assert found is None if said is None else (found or "").endswith(said)
 
 
 def test_a_decimal_comma_that_makes_another_circuit_is_warned_about() -> None:
@@ -308,15 +295,11 @@ def test_a_library_outside_the_decks_folder_is_not_looked_at(tmp_path: Path) -> 
 
 NAMES = ["D[0]", "A<3>", "unconnected-(U1-NC-Pad4)", "/OUT(+)", "Net-(C1-Pad1)", "/sub/a~b", "N$1", "+V"]
 DECKS = {
-    "KiCad, Eagle and busses": "\n".join(
-        [
-            ".title names",
-            "V1 in 0 PULSE(0 1 1u 10n 10n 5u 10u)",
-            *(f"R{i} in {name} 1k\nC{i} {name} 0 {i}n" for i, name in enumerate(NAMES, 1)),
-            ".ic v(unconnected-(U1-NC-Pad4))=0.5",
-            ".tran 10n 20u uic",
-        ]
-    ),
+    "KiCad, Eagle and busses": """.title names
+V1 in 0 PULSE(0 1 1u 10n 10n 5u 10u)
+"""
+    + "".join(f"R{i} in {name} 1k\nC{i} {name} 0 {i}n\n" for i, name in enumerate(NAMES, 1))
+    + ".ic v(unconnected-(U1-NC-Pad4))=0.5\n.tran 10n 20u uic",
     "PySpice": """.title Low-Pass RC Filter
 Vinput in 0 DC 0V AC 1V SIN(0V 1V 50kHz 0s 0Hz)
 R1 in out 1kOhm
@@ -412,17 +395,11 @@ C1 A B {C}
 def test_decks_of_other_tools_have_ngspices_voltages(text: str, tmp_path: Path) -> None:
     circuit = fs.parse_netlist(text)
     stop = circuit.tran.stop
-    block = [
-        ".control",
-        "run",
-        "set wr_singlescale",
-        "set numdgt=15",
-        "set wr_vecnames",
-        "wrdata out.txt all",
-        "quit 0",
-    ]
+    block = (
+        ".control\nrun\nset wr_singlescale\nset numdgt=15\nset wr_vecnames\nwrdata out.txt all\nquit 0\n.endc\n.end\n"
+    )
     bare = re.sub(r"(?im)^\.end\s*$", "", with_max_step(text, stop / 20_000))
-    (tmp_path / "deck.cir").write_text("\n".join([bare, *block, ".endc", ".end", ""]))
+    (tmp_path / "deck.cir").write_text(f"{bare}\n{block}")
     call_ngspice(tmp_path, "deck.cir")
     head, *rows = (tmp_path / "out.txt").read_text().splitlines()
     names, table = head.split(), np.array([row.split() for row in rows], float)

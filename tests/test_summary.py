@@ -11,21 +11,18 @@ from fingerspice.results import steps
 from fingerspice.results.summary import Figures
 from scenes import deck, table1
 
-NAMES = {
-    "f_el_mean": "f_el_mean", "f_el_mean_periodic": "f_el_mean_periodic", "f_el_peak": "f_el_peak",
-    "f_t_mean": "f_t_mean", "f_t_mean_periodic": "f_t_mean_periodic", "friction_mean": "friction_mean",
-    "area_mean": "area_mean", "u_gap_peak": "u_gap_peak", "u_gap_rms": "u_gap_rms",
-    "u_gap_amplitude": "u_gap_amplitude", "u_gap_phase_deg": "u_gap_phase_deg",
-}  # fmt: skip
+NAMES = [
+    "f_el_mean", "f_el_mean_periodic", "f_el_peak", "f_t_mean", "f_t_mean_periodic", "friction_mean", "area_mean",
+    "u_gap_peak", "u_gap_rms", "u_gap_amplitude", "u_gap_phase_deg",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("area", ["coupled", "frozen"])
 def test_every_attribute_is_the_summarys_entry_whichever_is_asked_for_first(area: str) -> None:
     run, other = (fs.simulate(table1(), area=area, t_stop=0.02) for _ in range(2))
     summary = other.summary()
-    for name, key in NAMES.items():
-        assert getattr(run, name) == summary[key], name
-        assert getattr(other, name) == summary[key], name
+    for name in NAMES:
+        assert getattr(run, name) == getattr(other, name) == summary[name], name
     assert run.summary() == summary
 
 
@@ -54,9 +51,9 @@ def test_a_steady_state_has_the_figures_of_its_period() -> None:
 def test_several_fingers_have_a_figure_each() -> None:
     run = fs.simulate(fs.read_netlist("circuits/two_fingers.cir"))
     summary = run.summary()
-    for name, key in NAMES.items():
-        signal = next(k for k in ("f_el", "f_t", "friction", "area", "u_gap") if key.startswith(f"{k}_"))
-        kept = [summary.get(f"{signal}:{gap}{key.removeprefix(signal)}") for gap in run.gaps]
+    for name in NAMES:
+        signal = next(k for k in ("f_el", "f_t", "friction", "area", "u_gap") if name.startswith(f"{k}_"))
+        kept = [summary.get(f"{signal}:{gap}{name.removeprefix(signal)}") for gap in run.gaps]
         if None not in kept:
             np.testing.assert_array_equal(getattr(run, name), kept)
             assert not getattr(run, name).flags.writeable

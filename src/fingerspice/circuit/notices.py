@@ -17,7 +17,7 @@ from fingerspice.circuit.spectrum import is_near, skin_error
 from fingerspice.circuit.topology import driving, driving_sources
 from fingerspice.circuit.usual import unusual_of_changed
 from fingerspice.waveforms.ramps import PWL
-from fingerspice.waveforms.recorded import as_samples
+from fingerspice.waveforms.samples import as_samples
 from fingerspice.waveforms.waveform import Waveform
 
 # Largest relative difference of frequencies that are the same; and the words by which a warning about a SKIN begins.

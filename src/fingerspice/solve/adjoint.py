@@ -32,8 +32,7 @@ from fingerspice.solve.recordings.pieces import driving
 from fingerspice.solve.recordings.run import ready
 from fingerspice.solve.simulation import asked
 from fingerspice.waveforms.combinations import Sum
-from fingerspice.waveforms.recorded import as_samples
-from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.samples import Samples, as_samples
 from fingerspice.waveforms.waveform import DC
 
 # Steps of an interval: of the first two numbers, or below this `rtol` of the second and third, and twice as many while

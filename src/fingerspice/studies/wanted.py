@@ -72,7 +72,7 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Profi
     if len(named) != 1:
         has = "columns force and friction" if named else "no column named force or friction"
         raise InputError(f"'{path}' has {has}; it has {found.listed()}; allowed: one column of these names")
-    values = found.newtons(kinds.index(named[0]))
+    values = found.scaled(kinds.index(named[0]), "N")
     if values.size < 2:
         raise InputError(f"'{path}' has one row; allowed: two or more")
     timed = next((i for i, name in enumerate(kinds) if name in ("t", "time")), None)
@@ -80,7 +80,7 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Profi
         if rate is None:
             raise InputError(f"'{path}' has no column of times and no rate; allowed: a column time, or a rate in Hz")
         return named[0], as_profile(values, named[0], rate, None)
-    return named[0], _timed(found, found.seconds(timed), values, rate)
+    return named[0], _timed(found, found.scaled(timed, "s"), values, rate)
 
 
 def _timed(found: Columns, t: FloatArray, values: FloatArray, rate: float | None) -> Profile:

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray, real_number
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-
-if TYPE_CHECKING:
-    from fingerspice.waveforms.waveform import Waveform
 
 #: Largest and smallest absolute value allowed of a nonzero number, by unit (the entry V also serves A).
 RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}
@@ -24,25 +18,6 @@ ANY_RANGE = (1e30, 1e-30)
 MOST_LISTED = 20_000_000
 #: Number of breakpoints in a window of time; the values at all times in one window are looked up together.
 _WINDOW = 1_000_000
-
-
-def take_numbers(waveform: Waveform, endless: tuple[str, ...] = ()) -> None:
-    """Make doubles of a waveform's numeric fields; those in `endless` may be infinite.
-
-    Raises
-    ------
-    InputError
-        If one is no number, NaN, infinite, or out of range.
-    """
-    for name in (field.name for field in fields(waveform) if field.name in waveform.units):  # type: ignore[arg-type]
-        what, unit = f"{type(waveform).__name__} {name}", waveform.units[name]
-        value = real_number(what, getattr(waveform, name), f"a number of {unit}" if unit else "a number")
-        if not (math.isfinite(value) or (value == math.inf and name in endless)):
-            raise InputError(f"{what} is {value}; allowed: a finite number")
-        largest, smallest = RANGES.get(unit, ANY_RANGE)
-        if value != 0.0 and not smallest <= abs(value) <= largest:
-            check_range(what, value, unit)
-        object.__setattr__(waveform, name, value)
 
 
 def check_range(what: str, values: ArrayLike, unit: str) -> None:
@@ -57,12 +32,9 @@ def check_range(what: str, values: ArrayLike, unit: str) -> None:
 
 
 def runs_through(first: float, last: float, count: int, t0: float, t1: float) -> FloatArray:
-    """Indices of the periods `first` to `last`, which cover t0 to t1 (s); each period has `count` breakpoints.
+    """Indices of the periods `first` to `last`, which cover t0 to t1 (s); each has `count` breakpoints.
 
-    Raises
-    ------
-    InputError
-        If these periods together have more than `MOST_LISTED` breakpoints.
+    More than `MOST_LISTED` breakpoints are refused.
     """
     total = (last - first + 1.0) * count
     if not total <= MOST_LISTED:

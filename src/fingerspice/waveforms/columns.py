@@ -21,6 +21,8 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e
 _VOLTS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6, "μV": 1e-6, "kV": 1e3}
 _AMPERES = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6, "μA": 1e-6, "nA": 1e-9}
 _NEWTONS = {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "µN": 1e-6, "μN": 1e-6, "kN": 1e3}
+#: Units of a column in s, of one in V (or in A, for a current), and of one in N, with their sizes.
+_UNITS = {"s": _SECONDS, "V": _VOLTS | _AMPERES, "N": _NEWTONS}
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 # Lines of comments; a comment behind numbers that blanks separate, where without a blank a semicolon separates cells.
 _COMMENTED = ("#", ";", "*")
@@ -41,6 +43,7 @@ class Columns:
     units: tuple[str, ...] = ()  # Of every column, an empty text where it has none; empty where there is no header
     lines: NDArray[np.int64] | None = None  # (n_row,): of each row, from 1; None for a file without lines
     faults: dict[int, str] = field(default_factory=dict)  # About the first cell that is no number, by column
+    words: tuple[str, ...] = ()  # Of the column of labels, in which each is written as its number among them
 
     def numbers(self, column: int) -> FloatArray:
         """The numbers of a column (n_row,), all finite; errors name the line."""
@@ -81,19 +84,9 @@ class Columns:
             raise InputError(f"'{self.file}' has no column {column}; it has {self.listed()}")
         return int(column)
 
-    def seconds(self, column: int) -> FloatArray:
-        """A column in s, shape (n_row,)."""
-        return self._scaled(column, _SECONDS)
-
-    def volts(self, column: int) -> FloatArray:
-        """A column in V (or in A, for a current), shape (n_row,)."""
-        return self._scaled(column, _VOLTS | _AMPERES)
-
-    def newtons(self, column: int) -> FloatArray:
-        """A column in N, shape (n_row,)."""
-        return self._scaled(column, _NEWTONS)
-
-    def _scaled(self, column: int, known: dict[str, float]) -> FloatArray:
+    def scaled(self, column: int, to: str) -> FloatArray:
+        """A column in s, V or N, shape (n_row,); one in V may be a current, in A."""
+        known = _UNITS[to]
         unit = self.units[column] if self.units else ""
         factors = {name.lower(): factor for name, factor in known.items()}
         if unit and unit.lower() not in factors:
@@ -115,45 +108,22 @@ class Columns:
         return Columns(self.file, (), self.data.reshape(-1, 2), (), lines)
 
 
-def read_text_columns(path: Path) -> Columns:
-    """Columns of a text file, which has rows of numbers with the same count of cells; errors name the line."""
-    return _parsed(path, _lines(path))
+def read_text_columns(path: Path, label: str | None = None) -> Columns:
+    """Columns of a text file, which has rows of numbers with the same count of cells; errors name the line.
 
-
-def read_labelled_columns(path: Path, label: str) -> tuple[Columns, tuple[str, ...]]:
-    """Columns of a text file, and the words of the one named `label`, in which each becomes its number among them."""
-    lines, words, place = _lines(path), dict[str, int](), -1
-    separator: str | None = None
-    for number, line in enumerate(lines):
-        if not line.strip() or line.lstrip().startswith(_COMMENTED):
-            continue
-        if place < 0:
-            separator = "\t" if "\t" in line else "," if "," in line else None
-            names = [_unit(cell)[0].lower() for cell in _cells(line, separator)]
-            if label.lower() not in names:
-                raise InputError(f"'{path}' has no column {label!r} in its header; it has {', '.join(names)}")
-            place = names.index(label.lower())
-            continue
-        cells = _cells(line, separator)
-        if place < len(cells):
-            cells[place] = str(words.setdefault(cells[place], len(words)))
-            lines[number] = (separator or " ").join(cells)
-    return _parsed(path, lines), tuple(words)
-
-
-def _lines(path: Path) -> list[str]:
-    data = path.read_bytes()
+    The column named `label` holds words.
+    """
+    data, words = path.read_bytes(), dict[str, int]()
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     if b"\0" in data and not wide:
         raise InputError(f"'{path}' is no text; allowed: a table as text, or an NPZ file")
     try:
-        return data.decode("utf-16" if wide else "utf-8-sig").splitlines()
+        lines = data.decode("utf-16" if wide else "utf-8-sig").splitlines()
     except UnicodeDecodeError:
         # Windows' Latin-1, in which spreadsheets and LTspice write the micro sign.
-        return data.decode("cp1252", "replace").splitlines()
-
-
-def _parsed(path: Path, lines: list[str]) -> Columns:
+        lines = data.decode("cp1252", "replace").splitlines()
+    if label is not None:
+        _number_words(path, lines, label, words)
     lines = [_COMMENT.sub(r"\1", line) if ";" in line else line for line in lines]
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
     steps = [one for one in numbered if one[1].startswith(_STEPPED)]
@@ -167,14 +137,42 @@ def _parsed(path: Path, lines: list[str]) -> Columns:
         raise InputError(f"'{path}' holds no rows of numbers")
     begin, line = rows[first]
     _refuse_semicolons(path, begin, line)
-    _refuse_decimal_commas(path, begin, line)
-    separator = "\t" if "\t" in line else "," if "," in line else None
+    # In a comma-separated table the number of cells shows decimal commas.
+    cells = line.split()
+    commas = list(filter(_DECIMAL_COMMA.fullmatch, cells))
+    if len(cells) > 1 and commas and not any(cell.endswith(",") for cell in cells):
+        said = f"{commas[0]} has a decimal comma; allowed: points, {commas[0].replace(',', '.')}"
+        raise InputError(f"'{path}', line {begin}: {said}")
+    separator = _separator(line)
     count = len(_cells(line, separator))
     header = [_unit(name) for name in _header(path, numbered, begin, separator, count)]
     names, units = zip(*header, strict=True) if header else ((), ())
     table, faults = _numbers(path, rows[first:], separator, count)
     places = np.array([number for number, _ in rows[first:]])
-    return Columns(path, names, table, units, places, faults)
+    return Columns(path, names, table, units, places, faults, tuple(words))
+
+
+def _number_words(path: Path, lines: list[str], label: str, words: dict[str, int]) -> None:
+    """Write the words of one column as numbers, into the lines, and list them."""
+    place, separator = -1, None
+    for number, line in enumerate(lines):
+        if not line.strip() or line.lstrip().startswith(_COMMENTED):
+            continue
+        if place < 0:
+            separator = _separator(line)
+            names = [_unit(cell)[0].lower() for cell in _cells(line, separator)]
+            if label.lower() not in names:
+                raise InputError(f"'{path}' has no column {label!r} in its header; it has {', '.join(names)}")
+            place = names.index(label.lower())
+            continue
+        cells = _cells(line, separator)
+        if place < len(cells):
+            cells[place] = str(words.setdefault(cells[place], len(words)))
+            lines[number] = (separator or " ").join(cells)
+
+
+def _separator(line: str) -> str | None:
+    return "\t" if "\t" in line else "," if "," in line else None
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
@@ -204,18 +202,6 @@ def _refuse_semicolons(path: Path, number: int, line: str) -> None:
         raise InputError(f"{problem}; allowed: commas, tabs or blanks between numbers with points")
 
 
-def _refuse_decimal_commas(path: Path, number: int, line: str) -> None:
-    """Refuse cells such as ``0,5`` separated by blanks; in a comma-separated table the number of cells shows them."""
-    cells = line.split()
-    if len(cells) > 1 and any(map(_DECIMAL_COMMA.fullmatch, cells)) and not any(c.endswith(",") for c in cells):
-        cell = next(filter(_DECIMAL_COMMA.fullmatch, cells))
-        raise InputError(f"'{path}', line {number}: {_comma(cell)}")
-
-
-def _comma(cell: str) -> str:
-    return f"{cell} has a decimal comma; allowed: points, {cell.replace(',', '.')}"
-
-
 def _header(
     path: Path, numbered: list[tuple[int, str]], begin: int, separator: str | None, count: int
 ) -> tuple[str, ...]:
@@ -241,29 +227,22 @@ def _numbers(
     """The numbers, shape (n_row, count), and the message about the first cell of each column that is none."""
     faults: dict[int, str] = {}
     try:
-        table = np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None)
+        return np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None), faults
     except ValueError:
         # NumPy reads neither SPICE's scales nor quoted cells, and its message does not help: read the rows one by one.
-        table = np.array([_row(path, number, line, separator, count, faults) for number, line in rows])
-    return np.asarray(table, float), faults
-
-
-def _row(
-    path: Path, number: int, line: str, separator: str | None, count: int, faults: dict[int, str]
-) -> list[float]:  # fmt: skip
-    _refuse_semicolons(path, number, line)
-    cells = _cells(line, separator)
-    if len(cells) != count:
-        raise InputError(f"'{path}', line {number} has {len(cells)} cells; allowed: {count}, as in the first row")
-    found = []
-    for column, cell in enumerate(cells):
-        try:
-            found.append(_number(cell))
-        except ValueError as error:
-            reason = str(error) if cell else f"the cell in column {column} is empty; allowed: numbers"
-            faults.setdefault(column, f"'{path}', line {number}: {reason}")
-            found.append(np.nan)
-    return found
+        table = np.full((len(rows), count), np.nan)
+    for (number, line), found in zip(rows, table, strict=True):
+        _refuse_semicolons(path, number, line)
+        cells = _cells(line, separator)
+        if len(cells) != count:
+            raise InputError(f"'{path}', line {number} has {len(cells)} cells; allowed: {count}, as in the first row")
+        for column, cell in enumerate(cells):
+            try:
+                found[column] = _number(cell)
+            except ValueError as error:
+                reason = str(error) if cell else f"the cell in column {column} is empty; allowed: numbers"
+                faults.setdefault(column, f"'{path}', line {number}: {reason}")
+    return table, faults
 
 
 def _number(cell: str) -> float:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property, reduce
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_numbers
-from fingerspice.waveforms.bounds import runs_through, take_numbers
+from fingerspice.waveforms.bounds import runs_through
 from fingerspice.waveforms.waveform import DC, Sine, Waveform, as_waveform, require
 
 #: Most cycles of a part in a common period.
@@ -24,6 +25,23 @@ _ROUNDING = 2e-15
 
 class _Combination(Waveform):
     parts: tuple[Waveform, ...]
+    _joined: ClassVar[Callable[..., Any]]  # Sum or product of numbers or arrays
+
+    @staticmethod
+    def _joined_terms(a: FloatArray, b: FloatArray) -> FloatArray:
+        """Terms (m, k, 6) of the sum or product of two parts."""
+        raise NotImplementedError
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        return np.asarray(self._joined(part.value(t, side) for part in self.parts))
+
+    def cancelling(self, t0: float, t1: float) -> float:
+        return float(self._joined(max(part.peak(t0, t1), part.cancelling(t0, t1)) for part in self.parts))
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
+        blocks = [part.terms(start, stop) for part in self.parts]
+        known = [block for block in blocks if block is not None]
+        return reduce(self._joined_terms, known) if len(known) == len(blocks) else None
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         return np.unique(np.concatenate([part.breakpoints(t0, t1) for part in self.parts]))
@@ -40,11 +58,11 @@ class _Combination(Waveform):
         return max(part.precision for part in self.parts)
 
     @property
-    def settled(self) -> float:
+    def settled(self) -> float:  # type: ignore[override]
         return max(part.settled for part in self.parts)
 
     @property
-    def course(self) -> tuple[float, float]:
+    def course(self) -> tuple[float, float]:  # type: ignore[override]
         first, last = zip(*(part.course for part in self.parts), strict=True)
         return min(first), max(last)
 
@@ -76,17 +94,11 @@ class Sum(_Combination):
     """Sum of waveforms; its fundamental is the lowest tone of its parts, if all other tones are harmonics of it."""
 
     parts: tuple[Waveform, ...]
+    _joined = staticmethod(sum)
 
-    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        return np.asarray(sum(part.value(t, side) for part in self.parts))
-
-    def cancelling(self, t0: float, t1: float) -> float:
-        return sum(max(part.peak(t0, t1), part.cancelling(t0, t1)) for part in self.parts)
-
-    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
-        blocks = [part.terms(start, stop) for part in self.parts]
-        known = [block for block in blocks if block is not None]
-        return np.concatenate(known, axis=1) if len(known) == len(blocks) else None
+    @staticmethod
+    def _joined_terms(a: FloatArray, b: FloatArray) -> FloatArray:
+        return np.concatenate([a, b], axis=1)
 
     def tone(self) -> float | None:
         tones = self._tones()
@@ -96,47 +108,40 @@ class Sum(_Combination):
         return lowest if all(abs(t / lowest - round(t / lowest)) < 1e-9 for t in tones) else None
 
 
-@dataclass(frozen=True)
-class Product(_Combination):
-    """Product of waveforms; its fundamental is the highest tone of its factors, which is the carrier's."""
+class _OfFactors(_Combination):
+    _joined = staticmethod(math.prod)
 
-    parts: tuple[Waveform, ...]
-
-    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        return np.asarray(math.prod(part.value(t, side) for part in self.parts))
-
-    def cancelling(self, t0: float, t1: float) -> float:
-        return math.prod(max(part.peak(t0, t1), part.cancelling(t0, t1)) for part in self.parts)
-
-    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
-        blocks = [part.terms(start, stop) for part in self.parts]
-        known = [block for block in blocks if block is not None]
-        return reduce(_multiply, known) if len(known) == len(blocks) else None
+    @staticmethod
+    def _joined_terms(a: FloatArray, b: FloatArray) -> FloatArray:
+        """By cos x cos y = (cos(x + y) + cos(x - y)) / 2."""
+        a = a[:, np.any(a[:, :, 0] != 0.0, axis=0)]
+        b = b[:, np.any(b[:, :, 0] != 0.0, axis=0)]
+        columns = []
+        for x, y in itertools.product(a.swapaxes(0, 1), b.swapaxes(0, 1)):
+            base = x + y
+            base[:, 0] = x[:, 0] * y[:, 0]
+            if np.any(x[:, 3:] != 0.0) and np.any(y[:, 3:] != 0.0):
+                base[:, 0] *= 0.5
+                other = base.copy()
+                other[:, 3:] = x[:, 3:] - y[:, 3:]
+                columns.append(other)
+            columns.append(base)
+        return np.stack(columns, axis=1) if columns else np.zeros((a.shape[0], 1, 6))
 
     def tone(self) -> float | None:
         tones = self._tones()
         return max(tones) if tones and self.period is not None else None
 
 
-def _multiply(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Product of two blocks of terms, by cos x cos y = (cos(x + y) + cos(x - y)) / 2."""
-    a = a[:, np.any(a[:, :, 0] != 0.0, axis=0)]
-    b = b[:, np.any(b[:, :, 0] != 0.0, axis=0)]
-    columns = []
-    for x, y in itertools.product(a.swapaxes(0, 1), b.swapaxes(0, 1)):
-        base = x + y
-        base[:, 0] = x[:, 0] * y[:, 0]
-        if np.any(x[:, 3:] != 0.0) and np.any(y[:, 3:] != 0.0):
-            base[:, 0] *= 0.5
-            other = base.copy()
-            other[:, 3:] = x[:, 3:] - y[:, 3:]
-            columns.append(other)
-        columns.append(base)
-    return np.stack(columns, axis=1) if columns else np.zeros((a.shape[0], 1, 6))
+@dataclass(frozen=True)
+class Product(_OfFactors):
+    """Product of waveforms; its fundamental is the highest tone of its factors, which is the carrier's."""
+
+    parts: tuple[Waveform, ...]
 
 
 @dataclass(frozen=True)
-class AM(_Combination):
+class AM(_OfFactors):
     """Amplitude-modulated carrier: amplitude (1 + depth sin(2 pi f_m t + phase)) / (1 + depth) sin(2 pi f_c t).
 
     Parameters
@@ -161,7 +166,7 @@ class AM(_Combination):
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         require(0.0 <= self.depth <= 1.0, "AM depth", f"{self.depth:g}", "0 to 1")
 
     @cached_property
@@ -169,11 +174,6 @@ class AM(_Combination):
         share = self.amplitude / (1.0 + self.depth)
         envelope = Sine(share * self.depth, self.modulation, offset=share, phase_deg=self.phase_deg)
         return (envelope, Sine(1.0, self.carrier))
-
-    value = Product.value
-    cancelling = Product.cancelling
-    terms = Product.terms
-    tone = Product.tone
 
 
 # A time within this relative distance of a breakpoint differs from it only by rounding, and is replaced by it.
@@ -187,8 +187,8 @@ class _Shifted(Waveform):
     _stretch: float  # Length of a stretch, s
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "waveform", as_waveform(self.waveform))
-        take_numbers(self)
+        self._declare(waveform=as_waveform(self.waveform))
+        super().__post_init__()
 
     @cached_property
     def _marks(self) -> FloatArray:
@@ -239,14 +239,7 @@ class Burst(_Shifted):
         super().__post_init__()
         require(self.duration > 0.0, "burst duration", f"{self.duration:g} s", "> 0")
         require(self.delay >= 0.0, "burst delay", f"{self.delay:g} s", ">= 0")
-
-    @property
-    def _stretch(self) -> float:  # type: ignore[override]
-        return self.duration
-
-    @property
-    def course(self) -> tuple[float, float]:
-        return self.delay, self.delay + self.duration
+        self._declare(_stretch=self.duration, course=(self.delay, self.delay + self.duration))
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = real_numbers("t", t, "times in s")
@@ -254,9 +247,8 @@ class Burst(_Shifted):
         on = (tau >= 0.0) & (tau < self.duration) if side == "right" else (tau > 0.0) & (tau <= self.duration)
         return np.where(on, self.waveform.value(np.where(on, tau, 0.0), side), 0.0)
 
-    def breakpoints(self, t0: float, t1: float) -> FloatArray:
-        times = self.delay + self._marks
-        return times[(times >= t0) & (times <= t1)]
+    def _edges(self, t0: float, t1: float) -> FloatArray:
+        return np.asarray(self.delay + self._marks)
 
     def breakpoint_rate(self) -> float:
         return self.waveform.breakpoint_rate()
@@ -293,25 +285,19 @@ class Repeat(_Shifted):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.period > 0.0, "repeat period", f"{self.period:g} s", "> 0")
-
-    @property
-    def _stretch(self) -> float:  # type: ignore[override]
-        return self.period
+        self._declare(_stretch=self.period)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = real_numbers("t", t, "times in s")
         tau = self._inner(t, np.floor(t / self.period) * self.period)
         # By rounding, the start of a period may count as the end of the period before, or an end as a start.
         first, last = (0.0, self.period) if side == "right" else (self.period, 0.0)
-        tau = np.where(tau == last, first, tau)
-        return self.waveform.value(tau, side)
+        return self.waveform.value(np.where(tau == last, first, tau), side)
 
-    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+    def _edges(self, t0: float, t1: float) -> FloatArray:
         marks = self._marks[:-1]
         low, high = math.floor(t0 / self.period) - 1.0, math.ceil(t1 / self.period) + 1.0
-        runs = runs_through(low, high, marks.size, t0, t1)
-        times = (runs[:, None] * self.period + marks).ravel()
-        return times[(times >= t0) & (times <= t1)]
+        return np.asarray((runs_through(low, high, marks.size, t0, t1)[:, None] * self.period + marks).ravel())
 
     def breakpoint_rate(self) -> float:
         return self._marks.size / self.period

@@ -33,14 +33,8 @@ _MOST_CHUNKS = 10_000
 _FORMATS = {2: "ADPCM", 6: "ALAW", 7: "MULAW", 17: "DVI_ADPCM", 85: "MPEGLAYER3"}
 # First bytes of other file formats, to name the format in the message.
 _OTHERS = {
-    b"ID3": "MP3",
-    b"\xff\xfb": "MP3",
-    b"\xff\xf3": "MP3",
-    b"OggS": "Ogg",
-    b"fLaC": "FLAC",
-    b"FORM": "AIFF",
-    b"caff": "CAF",
-    b"PK": "ZIP or NPZ",
+    b"ID3": "MP3", b"\xff\xfb": "MP3", b"\xff\xf3": "MP3", b"OggS": "Ogg", b"fLaC": "FLAC", b"FORM": "AIFF",
+    b"caff": "CAF", b"PK": "ZIP or NPZ",
 }  # fmt: skip
 
 
@@ -67,7 +61,10 @@ class WavLayout:
     offset: int  # Position of the first sample, bytes
 
     def read(self, first: int, last: int) -> FloatArray:
-        """Samples number `first` to `last` - 1 as fractions of full scale, if the file still has them."""
+        """Samples number `first` to `last` - 1 as fractions of full scale, if the file still has them.
+
+        Integers are divided by half the range of their type, so that full scale is -1 to just below 1.
+        """
         width = int(self.kind[2])
         block = self.channels * width
         try:
@@ -96,14 +93,7 @@ class WavLayout:
 
 
 def wav_layout(path: str | Path, channel: int | None = None, most: int = LARGEST_STREAMED) -> WavLayout:
-    """Position of the samples of one channel of a WAV file, which are read as fractions of full scale.
-
-    An integer is divided by half the range of its type (from 8-bit integers their middle, 128, is subtracted first), so
-    that full scale is -1 to just below 1. A float is taken as it is. The samples of a stream whose header was written
-    before its end was known go on to the end of the file.
-
-    Channels are counted from 0, and one has to be chosen of several; `most` is the largest size of the file in bytes.
-    """
+    """Position of the samples of one channel, counted from 0, of a WAV file of at most `most` bytes."""
     path = checked_file(path, most)
     with path.open("rb") as file:
         order, form, offset, length = _wav_chunks(path, file)
@@ -207,11 +197,12 @@ def read_table(
         raise InputError(f"'{path}' has one column and no rate; allowed: a column of times too, or rate= in Hz; "
                          "PWL FILE= takes alternating times and values")  # fmt: skip
     # A column that is named as times is one even beside a rate, which it may contradict.
-    named = columns > 1 and any(name.lower() in _TIME_NAMES for name in found.names)
-    if rate is not None and not (named or (columns == 2 and value is None)):
-        return Recording(found.volts(_only(found, value, "value", 1)), rate)
-    t = found.seconds(_chosen_time(found, time))
-    values = found.volts(_only(found, value, "value", 2, other=_chosen_time(found, time)))
+    named = [i for i, name in enumerate(found.names) if name.lower() in _TIME_NAMES]
+    if rate is not None and not (columns > 1 and (named or (columns == 2 and value is None))):
+        return Recording(found.scaled(_chosen(found, value, "value", 1, 0), "V"), rate)
+    at = named[0] if time is None and len(named) == 1 else _chosen(found, time, "time", 2, 0)
+    t = found.scaled(at, "s")
+    values = found.scaled(_chosen(found, value, "value", 2, 1 - at, other=at), "V")
     back = np.flatnonzero(t[1:] < t[:-1])
     if back.size:
         i = int(back[0])
@@ -232,19 +223,14 @@ def checked_file(path: str | Path, most: int) -> Path:
     """The path, after a check that it is a readable ordinary file, not empty and not larger than `most` bytes."""
     path, fault = Path(path), ""
     try:
-        if path.is_dir():
-            fault = "is a folder, not a file"
-        elif not path.exists():
-            fault = "does not exist"
-        elif not path.is_file():
-            fault = "is not an ordinary file"
+        if not path.is_file():
+            there = "is not an ordinary file" if path.exists() else "does not exist"
+            fault = "is a folder, not a file" if path.is_dir() else there
         else:
             path.open("rb").close()
             size = path.stat().st_size
-            if size == 0:
-                fault = "is empty"
-            elif size > most:
-                fault = f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB"
+            too_large = f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB" if size > most else ""
+            fault = too_large if size else "is empty"
     except (OSError, ValueError) as error:
         fault = f"cannot be read: {getattr(error, 'strerror', None) or error}"
     if fault:
@@ -258,16 +244,10 @@ def check_count(what: str, count: int) -> None:
         raise InputError(f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
 
 
-def _chosen_time(found: Columns, time: str | int | None) -> int:
-    """Index of the column of times: as given, else the only one named ``t`` or ``time``, else the first of two."""
-    if time is None:
-        named = [i for i, name in enumerate(found.names) if name.lower() in _TIME_NAMES]
-        return named[0] if len(named) == 1 else _only(found, None, "time", 2)
-    return _only(found, time, "time", 2)
-
-
-def _only(found: Columns, column: str | int | None, role: str, most: int, other: int | None = None) -> int:
-    """Index of a column; if none is given, the only one (`most` is 1), or the first of two, or the one not `other`."""
+def _chosen(
+    found: Columns, column: str | int | None, role: str, most: int, default: int, other: int | None = None
+) -> int:  # fmt: skip
+    """Index of a column, which is not `other`; if none is given, the default in a table of at most `most` columns."""
     if column is not None:
         index = found.index(column)
         if index == other:
@@ -276,7 +256,7 @@ def _only(found: Columns, column: str | int | None, role: str, most: int, other:
     if found.data.shape[1] > most:
         way = "name the column" if found.names else "the number of the column"
         raise InputError(f"'{found.file}' has {found.listed()}; allowed: {way} of the {role}")
-    return 0 if other is None else 1 - other
+    return default
 
 
 def _npz_columns(path: Path) -> tuple[Columns, float | None]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_numbers
-from fingerspice.waveforms.bounds import runs_through, take_numbers
+from fingerspice.waveforms.bounds import runs_through
 from fingerspice.waveforms.ramps import Ramps
 from fingerspice.waveforms.waveform import TAU, Waveform, require, terms_of
 
@@ -24,41 +25,39 @@ class _Periodic(Ramps):
     offset: float = 0.0
     phase_deg: float = 0.0
     delay: float = 0.0
+    _shift: ClassVar[float]  # Time of the shape's start, s
     units: ClassVar[dict[str, str]] = {
         "amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s"
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         kind = type(self).__name__.lower()
         require(self.frequency > 0.0, f"{kind} frequency", f"{self.frequency:g} Hz", "> 0")
+        period = 1.0 / self.frequency
+        # Begin whole periods earlier, at or before t = 0: the delay shifts the shape, and holds nothing before it.
+        shift = first = self.delay - self.phase_deg / 360.0 / self.frequency
+        if shift > 0.0:
+            first = shift - math.ceil(shift / period - 1e-12) * period
+        turned = self.offset == 0.0 and self._shape()[2]
+        self._declare(period=period, half_wave=turned, _shift=shift, _first=first, _origin=first)
 
-    @property
-    def period(self) -> float:  # type: ignore[override]
-        return 1.0 / self.frequency
-
-    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Times of the knots in periods, and their values over the offset in amplitudes."""
+    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
+        """Times of the knots in periods, values over the offset in amplitudes, and whether half of it is the other
+        half turned over."""
         raise NotImplementedError
 
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        x, y = map(np.array, self._shape())
-        return x * self.period, self.offset + self.amplitude * y
+    @cached_property
+    def knots(self) -> tuple[FloatArray, FloatArray]:
+        x, y, _ = self._shape()
+        return np.array(x) * self.period, self.offset + self.amplitude * np.array(y)
 
     def _times(self, t0: float, t1: float) -> FloatArray:
         # Computed as (k + x) / f, an edge is rounded to the same double as the time that a user writes for it.
-        x = self._knots()[0] * self.frequency
-        shift = self.delay - self.phase_deg / 360.0 / self.frequency
-        low = np.floor((t0 - shift) * self.frequency) - 1.0
-        high = np.ceil((t1 - shift) * self.frequency) + 1.0
-        runs = runs_through(low, high, x.size, t0, t1)
-        return np.asarray(((runs[:, None] + x) / self.frequency + shift).ravel())
-
-    @property
-    def _first(self) -> float:  # type: ignore[override]
-        # Begin whole periods earlier, at or before t = 0: the delay shifts the shape, and holds nothing before it.
-        shift = self.delay - self.phase_deg / 360.0 / self.frequency
-        return shift - math.ceil(shift / self.period - 1e-12) * self.period if shift > 0.0 else shift
+        x = self.knots[0] * self.frequency
+        low, high = (np.floor((t0 - self._shift) * self.frequency), np.ceil((t1 - self._shift) * self.frequency))
+        runs = runs_through(low - 1.0, high + 1.0, x.size, t0, t1)
+        return np.asarray(((runs[:, None] + x) / self.frequency + self._shift).ravel())
 
     def breakpoint_rate(self) -> float:
         return 4.0 * self.frequency
@@ -83,32 +82,24 @@ class Square(_Periodic):
         super().__init__(amplitude, frequency, offset, phase_deg, delay)
         require(0.0 < self.duty < 1.0, "square duty", f"{self.duty:g}", "between 0 and 1")
 
-    @property
-    def half_wave(self) -> bool:
-        return self.offset == 0.0 and self.duty == 0.5
-
-    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return (0.0, 0.0, self.duty, self.duty, 1.0), (-1.0, 1.0, 1.0, -1.0, -1.0)
+    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
+        return (0.0, 0.0, self.duty, self.duty, 1.0), (-1.0, 1.0, 1.0, -1.0, -1.0), self.duty == 0.5
 
 
 @dataclass(frozen=True)
 class Triangle(_Periodic):
     """Triangle in phase with a sine: +amplitude at a quarter and -amplitude at three quarters of a period."""
 
-    @property
-    def half_wave(self) -> bool:
-        return self.offset == 0.0
-
-    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return (0.0, 0.25, 0.75, 1.0), (0.0, 1.0, -1.0, 0.0)
+    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
+        return (0.0, 0.25, 0.75, 1.0), (0.0, 1.0, -1.0, 0.0), True
 
 
 @dataclass(frozen=True)
 class Sawtooth(_Periodic):
     """Rises from offset - amplitude to offset + amplitude over each period, and jumps back at its end."""
 
-    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return (0.0, 0.0, 1.0), (1.0, -1.0, 1.0)
+    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
+        return (0.0, 0.0, 1.0), (1.0, -1.0, 1.0), False
 
 
 @dataclass(frozen=True)
@@ -128,33 +119,26 @@ class Pulse(Ramps):
     units: ClassVar[dict[str, str]] = {
         "v1": "V", "v2": "V", "delay": "s", "rise": "s", "fall": "s", "width": "s", "pulse_period": "s"
     }  # fmt: skip
+    _endless = ("width", "pulse_period")
 
     def __post_init__(self) -> None:
-        take_numbers(self, endless=("width", "pulse_period"))
+        super().__post_init__()
         for name in ("rise", "fall", "width"):
             require(getattr(self, name) >= 0.0, f"pulse {name}", f"{getattr(self, name):g} s", ">= 0")
         require(self.pulse_period > 0.0, "pulse period", f"{self.pulse_period:g} s", "> 0")
         busy, longest = self.rise + self.width + self.fall, f"at most the period, {self.pulse_period:g} s"
         require(busy <= self.pulse_period * (1.0 + 1e-12), "pulse rise + width + fall", f"{busy:g} s", longest)
-
-    @property
-    def period(self) -> float | None:  # type: ignore[override]
-        return self.pulse_period if math.isfinite(self.pulse_period) else None
-
-    @property
-    def settled(self) -> float:
-        return max(0.0, self.delay)
-
-    @property
-    def half_wave(self) -> bool:
         even = abs(2.0 * (self.rise + self.width) - self.pulse_period) <= 4e-16 * self.pulse_period
-        return even and self.v1 == -self.v2 and self.rise == self.fall
+        self._declare(
+            period=self.pulse_period if math.isfinite(self.pulse_period) else None,
+            settled=max(0.0, self.delay),
+            half_wave=even and self.v1 == -self.v2 and self.rise == self.fall,
+            _first=self.delay,
+            _origin=self.delay,
+        )
 
-    @property
-    def _first(self) -> float:  # type: ignore[override]
-        return self.delay
-
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def knots(self) -> tuple[FloatArray, FloatArray]:
         start = 0.0 if self.period else self.delay
         up = start + self.rise
         if not math.isfinite(self.width):
@@ -196,9 +180,10 @@ class Chirp(Waveform):
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         require(self.f0 > 0.0 and self.f1 > 0.0, "chirp frequencies", f"{self.f0:g}, {self.f1:g} Hz", "> 0")
         require(self.duration > 0.0, "chirp duration", f"{self.duration:g} s", "> 0")
+        self._declare(_breaks=(0.0, self.duration), _quick=1.0 / max(self.f0, self.f1))
 
     def _phase(self, t: FloatArray) -> FloatArray:
         sweep = np.clip(t, 0.0, self.duration)
@@ -209,9 +194,6 @@ class Chirp(Waveform):
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.asarray(self.offset + self.amplitude * np.sin(self._phase(real_numbers("t", t, "times in s"))))
 
-    def breakpoints(self, t0: float, t1: float) -> FloatArray:
-        return np.array([t for t in (0.0, self.duration) if t0 <= t <= t1])
-
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         rate = (self.f1 - self.f0) / self.duration
         middle = 0.5 * (start + stop)
@@ -219,9 +201,6 @@ class Chirp(Waveform):
         omega = TAU * (self.f0 + rate * np.clip(start, 0.0, self.duration))
         wave = self.amplitude, 0.0, 0.0, omega, self._phase(start) - 0.5 * math.pi, rises
         return terms_of(start.size, (self.offset,), wave)
-
-    def shortest_time(self) -> float:
-        return 1.0 / max(self.f0, self.f1)
 
 
 @dataclass(frozen=True)
@@ -240,22 +219,17 @@ class Exp(Waveform):
     units: ClassVar[dict[str, str]] = {"v1": "V", "v2": "V", "td1": "s", "tau1": "s", "td2": "s", "tau2": "s"}
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         require(self.tau1 > 0.0 and self.tau2 > 0.0, "EXP time constants", f"{self.tau1:g}, {self.tau2:g} s", "> 0")
         require(self.td2 >= self.td1, "EXP td2", f"{self.td2:g} s", f">= td1 = {self.td1:g} s")
-
-    @property
-    def course(self) -> tuple[float, float]:
-        return self.td1, math.inf
+        breaks = tuple(sorted({self.td1, self.td2}))
+        self._declare(course=(self.td1, math.inf), _breaks=breaks, _quick=min(self.tau1, self.tau2))
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = real_numbers("t", t, "times in s")
         rise = -np.expm1(-np.maximum(t - self.td1, 0.0) / self.tau1)
         fall = -np.expm1(-np.maximum(t - self.td2, 0.0) / self.tau2)
         return np.asarray(self.v1 + (self.v2 - self.v1) * (rise - fall))
-
-    def breakpoints(self, t0: float, t1: float) -> FloatArray:
-        return np.array([t for t in sorted({self.td1, self.td2}) if t0 <= t <= t1])
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         step = self.v2 - self.v1
@@ -265,6 +239,3 @@ class Exp(Waveform):
         rise = np.where(first, -step * np.exp(-np.maximum(start - self.td1, 0.0) / self.tau1), 0.0)
         fall = np.where(second, step * np.exp(-np.maximum(start - self.td2, 0.0) / self.tau2), 0.0)
         return terms_of(start.size, (level,), (rise, 0.0, -1.0 / self.tau1), (fall, 0.0, -1.0 / self.tau2))
-
-    def shortest_time(self) -> float:
-        return min(self.tau1, self.tau2)

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
@@ -29,61 +29,47 @@ MOST_SHOWN = 10_000
 class Ramps(Waveform):
     """Straight lines between knots (t, v), constant outside them or repeated; two knots at one time are a jump.
 
-    Subclasses implement `_knots`. A periodic waveform repeats its knots once per `period` from the time `_first` on,
-    and they span exactly one period.
+    Subclasses have `knots`. The knots of a periodic one from the time `_first` on span one period and are repeated for
+    ever; earlier knots occur once.
     """
 
+    # Time (s) from which the waveform is periodic, and the time from which its knots' times are counted.
     _first: float = 0.0
+    _origin: float = 0.0
 
     @cached_property
     def knots(self) -> tuple[FloatArray, FloatArray]:
-        """Times (s, ascending) and values (V) of the knots of one run or period."""
-        return self._knots()
+        """Times (s, ascending) and values (V) of the knots, shape (n,) each."""
+        raise NotImplementedError
 
     @cached_property
     def _distinct(self) -> FloatArray:
         """Times of the knots, each once, s."""
         return _once(np.unique(self.knots[0]))
 
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
-        """Times (s, ascending) and values (V) of the knots, shape (n,) each."""
-        raise NotImplementedError
-
-    def _phase(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Start of the period that contains each time, and the time since then, s."""
-        if self.period is None:
-            return np.zeros_like(t), t
-        start = self._first + np.maximum(np.floor((t - self._first) / self.period), 0.0) * self.period
-        return start, t - start
-
     def _times(self, t0: float, t1: float) -> FloatArray:
-        """Times of a periodic waveform's knots (s, ascending) over [t0, t1] and a period beyond; jumps appear twice."""
+        """Times of a periodic waveform's knots (s) over [t0, t1] and a period beyond; jumps appear twice."""
         assert self.period is not None
-        times, _ = self.knots
-        low = max(0.0, np.floor((t0 - self._first) / self.period) - 1.0)
+        times = self.knots[0]
+        body = times[times >= self._first - self._origin]
+        low = max(1.0, np.floor((t0 - self._first) / self.period) - 1.0)
         high = max(low, np.ceil((t1 - self._first) / self.period) + 1.0)
-        starts = self._first + runs_through(low, high, times.size, t0, t1) * self.period
-        return np.asarray((starts[:, None] + times[None, :]).ravel())
+        starts = self._origin + runs_through(low, high, body.size, t0, t1) * self.period
+        return np.concatenate([self._origin + times, (starts[:, None] + body).ravel()])
 
     def _edges(self, t0: float, t1: float) -> FloatArray:
         if self.period is None:
-            times = self._distinct
-            return times[max(0, times.searchsorted(t0) - 1) : times.searchsorted(t1, "right") + 1]
+            return self._distinct[self._distinct.searchsorted(t0) : self._distinct.searchsorted(t1, "right")]
         return _once(np.unique(self._times(t0, t1)))
 
     @property
-    def course(self) -> tuple[float, float]:
+    def course(self) -> tuple[float, float]:  # type: ignore[override]
         times, values = self.knots
         changes = np.flatnonzero(np.diff(values))
         if changes.size == 0:
             return math.inf, -math.inf
-        if self.period:
-            return self._first + float(times[changes[0]]), math.inf
-        return float(times[changes[0]]), float(times[changes[-1] + 1])
-
-    def breakpoints(self, t0: float, t1: float) -> FloatArray:
-        times = self._edges(t0, t1)
-        return times[(times >= t0) & (times <= t1)]
+        first = self._origin + float(times[changes[0]]) if self.period else float(times[changes[0]])
+        return first, math.inf if self.period else float(times[changes[-1] + 1])
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = real_numbers("t", t, "times in s")
@@ -95,22 +81,18 @@ class Ramps(Waveform):
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
         """As `value`, at times (n_t,) within one window."""
-        if self.period is None:
-            return self._along(flat, side)
-        edges = self._edges(flat.min(), flat.max())
-        index = _place(edges, flat, side)
-        bounds = np.concatenate([[-math.inf], edges, [math.inf]])
-        start, stop = bounds[index], bounds[index + 1]
-        v0, slope = self._line(start, stop)
-        tau = np.where(np.isfinite(start), flat - np.where(np.isfinite(start), start, 0.0), 0.0)
-        return np.asarray(v0 + slope * tau)
-
-    def _along(self, flat: FloatArray, side: str) -> FloatArray:
-        """Values (V) of a waveform without a period at times (n_t,), each from the knot before it."""
         times, values = self.knots
+        if self.period is not None:
+            edges = self._edges(flat.min(), flat.max())
+            # Any time before the first edge, for what comes before it, and any time behind the last one.
+            far = 1.0 + 2.0 * np.abs(edges[[0, -1]])
+            bounds = np.concatenate([-far[:1], edges, far[1:]])
+            index = edges.searchsorted(flat, "right" if side == "right" else "left")
+            v0, slope = self._line(bounds[index], bounds[index + 1])
+            return np.asarray(v0 + slope * (flat - bounds[index]))
         if side == "right":
             return np.interp(flat, times, values)
-        index = _place(times, flat, side)
+        index = times.searchsorted(flat)
         j = np.clip(index, 1, times.size - 1)
         # Outside the knots the two nearest may be a jump, between which there is no slope.
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -125,19 +107,18 @@ class Ramps(Waveform):
         """
         times, values = self.knots
         middle = 0.5 * (start + stop)
-        run, tau = self._phase(np.where(np.isfinite(middle), middle, 0.0))
-        index = np.searchsorted(times, tau, side="right")
-        before = np.where(np.isfinite(middle), index == 0, start == -math.inf)
-        after = np.where(np.isfinite(middle), index == times.size, start != -math.inf)
+        run = np.zeros(1)
+        if self.period is not None:
+            run = self._origin + np.maximum(np.floor((middle - self._first) / self.period), 0.0) * self.period
+        index = times.searchsorted(middle - run, "right")
         j = np.clip(index, 1, times.size - 1)
-        width = times[j] - times[j - 1]
-        inside = ~before & ~after & (width > 0.0)
-        slope = np.where(inside, (values[j] - values[j - 1]) / np.where(width > 0.0, width, 1.0), 0.0)
-        offset = np.where(np.isfinite(start), start - run, 0.0) - times[j - 1]
+        inside = (index > 0) & (index < times.size)
+        width = np.where(inside, times[j] - times[j - 1], 1.0)
+        slope = np.where(inside, (values[j] - values[j - 1]) / width, 0.0)
+        offset = start - run - times[j - 1]
         # A piece whose start differs from a knot only by rounding starts with exactly the knot's value.
         offset = np.where(np.abs(offset) <= 1e-9 * width, 0.0, offset)
-        v0 = np.where(inside, values[j - 1] + slope * offset, np.where(before, values[0], values[-1]))
-        return v0, slope
+        return np.where(inside, values[j - 1] + slope * offset, np.where(index == 0, values[0], values[-1])), slope
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         value, slope = self._line(start, stop)
@@ -168,11 +149,6 @@ def _once(times: FloatArray) -> FloatArray:
     keep = np.ones(times.size, bool)
     keep[1:] = np.diff(times) > 1e-15 * np.abs(times[1:])
     return times[keep]
-
-
-def _place(edges: FloatArray, t: FloatArray, side: str) -> NDArray[np.intp]:
-    """Number of ascending edges before each time, one at the time itself among them where `side` is right."""
-    return edges.searchsorted(t, "right" if side == "right" else "left")
 
 
 @dataclass(frozen=True)
@@ -218,6 +194,7 @@ class PWL(Ramps):
             object.__setattr__(self, "repeat", real_number("PWL repeat", self.repeat, "a number in s"))
             own = t.size > 1 and self.repeat in t[:-1] and self.repeat < t[-1]
             require(own, "PWL repeat time", f"{self.repeat:g} s", "one of the PWL's own times before the last")
+            self._declare(period=self.times[-1] - self.repeat, settled=max(0.0, self.times[-1]), _first=self.repeat)
 
     def __repr__(self) -> str:
         return self._text
@@ -254,32 +231,6 @@ class PWL(Ramps):
         require(table.times is not None, f"'{path}'", "a table with a rate", "one with times; fs.Samples.from_table")
         return cls(table.times, table.values)  # type: ignore[arg-type]
 
-    @property
-    def period(self) -> float | None:  # type: ignore[override]
-        return None if self.repeat is None else self.times[-1] - self.repeat
-
-    @property
-    def settled(self) -> float:
-        return max(0.0, self.times[-1]) if self.repeat is not None else 0.0
-
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def knots(self) -> tuple[FloatArray, FloatArray]:
         return np.asarray(self.times), np.asarray(self.values)
-
-    # The part before `repeat` occurs only once, so that the knots span more than one period, and the base class's
-    # `_phase` and `_times` do not apply.
-    def _phase(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        if self.repeat is None:
-            return np.zeros_like(t), t
-        period = self.times[-1] - self.repeat
-        k = np.maximum(np.floor((t - self.repeat) / period), 0.0)
-        return k * period, t - k * period
-
-    def _times(self, t0: float, t1: float) -> FloatArray:
-        assert self.repeat is not None
-        times = np.asarray(self.times)
-        period = self.times[-1] - self.repeat
-        body = times[times >= self.repeat]
-        low = max(1.0, np.floor((t0 - self.repeat) / period) - 1.0)
-        high = max(low, np.ceil((t1 - self.repeat) / period) + 1.0)
-        runs = (runs_through(low, high, body.size, t0, t1) * period)[:, None] + body[None, :]
-        return np.concatenate([times, runs.ravel()])

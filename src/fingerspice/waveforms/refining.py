@@ -49,12 +49,10 @@ class _Interval(NamedTuple):
     largest: float = 0.0
     idle: int = 0  # Number of halvings in a row that did not reduce the misfit
 
-    def halves(self, misfit: float = math.inf, largest: float | None = None, idle: int = 0) -> list[_Interval]:
+    def halves(self, misfit: float = math.inf, largest: float = 0.0, idle: int = 0) -> list[_Interval]:
         """Both halves, the later one first, because they are put on a stack."""
-        middle, known = 0.5 * (self.lo + self.hi), self.largest if largest is None else largest
-        return [
-            _Interval(lo, hi, self.depth + 1, misfit, known, idle) for lo, hi in ((middle, self.hi), (self.lo, middle))
-        ]
+        middle, known = 0.5 * (self.lo + self.hi), (self.depth + 1, misfit, max(largest, self.largest), idle)
+        return [_Interval(middle, self.hi, *known), _Interval(self.lo, middle, *known)]
 
     def points(self) -> FloatArray:
         """Times (s) at which the waveform is evaluated: the nodes, then the points between them."""
@@ -120,7 +118,7 @@ class Refiner:
             if series is not None:
                 waiting += self._add(piece, series, floor, first=lo == a)
             elif hi - lo > floor:
-                waiting += piece.halves(misfit, max(piece.largest, misfit), idle)
+                waiting += piece.halves(misfit, misfit, idle)
             else:
                 # An interval of this width without a good series holds a jump (or a kink), which becomes an edge.
                 self.jumps.append((hi, float(values[-1] - values[0])))
@@ -140,7 +138,7 @@ class Refiner:
             # both intervals until they are short.
             change = float(series @ _AT_START - self.series[-1].sum())
             if abs(change) > self._least and piece.hi - piece.lo > floor:
-                again = piece.halves(largest=piece.largest)
+                again = piece.halves()
                 before = _Interval(self.edges[-2], piece.lo, piece.depth)
                 if before.hi - before.lo > floor:
                     del self.edges[-1], self.series[-1]
@@ -152,16 +150,9 @@ class Refiner:
         return []
 
     def _try(self, piece: _Interval) -> tuple[FloatArray | None, FloatArray, float]:
-        """Fit a series to one interval.
+        """Series of an interval (or None if it errs too much), values at its nodes, and error between these, V.
 
-        Returns
-        -------
-        series : ndarray, shape (POINTS,), or None
-            Chebyshev coefficients; None if their error between the nodes is larger than allowed.
-        values : ndarray
-            The waveform at the nodes, V; if a value is not finite, also at the points between the nodes.
-        misfit : float
-            Largest difference between series and waveform at the points between the nodes, V.
+        If a value is not finite, the values are those at all points.
         """
         lo, hi = piece.lo, piece.hi
         t, proven = piece.points(), _PROOF
@@ -189,13 +180,7 @@ class Refiner:
         return (c if good else None), values[:POINTS], misfit
 
     def _refuse_noise(self, piece: _Interval, values: FloatArray) -> None:
-        """Count an interval that stays rough, and refuse a waveform with so many of them that refining would not end.
-
-        Raises
-        ------
-        InputError
-            If the function gives two values at the same time, or is too rough.
-        """
+        """Count an interval that stays rough; refuse noise, and so many of them that refining would not end."""
         self.deep += 1
         if self.deep not in (1, self.allowed):
             return
@@ -229,27 +214,26 @@ class Refiner:
     def warn(self) -> None:
         """Warn once of jumps, and once of narrow features, that were found without having been declared."""
         real = [(t, dv) for t, dv in self.jumps if abs(dv) > self._least]
-        if real:
-            t, dv = real[0]
-            warnings.warn(
-                f"the source function jumps by {dv:.4g} V at t = {t:.9g} s"
-                + (f" and {len(real) - 1} more times" if len(real) > 1 else "")
-                + "; it was not declared: give Function(f, breaks=(...)) the times for exact edges",
-                FingerspiceWarning,
-                stacklevel=2,
-            )
         # Around a jump, a kink, or a NaN short series are expected; report only the short ones far from all of these.
         known = [*self.located, *(t for t, _ in real), *([] if self.not_finite is None else [self.not_finite])]
         apart = [t for t in self.narrow if all(abs(t - k) > 8.0 * self.step for k in known)]
         apart = sorted(apart + self._edges_found())
+        told = []
+        if real:
+            t, dv = real[0]
+            more = f" and {len(real) - 1} more times" if len(real) > 1 else ""
+            told.append(
+                f"the source function jumps by {dv:.4g} V at t = {t:.9g} s{more}; it was not declared: "
+                "give Function(f, breaks=(...)) the times for exact edges"
+            )
         if apart:
-            warnings.warn(
+            told.append(
                 f"the source function has a feature narrower than the output step {self.step:.3g} s "
                 f"near t = {apart[0]:.9g} s; it was resolved where it was seen, but others may be missed: "
-                "give Function(f, breaks=(...)) its edges",
-                FingerspiceWarning,
-                stacklevel=2,
+                "give Function(f, breaks=(...)) its edges"
             )
+        for text in told:
+            warnings.warn(text, FingerspiceWarning, stacklevel=2)
 
     def _edges_found(self) -> list[float]:
         """Time (s) of the first edge: short series whose change sums to more than `_STEEP` in a tenth of a step."""

@@ -1,4 +1,4 @@
-"""Samples at a constant rate, in memory or in a WAV file read by parts, and at a whole multiple of their rate."""
+"""Samples at a constant rate: in memory, in a WAV file read by parts, and waveforms that are samples as well."""
 
 from __future__ import annotations
 
@@ -14,18 +14,21 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, read_only, real_number, real_numbers, whole_number
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import RANGES, check_range, take_numbers
+from fingerspice.waveforms.bounds import RANGES, check_range
+from fingerspice.waveforms.combinations import Product, Sum
 from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, check_count, read_table, wav_layout
-from fingerspice.waveforms.ramps import FEW_KNOTS, Ramps
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.ramps import FEW_KNOTS, PWL, Ramps
+from fingerspice.waveforms.waveform import DC, Waveform, require
 
 # Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
 # to 0.46 of the rate.
 _WING, _BETA = 32, 8.0
-
-
 # Number of samples of a file that are read at once.
 AT_ONCE = 1 << 20
+# Largest distance of a time from the grid, relative to the spacing; rounding of the times themselves comes on top.
+ON_GRID, ROUNDING = 1e-9, 1e-15
+# Largest number of grid samples for each point of a PWL: beyond it, few long lines are faster taken one by one.
+MOST_PER_POINT = 8
 
 
 @jit
@@ -76,12 +79,11 @@ class Samples(Ramps):
     _number: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        values = real_numbers("the row of samples", self.values, "two or more numbers in V").copy()
-        values.flags.writeable = False
-        object.__setattr__(self, "values", values)
+        values = read_only(real_numbers("the row of samples", self.values, "two or more numbers in V").copy())
+        self._declare(values=values)
         require(values.ndim == 1 and values.size >= 2, "samples", f"shape {values.shape}", "one row of two or more")
         _check_samples(values, 0)
-        take_numbers(self)
+        super().__post_init__()
         require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
 
     @classmethod
@@ -195,19 +197,20 @@ class Samples(Ramps):
 
     def between(self, first: int, last: int) -> FloatArray:
         """Samples number `first` to `last` - 1, V; beyond the ends, the first or last one; maybe a part of `values`."""
-        if first >= 0 and last <= self.count:
-            return self.values[first:last]
-        return np.asarray(self.values[np.clip(np.arange(first, last), 0, self.count - 1)])
+        low, high = (min(max(n, 0), self.count - 1) for n in (first, last - 1))
+        values = self._read(low, high + 1)
+        return values if (low, high) == (first, last - 1) else values[np.clip(np.arange(first, last), low, high) - low]
+
+    def _read(self, first: int, last: int) -> FloatArray:
+        return self.values[first:last]
 
     def part(self, t0: float, t1: float) -> Samples:
         """The samples that determine the values between two times (s), as a waveform that needs no other samples."""
-        first, last = ((t - self.start) * self.rate for t in (t0, t1))
-        low = min(max(math.floor(first) - 2, 0), self.count - 2)
-        high = min(max(math.ceil(last) + 3, low + 2), self.count)
-        values = self.between(low, high)
-        values.flags.writeable = False
+        low, high = self._around(t0, t1)
         out = object.__new__(Samples)
-        out.__dict__.update(values=values, rate=self.rate, start=self.start, _number=self._number + low)
+        out._declare(
+            values=read_only(self.between(low, high)), rate=self.rate, start=self.start, _number=self._number + low
+        )
         return out
 
     def _number_of(self, t: float) -> float:
@@ -217,19 +220,22 @@ class Samples(Ramps):
     def _times_of(self, low: int, high: int) -> FloatArray:
         return np.asarray(self.start + np.arange(self._number + low, self._number + high) / self.rate)
 
+    def _around(self, t0: float, t1: float) -> tuple[int, int]:
+        """First index into `values`, and the one after the last, of two samples or more that determine a span (s)."""
+        low = min(max(math.floor(self._number_of(t0)) - 2, 0), self.count - 2)
+        return low, min(max(math.ceil(self._number_of(t1)) + 3, low + 2), self.count)
+
     @property
-    def course(self) -> tuple[float, float]:
+    def course(self) -> tuple[float, float]:  # type: ignore[override]
         # Not from the values, which may lie in a file of an hour.
         return self.start, self.start + (self.count - 1) / self.rate
 
-    def _knots(self) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def knots(self) -> tuple[FloatArray, FloatArray]:
         return self._times_of(0, self.count), self.values
 
     def _edges(self, t0: float, t1: float) -> FloatArray:
-        low = min(max(math.floor(self._number_of(t0)) - 2, 0), self.count - 1)
-        high = min(max(math.ceil(self._number_of(t1)) + 3, low + 1), self.count)
-        times = self._times_of(low, high)
-        return times[max(0, times.searchsorted(t0) - 1) : times.searchsorted(t1, "right") + 1]
+        return self._times_of(*self._around(t0, t1))
 
     def peak(self, t0: float, t1: float) -> float:
         low = max(math.ceil(self._number_of(t0) - 1e-6), 0)
@@ -269,7 +275,7 @@ class _WavFile(Samples):
     gain: float
 
     def __init__(self, layout: WavLayout, gain: float) -> None:
-        self.__dict__.update(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
+        self._declare(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
         require(self.count >= 2, "samples", f"shape ({self.count},)", "one row of two or more")
         # Integers are finite, and within full scale.
         sure = layout.kind[1] != "f" and abs(gain) <= RANGES["V"][0]
@@ -283,9 +289,7 @@ class _WavFile(Samples):
 
     @cached_property
     def values(self) -> FloatArray:
-        values = self.between(0, self.count)
-        values.flags.writeable = False
-        return values
+        return read_only(self.between(0, self.count))
 
     @property
     def count(self) -> int:
@@ -297,12 +301,10 @@ class _WavFile(Samples):
         found.update(repr((self.gain, self.layout.channel)).encode())
         return found.hexdigest()
 
-    def between(self, first: int, last: int) -> FloatArray:
+    def _read(self, first: int, last: int) -> FloatArray:
         if "values" in self.__dict__:
-            return super().between(first, last)
-        low, high = (min(max(n, 0), self.count - 1) for n in (first, last - 1))
-        values: FloatArray = self.gain * self.layout.read(low, high + 1)
-        return values if (low, high) == (first, last - 1) else values[np.clip(np.arange(first, last), low, high) - low]
+            return super()._read(first, last)
+        return np.asarray(self.gain * self.layout.read(first, last))
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
         if "values" in self.__dict__:
@@ -316,3 +318,63 @@ class _WavFile(Samples):
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         return self.part(float(start.min()), float(stop.max())).terms(start, stop)
+
+
+def as_samples(wave: Waveform) -> Samples | None:
+    """The samples that a waveform consists of, or None.
+
+    These are a recording; a PWL without jump and end whose intervals are multiples of its shortest one; sums of such
+    waveforms and constants on one grid; and products of one of them with constants. The result is kept with `wave`.
+    """
+    if isinstance(wave, Samples):
+        return wave
+    if "samples" not in wave.kept:
+        of_parts = _of_parts(wave) if isinstance(wave, Sum | Product) else None
+        wave.kept["samples"] = _of_points(wave) if isinstance(wave, PWL) else of_parts
+    found: Samples | None = wave.kept["samples"]
+    return found
+
+
+def _of_parts(wave: Sum | Product) -> Samples | None:
+    constants = [part.level for part in wave.parts if isinstance(part, DC)]
+    others = [as_samples(part) for part in wave.parts if not isinstance(part, DC)]
+    known = [part for part in others if part is not None]
+    if not known or len(known) < len(others):
+        return None
+    if isinstance(wave, Sum):
+        return _added(known, float(sum(constants)))
+    only = known[0]
+    return Samples(float(np.prod(constants)) * only.values, only.rate, only.start) if len(known) == 1 else None
+
+
+def _of_points(wave: PWL) -> Samples | None:
+    """The samples of a PWL on the grid of its shortest interval."""
+    t = np.asarray(wave.times)
+    if wave.repeat is not None or t.size < 2:
+        return None
+    shortest, length = float(np.diff(t).min()), float(t[-1] - t[0])
+    if shortest <= 0.0 or length > MOST_PER_POINT * t.size * shortest:
+        return None
+    count = round(length / shortest)
+    rate = count / length
+    place = np.rint((t - t[0]) * rate)
+    if np.any(np.abs(t[0] + place / rate - t) > ON_GRID / rate + ROUNDING * np.abs(t)):
+        return None
+    return Samples(np.interp(np.arange(count + 1), place, wave.values), rate, float(t[0]))
+
+
+def _added(parts: list[Samples], constant: float) -> Samples | None:
+    """Sum of recordings on one grid, over the time from the first sample of any to the last one; None on several."""
+    first = min(parts, key=lambda part: part.start)
+    rate = first.rate
+    begins = [(part.start - first.start) * rate for part in parts]
+    if any(part.rate != rate for part in parts) or any(abs(x - round(x)) > ON_GRID for x in begins):
+        return None
+    ends = [round(x) + part.count for x, part in zip(begins, parts, strict=True)]
+    # Recordings far apart would make a grid of mostly constant samples.
+    if max(ends) > MOST_PER_POINT * sum(part.count for part in parts):
+        return None
+    total = np.full(max(ends), constant)
+    for x, part in zip(begins, parts, strict=True):
+        total += part.between(-round(x), max(ends) - round(x))
+    return Samples(total, rate, first.start)

@@ -22,7 +22,7 @@ from fingerspice.engine.collocation.loopstate import SAME_TIME
 from fingerspice.waveforms.bounds import in_windows, runs_through
 from fingerspice.waveforms.ramps import Ramps
 from fingerspice.waveforms.refining import POINTS, Refiner
-from fingerspice.waveforms.waveform import DOUBLE, Waveform, require
+from fingerspice.waveforms.waveform import Waveform, require
 
 #: Longest segment of an oscillation, in periods; longer ones are divided, since a phase's rounding error grows with it.
 _PERIODS_PER_SEGMENT = 64.0
@@ -56,14 +56,10 @@ class Function(Waveform):
         require(callable(self.function), "source function", repr(self.function), "a function of time in s")
         breaks = set(real_numbers("function breaks", self.breaks, "times in s").ravel().tolist())
         if self.repeat is not None:
-            object.__setattr__(self, "repeat", positive_number("function period", self.repeat, "s"))
+            self._declare(repeat=positive_number("function period", self.repeat, "s"))
             # The end of a period is the start of the next one.
             breaks = {math.fmod(b, self.repeat) if b >= self.repeat else b for b in breaks}
-        object.__setattr__(self, "breaks", tuple(sorted(breaks)))
-
-    @property
-    def period(self) -> float | None:  # type: ignore[override]
-        return self.repeat
+        self._declare(breaks=tuple(sorted(breaks)), period=self.repeat)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = real_numbers("t", t, "times in s")
@@ -103,19 +99,14 @@ class Function(Waveform):
         """What the function returned as doubles; the coarsest precision of its numbers is kept."""
         found, kind = real_numbers("", values, ""), np.asarray(values).dtype
         if kind.kind == "f" and kind.itemsize < 8:
-            self.kept["precision"] = max(self.precision, float(np.finfo(kind).eps))
+            self._declare(precision=max(self.precision, float(np.finfo(kind).eps)))
         return found
 
-    @property
-    def precision(self) -> float:  # type: ignore[override]
-        return self.kept.get("precision", DOUBLE)  # type: ignore[no-any-return]
-
-    def breakpoints(self, t0: float, t1: float) -> FloatArray:
-        times = np.asarray(self.breaks, float)
-        if self.repeat is not None and times.size:
-            runs = runs_through(np.floor(t0 / self.repeat) - 1.0, np.ceil(t1 / self.repeat), times.size, t0, t1)
-            times = np.unique((runs[:, None] * self.repeat + times).ravel())
-        return times[(times >= t0) & (times <= t1)]
+    def _edges(self, t0: float, t1: float) -> FloatArray:
+        if self.repeat is None or not self.breaks:
+            return np.array(self.breaks)
+        runs = runs_through(np.floor(t0 / self.repeat) - 1.0, np.ceil(t1 / self.repeat), len(self.breaks), t0, t1)
+        return np.unique((runs[:, None] * self.repeat + np.array(self.breaks)).ravel())
 
     def breakpoint_rate(self) -> float:
         return len(self.breaks) / self.repeat if self.repeat else 0.0
@@ -186,21 +177,11 @@ def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
     out = np.zeros(marks.size, np.bool_)
     first = 0
     for k in range(marks.size):
-        low = marks[k] - slack * abs(marks[k])
-        # Find the first time that is not below `low`: double the stride until it passes `low`, then bisect.
-        stride = 1
-        while first + stride < t.size and t[first + stride] < low:
-            stride *= 2
-        last = min(first + stride, t.size)
-        first += stride // 2
-        while first < last and t[first] < low:
-            middle = (first + last) // 2
-            if t[middle] < low:
-                first = middle + 1
-            else:
-                last = middle
+        reach = slack * abs(marks[k])
+        while first < t.size and t[first] < marks[k] - reach:
+            first += 1
         i = first
-        while i < t.size and t[i] <= marks[k] + slack * abs(marks[k]):
+        while i < t.size and t[i] <= marks[k] + reach:
             out[k] |= t[i] != marks[k]
             i += 1
     return out

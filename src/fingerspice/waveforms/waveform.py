@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import take_numbers
+from fingerspice.waveforms.bounds import ANY_RANGE, RANGES, check_range
 
 TAU = 2.0 * math.pi
 # Places in [0, 1], both ends among them, one in each of 512 equal parts: so irregular that no carrier is 0 at all.
@@ -54,7 +54,8 @@ class Waveform:
     """A voltage against time, defined for all times.
 
     Subclasses implement `value`, `breakpoints` and, where the waveform has that form, `terms`; periodic ones also
-    `period` and, where the fundamental is not 1 / period, `tone`.
+    `period` and, where the fundamental is not 1 / period, `tone`. Those of this package declare what follows from their
+    numbers, under the names of the attributes below, when they are made.
     """
 
     units: ClassVar[dict[str, str]] = {}
@@ -65,6 +66,36 @@ class Waveform:
 
     precision: float = DOUBLE
     """Distance of neighbouring numbers of the kind that the values are computed in, relative to their size."""
+
+    settled: float = 0.0
+    """Time (s) from which the waveform is periodic."""
+
+    course: tuple[float, float] = (-math.inf, math.inf)
+    """Times (s) before the first and after the second of which the waveform is constant."""
+
+    half_wave: bool = False
+    """Whether each half period after `settled` is the negative of the half period before it."""
+
+    # Times (s, ascending) at which the waveform is not smooth, and the shortest time scale (s) between them.
+    _breaks: tuple[float, ...] = ()
+    _quick: float = math.inf
+    # Names of fields that may be infinite.
+    _endless: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        """Make doubles of the fields that have a unit, and refuse what is no number of it."""
+        for name in (field.name for field in fields(self) if field.name in self.units):  # type: ignore[arg-type]
+            what, unit = f"{type(self).__name__} {name}", self.units[name]
+            value = real_number(what, getattr(self, name), f"a number of {unit}" if unit else "a number")
+            if not (math.isfinite(value) or (value == math.inf and name in self._endless)):
+                raise InputError(f"{what} is {value}; allowed: a finite number")
+            largest, smallest = RANGES.get(unit, ANY_RANGE)
+            if value != 0.0 and not smallest <= abs(value) <= largest:
+                check_range(what, value, unit)
+            self._declare(**{name: value})
+
+    def _declare(self, **facts: Any) -> None:
+        self.__dict__.update(facts)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is computed when it is first asked for."""
@@ -86,7 +117,12 @@ class Waveform:
 
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         """Times in [t0, t1] (s, ascending) at which the waveform is not smooth."""
-        return np.empty(0)
+        times = self._edges(t0, t1)
+        return times[(times >= t0) & (times <= t1)]
+
+    def _edges(self, t0: float, t1: float) -> FloatArray:
+        """The breakpoints in [t0, t1] (s), and maybe others."""
+        return np.array(self._breaks)
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
         """Coefficients of the waveform's terms on segments that contain no breakpoint in their interior.
@@ -110,26 +146,11 @@ class Waveform:
 
     def shortest_time(self) -> float:
         """Shortest time scale (s) on which the waveform varies between breakpoints; inf for constants and ramps."""
-        return math.inf
+        return self._quick
 
     def breakpoint_rate(self) -> float:
         """Upper bound of the number of breakpoints per second; it sets the windows into which long runs are divided."""
         return 0.0
-
-    @property
-    def settled(self) -> float:
-        """Time (s) from which the waveform is periodic."""
-        return 0.0
-
-    @property
-    def course(self) -> tuple[float, float]:
-        """Times (s) before the first and after the second of which the waveform is constant."""
-        return -math.inf, math.inf
-
-    @property
-    def half_wave(self) -> bool:
-        """Whether each half period after `settled` is the negative of the half period before it."""
-        return False
 
     @cached_property
     def fundamental(self) -> Fundamental | None:
@@ -252,11 +273,8 @@ class DC(Waveform):
     units: ClassVar[dict[str, str]] = {"level": "V"}
 
     def __post_init__(self) -> None:
-        take_numbers(self)
-
-    @property
-    def course(self) -> tuple[float, float]:
-        return math.inf, -math.inf
+        super().__post_init__()
+        self._declare(course=(math.inf, -math.inf))
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.full(real_numbers("t", t, "times in s").shape, self.level)
@@ -296,24 +314,16 @@ class Sine(Waveform):
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        take_numbers(self)
+        super().__post_init__()
         require(self.frequency > 0.0, "sine frequency", f"{self.frequency:g} Hz", "> 0")
-
-    @property
-    def period(self) -> float | None:  # type: ignore[override]
-        return 1.0 / self.frequency if self.damping == 0.0 else None
-
-    @property
-    def settled(self) -> float:
-        return max(0.0, self.delay)
-
-    @property
-    def course(self) -> tuple[float, float]:
-        return self.delay, math.inf
-
-    @property
-    def half_wave(self) -> bool:
-        return self.offset == 0.0 and self.damping == 0.0
+        self._declare(
+            period=1.0 / self.frequency if self.damping == 0.0 else None,
+            settled=max(0.0, self.delay),
+            course=(self.delay, math.inf),
+            half_wave=self.offset == 0.0 and self.damping == 0.0,
+            _breaks=(self.delay,) if self.delay > 0.0 else (),
+            _quick=1.0 / self.frequency,
+        )
 
     def peak(self, t0: float, t1: float) -> float:
         if self.damping or t1 - max(t0, self.delay) < (1.0 - 1e-9) / self.frequency:
@@ -331,9 +341,6 @@ class Sine(Waveform):
             wave = wave * np.exp(-self.damping * (since - self.delay))
         return np.asarray(self.offset + self.amplitude * wave)
 
-    def breakpoints(self, t0: float, t1: float) -> FloatArray:
-        return np.array([self.delay]) if t0 <= self.delay <= t1 and self.delay > 0.0 else np.empty(0)
-
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         on = 0.5 * (start + stop) >= self.delay if self.delay > 0.0 else np.ones(start.size, bool)
         phase = math.radians(self.phase_deg)
@@ -343,9 +350,6 @@ class Sine(Waveform):
         angle = TAU * self._turns(start) + phase - 0.5 * math.pi
         wave = np.where(on, self.amplitude * decay, 0.0), 0.0, -self.damping, TAU * self.frequency, angle
         return terms_of(start.size, (level,), wave)
-
-    def shortest_time(self) -> float:
-        return 1.0 / self.frequency
 
     @property
     def fundamental(self) -> Fundamental | None:

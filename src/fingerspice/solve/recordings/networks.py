@@ -34,8 +34,7 @@ from fingerspice.results.outcome import State
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.form import LaneForm, Shown, curves, roomy, slopes
 from fingerspice.solve.scenes import Scene
-from fingerspice.waveforms.recorded import as_samples
-from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.samples import Samples, as_samples
 from fingerspice.waveforms.waveform import DC
 
 

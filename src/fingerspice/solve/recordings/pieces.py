@@ -12,8 +12,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.networks import recording_of
 from fingerspice.waveforms.ramps import PWL
-from fingerspice.waveforms.recorded import MOST_PER_POINT, as_samples
-from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.samples import MOST_PER_POINT, Samples, as_samples
 
 # Fewest samples for which this method pays, and the samples of a piece; pieces begin at multiples of that number.
 LEAST_SAMPLES, PIECE = 64, 1 << 18

@@ -21,8 +21,7 @@ from fingerspice.physics.contact import universal_curve_array
 from fingerspice.physics.materials import EPS0
 from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.periodic import Pulse, Square
-from fingerspice.waveforms.recorded import as_samples
-from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.samples import Samples, as_samples
 from fingerspice.waveforms.waveform import DC, Sine
 
 Curves = tuple[FloatArray, FloatArray, FloatArray]

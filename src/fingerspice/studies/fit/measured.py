@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.columns import read_labelled_columns, read_text_columns
+from fingerspice.waveforms.columns import read_text_columns
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file
 
 SIGMA = "sigma"
@@ -94,7 +94,7 @@ def _number_columns(given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
 
 def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> Measured:
     file = checked_file(path, MAX_TEXT_BYTES)
-    table, words = (read_text_columns(file), ()) if by is None else read_labelled_columns(file, by)
+    table = read_text_columns(file, by)
     if not table.names:
         raise InputError(f"'{path}' has no header; allowed: names with units, such as {example}")
     found: dict[str, FloatArray] = {}
@@ -103,7 +103,7 @@ def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> M
     groups: Groups | None = None
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
         if by is not None and name.lower() == by.lower():
-            groups = Groups(by, tuple(words[int(number)] for number in table.numbers(i)))
+            groups = Groups(by, tuple(table.words[int(number)] for number in table.numbers(i)))
             continue
         key, values, base = meaning(name, table.names)
         if key in found:
