@@ -93,28 +93,20 @@ def test_arrays_are_read_only_and_the_result_is_frozen(square: fs.Solution) -> N
         square.rtol = 1.0  # type: ignore[misc]
 
 
-def test_every_signal_has_its_unit(square: fs.Solution) -> None:
+def test_every_signal_has_its_unit_and_is_that_of_its_name(square: fs.Solution) -> None:
     units = {name: unit for name, (_, unit, _) in square.signals.items()}
     assert units == {
-        "u_source": "V",
-        "u_layer:Xcoat": "V",
-        "u_layer:Xgap": "V",
-        "u_layer:Xskin": "V",
-        "u_gap": "V",
-        "area": "m^2",
-        "sigma_el": "Pa",
-        "f_el": "N",
-        "f_t": "N",
-        "friction": "1",
-        "q_source": "C",
-        "i_source": "A",
-        "fold_margin": "1",
-        "v:drive": "V",
-        "v:top": "V",
-        "v:skin": "V",
-    }
+        **dict.fromkeys(("u_source", "u_layer:Xcoat", "u_layer:Xgap", "u_layer:Xskin", "u_gap"), "V"),
+        "area": "m^2", "sigma_el": "Pa", "f_el": "N", "f_t": "N", "friction": "1", "q_source": "C", "i_source": "A",
+        "fold_margin": "1", **dict.fromkeys(("v:drive", "v:top", "v:skin"), "V"),
+    }  # fmt: skip
     assert square.layers == ("Xcoat", "Xgap", "Xskin")
     np.testing.assert_array_equal(square.signals["u_layer:Xgap"][0], square.u_gap)
+    for key in SIGNALS:
+        if key not in ("u_layer", "v"):
+            assert square.by_name(key)[key] is getattr(square, key)
+    np.testing.assert_array_equal(square.f_t, 0.3 * (0.5 + square.f_el))
+    np.testing.assert_array_equal(square.friction, square.f_t / 0.5)
 
 
 # Figures
@@ -275,9 +267,6 @@ def test_a_failed_run_keeps_what_came_before_it(tmp_path: Path) -> None:
     assert dataset.attrs["message"] == partial.message
     assert rows(partial.to_csv(tmp_path / "run.csv"))[1].shape[0] == partial.t.size
     assert partial.summary()["status"] == "FOLD"
-
-
-def test_only_success_says_success() -> None:
     assert [s.name for s in fs.Status if "success" in s.value] == ["SUCCESS"]
 
 
@@ -329,11 +318,3 @@ def test_states_status_and_elements_show_themselves_in_one_short_line(square: fs
     gap = repr(table1()["Xgap"])
     assert gap.startswith("<GAP Xgap top skin area d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 ")
     assert repr(table1()["Vdrive"]) == "<V Vdrive drive 0 Sine(200 V, 100 Hz)>"
-
-
-def test_a_signal_of_a_solution_is_that_of_its_name(square: fs.Solution) -> None:
-    for key in SIGNALS:
-        if key not in ("u_layer", "v"):
-            assert square.by_name(key)[key] is getattr(square, key)
-    np.testing.assert_array_equal(square.f_t, 0.3 * (0.5 + square.f_el))
-    np.testing.assert_array_equal(square.friction, square.f_t / 0.5)

@@ -33,7 +33,7 @@ def noise() -> fs.Solution:
     return resistor(fs.Samples(values, rate=RATE), 3.0, t_eval=np.arange(24_000) / RATE)
 
 
-def test_the_lines_are_the_tones_of_the_source() -> None:
+def test_the_lines_are_the_tones_of_the_source_and_those_of_a_square_its_fourier_series() -> None:
     tones = fs.Sine(3.0, 100.0) + fs.Sine(0.5, 300.0, phase_deg=40.0) + 2.0
     found = resistor(tones, 0.05).spectrum("u_source")
     expected = np.zeros(found.frequency.size)
@@ -43,15 +43,13 @@ def test_the_lines_are_the_tones_of_the_source() -> None:
     assert found.mean == pytest.approx(2.0, rel=1e-12)
     assert found.variance == pytest.approx(0.5 * (3.0**2 + 0.5**2), rel=1e-12)
 
-
-def test_the_lines_of_a_square_are_those_of_its_fourier_series() -> None:
     found = resistor(fs.Square(2.0, 100.0), 0.05).spectrum("u_source", highest=50e3)
     n = np.arange(1, 501)
     assert found.amplitude is not None
     np.testing.assert_allclose(found.amplitude, np.where(n % 2, 8.0 / (math.pi * n), 0.0), rtol=0, atol=1e-9)
 
 
-def test_half_the_squares_of_the_lines_are_the_variance(sine: fs.Solution) -> None:
+def test_half_the_squares_of_the_lines_are_the_variance(sine: fs.Solution, tmp_path: Path) -> None:
     summary = sine.summary()
     found = sine.spectrum("u_gap")
     variance = summary["u_gap_rms_periodic"] ** 2 - summary["u_gap_mean_periodic"] ** 2
@@ -61,18 +59,14 @@ def test_half_the_squares_of_the_lines_are_the_variance(sine: fs.Solution) -> No
     friction = sine.spectrum()
     assert friction.shown_variance == pytest.approx(friction.variance, rel=1e-9)
     assert friction.mean == pytest.approx(summary["f_t_mean_periodic"], rel=1e-9)
+    read = fs.load(sine.to_netcdf(tmp_path / "x.nc")).spectrum()
+    np.testing.assert_allclose(read.amplitude, friction.amplitude, rtol=0, atol=1e-11)  # type: ignore[arg-type]
 
 
 def test_the_lines_do_not_depend_on_the_outputs() -> None:
     few, many = (fs.steady_state(table1(), points=n).solution.spectrum() for n in (5, 400))
     assert few.amplitude is not None
     np.testing.assert_allclose(few.amplitude, many.amplitude, rtol=0, atol=1e-10)
-
-
-def test_a_run_read_from_a_file_has_its_lines(sine: fs.Solution, tmp_path: Path) -> None:
-    found = fs.load(sine.to_netcdf(tmp_path / "x.nc")).spectrum(highest=1000.0)
-    assert found.amplitude is not None
-    np.testing.assert_allclose(found.amplitude, sine.spectrum(highest=1000.0).amplitude, rtol=0, atol=1e-11)
 
 
 def test_charge_and_current_have_the_lines_of_their_outputs() -> None:

@@ -155,42 +155,33 @@ def _lines(solution: Solution, name: str, highest: float | None) -> Spectrum | N
     _warn_if_open(solution, name, weighed)
     mean = weighed.mean()
     weight, x = weighed.weight.ravel(), weighed.x.ravel() - mean
-    variance = float((weight * x**2).sum())
-    return Spectrum(
-        name, signal_of(name).unit, np.arange(1, count + 1) / period,
-        _amplitudes(weighed.t.ravel(), weight * x, period, count), None, None, None, mean, variance, 1.0 / period, 1.0,
-    )  # fmt: skip
-
-
-def _amplitudes(t: FloatArray, weighed: FloatArray, period: float, count: int) -> FloatArray:
-    """Amplitudes of the first `count` harmonics of a signal times its quadrature weights, at times t (s)."""
-    turn = np.exp(-2j * np.pi * np.remainder(t / period, 1.0))
-    turning = 2.0 * weighed + 0j
-    out = np.empty(count)
+    turn = np.exp(-2j * np.pi * np.remainder(weighed.t.ravel() / period, 1.0))
+    turning, amplitude = 2.0 * (weight * x) + 0j, np.empty(count)
     for k in range(count):
         turning *= turn
-        out[k] = abs(turning.sum())
-    return out
+        amplitude[k] = abs(turning.sum())
+    return Spectrum(
+        name, signal_of(name).unit, np.arange(1, count + 1) / period, amplitude, None, None, None, mean,
+        float((weight * x**2).sum()), 1.0 / period, 1.0,
+    )  # fmt: skip
 
 
 def _warn_if_open(solution: Solution, name: str, weighed: Weighed) -> None:
     """Warn if the signal is not periodic yet: its values at both ends of the source's last period differ."""
     first, last = int(weighed.t.argmin()), int(weighed.t.argmax())
     x = weighed.x.ravel()
-    if abs(x[last] - x[first]) > _CLOSED * float(np.ptp(x)) and not _has_edge(solution):
+    if abs(x[last] - x[first]) <= _CLOSED * float(np.ptp(x)):
+        return
+    assert solution.period is not None
+    stop, slack = solution.t_stop, 1e-6 * solution.period
+    # At a breakpoint of a source the signals may jump.
+    if not any(w.breakpoints(stop - slack, stop + slack).size for w in network_of(solution.circuit).waveforms):
         warnings.warn(
             f"{name} changes over the last period by more than {100 * _CLOSED:g} % of its range, so its lines are not "
             "those of the periodic state; a longer run, or start='periodic', has it",
             FingerspiceWarning,
             stacklevel=5,
         )
-
-
-def _has_edge(solution: Solution) -> bool:
-    """Whether the run ends at a breakpoint of a source, where the signals may jump."""
-    assert solution.period is not None
-    stop, slack = solution.t_stop, 1e-6 * solution.period
-    return any(w.breakpoints(stop - slack, stop + slack).size > 0 for w in network_of(solution.circuit).waveforms)
 
 
 def _density(
