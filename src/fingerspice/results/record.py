@@ -218,7 +218,7 @@ class Record(Sealed):
 def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray:
     """Signals (n_t,) of several elements as a table, that of one as it is."""
     # A view of a run's rows is copied, so that it does not seal them.
-    return sealed(np.column_stack(columns) if len(columns) != 1 else np.array(columns[0]))
+    return sealed(np.column_stack([*columns]) if len(columns) != 1 else np.array(columns[0]))
 
 
 def bare_record(network: Network, net: Net, t: FloatArray, left: BoolArray, rows: FloatArray) -> Record:
