@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from matplotlib import image, rc_context
+from matplotlib.font_manager import FontProperties
+from matplotlib.patches import Rectangle
 
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
@@ -108,8 +111,6 @@ class Schematic(Picture):
         return {"image/svg+xml": self._repr_svg_()}, {}
 
     def _write_svg(self, target: Path | io.StringIO, about: Mapping[str, str]) -> None:
-        from matplotlib import rc_context
-
         # Texts stay texts, and the same circuit gives the same file.
         with rc_context({"svg.fonttype": "none", "svg.hashsalt": "fingerspice"}):
             self.savefig(target, format="svg", metadata={"Date": None, **about})
@@ -147,8 +148,6 @@ class _Sheet(NamedTuple):
 
 def put_beside(picture: Figure, circuit: Circuit) -> Figure:
     """The picture of a run with the circuit's schematic, small, on its right."""
-    from matplotlib import image
-
     schematic = draw_circuit(circuit)
     content = io.BytesIO()
     schematic.savefig(content, format="png", dpi=_SMALL_DPI)
@@ -176,8 +175,6 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     if len(circuit.elements) > MOST_ELEMENTS:
         count = f"{len(circuit.elements):,}"
         raise InputError(f"the circuit has {count} elements; allowed: at most {MOST_ELEMENTS} in a picture")
-    from matplotlib.font_manager import FontProperties
-
     figure, placed = Schematic(facecolor="white"), place(circuit)
     renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
 
@@ -194,7 +191,7 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     labels = {p.element.name: _label(p.element, told) for p in placed.places}
     title = textwrap.wrap(drawing.drawable(circuit.title), 60) or [""]
     widths = {node: size(name, False) for node, name in names.items()}
-    wide = {name: max(size(line, line is lines[0]) for line in lines) for name, lines in labels.items()}
+    wide = {name: max(size(line, k == 0) for k, line in enumerate(lines)) for name, lines in labels.items()}
     sheet = _sheet(placed, labels, wide, widths, max(size(line, True) for line in title), len(title))
     figure.set_size_inches(sheet.width, sheet.height)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -291,8 +288,6 @@ def _sheet(
 
 def _draw_element(ax: Axes, sheet: _Sheet, p: Place, label: Sequence[str]) -> list[Stroke]:
     """Write an element's label; gives the strokes of its symbol and of its wires."""
-    from matplotlib.patches import Rectangle
-
     strokes, tall, wide = symbol(p.element)
     x = sheet.x[p.column]
     # The name of the node below needs the lowest line.
