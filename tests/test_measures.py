@@ -28,10 +28,10 @@ def table1_run(source, f, periods, law="local", *, outputs=7, rtol=1e-8, **more)
 
 
 SCENES = {
-    "sine 100 Hz": (fs.Sine(200.0, 100.0), ref.sine_segments(200.0, 100.0, 0.03), 100.0, 3),
-    "sine 5 kHz": (fs.Sine(200.0, 5000.0), ref.sine_segments(200.0, 5000.0, 2e-3), 5000.0, 10),
-    "square 100 Hz": (fs.Square(200.0, 100.0), ref.square_segments(200.0, 100.0, 3), 100.0, 3),
-    "square 5 kHz": (fs.Square(200.0, 5000.0), ref.square_segments(200.0, 5000.0, 4), 5000.0, 4),
+    "sine 100 Hz": (fs.Sine(200.0, 100.0), ref.sine_segments(200.0, 100.0, 0.02), 100.0, 2),
+    "sine 5 kHz": (fs.Sine(200.0, 5000.0), ref.sine_segments(200.0, 5000.0, 6e-4), 5000.0, 3),
+    "square 100 Hz": (fs.Square(200.0, 100.0), ref.square_segments(200.0, 100.0, 2), 100.0, 2),
+    "square 5 kHz": (fs.Square(200.0, 5000.0), ref.square_segments(200.0, 5000.0, 3), 5000.0, 3),
 }
 
 
@@ -174,28 +174,16 @@ def test_tstart_is_where_figures_begin():
     assert fs.simulate(late).f_el_mean == pytest.approx(expected.mean_force(0.03, 0.05), rel=1e-8)
 
 
-@pytest.mark.parametrize("method", ["scipy:DOP853", "radau"])
-def test_figures_of_a_run_of_another_method_do_not_depend_on_its_outputs(method):
-    expected = ref.transient(ref.sine_segments(200.0, 100.0, 0.02), [0.0], freq=100.0)
-    for outputs in (11, 801):
-        solution = table1_run(fs.Sine(200.0, 100.0), 100.0, 2, method=method, outputs=outputs, rtol=1e-6)
-        figures = solution.summary()
-        assert figures["figures_from"] == "steps"
-        assert figures["f_el_max"] >= solution.f_el.max()
-        assert figures["f_el_mean"] == pytest.approx(expected.mean_force(0.0, 0.02), rel=1e-5)
-
-
 def test_weights_of_outputs_integrate_cubics_between_jumps_and_lines_where_points_are_few():
     rng = np.random.default_rng(3)
     t = np.sort(np.concatenate([[0.0, 1.0, 1.0, 1.5, 1.5, 3.0], rng.uniform(0.0, 1.0, 9), rng.uniform(1.5, 3.0, 5)]))
-    weights = measures.output_weights(t)
     first = t <= 1.0
     first[np.flatnonzero(t == 1.0)[1]] = False
     cubic = np.where(first, t**3 - t, np.where(t <= 1.5, 2.0 * t, t**2))
     second_half = np.flatnonzero(t == 1.5)[1]
     cubic[second_half] = 1.5**2
     exact = (0.25 - 0.5) + (1.5**2 - 1.0) + (27.0 - 1.5**3) / 3.0
-    assert weights @ cubic == pytest.approx(exact, rel=1e-13)
+    assert 3.0 * measures.weigh_outputs(t, cubic).mean() == pytest.approx(exact, rel=1e-13)
 
 
 def test_weights_of_four_hundred_thousand_outputs_with_a_jump_at_every_tenth():

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from scenes import deck, table1
+from scenes import cases, deck, table1
 
 every_law = pytest.mark.parametrize("law", ["local", "mobile"])
 INSULATING = {"coat": {"r": "inf"}, "gap": {"r": "inf"}}
@@ -39,11 +39,10 @@ def stack(source: str, coat: str, skin: str, **gap: Any) -> fs.Circuit:
     return deck(".include fingerspice.lib", *lines)
 
 
-def agree(light: fs.Solution, heavy: fs.Solution, bound: float = 0.0) -> None:
+def agree(light: fs.Solution, heavy: fs.Solution) -> None:
     """Within what both say of their errors."""
     assert light.success
     assert heavy.success
-    assert light.error.u_gap >= bound
     assert np.array_equal(light.t, heavy.t)
     assert np.abs(light.u_gap - heavy.u_gap).max() <= light.error.u_gap + heavy.error.u_gap
     # F goes as u^2: its error is at least twice the voltage's, relative to the peaks.
@@ -97,21 +96,18 @@ def test_a_stack_with_one_leak_that_no_area_moves_is_not_algebraic() -> None:
     assert fs.plan(table1(**INSULATING), charge=False).tier == "linear", "only SKIN leaks, by area"
 
 
-def test_rates_are_ascending_and_a_stiff_stack_says_so() -> None:
+def test_a_plan_is_plain_data_with_ascending_rates_and_says_whether_a_stack_is_stiff() -> None:
     easy, stiff = fs.plan(table1()), fs.plan(table1(coat={"r": 1}))
     assert len(easy.rates) == 2
     assert list(easy.rates) == sorted(easy.rates)
     assert not easy.stiff
     assert stiff.stiff
     assert "stiff: the fastest rate" in stiff.reasons[-1]
-
-
-def test_a_plan_is_plain_data() -> None:
-    data = fs.plan(table1()).to_dict()
+    data = easy.to_dict()
     assert json.loads(json.dumps(data)) == data
     assert data["tier"] == "coupled"
     with pytest.raises(dataclasses.FrozenInstanceError):
-        fs.plan(table1()).tier = "linear"  # type: ignore[misc]
+        easy.tier = "linear"  # type: ignore[misc]
 
 
 def test_how_a_run_starts_is_in_its_plan() -> None:
@@ -165,7 +161,7 @@ def both(circuit: fs.Circuit, light: str, heavy: str, seed: int, u: float, **opt
 
 
 @every_law
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(cases(12, 8)))
 def test_algebraic_is_the_coupled_model_without_leaks(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
     circuit = dry(d=f"{rng.uniform(2.0, 8.0):.6g}u", fn=rng.uniform(0.2, 1.0))
@@ -190,7 +186,7 @@ def random_finger(rng: np.random.Generator) -> fs.Circuit:
 
 
 @every_law
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", range(cases(16, 9)))
 def test_linear_is_the_coupled_model_at_a_fixed_area(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
     area = ["frozen", 30e-6, 37.5e-6][seed % 3]
@@ -214,7 +210,7 @@ def test_the_force_at_a_fixed_area_has_its_error_stated(tier: str) -> None:
     assert solution.error.f_el >= solution.error.u_gap / np.abs(exact.u_gap).max() * exact.f_el.max()
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(cases(10, 6)))
 def test_leaks_that_scale_with_the_area_feel_nothing_of_it_under_the_local_law(seed: int) -> None:
     light, heavy = both(area_leaks(), "linear", "coupled", seed, 200.0, rtol=1e-11, charge=False)
     agree(light, heavy)
@@ -222,7 +218,7 @@ def test_leaks_that_scale_with_the_area_feel_nothing_of_it_under_the_local_law(s
     assert np.ptp(light.area) > 0.05 * light.area.max(), "the area still follows the voltage"
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", range(cases(24, 12)))
 def test_at_small_voltages_the_linear_tier_is_as_near_as_it_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
     circuit, rtol = random_finger(rng), 10.0 ** rng.uniform(-5.0, -2.0)

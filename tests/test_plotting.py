@@ -11,7 +11,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -37,12 +37,17 @@ def curve(ax: Axes, label: str) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
 
 
+def legend(ax: Axes) -> list[str]:
+    found = ax.get_legend()
+    return [] if found is None else [text.get_text() for text in found.get_texts()]
+
+
 def small_print(figure: Figure) -> str:
     return " ".join(figure.get_supxlabel().split())
 
 
 def with_source(value: fs.Waveform, **options: object) -> fs.Solution:
-    """A run under `value`, whatever comes of it."""
+    """A run of Table 1 under `value`, whatever comes of it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fs.FingerspiceWarning)
         return simulate(table1(), sources={"Vdrive": value}, throw=False, **options)  # type: ignore[arg-type]
@@ -61,22 +66,16 @@ def test_a_run_is_shown_in_four_panels_with_units(sine: fs.Solution) -> None:
     np.testing.assert_allclose(t, 1e3 * sine.t)
     np.testing.assert_array_equal(u, sine.u_gap)
     np.testing.assert_allclose(figure.axes[2].lines[0].get_ydata(), 1e6 * sine.area)
-
-
-def test_the_mean_shown_is_that_of_the_last_period(sine: fs.Solution) -> None:
-    ax = traces.plot_solution(sine).axes[1]
-    _, level = curve(ax, "mean of the last period, 0.109 N")
+    # The mean is that of the last period.
+    level = curve(figure.axes[1], "mean of the last period, 0.109 N")[1]
     np.testing.assert_allclose(level, sine.summary()["f_el_mean_periodic"])
-
-
-def test_the_small_print_says_how_it_was_made(sine: fs.Solution) -> None:
-    text = small_print(traces.plot_solution(sine))
-    for part in ("Table 1", "local charge law", "area: coupled", "rtol 1e-08", f"{sine.error.u_gap:.2g} V"):
-        assert part in text
-
-
-def test_the_friction_coefficient_is_the_right_scale_of_the_friction_panel(sine: fs.Solution) -> None:
-    figure = traces.plot_solution(sine)
+    # The small print says how it was made.
+    for part in (
+        "Table 1", "local charge law", "area: coupled", "rtol 1e-08", f"{sine.error.u_gap:.2g} V",
+        "Vdrive: Sine(200 V, 100 Hz)",
+    ):  # fmt: skip
+        assert part in small_print(figure)
+    # The friction coefficient is the right scale of the friction panel.
     figure.canvas.draw()
     force, right = figure.axes[3].get_ylim(), figure.axes[3].child_axes[0].get_ylim()
     np.testing.assert_allclose(right, np.array(force) / 0.5)
@@ -96,10 +95,8 @@ def test_without_a_gap_the_layers_voltages_are_shown_alone() -> None:
     solution = simulate(circuit)
     figure = traces.plot_solution(solution)
     assert labels(figure) == ["Voltage [V]"]
-    legend = figure.axes[0].get_legend()
-    assert legend is not None
-    assert [t.get_text() for t in legend.get_texts()] == ["source", "layer Xc$x$", "layer Xs"]
-    assert not any(t.get_parse_math() for t in legend.get_texts())
+    assert legend(figure.axes[0]) == ["source", "layer Xc$x$", "layer Xs"]
+    assert not any(t.get_parse_math() for t in figure.axes[0].get_legend().get_texts())
     np.testing.assert_array_equal(curve(figure.axes[0], "layer Xs")[1], solution.u_layer[:, 1])
 
 
@@ -122,7 +119,6 @@ def test_a_run_that_stopped_at_once_still_makes_a_picture(sine: fs.Solution, row
     state = dataclasses.replace(sine.state, t=float(sine.t[max(rows - 1, 0)]))
     status = fs.Status.SOURCE_NOT_FINITE
     solution = dataclasses.replace(sine, t=sine.t[:rows].copy(), record=record, state=state, status=status)
-    assert solution.u_gap is not None
     assert solution.u_gap.size == rows
     figure = traces.plot_solution(solution)
     assert "stopped" in figure.axes[0].texts[0].get_text()
@@ -138,13 +134,10 @@ def test_a_friction_line_is_within_its_frame(amplitude: float) -> None:
     assert float(np.max(ax.lines[0].get_ydata())) < 0.97 * top
 
 
-def test_a_fixed_area_is_drawn_flat_not_as_its_rounding() -> None:
+def test_a_fixed_area_is_drawn_flat_and_no_voltage_is_no_force(tmp_path: Path) -> None:
     figure = traces.plot_solution(simulate(table1(), area="frozen", t_stop=0.01))
     low, high = figure.axes[2].get_ylim()
     assert low < 34.0 < 36.0 < high
-
-
-def test_no_voltage_is_no_force_and_still_a_picture(tmp_path: Path) -> None:
     figure = traces.plot_solution(with_source(fs.DC(0.0), t_stop=0.01))
     assert figure.axes[1].get_ylim() == pytest.approx((0.0, figure.axes[1].get_ylim()[1]))
     drawing.save(figure, tmp_path / "x.png")
@@ -164,10 +157,7 @@ def test_a_sweep_shows_gain_phase_force_and_area() -> None:
     ):
         np.testing.assert_allclose(ax.lines[0].get_ydata(), values)
     assert "outside the skin data" in small_print(figure)
-
-
-def test_within_the_skin_data_nothing_is_shaded() -> None:
-    circuit = table1()
+    # Within the skin data nothing is shaded.
     figure = traces.plot_phasor((fs.phasor(circuit, np.geomspace(10.0, 1e5, 9)),), circuit)
     assert "outside" not in small_print(figure)
     assert not any(ax.patches for ax in figure.axes)
@@ -207,34 +197,26 @@ def test_the_table_of_several_fingers_has_room_for_their_names() -> None:
         assert all(left.x1 < right.x0 for left, right in itertools.pairwise(texts))
 
 
-def test_a_picture_has_150_dots_an_inch_or_more(sine: fs.Solution, tmp_path: Path) -> None:
+def test_a_picture_has_150_dots_an_inch_or_more_and_a_folder_that_can_be_written(
+    sine: fs.Solution, tmp_path: Path
+) -> None:
     figure = traces.plot_solution(sine)
     with Image.open(drawing.save(figure, tmp_path / "new" / "run.png")) as image:
         assert image.format == "PNG"
         assert image.width >= 150 * figure.get_size_inches()[0]
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["run.png"]
-
-
-def test_a_folder_that_cannot_be_written_is_bad_input(sine: fs.Solution, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
     with pytest.raises(fs.InputError, match="cannot write"):
-        drawing.save(traces.plot_solution(sine), tmp_path / "file" / "run.png")
+        drawing.save(figure, tmp_path / "new" / "run.png" / "run.png")
 
 
 @pytest.mark.parametrize(
     ("peak", "unit", "least", "expected"),
     [
-        (0.05, "s", 1.0, (1e3, "ms")),
-        (2e-4, "s", 1.0, (1e6, "µs")),
-        (1e-3, "s", 1.0, (1e3, "ms")),
-        (1.0, "s", 1.0, (1.0, "s")),
-        (0.21, "N", 0.05, (1.0, "N")),
-        (0.004, "N", 0.05, (1e3, "mN")),
-        (200.0, "V", 2.0, (1.0, "V")),
-        (0.0, "V", 2.0, (1.0, "V")),
-        (math.nan, "V", 2.0, (1.0, "V")),
+        (0.05, "s", 1.0, (1e3, "ms")), (2e-4, "s", 1.0, (1e6, "µs")), (1e-3, "s", 1.0, (1e3, "ms")),
+        (1.0, "s", 1.0, (1.0, "s")), (0.21, "N", 0.05, (1.0, "N")), (0.004, "N", 0.05, (1e3, "mN")),
+        (200.0, "V", 2.0, (1.0, "V")), (0.0, "V", 2.0, (1.0, "V")), (math.nan, "V", 2.0, (1.0, "V")),
     ],
-)
+)  # fmt: skip
 def test_engineering_units(peak: float, unit: str, least: float, expected: tuple[float, str]) -> None:
     factor, name = drawing.engineering(peak, unit, least)
     assert (factor, name) == (pytest.approx(expected[0]), expected[1])
@@ -252,18 +234,6 @@ def test_thinning_keeps_every_extreme_and_both_ends() -> None:
     assert thin_x.min() == x.min()
 
 
-def test_pictures_need_no_pyplot_and_their_module_no_matplotlib() -> None:
-    code = (
-        "import sys, numpy, fingerspice as fs\n"
-        "from fingerspice.plots import drawing, lines, traces\n"
-        "from fingerspice.studies import figures\n"
-        "assert not any(m.startswith('matplotlib') for m in sys.modules)\n"
-        "drawing.new_figure(1)\n"
-        "assert 'matplotlib.pyplot' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
-
-
 def test_what_a_deck_names_is_drawn_without_formulas_floods_or_warnings(tmp_path: Path) -> None:
     name = "n$x^$漢\x1b[31m" + "y" * 200
     lines = (f"V1 {name} 0 SIN(0 10 100)", f"R1 {name} out$ 1k", "C1 out$ 0 1n", ".tran 100u 20m uic")
@@ -272,18 +242,13 @@ def test_what_a_deck_names_is_drawn_without_formulas_floods_or_warnings(tmp_path
     circuit = fs.parse_netlist("\n".join((title, *lines)))
     figure = simulate(circuit).plot()
     drawing.save(figure, tmp_path / "odd.png")
-    shown = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    shown = legend(figure.axes[0])
     assert any(text.startswith("n$x^$□\\x1b[31myyy") for text in shown)
     assert max(map(len, shown)) <= drawing.LONGEST_LABEL
     assert "$\\frac{$ □□ 😀 \\x1b[31mxxx" in small_print(figure)
 
 
 # Signals, windows, several runs, long runs
-
-
-def legend(ax: Axes) -> list[str]:
-    found = ax.get_legend()
-    return [] if found is None else [text.get_text() for text in found.get_texts()]
 
 
 def test_signals_that_are_asked_for_share_a_panel_with_their_like(sine: fs.Solution) -> None:
@@ -294,13 +259,23 @@ def test_signals_that_are_asked_for_share_a_panel_with_their_like(sine: fs.Solut
     assert labels(sine.plot("friction")) == ["Friction coefficient"]
 
 
-def test_a_signal_that_there_is_none_of_is_refused_with_the_nearest(sine: fs.Solution) -> None:
-    with pytest.raises(fs.InputError, match=r"unknown signal 'fel'; nearest: 'f_el'; allowed: u_source, "):
-        sine.plot("fel")
-    with pytest.raises(fs.InputError, match="unknown signal 3"):
-        sine.plot([3])  # type: ignore[list-item]
-    with pytest.raises(fs.InputError, match="signals is empty"):
-        sine.plot([])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"signals": "fel"}, "unknown signal 'fel'; nearest: 'f_el'; allowed: u_source, "),
+        ({"signals": [3]}, "unknown signal 3"),
+        ({"signals": []}, "signals is empty"),
+        *(
+            ({"window": window}, r"window is .* s; allowed: ascending, with two outputs")
+            for window in ((0.02, 0.01), (1.0, 2.0), (0.01, 0.010001))
+        ),
+        ({"window": 3}, "window is 3; allowed: two times in s"),
+        ({"others": "x"}, "others is 'x'; allowed: Solutions"),
+    ],
+)
+def test_what_a_picture_refuses(sine: fs.Solution, options: dict[str, Any], said: str) -> None:
+    with pytest.raises(fs.InputError, match=said):
+        sine.plot(**options)
 
 
 def test_a_window_is_what_is_shown(sine: fs.Solution) -> None:
@@ -309,15 +284,11 @@ def test_a_window_is_what_is_shown(sine: fs.Solution) -> None:
     t, _ = curve(figure.axes[0], "electroadhesive force")
     # A neighbour on either side leads the line out.
     assert 11.98 < t[0] < 12.0 < 21.0 < t[-1] < 21.02
-    for window in ((0.02, 0.01), (1.0, 2.0), (0.01, 0.010001)):
-        with pytest.raises(fs.InputError, match=r"window is .* s; allowed: ascending, with two outputs"):
-            sine.plot(window=window)
-    with pytest.raises(fs.InputError, match="window is 3; allowed: two times in s"):
-        sine.plot(window=3)  # type: ignore[arg-type]
 
 
 def test_other_runs_lie_over_it_called_by_what_sets_them_apart(sine: fs.Solution) -> None:
     thick = simulate(table1().replace({"Xgap.d": 5e-6}))
+    assert "Table 1 (changed: Xgap.d = 5 um)" in small_print(thick.plot())
     figure = sine.plot("f_el", others=thick)
     names = ["electroadhesive force, the deck as it is", "electroadhesive force, Xgap.d = 5 um"]
     assert legend(figure.axes[0]) == names
@@ -330,8 +301,6 @@ def test_other_runs_lie_over_it_called_by_what_sets_them_apart(sine: fs.Solution
     assert legend(named.axes[0])[1] == "electroadhesive force, thick"
     # What drives both alike is drawn once.
     assert legend(sine.plot(others=[thick]).axes[0])[0] == "source"
-    with pytest.raises(fs.InputError, match="others is 'x'; allowed: Solutions"):
-        sine.plot(others="x")  # type: ignore[arg-type]
 
 
 def test_each_finger_keeps_its_colour_in_every_panel_and_has_a_legend_in_each() -> None:
@@ -360,7 +329,6 @@ def test_a_long_run_is_an_envelope_beside_its_last_oscillations() -> None:
     assert left[3].get_xlabel() == "Time [ms]: envelope of 250 oscillations"
     assert right[3].get_xlabel() == "Time [ms]: the last 4"
     assert right[3].get_xlim()[1] - right[3].get_xlim()[0] == pytest.approx(0.8, abs=0.06)
-    assert run.f_el is not None
     upper = curve(left[1], "electroadhesive force")[1]
     # Each part of the envelope reaches the force's peak, which the last periods have all of.
     np.testing.assert_allclose(upper[100:-1], run.f_el[5000:].max(), rtol=1e-6)
@@ -372,30 +340,18 @@ def test_a_long_run_is_an_envelope_beside_its_last_oscillations() -> None:
 
 def test_an_envelope_is_smooth_where_oscillations_are_longer_than_most_and_falls_between_bursts() -> None:
 
-    def run(source: fs.Waveform, stop: float, step: float) -> fs.Solution:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", fs.FingerspiceWarning)
-            return simulate(
-                table1(), sources={"Vdrive": source}, t_stop=stop, t_eval=np.arange(0.0, stop, step), rtol=1e-4
-            )
+    def picture(source: fs.Waveform, stop: float, step: float) -> Axes:
+        run = with_source(source, t_stop=stop, t_eval=np.arange(0.0, stop, step), rtol=1e-4)
+        return run.plot("u_source").axes[0]
 
-    chirp = run(fs.Chirp(150.0, 20.0, 2000.0, 0.3), 0.3, 2e-5)
-    t, upper = curve(traces.plot_solution(chirp, "u_source").axes[0], "source")
+    chirp = picture(fs.Chirp(150.0, 20.0, 2000.0, 0.3), 0.3, 2e-5)
     # Every part of it reaches the amplitude on both sides, the first ones, too.
-    assert upper.min() > 0.97 * 150.0
-    lower = traces.plot_solution(chirp, "u_source").axes[0].lines[0].get_ydata()
-    assert np.max(lower) < -0.97 * 150.0
+    assert curve(chirp, "source")[1].min() > 0.97 * 150.0
+    assert np.max(chirp.lines[0].get_ydata()) < -0.97 * 150.0
     burst = fs.Repeat(fs.Burst(fs.Sine(200.0, 5000.0), 2e-3), 10e-3)
-    bursts = run(burst, 0.05, 5e-6)
-    t, upper = curve(traces.plot_solution(bursts, "u_source").axes[0], "source")
+    t, upper = curve(picture(burst, 0.05, 5e-6), "source")
     assert upper[(t % 10.0 > 3.0) & (t % 10.0 < 9.0)].max() < 1e-9
     assert upper[(t % 10.0 > 0.5) & (t % 10.0 < 1.5)].min() > 199.0
-
-
-def test_the_caption_names_source_and_changes(sine: fs.Solution) -> None:
-    assert "Vdrive: Sine(200 V, 100 Hz)" in small_print(sine.plot())
-    changed = simulate(table1().replace({"Xgap.d": 5e-6}))
-    assert "Table 1 (changed: Xgap.d = 5 um)" in small_print(changed.plot())
 
 
 # Pictures show themselves
@@ -414,6 +370,11 @@ def test_where_there_is_no_window_show_says_what_to_do(sine: fs.Solution) -> Non
 
 WINDOW = """
 import sys, types
+from fingerspice.plots import drawing, lines, traces
+from fingerspice.studies import figures
+assert not any(name.startswith("matplotlib") for name in sys.modules)
+figure, _ = drawing.new_figure(1)
+assert "matplotlib.pyplot" not in sys.modules
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backend_bases import FigureManagerBase
@@ -431,15 +392,13 @@ window = types.ModuleType("window")
 window.FigureCanvas, window.FigureManager = Canvas, Manager
 sys.modules["window"] = window
 matplotlib.use("module://window")
-from fingerspice.plots.drawing import new_figure
-figure, _ = new_figure(1)
 figure.show()
 assert shown == [figure, "until closed"], shown
 figure.savefig(sys.argv[1])
 """
 
 
-def test_from_a_script_a_picture_opens_a_window(tmp_path: Path) -> None:
+def test_a_picture_needs_no_pyplot_until_it_opens_a_window_from_a_script(tmp_path: Path) -> None:
     code = [sys.executable, "-W", "error", "-c", WINDOW, str(tmp_path / "x.png")]
     subprocess.run(code, check=True, timeout=60, env={**os.environ, "DISPLAY": ":none"})
     assert (tmp_path / "x.png").stat().st_size > 0
@@ -447,11 +406,7 @@ def test_from_a_script_a_picture_opens_a_window(tmp_path: Path) -> None:
 
 def test_a_click_in_a_long_run_is_enlarged_beside_it() -> None:
     click = fs.PWL((0.0, 0.5, 0.5005, 0.5015, 0.5025, 0.503), (0.0, 0.0, 200.0, -200.0, 200.0, 0.0))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fs.FingerspiceWarning)
-        solution = simulate(
-            table1(), sources={"Vdrive": click}, t_stop=2.0, t_eval=np.arange(0.0, 2.0, 1e-4), rtol=1e-5
-        )
+    solution = with_source(click, t_stop=2.0, t_eval=np.arange(0.0, 2.0, 1e-4), rtol=1e-5)
     whole, part = traces.plot_solution(solution, "u_source").axes
     assert (whole.get_xlabel(), part.get_xlabel()) == ("Time [s]: the whole run", "Time [s]: enlarged")
     start, stop = part.get_xlim()
@@ -463,9 +418,7 @@ def test_a_click_in_a_long_run_is_enlarged_beside_it() -> None:
 def test_of_many_oscillations_the_last_ones_that_are_not_small_are_enlarged() -> None:
     # The envelope of 50 Hz is zero where the run ends, and widest 10 ms before.
     t = np.arange(0.0, 0.055, 1e-5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fs.FingerspiceWarning)
-        solution = simulate(table1(), sources={"Vdrive": fs.AM(200, 5000, 50)}, t_stop=0.055, t_eval=t, rtol=1e-5)
+    solution = with_source(fs.AM(200, 5000, 50), t_stop=0.055, t_eval=t, rtol=1e-5)
     whole, part = traces.plot_solution(solution, "u_source").axes
     assert "envelope of 27" in whole.get_xlabel()
     assert part.get_xlabel() == "Time [ms]: enlarged"

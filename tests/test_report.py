@@ -54,28 +54,19 @@ def rows() -> dict[str, dict[str, float]]:
     return printed(fs.simulate(table1(), start="periodic", t_stop=1.0 / F, rtol=1e-8))
 
 
-def test_the_printed_area_is_the_reference_s_in_square_millimetres(
+def test_the_printed_area_and_friction_are_the_reference_s(
     rows: dict[str, dict[str, float]], state: ref.Transient
 ) -> None:
-    row, area = rows["ridge contact area"], state.area
-    assert row["min"] == digits(area.min())
-    assert row["max"] == digits(area.max())
-    assert row["mean"] == row["last period"] == digits(area.mean())
-    assert row["ripple"] == digits(np.ptp(area))
-    assert "rms" not in row
-
-
-def test_the_printed_friction_is_mu_times_load_and_force_over_load(
-    rows: dict[str, dict[str, float]], state: ref.Transient
-) -> None:
-    # Eq. 1: F_T = mu (F_N + F_el), of which the coefficient is F_T / F_N.
-    force = 0.3 * (0.5 + state.force)
-    for name, want in (("friction force", force), ("friction coefficient", force / 0.5)):
+    # Eq. 1: F_T = mu (F_N + F_el), of which the coefficient is F_T / F_N. The area is printed in mm^2.
+    friction = 0.3 * (0.5 + state.force)
+    wanted = {"ridge contact area": state.area, "friction force": friction, "friction coefficient": friction / 0.5}
+    for name, want in wanted.items():
         row = rows[name]
         assert row["min"] == digits(want.min())
         assert row["max"] == digits(want.max())
         assert row["mean"] == row["last period"] == digits(want.mean())
         assert row["ripple"] == digits(np.ptp(want))
+        assert "rms" not in row
     assert rows["electroadhesive force"]["mean"] == digits(state.force.mean())
     assert rows["electroadhesive force"]["max"] == digits(state.force.max())
 
@@ -100,7 +91,6 @@ def test_the_printed_lead_is_that_of_the_gap_over_the_source(f: float, phase: fl
     said = re.search(
         r"at (\S+ k?Hz): gap voltage (\S+ V), (\S+) % of the source, leading by (\S+) deg", summary_table(run)
     )
-    assert said is not None
     assert said[1] == {100.0: "100 Hz", 5000.0: "5 kHz"}[f]
     assert number(said[2]) == digits(200.0 * abs(gain))
     assert float(said[3]) == pytest.approx(100.0 * abs(gain), abs=5.1e-3)

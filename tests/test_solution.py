@@ -93,28 +93,20 @@ def test_arrays_are_read_only_and_the_result_is_frozen(square: fs.Solution) -> N
         square.rtol = 1.0  # type: ignore[misc]
 
 
-def test_every_signal_has_its_unit(square: fs.Solution) -> None:
+def test_every_signal_has_its_unit_and_is_that_of_its_name(square: fs.Solution) -> None:
     units = {name: unit for name, (_, unit, _) in square.signals.items()}
     assert units == {
-        "u_source": "V",
-        "u_layer:Xcoat": "V",
-        "u_layer:Xgap": "V",
-        "u_layer:Xskin": "V",
-        "u_gap": "V",
-        "area": "m^2",
-        "sigma_el": "Pa",
-        "f_el": "N",
-        "f_t": "N",
-        "friction": "1",
-        "q_source": "C",
-        "i_source": "A",
-        "fold_margin": "1",
-        "v:drive": "V",
-        "v:top": "V",
-        "v:skin": "V",
-    }
+        **dict.fromkeys(("u_source", "u_layer:Xcoat", "u_layer:Xgap", "u_layer:Xskin", "u_gap"), "V"),
+        "area": "m^2", "sigma_el": "Pa", "f_el": "N", "f_t": "N", "friction": "1", "q_source": "C", "i_source": "A",
+        "fold_margin": "1", **dict.fromkeys(("v:drive", "v:top", "v:skin"), "V"),
+    }  # fmt: skip
     assert square.layers == ("Xcoat", "Xgap", "Xskin")
     np.testing.assert_array_equal(square.signals["u_layer:Xgap"][0], square.u_gap)
+    for key in SIGNALS:
+        if key not in ("u_layer", "v"):
+            assert square.by_name(key)[key] is getattr(square, key)
+    np.testing.assert_array_equal(square.f_t, 0.3 * (0.5 + square.f_el))
+    np.testing.assert_array_equal(square.friction, square.f_t / 0.5)
 
 
 # Figures
@@ -123,8 +115,6 @@ def test_every_signal_has_its_unit(square: fs.Solution) -> None:
 def test_figures_of_a_sine_equal_plain_numpy(sine: fs.Solution) -> None:
     s = sine.summary()
     t, u, f = sine.t, sine.u_gap, sine.f_el
-    assert u is not None
-    assert f is not None
     # 1000 outputs a period miss an extreme by (pi / 1000)^2 / 2 of it at most.
     assert u.max() <= s["u_gap_max"] <= u.max() * (1.0 + 5e-6)
     assert u.min() >= s["u_gap_min"] >= u.min() * (1.0 + 5e-6)
@@ -147,19 +137,8 @@ def test_figures_of_a_sine_equal_plain_numpy(sine: fs.Solution) -> None:
     assert s["status"] == "SUCCESS"
 
 
-def test_figures_of_a_square_equal_plain_numpy(square: fs.Solution) -> None:
+def test_figures_of_the_source_of_a_square_are_by_hand(square: fs.Solution) -> None:
     s = square.summary()
-    f = square.f_el
-    assert f is not None
-    # From jump to jump, one-sided values at both ends.
-    cuts = np.flatnonzero(np.diff(square.t) == 0.0) + 1
-    parts = zip(np.split(square.t, cuts), np.split(f, cuts), strict=True)
-    total = sum(simpson(y, x=t) for t, y in parts if t.size > 1)
-    assert s["f_el_mean"] == pytest.approx(total / T_STOP, rel=1e-4)
-    fine = fs.simulate(table1(SQUARE, tran="2u 30m uic"), rtol=1e-9).summary()
-    # TSTEP is the output spacing, not the accuracy.
-    assert s["f_el_mean"] == pytest.approx(fine["f_el_mean"], rel=2e-5)
-    assert s["f_el_max"] == pytest.approx(fine["f_el_max"], rel=1e-6)
     assert s["u_source_rms"] == pytest.approx(200.0, rel=1e-12)
     assert s["u_source_mean_periodic"] == pytest.approx(0.0, abs=1e-9)
     assert s["u_source_amplitude"] == pytest.approx(200.0 * 4.0 / np.pi, rel=1e-3)
@@ -265,7 +244,6 @@ def test_a_failed_run_keeps_what_came_before_it(tmp_path: Path) -> None:
     assert not partial.success
     assert partial.status is fs.Status.FOLD
     assert partial.message == str(caught.value)
-    assert caught.value.solution is not None
     np.testing.assert_array_equal(caught.value.solution.t, partial.t)
     assert 0 < partial.t.size < 100
     assert all(value.shape[0] == partial.t.size for value, _, _ in partial.signals.values())
@@ -275,9 +253,6 @@ def test_a_failed_run_keeps_what_came_before_it(tmp_path: Path) -> None:
     assert dataset.attrs["message"] == partial.message
     assert rows(partial.to_csv(tmp_path / "run.csv"))[1].shape[0] == partial.t.size
     assert partial.summary()["status"] == "FOLD"
-
-
-def test_only_success_says_success() -> None:
     assert [s.name for s in fs.Status if "success" in s.value] == ["SUCCESS"]
 
 
@@ -329,11 +304,3 @@ def test_states_status_and_elements_show_themselves_in_one_short_line(square: fs
     gap = repr(table1()["Xgap"])
     assert gap.startswith("<GAP Xgap top skin area d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 ")
     assert repr(table1()["Vdrive"]) == "<V Vdrive drive 0 Sine(200 V, 100 Hz)>"
-
-
-def test_a_signal_of_a_solution_is_that_of_its_name(square: fs.Solution) -> None:
-    for key in SIGNALS:
-        if key not in ("u_layer", "v"):
-            assert square.by_name(key)[key] is getattr(square, key)
-    np.testing.assert_array_equal(square.f_t, 0.3 * (0.5 + square.f_el))
-    np.testing.assert_array_equal(square.friction, square.f_t / 0.5)

@@ -25,7 +25,7 @@ from fingerspice.base.files import settle_on_disk, write_aside, write_durably
 from fingerspice.cli.options import check_output, time_from_text
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import Answering
-from fingerspice.results.datafiles import variables
+from fingerspice.results.signals import variables
 from fingerspice.results.store import CHECKSUM, SIGNATURE, Array, attributes_of, create, signature, tidy, zarr_library
 
 if TYPE_CHECKING:

@@ -61,10 +61,9 @@ class Drawn(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """One line of a panel: signal `name` of a run with its values `x`, its label, and matplotlib's line style."""
+    """One line of a panel: a signal's values `x` in a run, its label, and matplotlib's line style."""
 
     solution: Solution
-    name: str
     label: str
     x: FloatArray
     style: dict[str, Any]
@@ -115,7 +114,7 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
                     above += 1
                 if run.label and not (source and shared):
                     label = f"{label}, {run.label}"
-                out.append(Trace(run.solution, name, label, x, style))
+                out.append(Trace(run.solution, label, x, style))
     return out
 
 
@@ -236,12 +235,6 @@ def time_axis(axes: Sequence[Axes], runs: Sequence[Drawn], start: float, stop: f
     axes[-1].set_xlabel(f"Time [{unit}]", fontsize=drawing.FONT)
 
 
-def about(solution: Solution) -> str:
-    """Circuit, method and error of a run, in one line."""
-    text = " · ".join(fact for fact in _facts(solution) if fact)
-    return text if solution.success else f"{text} · {solution.message}"
-
-
 def _facts(solution: Solution) -> list[str]:
     """Facts of a run for its caption, each always at the same index; an empty text if a fact does not apply."""
     error = f"error estimate {solution.error.u_gap:.2g} V"
@@ -259,9 +252,10 @@ def _facts(solution: Solution) -> list[str]:
 
 def about_all(runs: list[Drawn]) -> str:
     """Circuit, method and error of several runs: first the facts that all runs share, then each run's own facts."""
-    if len(runs) == 1:
-        return about(runs[0].solution)
     facts = [_facts(run.solution) for run in runs]
+    if len(runs) == 1:
+        end = [] if runs[0].solution.success else [runs[0].solution.message]
+        return " · ".join([fact for fact in facts[0] if fact] + end)
     shared = [f for i, f in enumerate(facts[0]) if f and all(other[i] == f for other in facts)]
     own = []
     for run, fact in zip(runs, facts, strict=True):

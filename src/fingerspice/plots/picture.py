@@ -69,7 +69,9 @@ class Picture(Figure):
         backend = matplotlib.get_backend()
         registry: Any = backend_registry
         canvas = registry.load_backend_module(backend).FigureCanvas
-        if not _opens(canvas.manager_class):
+        # Of a backend that opens windows, the manager has one of these methods of its own.
+        own, plain = canvas.manager_class, FigureManagerBase
+        if all(getattr(own, x).__func__ is getattr(plain, x).__func__ for x in ("pyplot_show", "start_main_loop")):
             raise InputError(
                 f"no window can be opened here (matplotlib's backend is {backend}); allowed: savefig('picture.png')"
             )
@@ -86,9 +88,3 @@ _waiting: list[Picture] = []
 def _show_waiting() -> None:
     for picture in tuple(_waiting):
         picture.show()
-
-
-def _opens(manager: Any) -> bool:
-    """Whether a backend's manager opens windows."""
-    own = ("pyplot_show", "start_main_loop")
-    return any(getattr(manager, name).__func__ is not getattr(FigureManagerBase, name).__func__ for name in own)

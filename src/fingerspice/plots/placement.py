@@ -115,7 +115,8 @@ def _columns(order: Sequence[tuple[Element, Element | None]], rows: Rows) -> Pla
         preferred = [places[before.name].column] if before is not None else []
         for column in (*preferred, *range(len(taken) + 1)):
             room = column == len(taken) or all(p.bottom <= top or p.top >= bottom for p in taken[column])
-            wider = {node: _with(extents.get(node), column) for node in ends}
+            so_far = {node: extents.get(node, (column, column)) for node in ends}
+            wider = {node: (min(lo, column), max(hi, column)) for node, (lo, hi) in so_far.items()}
             if room and not _meet(wider, extents, rows):
                 break
         else:
@@ -127,10 +128,6 @@ def _columns(order: Sequence[tuple[Element, Element | None]], rows: Rows) -> Pla
         taken[column].append(places[element.name])
         extents |= wider
     return Placement(tuple(places.values()), rows, extents)
-
-
-def _with(extent: Extent | None, column: int) -> Extent:
-    return (column, column) if extent is None else (min(extent[0], column), max(extent[1], column))
 
 
 def _meet(wider: Mapping[str, Extent], extents: Mapping[str, Extent], rows: Rows) -> bool:

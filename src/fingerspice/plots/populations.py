@@ -37,7 +37,12 @@ def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> P
     if dims:
         figure = _along(found[dims[0]], factor * values, label, indices, factor, output)
     else:
-        figure = _at_once(factor * np.ravel(values), label, indices, output)
+        rows = 1 if indices is None else 2
+        figure, axes = drawing.new_figure(rows, height=2.4 * rows)
+        axes[0].hist(factor * np.ravel(values), bins=40, color=drawing.CYCLE[0])
+        drawing.dress(axes[0], "scenes", label)
+        if indices is not None:
+            _shares(axes[1], indices, output, None)
     if "scene" in one.dims:
         drawing.caption(figure, f"{found.sizes['scene']:,} scenes, seed {found.attrs.get('seed', 0)}")
     return figure
@@ -71,21 +76,16 @@ def _along(
         ax.tick_params(labelbottom=True)
     for ax in figure.axes:
         if named:
-            _name_places(ax, [str(name) for name in grid.values])
+            # Names of sets of parameters instead of numbers, with a mark at each: nothing lies between them.
+            ax.set_xticks(range(x.size), [str(name) for name in grid.values], rotation=20.0 if x.size > 4 else 0.0)
+            ax.set_xlim(-0.3, x.size - 0.7)
+            for line in ax.lines:
+                line.set(marker="o", markersize=4.0)
             continue
         if x.min() > 0.0 and x.max() > _WIDE * x.min():
             ax.set_xscale("log")
         ax.set_xlim(x.min(), x.max() if x.size > 1 else None)
     return figure
-
-
-def _name_places(ax: Axes, names: list[str]) -> None:
-    """Names of sets of parameters instead of numbers along an axis, with a mark at each: nothing lies between them."""
-    ax.set_xticks(range(len(names)), names, rotation=20.0 if len(names) > 4 else 0.0)
-    ax.set_xlim(-0.3, len(names) - 0.7)
-    for line in ax.lines:
-        line.set_marker("o")
-        line.set_markersize(4.0)
 
 
 def _alone(ax: Axes, x: FloatArray, values: FloatArray, indices: Dataset, j: int) -> None:
@@ -99,17 +99,6 @@ def _alone(ax: Axes, x: FloatArray, values: FloatArray, indices: Dataset, j: int
     for k, colour in enumerate((drawing.BLUE, drawing.BLACK, drawing.VERMILION)):
         name = f"its {100 * float(indices['quantile'][k]):g} % quantile"
         ax.plot(x, values[:, k], linestyle=drawing.DASHES[k], color=colour, linewidth=1.3, label=name)
-
-
-def _at_once(values: FloatArray, label: str, indices: Dataset | None, output: str) -> Picture:
-    """A histogram, and bars for the shares."""
-    rows = 1 if indices is None else 2
-    figure, axes = drawing.new_figure(rows, height=2.4 * rows)
-    axes[0].hist(values, bins=40, color=drawing.CYCLE[0])
-    drawing.dress(axes[0], "scenes", label)
-    if indices is not None:
-        _shares(axes[1], indices, output, None)
-    return figure
 
 
 def _band(ax: Axes, x: FloatArray, values: FloatArray, with_median: bool) -> None:

@@ -8,12 +8,14 @@ from __future__ import annotations
 import io
 import math
 import textwrap
-from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from matplotlib import image, rc_context
+from matplotlib.font_manager import FontProperties
+from matplotlib.patches import Rectangle
 
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
@@ -65,9 +67,8 @@ def _cell(y: float, *, leaks: bool) -> list[Stroke]:
 
 
 def _resistor(x: float, y: float) -> list[Stroke]:
-    top, step, wide = y + 0.15, 0.05, 0.06
-    zigzag = [(x + wide * (-1.0) ** k, top - step * (k + 0.5)) for k in range(6)]
-    return [[(x, y + HALF), (x, top), *zigzag, (x, y - 0.15), (x, y - HALF)]]
+    zigzag = [(x + 0.06 * (-1.0) ** k, y + 0.15 - 0.05 * (k + 0.5)) for k in range(6)]
+    return [[(x, y + HALF), (x, y + 0.15), *zigzag, (x, y - 0.15), (x, y - HALF)]]
 
 
 def _capacitor(x: float, y: float) -> list[Stroke]:
@@ -110,8 +111,6 @@ class Schematic(Picture):
         return {"image/svg+xml": self._repr_svg_()}, {}
 
     def _write_svg(self, target: Path | io.StringIO, about: Mapping[str, str]) -> None:
-        from matplotlib import rc_context
-
         # Texts stay texts, and the same circuit gives the same file.
         with rc_context({"svg.fonttype": "none", "svg.hashsalt": "fingerspice"}):
             self.savefig(target, format="svg", metadata={"Date": None, **about})
@@ -138,20 +137,7 @@ class Schematic(Picture):
         return write_aside(path, lambda target: self._write_svg(target, about or {}))
 
 
-@dataclass(frozen=True)
-class _Label:
-    """Name and values beside a symbol, with the width of its longest line, inches."""
-
-    lines: tuple[str, ...]
-    width: float
-
-    @property
-    def height(self) -> float:
-        return _LINE * len(self.lines)
-
-
-@dataclass(frozen=True)
-class _Sheet:
+class _Sheet(NamedTuple):
     """Where columns and rows lie, inches."""
 
     x: list[float]
@@ -162,8 +148,6 @@ class _Sheet:
 
 def put_beside(picture: Figure, circuit: Circuit) -> Figure:
     """The picture of a run with the circuit's schematic, small, on its right."""
-    from matplotlib import image
-
     schematic = draw_circuit(circuit)
     content = io.BytesIO()
     schematic.savefig(content, format="png", dpi=_SMALL_DPI)
@@ -191,24 +175,31 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     if len(circuit.elements) > MOST_ELEMENTS:
         count = f"{len(circuit.elements):,}"
         raise InputError(f"the circuit has {count} elements; allowed: at most {MOST_ELEMENTS} in a picture")
-    figure = Schematic(facecolor="white")
-    size = _measure(figure)
-    placed = place(circuit)
-    names = _node_names(circuit)
+    figure, placed = Schematic(facecolor="white"), place(circuit)
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+
+    def size(text: str, bold: bool) -> float:
+        """The width of a text, inches."""
+        font = FontProperties(size=drawing.FONT, weight="bold" if bold else "normal")
+        return float(renderer.get_text_width_height_descent(text, font, False)[0]) / float(figure.dpi)
+
+    pairs = [pair for e in circuit.elements for pair in zip(e.nodes[:2], e.node_names[:2], strict=True)]
+    names = {node: drawing.drawable(name, _LONGEST) for node, name in reversed(pairs) if node != GROUND}
     areas = {node for e in circuit.elements for node in e.nodes[2:]}
     # One area that no source gives goes without saying.
     told = areas if len(areas) > 1 or areas & set(names) else set()
-    labels = {p.element.name: _label(p.element, told, size) for p in placed.places}
+    labels = {p.element.name: _label(p.element, told) for p in placed.places}
     title = textwrap.wrap(drawing.drawable(circuit.title), 60) or [""]
-    widths = {node: size(names[node], False) for node in names}
-    sheet = _sheet(placed, labels, widths, max(size(line, True) for line in title), len(title))
+    widths = {node: size(name, False) for node, name in names.items()}
+    wide = {name: max(size(line, k == 0) for k, line in enumerate(lines)) for name, lines in labels.items()}
+    sheet = _sheet(placed, labels, wide, widths, max(size(line, True) for line in title), len(title))
     figure.set_size_inches(sheet.width, sheet.height)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set(xlim=(0.0, sheet.width), ylim=(0.0, sheet.height))
     ax.set_axis_off()
     for k, line in enumerate(title):
         _write(ax, _MARGIN, sheet.height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, bold=True)
-    strokes = _wires(placed, sheet)
+    strokes, dots = _wires(placed, sheet)
     for p in placed.places:
         strokes += _draw_element(ax, sheet, p, labels[p.element.name])
     for node, name in names.items():
@@ -216,21 +207,11 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
         _write(ax, x, y, name, color=drawing.BLUE)
     for stroke in strokes:
         ax.plot(*zip(*stroke, strict=True), color=drawing.BLACK, linewidth=1.0, solid_capstyle="round")
-    for x, y in _dots(placed, sheet):
+    for x, y in dots:
         ax.plot([x], [y], "o", color=drawing.BLACK, markersize=3.5)
     if path is not None:
         figure.write(path)
     return figure
-
-
-def _measure(figure: Schematic) -> Callable[[str, bool], float]:
-    """A function that gives the width of a text, inches."""
-    from matplotlib.font_manager import FontProperties
-
-    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
-    fonts = {bold: FontProperties(size=drawing.FONT, weight="bold" if bold else "normal") for bold in (False, True)}
-    dots = float(figure.dpi)
-    return lambda text, bold: float(renderer.get_text_width_height_descent(text, fonts[bold], False)[0]) / dots
 
 
 def _write(ax: Axes, x: float, y: float, text: str, *, bold: bool = False, color: str = drawing.BLACK) -> None:
@@ -239,14 +220,8 @@ def _write(ax: Axes, x: float, y: float, text: str, *, bold: bool = False, color
     ax.text(x, y, text, fontsize=drawing.FONT, weight=weight, color=color, va="center", parse_math=False)
 
 
-def _node_names(circuit: Circuit) -> dict[str, str]:
-    """Nodes but ground, with their names as written."""
-    pairs = [pair for e in circuit.elements for pair in zip(e.nodes[:2], e.node_names[:2], strict=True)]
-    return {node: drawing.drawable(name, _LONGEST) for node, name in reversed(pairs) if node != GROUND}
-
-
-def _label(element: Element, areas: Set[str], size: Callable[[str, bool], float]) -> _Label:
-    """Name and values of an element; of a layer also its area where it is among `areas`."""
+def _label(element: Element, areas: Set[str]) -> tuple[str, ...]:
+    """Name of an element, and lines of its values; of a layer also its area where it is among `areas`."""
     said = [element.device] if element.spec.is_layer else []
     for spec in element.spec.parameters:
         value = element.values[spec.name]
@@ -264,19 +239,13 @@ def _label(element: Element, areas: Set[str], size: Callable[[str, bool], float]
         said.append(f"IC = {_quantity(element.initial, 'V')}")
     if areas & set(element.nodes[2:]):
         said.append(f"area = {element.node_names[2]}")
-    values = _wrapped([drawing.drawable(text) for text in said])
-    name = drawing.drawable(element.name, _LONGEST)
-    return _Label((name, *values), max(size(name, True), *(size(line, False) for line in values), 0.0))
-
-
-def _wrapped(said: Sequence[str]) -> list[str]:
-    """Values in lines; one that fits a line is not divided, since textwrap breaks at plain spaces only."""
-    pieces = [piece for text in said for piece in text.split(", ")]
+    pieces = [piece for text in said for piece in drawing.drawable(text).split(", ")]
+    # A value that fits a line is not divided, since textwrap breaks at plain spaces only.
     kept = ", ".join(text.replace(" ", "\N{NO-BREAK SPACE}") if len(text) <= _LETTERS else text for text in pieces)
     lines = textwrap.wrap(kept, _LETTERS + 1, break_on_hyphens=False)
     if len(lines) > _LINES:
         lines = [*lines[: _LINES - 1], f"{lines[_LINES - 1][: _LETTERS - 4]} ..."]
-    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
+    return (drawing.drawable(element.name, _LONGEST), *(line.replace("\N{NO-BREAK SPACE}", " ") for line in lines))
 
 
 def _quantity(value: float, unit: str) -> str:
@@ -288,18 +257,19 @@ def _quantity(value: float, unit: str) -> str:
 
 
 def _sheet(
-    placed: Placement, labels: Mapping[str, _Label], names: Mapping[str, float], title: float, lines: int
-) -> _Sheet:
-    """Columns so wide and rows so high that nothing meets."""
+    placed: Placement, labels: Mapping[str, tuple[str, ...]], widths: Mapping[str, float], names: Mapping[str, float],
+    title: float, lines: int,
+) -> _Sheet:  # fmt: skip
+    """Columns so wide and rows so high that nothing meets, from the widths (inches) of labels, nodes and title."""
     columns = 1 + max(p.column for p in placed.places)
     gaps = max(p.bottom for p in placed.places)
     left, right, high = [0.2] * columns, [0.3] * columns, [0.0] * gaps
     for p in placed.places:
         _, tall, wide = symbol(p.element)
-        label = labels[p.element.name]
+        name = p.element.name
         left[p.column] = max(left[p.column], wide)
-        right[p.column] = max(right[p.column], wide + _BESIDE + label.width)
-        high[p.gap] = max(high[p.gap], 2.0 * tall, label.height)
+        right[p.column] = max(right[p.column], wide + _BESIDE + widths[name])
+        high[p.gap] = max(high[p.gap], 2.0 * tall, _LINE * len(labels[name]))
     for node, width in names.items():
         column = placed.extents[node][0]
         right[column] = max(right[column], 0.07 + width)
@@ -316,10 +286,8 @@ def _sheet(
     return _Sheet(x, y, width, height)
 
 
-def _draw_element(ax: Axes, sheet: _Sheet, p: Place, label: _Label) -> list[Stroke]:
+def _draw_element(ax: Axes, sheet: _Sheet, p: Place, label: Sequence[str]) -> list[Stroke]:
     """Write an element's label; gives the strokes of its symbol and of its wires."""
-    from matplotlib.patches import Rectangle
-
     strokes, tall, wide = symbol(p.element)
     x = sheet.x[p.column]
     # The name of the node below needs the lowest line.
@@ -328,32 +296,25 @@ def _draw_element(ax: Axes, sheet: _Sheet, p: Place, label: _Label) -> list[Stro
     if tint is not None:
         corner = (x - wide - 0.02, y - tall)
         ax.add_patch(Rectangle(corner, 2.0 * wide + 0.04, 2.0 * tall, color=tint, alpha=0.2, linewidth=0))
-    for k, line in enumerate(label.lines):
-        _write(ax, x + wide + _BESIDE, y + 0.5 * label.height - (k + 0.5) * _LINE, line, bold=k == 0)
+    for k, line in enumerate(label):
+        _write(ax, x + wide + _BESIDE, y + 0.5 * _LINE * len(label) - (k + 0.5) * _LINE, line, bold=k == 0)
     up = 1.0 if p.upright else -1.0
     moved: list[Stroke] = [[(x + dx, y + up * dy) for dx, dy in stroke] for stroke in strokes]
     return [*moved, [(x, sheet.y[p.top]), (x, y + tall)], [(x, y - tall), (x, sheet.y[p.bottom])]]
 
 
-def _wires(placed: Placement, sheet: _Sheet) -> list[Stroke]:
-    """The rows of nodes, and ground."""
+def _wires(placed: Placement, sheet: _Sheet) -> tuple[list[Stroke], Stroke]:
+    """The rows of nodes with ground, and the points where three wires or more meet."""
     rows: list[Stroke] = []
+    dots = []
     for node, (first, last) in placed.extents.items():
         y = sheet.y[placed.rows[node]]
         if last > first:
             rows.append([(sheet.x[first], y), (sheet.x[last], y)])
-    column = placed.extents[GROUND][0]
-    return [*rows, *ground(sheet.x[column], sheet.y[placed.rows[GROUND]])]
-
-
-def _dots(placed: Placement, sheet: _Sheet) -> Sequence[tuple[float, float]]:
-    """Points where three wires or more meet."""
-    found = []
-    for node, (first, last) in placed.extents.items():
-        row = placed.rows[node]
         ends = [p.column for p in placed.places if node in p.element.nodes[:2]]
         for column in sorted(set(ends)):
             meeting = ends.count(column) + (column > first) + (column < last)
             if meeting + (node == GROUND and column == first) >= 3:
-                found.append((sheet.x[column], sheet.y[row]))
-    return found
+                dots.append((sheet.x[column], y))
+    column = placed.extents[GROUND][0]
+    return [*rows, *ground(sheet.x[column], sheet.y[placed.rows[GROUND]])], dots

@@ -130,7 +130,8 @@ def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[tupl
     for name in asked:
         if name not in known:
             near = get_close_matches(str(name), known, 1, 0.0)
-            raise InputError(f"unknown signal {name!r}; nearest: {near[0]!r}; allowed: {', '.join(_short(known))}")
+            allowed = ", ".join([*(name for name in known if ":" not in name), "and name:element"])
+            raise InputError(f"unknown signal {name!r}; nearest: {near[0]!r}; allowed: {allowed}")
         quantity = lines.QUANTITIES[name.partition(":")[0]]
         same = [keys for q, keys in panels if q == quantity]
         if same:
@@ -139,10 +140,6 @@ def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[tupl
             panels.append((quantity, [name]))
     require(bool(panels), "signals", "empty", "one name or more")
     return panels
-
-
-def _short(names: Mapping[str, None]) -> list[str]:
-    return [name for name in names if ":" not in name] + ["and name:element"]
 
 
 def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[float, float]:
@@ -214,7 +211,14 @@ def plot_spectrum(spectrum: Spectrum) -> Picture:
         drawing.dress(ax, f"{label}: amplitude [{unit}]", "Frequency [Hz]")
         small = f"Fourier integrals over a period; {spectrum.frequency.size} lines, {spectrum.resolution:.4g} Hz apart"
     else:
-        _band(ax, spectrum, color)
+        assert spectrum.density is not None
+        assert spectrum.lower is not None
+        assert spectrum.upper is not None
+        some = (spectrum.frequency > 0.0) & (spectrum.density > 0.0)
+        if some.any():
+            f = spectrum.frequency[some]
+            ax.fill_between(f, spectrum.lower[some], spectrum.upper[some], color=color, alpha=0.25, linewidth=0.0)
+            ax.loglog(f, spectrum.density[some], color=color, linewidth=1.2)
         drawing.dress(ax, f"{label}: density [{unit}²/Hz]", "Frequency [Hz]")
         small = (
             f"Welch's density, {spectrum.resolution:.4g} Hz wide, with the interval that holds the true one with a "
@@ -225,18 +229,6 @@ def plot_spectrum(spectrum: Spectrum) -> Picture:
     rms = spectrum.variance**0.5
     drawing.caption(figure, f"{small} · mean {spectrum.mean:.4g} {unit}, rms about it {rms:.4g} {unit}")
     return figure
-
-
-def _band(ax: Axes, spectrum: Spectrum, color: str) -> None:
-    """Draw a density and its confidence interval at frequencies above 0 where the density is not zero."""
-    assert spectrum.density is not None
-    assert spectrum.lower is not None
-    assert spectrum.upper is not None
-    some = (spectrum.frequency > 0.0) & (spectrum.density > 0.0)
-    if some.any():
-        f = spectrum.frequency[some]
-        ax.fill_between(f, spectrum.lower[some], spectrum.upper[some], color=color, alpha=0.25, linewidth=0.0)
-        ax.loglog(f, spectrum.density[some], color=color, linewidth=1.2)
 
 
 def stems(

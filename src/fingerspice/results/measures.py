@@ -81,8 +81,8 @@ class Stretch:
         weighed, panels = self._cut(read, *self.run.at_points(read, self.panels), max(_FINEST, 1e-3 * self.rtol))
         found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
         panel, place = np.array([p for p, _, _ in found]), np.array([x for _, x, _ in found])
-        at = panels.low[panel] * (1.0 - place) + panels.high[panel] * place
-        _, exact = self.run.values_at(read, panels.step[panel], at[:, None])
+        panels = panels.take(panel)
+        _, exact = self.run.values_at(read, panels.step, panels.fractions(place[:, None]))
         low, high = exact[:, 0].tolist()
         return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
 
@@ -159,13 +159,7 @@ class Outputs:
 
 
 def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:
-    """A signal's outputs with weights, by cubics through neighbouring values; a repeated time is a jump."""
-    weight = output_weights(t)
-    return Weighed(t, weight / weight.sum(), x)
-
-
-def output_weights(t: FloatArray) -> FloatArray:
-    """Weights (n,) of values at times t (s, ascending) in the integral over them, exact for cubics between jumps.
+    """A signal's outputs at times t (s, ascending), with weights that are exact for cubics; a repeated time is a jump.
 
     Where fewer than four values lie between two jumps, the trapezoidal rule is used.
     """
@@ -190,4 +184,4 @@ def output_weights(t: FloatArray) -> FloatArray:
                 if m != j:
                     share *= (at - nodes[:, m]) / (nodes[:, j] - nodes[:, m])
             weight += np.bincount(index[:, j], share, t.size)
-    return weight
+    return Weighed(t, weight / weight.sum(), x)

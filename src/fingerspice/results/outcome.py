@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Status(Enum):
-    """How a run ended: the cause in words, and the action that the user is advised to take."""
+    """How a run ended: its `cause` in words, and the `action` that the user is advised to take."""
 
     SUCCESS = ("success", "")
     FOLD = (
@@ -44,18 +44,11 @@ class Status(Enum):
         "simulate more periods from rest instead, and see what they do",
     )
 
+    def __init__(self, cause: str, action: str) -> None:
+        self.cause, self.action = cause, action
+
     def __repr__(self) -> str:
         return f"Status.{self.name}"
-
-    @property
-    def cause(self) -> str:
-        """What happened."""
-        return self.value[0]
-
-    @property
-    def action(self) -> str:
-        """What to do."""
-        return self.value[1]
 
 
 class Attempt(NamedTuple):

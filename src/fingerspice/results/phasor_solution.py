@@ -6,20 +6,31 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
-from fingerspice.base.pages import Page, Shown
+from fingerspice.base.files import write_csv
+from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import heading
-from fingerspice.results.report import Column, table_of, write_columns
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+class Column(NamedTuple):
+    """A column of a result, from which its table, its file and its plain data follow."""
+
+    key: str
+    unit: str
+    values: FloatArray  # In that unit, shape (n,)
+    head: str = ""  # Heading in a table; a column without one only belongs into files
+    factor: float = 1.0  # From its unit to that of the heading
+    form: str = ".5g"
 
 
 @dataclass(frozen=True, repr=False)
@@ -103,7 +114,10 @@ class PhasorSolution(Shown):
         """A table; of a long sweep, only every n-th row, so that at most `most` rows remain."""
         rows = slice(None, None, max(1, -(-self.frequency.size // most)))
         drive = f"source amplitude {format_si(self.amplitude, 'V')}, phase {math.degrees(self.phase):.4g} deg"
-        return Page([f"{drive}: {self.drive}", *self.notes, table_of(self._columns(), rows)])
+        shown = [column for column in self._columns() if column.head]
+        cells = [[f"{c.factor * x:{c.form}}" for x in c.values[rows].tolist()] for c in shown]
+        table = Table(tuple(column.head for column in shown), [*zip(*cells, strict=True)])
+        return Page([f"{drive}: {self.drive}", *self.notes, table])
 
     def to_dict(self) -> dict[str, Any]:
         """The sweep as plain data, SI units."""
@@ -134,4 +148,7 @@ def phasor_tables(results: Sequence[PhasorSolution], circuit: Circuit) -> str:
 
 def phasor_csv(results: Sequence[PhasorSolution], path: Path) -> Path:
     """Write sweeps as CSV, one after the other where there are several amplitudes."""
-    return write_columns(path, [r._columns() for r in results])
+    tables = [r._columns() for r in results]
+    header = [f"{column.key} [{column.unit}]" for column in tables[0]]
+    rows = (row for columns in tables for row in zip(*(c.values.tolist() for c in columns), strict=True))
+    return write_csv(path, header, rows)

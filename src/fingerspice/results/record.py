@@ -77,13 +77,8 @@ class Record(Sealed):
     @cached_property
     def fingers(self) -> tuple[tuple[str, Contact], ...]:
         """Each GAP's name and contact."""
-        found = []
-        for i in self.network.fingers:
-            contact, gap = self.network.contacts[i], self.network.areas[i].gap
-            assert contact is not None
-            assert gap is not None
-            found.append((gap.name, contact))
-        return tuple(found)
+        found = ((self.network.areas[i].gap, self.network.contacts[i]) for i in self.network.fingers)
+        return tuple((gap.name, contact) for gap, contact in found if gap is not None and contact is not None)
 
     @cached_property
     def _x(self) -> FloatArray:
@@ -147,17 +142,11 @@ class Record(Sealed):
         n_v = self.network.n_voltage
         out = self._s[:, : len(self.network.sources)].copy()
         if n_v < out.shape[1]:
+            at = {name.lower(): u for name, u in self.node_voltages.items()}
             for j, element in enumerate(self.network.sources[n_v:]):
-                ends = [self._at_node(node) for node in element.nodes[:2]]
-                out[:, n_v + j] = ends[1] - ends[0]
-        return _columns(out)
-
-    def _at_node(self, node: str) -> FloatArray:
-        n = self._x.shape[1]
-        for name, row in zip(self.network.node_names, self.network.nodes, strict=True):
-            if name.lower() == node:
-                return self._voltage(row[:n], row[n:])
-        return np.zeros(self.t.size)
+                p, n = (at.get(node, 0.0) for node in element.nodes[:2])
+                out[:, n_v + j] = n - p
+        return side_by_side(out.T)
 
     @cached_property
     def u_layer(self) -> FloatArray:
@@ -188,12 +177,12 @@ class Record(Sealed):
         """Charge (C) that each source has delivered at its p node, or at its n node if it is an I."""
         n_s = len(self.network.sources)
         end = self.rows.shape[1] - n_s
-        return _columns(self.rows[:, end - n_s : end].copy()) if self.has_charge else None
+        return side_by_side(self.rows[:, end - n_s : end].T) if self.has_charge else None
 
     @cached_property
     def i_source(self) -> FloatArray | None:
         """Current (A) that each source delivers at that node, without the impulses at jumps."""
-        return _columns(self.rows[:, -len(self.network.sources) :].copy()) if self.has_charge else None
+        return side_by_side(self.rows[:, -len(self.network.sources) :].T) if self.has_charge else None
 
     @cached_property
     def fold_margin(self) -> FloatArray:
@@ -226,14 +215,10 @@ class Record(Sealed):
         return {name: sealed(self._voltage(row[:n], row[n:])) for name, row in rows}
 
 
-def side_by_side(columns: Sequence[FloatArray]) -> FloatArray:
-    """Signals of several elements as a table, that of one as it is."""
-    return sealed(columns[0] if len(columns) == 1 else np.column_stack(columns))
-
-
-def _columns(x: FloatArray) -> FloatArray:
-    """A table of one column as a one-dimensional array; others as they are."""
-    return sealed(np.ascontiguousarray(x[:, 0]) if x.shape[1] == 1 else x)
+def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray:
+    """Signals (n_t,) of several elements as a table, that of one as it is."""
+    # A view of a run's rows is copied, so that it does not seal them.
+    return sealed(np.column_stack([*columns]) if len(columns) != 1 else np.array(columns[0]))
 
 
 def bare_record(network: Network, net: Net, t: FloatArray, left: BoolArray, rows: FloatArray) -> Record:

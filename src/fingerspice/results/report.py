@@ -1,13 +1,9 @@
-"""Pages of results: the figures of a run as a table, and tables of columns."""
+"""The page of a run: its figures as a table."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from fingerspice.base.arrays import FloatArray
-from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines
@@ -15,31 +11,6 @@ from fingerspice.results.signals import signal_of
 
 if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
-
-
-class Column(NamedTuple):
-    """A column of a result, from which its table, its file and its plain data follow."""
-
-    key: str
-    unit: str
-    values: FloatArray  # In that unit, shape (n,)
-    head: str = ""  # Heading in a table; a column without one only belongs into files
-    factor: float = 1.0  # From its unit to that of the heading
-    form: str = ".5g"
-
-
-def table_of(columns: Sequence[Column], rows: slice) -> Table:
-    """A table of the columns that have a heading, with those rows."""
-    shown = [column for column in columns if column.head]
-    cells = [[f"{c.factor * x:{c.form}}" for x in c.values[rows].tolist()] for c in shown]
-    return Table(tuple(column.head for column in shown), [*zip(*cells, strict=True)])
-
-
-def write_columns(path: Path, tables: Sequence[Sequence[Column]]) -> Path:
-    """Write tables of the same columns as CSV, one after the other; errors as of `write_csv`."""
-    header = [f"{column.key} [{column.unit}]" for column in tables[0]]
-    rows = (row for columns in tables for row in zip(*(c.values.tolist() for c in columns), strict=True))
-    return write_csv(path, header, rows)
 
 
 #: Signals that have rows, in their order.

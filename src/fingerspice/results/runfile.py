@@ -1,4 +1,4 @@
-"""The NetCDF file of a run: written and read back."""
+"""The NetCDF file of a run, written and read back, with its circuit as plain data and arrays."""
 
 from __future__ import annotations
 
@@ -6,36 +6,50 @@ import dataclasses
 import io
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from fingerspice.base import files
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran
+from fingerspice.circuit.loop import checked
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.physics.contact import Contact
-from fingerspice.results.datafiles import Variable, kept_rows, variables
 from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, State, Status
-from fingerspice.results.signals import stored_record
+from fingerspice.results.signals import kept_rows, stored_record, variables
 from fingerspice.results.solution import Solution
 from fingerspice.results.steps import Block, Recorded
-from fingerspice.results.stored_circuit import made_again, stored_circuit
-from fingerspice.waveforms.waveform import Fundamental
+from fingerspice.waveforms import combinations, periodic, ramps, samples
+from fingerspice.waveforms import waveform as waveforms
+from fingerspice.waveforms.sampling import Function, SourceTable, source_table
+from fingerspice.waveforms.waveform import Fundamental, Waveform
 
 #: Name of the NetCDF group with what `load` needs besides the variables, and the number of its format.
 GROUP, FORMAT = "fingerspice", 1
 _ALLOWED = "allowed: a NetCDF file that to_netcdf or the command wrote"
+#: Largest number of a circuit's samples, points and coefficients that a file keeps (64 MB).
+MOST_NUMBERS = 8_000_000
+_WAVEFORMS = {
+    kind.__name__: kind
+    for kind in (
+        waveforms.DC, waveforms.Sine, periodic.Chirp, periodic.Exp, ramps.PWL, periodic.Pulse, periodic.Square,
+        periodic.Triangle, periodic.Sawtooth, combinations.Sum, combinations.Product, combinations.AM,
+        combinations.Burst, combinations.Repeat, samples.Samples,
+    )
+}  # fmt: skip
+# Attributes of a circuit that a file holds as they are.
+_OF_CIRCUIT = ("title", "charge_law", "work", "warnings", "unused", "overrides", "initial")
 
 
-def _failure(plain: dict[str, Any] | None) -> Failure | None:
-    if plain is None:
-        return None
+def _failure(plain: dict[str, Any]) -> Failure:
     tried = tuple(Attempt(**a) for a in plain["tried"])
-    own = {f.name: plain[f.name] for f in dataclasses.fields(Failure) if f.name in plain}
+    own = {key: x for key, x in plain.items() if key != "step"}
     return Failure(**{**own, "status": Status[plain["status"]], "tried": tried})
 
 
@@ -59,7 +73,7 @@ _PLAIN: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
         lambda plain: Plan(**{**plain, "reasons": tuple(plain["reasons"]), "rates": tuple(plain["rates"])}),
     ),
     "status": (lambda status: status.name, lambda name: Status[name]),
-    "failure": (lambda failure: failure and failure.to_dict(), _failure),
+    "failure": (lambda failure: failure and failure.to_dict(), lambda plain: plain and _failure(plain)),
     "fundamental": (lambda x: x and vars(x), lambda plain: plain and Fundamental(**plain)),
     "period": (lambda x: x, lambda x: x),
     "fold_margin_min": (float, float),
@@ -73,6 +87,7 @@ _PLAIN: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
 def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
     """Write the variables as a NetCDF file, with a group of further data that `load` needs."""
     import h5netcdf
+    import h5py
 
     keep = kept_rows(solution, jumps)
 
@@ -80,7 +95,12 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
         # HDF5 would end the process on a full disk, so let it write into memory.
         content = io.BytesIO()
         with h5netcdf.File(content, "w") as file:
-            _fill(file, *variables(solution, keep))
+            data, coords = variables(solution, keep)
+            for name, (_, values, _) in coords.items():
+                file.dimensions[name] = values.size
+            for name, (dimensions, values, attributes) in {**coords, **data}.items():
+                kind = h5py.string_dtype() if values.dtype == object else values.dtype
+                file.create_variable(name, dimensions, dtype=kind, data=values).attrs.update(attributes)
             for key, text in solution.provenance().items():
                 file.attrs[key] = text
             group = file.create_group(GROUP)
@@ -108,17 +128,6 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
         files.write_pieces(target, content.getbuffer())
 
     return files.write_aside(path, write)
-
-
-def _fill(file: Any, data: dict[str, Variable], coords: dict[str, Variable]) -> None:
-    import h5py
-
-    for name, (_, values, _) in coords.items():
-        file.dimensions[name] = values.size
-    for name, (dimensions, values, attributes) in {**coords, **data}.items():
-        kind = h5py.string_dtype() if values.dtype == object else values.dtype
-        variable = file.create_variable(name, dimensions, dtype=kind, data=values)
-        variable.attrs.update(attributes)
 
 
 def load(path: str | Path) -> Solution:
@@ -222,3 +231,106 @@ def _circuit(file: Any, run: dict[str, Any]) -> Circuit:
         return Circuit(
             _text(file.attrs["title"]), (), text=_text(file.attrs["deck"]), overrides=dict(run["overrides"]), sets=sets
         )
+
+
+def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str, Any] | str, list[FloatArray]]:
+    """A circuit as plain data and arrays, or the reason why it is not kept.
+
+    A function is kept as Chebyshev series up to the end of the run, `stop` (s), as exact as its tolerance asks.
+    """
+    arrays: list[FloatArray] = []
+
+    def plain(value: Any) -> Any:
+        """A waveform, a row of numbers or a tuple of waveforms as plain data; anything else as it is."""
+        if isinstance(value, Waveform):
+            kind: Any = samples.Samples if isinstance(value, samples.Samples) else type(value)
+            if kind in _WAVEFORMS.values():
+                own = {"kind": kind.__name__} | {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}
+            else:
+                own = _tabulated(value, stop, rtol, circuit.tran.step if circuit.tran else 1e-3 * stop)
+            return {name: plain(x) for name, x in own.items()}
+        waves = isinstance(value, tuple) and any(isinstance(x, Waveform) for x in value)
+        if waves or not isinstance(value, (tuple, np.ndarray)):
+            return [plain(part) for part in value] if waves else value
+        arrays.append(np.asarray(value, float))
+        return {"array": len(arrays) - 1}
+
+    elements = [
+        {f.name: getattr(e, f.name) for f in dataclasses.fields(Element) if f.name != "where"}
+        | {"waveform": plain(e.waveform), "values": dict(e.values), "ac": e.ac and vars(e.ac)}
+        for e in circuit.elements
+    ]
+    kept = {name: getattr(circuit, name) for name in _OF_CIRCUIT}
+    kept |= {"tran": circuit.tran and vars(circuit.tran), "ac": circuit.ac and vars(circuit.ac), "elements": elements}
+    kept["sets"] = {name: {path: plain(x) for path, x in one.items()} for name, one in circuit.sets.items()}
+    count = sum(array.size for array in arrays)
+    if count > MOST_NUMBERS:
+        return f"its sources have {count:,} numbers, and a file keeps at most {MOST_NUMBERS:,}", []
+    return kept, arrays
+
+
+def _tabulated(wave: Waveform, stop: float, rtol: float, step: float) -> dict[str, Any]:
+    """A function as the Chebyshev series by which a run represents it."""
+    end = wave.settled + wave.period if wave.period is not None else stop
+    with warnings.catch_warnings():
+        # The run has warned of edges.
+        warnings.simplefilter("ignore")
+        table = source_table(wave, 0.0, end, min(1e-3, max(0.05 * rtol, 1e-14)), step)
+    breaks = wave.breakpoints(0.0, end)
+    return {
+        "kind": "Function", "name": getattr(getattr(wave, "function", None), "__name__", ""), "repeat": wave.period,
+        "breaks": breaks[breaks < end].tolist(), "edges": table.edges, "series": table.series,
+    }  # fmt: skip
+
+
+def made_again(kept: Mapping[str, Any], arrays: list[FloatArray]) -> Circuit:
+    """The circuit of `stored_circuit`; data that are not of a circuit raise an error of any of Python's kinds."""
+    elements = tuple(
+        Element(**{
+            **one, "nodes": tuple(map(str, one["nodes"])), "node_names": tuple(map(str, one["node_names"])),
+            "values": MappingProxyType({name: float(x) for name, x in one["values"].items()}),
+            **{name: _value(one[name], arrays) for name in ("waveform", "initial")},
+            "ac": one["ac"] and SmallSignal(**one["ac"]),
+        })
+        for one in kept["elements"]
+    )  # fmt: skip
+    plain = {name: kept[name] for name in _OF_CIRCUIT}
+    plain |= {name: tuple(map(str, kept[name])) for name in ("warnings", "unused")}
+    sets = {name: {path: _value(x, arrays) for path, x in one.items()} for name, one in kept["sets"].items()}
+    tran, ac = kept["tran"] and Tran(**kept["tran"]), kept["ac"] and AcSweep(**kept["ac"])
+    return checked(Circuit(**{**plain, "elements": elements, "tran": tran, "ac": ac, "sets": sets}))
+
+
+def _value(plain: Any, arrays: list[FloatArray]) -> Any:
+    """What `plain` of `stored_circuit` was given."""
+    if isinstance(plain, list):
+        return tuple(_value(part, arrays) for part in plain)
+    if plain is None or isinstance(plain, (int, float)):
+        return plain
+    if not isinstance(plain, dict):
+        raise ValueError(f"{plain!r} is no waveform")
+    if "array" in plain:
+        return arrays[plain["array"]]
+    given = {name: _value(x, arrays) for name, x in plain.items() if name not in ("kind", "name")}
+    if plain["kind"] != "Function":
+        for name, x in given.items():
+            parts = x if isinstance(x, tuple) else (x,)
+            if any(isinstance(part, Waveform) != (name in ("parts", "waveform")) for part in parts):
+                raise ValueError(f"{name} of {plain['kind']} is {x!r}")
+        made: Any = _WAVEFORMS[plain["kind"]]
+        return made(**given)
+    series = given["series"]
+    table = SourceTable(given["edges"], np.zeros((len(series), 1, 6)), series)
+    along = partial(_along, table, given["repeat"])
+    # By its name the run's summary shows a function.
+    vars(along).update({"__name__": str(plain["name"])} if plain["name"] else {})
+    return Function(along, given["breaks"], given["repeat"])
+
+
+def _along(table: SourceTable, repeat: float | None, t: FloatArray) -> FloatArray:
+    """Values (V) of a function's table at times (s), repeated with a period (s), or held beyond its ends."""
+    t = np.asarray(t, float)
+    low, high = float(table.edges[0]), float(table.edges[-1])
+    if repeat is not None:
+        t = np.where(t > high, high - repeat + np.remainder(t - high, repeat), t)
+    return table.values(np.clip(t, low, high).ravel()).reshape(t.shape)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.physics.contact import Contact
 from fingerspice.results.record import Record, Sealed, side_by_side
+from fingerspice.waveforms.waveform import require
 
 
 class Signal(NamedTuple):
@@ -103,9 +105,8 @@ class Signals:
         if signal.of == "gap" and key != "area" and not self.gaps:
             return None
         if signal.make is None:
-            held: FloatArray | None
-            held = self.record.values.get(key) if isinstance(self.record, StoredRecord) else getattr(self.record, key)
-            return held
+            found = self.record.values if isinstance(self.record, StoredRecord) else {key: getattr(self.record, key)}
+            return found.get(key)
         if key not in self._derived:
             base, contacts = self.value(signal.base), [contact for _, contact in self.record.fingers]
             assert base is not None
@@ -116,8 +117,7 @@ class Signals:
 
     def columns(self, key: str) -> tuple[str, ...]:
         """Names of the layers, gaps, sources or nodes to which the columns of a signal belong."""
-        record = self.record
-        of = SIGNALS[key].of
+        record, of = self.record, SIGNALS[key].of
         if of == "node":
             return tuple(record.node_voltages)
         return {"": (), "source": record.sources, "layer": record.layers, "gap": self.gaps}[of]
@@ -154,20 +154,20 @@ class Signals:
         return value[:, self.columns(key).index(element)] if colon else value
 
 
-class _Given(property):
-    """A signal as an attribute; None where the run has no such signal."""
+def attribute(get: Callable[[Any], Any], doc: str) -> Any:
+    """A property of a result, with its documentation."""
+    return property(get, doc=doc)
 
-    def __init__(self, key: str, doc: str) -> None:
-        super().__init__(lambda result: result.all_signals.value(key), doc=doc)
 
-    def __get__(self, result: Any, owner: type | None = None, /) -> FloatArray | None:  # type: ignore[override]
-        found: FloatArray | None = super().__get__(result, owner)
-        return found
+def _given(key: str, doc: str) -> FloatArray | None:
+    """A property: a signal; None where the run has no such signal."""
+    return attribute(lambda result: result.all_signals.value(key), doc)  # type: ignore[no-any-return]
 
 
 class Signalled:
     """A result with the signals of a record."""
 
+    t: FloatArray
     record: AnyRecord
 
     @cached_property
@@ -175,62 +175,48 @@ class Signalled:
         """The signals by name, with the elements to which their columns belong."""
         return Signals(self.record)
 
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the columns of `u_layer`."""
-        return self.record.layers
-
-    @property
-    def gaps(self) -> tuple[str, ...]:
-        """Names of the GAPs."""
-        return self.all_signals.gaps
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """Names of the sources of a network; of a series stack there is one, its loop."""
-        return self.record.sources
-
-    @property
-    def u_source(self) -> FloatArray:
-        """Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,)."""
-        return self.all_signals.one("u_source")
-
-    @property
-    def u_layer(self) -> FloatArray:
-        """Voltage of each layer from its p to its n node, V, shape (n_t, n_layer)."""
-        return self.all_signals.one("u_layer")
-
-    @property
-    def node_voltages(self) -> dict[str, FloatArray]:
-        """Node name to its voltage, V, shape (n_t,)."""
-        return self.record.node_voltages
-
-    @property
-    def fold_margin(self) -> FloatArray:
-        """Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`."""
-        return self.all_signals.one("fold_margin")
-
-    area = _Given("area", "Ridge contact area, m^2, shape (n_t,); None for a circuit without any.")
-    q_source = _Given(
+    layers: tuple[str, ...] = attribute(lambda result: result.record.layers, "Names of the columns of `u_layer`.")
+    gaps: tuple[str, ...] = attribute(lambda result: result.all_signals.gaps, "Names of the GAPs.")
+    sources: tuple[str, ...] = attribute(
+        lambda result: result.record.sources,
+        "Names of the sources of a network; of a series stack there is one, its loop.",
+    )
+    u_source: FloatArray = attribute(
+        lambda result: result.all_signals.one("u_source"),
+        "Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,).",
+    )
+    u_layer: FloatArray = attribute(
+        lambda result: result.all_signals.one("u_layer"),
+        "Voltage of each layer from its p to its n node, V, shape (n_t, n_layer).",
+    )
+    node_voltages: dict[str, FloatArray] = attribute(
+        lambda result: result.record.node_voltages, "Node name to its voltage, V, shape (n_t,)."
+    )
+    fold_margin: FloatArray = attribute(
+        lambda result: result.all_signals.one("fold_margin"),
+        "Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`.",
+    )
+    area = _given("area", "Ridge contact area, m^2, shape (n_t,); None for a circuit without any.")
+    q_source = _given(
         "q_source",
         "Charge delivered by the source since the start, C, shape (n_t,), with the impulses at jumps.\n\n"
         "None where the run was asked to leave it out.",
     )
-    i_source = _Given(
+    i_source = _given(
         "i_source",
         "Current of the source, A, shape (n_t,), without the impulses at jumps, which only `q_source` shows.",
     )
-    u_gap = _Given("u_gap", "Gap voltage, V, shape (n_t,); None for a circuit without GAP.")
-    sigma_el = _Given("sigma_el", "Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP.")
-    f_el = _Given(
+    u_gap = _given("u_gap", "Gap voltage, V, shape (n_t,); None for a circuit without GAP.")
+    sigma_el = _given("sigma_el", "Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP.")
+    f_el = _given(
         "f_el",
         "Electroadhesive force, N, shape (n_t,); None for a circuit without GAP.\n\n"
         "Its mean is `f_el_mean`, and over the last period `f_el_mean_periodic`. ``f_el.mean()`` is another figure: it "
         "gives every output the same weight, including both ends of a period and both rows of a jump, which causes an "
         "error of some per cent at 50 to 200 outputs per period.",
     )
-    f_t = _Given("f_t", "Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP.")
-    friction = _Given("friction", "Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP.")
+    f_t = _given("f_t", "Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP.")
+    friction = _given("friction", "Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP.")
 
     def by_name(self, key: str) -> dict[str, FloatArray]:
         """A signal by its name, or the columns of several elements by ``name:element``.
@@ -252,3 +238,35 @@ class Signalled:
                 said = {"u_layer": f"voltage of {element}", "v": f"voltage of node {element}"}.get(key, signal.text)
                 out[name] = value, signal.unit, said
         return out
+
+
+#: Dimensions, values and attributes of a variable, as xarray and NetCDF take them.
+Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]
+
+
+def kept_rows(solution: Signalled, jumps: str) -> BoolArray:
+    """Mask of the rows that are written, shape (n_t,): all rows, or all but the left-hand rows of jumps."""
+    require(jumps in ("right", "both"), "jumps", repr(jumps), "'right' or 'both'")
+    keep = np.ones(solution.t.size, bool)
+    if jumps == "right" and solution.t.size:
+        keep[:-1] = np.diff(solution.t) > 0.0
+    return keep
+
+
+def variables(
+    solution: Signalled, keep: BoolArray, wanted: Collection[str] = SIGNALS
+) -> tuple[dict[str, Variable], dict[str, Variable]]:
+    """Variables and coordinates of the data files, with the rows in `keep` and those signals that are wanted."""
+    data: dict[str, Variable] = {}
+    coords: dict[str, Variable] = {"time": (("time",), solution.t[keep], {"units": "s", "long_name": "time"})}
+    for key, signal in SIGNALS.items():
+        columns = [x[keep] for x in solution.by_name(key).values()] if key in wanted else []
+        several = key in ("u_layer", "v")
+        about = {"units": signal.unit, "long_name": signal.text}
+        if len(columns) > 1 or (several and key in wanted):
+            coords[signal.of] = ((signal.of,), np.array(solution.all_signals.columns(key), dtype=object), {})
+            table = np.column_stack([np.zeros((int(keep.sum()), 0)), *columns])
+            data[key] = (("time", signal.of), table, about)
+        elif columns:
+            data[key] = (("time",), columns[0], about)
+    return data, coords

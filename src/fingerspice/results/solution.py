@@ -14,11 +14,10 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown
-from fingerspice.results.datafiles import kept_rows, variables
 from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status
 from fingerspice.results.record import Sealed
 from fingerspice.results.report import summary_table
-from fingerspice.results.signals import AnyRecord, Signalled
+from fingerspice.results.signals import AnyRecord, Signalled, kept_rows, variables
 from fingerspice.results.summary import Figured, Figures
 
 if TYPE_CHECKING:

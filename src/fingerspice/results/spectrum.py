@@ -22,7 +22,6 @@ from fingerspice.waveforms.waveform import require
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from fingerspice.results.measures import Weighed
     from fingerspice.results.solution import Solution
 
 METHODS = ("auto", "lines", "welch")
@@ -152,45 +151,27 @@ def _lines(solution: Solution, name: str, highest: float | None) -> Spectrum | N
     if not exact:
         # The outputs alone determine no frequency beyond half their rate.
         count = max(min(count, (weighed.t.size - 1) // 2), 1)
-    _warn_if_open(solution, name, weighed)
     mean = weighed.mean()
     weight, x = weighed.weight.ravel(), weighed.x.ravel() - mean
-    variance = float((weight * x**2).sum())
-    return Spectrum(
-        name, signal_of(name).unit, np.arange(1, count + 1) / period,
-        _amplitudes(weighed.t.ravel(), weight * x, period, count), None, None, None, mean, variance, 1.0 / period, 1.0,
-    )  # fmt: skip
-
-
-def _amplitudes(t: FloatArray, weighed: FloatArray, period: float, count: int) -> FloatArray:
-    """Amplitudes of the first `count` harmonics of a signal times its quadrature weights, at times t (s)."""
-    turn = np.exp(-2j * np.pi * np.remainder(t / period, 1.0))
-    turning = 2.0 * weighed + 0j
-    out = np.empty(count)
+    if abs(x[weighed.t.argmax()] - x[weighed.t.argmin()]) > _CLOSED * float(np.ptp(x)):
+        # The signal is not periodic yet, unless a source has a breakpoint at the end, where it may jump.
+        ends = solution.t_stop - 1e-6 * period, solution.t_stop + 1e-6 * period
+        if not any(w.breakpoints(*ends).size for w in network_of(solution.circuit).waveforms):
+            warnings.warn(
+                f"{name} changes over the last period by more than {100 * _CLOSED:g} % of its range, so its lines are "
+                "not those of the periodic state; a longer run, or start='periodic', has it",
+                FingerspiceWarning,
+                stacklevel=4,
+            )
+    turn = np.exp(-2j * np.pi * np.remainder(weighed.t.ravel() / period, 1.0))
+    turning, amplitude = 2.0 * (weight * x) + 0j, np.empty(count)
     for k in range(count):
         turning *= turn
-        out[k] = abs(turning.sum())
-    return out
-
-
-def _warn_if_open(solution: Solution, name: str, weighed: Weighed) -> None:
-    """Warn if the signal is not periodic yet: its values at both ends of the source's last period differ."""
-    first, last = int(weighed.t.argmin()), int(weighed.t.argmax())
-    x = weighed.x.ravel()
-    if abs(x[last] - x[first]) > _CLOSED * float(np.ptp(x)) and not _has_edge(solution):
-        warnings.warn(
-            f"{name} changes over the last period by more than {100 * _CLOSED:g} % of its range, so its lines are not "
-            "those of the periodic state; a longer run, or start='periodic', has it",
-            FingerspiceWarning,
-            stacklevel=5,
-        )
-
-
-def _has_edge(solution: Solution) -> bool:
-    """Whether the run ends at a breakpoint of a source, where the signals may jump."""
-    assert solution.period is not None
-    stop, slack = solution.t_stop, 1e-6 * solution.period
-    return any(w.breakpoints(stop - slack, stop + slack).size > 0 for w in network_of(solution.circuit).waveforms)
+        amplitude[k] = abs(turning.sum())
+    return Spectrum(
+        name, signal_of(name).unit, np.arange(1, count + 1) / period, amplitude, None, None, None, mean,
+        float((weight * x**2).sum()), 1.0 / period, 1.0,
+    )  # fmt: skip
 
 
 def _density(
@@ -210,7 +191,20 @@ def _density(
     segments = equivalent_segments(window, size - size // 2, 1 + (t.size - size) // (size - size // 2))
     low, high = interval(segments)
     variance = float(np.mean((x - mean) ** 2))
-    _warn_if_folded(solution, name, rate)
+    # The band of a voltage is that of the sources; areas and forces follow the voltage's square, with twice that band.
+    wide = 1.0 if name.partition(":")[0] in ("u_source", "u_layer", "u_gap", "v", "i_source", "q_source") else 2.0
+    half, waves = 0.5 * rate / wide, network_of(solution.circuit).waveforms
+    # `energy_outside` samples the source at four times the given frequency. The second call, at a higher frequency,
+    # finds energy that the first one's own sampling would alias.
+    share = max((energy_outside(w, solution.t_stop, (0.0, f))[1] for w in waves for f in (half, 8.0 * half)), default=0)
+    if share > NOTABLE:
+        warnings.warn(
+            f"{name} has frequencies beyond half the rate of the outputs, {0.5 * rate:g} Hz, which are folded into its "
+            f"spectrum ({100.0 * share:.0f} % of the source's energy lie above {half:g} Hz); a shorter step of the "
+            "outputs, at most half a period of the highest frequency, keeps them apart",
+            FingerspiceWarning,
+            stacklevel=4,
+        )
     kept = slice(None) if highest is None else f <= highest
     require(bool(np.any(f[kept])), "highest", f"{highest} Hz", f"{f[1]:.4g} Hz or more")
     return Spectrum(
@@ -261,24 +255,3 @@ def interval(segments: float) -> tuple[float, float]:
     degrees = 2.0 * segments
     tail = 0.5 * (1.0 - CONFIDENCE)
     return float(degrees / chi2.ppf(1.0 - tail, degrees)), float(degrees / chi2.ppf(tail, degrees))
-
-
-def _warn_if_folded(solution: Solution, name: str, rate: float) -> None:
-    """Warn if the outputs undersample the signal, so that higher frequencies are aliased into the spectrum.
-
-    The band of a voltage is that of the sources; areas and forces follow the voltage's square, with twice that band.
-    """
-    wide = 1.0 if name.partition(":")[0] in ("u_source", "u_layer", "u_gap", "v", "i_source", "q_source") else 2.0
-    half = 0.5 * rate / wide
-    waves = network_of(solution.circuit).waveforms
-    # `energy_outside` samples the source at four times the given frequency. The second call, at a higher frequency,
-    # finds energy that the first one's own sampling would alias.
-    share = max((energy_outside(w, solution.t_stop, (0.0, f))[1] for w in waves for f in (half, 8.0 * half)), default=0)
-    if share > NOTABLE:
-        warnings.warn(
-            f"{name} has frequencies beyond half the rate of the outputs, {0.5 * rate:g} Hz, which are folded into its "
-            f"spectrum ({100.0 * share:.0f} % of the source's energy lie above {half:g} Hz); a shorter step of the "
-            "outputs, at most half a period of the highest frequency, keeps them apart",
-            FingerspiceWarning,
-            stacklevel=5,
-        )

@@ -145,7 +145,10 @@ def check_store(path: Path) -> dict[str, int]:
         head = attributes_of(path)
         about = {file.parent.name: json.loads(file.read_text()) for file in sorted(path.glob("*/zarr.json"))}
         codecs = [one["name"] for array in about.values() for one in array["codecs"]]
-        sizes = {name: _chunk_size(array) for name, array in about.items()}
+        sizes = {
+            name: np.dtype(array["data_type"]).itemsize * math.prod(array["chunk_grid"]["configuration"]["chunk_shape"])
+            for name, array in about.items()
+        }
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path} is no whole store; allowed: one that --stream or --store wrote") from None
     if codecs.count(CHECKSUM) < len(about):
@@ -168,13 +171,6 @@ def check_store(path: Path) -> dict[str, int]:
         raise InputError(f"{path} is damaged: {bad[0]}{more}; allowed: the command that wrote it, which runs a sweep's "
                          "chunk again, and a run with --overwrite")  # fmt: skip
     return {name: len(files) for name, files in found.items()}
-
-
-def _chunk_size(array: Mapping[str, Any]) -> int:
-    """Bytes of a chunk, from the description of its array."""
-    size: int = np.dtype(array["data_type"]).itemsize
-    shape: list[int] = array["chunk_grid"]["configuration"]["chunk_shape"]
-    return size * math.prod(shape)
 
 
 def _fault(file: Path, size: int) -> str | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.measures import Outputs, Stretch, Weighed
 from fingerspice.results.record import sealed
-from fingerspice.results.signals import AnyRecord, Signals, signal_of
+from fingerspice.results.signals import AnyRecord, Signals, attribute, signal_of
 
 if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
@@ -76,14 +75,11 @@ class Figures:
         figures: dict[str, float] = {"min": low, "max": high, "peak": max(high, -low), "ripple": high - low}
         return figures[kind]
 
-    @cached_property
-    def _readers(self) -> Mapping[str, Callable[[Any], FloatArray]]:
-        return {name: partial(_read, name) for name in self.shown}
-
     def _between(self, since: float, until: float) -> Stretch | None:
         """The run between two times (s); None where it is not known between its outputs."""
         continuous = self.solution.continuous
-        run = None if continuous is None else continuous.run(self._readers, since, until)
+        readers = {name: partial(_read, name) for name in self.shown}
+        run = None if continuous is None else continuous.run(readers, since, until)
         return None if run is None else Stretch(run, since, until, self.solution.rtol)
 
     @cached_property
@@ -186,15 +182,9 @@ class Figures:
         return out
 
 
-class Figure(property):
-    """A figure of a signal as an attribute of a result that has `_figures`."""
-
-    def __init__(self, key: str, kind: str, doc: str) -> None:
-        super().__init__(lambda result: result._figures.value(key, kind), doc=doc)
-
-    def __get__(self, result: Any, owner: type | None = None, /) -> Value:  # type: ignore[override]
-        found: Value = super().__get__(result, owner)
-        return found
+def figure(key: str, kind: str, doc: str) -> Value:
+    """A property of a result that has `_figures`: a figure of a signal."""
+    return attribute(lambda result: result._figures.value(key, kind), doc)  # type: ignore[no-any-return]
 
 
 class Figured:
@@ -207,27 +197,25 @@ class Figured:
     def _figures(self) -> Figures:
         raise NotImplementedError
 
-    f_el_mean = Figure("f_el", "mean", "Mean electroadhesive force over the run, N.")
-    f_el_mean_periodic = Figure(
-        "f_el",
-        "mean_periodic",
+    f_el_mean = figure("f_el", "mean", "Mean electroadhesive force over the run, N.")
+    f_el_mean_periodic = figure(
+        "f_el", "mean_periodic",
         "Mean electroadhesive force over the source's last period, N; None where the run holds none.",
-    )
-    f_el_peak = Figure("f_el", "peak", "Largest electroadhesive force, N.")
-    f_t_mean = Figure("f_t", "mean", "Mean friction force over the run, N.")
-    f_t_mean_periodic = Figure(
+    )  # fmt: skip
+    f_el_peak = figure("f_el", "peak", "Largest electroadhesive force, N.")
+    f_t_mean = figure("f_t", "mean", "Mean friction force over the run, N.")
+    f_t_mean_periodic = figure(
         "f_t", "mean_periodic", "Mean friction force over the source's last period, N; None where the run holds none."
     )
-    friction_mean = Figure("friction", "mean", "Mean friction coefficient over the run.")
-    area_mean = Figure("area", "mean", "Mean ridge contact area over the run, m^2.")
-    u_gap_peak = Figure("u_gap", "peak", "Largest modulus of the gap voltage, V.")
-    u_gap_rms = Figure("u_gap", "rms", "Root of the mean square of the gap voltage over the run, V.")
-    u_gap_amplitude = Figure(
-        "u_gap",
-        "amplitude",
+    friction_mean = figure("friction", "mean", "Mean friction coefficient over the run.")
+    area_mean = figure("area", "mean", "Mean ridge contact area over the run, m^2.")
+    u_gap_peak = figure("u_gap", "peak", "Largest modulus of the gap voltage, V.")
+    u_gap_rms = figure("u_gap", "rms", "Root of the mean square of the gap voltage over the run, V.")
+    u_gap_amplitude = figure(
+        "u_gap", "amplitude",
         "Amplitude of the gap voltage at the source's fundamental, over its last period, V; None without one.",
-    )
-    u_gap_phase_deg = Figure(
+    )  # fmt: skip
+    u_gap_phase_deg = figure(
         "u_gap", "phase_deg",
         "Phase of the gap voltage at the source's fundamental, relative to a sine, degrees.",
     )  # fmt: skip

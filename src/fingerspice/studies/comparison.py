@@ -143,7 +143,7 @@ class Comparison(Shown):
             lines.finish_panel(ax, quantity, unit, [factor * trace.x for trace in traces])
         lines.time_axis(axes[:2], runs, start, stop)
         self._draw_table(axes[2])
-        drawing.caption(figure, f"{lines.about(solution)} · periodic state; the phasor is of the fundamental alone")
+        drawing.caption(figure, f"{lines.about_all(runs)} · periodic state; the phasor is of the fundamental alone")
         figure.align_ylabels(axes[:2])
         return figure
 
