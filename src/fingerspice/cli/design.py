@@ -54,8 +54,7 @@ def design(
 
       fingerspice design wanted.csv circuits/fingerpad_5khz.cir --carrier 5k --limit 200
     """
-    from fingerspice.studies.design.inverse import inverse_drive
-    from fingerspice.studies.wanted import read_wanted
+    from fingerspice.studies.design.inverse import inverse_drive, read_wanted
 
     with Answering("design", as_json, charge_law=charge_law) as answer:
         circuit = read_circuit(deck, changes, None)

@@ -15,8 +15,8 @@ from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import Answering
 
 if TYPE_CHECKING:
-    from fingerspice.studies.fit.circuitresult import Fit
-    from fingerspice.studies.fit.contactresult import ContactFit
+    from fingerspice.studies.fit.circuitfit import Fit
+    from fingerspice.studies.fit.contactfit import ContactFit
 
 
 def fit(

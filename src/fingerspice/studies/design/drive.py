@@ -17,6 +17,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import head_lines, heading
 from fingerspice.plots import drawing
+from fingerspice.results.record import Sealed
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
@@ -29,7 +30,7 @@ _FULL = 2.0**31
 
 
 @dataclass(frozen=True, repr=False)
-class InverseDrive(Shown):
+class InverseDrive(Sealed, Shown):
     """A drive, the force and friction wanted from it, and those that a forward run gives.
 
     Attributes
