@@ -57,13 +57,13 @@ def design(
         given = {"carrier": carrier, "limit": limit, "slew": slew, "rate": rate}
         numbers = {key: number(f"--{key}", text) for key, text in given.items()}
         results = Results(deck, circuit, out, name, overwrite, charge_law)
-        kind, profile = read_wanted(table, numbers["rate"])
+        kind, wave, end = read_wanted(table, numbers["rate"])
         results.will_write("_drive.wav", lambda file: found.to_wav(file))
         results.will_write("_drive.csv", lambda file: found.to_csv(file))
         results.will_write("_friction.csv", lambda file: found.friction_to_csv(file))
         results.will_draw("_design.png", lambda: found.plot(), unless=no_plot)
-        wanted: dict[str, Any] = {kind: profile.wave}
-        found = inverse_drive(circuit, duration=profile.duration, charge_law=charge_law, **numbers, **wanted)
+        wanted: dict[str, Any] = {kind: wave}
+        found = inverse_drive(circuit, duration=end, charge_law=charge_law, **numbers, **wanted)
         answer.update(**found.to_dict())
         answer.give(lambda: str(found), results.ready())
 

@@ -23,7 +23,7 @@ from fingerspice.circuit.describe import heading
 from fingerspice.plots.drawing import BLUE, caption, dress, engineering, new_figure
 from fingerspice.solve.runs import Progress
 from fingerspice.studies.design.finger import Finger, ForceCurve, Inverter, the_finger
-from fingerspice.studies.design.inverse import Profile, Task
+from fingerspice.studies.design.inverse import Task
 from fingerspice.waveforms.samples import Samples
 
 if TYPE_CHECKING:
@@ -230,8 +230,8 @@ class _Search:
             if self.finger.network.stack is not None or found == 0.0:
                 break
             force = wanted(found)
-            profile = Profile(force, (force.values.size - 1) / force.rate, force.rate)
-            task = Task(self.finger, "force", profile, force.rate, self.carrier, self.finger.lead)
+            end = (force.values.size - 1) / force.rate
+            task = Task(self.finger, "force", force, end, force.rate, self.carrier, self.finger.lead)
             peak = task.solve(close=0.3 * _EXACT).peak
             before, self.ratio = self.ratio, peak / self._peak(force)
             if abs(self.ratio / before - 1.0) < 0.5 * _EXACT or (found == most and peak <= self.limit):

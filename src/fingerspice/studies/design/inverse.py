@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +17,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.design.drive import InverseDrive
 from fingerspice.studies.design.finger import Finger, ForceCurve, the_finger
-from fingerspice.waveforms.columns import Columns, read_text_columns
+from fingerspice.waveforms.columns import read_text_columns
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.samples import Samples
@@ -37,27 +36,20 @@ RTOL, CLOSE, CORRECTIONS, STALLED = 1e-6, 1e-5, 25, 0.7
 HUGE = 1000.0
 
 
-class Profile(NamedTuple):
-    """A wanted quantity (N) against time, from 0 to `duration` (s); `rate` (Hz) is its sample rate, or None."""
+def _wave_of(given: Wanted, what: str, rate: float | None, duration: float | None) -> tuple[Waveform, float]:
+    """What a caller wants (N) against time, and until when (s).
 
-    wave: Waveform
-    duration: float
-    rate: float | None
-
-
-def as_profile(given: Wanted, what: str, rate: float | None, duration: float | None) -> Profile:
-    """The profile that a caller gave; an array needs its `rate`, and a waveform without an end a `duration`."""
+    An array needs its `rate`, and a waveform without an end a `duration`.
+    """
     if isinstance(given, Waveform) or callable(given):
-        wave = as_waveform(given)
-        own = wave.rate if isinstance(wave, Samples) else None
-        end = duration
+        wave, end = as_waveform(given), duration
         if end is None and isinstance(wave, Samples):
             end = wave.start + (wave.values.size - 1) / wave.rate
         elif end is None and isinstance(wave, PWL) and wave.period is None:
             end = float(np.asarray(wave.times)[-1])
         if end is None:
             raise InputError(f"{what} is a waveform without an end; allowed: with duration= in s")
-        return Profile(wave, positive_number("duration", end, "s"), own)
+        return wave, positive_number("duration", end, "s")
     values = real_numbers(what, given, "numbers in N, a waveform or a function")
     if rate is None:
         raise InputError(f"{what} is an array without a rate; allowed: with rate= in Hz, or fs.Samples({what}, rate)")
@@ -65,14 +57,14 @@ def as_profile(given: Wanted, what: str, rate: float | None, duration: float | N
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
         raise InputError(f"{what}: row {bad[0]} is {values[bad[0]]}; allowed: finite numbers in N")
-    return Profile(Samples(values, rate), (values.size - 1) / rate, rate)
+    return Samples(values, rate), (values.size - 1) / rate
 
 
-def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Profile]:
-    """The wanted quantity of a table, ``"force"`` or ``"friction"``, and its profile.
+def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Waveform, float]:
+    """The wanted quantity of a table, ``"force"`` or ``"friction"``, its course from time 0 on, and its end, s.
 
     The header names a column ``force`` or ``friction`` (N or mN), and a column of times, ``t`` or ``time``, unless a
-    `rate` (Hz) is given: ``time (ms), friction (N)``.
+    `rate` (Hz) is given: ``time (ms), friction (N)``. Time 0 of the course is the first of the table's times.
     """
     path = checked_file(path, MAX_TEXT_BYTES)
     found = read_text_columns(path)
@@ -90,28 +82,24 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Profi
     if timed is None:
         if rate is None:
             raise InputError(f"'{path}' has no column of times and no rate; allowed: a column time, or a rate in Hz")
-        return named[0], as_profile(values, named[0], rate, None)
-    return named[0], _timed(found, found.seconds(timed), values, rate)
-
-
-def _timed(found: Columns, t: FloatArray, values: FloatArray, rate: float | None) -> Profile:
-    """The profile of values at times; time 0 of the profile is the first of them."""
+        return named[0], *_wave_of(values, named[0], rate, None)
+    t = found.seconds(timed)
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if back.size:
         i = int(back[0])
         raise InputError(f"{found.place(i + 1)}: the time {t[i + 1]:g} s follows {t[i]:g} s; allowed: rising times")
     t = t - t[0]
-    own = (t.size - 1) / float(t[-1])
-    even = bool(np.all(np.abs(t * own - np.arange(t.size)) < 1e-3))
-    if even:
-        if rate is not None and abs(rate - own) > 1e-3 * own:
-            raise InputError(
-                f"'{found.file}': its times are at {own:g} Hz, and the rate given is {rate:g} Hz; allowed: one of them"
-            )
-        return Profile(Samples(values, own), float(t[-1]), own)
-    if rate is not None:
-        raise InputError(f"'{found.file}': its times are uneven, and a rate is given; allowed: one of them")
-    return Profile(PWL(tuple(t.tolist()), tuple(values.tolist())), float(t[-1]), None)
+    end = float(t[-1])
+    own = (t.size - 1) / end
+    if not np.all(np.abs(t * own - np.arange(t.size)) < 1e-3):
+        if rate is not None:
+            raise InputError(f"'{path}': its times are uneven, and a rate is given; allowed: one of them")
+        return named[0], PWL(tuple(t.tolist()), tuple(values.tolist())), end
+    if rate is not None and abs(rate - own) > 1e-3 * own:
+        raise InputError(
+            f"'{path}': its times are at {own:g} Hz, and the rate given is {rate:g} Hz; allowed: one of them"
+        )
+    return named[0], Samples(values, own), end
 
 
 def inverse_drive(
@@ -188,11 +176,11 @@ def inverse_drive(
         )
     )  # fmt: skip
     finger = the_finger(circuit, charge_law)
-    profile = as_profile(wanted, kind, rate, duration)
-    rate = _rate(rate, carrier, profile)
+    wave, end = _wave_of(wanted, kind, rate, duration)
+    rate = _rate(rate, carrier, wave, end)
     begin = finger.lead if lead is None else real_number("lead", lead, "a number in s")
     require(0.0 <= begin < 1e3, "lead", f"{begin:g} s", "0 or more, less than 1000")
-    found = Task(finger, kind, profile, rate, carrier, begin).solve(limit or math.inf, slew or math.inf)
+    found = Task(finger, kind, wave, end, rate, carrier, begin).solve(limit or math.inf, slew or math.inf)
     if limit is None and found.peak > HUGE:
         text = (
             f"the drive reaches {found.peak:.0f} V; limit= (V) keeps it within what the amplifier gives, and says what "
@@ -202,7 +190,7 @@ def inverse_drive(
     return found
 
 
-def _rate(rate: float | None, carrier: float | None, profile: Profile) -> float:
+def _rate(rate: float | None, carrier: float | None, wave: Waveform, end: float) -> float:
     """The drive's rate, Hz."""
     if carrier is not None:
         if rate is not None and rate < FEWEST * carrier:
@@ -211,30 +199,31 @@ def _rate(rate: float | None, carrier: float | None, profile: Profile) -> float:
                 f"it, {rate / FEWEST:g} Hz, or a higher rate"
             )
         rate = PER_PERIOD * carrier if rate is None else rate
-        if profile.duration * carrier < 1.0:
-            raise InputError(f"{profile.duration:g} s hold no period of the carrier; allowed: 1 or more")
-    rate = (profile.rate or RATE) if rate is None else rate
-    count = profile.duration * rate
+        if end * carrier < 1.0:
+            raise InputError(f"{end:g} s hold no period of the carrier; allowed: 1 or more")
+    if rate is None:
+        rate = wave.rate if isinstance(wave, Samples) else RATE
+    count = end * rate
     allowed = f"2 to {MOST_SAMPLES:,} samples"
     require(2.0 <= count + 1.0 <= MOST_SAMPLES, "the drive", f"{count:,.0f} samples long", allowed)
     return rate
 
 
 class Task:
-    """The gap voltage that produces a wanted force or friction (`kind`), and the iteration for its drive.
+    """The gap voltage for a wanted force or friction (`kind`) until `end` (s), and the iteration for its drive.
 
     The force first rises for `lead` (s). `rate` and `carrier` (Hz) are those of `inverse_drive`.
     """
 
     def __init__(
-        self, finger: Finger, kind: str, profile: Profile, rate: float, carrier: float | None, lead: float
+        self, finger: Finger, kind: str, wave: Waveform, end: float, rate: float, carrier: float | None, lead: float
     ) -> None:
         self.finger, self.kind, self.rate, self.carrier, self.lead = finger, kind, rate, carrier, round(lead * rate)
         # With a carrier the force is also evaluated midway between samples, as Simpson's rule for its mean needs it.
         self.fine = 1 if carrier is None else 2
-        count = math.floor(profile.duration * rate * (1.0 + 1e-12)) + 1
+        count = math.floor(end * rate * (1.0 + 1e-12)) + 1
         t = np.arange(self.fine * (count - 1) + 1) / (self.fine * rate)
-        self.wanted = self._forces(profile.wave.value(t), t)
+        self.wanted = self._forces(wave.value(t), t)
         points = None if carrier is None else rate / carrier
         self.curve = ForceCurve(finger, points, float(self.wanted.max()))
         self.target = self.curve.voltages(self.wanted[:: self.fine], rate, carrier, self.lead)
