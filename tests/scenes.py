@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from scipy.stats import binom
+
 import fingerspice as fs
 
 COAT = {"d": "1u", "eps_r": 3.9, "r": "0.2meg"}
@@ -25,6 +27,11 @@ GAP = {
 def cases(whole: int, few: int) -> int:
     """How many random cases a statistic takes: `whole` in ``make stress``, which sets STRESS, else `few`."""
     return whole if os.environ.get("STRESS") else few
+
+
+def covers(hits: int, count: int) -> bool:
+    """Whether `hits` of `count` intervals of 95 % held the truth: fewer would have a probability of 0.1 % or less."""
+    return bool(binom.cdf(hits, count, 0.95) >= 1e-3)
 
 
 def assignments(values: dict[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
+from scenes import cases, covers, deck
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 TRUE = {"alpha": 48.0, "m_exp": 0.45, "beta": 40.0, "n_exp": 1.6, "mu": 0.35, "c2": 4000.0}
@@ -63,6 +65,12 @@ def adhesive_area(fn: float, u: float) -> float:
     return low
 
 
+def under_voltage() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Loads (N), gap voltages (V) and areas (mm^2) of Eq. 4."""
+    fn, u = (x.ravel() for x in np.meshgrid([0.25, 0.5, 1.0], [0.0, 60.0, 120.0, 200.0]))
+    return fn, u, np.array([adhesive_area(*pair) for pair in zip(fn, u, strict=True)])
+
+
 def test_true_values_are_found_again_from_four_relations(circuit: fs.Circuit) -> None:
     found = fs.fit_contact(circuit, finger())
     for name, value in TRUE.items():
@@ -81,8 +89,7 @@ def test_true_values_are_found_again_from_four_relations(circuit: fs.Circuit) ->
 
 
 def test_areas_under_voltage_tell_beta_where_n_is_known(circuit: fs.Circuit) -> None:
-    fn, u = (x.ravel() for x in np.meshgrid([0.25, 0.5, 1.0], [0.0, 60.0, 120.0, 200.0]))
-    area = np.array([adhesive_area(*pair) for pair in zip(fn, u, strict=True)])
+    fn, u, area = under_voltage()
     assert area.max() > 1.04 * resting(fn).max()
     start = circuit.replace({"Xgap.n_exp": TRUE["n_exp"]})
     found = fs.fit_contact(start, {"fn": fn, "u_gap": u, "area": 1e-6 * area}, ["alpha", "m_exp", "beta"])
@@ -115,14 +122,13 @@ def test_a_power_law_has_the_intervals_of_linear_regression(circuit: fs.Circuit)
 
 
 def test_intervals_cover_the_truth_though_every_relation_has_its_own_noise(circuit: fs.Circuit) -> None:
-    # 240 intervals of 95 %: fewer than 216 would have a probability of 0.1 % even if errors were independent.
-    rng, covered = np.random.default_rng(4), 0
-    for _ in range(40):
+    rng, hits, count = np.random.default_rng(4), 0, cases(40, 8)
+    for _ in range(count):
         parts = finger(rng, 0.03)
         parts[1]["area"] = parts[1]["area"] * np.exp(0.1 * rng.standard_normal(DEPTH.size))
         found = fs.fit_contact(circuit, parts)
-        covered += sum(e.low <= TRUE[path.rpartition(".")[2]] <= e.high for path, e in found.estimates.items())
-    assert 216 <= covered <= 240
+        hits += sum(e.low <= TRUE[path.rpartition(".")[2]] <= e.high for path, e in found.estimates.items())
+    assert covers(hits, 6 * count)
 
 
 @pytest.mark.parametrize(
@@ -138,21 +144,17 @@ def test_intervals_cover_the_truth_though_every_relation_has_its_own_noise(circu
     ],
 )  # fmt: skip
 def test_what_the_data_cannot_tell_is_said(circuit: fs.Circuit, data: Columns, said: str) -> None:
-    import re
-
     notes = fs.fit_contact(circuit, data).notes
     assert any(re.search(said, note) for note in notes), notes
 
 
+# Values of which nothing is known may be unusual.
+@pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
 def test_areas_under_voltage_alone_do_not_tell_beta_from_n(circuit: fs.Circuit) -> None:
-    fn, u = (x.ravel() for x in np.meshgrid([0.25, 0.5, 1.0], [0.0, 60.0, 120.0, 200.0]))
-    area = np.array([adhesive_area(*pair) for pair in zip(fn, u, strict=True)])
-    for seed in range(20):
+    fn, u, area = under_voltage()
+    for seed in range(cases(20, 3)):
         noisy = 1e-6 * area * np.exp(0.02 * np.random.default_rng(seed).standard_normal(area.size))
-        with pytest.MonkeyPatch.context() as patch:
-            # Values of which nothing is known may be unusual.
-            patch.setattr("warnings.warn", lambda *_, **__: None)
-            notes = " ".join(fs.fit_contact(circuit, {"fn": fn, "u_gap": u, "area": noisy}).notes)
+        notes = " ".join(fs.fit_contact(circuit, {"fn": fn, "u_gap": u, "area": noisy}).notes)
         assert "Xgap.beta" in notes
         assert "Measure the area against the indentation as well, or fix one of them" in notes
 
@@ -171,25 +173,17 @@ def test_a_wrong_unit_is_warned_about(circuit: fs.Circuit) -> None:
         fs.fit_contact(circuit, {"fn": FN, "area": 1e-6 * resting(FN) * rough})
 
 
-def test_a_profile_agrees_with_the_interval(circuit: fs.Circuit) -> None:
+def test_report_page_picture_and_profile_go_with_the_intervals(circuit: fs.Circuit) -> None:
     found = fs.fit_contact(circuit, finger(np.random.default_rng(2), 0.02), profiles=["alpha"])
     profile, estimate = found.profiles["Xgap.alpha"], found.estimates["Xgap.alpha"]
     assert profile.shape == "symmetric"
-    assert profile.low == pytest.approx(estimate.low, rel=1e-3)
-    assert profile.high == pytest.approx(estimate.high, rel=1e-3)
-
-
-def test_report_and_page_name_every_parameter(circuit: fs.Circuit) -> None:
-    found = fs.fit_contact(circuit, finger(np.random.default_rng(2), 0.02))
-    assert "# data points      = 38" in found.report()
-    for name in TRUE:
-        assert f"    Xgap.{name}:" in found.report()
-        assert f"\nXgap.{name} " in str(found)
-    assert "ridge area while sliding: 10 values, residual" in str(found)
-    assert [axis.get_ylabel() for axis in found.plot().axes[:2]] == [
-        "ridge area at rest [mm²]",
-        "ridge area by indentation [mm²]",
-    ]
+    assert (profile.low, profile.high) == pytest.approx((estimate.low, estimate.high), rel=1e-3)
+    report, page = found.report(), str(found)
+    assert "# data points      = 38" in report
+    assert all(f"    Xgap.{name}:" in report and f"\nXgap.{name} " in page for name in TRUE)
+    assert "ridge area while sliding: 10 values, residual" in page
+    labels = [axis.get_ylabel() for axis in found.plot().axes[:2]]
+    assert labels == ["ridge area at rest [mm²]", "ridge area by indentation [mm²]"]
 
 
 def test_the_command_reads_the_tables_of_the_examples(command: Command, tmp_path: Path) -> None:
@@ -223,6 +217,7 @@ def test_the_command_reads_the_tables_of_the_examples(command: Command, tmp_path
         ({"area": [3e-5], "f_t": [0.1], "sigma": [0.1]}, {}, "'sigma': which of the measured columns it belongs to"),
         ({"indentation": [1e-3] * 2, "u_gap": [1.0, 2.0], "area": [3e-5] * 2}, {}, "indentations without voltage"),
         (5.0, {}, "data is a float; allowed: a mapping of columns"),
+        ({"fn": [1.0, 2.0], "area": [3e-5, 4e-5]}, {"parameters": ["alpha", "Xgap.alpha"]}, "alpha is named twice"),
         ({"fn": [1.0, 2.0], "area": [3e-5, 4e-5]}, {"parameters": ["d"]}, "parameters is 'd'; allowed: alpha, m_exp"),
         ({"fn": [1.0, 2.0], "area": [3e-5, 4e-5]}, {"finger": "Xno"}, "finger is 'Xno'; allowed: the name of a GAP"),
         ({"fn": [1.0, 2.0], "area": [3e-5, 4e-5]}, {"bounds": {"mu": (0.1, 1.0)}}, r"bounds names Xgap\.mu, which"),
@@ -233,18 +228,17 @@ def test_bad_requests(circuit: fs.Circuit, data: Columns, options: dict[str, obj
         fs.fit_contact(circuit, data, **options)  # type: ignore[arg-type]
 
 
-def test_circuits_without_one_contact_are_refused() -> None:
+def test_circuits_without_one_contact_are_refused(circuit: fs.Circuit) -> None:
     two = fs.read_netlist(CIRCUITS / "two_fingers.cir")
     data = {"fn": FN, "area": 1e-6 * resting(FN)}
     with pytest.raises(fs.InputError, match="several GAPs; allowed: finger= one of"):
         fs.fit_contact(two, data)
     name = two.by_device("GAP")[1].name
     assert fs.fit_contact(two, data, finger=name).values[f"{name}.alpha"] == pytest.approx(48.0, rel=1e-6)
-    fixed = fs.read_netlist(CIRCUITS / "fingerpad.cir").replace({"Xgap.a_fix": 30.0})
     with pytest.raises(fs.InputError, match=r"Xgap.a_fix is 30 mm\^2; allowed: 0"):
-        fs.fit_contact(fixed, data)
+        fs.fit_contact(circuit.replace({"Xgap.a_fix": 30.0}), data)
     with pytest.raises(fs.InputError, match="this circuit has no GAP"):
-        fs.fit_contact(fs.parse_netlist("t\nV1 a 0 1\nR1 a b 1k\nC1 b 0 1u\n.tran 1u 1m\n.end\n"), data)
+        fs.fit_contact(deck("V1 a 0 1", "R1 a b 1k", "C1 b 0 1u", ".tran 1u 1m"), data)
 
 
 def test_tables_with_bad_units_are_refused(circuit: fs.Circuit, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from fingerspice.studies.perception import (
     SkinMechanics,
     Threshold,
     android_threshold,
-)
+)  # fmt: skip
 from scenes import deck, table1
 
 ROOT = Path(__file__).parents[1]
@@ -56,19 +56,17 @@ def test_the_skin_moves_as_its_equation_of_motion_says(frequency: float) -> None
     np.testing.assert_allclose(skin.acceleration(np.array([frequency]))[0], -(omega**2) * amplitude, rtol=1e-6)
 
 
-def test_the_fingerpad_is_a_spring_at_low_and_a_mass_at_high_frequencies() -> None:
+def test_skin_and_thresholds_are_those_of_their_sources() -> None:
+    assert (DIFFERENCE_DB, WEBER_FRICTION) == (1.21, 0.11)
+    # The fingerpad is a spring at low and a mass at high frequencies.
     assert (FINGERPAD.mass, FINGERPAD.damping, FINGERPAD.stiffness) == (1e-4, 1.0, 1e3)
     low, high = np.abs(FINGERPAD.displacement(np.array([0.1]))), np.abs(FINGERPAD.acceleration(np.array([1e6])))
     np.testing.assert_allclose([low[0], high[0]], [1e-3, 1e4], rtol=1e-5)
-
-
-def test_the_threshold_is_androids() -> None:
     table = android_threshold()
     assert table.frequency.size == 41
     assert (table.frequency[0], table.frequency[-1]) == (0.4, 400.0)
-    for frequency, level in ANDROID.items():
-        found = table.acceleration(np.array([frequency]))[0]
-        assert found == pytest.approx(GRAVITY * 10.0 ** (level / 20.0), rel=1e-12)
+    found = table.acceleration(np.array(list(ANDROID)))
+    np.testing.assert_allclose(found, GRAVITY * 10.0 ** (np.array(list(ANDROID.values())) / 20.0), rtol=1e-12)
     # Decibels are linear in frequency between two points: 15 Hz has -44.35, 17.92 Hz has -41.96.
     middle = table.acceleration(np.array([16.46]))[0]
     assert 20.0 * math.log10(middle / GRAVITY) == pytest.approx(-43.155, abs=1e-9)
@@ -82,10 +80,6 @@ def test_the_tables_head_has_licence_and_origin() -> None:
         assert said in head
     assert "least_perceptible_acceleration.csv" in (ROOT / "NOTICE").read_text()
     assert "Apache License" in (ROOT / "LICENSES" / "Apache-2.0.txt").read_text()
-
-
-def test_the_other_thresholds_are_those_of_their_papers() -> None:
-    assert (DIFFERENCE_DB, WEBER_FRICTION) == (1.21, 0.11)
 
 
 def test_the_level_of_a_sines_friction_is_that_of_the_formula(frozen: fs.Solution) -> None:
@@ -254,12 +248,13 @@ def test_mechanics_and_thresholds_without_sense_are_refused(make: object, said: 
 
 
 def test_what_cannot_be_felt_is_refused(frozen: fs.Solution) -> None:
-    with pytest.raises(fs.InputError, match="'f_t', the friction force"):
-        feel(frozen, "u_gap")
-    with pytest.raises(fs.InputError, match="a Threshold"):
-        feel(frozen, threshold=3.0)  # type: ignore[arg-type]
-    with pytest.raises(fs.InputError, match="a SkinMechanics"):
-        feel(frozen, mechanics="soft")  # type: ignore[arg-type]
+    for given, said in (
+        ({"signal": "u_gap"}, "'f_t', the friction force"),
+        ({"threshold": 3.0}, "a Threshold"),
+        ({"mechanics": "soft"}, "a SkinMechanics"),
+    ):
+        with pytest.raises(fs.InputError, match=said):
+            feel(frozen, **given)  # type: ignore[arg-type]
     with pytest.raises(fs.InputError, match="no GAP"):
         feel(fs.simulate(deck("V1 a 0 SIN(0 1 100)", "R1 a 0 1k", ".tran 1m 20m")))
 
@@ -269,13 +264,9 @@ def test_the_picture_has_the_threshold_and_every_finger() -> None:
     solution = fs.simulate(circuit, sources={"Vdrive": fs.Sine(200.0, 50.0)}, t_stop=0.04, rtol=1e-5)
     firm, light = (feel(solution, f"f_t:{gap}") for gap in solution.gaps)
     (ax,) = firm.plot([light]).axes
-    legend = ax.get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == [
-        "Android's least perceptible acceleration",
-        "skin, lines Xfirm.Xgap",
-        "skin, lines Xlight.Xgap",
-    ]
+    _, names = ax.get_legend_handles_labels()
+    assert names[0] == "Android's least perceptible acceleration"
+    assert names[1:] == ["skin, lines Xfirm.Xgap", "skin, lines Xlight.Xgap"]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency [Hz]", "Acceleration amplitude [m/s²]")
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
     caption = firm.plot([light]).get_supxlabel().replace("\n", " ")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import warnings
 from pathlib import Path
 
@@ -45,15 +46,6 @@ def amplifier() -> fs.Circuit:
     return fs.read_netlist(CIRCUITS / "amplifier.cir")
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("carrier", [None, 2000.0])
-@pytest.mark.parametrize("law", ["local", "mobile"])
-def test_a_stack_makes_the_wanted_friction(seed: int, carrier: float | None, law: str) -> None:
-    found = fs.inverse_drive(table1(), friction=profile(seed), carrier=carrier, charge_law=law)
-    assert found.worst_share < 1e-4
-    assert found.at_limit == 0.0
-
-
 # Of 50 random profiles for each kind of circuit, those with the largest miss.
 HARDEST = [
     (1013, "stack", None, "local"), (1013, "stack", None, "mobile"), (1028, "stack", 2000.0, "local"),
@@ -66,7 +58,9 @@ HARDEST = [
 def test_the_hardest_of_fifty_profiles_are_made(seed: int, kind: str, carrier: float | None, law: str) -> None:
     circuit = {"stack": table1, "dispersive": lambda: fs.parse_netlist(DISPERSIVE), "amplifier": amplifier}[kind]()
     wanted = profile(seed, 0.005 if carrier and kind == "amplifier" else 0.01)
-    assert fs.inverse_drive(circuit, friction=wanted, carrier=carrier, charge_law=law).worst_share < 1e-4
+    found = fs.inverse_drive(circuit, friction=wanted, carrier=carrier, charge_law=law)
+    assert found.worst_share < 1e-4
+    assert found.at_limit == 0.0
 
 
 def test_a_drive_of_a_thousand_volts_is_warned_about() -> None:
@@ -81,11 +75,6 @@ def test_a_drive_of_a_thousand_volts_is_warned_about() -> None:
         fs.inverse_drive(table1(), force=wanted, rate=48e3)
 
 
-@pytest.mark.parametrize("carrier", [None, 2000.0])
-def test_a_dispersive_skin_is_inverted(carrier: float | None) -> None:
-    assert fs.inverse_drive(fs.parse_netlist(DISPERSIVE), friction=profile(7), carrier=carrier).worst_share < 1e-4
-
-
 @pytest.mark.parametrize("deck", ["amplifier", "ungrounded_user"])
 def test_what_stands_around_the_stack_is_corrected(deck: str) -> None:
     circuit = fs.read_netlist(CIRCUITS / f"{deck}.cir")
@@ -93,10 +82,6 @@ def test_what_stands_around_the_stack_is_corrected(deck: str) -> None:
     assert found.worst_share < 1e-4
     assert found.lead == 2e-3
     assert found.times[0] == pytest.approx(2e-3)
-
-
-def test_a_carrier_behind_an_amplifier() -> None:
-    assert fs.inverse_drive(amplifier(), friction=profile(4, 0.005), carrier=2000.0).worst_share < 1e-4
 
 
 def test_a_run_of_its_own_finds_the_same_force() -> None:
@@ -112,19 +97,13 @@ def test_the_independent_transient_makes_the_wanted_force() -> None:
     rate, n = 20e3, 41
     wanted = 0.15 + 0.1 * np.sin(2 * np.pi * 250.0 * np.arange(n) / rate)
     found = fs.inverse_drive(table1(), force=wanted, rate=rate)
-    points = list(zip((np.arange(n) / rate).tolist(), found.drive.values.tolist(), strict=True))
-    force = forward_of_reference(points)
+    t = (np.arange(n) / rate).tolist()
+    points = list(zip(t, found.drive.values.tolist(), strict=True))
+    force = np.asarray(ref.transient(ref.pwl_segments(points), t, freq=100.0).force)
     np.testing.assert_allclose(force, wanted, atol=1e-4 * wanted.max())
 
 
-def forward_of_reference(points: list[tuple[float, float]]) -> np.ndarray:
-    """F_el (N) at the points, by the reference's own transient."""
-    t = np.array([x for x, _ in points])
-    run = ref.transient(ref.pwl_segments(points), t.tolist(), freq=100.0)
-    return np.asarray(run.force)
-
-
-def test_a_limit_holds_the_drive_and_its_cost_is_said() -> None:
+def test_a_limit_and_a_slew_rate_hold_the_drive_and_the_cost_is_said() -> None:
     free = fs.inverse_drive(table1(), friction=profile(1))
     limit = 0.9 * free.peak
     held = fs.inverse_drive(table1(), friction=profile(1), limit=limit)
@@ -136,12 +115,9 @@ def test_a_limit_holds_the_drive_and_its_cost_is_said() -> None:
     # Where the drive is below its limit the friction is the wanted one again.
     away = np.abs(held.drive.values) < 0.999 * limit
     assert np.abs(held.friction - held.wanted_friction)[away].max() < 1e-4 * 0.22
-
-
-def test_a_slew_rate_is_kept() -> None:
-    found = fs.inverse_drive(table1(), friction=profile(1), slew=2e4)
-    assert np.abs(np.diff(found.drive.values)).max() <= 2e4 / 48e3 * (1.0 + 1e-9)
-    assert found.at_limit > 0.0
+    slow = fs.inverse_drive(table1(), friction=profile(1), slew=2e4)
+    assert np.abs(np.diff(slow.drive.values)).max() <= 2e4 / 48e3 * (1.0 + 1e-9)
+    assert slow.at_limit > 0.0
 
 
 def test_no_other_drive_within_the_limit_does_much_better() -> None:
@@ -161,11 +137,8 @@ def test_no_other_drive_within_the_limit_does_much_better() -> None:
     start = held.drive.values.copy()
     best = minimize(cost, start, bounds=[(-limit, limit)] * n, method="L-BFGS-B", options={"maxiter": 60})
     assert math.sqrt(cost(start) / 1e4) == pytest.approx(held.rms, rel=1e-3)
-    assert held.rms <= OPTIMAL * math.sqrt(best.fun / 1e4)
-
-
-#: Rms miss of the clipped drive over that of the best one found by search.
-OPTIMAL = 1.05
+    # The best drive found by search.
+    assert held.rms <= 1.05 * math.sqrt(best.fun / 1e4)
 
 
 BAD = [
@@ -185,24 +158,22 @@ BAD = [
 
 @pytest.mark.parametrize(("given", "said"), BAD, ids=lambda x: x if isinstance(x, str) else "")
 def test_what_cannot_be_is_refused(given: dict[str, object], said: str) -> None:
-    with pytest.raises(fs.InputError) as caught:
+    with pytest.raises(fs.InputError, match=re.escape(said)) as caught:
         fs.inverse_drive(table1(), **given)  # type: ignore[arg-type]
-    assert said in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_circuits_without_one_finger_and_one_source_are_refused() -> None:
-    for deck, said in (("two_fingers", "one finger"), ("current_drive", "one V"), ("fingerpad_dispersive", "one V")):
+    decks = {"two_fingers": "one finger", "current_drive": "one V", "fingerpad_dispersive": "one V"}
+    refused = [(fs.read_netlist(CIRCUITS / f"{deck}.cir"), "force", said) for deck, said in decks.items()]
+    refused += [(table1(gap={"tau": 1e-3}), "force", "tau"), (table1(gap={"mu": 0}), "friction", "mu=0")]
+    for circuit, kind, said in refused:
         with pytest.raises(fs.InputError, match=said):
-            fs.inverse_drive(fs.read_netlist(CIRCUITS / f"{deck}.cir"), force=[0.1, 0.1], rate=1e3)
-    with pytest.raises(fs.InputError, match="tau"):
-        fs.inverse_drive(table1(gap={"tau": 1e-3}), force=[0.1, 0.1], rate=1e3)
-    with pytest.raises(fs.InputError, match="mu=0"):
-        fs.inverse_drive(table1(gap={"mu": 0}), friction=[0.1, 0.1], rate=1e3)
+            fs.inverse_drive(circuit, rate=1e3, **{kind: [0.1, 0.1]})  # type: ignore[arg-type]
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    found = fs.inverse_drive(table1(), friction=profile(2, 0.005))
+def test_what_is_written_is_read_back_and_the_picture_shows_wanted_and_reached(tmp_path: Path) -> None:
+    found = fs.inverse_drive(table1(), friction=profile(2, 0.005), limit=150.0)
     found.to_wav(tmp_path / "a.wav")
     read = fs.Samples.from_wav(tmp_path / "a.wav", 1.0)
     assert read.rate == 48e3
@@ -212,26 +183,18 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.values, found.drive.values)
     with pytest.raises(fs.InputError, match="gain"):
         found.to_wav(tmp_path / "b.wav", gain=1.0)
-
-
-def test_the_picture_shows_wanted_and_reached() -> None:
-    figure = fs.inverse_drive(table1(), friction=profile(2, 0.005), limit=150.0).plot()
-    top, middle, bottom = figure.axes
+    top, middle, bottom = found.plot().axes
     assert [x.get_label() for x in top.get_lines()] == ["wanted", "reached"]
     assert (top.get_ylabel(), bottom.get_ylabel()) == ("Friction [mN]", "Drive [V]")
     assert middle.get_ylabel().startswith("Miss [")
     assert bottom.get_xlabel() == "Time [ms]"
 
 
-def table(rows: str) -> None:
-    Path("wanted.csv").write_text(rows)
-
-
 ROWS = "time (ms), friction (mN)\n" + "".join(f"{0.1 * i:.1f}, {170 + i % 7}\n" for i in range(60))
 
 
 def test_design_writes_drive_prediction_and_picture(command: Command) -> None:
-    table(ROWS)
+    Path("wanted.csv").write_text(ROWS)
     result = command("design", "wanted.csv", "pad.cir", "--out", "got", "--rate", "10k", "--json")
     answer = json.loads(result.out)
     assert result.code == 0, result.err
@@ -262,7 +225,7 @@ def test_design_writes_drive_prediction_and_picture(command: Command) -> None:
     ],
 )
 def test_bad_tables_are_refused_in_one_sentence(command: Command, rows: str, words: list[str], said: str) -> None:
-    table(rows)
+    Path("wanted.csv").write_text(rows)
     result = command("design", "wanted.csv", "pad.cir", *words)
     assert result.code == 2
     assert said in result.err
@@ -271,7 +234,7 @@ def test_bad_tables_are_refused_in_one_sentence(command: Command, rows: str, wor
 
 @pytest.mark.parametrize("plot", [[], ["--no-plot"]])
 def test_design_replaces_the_files_it_wrote_and_no_others(command: Command, plot: list[str]) -> None:
-    table(ROWS)
+    Path("wanted.csv").write_text(ROWS)
     words = ("design", "wanted.csv", "pad.cir", "--rate", "10k", *plot)
     assert command(*words).code == 0
     again = command(*words)

@@ -49,10 +49,10 @@ if TYPE_CHECKING:
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
+    from fingerspice.studies.fit.circuitfit import Fit as Fit
     from fingerspice.studies.fit.circuitfit import fit as fit
-    from fingerspice.studies.fit.circuitresult import Fit as Fit
+    from fingerspice.studies.fit.contactfit import ContactFit as ContactFit
     from fingerspice.studies.fit.contactfit import fit_contact as fit_contact
-    from fingerspice.studies.fit.contactresult import ContactFit as ContactFit
     from fingerspice.studies.fit.materialfit import ColeCole as ColeCole
     from fingerspice.studies.fit.materialfit import MaterialFit as MaterialFit
     from fingerspice.studies.fit.materialfit import fit_material as fit_material
@@ -93,12 +93,10 @@ _HOMES = {
     "studies.comparison": ("Comparison", "compare", "large_signal"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "explorer.server": ("Explorer", "explore"),
-    "studies.fit.contactfit": ("fit_contact",),
-    "studies.fit.contactresult": ("ContactFit",),
+    "studies.fit.contactfit": ("ContactFit", "fit_contact"),
     "studies.export": ("export_netlist",),
     "studies.feel": ("Feel", "feel"),
-    "studies.fit.circuitfit": ("fit",),
-    "studies.fit.circuitresult": ("Fit",),
+    "studies.fit.circuitfit": ("Fit", "fit"),
     "studies.fit.materialfit": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.design.drive": ("InverseDrive",),
     "studies.design.inverse": ("inverse_drive",),

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number
-from fingerspice.circuit.circuit import Circuit
 from fingerspice.cli import answers
 from fingerspice.cli.options import read_circuit
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import Answering, progress
 from fingerspice.waveforms.waveform import require
-
-if TYPE_CHECKING:
-    from fingerspice.studies.design.capability import Capability
-    from fingerspice.studies.design.folds import FoldLimits
 
 
 def number(option: str, text: str | None) -> float | None:
@@ -54,8 +49,7 @@ def design(
 
       fingerspice design wanted.csv circuits/fingerpad_5khz.cir --carrier 5k --limit 200
     """
-    from fingerspice.studies.design.inverse import inverse_drive
-    from fingerspice.studies.wanted import read_wanted
+    from fingerspice.studies.design.inverse import inverse_drive, read_wanted
 
     with Answering("design", as_json, charge_law=charge_law) as answer:
         circuit = read_circuit(deck, changes, None)
@@ -63,13 +57,13 @@ def design(
         given = {"carrier": carrier, "limit": limit, "slew": slew, "rate": rate}
         numbers = {key: number(f"--{key}", text) for key, text in given.items()}
         results = Results(deck, circuit, out, name, overwrite, charge_law)
-        kind, profile = read_wanted(table, numbers["rate"])
+        kind, wave, end = read_wanted(table, numbers["rate"])
         results.will_write("_drive.wav", lambda file: found.to_wav(file))
         results.will_write("_drive.csv", lambda file: found.to_csv(file))
         results.will_write("_friction.csv", lambda file: found.friction_to_csv(file))
         results.will_draw("_design.png", lambda: found.plot(), unless=no_plot)
-        wanted: dict[str, Any] = {kind: profile.wave}
-        found = inverse_drive(circuit, duration=profile.duration, charge_law=charge_law, **numbers, **wanted)
+        wanted: dict[str, Any] = {kind: wave}
+        found = inverse_drive(circuit, duration=end, charge_law=charge_law, **numbers, **wanted)
         answer.update(**found.to_dict())
         answer.give(lambda: str(found), results.ready())
 
@@ -97,7 +91,7 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.studies.design.folds import grid_of
+    from fingerspice.studies.design.folds import fold_limits, grid_of
 
     law = None if capability else "mobile"
     with Answering("limits", as_json, charge_law=law) as answer:
@@ -112,25 +106,18 @@ def limits(
         end = "_capability" if capability else "_limits"
         results.will_write(f"{end}.csv", lambda file: found.to_csv(file))
         results.will_draw(f"{end}.png", lambda: found.plot(), unless=no_plot)
-        found: Any = _capability(circuit, largest, tone) if capability else _folds(circuit, points, span)
+        found: Any
+        if capability:
+            from fingerspice.studies.design.capability import capability as friction_map
+
+            if largest is None:
+                # The peak of the deck's own sources.
+                stop, own = circuit.tran.stop if circuit.tran else 1.0, circuit.by_device("V")
+                largest = max((e.waveform.peak(0.0, stop) for e in own if e.waveform is not None), default=0.0)
+            with progress("looking for the largest amplitudes") as update:
+                found = friction_map(circuit, largest, carrier=tone, progress=update)
+        else:
+            with progress("looking for folds") as update:
+                found = fold_limits(circuit, points=points, span=span, progress=update)
         answer.update(**({"capability": found.to_dict()} if capability else found.to_dict()))
         answer.give(lambda: str(found), results.ready())
-
-
-def _folds(circuit: Circuit, points: int, span: float) -> FoldLimits:
-    """Where the mobile law folds."""
-    from fingerspice.studies.design.folds import fold_limits
-
-    with progress("looking for folds") as update:
-        return fold_limits(circuit, points=points, span=span, progress=update)
-
-
-def _capability(circuit: Circuit, limit: float | None, carrier: float | None) -> Capability:
-    """The friction that the screen can produce, up to the peak of the deck's own sources if there is no limit."""
-    from fingerspice.studies.design.capability import capability
-
-    if limit is None:
-        stop = circuit.tran.stop if circuit.tran else 1.0
-        limit = max((e.waveform.peak(0.0, stop) for e in circuit.by_device("V") if e.waveform is not None), default=0.0)
-    with progress("looking for the largest amplitudes") as update:
-        return capability(circuit, limit, carrier=carrier, progress=update)

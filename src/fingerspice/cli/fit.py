@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -13,10 +13,6 @@ from fingerspice.cli.answers import AsJson, ChargeLaw, Deck, Name, NoPlot, Out, 
 from fingerspice.cli.options import read_circuit
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import Answering
-
-if TYPE_CHECKING:
-    from fingerspice.studies.fit.circuitresult import Fit
-    from fingerspice.studies.fit.contactresult import ContactFit
 
 
 def fit(
@@ -50,13 +46,15 @@ def fit(
         circuit = read_circuit(deck, changes, None)
         answer.update(**answers.of_circuit(circuit, charge_law))
         results = Results(deck, circuit, out, name, overwrite, charge_law)
-        file, image = results.file("_fit.csv"), None if no_plot else results.file("_fit.png")
+        results.will_write("_fit.csv", lambda file: found.to_csv(file))
+        results.will_draw("_fit.png", lambda: found.plot(), unless=no_plot)
         paths = [path.strip() for path in free.split(",")]
         found = find(
             circuit, table, paths, groups=grouped, average=average, skin=skin, charge_law=charge_law,
             profiles=profile,
         )  # fmt: skip
-        _give(answer, results, found, file, image)
+        answer.update(**found.to_dict())
+        answer.give(lambda: str(found), results.ready())
 
 
 def _groups(text: str | None) -> dict[str, list[str]] | None:
@@ -100,12 +98,7 @@ def fit_contact(
         names = None if free is None else [one.strip() for one in free.split(",")]
         found = find(circuit, list(tables), names, finger=finger, profiles=profile)
         results = Results(deck, circuit, out, name, overwrite, None)
-        file, image = results.file("_contact.csv"), None if no_plot else results.file("_contact.png")
-        _give(answer, results, found, file, image)
-
-
-def _give(answer: Answering, results: Results, found: Fit | ContactFit, file: Path, image: Path | None) -> None:
-    """Write table and picture of a fit, and answer."""
-    results.open()
-    answer.update(**found.to_dict())
-    answer.give(lambda: str(found), [lambda: found.to_csv(file), *results.pictures(image, found.plot)])
+        results.will_write("_contact.csv", found.to_csv)
+        results.will_draw("_contact.png", found.plot, unless=no_plot)
+        answer.update(**found.to_dict())
+        answer.give(lambda: str(found), results.ready())

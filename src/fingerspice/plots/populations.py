@@ -152,11 +152,6 @@ class Panel(NamedTuple):
     unit: str
 
 
-def plot_fit(curves: Sequence[Curve], x_label: str, signal: str, unit: str) -> Picture:
-    """Data with error bars (one standard deviation) and the fit, and the residuals over sigma below."""
-    return plot_panels([Panel(curves, x_label, signal, unit)])
-
-
 def plot_panels(panels: Sequence[Panel]) -> Picture:
     """Data with error bars and the fit of several quantities side by side, each with its residuals below."""
     count = len(panels)

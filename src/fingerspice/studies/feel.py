@@ -15,7 +15,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.plots import drawing
 from fingerspice.plots.traces import stems
-from fingerspice.results.record import Sealed, sealed
+from fingerspice.results.record import Sealed
 from fingerspice.studies.perception import (
     DIFFERENCE_DB,
     FASTEST_FELT,
@@ -24,7 +24,7 @@ from fingerspice.studies.perception import (
     SkinMechanics,
     Threshold,
     android_threshold,
-)  # fmt: skip
+)
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -99,10 +99,6 @@ class Feel(Sealed, Shown):
     unjudged: Unjudged | None
     mechanics: SkinMechanics
     threshold: Threshold
-
-    def __post_init__(self) -> None:
-        for x in self._columns:
-            sealed(x)
 
     @property
     def _columns(self) -> tuple[FloatArray, ...]:
@@ -296,16 +292,13 @@ def feel(
         below = np.geomspace(1e-3 * edge, edge, 200)
         least = np.fmin(table.acceleration(below), table.beyond(below)) / np.abs(mechanics.acceleration(below))
         unjudged.append(Unjudged(20.0 * math.log10(slower / least.min()), slower, edge, slower=True))
+    # Of the mean plus a sine with the rms of what is judged.
+    sine = math.sqrt(float((force[np.isfinite(level)] ** 2).sum()))
+    change = 2.0 * sine / (spectrum.mean + sine) if sine > 0.0 else 0.0
     return Feel(
-        spectrum.signal, kind, f, force, np.abs(mechanics.displacement(f)) * force, size, level,
-        _change(spectrum.mean, force[np.isfinite(level)]), max(unjudged, default=None), mechanics, table,
+        spectrum.signal, kind, f, force, np.abs(mechanics.displacement(f)) * force, size, level, change,
+        max(unjudged, default=None), mechanics, table,
     )  # fmt: skip
-
-
-def _change(mean: float, force: FloatArray) -> float:
-    """Peak-to-peak change relative to the highest value, of a mean (N) plus a sine with the amplitudes' rms (N)."""
-    amplitude = math.sqrt(float((force**2).sum()))
-    return 2.0 * amplitude / (mean + amplitude) if amplitude > 0.0 else 0.0
 
 
 def _bands(spectrum: Spectrum) -> tuple[FloatArray, FloatArray, float]:

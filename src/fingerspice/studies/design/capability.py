@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,16 +22,8 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import heading
 from fingerspice.plots.drawing import BLUE, caption, dress, engineering, new_figure
 from fingerspice.solve.runs import Progress
-from fingerspice.studies.design.finger import (
-    Finger,
-    Limits,
-    NetworkInverter,
-    StackInverter,
-    gap_voltages,
-    the_finger,
-)  # fmt: skip
+from fingerspice.studies.design.finger import Finger, ForceCurve, Inverter, the_finger
 from fingerspice.studies.design.inverse import Task
-from fingerspice.studies.wanted import ForceCurve, as_profile
 from fingerspice.waveforms.samples import Samples
 
 if TYPE_CHECKING:
@@ -193,13 +186,13 @@ def capability(
     # The charges in the layers can raise the gap voltage above the source voltage, but not to ten times the limit.
     area = float(contact.area(10.0 * limit)) if finger.area is None else finger.area
     most = 0.4 * float(contact.stress(10.0 * limit)) * area
-    curve = ForceCurve(contact, finger.area, None if carrier is None else float(_PER_CARRIER), most)
+    curve = ForceCurve(finger, None if carrier is None else float(_PER_CARRIER), most)
     search = _Search(finger, curve, finger.inverter(10.0 * limit), limit, carrier)
-    largest = search.largest_mean(most)
+    largest = search.largest(lambda x: search.wanted(x, 1.0 / _LASTS, 0.0), most)
     force = np.linspace(0.0, largest, means)
     amplitude = np.zeros((means, f.size))
-    for i in range(1, means - 1):
-        amplitude[i] = [search.amplitude(float(force[i]), x) for x in f.tolist()]
+    for i, mean in enumerate(force[1:-1].tolist(), 1):
+        amplitude[i] = [search.largest(partial(search.wanted, mean, x), mean) for x in f.tolist()]
         if progress is not None:
             progress(i / (means - 2))
     friction = contact.mu * (contact.f_n + force)
@@ -219,48 +212,36 @@ class _Search:
 
     finger: Finger
     curve: ForceCurve
-    inverter: StackInverter | NetworkInverter
+    inverter: Inverter
     limit: float  # V
     carrier: float | None  # Hz
     ratio: float = 1.0
 
-    def largest_mean(self, most: float) -> float:
-        """Largest constant force, N, to the relative accuracy `_EXACT`."""
-        return self._within(lambda x: self.wanted(x, 0.0, 1.0 / _LASTS), most)
-
-    def amplitude(self, mean: float, frequency: float) -> float:
-        """Largest amplitude (N) around a mean force (N)."""
-        return self._within(lambda x: self.wanted(mean, x, frequency), mean)
-
-    def wanted(self, mean: float, amplitude: float, frequency: float) -> Samples:
-        """A mean force (N) with a modulation (N, Hz), sampled at the rate of the drive."""
+    def wanted(self, mean: float, frequency: float, amplitude: float) -> Samples:
+        """A mean force (N) with a modulation (Hz, N), sampled at the rate of the drive."""
         rate = max(_PER_PERIOD * frequency, _LEAST_RATE) if self.carrier is None else _PER_CARRIER * self.carrier
         t = np.arange(math.ceil(max(_PERIODS / frequency, _LASTS) * rate)) / rate
         return Samples(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0), rate)
 
-    def _within(self, wanted: Callable[[float], Samples], most: float) -> float:
+    def largest(self, wanted: Callable[[float], Samples], most: float) -> float:
         """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit."""
         for _ in range(_MOST):
             found = _largest(lambda x: self.ratio * self._peak(wanted(x)) <= self.limit, most)
             if self.finger.network.stack is not None or found == 0.0:
                 break
-            peak = self._corrected_peak(wanted(found))
-            before, self.ratio = self.ratio, peak / self._peak(wanted(found))
+            force = wanted(found)
+            end = (force.values.size - 1) / force.rate
+            task = Task(self.finger, "force", force, end, force.rate, self.carrier, self.finger.lead)
+            peak = task.solve(close=0.3 * _EXACT).peak
+            before, self.ratio = self.ratio, peak / self._peak(force)
             if abs(self.ratio / before - 1.0) < 0.5 * _EXACT or (found == most and peak <= self.limit):
                 break
         return found
 
     def _peak(self, force: Samples) -> float:
         """Largest voltage (V) of the inverter's drive for a force."""
-        lead = round(self.finger.lead * force.rate)
-        u = gap_voltages(self.curve, force.values, force.rate, self.carrier, lead)
-        return float(np.abs(self.inverter.drive(u, 1.0 / force.rate, Limits())[0]).max())
-
-    def _corrected_peak(self, force: Samples) -> float:
-        """Largest voltage (V) of the drive for a force, corrected by forward runs."""
-        profile = as_profile(force, "force", None, None)
-        task = Task(self.finger, "force", profile, force.rate, self.carrier, self.finger.lead)
-        return task.solve(Limits(), 0.3 * _EXACT).peak
+        u = self.curve.voltages(force.values, force.rate, self.carrier, round(self.finger.lead * force.rate))
+        return float(np.abs(self.inverter(u, 1.0 / force.rate, math.inf, math.inf)[0]).max())
 
 
 def _largest(holds: Callable[[float], bool], most: float) -> float:

@@ -17,6 +17,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import head_lines, heading
 from fingerspice.plots import drawing
+from fingerspice.results.record import Sealed
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
@@ -29,7 +30,7 @@ _FULL = 2.0**31
 
 
 @dataclass(frozen=True, repr=False)
-class InverseDrive(Shown):
+class InverseDrive(Sealed, Shown):
     """A drive, the force and friction wanted from it, and those that a forward run gives.
 
     Attributes
@@ -74,38 +75,31 @@ class InverseDrive(Shown):
     corrections: int
 
     @property
-    def _asked(self) -> tuple[FloatArray, FloatArray]:
-        """The quantity asked for, as wanted and as reached, N."""
-        return (self.wanted, self.force) if self.kind == "force" else (self.wanted_friction, self.friction)
-
-    @property
-    def _miss(self) -> FloatArray:
-        wanted, reached = self._asked
-        return reached - wanted
+    def _asked(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The quantity asked for, as wanted and as reached, and the difference, N."""
+        force = self.kind == "force"
+        wanted, reached = (self.wanted, self.force) if force else (self.wanted_friction, self.friction)
+        return wanted, reached, reached - wanted
 
     @property
     def worst(self) -> float:
         """Largest difference between reached and wanted force or friction, N."""
-        return float(np.abs(self._miss).max())
+        return float(np.abs(self._asked[2]).max())
 
     @property
     def rms(self) -> float:
         """Root mean square of the difference between reached and wanted force or friction, N."""
-        return float(np.sqrt(np.mean(self._miss**2)))
+        return float(np.sqrt(np.mean(self._asked[2] ** 2)))
 
     @property
     def worst_share(self) -> float:
         """`worst` relative to the largest wanted value."""
-        return self._share(self.worst)
+        return self.worst / (float(self._asked[0].max()) or math.inf)
 
     @property
     def rms_share(self) -> float:
         """`rms` relative to the largest wanted value."""
-        return self._share(self.rms)
-
-    def _share(self, miss: float) -> float:
-        largest = float(self._asked[0].max())
-        return miss / largest if largest > 0.0 else 0.0
+        return self.rms / (float(self._asked[0].max()) or math.inf)
 
     @property
     def peak(self) -> float:
@@ -114,7 +108,7 @@ class InverseDrive(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The figures as plain data, in SI units."""
-        wanted, reached = self._asked
+        wanted, reached, _ = self._asked
         return {
             "kind": self.kind, "rate": self.drive.rate, "samples": self.drive.values.size, "carrier": self.carrier,
             "limit": self.limit, "slew": self.slew, "lead": self.lead, "peak": self.peak, "at_limit": self.at_limit,
@@ -124,7 +118,7 @@ class InverseDrive(Shown):
         }  # fmt: skip
 
     def _page(self) -> Page:
-        wanted, reached = self._asked
+        wanted, reached, _ = self._asked
         wave = "without a carrier" if self.carrier is None else f"on a carrier of {format_si(self.carrier, 'Hz')}"
         rows = [
             ("peak of the drive", format_si(self.peak, "V")),
@@ -150,7 +144,7 @@ class InverseDrive(Shown):
     def plot(self) -> Picture:
         """Picture of the wanted and the reached quantity, their difference, and the drive, against time."""
         figure, (top, middle, bottom) = drawing.new_figure(3, height=5.2, sharex=True, height_ratios=(3, 1.4, 2))
-        wanted, reached = self._asked
+        wanted, reached, miss = self._asked
         volts = self.drive.values
         at = np.arange(volts.size) / self.drive.rate
         scale, unit = drawing.engineering(float(at[-1]), "s")
@@ -160,7 +154,7 @@ class InverseDrive(Shown):
             (top, self.times, force * wanted, {"color": drawing.BLACK, "linewidth": 2.2, "label": "wanted"}),
             (top, self.times, force * reached,
              {"color": drawing.ORANGE, "linewidth": 1.2, "linestyle": (0, (4, 1.5)), "label": "reached"}),
-            (middle, self.times, small * self._miss, {"color": drawing.VERMILION, "linewidth": 1.0}),
+            (middle, self.times, small * miss, {"color": drawing.VERMILION, "linewidth": 1.0}),
             (bottom, at, volts, {"color": drawing.BLUE, "linewidth": 0.9}),
         ]  # fmt: skip
         for ax, t, x, style in lines:

@@ -1,10 +1,11 @@
-"""The finger of an inverse drive, and the source voltage for a gap voltage wanted there."""
+"""The finger of an inverse drive: the gap voltage for a force wanted there, and the source voltage for that."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import lru_cache
 
 import numpy as np
 
@@ -18,8 +19,11 @@ from fingerspice.circuit.statespace import Stack
 from fingerspice.circuit.topology import find_branches
 from fingerspice.engine.inverse import drive_stack, hold
 from fingerspice.physics.contact import Contact, fixed_area_curve
-from fingerspice.studies.wanted import ForceCurve
 from fingerspice.waveforms.waveform import require
+
+#: Source voltages for gap voltages u (V, shape (n,), positive in the direction of the source) at intervals h (s), and
+#: the samples at a limit: of `inverter(u, h, largest voltage (V), largest slew rate (V/s))`.
+Inverter = Callable[[FloatArray, float, float, float], tuple[FloatArray, BoolArray]]
 
 # Default time in which the force rises to its first value, for networks other than a series stack, s.
 _LEAD = 2e-3
@@ -30,13 +34,8 @@ _DAMPING = 14.0
 # Smallest response of the gap voltage to the source, relative to the largest over all frequencies; a smaller response
 # counts as none.
 _DEAF = 1e-9
-
-
-class Limits(NamedTuple):
-    """Limits of the source."""
-
-    voltage: float = math.inf  # Largest absolute voltage, V
-    slew: float = math.inf  # Largest slew rate, V/s
+# Number of amplitudes of the carrier between which the mean force is interpolated.
+_GRID = 80
 
 
 @dataclass(frozen=True)
@@ -56,10 +55,18 @@ class Finger:
         """Default time in which the force rises, s: none for a stack, whose gap voltage jumps with the source."""
         return _LEAD if self.network.stack is None else 0.0
 
-    def inverter(self, u_max: float) -> StackInverter | NetworkInverter:
+    @property
+    def sign(self) -> float:
+        """Sign of the GAP's voltage, from p to n, relative to the voltage along the source."""
+        stack = self.network.stack
+        if stack is None or stack.gap is None:
+            return 1.0
+        return float(stack.sign[stack.gap]) * stack.sources[0][1]
+
+    def inverter(self, u_max: float) -> Inverter:
         """What computes the source voltage for gap voltages up to `u_max` (V)."""
         stack = self.network.stack
-        return NetworkInverter(self.network) if stack is None else StackInverter(stack, u_max, self.law == "mobile")
+        return _of_network(self.network) if stack is None else _of_stack(stack, u_max, self.law == "mobile")
 
 
 def the_finger(circuit: Circuit, charge_law: str | None) -> Finger:
@@ -84,56 +91,43 @@ def the_finger(circuit: Circuit, charge_law: str | None) -> Finger:
     return Finger(circuit, law, gaps[0], sources[0], contact, network.areas[place].given, network)
 
 
-class StackInverter:
+def _of_stack(stack: Stack, u_max: float, mobile: bool) -> Inverter:
     """Inverts a stack step by step; while a limit holds the source, it integrates the layers' state from the source."""
+    assert stack.contact is not None
+    assert stack.gap is not None
+    gap, area = stack.gap, stack.area_given
+    curve = stack.contact.curve(1.2 * max(u_max, 1.0)) if area is None else fixed_area_curve(area)
+    cells = np.column_stack([stack.c, stack.g_total, stack.g_area])
 
-    def __init__(self, stack: Stack, u_max: float, mobile: bool) -> None:
-        assert stack.contact is not None
-        assert stack.gap is not None
-        area = stack.area_given
-        self._curve = stack.contact.curve(1.2 * max(u_max, 1.0)) if area is None else fixed_area_curve(area)
-        self._cells = np.column_stack([stack.c, stack.g_total, stack.g_area])
-        self._gap, self._mobile = stack.gap, mobile
-        #: Sign of the GAP's voltage, from p to n, relative to the voltage along the source.
-        self.sign = float(stack.sign[stack.gap]) * stack.sources[0][1]
-
-    def drive(self, u: FloatArray, h: float, limits: Limits) -> tuple[FloatArray, BoolArray]:
-        """Source voltages for gap voltages `u` (V, shape (n,)) at intervals `h` (s), and the samples at a limit.
-
-        `u` is positive in the direction of the source.
-        """
+    def drive(u: FloatArray, h: float, limit: float, slew: float) -> tuple[FloatArray, BoolArray]:
         out, held = np.empty(u.size), np.empty(u.size, np.bool_)
-        drive_stack(
-            u, h, self._curve, self._cells, self._gap, self._mobile, limits.voltage, limits.slew * h, out, held
-        )  # fmt: skip
+        drive_stack(u, h, curve, cells, gap, mobile, limit, slew * h, out, held)
         return out, held
 
+    return drive
 
-class NetworkInverter:
+
+def _of_network(net: Network) -> Inverter:
     """Inverts the linear response of a network at its areas at rest.
 
     The signals are damped by exp(-a t), which evaluates the response at s = a + i omega. There it has no zero (a
     floating body passes no direct voltage, a zero at s = 0), and the end of the signal does not wrap round.
     """
+    from scipy.fft import irfft, next_fast_len, rfft
 
-    sign = 1.0
+    areas = areas_at_rest(net)
+    leak, c = net.leak(areas), net.capacitance(areas)
+    gap = next(g for g in net.gaps if g is not None)
 
-    def __init__(self, network: Network) -> None:
-        areas = areas_at_rest(network)
-        self._leak, self._c = network.leak(areas), network.capacitance(areas)
-        self._network = network
-        self._gap = next(g for g in network.gaps if g is not None)
-        # The last number of frequencies and interval (s), and the response there: it takes longer than the transforms.
-        self._last: tuple[tuple[int, float], ComplexArray] | None = None
-
-    def response(self, s: ComplexArray) -> ComplexArray:
-        """Ratio of the gap voltage to the source voltage at complex frequencies (1/s), shape (n,)."""
-        net = self._network
-        y = self._leak + s[:, None] * self._c
+    # It takes longer than the transforms, and is asked for again and again for drives of one length.
+    @lru_cache(maxsize=1)
+    def response(m: int, h: float) -> ComplexArray:
+        s = _DAMPING / (m * h) + 2j * np.pi * np.arange(m // 2 + 1) / (m * h)
+        y = leak + s[:, None] * c
         kernel = net.k + np.einsum("ci,fc,cj->fij", net.p, y, net.p, optimize=True)
         right = net.b[:, 0] + np.einsum("ci,fc,c->fi", net.p, y, net.q[:, 0], optimize=True)
         x = np.linalg.solve(kernel, -right[:, :, None])[:, :, 0]
-        gain = x @ net.p[self._gap] + net.q[self._gap, 0]
+        gain = x @ net.p[gap] + net.q[gap, 0]
         if not np.all(np.abs(gain) > _DEAF * np.abs(gain).max(initial=0.0)):
             raise InputError(
                 f"{net.sources[0].name} does not drive the gap at every frequency of the drive; allowed: a source with "
@@ -141,29 +135,75 @@ class NetworkInverter:
             )
         return np.asarray(gain)
 
-    def drive(self, u: FloatArray, h: float, limits: Limits) -> tuple[FloatArray, BoolArray]:
-        """As `StackInverter.drive`."""
-        from scipy.fft import irfft, next_fast_len, rfft
-
+    def drive(u: FloatArray, h: float, limit: float, slew: float) -> tuple[FloatArray, BoolArray]:
         n = u.size
         m = next_fast_len(2 * n, real=True)
         damp = np.exp(-_DAMPING / (m * h) * h * np.arange(m))
         spectrum = rfft(np.append(u, np.full(m - n, u[-1])) * damp)
-        if self._last is None or self._last[0] != (m, h):
-            s = _DAMPING / (m * h) + 2j * np.pi * np.arange(spectrum.size) / (m * h)
-            self._last = (m, h), self.response(s)
-        wish = irfft(spectrum / self._last[1], m)[:n] / damp[:n]
+        wish = irfft(spectrum / response(m, h), m)[:n] / damp[:n]
         out, held = np.empty(n), np.empty(n, np.bool_)
-        hold(wish, limits.voltage, limits.slew * h, out, held)
+        hold(wish, limit, slew * h, out, held)
         return out, held
 
+    return drive
 
-def gap_voltages(curve: ForceCurve, force: FloatArray, rate: float, carrier: float | None, lead: int) -> FloatArray:
-    """Gap voltages (V) at a rate (Hz) that rise in `lead` steps, and then produce the forces (N) on a carrier (Hz)."""
-    u = curve.amplitude(force)
-    # The rise has zero first and second derivative at both ends.
-    x = np.arange(lead) / max(lead, 1)
-    u = np.append(u[0] * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x)), u)
-    if carrier is not None:
-        u *= np.sin(2.0 * np.pi * carrier / rate * (np.arange(u.size) - lead))
-    return u
+
+class ForceCurve:
+    """Mean force over a period of the carrier against the carrier's amplitude; without a carrier, the force itself.
+
+    `points` is the number of samples in a period of the carrier, between which the voltage is linear, or None without a
+    carrier; `most` (N) the largest force that is needed.
+    """
+
+    def __init__(self, finger: Finger, points: float | None, most: float) -> None:
+        from scipy.interpolate import CubicSpline
+
+        self._contact, self._area = finger.contact, finger.area
+        self._shape, self._weight = np.ones(1), np.ones(1)
+        if points is not None:
+            count = round(points) if abs(points - round(points)) < 1e-9 else round(8 * points)
+            at = np.sin(2.0 * np.pi * np.arange(count + 1) / points)
+            self._shape = np.abs(np.concatenate([at[:-1], 0.5 * (at[1:] + at[:-1])]))
+            # Simpson's rule between samples: the voltage is linear there, so the force is a parabola but for the change
+            # of the area.
+            self._weight = np.repeat([1.0 / 3.0, 2.0 / 3.0], count) / count
+        top = 1.0
+        while self.mean(np.array([top]))[0] < 1.01 * most:
+            if top > 1e6:
+                raise InputError(
+                    f"the force wanted, {most:g} N, is reached by no voltage: at 1 MV the gap has "
+                    f"{float(self.mean(np.array([1e6]))[0]):.3g} N; allowed: less"
+                )
+            top *= 1.4
+        amplitude = top * np.arange(1, _GRID + 1) / _GRID
+        force = self.mean(amplitude)
+        rising = np.concatenate([[True], np.diff(force) > 0.0])
+        last = _GRID if rising.all() else int(np.argmin(rising))
+        root = np.sqrt(force[:last])
+        if root[-1] ** 2 < most:
+            raise InputError(f"the force wanted, {most:g} N, is reached by no voltage; allowed: at most "
+                             f"{root[-1] ** 2:.3g} N")  # fmt: skip
+        # The voltage over the root of the force, which at 0 V is that of a small voltage.
+        scale = float(self.force(np.array([1e-3]))[0]) / 1e-3**2
+        at_zero = math.sqrt(1.0 / float(self._weight @ self._shape**2) / scale)
+        self._spline = CubicSpline(np.append(0.0, root), np.append(at_zero, amplitude[:last] / root))
+
+    def force(self, u: FloatArray) -> FloatArray:
+        """Force at gap voltages, N."""
+        area = self._contact.area(u) if self._area is None else self._area
+        return np.asarray(self._contact.stress(u) * area)
+
+    def mean(self, amplitude: FloatArray) -> FloatArray:
+        """Mean force at amplitudes of the gap voltage (V, shape (n,)), N."""
+        return np.asarray(self.force(amplitude[:, None] * self._shape) @ self._weight)
+
+    def voltages(self, force: FloatArray, rate: float, carrier: float | None, lead: int) -> FloatArray:
+        """Gap voltages (V) at a rate (Hz) that rise in `lead` steps, and then produce forces (N) on a carrier (Hz)."""
+        root = np.sqrt(force)
+        u = root * self._spline(root)
+        # The rise has zero first and second derivative at both ends.
+        x = np.arange(lead) / max(lead, 1)
+        u = np.append(u[0] * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x)), u)
+        if carrier is not None:
+            u *= np.sin(2.0 * np.pi * carrier / rate * (np.arange(u.size) - lead))
+        return u

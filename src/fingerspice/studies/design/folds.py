@@ -56,6 +56,12 @@ class FoldSweep:
     values: FloatArray
     voltages: FloatArray
 
+    @property
+    def rows(self) -> list[tuple[float, float | None]]:
+        """Every value with the voltage at its fold, or None without one."""
+        pairs = zip(self.values.tolist(), self.voltages.tolist(), strict=True)
+        return [(x, u if math.isfinite(u) else None) for x, u in pairs]
+
 
 @dataclass(frozen=True, repr=False)
 class FoldLimits(Shown):
@@ -78,20 +84,14 @@ class FoldLimits(Shown):
     sweeps: tuple[FoldSweep, ...]
 
     def _page(self) -> Page:
-        own = format_si(self.peak, "V")
+        how, share = "does not fold", ""
         if math.isfinite(self.voltage):
-            head = (
-                f"under the mobile law this deck folds at {format_si(self.voltage, 'V')} peak; its source reaches "
-                f"{own}, {100.0 * self.peak / self.voltage:.3g} % of that"
-            )
-        else:
-            head = f"under the mobile law this deck does not fold; its source reaches {own}"
+            how = f"folds at {format_si(self.voltage, 'V')} peak"
+            share = f", {100.0 * self.peak / self.voltage:.3g} % of that"
+        head = f"under the mobile law this deck {how}; its source reaches {format_si(self.peak, 'V')}{share}"
         lines: list[str | Table] = [*head_lines(self.circuit), head]
         for sweep in self.sweeps:
-            rows = [
-                (format_si(x, sweep.unit), format_si(u, "V") if math.isfinite(u) else "none")
-                for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
-            ]
+            rows = [(format_si(x, sweep.unit), "none" if u is None else format_si(u, "V")) for x, u in sweep.rows]
             lines += ["", Table((sweep.name, "folds at"), rows)]
         return Page(lines)
 
@@ -120,11 +120,7 @@ class FoldLimits(Shown):
 
     def to_csv(self, path: str | Path) -> Path:
         """Write the map as CSV; a row without a fold has an empty voltage."""
-        rows = [
-            (sweep.name, x, sweep.unit, u if math.isfinite(u) else "")
-            for sweep in self.sweeps
-            for x, u in zip(sweep.values.tolist(), sweep.voltages.tolist(), strict=True)
-        ]
+        rows = [(one.name, x, one.unit, "" if u is None else u) for one in self.sweeps for x, u in one.rows]
         return write_csv(path, ("parameter", "value [SI]", "unit", "fold [V]"), rows)
 
 

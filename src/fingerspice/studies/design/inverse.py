@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import BoolArray, FloatArray, positive_number, real_number
+from fingerspice.base.arrays import FloatArray, positive_number, real_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.design.drive import InverseDrive
-from fingerspice.studies.design.finger import Finger, Limits, gap_voltages, the_finger
-from fingerspice.studies.wanted import ForceCurve, Profile, Wanted, as_profile, check_forces, force_of_friction
+from fingerspice.studies.design.finger import Finger, ForceCurve, the_finger
+from fingerspice.waveforms.columns import read_text_columns
+from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file
+from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import Waveform, as_waveform, require
 
+#: Types that may be given as a wanted force.
+Wanted = ArrayLike | Waveform | Callable[[float], float]
 # Default rate of a drive, Hz; default and smallest number of samples in a period of the carrier.
 RATE, PER_PERIOD, FEWEST = 48_000.0, 128, 20
 # Largest number of samples of a drive: its Fourier transform and its run then need less than a gigabyte.
@@ -27,6 +34,72 @@ MOST_SAMPLES = 5_000_000
 RTOL, CLOSE, CORRECTIONS, STALLED = 1e-6, 1e-5, 25, 0.7
 # Largest voltage of a drive without a warning where no limit is given, V: usual amplifiers end below it.
 HUGE = 1000.0
+
+
+def _wave_of(given: Wanted, what: str, rate: float | None, duration: float | None) -> tuple[Waveform, float]:
+    """What a caller wants (N) against time, and until when (s).
+
+    An array needs its `rate`, and a waveform without an end a `duration`.
+    """
+    if isinstance(given, Waveform) or callable(given):
+        wave, end = as_waveform(given), duration
+        if end is None and isinstance(wave, Samples):
+            end = wave.start + (wave.values.size - 1) / wave.rate
+        elif end is None and isinstance(wave, PWL) and wave.period is None:
+            end = float(np.asarray(wave.times)[-1])
+        if end is None:
+            raise InputError(f"{what} is a waveform without an end; allowed: with duration= in s")
+        return wave, positive_number("duration", end, "s")
+    values = real_numbers(what, given, "numbers in N, a waveform or a function")
+    if rate is None:
+        raise InputError(f"{what} is an array without a rate; allowed: with rate= in Hz, or fs.Samples({what}, rate)")
+    require(values.ndim == 1 and values.size >= 2, what, f"an array of shape {values.shape}", "a row of two or more")
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        raise InputError(f"{what}: row {bad[0]} is {values[bad[0]]}; allowed: finite numbers in N")
+    return Samples(values, rate), (values.size - 1) / rate
+
+
+def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Waveform, float]:
+    """The wanted quantity of a table, ``"force"`` or ``"friction"``, its course from time 0 on, and its end, s.
+
+    The header names a column ``force`` or ``friction`` (N or mN), and a column of times, ``t`` or ``time``, unless a
+    `rate` (Hz) is given: ``time (ms), friction (N)``. Time 0 of the course is the first of the table's times.
+    """
+    path = checked_file(path, MAX_TEXT_BYTES)
+    found = read_text_columns(path)
+    if not found.names:
+        raise InputError(f"'{path}' has no header; allowed: a first line such as 'time (s), friction (N)'")
+    kinds = [name.lower() for name in found.names]
+    named = [kind for kind in ("force", "friction") if kind in kinds]
+    if len(named) != 1:
+        has = "columns force and friction" if named else "no column named force or friction"
+        raise InputError(f"'{path}' has {has}; it has {found.listed()}; allowed: one column of these names")
+    values = found.scaled(kinds.index(named[0]), "N")
+    if values.size < 2:
+        raise InputError(f"'{path}' has one row; allowed: two or more")
+    timed = next((i for i, name in enumerate(kinds) if name in ("t", "time")), None)
+    if timed is None:
+        if rate is None:
+            raise InputError(f"'{path}' has no column of times and no rate; allowed: a column time, or a rate in Hz")
+        return named[0], *_wave_of(values, named[0], rate, None)
+    t = found.scaled(timed, "s")
+    back = np.flatnonzero(np.diff(t) <= 0.0)
+    if back.size:
+        i = int(back[0])
+        raise InputError(f"{found.place(i + 1)}: the time {t[i + 1]:g} s follows {t[i]:g} s; allowed: rising times")
+    t = t - t[0]
+    end = float(t[-1])
+    own = (t.size - 1) / end
+    if not np.all(np.abs(t * own - np.arange(t.size)) < 1e-3):
+        if rate is not None:
+            raise InputError(f"'{path}': its times are uneven, and a rate is given; allowed: one of them")
+        return named[0], PWL(tuple(t.tolist()), tuple(values.tolist())), end
+    if rate is not None and abs(rate - own) > 1e-3 * own:
+        raise InputError(
+            f"'{path}': its times are at {own:g} Hz, and the rate given is {rate:g} Hz; allowed: one of them"
+        )
+    return named[0], Samples(values, own), end
 
 
 def inverse_drive(
@@ -103,11 +176,11 @@ def inverse_drive(
         )
     )  # fmt: skip
     finger = the_finger(circuit, charge_law)
-    profile = as_profile(wanted, kind, rate, duration)
-    rate = _rate(rate, carrier, profile)
+    wave, end = _wave_of(wanted, kind, rate, duration)
+    rate = _rate(rate, carrier, wave, end)
     begin = finger.lead if lead is None else real_number("lead", lead, "a number in s")
     require(0.0 <= begin < 1e3, "lead", f"{begin:g} s", "0 or more, less than 1000")
-    found = Task(finger, kind, profile, rate, carrier, begin).solve(Limits(limit or math.inf, slew or math.inf))
+    found = Task(finger, kind, wave, end, rate, carrier, begin).solve(limit or math.inf, slew or math.inf)
     if limit is None and found.peak > HUGE:
         text = (
             f"the drive reaches {found.peak:.0f} V; limit= (V) keeps it within what the amplifier gives, and says what "
@@ -117,7 +190,7 @@ def inverse_drive(
     return found
 
 
-def _rate(rate: float | None, carrier: float | None, profile: Profile) -> float:
+def _rate(rate: float | None, carrier: float | None, wave: Waveform, end: float) -> float:
     """The drive's rate, Hz."""
     if carrier is not None:
         if rate is not None and rate < FEWEST * carrier:
@@ -126,48 +199,63 @@ def _rate(rate: float | None, carrier: float | None, profile: Profile) -> float:
                 f"it, {rate / FEWEST:g} Hz, or a higher rate"
             )
         rate = PER_PERIOD * carrier if rate is None else rate
-        if profile.duration * carrier < 1.0:
-            raise InputError(f"{profile.duration:g} s hold no period of the carrier; allowed: 1 or more")
-    rate = (profile.rate or RATE) if rate is None else rate
-    count = profile.duration * rate
+        if end * carrier < 1.0:
+            raise InputError(f"{end:g} s hold no period of the carrier; allowed: 1 or more")
+    if rate is None:
+        rate = wave.rate if isinstance(wave, Samples) else RATE
+    count = end * rate
     allowed = f"2 to {MOST_SAMPLES:,} samples"
     require(2.0 <= count + 1.0 <= MOST_SAMPLES, "the drive", f"{count:,.0f} samples long", allowed)
     return rate
 
 
 class Task:
-    """The gap voltage that produces a wanted force or friction (`kind`), and the iteration for its drive.
+    """The gap voltage for a wanted force or friction (`kind`) until `end` (s), and the iteration for its drive.
 
     The force first rises for `lead` (s). `rate` and `carrier` (Hz) are those of `inverse_drive`.
     """
 
     def __init__(
-        self, finger: Finger, kind: str, profile: Profile, rate: float, carrier: float | None, lead: float
+        self, finger: Finger, kind: str, wave: Waveform, end: float, rate: float, carrier: float | None, lead: float
     ) -> None:
         self.finger, self.kind, self.rate, self.carrier, self.lead = finger, kind, rate, carrier, round(lead * rate)
         # With a carrier the force is also evaluated midway between samples, as Simpson's rule for its mean needs it.
         self.fine = 1 if carrier is None else 2
-        count = math.floor(profile.duration * rate * (1.0 + 1e-12)) + 1
+        count = math.floor(end * rate * (1.0 + 1e-12)) + 1
         t = np.arange(self.fine * (count - 1) + 1) / (self.fine * rate)
-        values = profile.wave.value(t)
-        if kind == "friction":
-            values = force_of_friction(values, finger.contact)
-        self.wanted = check_forces(values, t, kind, finger.contact)
-        self.curve = ForceCurve(
-            finger.contact, finger.area, None if carrier is None else rate / carrier, float(self.wanted.max())
-        )
-        self.target = gap_voltages(self.curve, self.wanted[:: self.fine], rate, carrier, self.lead)
+        self.wanted = self._forces(wave.value(t), t)
+        points = None if carrier is None else rate / carrier
+        self.curve = ForceCurve(finger, points, float(self.wanted.max()))
+        self.target = self.curve.voltages(self.wanted[:: self.fine], rate, carrier, self.lead)
 
-    def solve(self, limits: Limits, close: float = CLOSE) -> InverseDrive:
-        """The drive, corrected by the errors of the gap voltage that forward runs show, until they are `close`."""
+    def _forces(self, values: FloatArray, t: FloatArray) -> FloatArray:
+        """The forces (N) that are wanted at times (s), all of them attractive; negative round-off becomes 0."""
+        contact, friction = self.finger.contact, self.kind == "friction"
+        if friction and contact.mu == 0.0:
+            raise InputError("the GAP has mu=0, so that no voltage makes friction; allowed: mu > 0, or a wanted force")
+        # F_el = F_T / mu - F_N (Eq. 1 with full slip).
+        force = values / contact.mu - contact.f_n if friction else values
+        bad = np.flatnonzero(~(force >= -1e-12 * max(1.0, float(np.abs(force).max()))))
+        if bad.size:
+            i = int(bad[0])
+            least = f"{contact.mu * contact.f_n:g} N, the friction without a voltage" if friction else "0 N"
+            value = contact.mu * (force[i] + contact.f_n) if friction else force[i]
+            raise InputError(
+                f"{self.kind}: {value:g} N at {t[i]:g} s is reached by no voltage, which only attracts; allowed: from "
+                f"{least}"
+            )
+        return np.asarray(np.maximum(force, 0.0))
+
+    def solve(self, limit: float = math.inf, slew: float = math.inf, close: float = CLOSE) -> InverseDrive:
+        """The drive within limits (V, V/s), corrected by the errors of the gap voltage until they are `close`."""
         peak = float(np.abs(self.target).max())
         inverter = self.finger.inverter(peak)
         target, best, least, done = self.target, None, math.inf, -1
         wish, levelled = target.copy(), self.carrier is None
         while best is None or done < CORRECTIONS:
-            drive, held = inverter.drive(wish, 1.0 / self.rate, limits)
+            drive, held = inverter(wish, 1.0 / self.rate, limit, slew)
             u, force = self._forward(drive, close * RTOL / CLOSE)
-            miss = np.where(held, 0.0, target - inverter.sign * u)
+            miss = np.where(held, 0.0, target - self.finger.sign * u)
             size = float(np.abs(miss[self.lead :]).max()) / max(peak, 1e-300)
             done += 1
             stalled = size > STALLED * least
@@ -182,7 +270,14 @@ class Task:
                 factor, levelled, least = np.where(held, 1.0, self._level(force)), True, math.inf
                 target, wish = target * factor, wish * factor
         assert best is not None
-        return self._result(limits, *best)
+        drive, held, force, done = best
+        lead, contact = self.lead / self.rate, self.finger.contact
+        times, wanted, reached = self._compared(force)
+        return InverseDrive(
+            self._driven(drive), Samples(drive, self.rate), lead + times, wanted, reached,
+            contact.mu * (contact.f_n + wanted), contact.mu * (contact.f_n + reached), self.kind, self.carrier,
+            limit, slew, lead, float(held.mean()), done,
+        )  # fmt: skip
 
     def _forward(self, drive: FloatArray, rtol: float) -> tuple[FloatArray, FloatArray]:
         """Gap voltage at the samples (V), and force at the fine times (N), that a drive gives."""
@@ -191,7 +286,7 @@ class Task:
             # The reader has given the deck's warnings, and warnings about an uncorrected drive do not concern the user.
             warnings.simplefilter("ignore", FingerspiceWarning)
             run = simulate(
-                self._driven(Samples(drive, self.rate)), t_stop=float(t[-1]), t_eval=t, charge_law=self.finger.law,
+                self._driven(drive), t_stop=float(t[-1]), t_eval=t, charge_law=self.finger.law,
                 rtol=rtol, start="uncharged", charge=False,
             )  # fmt: skip
         u, force = run.u_gap, run.f_el
@@ -199,8 +294,8 @@ class Task:
         assert force is not None
         return u[:: self.fine], force
 
-    def _driven(self, drive: Samples) -> Circuit:
-        return self.finger.circuit.varied({self.finger.source.name: drive})
+    def _driven(self, drive: FloatArray) -> Circuit:
+        return self.finger.circuit.varied({self.finger.source.name: Samples(drive, self.rate)})
 
     def _compared(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Times after the lead (s), and the wanted and the reached force there (N), from the force at the fine times.
@@ -227,17 +322,3 @@ class Task:
         some = (reached > 0.5 * wanted) & (wanted > 1e-3 * wanted.max())
         factor = np.sqrt(np.divide(wanted, reached, out=np.ones_like(wanted), where=some))
         return np.interp((np.arange(self.target.size) - self.lead) / self.rate, times, factor)
-
-    def _result(
-        self, limits: Limits, drive: FloatArray, held: BoolArray, force: FloatArray, corrections: int
-    ) -> InverseDrive:
-        lead, wave = self.lead / self.rate, Samples(drive, self.rate)
-        times, wanted, reached = self._compared(force)
-        times, contact = lead + times, self.finger.contact
-        wanted_friction, friction = (contact.mu * (contact.f_n + x) for x in (wanted, reached))
-        for array in (times, wanted, reached, wanted_friction, friction):
-            array.flags.writeable = False
-        return InverseDrive(
-            self._driven(wave), wave, times, wanted, reached, wanted_friction, friction, self.kind, self.carrier,
-            limits.voltage, limits.slew, lead, float(held.mean()), corrections,
-        )  # fmt: skip

@@ -1,20 +1,34 @@
-"""Measured data for the fit of a circuit: means or impedances under conditions, or a signal over time."""
+"""Measured data for the fit of a circuit, and what a circuit predicts of them, with derivatives by its parameters."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.circuit.usual import MEASURED as USUAL
 from fingerspice.circuit.usual import MEASURING
-from fingerspice.studies.fit.measured import SIGMA, Given, Groups, Measured, measured_of
+from fingerspice.numerics.small import AT, STEP, derivative
+from fingerspice.solve.simulation import simulate
+from fingerspice.studies.batch.batch import batch
+from fingerspice.studies.batch.form import in_lockstep_by
+from fingerspice.studies.batch.task import REFUSED
+from fingerspice.studies.fit.measured import SIGMA, Given, Groups, measured_of
+from fingerspice.studies.fit.search import Problem
+from fingerspice.studies.phasors import phasor
+from fingerspice.studies.steady import steady_state
+
+if TYPE_CHECKING:
+    from xarray import Dataset
 
 #: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
 MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V", "impedance": "ohm"}
@@ -23,6 +37,8 @@ IMPEDANCE, PHASE = "impedance", "impedance_phase"
 _MEANS = ("f_el", "f_t", "friction", "area")
 _TIME, _SOURCE = "t", "source"
 _UNITS = MEASURED | {f"{signal}_mean": unit for signal, unit in MEASURED.items()} | {_TIME: "s", PHASE: "deg"}
+# Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's.
+_SLOPES = 1e-6
 
 
 @dataclass(frozen=True)
@@ -44,9 +60,18 @@ class Data:
         return self.signal if self.t is not None or self.signal == IMPEDANCE else f"{self.signal}_mean"
 
     @property
-    def count(self) -> int:
-        """Number of residuals: of an impedance with its phase two for each value."""
-        return self.values.size * (1 if self.phase is None else 2)
+    def target(self) -> FloatArray:
+        """What is to be predicted: the values, and after them the phases (deg) of an impedance where given."""
+        return self.values if self.phase is None else np.concatenate([self.values, self.phase])
+
+    @property
+    def scale(self) -> FloatArray:
+        """Scale of the residuals: sigma, or the largest value; of an impedance each value's own size."""
+        sizes = np.abs(self.values)
+        own = sizes if self.signal == IMPEDANCE else np.full(sizes.size, float(sizes.max()) or 1.0)
+        scale = own if self.sigma is None else self.sigma
+        # An error of the complex impedance, equal in all directions, is as large across as along.
+        return scale if self.phase is None else np.concatenate([scale, np.degrees(scale / sizes)])
 
     def unusual(self) -> Iterator[str]:
         """Warnings about measured values and amplitudes that are probably in another unit."""
@@ -62,18 +87,46 @@ class Data:
         """The conditions that are not the same in all measurements."""
         return {path: x for path, x in self.conditions.items() if np.ptp(x) > 0.0}
 
+    def remedy(self, circuit: Circuit) -> str:
+        """A measurement that would add what is missing: at another voltage, frequency or load."""
+        if self.t is not None:
+            return "Measure under another voltage or load as well, or fix one of them."
+        varying, known = ({path.rpartition(".")[2] for path in paths} for paths in (self.varying, circuit.parameters))
+        for key, text in (("amplitude", "voltage"), ("frequency", "frequency"), ("fn", "load")):
+            if key in known - varying:
+                return f"Measure at a second {text} as well, or fix one of them."
+        return "Fix one of them to a value known from elsewhere."
+
 
 def data_of(circuit: Circuit, given: Given, by: str | None = None) -> Data:
     """The checked data that a caller of `fit` gave; the column `by` tells which group a measurement belongs to."""
-    found = _read(circuit, given, by)
-    columns, place = found.columns, found.place
+    if isinstance(given, Mapping) and np.iscomplexobj(given.get(IMPEDANCE, 0.0)):
+        if PHASE in given:
+            raise InputError(f"{IMPEDANCE} is complex, and {PHASE} is given; allowed: one of them")
+        z = np.asanyarray(given[IMPEDANCE])
+        given = {**given, IMPEDANCE: np.abs(z), PHASE: np.angle(z, deg=True)}
+
+    def meaning(name: str, names: Sequence[str]) -> tuple[str, str, str]:
+        key = {"time": _TIME, _TIME: _TIME, SIGMA: SIGMA}.get(name.lower(), name)
+        if key == SIGMA:
+            measured = next((one for one in names if one.removesuffix("_mean") in MEASURED), "")
+            return SIGMA, measured, _UNITS.get(measured, "")
+        return key, key, _UNITS[key] if key in _UNITS else circuit.parameters[_path(circuit, name)].unit
+
+    try:
+        columns, place, groups = measured_of(given, meaning, "Vdrive.amplitude (V), f_el_mean (N)", by)
+    except InputError as refused:
+        if by is not None or "no rows of numbers" not in refused.message:
+            raise
+        raise InputError(f"{refused.message}; allowed: numbers, and names in the column that groups names") from None
     names = {f"{name}_mean": name for name in _MEANS}
     names |= {name: name for name in MEASURED if name != IMPEDANCE} if _TIME in columns else {IMPEDANCE: IMPEDANCE}
     measured = [name for name in columns if name in names]
     if len(measured) != 1:
-        allowed = ", ".join(names)
         what = f"several measured columns ({', '.join(measured)})" if measured else "no measured column"
-        raise InputError(f"{place} have {what}, and the columns {', '.join(columns)}; allowed: one of {allowed}")
+        raise InputError(
+            f"{place} have {what}, and the columns {', '.join(columns)}; allowed: one of {', '.join(names)}"
+        )
     values = columns.pop(measured[0])
     sigma, t, phase = (columns.pop(name, None) for name in (SIGMA, _TIME, PHASE))
     if phase is not None and measured[0] != IMPEDANCE:
@@ -89,34 +142,12 @@ def data_of(circuit: Circuit, given: Given, by: str | None = None) -> Data:
         if path in conditions:
             raise InputError(f"{place} have two columns of {path}; allowed: one")
         conditions[path] = x
-    if t is not None and any(np.ptp(x) > 0.0 for x in conditions.values()):
+    data = Data(names[measured[0]], values, sigma, conditions, t, phase, groups)
+    if t is not None and data.varying:
         raise InputError(f"{place} have times and changing conditions; allowed: one run over time, or means")
-    if t is not None and found.groups is not None:
+    if t is not None and groups is not None:
         raise InputError(f"{place} have times and groups; allowed: groups of means or of impedances")
-    return Data(names[measured[0]], values, sigma, conditions, t, phase, found.groups)
-
-
-def _read(circuit: Circuit, given: Given, by: str | None) -> Measured:
-    """The columns as they are named, of which a complex impedance becomes two."""
-    if isinstance(given, Mapping) and np.iscomplexobj(given.get(IMPEDANCE, 0.0)):
-        if PHASE in given:
-            raise InputError(f"{IMPEDANCE} is complex, and {PHASE} is given; allowed: one of them")
-        z = np.asanyarray(given[IMPEDANCE])
-        given = {**given, IMPEDANCE: np.abs(z), PHASE: np.angle(z, deg=True)}
-
-    def meaning(name: str, names: Sequence[str]) -> tuple[str, str, str]:
-        key = {"time": _TIME, _TIME: _TIME, SIGMA: SIGMA}.get(name.lower(), name)
-        if key == SIGMA:
-            measured = next((one for one in names if one.removesuffix("_mean") in MEASURED), "")
-            return SIGMA, measured, _UNITS.get(measured, "")
-        return key, key, _UNITS[key] if key in _UNITS else circuit.parameters[_path(circuit, name)].unit
-
-    try:
-        return measured_of(given, meaning, "Vdrive.amplitude (V), f_el_mean (N)", by)
-    except InputError as refused:
-        if by is not None or "no rows of numbers" not in refused.message:
-            raise
-        raise InputError(f"{refused.message}; allowed: numbers, and names in the column that groups names") from None
+    return data
 
 
 def _refuse_signs(name: str, values: FloatArray, place: str, first: int) -> None:
@@ -157,3 +188,116 @@ def _path(circuit: Circuit, name: str) -> str:
             f"and conditions{hint}"
         )
     return known[name.lower()]
+
+
+@dataclass(frozen=True)
+class Task(Problem):
+    """The fit of a circuit's parameters; how it is run is said by `fit`."""
+
+    data: Data
+    average: str
+    skin: str
+    rtol: float
+    charge_law: str | None
+    watch: Callable[[], None] = lambda: None  # Called before every evaluation
+
+    @cached_property
+    def members(self) -> BoolArray:
+        """Whether each unknown belongs to each measurement, shape (n_parameter, n)."""
+        groups, count = self.data.groups, self.data.values.size
+        own = groups.of if groups is not None else [None] * count
+        return np.array([[one.label in (None, label) for label in own] for one in self.unknowns])
+
+    @cached_property
+    def places(self) -> dict[str, list[int]]:
+        """Places of every fitted parameter's unknowns, by its path: one, or one for each group."""
+        paths = [one.path for one in self.unknowns]
+        return {path: [k for k, other in enumerate(paths) if other == path] for path in paths}
+
+    def compared(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        self.watch()
+        found, by = self._predicted(values)
+        off = found - self.data.target
+        if self.data.phase is not None:
+            n = self.data.values.size
+            off[n:] = np.remainder(off[n:] + 180.0, 360.0) - 180.0
+        return off / self.scale, by / self.scale[:, None]
+
+    def _predicted(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predicted data (n,), and their derivatives by the logarithms of the parameters (n, n_parameter)."""
+        data, how = self.data, {"rtol": self.rtol, "charge_law": self.charge_law, "charge": False}
+        if data.t is not None:
+            paths = tuple(self.places)
+            run = simulate(self._scene(values, 0), t_eval=data.t, sensitivities=paths, **how)  # type: ignore[arg-type]
+            slopes = [getattr(run.sensitivities[path], data.signal) for path in paths]
+            return np.asarray(getattr(run, data.signal)), np.array(slopes).T * values
+        if data.signal == IMPEDANCE:
+            moved = values * (1.0 + np.multiply.outer(STEP * np.array(AT), np.eye(values.size)))
+            by = derivative([np.array([self._impedance(one) for one in each]) for each in moved], STEP)
+            return self._impedance(values), by.T
+        if self._in_lockstep:
+            return self._in_batches(values)
+        if self.average == "run" and self.circuit.tran is None:
+            raise InputError("the deck has no .tran, and average is 'run'; allowed: a deck with .tran, or 'periodic'")
+        name, found, by = data.name, np.empty(data.values.size), np.zeros((data.values.size, values.size))
+        for row in range(data.values.size):
+            circuit = self._scene(values, row)
+            felt = np.flatnonzero(self.members[:, row])
+            paths = tuple(self.unknowns[k].path for k in felt)
+            if self.average == "periodic":
+                one = steady_state(circuit, sensitivities=paths, points=4, **how)  # type: ignore[arg-type]
+            else:
+                one = simulate(circuit, sensitivities=paths, t_eval=[0.0], **how)  # type: ignore[arg-type,assignment]
+            found[row] = getattr(one, name)
+            for k, path in zip(felt, paths, strict=True):
+                by[row, k] = getattr(one.sensitivities[path], name) * values[k]
+        return found, by
+
+    def _scene(self, values: FloatArray, row: int) -> Circuit:
+        """The circuit of one measurement."""
+        changes = {path: float(x[row]) for path, x in self.data.conditions.items()}
+        changes |= {self.unknowns[k].path: float(values[k]) for k in np.flatnonzero(self.members[:, row])}
+        changed = self.circuit.varied(changes)
+        if self.skin == "follow":
+            fundamental = build_stack(changed).waveform.fundamental if is_stack(changed) else None
+            skins = {f"{e.name}.f": fundamental.frequency for e in changed.by_device("SKIN") if fundamental is not None}
+            changed = changed.varied(skins)
+        return changed
+
+    def _impedance(self, values: FloatArray) -> FloatArray:
+        """Magnitudes (ohm), and phases (deg) where they are given, at the area that the deck's amplitude causes."""
+        how = "swept" if self.skin == "follow" else "own"
+        runs = [phasor(self._scene(values, row), skin=how).impedance for row in range(self.data.values.size)]
+        z = np.array([one[0] for one in runs if one is not None])
+        return np.abs(z) if self.data.phase is None else np.concatenate([np.abs(z), np.degrees(np.angle(z))])
+
+    @cached_property
+    def _in_lockstep(self) -> bool:
+        """Whether a batch predicts all measurements, and has their derivatives, in lockstep."""
+        paths = {*self.data.conditions, *self.places}
+        skins = {f"{e.name}.f" for e in self.circuit.by_device("SKIN")}
+        if self.charge_law is not None or (self.skin == "follow" and paths & skins):
+            return False
+        alone = self.skin == "own" or len(driving_sources(self.circuit)) == 1
+        return alone and in_lockstep_by(self.circuit, paths, (self.data.name,), max(self.rtol, _SLOPES))
+
+    def _in_batches(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `_predicted`, all measurements at once, and their derivatives with an error that suits least squares."""
+        name, by, runs = self.data.name, np.zeros((self.data.values.size, values.size)), []
+        slopes = max(self.rtol, _SLOPES), tuple(self.places)
+        for status, (rtol, gradients) in (("gradient_status", slopes), ("status", (self.rtol, ()))):
+            runs.append(self.scenes(values[None], rtol, gradients))
+            if np.any(runs[-1][status].to_numpy() >= REFUSED):
+                raise InputError(runs[-1].attrs["failures"][0])
+        for i, own in enumerate(self.places.values()):
+            by[:, own] = self.members[own].T * runs[0][f"d_{name}"].to_numpy()[:, i, None] * values[own]
+        return runs[1][name].to_numpy(), by
+
+    def scenes(self, values: FloatArray, rtol: float, gradients: tuple[str, ...] = ()) -> Dataset:
+        """A batch of all measurements, with every row of `values` (n_row, n_parameter) one after the other."""
+        table = {path: np.tile(x, len(values)) for path, x in self.data.conditions.items()}
+        table |= {path: (values[:, own] @ self.members[own]).ravel() for path, own in self.places.items()}
+        return batch(
+            self.circuit, table, outputs=(self.data.name,), rtol=rtol, periodic=self.average == "periodic",
+            skin=self.skin, gradients=gradients,
+        )  # fmt: skip

@@ -6,10 +6,10 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,14 +17,16 @@ from numpy.typing import ArrayLike
 from fingerspice.base.announcing import Bar
 from fingerspice.base.arrays import FloatArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.pages import Page, Table
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.describe import meaning_of
 from fingerspice.circuit.notices import scenes_warnings
+from fingerspice.results.signals import SIGNALS
 from fingerspice.solve.simulation import rtol_given
-from fingerspice.studies.fit.circuitdata import IMPEDANCE, Data, data_of
-from fingerspice.studies.fit.circuitresult import Fit, fit_result
-from fingerspice.studies.fit.circuittask import Task
-from fingerspice.studies.fit.search import FARTHEST, Fitted, Unknown, bounds_of, followed, profile_of, refuse_few
+from fingerspice.studies.fit.circuitdata import IMPEDANCE, MEASURED, Data, Task, data_of
+from fingerspice.studies.fit.result import Drawn, FitResult, covariance_of, estimated, misfit_note, profile_of
+from fingerspice.studies.fit.search import FARTHEST, Fitted, Unknown, bounds_of, followed, refuse_few
 from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
@@ -34,6 +36,113 @@ _SPREAD, _FOLLOWED = 4.0, 3
 _CLEARLY, _CHOOSING = 2.0, 4
 # Error of the means by which starts are compared.
 _ROUGH = 1e-5
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Fit(FitResult):
+    """A fit of parameters to data; `circuit` is ready to run.
+
+    Attributes
+    ----------
+    circuit : Circuit
+        With the fitted values.
+    estimates : dict of str to Estimate
+        By path; that of a group's parameter is followed by the group in brackets: ``Xgap.d[left]``.
+    correlation : ndarray, shape (n_parameter, n_parameter)
+        Of the errors of the logarithms.
+    data : Data
+    predicted : ndarray, shape (n,)
+        The data as the fitted circuit gives them.
+    sigma : ndarray, shape (n,)
+        Standard deviation of every value: as given, or as the residuals have it.
+    objective : float
+        Sum of the squared residuals over sigma as given, or over the largest value of the data, or, where errors are
+        likelier equal shares of the values, over these.
+    objectives : tuple of float
+        That reached from every start that was followed.
+    freedom : int
+        Data less parameters, and less one where the residuals say whether errors are equal or shares.
+    evaluations : int
+    closed : bool
+        Whether the iteration closed.
+    notes : tuple of str
+        What the data do not tell, and which measurement would.
+    circuits : dict of str to Circuit
+        With groups: the circuit of each, by its name. `circuit` then has the geometric means of their parameters.
+    profiles : dict of str to Profile
+        By path, as far as they were asked for.
+    """
+
+    data: Data
+    predicted: FloatArray
+    sigma: FloatArray
+    objectives: tuple[float, ...]
+    circuits: dict[str, Circuit] = field(default_factory=dict)
+
+    @property
+    def residual(self) -> FloatArray:
+        """Data less prediction, in the unit of the data, shape (n,)."""
+        return np.asarray(self.data.values - self.predicted)
+
+    @property
+    def _rms(self) -> float:
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+    @property
+    def _count(self) -> int:
+        return self.data.target.size
+
+    def _page(self) -> Page:
+        data = self.data
+        share = 100.0 * self._rms / (float(np.abs(data.values).max()) or 1.0)
+        equal = float(np.ptp(self.sigma)) <= 1e-9 * float(self.sigma.max())
+        noise = f"estimated from the residuals, {'equal for all' if equal else 'as equal shares of the values'}"
+        lines: list[str | Table] = [
+            f"{len(self.estimates)} parameters fitted to {data.values.size} values of {data.name}, {self._effort}",
+            f"residual {self._rms:.3g} {MEASURED[data.signal]} rms, {share:.2g} % of the largest value; "
+            f"sigma {'as given' if data.sigma is not None else noise}",
+        ]
+        if data.groups is not None:
+            lines.append(f"groups by {data.groups.column}: {', '.join(data.groups.labels)}")
+        return Page([*lines, *self._lines()])
+
+    def _panels(self) -> list[Drawn]:
+        data = self.data
+        signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal
+        signal = f"mean {signal}" if data.name.endswith("_mean") else signal
+        varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
+        names = ["measured and fitted"] * data.values.size
+        if data.t is not None:
+            x, label = data.t, "time [s]"
+        elif varying:
+            (path, x), others = varying[0], varying[1:]
+            unit = self.circuit.parameters[path].unit
+            label = meaning_of(self.circuit, path) + (f" [{unit}]" if unit else "")
+            keys = [] if data.groups is None else [[f"{data.groups.column} = {one}" for one in data.groups.of]]
+            for path, values in others:
+                unit = self.circuit.parameters[path].unit
+                keys.append([f"{meaning_of(self.circuit, path)} = {y:g} {unit}".rstrip() for y in values])
+            if keys:
+                names = [", ".join(told) for told in zip(*keys, strict=True)]
+        else:
+            x, label = np.arange(1.0, data.values.size + 1.0), "measurement"
+        return [(names, (x, data.values, self.predicted, self.sigma), label, signal, MEASURED[data.signal])]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fit as plain numbers and texts; `parameters` has a row for each."""
+        return {
+            **self._plain(),
+            "groups": list(self.circuits),
+            "signal": self.data.signal,
+            "count": int(self.data.values.size),
+            "residual_rms": self._rms,
+            "objectives": list(self.objectives),
+        }
+
+    def _columns(self) -> dict[str, Any]:
+        data, groups = self.data, self.data.groups
+        first = {groups.column: groups.of} if groups is not None else {} if data.t is None else {"t": data.t}
+        return {**first, **data.conditions, data.signal: data.values, "fitted": self.predicted, "sigma": self.sigma}
 
 
 def fit(
@@ -101,19 +210,6 @@ def fit(
     require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
     start, box = bounds_of(circuit, tuple(one.path for one in unknowns), bounds or {})
-    target, scale = _target(measured)
-    task = Task(start, unknowns, box, scale, measured, average, skin, rtol, charge_law, target)
-    wanted = task.profiled(profiles)
-    said = [*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin)]
-    for text in filter(None, said):
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    with _evaluations_shown() as watch:
-        return _fitted(replace(task, watch=watch), starts, wanted)
-
-
-@contextmanager
-def _evaluations_shown() -> Iterator[Callable[[], None]]:
-    """A progress bar of a fit, which appears after one second; the function counts the evaluations."""
     bar, begun, count = Bar("fitting", endless=True), time.perf_counter(), itertools.count(1)
 
     def watch() -> None:
@@ -121,15 +217,22 @@ def _evaluations_shown() -> Iterator[Callable[[], None]]:
         if time.perf_counter() - begun > 1.0:
             bar.show(note=f"evaluation {number}")
 
+    task = Task(start, unknowns, box, measured.scale, measured, average, skin, rtol, charge_law, watch)
+    wanted = task.profiled(profiles)
+    said = [*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin)]
+    for text in filter(None, said):
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     try:
-        yield watch
+        return _fitted(task, starts, wanted)
     finally:
         bar.stop()
 
 
 def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
     """The fit, with the profiles `wanted`."""
-    data = free.data
+    from scipy.stats import norm, t
+
+    data, n = free.data, free.data.values.size
     # Where no bounds are given, nothing is looked for far from the start: there are no likely values, and slow runs.
     (low, high), near, far = free.bounds.T, free.initial / FARTHEST, free.initial * FARTHEST
     walls = np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
@@ -141,29 +244,37 @@ def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
             "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
             "circuit that runs under the conditions of the data"
         )
-    freedom = task.target.size - len(task.unknowns)
+    freedom = best.residual.size - len(task.unknowns)
     if data.sigma is None and data.t is None and data.signal != IMPEDANCE and freedom >= _CHOOSING:
         task, ends = _with_likelier_noise(task, ends, best)
         best = min(ends, key=lambda end: end.objective)
         freedom -= 1
-    variance, reach = _spread(best, freedom, given=data.sigma is not None)
-    found = fit_result(task, best, [end.objective for end in ends], freedom, variance, reach)
+    # Variance of the residuals over their scale, and half a 95 % interval over a standard error.
+    variance, reach = math.inf, math.inf
+    if data.sigma is not None:
+        variance, reach = 1.0, float(norm.ppf(0.975))
+    elif freedom > 0:
+        variance, reach = best.objective / freedom, float(t.ppf(0.975, freedom))
+    covariance, remedy = covariance_of(best.by_log), data.remedy(task.circuit)
+    found = Fit(
+        **estimated(
+            task, best, covariance, np.sqrt(np.diag(covariance) * variance), [reach] * len(task.unknowns),
+            lambda _: remedy, misfit_note(best.objective, freedom) if data.sigma is not None else [],
+        ),
+        data=data,
+        predicted=data.values + (best.residual * task.scale)[:n],
+        sigma=data.sigma if data.sigma is not None else math.sqrt(variance) * task.scale[:n],
+        objectives=tuple(end.objective for end in ends),
+        freedom=freedom,
+        **_fitted_circuits(task, best.values.tolist()),
+    )  # fmt: skip
     # Of chi squared and F with one degree of freedom, quantiles are the squares of those of the normal distribution
     # and of Student's (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
-    limit = best.objective + variance * reach**2
-    for name in wanted:
-        one = found.estimates[name]
-        found.profiles[name] = profile_of(replace(task, bounds=free.bounds), best, name, one.error / one.value, limit)
+    found.profiles.update(
+        (name, profile_of(replace(task, bounds=free.bounds), best, found.estimates[name], variance * reach**2))
+        for name in wanted
+    )
     return found
-
-
-def _spread(best: Fitted, freedom: int, *, given: bool) -> tuple[float, float]:
-    """Variance of the residuals over their scale, and half a 95 % interval over a standard error."""
-    from scipy.stats import norm, t
-
-    if given:
-        return 1.0, float(norm.ppf(0.975))
-    return (best.objective / freedom, float(t.ppf(0.975, freedom))) if freedom > 0 else (math.inf, math.inf)
 
 
 def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[Task, list[Fitted]]:
@@ -171,7 +282,7 @@ def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[
 
     The largest likelihood of normal errors of unknown size is RSS^(-n/2) over the product of the scales.
     """
-    predicted = np.abs(task.target + best.residual * task.scale)
+    predicted = np.abs(task.data.target + best.residual * task.scale)
     if not np.all(predicted > 0.0) or best.objective == 0.0:
         return task, ends
     shares = replace(task, scale=predicted)
@@ -183,6 +294,22 @@ def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[
         if 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY
         else (task, ends)
     )
+
+
+def _fitted_circuits(task: Task, values: list[float]) -> dict[str, Any]:
+    """`circuit` and `circuits` of a `Fit`."""
+    mean = {path: values[own[0]] for path, own in task.places.items()}
+    for path, own in task.places.items():
+        if len(own) > 1:
+            mean[path] = math.exp(sum(math.log(values[k]) for k in own) / len(own))
+    found = list(zip(task.unknowns, values, strict=True))
+    return {
+        "circuit": task.circuit.varied(mean),
+        "circuits": {
+            label: task.circuit.varied({one.path: value for one, value in found if one.label in (None, label)})
+            for label in (task.data.groups.labels if task.data.groups is not None else ())
+        },
+    }
 
 
 def _request(
@@ -199,7 +326,7 @@ def _request(
     paths = tuple(known[path.lower()] for path in parameters)
     for path in paths:
         require(paths.count(path) == 1, path, "named twice", "once")
-    by = _group_column(circuit, groups)
+    by, separate = (None, []) if groups is None else _grouped(circuit, groups)
     data = data_of(circuit, given, by)
     both = sorted(set(paths) & set(data.conditions))
     if both:
@@ -208,43 +335,26 @@ def _request(
         value = circuit.parameters[path].value
         if not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
-    separate = [path.lower() for path in (groups or {}).get(by or "", ())]
-    for path in (groups or {}).get(by or "", ()):
-        if path.lower() not in map(str.lower, paths):
+    for path in separate:
+        if known.get(path.lower()) not in paths:
             raise InputError(f"groups names {path!r}, which is not fitted; allowed: {', '.join(paths)}")
+    own = {known[path.lower()] for path in separate}
     labels = data.groups.labels if data.groups is not None else ()
-    unknowns = tuple(
-        Unknown(path, label) for path in paths for label in (labels if path.lower() in separate else (None,))
-    )
-    refuse_few(data.count, unknowns)
+    unknowns = tuple(Unknown(path, label) for path in paths for label in (labels if path in own else (None,)))
+    refuse_few(data.target.size, unknowns)
     return data, unknowns
 
 
-def _group_column(circuit: Circuit, groups: Mapping[str, Sequence[str]] | None) -> str | None:
-    """The column that tells the group, of a request such as ``{"finger": ["Xgap.d"]}``."""
-    if groups is None:
-        return None
+def _grouped(circuit: Circuit, groups: Mapping[str, Sequence[str]]) -> tuple[str, Sequence[str]]:
+    """The column that tells the group, and what every group has of its own: ``{"finger": ["Xgap.d"]}``."""
     wanted = "a mapping of a column of the data to the parameters of each group, such as {'finger': ['Xgap.d']}"
     if isinstance(groups, Mapping) and len(groups) == 1:
         ((column, paths),) = groups.items()
         if isinstance(column, str) and not isinstance(paths, str) and paths:
             if column.lower() in map(str.lower, circuit.parameters):
                 raise InputError(f"groups names the column {column!r}, which is a parameter; allowed: {wanted}")
-            return column
+            return column, paths
     raise InputError(f"groups is {groups!r}; allowed: {wanted}")
-
-
-def _target(table: Data) -> tuple[FloatArray, FloatArray]:
-    """What is to be predicted, and its scale: sigma, or the largest value; of an impedance each value's own size."""
-    sizes = np.abs(table.values)
-    if table.signal != IMPEDANCE:
-        scale = table.sigma if table.sigma is not None else np.full(sizes.size, float(sizes.max()) or 1.0)
-        return table.values, scale
-    scale = table.sigma if table.sigma is not None else sizes
-    if table.phase is None:
-        return table.values, scale
-    # An error of the complex impedance, equal in all directions, is as large across as along.
-    return np.concatenate([table.values, table.phase]), np.concatenate([scale, np.degrees(scale / sizes)])
 
 
 def _starts(task: Task, count: int) -> list[FloatArray]:

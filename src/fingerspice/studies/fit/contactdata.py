@@ -80,10 +80,14 @@ def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, .
     found: dict[tuple[str, bool], Relation] = {}
     for number, one in enumerate(several, 1):
         place = "the data" if len(several) == 1 else f"data {number}"
-        measured = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
-        for relation in _relations(measured.columns, fn, measured.place):
+        columns, place, _ = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
+        for relation in _relations(columns, fn, place):
             key = relation.kind, relation.sigma is None
-            found[key] = _joined(found[key], relation) if key in found else relation
+            if key in found:
+                known = {name: x for name, x in vars(found[key]).items() if isinstance(x, np.ndarray)}
+                joined: Any = {name: np.concatenate([x, getattr(relation, name)]) for name, x in known.items()}
+                relation = replace(relation, **joined)
+            found[key] = relation
     return tuple(found.values())
 
 
@@ -98,8 +102,9 @@ def _relations(columns: Mapping[str, FloatArray], fn: float, place: str) -> list
     measured = [name for name in MEASURED if name in columns]
     if not measured:
         raise InputError(f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
-    sigmas = {name: f"{name}_{SIGMA}" for name in measured} | ({measured[0]: SIGMA} if len(measured) == 1 else {})
-    sigmas = {name: key if key in columns else f"{name}_{SIGMA}" for name, key in sigmas.items()}
+    sigmas = {name: f"{name}_{SIGMA}" for name in measured}
+    if len(measured) == 1 and SIGMA in columns:
+        sigmas[measured[0]] = SIGMA
     unknown = [name for name in columns if name not in (*measured, *CONDITIONS, *sigmas.values())]
     if unknown:
         why = ": which of the measured columns it belongs to is not known" if unknown[0] == SIGMA else ""
@@ -121,14 +126,6 @@ def _relations(columns: Mapping[str, FloatArray], fn: float, place: str) -> list
         if name != "area" or depth is None or "fn" in columns:
             found.append(Relation(name, values, sigma, at, u, none))
     return found
-
-
-def _joined(a: Relation, b: Relation) -> Relation:
-    """Two relations of one kind as one; both have sigma, or none of them."""
-    names = ("values", "sigma", "fn", "u_gap", "indentation")
-    pairs = {name: (getattr(a, name), getattr(b, name)) for name in names}
-    joined: dict[str, Any] = {name: np.concatenate(pair) for name, pair in pairs.items() if pair[0] is not None}
-    return replace(a, **joined)
 
 
 @dataclass(frozen=True)
@@ -171,45 +168,50 @@ class Pool(NamedTuple):
 
     name: str  # What was measured, in words
     at: IntArray  # Places of their values among the residuals
-    estimated: bool  # Whether the standard deviation follows from the residuals, and is not given
+    # Number of values less what the parameters take up of them; infinity where the standard deviation is given, and
+    # does not follow from the residuals
+    freedom: float
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the standard deviation follows from the residuals."""
+        return self.freedom < np.inf
 
 
-def pools_of(task: ContactTask) -> list[Pool]:
-    """The relations by what they have been measured with: ridge areas against the load come from one set of images."""
-    places = task.split(np.arange(task.scale.size))
+def _pools(task: ContactTask, best: Fitted) -> list[Pool]:
+    """The relations by what they have been measured with: ridge areas against the load come from one set of images.
+
+    What the parameters take up of values is the sum of their leverages.
+    """
+    left, singular, _ = np.linalg.svd(best.by_log, full_matrices=False)
+    left = left[:, singular > 1e-9 * max(float(singular.max()), 1e-300)]
+    leverage = np.sum(left**2, axis=1)
     members: dict[tuple[str, bool], list[tuple[str, IntArray]]] = {}
-    for relation, at in zip(task.relations, places, strict=True):
+    for relation, at in zip(task.relations, task.split(np.arange(task.scale.size)), strict=True):
         key = relation.kind.removesuffix("_sliding"), relation.sigma is None
         members.setdefault(key, []).append((relation.name, at))
-    return [
-        Pool(" and the ".join(name for name, _ in own), np.concatenate([at for _, at in own]), estimated)
-        for (_, estimated), own in members.items()
-    ]
+    found = []
+    for (_, estimated), own in members.items():
+        at = np.concatenate([at for _, at in own])
+        freedom = at.size - float(leverage[at].sum()) if estimated else float("inf")
+        found.append(Pool(" and the ".join(name for name, _ in own), at, freedom))
+    return found
 
 
-def solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[float]]:
+def solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
     """Least squares, with the standard deviation of every pool that has none from its own residuals.
 
-    Returns the task with the standard deviations found, the fit, and the degrees of freedom of each pool: its values
-    less what the parameters take up of them; infinity where sigma is given.
+    Returns the task with the standard deviations found, the fit, and the pools.
     """
-    begin, pools = task.initial, pools_of(task)
+    begin = task.initial
     for _ in range(_ROUNDS):
         best = followed(task.residuals, task.bounds, begin)
-        left, scale = _freedoms(best, pools), task.scale.copy()
-        for pool, freedom in zip(pools, left, strict=True):
-            if pool.estimated and freedom >= FEWEST:
-                spread = float(np.sqrt(np.sum(best.residual[pool.at] ** 2) / freedom))
+        pools, scale = _pools(task, best), task.scale.copy()
+        for pool in pools:
+            if pool.estimated and pool.freedom >= FEWEST:
+                spread = float(np.sqrt(np.sum(best.residual[pool.at] ** 2) / pool.freedom))
                 scale[pool.at] = np.maximum(scale[pool.at] * spread, _LEAST)
         if np.abs(np.log(scale / task.scale)).max() < _SETTLED:
             break
         task, begin = replace(task, scale=scale), best.values
-    return task, best, left
-
-
-def _freedoms(best: Fitted, pools: Sequence[Pool]) -> list[float]:
-    """Degrees of freedom of each pool: its number of values less the sum of their leverages."""
-    left, singular, _ = np.linalg.svd(best.by_log, full_matrices=False)
-    left = left[:, singular > 1e-9 * max(float(singular.max()), 1e-300)]
-    leverage = np.sum(left**2, axis=1)
-    return [pool.at.size - float(leverage[pool.at].sum()) if pool.estimated else float("inf") for pool in pools]
+    return task, best, pools

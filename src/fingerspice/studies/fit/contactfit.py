@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.pages import Page
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.studies.fit.contactdata import ContactTask, Relation, relations_of, solved
-from fingerspice.studies.fit.contactresult import ContactFit, contact_result
+from fingerspice.studies.fit.contactdata import FEWEST, ContactTask, Pool, Relation, relations_of, solved
 from fingerspice.studies.fit.measured import Given
-from fingerspice.studies.fit.search import Unknown, bounds_of, profile_of, refuse_few
+from fingerspice.studies.fit.result import Drawn, FitResult, covariance_of, estimated, misfit_note, profile_of
+from fingerspice.studies.fit.search import Fitted, Unknown, bounds_of, refuse_few
 from fingerspice.waveforms.waveform import require
 
 PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
@@ -22,6 +27,93 @@ PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
 _TOO_MUCH = 0.2
 # The share of its value that a measured value without sigma is off by, at first.
 _SHARE = 0.1
+# The share of an error's variance below which a relation has no part in it.
+_NO_PART = 1e-9
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class ContactFit(FitResult):
+    """A fit of a contact to data; `circuit` is ready to run.
+
+    Attributes
+    ----------
+    circuit, estimates, correlation, evaluations, closed, notes, profiles
+        As of `Fit`.
+    gap : str
+        Name of the GAP.
+    relations : tuple of Relation
+        The data, by kind.
+    predicted, sigma : tuple of ndarray
+        Values and standard deviations of every relation, as the fit has them.
+    misfits : tuple of float
+        Root mean square of the logarithm of prediction over data, of every relation.
+    objective : float
+        Sum of the squared residuals over sigma.
+    freedom : int
+        Data less parameters.
+    reach : dict of str to float
+        Half of each interval in the logarithm over the standard error: Student's t, with the degrees of freedom of the
+        relations that the parameter is known from.
+    """
+
+    gap: str
+    relations: tuple[Relation, ...]
+    predicted: tuple[FloatArray, ...]
+    sigma: tuple[FloatArray, ...]
+    misfits: tuple[float, ...]
+    reach: dict[str, float]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Fitted values by path, as `Circuit.replace` takes them."""
+        return {path: one.value for path, one in self.estimates.items()}
+
+    @property
+    def line(self) -> str:
+        """The fitted parameters as a netlist has them."""
+        return " ".join(f"{path.rpartition('.')[2]}={one.value:.6g}" for path, one in self.estimates.items())
+
+    def _page(self) -> Page:
+        fitted = f"{len(self.estimates)} parameters fitted to {self._count} values"
+        lines = [f"contact of {self.gap}: {fitted}, {self._effort}"]
+        for one, misfit in zip(self.relations, self.misfits, strict=True):
+            known = "sigma as given" if one.sigma is not None else "sigma estimated from the residuals"
+            lines.append(f"{one.name}: {one.values.size} values, residual {100.0 * misfit:.3g} % rms; {known}")
+        return Page([*lines, *self._lines(), "", f"in the deck: {self.gap} ... {self.line}"])
+
+    def _panels(self) -> list[Drawn]:
+        panels: list[Drawn] = []
+        for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True):
+            # The condition along the axis, and another, of which every value has a curve.
+            x, label, others, name = one.fn, "normal load [N]", one.u_gap, "gap voltage = {:g} V"
+            if one.kind == "indentation":
+                x, label, others = 1e3 * one.indentation, "indentation [mm]", np.zeros(one.fn.size)
+            elif np.unique(one.u_gap).size > np.unique(one.fn).size:
+                x, label, others, name = one.u_gap, "gap voltage [V]", one.fn, "normal load = {:g} N"
+            order = np.argsort(others, kind="stable")
+            names = [name.format(other) if np.ptp(others) > 0.0 else one.name for other in others[order]]
+            columns = [column[order] for column in (x, one.values, fitted, sigma)]
+            panels.append((names, columns, label, one.name, one.unit))
+        return panels
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fit as plain numbers and texts; `parameters` has a row for each."""
+        return {
+            "gap": self.gap,
+            **self._plain(),
+            "relations": [
+                {"kind": one.kind, "count": int(one.values.size), "misfit": misfit}
+                for one, misfit in zip(self.relations, self.misfits, strict=True)
+            ],
+        }
+
+    def _columns(self) -> dict[str, Any]:
+        every = self.relations
+        columns: dict[str, Any] = {"relation": [one.kind for one in every for _ in one.values]}
+        for name in ("fn", "u_gap", "indentation", "values"):
+            columns[name] = np.concatenate([getattr(one, name) for one in every])
+        columns["measured"] = columns.pop("values")
+        return columns | {"fitted": np.concatenate(self.predicted), "sigma": np.concatenate(self.sigma)}
 
 
 def fit_contact(
@@ -72,6 +164,11 @@ def fit_contact(
     require_circuit(circuit)
     gap = _gap(circuit, finger)
     own = circuit[gap].values
+
+    def named(name: str) -> str:
+        # A parameter may be given without its GAP.
+        return name if "." in name else f"{gap}.{name}"
+
     relations = relations_of(data, own["fn"])
     largest = max(float(relation.fn.max()) for relation in relations)
     heavy = DEVICES["GAP"].parameter("fn").unusual("the data's largest", largest)
@@ -87,10 +184,10 @@ def fit_contact(
     paths = tuple(f"{gap}.{name}" for name in names)
     scale = np.concatenate([np.full(one.values.size, _SHARE) if one.sigma is None else one.sigma for one in relations])
     refuse_few(scale.size, paths)
-    start, box = bounds_of(start, paths, {_named(gap, path): pair for path, pair in (bounds or {}).items()})
+    start, box = bounds_of(start, paths, {named(path): pair for path, pair in (bounds or {}).items()})
     task = ContactTask(start, tuple(map(Unknown, paths)), box, scale, gap, relations)
-    wanted = task.profiled(profiles if isinstance(profiles, bool) else [_named(gap, path) for path in profiles])
-    task, best, freedom = solved(task)
+    wanted = task.profiled(profiles if isinstance(profiles, bool) else [named(path) for path in profiles])
+    task, best, pools = solved(task)
     if not best.found:
         raise InputError(
             f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data; "
@@ -101,7 +198,7 @@ def fit_contact(
         fitted = circuit.replace({path: float(value) for path, value in zip(paths, best.values, strict=True)})
     except InputError as refused:
         raise InputError(f"the fitted values do not go with the circuit's others: {refused.message}") from None
-    found = contact_result(fitted, task, best, freedom)
+    found = _result(fitted, task, best, pools)
     for relation, misfit in zip(relations, found.misfits, strict=True):
         if misfit > _TOO_MUCH:
             said = (
@@ -109,14 +206,8 @@ def fit_contact(
             )
             warnings.warn(f"{said}, or a column is in another unit", FingerspiceWarning, stacklevel=2)
     for path in wanted:
-        one, limit = found.estimates[path], best.objective + found.reach[path] ** 2
-        found.profiles[path] = profile_of(task, best, path, one.error / one.value, limit)
+        found.profiles[path] = profile_of(task, best, found.estimates[path], found.reach[path] ** 2)
     return found
-
-
-def _named(gap: str, name: str) -> str:
-    """The path of a parameter that may be given without its GAP."""
-    return name if "." in name else f"{gap}.{name}"
 
 
 def _gap(circuit: Circuit, finger: str | None) -> str:
@@ -151,3 +242,86 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
         require(name in PARAMETERS, "parameters", repr(name), ", ".join(PARAMETERS))
         require(bare.count(name) == 1, name, "named twice", "once")
     return tuple(name for name in PARAMETERS if name in bare)
+
+
+def _result(circuit: Circuit, task: ContactTask, best: Fitted, pools: Sequence[Pool]) -> ContactFit:
+    """The result of the best fit; `circuit` is the fitted one."""
+    covariance, predicted = covariance_of(best.by_log), task.predict(best.values)
+    error, reach = _errors(best, covariance, pools)
+    sized = [*zip(task.relations, predicted, task.split(task.scale), strict=True)]
+    return ContactFit(
+        **estimated(
+            task, best, covariance, error, reach, lambda names: _remedy(task, names), _further_notes(task, best, pools),
+        ),
+        circuit=circuit,
+        gap=task.gap,
+        relations=task.relations,
+        predicted=tuple(predicted),
+        sigma=tuple(one.sigma if one.sigma is not None else share * found for one, found, share in sized),
+        misfits=tuple(
+            float(np.sqrt(np.mean(np.log(np.maximum(found, 1e-300) / one.values) ** 2))) for one, found, _ in sized
+        ),
+        freedom=best.residual.size - len(task.unknowns),
+        reach=dict(zip(task.names, reach, strict=True)),
+    )  # fmt: skip
+
+
+def _errors(best: Fitted, covariance: FloatArray, pools: Sequence[Pool]) -> tuple[FloatArray, list[float]]:
+    """Standard errors of the logarithms, and Student's t with the degrees of freedom of Satterthwaite.
+
+    (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946.) Each pool has its own variance, known from its own
+    residuals, and a part in the variance of a parameter.
+    """
+    from scipy.stats import norm, t
+
+    parts = np.array([np.sum((covariance @ best.by_log[pool.at].T) ** 2, axis=1) for pool in pools])
+    error, reach = np.sqrt(np.diag(covariance)), []
+    for k, own in enumerate(parts.T):
+        shares = own / max(float(own.sum()), 1e-300)
+        felt = [(share, pool.freedom) for share, pool in zip(shares.tolist(), pools, strict=True) if share > _NO_PART]
+        inverse = sum(share**2 / left if left >= FEWEST else math.inf for share, left in felt)
+        if math.isinf(inverse):
+            error[k] = math.inf
+            reach.append(math.inf)
+        else:
+            reach.append(float(t.ppf(0.975, 1.0 / inverse) if inverse > 0.0 else norm.ppf(0.975)))
+    return error, reach
+
+
+def _further_notes(task: ContactTask, best: Fitted, pools: Sequence[Pool]) -> list[str]:
+    found = []
+    for pool in pools:
+        if pool.freedom < FEWEST:
+            found.append(
+                f"Of the {pool.name} there are hardly more values ({pool.at.size}) than parameters, which leaves no "
+                "measure of their errors: measure more of them, or give sigma."
+            )
+        if not pool.estimated:
+            own = misfit_note(float(np.sum(best.residual[pool.at] ** 2)), pool.at.size)
+            found += [note.replace("The residuals", f"The residuals of the {pool.name}", 1) for note in own]
+    fitted = {path.rpartition(".")[2] for path in task.names}
+    if "c2" in fitted and "mu" not in fitted:
+        mu = task.circuit[task.gap].values["mu"]
+        found.append(
+            f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
+        )
+    return found
+
+
+def _remedy(task: ContactTask, names: tuple[str, ...]) -> str:
+    """The measurement that would tell one parameter, or two apart."""
+    bare = {name.rpartition(".")[2] for name in names}
+    kinds = {one.kind for one in task.relations}
+    loads = np.concatenate([one.fn for one in task.relations if one.kind != "indentation"] or [np.ones(1)])
+    what = "over a wider range of loads"
+    if bare <= {"alpha", "m_exp"}:
+        what = "the area at a second load as well" if float(np.ptp(loads)) == 0.0 else f"the area {what}"
+    elif bare <= {"beta", "n_exp"} and "indentation" in kinds:
+        what = "the area over a wider range of indentations"
+    elif bare <= {"beta", "n_exp"}:
+        what = "the area against the indentation as well"
+    elif "area" not in kinds and "c2" in bare:
+        what = "the area at rest as well"
+    elif bare & {"beta", "n_exp"}:
+        what = "the area against the indentation, or under a higher voltage"
+    return f"Measure {what}, or fix one of them."

@@ -6,6 +6,7 @@ import csv
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,23 +21,33 @@ _PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "G": 1e9, "m": 1e-3, "u": 1e-6, "µ": 
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _PREFIX = f"(?P<prefix>[{''.join(_PREFIXES)}]?)"
 _METRE = "(?P<metre>cm|mm|m)"
-# Patterns of a column's name, by quantity, and below them the patterns of its unit with a factor and a power: the SI
-# value is value * prefix * metre^power * factor.
-_NAMES = {
-    "frequency": "f|freq|frequency|frequenz|hz",
-    "angular frequency": "w|omega|ω|angular frequency|angular_frequency",
-    "resistivity": "rho|ρ|rho_sc|resistivity|resistance",
-    "conductivity": "sigma|σ|kappa|conductivity|conductance",
-    "permittivity": "eps|eps_r|epsr|eps'|eps_r'|epsilon|epsilon_r|ε|ε_r|εr|ε'|eps_r_sc|permittivity|"
-    "relative permittivity|relative_permittivity|dielectric constant|dk",
-}
-_UNITS: dict[str, tuple[tuple[str, float, int], ...]] = {
-    "frequency": ((f"{_PREFIX}[Hh]z|1/s", 1.0, 0),),
-    "angular frequency": (("rad/s|1/s", 1.0, 0),),
-    "resistivity": ((f"{_PREFIX}(?:[Oo]hms?|[\u03a9\u2126])[ *·.-]?{_METRE}", 1.0, 1),),
-    "conductivity": ((f"{_PREFIX}S/{_METRE}", 1.0, -1),),
-    "permittivity": (("1|-", 1.0, 0), (f"{_PREFIX}F/{_METRE}", 1.0 / EPS0, -1)),
-}
+_FREQUENCY = "f|freq|frequency|frequenz|hz"
+_PERMITTIVITY = (
+    "eps|eps_r|epsr|eps'|eps_r'|epsilon|epsilon_r|ε|ε_r|εr|ε'|eps_r_sc|permittivity|relative permittivity|"
+    "relative_permittivity|dielectric constant|dk"
+)
+
+
+class _Kind(NamedTuple):
+    """What a column may hold by its name and unit; of several kinds with a name the first is that without a unit."""
+
+    column: str  # The one of `COLUMNS` that it tells
+    names: str  # Pattern of its names
+    units: str  # Pattern of its units
+    metres: int  # Power of the metre in its unit
+    meant: Callable[[FloatArray], FloatArray]  # From its values in SI units to those of the column
+
+
+_KINDS = (
+    _Kind("frequency", _FREQUENCY, f"{_PREFIX}[Hh]z|1/s", 0, lambda x: x),
+    _Kind("frequency", _FREQUENCY, "rad/s", 0, lambda x: x / (2.0 * np.pi)),
+    _Kind("frequency", "w|omega|ω|angular frequency|angular_frequency", "rad/s|1/s", 0, lambda x: x / (2.0 * np.pi)),
+    _Kind("resistivity", "rho|ρ|rho_sc|resistivity|resistance",
+          f"{_PREFIX}(?:[Oo]hms?|[\u03a9\u2126])[ *·.-]?{_METRE}", 1, lambda x: x),
+    _Kind("resistivity", "sigma|σ|kappa|conductivity|conductance", f"{_PREFIX}S/{_METRE}", -1, lambda x: 1.0 / x),
+    _Kind("permittivity", _PERMITTIVITY, "1|-", 0, lambda x: x),
+    _Kind("permittivity", _PERMITTIVITY, f"{_PREFIX}F/{_METRE}", -1, lambda x: x * (1.0 / EPS0)),
+)  # fmt: skip
 
 
 def read_table(path: Path) -> FloatArray:
@@ -70,48 +81,39 @@ def _as_named(table: FloatArray, head: list[str], file: str) -> FloatArray:
     """Columns put into order and SI units by their names; columns with unknown names fill the remaining places."""
     named: dict[str, FloatArray] = {}
     others = []
-    for column, x in zip([_column(name, file) for name in head], table.T, strict=True):
-        if column is None:
+    for name, x in zip(head, table.T, strict=True):
+        kind, scale = _kind(name, file)
+        if kind is None:
             others.append(x)
             continue
-        quantity, values = column[0], column[1] * x
-        with np.errstate(divide="ignore"):
-            if quantity == "conductivity":
-                quantity, values = "resistivity", 1.0 / values
-        if quantity == "angular frequency":
-            quantity, values = "frequency", values / (2.0 * np.pi)
-        if quantity in named:
+        if kind.column in named:
             raise InputError(
-                f"{file}: two columns are a {quantity} by their names, {', '.join(head)}; allowed: {ALLOWED}"
+                f"{file}: two columns are a {kind.column} by their names, {', '.join(head)}; allowed: {ALLOWED}"
             )
-        named[quantity] = values
+        with np.errstate(divide="ignore"):
+            named[kind.column] = kind.meant(scale * x)
     return np.column_stack([named[name] if name in named else others.pop(0) for name in COLUMNS])
 
 
-def _column(name: str, file: str) -> tuple[str, float] | None:
-    """Quantity of a column by its name, and the factor to SI units; None for an unknown name."""
+def _kind(name: str, file: str) -> tuple[_Kind | None, float]:
+    """What a column holds by its name, and the factor of its unit; None for an unknown name."""
     bare = name.strip().strip("\"'")
     match = re.fullmatch(r"(?P<what>[^\[(/]*?)\s*(?:[\[(](?P<bracket>[^\])]*)[\])]|/\s*(?P<slash>.+))?", bare)
     if match is None:
-        return None
+        return None, 1.0
     what, unit = match["what"].strip(), (match["bracket"] or match["slash"] or "").strip()
-    quantity = next((q for q, names in _NAMES.items() if re.fullmatch(names, what, re.IGNORECASE)), None)
-    if quantity is None and "_" in what and not unit:
+    known = [kind for kind in _KINDS if re.fullmatch(kind.names, what, re.IGNORECASE)]
+    if not known and "_" in what and not unit:
         # A name such as f_kHz ends with its unit.
         what, _, unit = what.rpartition("_")
-        quantity = next((q for q, names in _NAMES.items() if re.fullmatch(names, what, re.IGNORECASE)), None)
-    if quantity is None:
-        return None
-    if quantity == "frequency" and unit == "rad/s":
-        quantity = "angular frequency"
-    if not unit:
-        return quantity, 1.0
-    for pattern, factor, power in _UNITS[quantity]:
-        found = re.fullmatch(pattern, unit)
+        known = [kind for kind in _KINDS if re.fullmatch(kind.names, what, re.IGNORECASE)]
+    if not known or not unit:
+        return next(iter(known), None), 1.0
+    for kind in known:
+        found = re.fullmatch(kind.units, unit)
         if found:
             groups = found.groupdict()
-            scale = _PREFIXES[groups.get("prefix") or ""] * _METRES[groups.get("metre") or "m"] ** power
-            return quantity, factor * scale
+            return kind, _PREFIXES[groups.get("prefix") or ""] * _METRES[groups.get("metre") or "m"] ** kind.metres
     raise InputError(
         f"{file}: the unit of column {name.strip()!r} is not known; allowed: Hz, rad/s, ohm m, S/m, and 1 or F/m"
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -246,12 +245,19 @@ def fit_material(
         f, y = _admittivity(table)
         consistency = _consistency(f, y)
         doubt = _doubt(table, consistency)
-    try:
-        ladder, misfit, rms = _least_ladder(
-            f, y, [poles] if poles is not None else range(1, MOST_POLES + 1), max(error, 1.05 * consistency.rms)
-        )
-    except InputError as refused:
-        raise InputError(f"{doubt}; {refused.message}" if doubt else refused.message) from None
+    ladder, refused, enough = None, "", max(error, 1.05 * consistency.rms)
+    for count in range(1, MOST_POLES + 1) if poles is None else [poles]:
+        try:
+            ladder, misfit = _fit(f, y, count)
+        except InputError as problem:
+            # A fit with more branches may succeed.
+            refused = problem.message
+            continue
+        rms = float(np.sqrt(np.mean(misfit**2)))
+        if rms <= enough:
+            break
+    if ladder is None:
+        raise InputError(f"{doubt}; {refused}" if doubt else refused)
     said = f"the ladder misses the data by {100.0 * rms:.2g} % rms"
     if rms > TOO_MUCH:
         raise InputError(f"{said}; allowed: at most {100.0 * TOO_MUCH:g} %, so more poles, or data of a narrower band")
@@ -300,26 +306,6 @@ def _doubt(table: FloatArray, found: Consistency) -> str:
         raise InputError(f"{said}; allowed: at most {100.0 * TOO_MUCH:g} %, columns of {ALLOWED}")
     warnings.warn(said, FingerspiceWarning, stacklevel=3)
     return said
-
-
-def _least_ladder(
-    f: FloatArray, y: ComplexArray, counts: Sequence[int], error: float
-) -> tuple[Ladder, FloatArray, float]:
-    """The first ladder, in the order of `counts`, with a misfit (rms) of at most `error`, or the last one."""
-    found, refused = None, InputError("")
-    for count in counts:
-        try:
-            ladder, misfit = _fit(f, y, count)
-        except InputError as problem:
-            # A fit with more branches may succeed.
-            refused = problem
-            continue
-        found = ladder, misfit, float(np.sqrt(np.mean(misfit**2)))
-        if found[2] <= error:
-            break
-    if found is None:
-        raise refused
-    return found
 
 
 def _weights(f: FloatArray, y: ComplexArray, poles: FloatArray) -> tuple[FloatArray, ComplexArray]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,8 +24,7 @@ Given = Mapping[str, ArrayLike] | str | Path
 Meaning = Callable[[str, Sequence[str]], tuple[str, str, str | None]]
 
 
-@dataclass(frozen=True)
-class Groups:
+class Groups(NamedTuple):
     """The group of every measurement."""
 
     column: str  # Name of the column that tells it
@@ -37,8 +36,7 @@ class Groups:
         return tuple(dict.fromkeys(self.of))
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(NamedTuple):
     """Columns of measured numbers, (n,) each, in SI units or, of a circuit's parameters, those of the netlist."""
 
     columns: dict[str, FloatArray]
@@ -55,30 +53,11 @@ def measured_of(
     """
     if isinstance(given, (str, Path)):
         return _from_table(Path(given), meaning, example, by)
-    if by is None or not isinstance(given, Mapping):
-        return Measured(_number_columns(given), place)
-    if by not in given:
-        raise InputError(f"the data have no column {by!r}, which groups names; they have {', '.join(given)}")
-    groups = _groups_of(by, given[by])
-    found = _number_columns({name: x for name, x in given.items() if name != by})
-    size = next((x.size for x in found.values()), 0)
-    if len(groups.of) != size:
-        raise InputError(f"data column {by!r} has {len(groups.of)} rows, others have {size}; allowed: as many")
-    return Measured(found, place, groups)
-
-
-def _groups_of(column: str, given: ArrayLike) -> Groups:
-    cells = np.asarray(given)
-    if cells.ndim != 1 or cells.dtype.kind not in "iufU":
-        raise InputError(f"data column {column!r} tells the group; allowed: a text or a number for every measurement")
-    return Groups(column, tuple(str(x) if cells.dtype.kind == "U" else f"{x:g}" for x in cells.tolist()))
-
-
-def _number_columns(given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
-    """The columns of a mapping as arrays of one length; a number stands for a column of it."""
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
-    found = {name: real_numbers(f"data column {name!r}", x, "numbers") for name, x in given.items()}
+    if by is not None and by not in given:
+        raise InputError(f"the data have no column {by!r}, which groups names; they have {', '.join(given)}")
+    found = {name: real_numbers(f"data column {name!r}", x, "numbers") for name, x in given.items() if name != by}
     size = max((x.size for x in found.values()), default=0)
     for name, x in found.items():
         if x.shape not in ((), (size,)):
@@ -89,7 +68,16 @@ def _number_columns(given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         bad = np.flatnonzero(~np.isfinite(x))
         if bad.size:
             raise InputError(f"data column {name!r} is {x.flat[bad[0]]} in row {bad[0]}; allowed: finite numbers")
-    return {name: np.broadcast_to(x, size).copy() for name, x in found.items()}
+    # A number stands for a column of it.
+    columns = {name: np.broadcast_to(x, size).copy() for name, x in found.items()}
+    if by is None:
+        return Measured(columns, place)
+    cells = np.asarray(given[by])
+    if cells.ndim != 1 or cells.dtype.kind not in "iufU":
+        raise InputError(f"data column {by!r} tells the group; allowed: a text or a number for every measurement")
+    if cells.size != size:
+        raise InputError(f"data column {by!r} has {cells.size} rows, others have {size}; allowed: as many")
+    return Measured(columns, place, Groups(by, tuple(x if isinstance(x, str) else f"{x:g}" for x in cells.tolist())))
 
 
 def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> Measured:

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Shown, Table
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.studies.fit.search import Fitted, Problem, Profile
+from fingerspice.studies.fit.search import FARTHEST, Fitted, Problem, followed
+
+if TYPE_CHECKING:
+    from fingerspice.plots.picture import Picture
 
 # Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
 # the error of a parameter, in its logarithm, from which on nothing is known of it.
@@ -26,6 +31,14 @@ _AT_BOUND = 1e-6
 _NO_END = 50.0
 # Residuals this unlikely by noise of the given sigma are named.
 _UNLIKELY = 1e-3
+# Of profiles: growth of the distance from the value, in its logarithm, and error of an interval's end over that
+# distance; error of the other parameters on the way; ratio of the interval's parts from which on it is called skewed.
+_GROWTH, _END, _ROUGHLY, _SKEWED = 1.6, 0.01, 1e-4, 1.2
+
+
+#: A panel of a picture: to which curve each row belongs; abscissa, measured, fitted and standard deviation; what the
+#: abscissa is, the quantity, and its unit.
+Drawn = tuple[Sequence[str], Sequence[FloatArray], str, str, str]
 
 
 @dataclass(frozen=True)
@@ -43,6 +56,34 @@ class Estimate:
     at_bound: bool
 
 
+@dataclass(frozen=True)
+class Profile:
+    """The best fits with one parameter held at each of several values.
+
+    Attributes
+    ----------
+    path : str
+    values : ndarray, shape (n,)
+        Values of the parameter, ascending.
+    objective : ndarray, shape (n,)
+        Sum of the squared residuals at each, as `Fit.objective`.
+    limit : float
+        The objective at the ends of the 95 % interval.
+    low, high : float
+        The interval; 0 or a bound, and infinity or a bound, where the data set no end.
+    shape : str
+        ``"symmetric"`` (in the logarithm), ``"skewed"``, ``"open below"``, ``"open above"`` or ``"open"``.
+    """
+
+    path: str
+    values: FloatArray
+    objective: FloatArray
+    limit: float
+    low: float
+    high: float
+    shape: str
+
+
 @dataclass(frozen=True, repr=False, kw_only=True)
 class FitResult(Shown):
     """What results of fits have in common; `Fit` says what its attributes are."""
@@ -57,10 +98,39 @@ class FitResult(Shown):
     notes: tuple[str, ...]
     profiles: dict[str, Profile] = field(default_factory=dict)
 
+    def _panels(self) -> list[Drawn]:
+        raise NotImplementedError
+
+    def _columns(self) -> dict[str, Any]:
+        """Columns of the table, by their heads."""
+        raise NotImplementedError
+
+    def plot(self) -> Picture:
+        """Data and fit, of contacts of every relation, with the residuals below."""
+        from fingerspice.plots.populations import Curve, Panel, plot_panels
+
+        panels = []
+        for names, columns, *labels in self._panels():
+            at = np.array(names)
+            curves = [Curve(name, *(x[at == name] for x in columns)) for name in dict.fromkeys(names)]
+            panels.append(Panel(curves, *labels))
+        return plot_panels(panels)
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write conditions (in the units of the netlist; of a contact in SI units), data, prediction and sigma as CSV.
+
+        Raises
+        ------
+        InputError
+            If the folder cannot be written.
+        """
+        columns = self._columns()
+        return write_csv(path, columns, zip(*columns.values(), strict=True))
+
     @property
     def _count(self) -> int:
-        """Number of data."""
-        raise NotImplementedError
+        """Number of residuals."""
+        return self.freedom + len(self.estimates)
 
     @property
     def _pairs(self) -> list[tuple[str, str, float]]:
@@ -158,7 +228,7 @@ def estimated(
     `error` has the standard errors of the logarithms and `reach` how many of them half an interval is; `remedy` says of
     one or two parameters what would tell them, and `more` are further notes.
     """
-    estimates = {}
+    estimates, notes = {}, []
     for one, start, value, off, far, box in zip(
         task.unknowns, task.initial.tolist(), best.values.tolist(), error.tolist(), reach, task.bounds, strict=True
     ):
@@ -168,38 +238,27 @@ def estimated(
         estimates[one.name] = Estimate(
             one.name, unit, value, start, value * off, value / ratio, value * ratio, at_bound
         )  # fmt: skip
+        if at_bound:
+            own = f"{value:g} {unit}".rstrip()
+            notes.append(f"{one.name} is at its bound, {own}: its interval is not that of a free parameter.")
     spread = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(spread, spread)
-    notes = [*_notes(estimates, correlation, error.tolist(), remedy), *more]
+    for (i, a), (j, b) in itertools.combinations(enumerate(estimates), 2):
+        if abs(correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
+            notes.append(
+                f"{a} and {b} are not told apart (correlation {correlation[i, j]:+.4f}): they change these data in "
+                f"almost the same way, and only a combination of both is known. {remedy((a, b))}"
+            )
+    named = " ".join(notes)
+    notes += [
+        f"Of {name} these data tell next to nothing: its error is larger than itself. {remedy((name,))}"
+        for name, off in zip(estimates, error.tolist(), strict=True)
+        if not off < _UNKNOWN and name not in named
+    ]
     return {
         "estimates": estimates, "correlation": correlation, "objective": best.objective,
-        "evaluations": best.evaluations, "closed": best.closed, "notes": tuple(notes),
+        "evaluations": best.evaluations, "closed": best.closed, "notes": (*notes, *more),
     }  # fmt: skip
-
-
-def _notes(
-    estimates: Mapping[str, Estimate], correlation: FloatArray, error: Sequence[float],
-    remedy: Callable[[tuple[str, ...]], str],
-) -> list[str]:  # fmt: skip
-    """What the data do not tell, and what would: `remedy` says it of one or two parameters."""
-    found, names = [], list(estimates)
-    for e in estimates.values():
-        if e.at_bound:
-            own = f"{e.value:g} {e.unit}".rstrip()
-            found.append(f"{e.path} is at its bound, {own}: its interval is not that of a free parameter.")
-    for i, j in itertools.combinations(range(len(names)), 2):
-        if abs(correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
-            found.append(
-                f"{names[i]} and {names[j]} are not told apart (correlation {correlation[i, j]:+.4f}): they change "
-                f"these data in almost the same way, and only a combination of both is known. "
-                f"{remedy((names[i], names[j]))}"
-            )
-    named = " ".join(found)
-    for name, off in zip(names, error, strict=True):
-        if not off < _UNKNOWN and name not in named:
-            found.append(f"Of {name} these data tell next to nothing: its error is larger than itself. "
-                         f"{remedy((name,))}")  # fmt: skip
-    return found
 
 
 def misfit_note(square: float, freedom: int) -> list[str]:
@@ -213,3 +272,61 @@ def misfit_note(square: float, freedom: int) -> list[str]:
         "than one of a thousand cases: the circuit does not describe these data, or sigma is too small, and so are the "
         "intervals."
     ]
+
+
+def profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profile:
+    """The profile of a parameter; in its interval the objective is at most by `room` worse than the best."""
+    place, limit = task.names.index(one.path), best.objective + room
+    here, error = math.log(best.values[place]), one.error / one.value
+    known = {here: best.objective}
+    ends = [_end(task, best, place, error, limit, side, known) for side in (0, 1)]
+    low, high = (float(task.bounds[place, side]) if end is None else end for side, end in enumerate(ends))
+    opened = [word for word, end in zip(("below", "above"), ends, strict=True) if end is None]
+    if opened:
+        shape = "open" if len(opened) == 2 else f"open {opened[0]}"
+    else:
+        reach = here - math.log(low), math.log(high) - here
+        shape = "skewed" if max(reach) > _SKEWED * min(reach) else "symmetric"
+    at = sorted(known)
+    return Profile(one.path, np.exp(at), np.array([known[x] for x in at]), limit, low, high, shape)
+
+
+def _end(
+    task: Problem, best: Fitted, place: int, error: float, limit: float, side: int, known: dict[float, float]
+) -> float | None:
+    """The end of the interval below (`side` 0) or above (1), or None where it is open.
+
+    Adds the least objectives on the way to `known`, by the parameter's logarithm.
+    """
+    from scipy.optimize import brentq
+
+    here, begin, sign = math.log(best.values[place]), np.delete(best.values, place), 2 * side - 1
+
+    def look(x: float) -> float:
+        nonlocal begin
+
+        def held(others: FloatArray) -> tuple[FloatArray, FloatArray]:
+            residual, by = task.residuals(np.insert(others, place, math.exp(x)))
+            return residual, np.delete(by, place, axis=1)
+
+        if x not in known and begin.size:
+            # From where the last value was fitted, which lies on the way.
+            found = followed(held, np.delete(task.bounds, place, axis=0), begin, _ROUGHLY)
+            known[x], begin = found.objective, found.values
+        elif x not in known:
+            residual, _ = held(begin)
+            known[x] = float(residual @ residual)
+        return known[x]
+
+    def beyond(far: float) -> float:
+        # About linear in the distance, as the objective is about a parabola.
+        return math.sqrt(max(look(here + sign * far) - best.objective, 0.0)) - math.sqrt(limit - best.objective)
+
+    with np.errstate(divide="ignore"):
+        farthest = min(math.log(FARTHEST), abs(float(np.log(task.bounds[place, side])) - here))
+    near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
+    while look(here + sign * far) <= limit:
+        if far >= farthest:
+            return None
+        near, far = far, min(_GROWTH * far, farthest)
+    return math.exp(here + sign * brentq(beyond, near, far, xtol=_END * far, rtol=1e-6))

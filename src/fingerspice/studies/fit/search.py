@@ -1,4 +1,4 @@
-"""Least squares in the logarithms of a circuit's parameters: their bounds, the way from a start, and profiles."""
+"""Least squares in the logarithms of a circuit's parameters: their bounds, and the way from a start."""
 
 from __future__ import annotations
 
@@ -21,12 +21,6 @@ REFUSED = 1e6
 _CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
 #: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
 FARTHEST = 1e3
-# Growth of the distance from the value, in its logarithm; and the error of an interval's end over that distance.
-_GROWTH, _END = 1.6, 0.01
-# Error of the other parameters on the way.
-_ROUGHLY = 1e-4
-# Ratio of the interval's two parts, in the logarithm, from which on it is called skewed.
-_SKEWED = 1.2
 
 
 class Unknown(NamedTuple):
@@ -55,23 +49,20 @@ def bounds_of(
     A start outside its bounds moves to the nearer one, with a warning.
     """
     lower = {path.lower(): tuple(pair) for path, pair in given.items()}
-    unknown = [path for path in given if path.lower() not in {p.lower() for p in paths}]
-    if unknown:
-        raise InputError(f"bounds names {unknown[0]}, which is not fitted; allowed: {', '.join(paths)}")
-    out = np.tile([0.0, math.inf], (len(paths), 1))
-    for i, path in enumerate(paths):
-        if path.lower() in lower:
-            pair = lower[path.lower()]
-            if len(pair) != 2 or not 0.0 <= pair[0] < pair[1]:
-                raise InputError(f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
-            out[i] = pair
-            value = circuit.parameters[path].value
-            moved = min(max(value, pair[0]), pair[1])
-            if moved != value:
-                said = f"{path} is {value:g}, outside its bounds {pair[0]:g} to {pair[1]:g}: it starts at {moved:g}"
-                warnings.warn(said, FingerspiceWarning, stacklevel=3)
-                circuit = circuit.varied({path: moved})
-    return circuit, out
+    for path in given:
+        if path.lower() not in map(str.lower, paths):
+            raise InputError(f"bounds names {path}, which is not fitted; allowed: {', '.join(paths)}")
+    out = [lower.get(path.lower(), (0.0, math.inf)) for path in paths]
+    for path, pair in zip(paths, out, strict=True):
+        if len(pair) != 2 or not 0.0 <= pair[0] < pair[1]:
+            raise InputError(f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
+        value = circuit.parameters[path].value
+        moved = min(max(value, pair[0]), pair[1])
+        if moved != value:
+            said = f"{path} is {value:g}, outside its bounds {pair[0]:g} to {pair[1]:g}: it starts at {moved:g}"
+            warnings.warn(said, FingerspiceWarning, stacklevel=3)
+            circuit = circuit.varied({path: moved})
+    return circuit, np.array(out, float)
 
 
 @dataclass(frozen=True)
@@ -173,88 +164,3 @@ def followed(
     values = unit * np.exp(found.x)
     residual, by = at(found.x) if ended else residuals(values)
     return Fitted(values, residual, by, float(residual @ residual), int(found.nfev), found.status > 0 and ended)
-
-
-@dataclass(frozen=True)
-class Profile:
-    """The best fits with one parameter held at each of several values.
-
-    Attributes
-    ----------
-    path : str
-    values : ndarray, shape (n,)
-        Values of the parameter, ascending.
-    objective : ndarray, shape (n,)
-        Sum of the squared residuals at each, as `Fit.objective`.
-    limit : float
-        The objective at the ends of the 95 % interval.
-    low, high : float
-        The interval; 0 or a bound, and infinity or a bound, where the data set no end.
-    shape : str
-        ``"symmetric"`` (in the logarithm), ``"skewed"``, ``"open below"``, ``"open above"`` or ``"open"``.
-    """
-
-    path: str
-    values: FloatArray
-    objective: FloatArray
-    limit: float
-    low: float
-    high: float
-    shape: str
-
-
-def profile_of(task: Problem, best: Fitted, name: str, error: float, limit: float) -> Profile:
-    """The profile of a parameter with this error of its logarithm; its interval has objectives up to `limit`."""
-    place = task.names.index(name)
-    here = math.log(best.values[place])
-    known = {here: best.objective}
-    ends = [_end(task, best, place, error, limit, side, known) for side in (0, 1)]
-    low, high = (float(task.bounds[place, side]) if end is None else end for side, end in enumerate(ends))
-    shapes = {(True, True): "open", (True, False): "open below", (False, True): "open above"}
-    shape = shapes.get((ends[0] is None, ends[1] is None))
-    if shape is None:
-        reach = here - math.log(low), math.log(high) - here
-        shape = "skewed" if max(reach) > _SKEWED * min(reach) else "symmetric"
-    at = sorted(known)
-    return Profile(name, np.exp(at), np.array([known[x] for x in at]), limit, low, high, shape)
-
-
-def _end(
-    task: Problem, best: Fitted, place: int, error: float, limit: float, side: int, known: dict[float, float]
-) -> float | None:
-    """The end of the interval below (`side` 0) or above (1), or None where it is open.
-
-    Adds the least objectives on the way to `known`, by the parameter's logarithm.
-    """
-    from scipy.optimize import brentq
-
-    here, begin, sign = math.log(best.values[place]), np.delete(best.values, place), 2 * side - 1
-
-    def look(x: float) -> float:
-        nonlocal begin
-
-        def held(others: FloatArray) -> tuple[FloatArray, FloatArray]:
-            residual, by = task.residuals(np.insert(others, place, math.exp(x)))
-            return residual, np.delete(by, place, axis=1)
-
-        if x not in known and begin.size:
-            # From where the last value was fitted, which lies on the way.
-            found = followed(held, np.delete(task.bounds, place, axis=0), begin, _ROUGHLY)
-            known[x], begin = found.objective, found.values
-        elif x not in known:
-            residual, _ = held(begin)
-            known[x] = float(residual @ residual)
-        return known[x]
-
-    def beyond(far: float) -> float:
-        # About linear in the distance, as the objective is about a parabola.
-        return math.sqrt(max(look(here + sign * far) - best.objective, 0.0)) - math.sqrt(limit - best.objective)
-
-    with np.errstate(divide="ignore"):
-        farthest = min(math.log(FARTHEST), abs(float(np.log(task.bounds[place, side])) - here))
-    near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
-    while look(here + sign * far) <= limit:
-        if far >= farthest:
-            return None
-        near, far = far, min(_GROWTH * far, farthest)
-    return math.exp(here + sign * brentq(beyond, near, far, xtol=_END * far, rtol=1e-6))
