@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hmac
 import json
-import math
 import secrets
 import socket
 import struct
@@ -243,19 +242,11 @@ def framed(data: Any) -> bytes:
 
 def _dumped(data: Any, array: Callable[[FloatArray], Any]) -> bytes:
     """Data as JSON, with `array` for its arrays, and null for what is not finite."""
-
-    def finite(x: Any) -> Any:
-        if isinstance(x, dict):
-            return {key: finite(value) for key, value in x.items()}
-        if isinstance(x, list | tuple):
-            return [finite(value) for value in x]
-        return x if not isinstance(x, float) or math.isfinite(x) else None
-
-    try:
-        return json.dumps(data, allow_nan=False, default=array).encode()
-    except ValueError:
+    text = json.dumps(data, default=array)
+    if "NaN" in text or "Infinity" in text:
         # Seldom, and all data have to be gone through.
-        return json.dumps(finite(data), allow_nan=False, default=array).encode()
+        text = json.dumps(json.loads(text, parse_constant=lambda _: None))
+    return text.encode()
 
 
 class _Server(ThreadingHTTPServer):
