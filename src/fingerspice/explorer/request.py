@@ -92,15 +92,13 @@ _NAMES = tuple(f.name for f in dataclasses.fields(Request))
 
 def request_of(given: Any) -> Request:
     """A request from plain data; wrong values are refused, and names that are not known left out."""
-    require(
-        isinstance(given, dict), "the request", type(given).__name__, f"an object with the keys {', '.join(_NAMES)}"
-    )
+    keys = f"an object with the keys {', '.join(_NAMES)}"
+    require(isinstance(given, dict), "the request", type(given).__name__, keys)
     asked = {name: given[name] for name in _NAMES if given.get(name) is not None}
-    deck, source, sets = asked.get("deck"), asked.get("source", ""), asked.get("sets", "")
+    deck: Any = asked.get("deck")
+    source, sets = asked.get("source", ""), asked.get("sets", "")
     require(isinstance(deck, str), "deck", f"of type {type(deck).__name__}", "the text of a netlist")
-    require(
-        len(deck or "") <= LONGEST_DECK, "deck", f"{len(deck or ''):,} characters long", f"at most {LONGEST_DECK:,}"
-    )
+    require(len(deck) <= LONGEST_DECK, "deck", f"{len(deck):,} characters long", f"at most {LONGEST_DECK:,}")
     require(isinstance(source, str), "source", f"of type {type(source).__name__}", "text such as SQUARE(200 100)")
     for name, allowed in (("charge_law", CHARGE_LAWS), ("skin", ("own", "follow", "dispersive"))):
         require(asked.get(name, allowed[0]) in allowed, name, _short(asked.get(name)), " or ".join(allowed))
@@ -219,9 +217,8 @@ class Asked:
         paths = {path.lower(): path for path in circuit.parameters}
         known = {paths[path.lower()]: x for path, x in asked.overrides.items() if path.lower() in paths}
         self.unknown = [_unknown("name", str(name), _NAMES) for name in given if name not in _NAMES]
-        self.unknown += [
-            _unknown("parameter", path, paths.values()) for path in asked.overrides if path.lower() not in paths
-        ]
+        lost = [path for path in asked.overrides if path.lower() not in paths]
+        self.unknown += [_unknown("parameter", path, paths.values()) for path in lost]
         if known:
             circuit = circuit.replace(known)
         if asked.skin == "follow":
