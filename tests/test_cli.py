@@ -72,10 +72,12 @@ def test_json_is_all_that_is_printed_and_null_stands_for_no_number(command: Comm
     assert sweep["gain"][0] > 0.0
 
 
-def test_two_decks_that_differ_after_a_dot_do_not_share_their_files(command: Command) -> None:
-    for name in ("pad.v1.cir", "pad.v2.cir"):
-        Path(name).write_text(edited(QUICK))
-        assert command("run", name, "--no-plot").code == 0
+def test_two_decks_that_differ_after_a_dot_do_not_share_their_files_which_git_ignores(command: Command) -> None:
+    ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
+    assert "/out/" in ignored
+    for name in ("pad.v1", "pad.v2"):
+        Path(f"{name}.cir").write_text(edited(QUICK))
+        assert command("run", f"{name}.cir", "--no-plot").out.splitlines()[-1] == f"wrote out/{name}.nc"
     assert {"out/pad.v1.nc", "out/pad.v2.nc"} <= set(tree(Path()))
 
 
@@ -139,7 +141,9 @@ def test_a_solve_that_fails_keeps_what_it_has_and_says_when_and_how_close(comman
 
 
 @pytest.mark.parametrize("name", ["run", "compare"])
-def test_a_skin_at_another_frequency_than_the_source_is_warned_about_once(command: Command, name: str) -> None:
+def test_a_skin_at_another_frequency_or_a_voltage_that_air_does_not_bear_is_warned_about_once(
+    command: Command, name: str
+) -> None:
     result = command(name, "pad.cir", "--no-plot", "--set", "Xskin.f=200")
     assert result.code == 0
     (line,) = result.lines
@@ -148,12 +152,9 @@ def test_a_skin_at_another_frequency_than_the_source_is_warned_about_once(comman
     )
     assert line.endswith("Xskin.f=100 would match")
     assert not command(name, "pad.cir", "--no-plot", "--name", "matched").lines
-
-
-def test_a_voltage_that_air_does_not_bear_is_warned_about_once(command: Command) -> None:
-    result = command("run", "pad.cir", "--no-plot", "--set", "Vdrive.amplitude=500")
-    (line,) = result.lines
-    assert re.search(r"warning: the gap voltage reaches \d+(\.\d+)? V; air breaks down above about 300 V", line)
+    if name == "run":
+        (line,) = command("run", "pad.cir", "--no-plot", "--set", "Vdrive.amplitude=500", "--overwrite").lines
+        assert re.search(r"warning: the gap voltage reaches \d+(\.\d+)? V; air breaks down above about 300 V", line)
 
 
 def test_what_the_reader_notices_is_printed_once_with_its_line(command: Command) -> None:
@@ -222,15 +223,11 @@ def test_export_writes_one_deck_with_the_changes_in_it(command: Command) -> None
 
 
 @pytest.mark.parametrize("name", ["run", "ac", "compare", "export", "figures", "explore", "sets", "check"])
-@pytest.mark.parametrize("flag", ["--help", "-h"])
-def test_help_of_every_command_shows_an_example(command: Command, name: str, flag: str) -> None:
-    result = command(name, flag)
-    assert result.code == 0
-    assert "Example" in result.out
-    assert f"fingerspice {name} " in result.out.partition("Example")[2]
-
-
-def test_version_is_the_packages(command: Command) -> None:
+def test_help_of_every_command_shows_an_example(command: Command, name: str) -> None:
+    for flag in ("--help", "-h"):
+        result = command(name, flag)
+        assert result.code == 0
+        assert f"fingerspice {name} " in result.out.partition("Example")[2]
     assert command("--version") == Result(0, f"fingerspice {fs.__version__}\n", "")
 
 
@@ -269,12 +266,6 @@ def test_stop_and_start_are_those_of_the_interface(command: Command) -> None:
     assert figures(command("plan", "endless.cir", "--stop", "10m", "--json"))["tier"] == "coupled"
 
 
-def test_results_go_to_a_folder_that_git_ignores(command: Command) -> None:
-    ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
-    assert command("run", "pad.cir", "--no-plot").out.splitlines()[-1] == "wrote out/pad.nc"
-    assert "/out/" in ignored
-
-
 def test_each_of_several_sources_is_replaced_by_its_name(command: Command) -> None:
     text = edited(QUICK, ("Vdrive drive 0", "Vbias drive b DC 5\nVdrive b 0"))
     Path("pad.cir").write_text(text)
@@ -294,17 +285,10 @@ def test_each_of_several_sources_is_replaced_by_its_name(command: Command) -> No
 # decks from elsewhere
 
 
-class Input(io.BytesIO):
-    """Standard input with these bytes."""
-
-    @property
-    def buffer(self) -> io.BytesIO:
-        return self
-
-
 def test_a_deck_from_standard_input_runs_as_that_in_a_file(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("part.inc").write_text(Path("pad.cir").read_text().partition("\n")[2].replace(".end\n", ""))
-    monkeypatch.setattr(sys, "stdin", Input(b"Fingerpad\n.include part.inc\n.end\n"))
+    deck = io.TextIOWrapper(io.BytesIO(b"Fingerpad\n.include part.inc\n.end\n"))
+    monkeypatch.setattr(sys, "stdin", deck)
     report = figures(command("run", "-", "--json", "--no-plot"))
     assert report["files"] == ["out/stdin.nc"]
     assert row(report, "u_gap") == row(figures(command("run", "pad.cir", "--json", "--no-plot")), "u_gap")

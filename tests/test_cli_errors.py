@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import shlex
 import subprocess
@@ -15,6 +14,7 @@ import pytest
 import fingerspice as fs
 from commands import Command, tree
 from deck_edits import edited
+from scenes import cases
 
 FINGERSPICE = str(Path(sys.executable).with_name("fingerspice"))
 
@@ -137,7 +137,7 @@ def folder(command: Command, tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [*((["run", "pad.cir", "--out", "new", *words], said) for words, said in OPTIONS), *OTHERS],
+    [*((["run", "pad.cir", "--out", "new", *words], said) for words, said in OPTIONS), *OTHERS, *USAGE],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",
 )
 def test_bad_input_gets_one_sentence_and_leaves_nothing(
@@ -145,12 +145,14 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(
 ) -> None:
     before = tree(folder)
     result = command(*arguments)
-    assert result.code == 2
-    assert result.out == ""
-    lines = [line for line in result.lines if not line.startswith("fingerspice: warning: Xskin takes its data")]
-    assert len(lines) == 1
-    assert lines[0].startswith("fingerspice: ")
-    assert said in lines[0]
+    assert (result.code, result.out) == (2, "")
+    if (arguments, said) in USAGE:
+        assert said in result.err
+        assert "--help" in result.err
+    else:
+        (line,) = [line for line in result.lines if not line.startswith("fingerspice: warning: Xskin takes its data")]
+        assert line.startswith("fingerspice: ")
+        assert said in line
     assert tree(folder) == before
 
 
@@ -161,30 +163,17 @@ def test_a_fault_of_the_program_is_one_sentence_with_its_place(
         raise errors.pop()
 
     monkeypatch.setattr("fingerspice.solve.simulation.simulate", fail)
-    errors = [ZeroDivisionError("float division by zero"), MemoryError()]
+    errors = [KeyboardInterrupt(), ZeroDivisionError("float division by zero"), MemoryError()]
     result = command("run", "pad.cir")
-    assert (result.code, result.lines) == (2, ["fingerspice: " + SAID_OF_MEMORY])
+    said = "not enough memory; allowed: fewer outputs (a longer TSTEP, or TSTART), or a shorter run"
+    assert (result.code, result.lines) == (2, [f"fingerspice: {said}"])
     result = command("run", "pad.cir")
     assert result.code == 1
     (line,) = result.lines
     assert line.startswith("fingerspice: this is a fault of fingerspice, please report it with the deck (ZeroDivision")
     assert "in test_cli_errors.py:" in line
-
-
-SAID_OF_MEMORY = "not enough memory; allowed: fewer outputs (a longer TSTEP, or TSTART), or a shorter run"
-
-
-@pytest.mark.parametrize(("arguments", "said"), USAGE, ids=lambda x: " ".join(x) if isinstance(x, list) else "")
-def test_a_command_that_is_none_is_refused_with_where_to_look(
-    command: Command, folder: Path, arguments: list[str], said: str
-) -> None:
-    before = tree(folder)
-    result = command(*arguments)
-    assert result.code == 2
-    assert result.out == ""
-    assert said in result.err
-    assert "--help" in result.err
-    assert tree(folder) == before
+    assert command("run", "pad.cir").code == 130
+    assert set(tree(Path())) == {"pad.cir"}
 
 
 CHECKED_FIRST = [
@@ -220,98 +209,61 @@ def test_arguments_are_checked_before_files(command: Command, words: str, said: 
     assert said in result.err
 
 
-@pytest.mark.parametrize("out", ["/proc/new", "/proc", f"new/{'x' * 300}/y"])
+@pytest.mark.parametrize("out", ["/proc/new", "/proc", f"new/{'x' * 300}/y", "x/y"])
 def test_a_folder_that_cannot_be_made_is_told_before_the_run(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
 ) -> None:
     if out.startswith("/proc") and not Path("/proc/self").exists():
         pytest.skip("this system has no /proc")
     monkeypatch.setattr("fingerspice.solve.simulation.simulate", lambda *a, **k: pytest.fail("it ran"))
+    if out == "x/y":
+        # Root may write anywhere, so the answer of the system is put in its mouth.
+        monkeypatch.setattr("fingerspice.cli.options.os.access", lambda path, mode: not mode & os.W_OK)
     before = tree(tmp_path)
     result = command("run", "pad.cir", "--out", out)
     assert result.code == 2
     assert f"cannot write {out}/pad.nc: " in result.err or "File name too long" in result.err
+    if out == "x/y":
+        said = "cannot write x/y/pad.nc: no permission in .; allowed: a folder that can be written"
+        assert result.lines == [f"fingerspice: {said}"]
     assert tree(tmp_path) == before
-
-
-def test_a_folder_without_permission_is_refused_before_the_run(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Root may write anywhere, so the answer of the system is put in its mouth.
-    monkeypatch.setattr("fingerspice.cli.options.os.access", lambda path, mode: not mode & os.W_OK)
-    monkeypatch.setattr("fingerspice.solve.simulation.simulate", lambda *a, **k: pytest.fail("it ran"))
-    before = tree(tmp_path)
-    result = command("run", "pad.cir", "--out", "x/y")
-    assert result.code == 2
-    assert result.lines == [
-        "fingerspice: cannot write x/y/pad.nc: no permission in .; allowed: a folder that can be written"
-    ]
-    assert tree(tmp_path) == before
-
-
-def test_a_disk_that_is_full_is_told_and_leaves_no_half_file(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(self: Path, target: Any) -> Path:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    (tmp_path / "out").mkdir()
-    before = tree(tmp_path)
-    monkeypatch.setattr(Path, "replace", full)
-    result = command("run", "pad.cir", "--no-plot")
-    assert result.code == 2
-    assert result.lines == ["fingerspice: cannot write out/pad.nc: No space left on device"]
-    assert tree(tmp_path) == before
-
-
-def test_an_interrupt_is_one_line_and_code_130(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("fingerspice.solve.simulation.simulate", interrupt)
-    result = command("run", "pad.cir")
-    assert result.code == 130
-    assert set(tree(Path())) == {"pad.cir"}
 
 
 # The command itself, in its own process
 
 
-def process(*arguments: str, folder: Path, module: bool = False) -> subprocess.CompletedProcess[str]:
-    program = [sys.executable, "-m", "fingerspice"] if module else [FINGERSPICE]
-    return subprocess.run([*program, *arguments], cwd=folder, capture_output=True, text=True, timeout=60)
+def process(*arguments: str, folder: Path, **how: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(arguments, cwd=folder, capture_output=True, text=True, timeout=60, **how)
 
 
-def test_the_installed_command_exits_with_0_1_and_2(tmp_path: Path) -> None:
+def test_the_installed_command_exits_with_0_1_and_2_and_the_package_runs_as_a_module(tmp_path: Path) -> None:
     (tmp_path / "pad.cir").write_text(edited())
-    done = process("run", "pad.cir", "--no-plot", folder=tmp_path)
+    run = (FINGERSPICE, "run", "pad.cir", "--no-plot")
+    done = process(*run, folder=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "wrote out/pad.nc" in done.stdout
-    words = ["--charge-law", "mobile", "--set", "Xgap.d=10n", "--name", "thin"]
-    failed = process("run", "pad.cir", "--no-plot", *words, folder=tmp_path)
+    failed = process(*run, "--charge-law", "mobile", "--set", "Xgap.d=10n", "--name", "thin", folder=tmp_path)
     assert failed.returncode == 1
     assert failed.stderr.startswith("fingerspice: stopped at t = ")
-    wrong = process("run", "nothing.cir", folder=tmp_path)
+    wrong = process(FINGERSPICE, "run", "nothing.cir", folder=tmp_path)
     assert (wrong.returncode, wrong.stdout) == (2, "")
     for text in (failed.stderr, wrong.stderr):
         assert text.count("\n") == 1
         assert "Traceback" not in text
-
-
-def test_the_package_runs_as_a_module(tmp_path: Path) -> None:
-    done = process("--version", folder=tmp_path, module=True)
+    done = process(sys.executable, "-m", "fingerspice", "--version", folder=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, f"fingerspice {fs.__version__}\n", "")
 
 
 def test_an_encoding_without_the_letters_and_closed_streams_change_nothing(tmp_path: Path) -> None:
     (tmp_path / "µ.cir").write_text(edited(("Fingerpad", "Finger µ \x1b[31m \x07 漢 " + "x" * 100_000)), "utf-8")
-    plan = [FINGERSPICE, "plan", "µ.cir"]
-    bare = {**os.environ, "PYTHONIOENCODING": "ascii"}
-    done = subprocess.run(plan, cwd=tmp_path, capture_output=True, text=True, env=bare)
+    done = process(FINGERSPICE, "plan", "µ.cir", folder=tmp_path, env={**os.environ, "PYTHONIOENCODING": "ascii"})
     assert (done.returncode, done.stderr) == (0, "")
     assert len(done.stdout) < 1000
     assert done.stdout.startswith("Finger \\xb5 \\x1b[31m \\x07 \\u6f22 xxx")
-    for closed in ("0<&-", "1>&-", "2>&-", "0<&- 1>&- 2>&-"):
-        for words, code in ((plan, 0), ([FINGERSPICE, "plan", "none.cir"], 2), ([FINGERSPICE, "plan", "--no"], 2)):
-            command = f"{shlex.join(words)} {closed}"
-            assert subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True).returncode == code
+    streams = ("0<&- 1>&- 2>&-", "1>&-", "2>&-", "0<&-")
+    # Every stream and every outcome at least once.
+    words = (("µ.cir", 0, streams), ("none.cir", 2, streams[: cases(4, 2)]), ("--no", 2, streams[: cases(4, 1)]))
+    for word, code, every in words:
+        for closed in every:
+            command = f"{shlex.join([FINGERSPICE, 'plan', word])} {closed}"
+            assert process("sh", "-c", command, folder=tmp_path).returncode == code

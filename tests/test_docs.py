@@ -56,12 +56,10 @@ def area_at_rest(load: float) -> float:
     return 1e-6 * (unloaded - 5000.0 * (0.3 * load) ** 2 / unloaded)
 
 
-def test_every_code_block_is_a_deck_or_commands() -> None:
+def test_the_finger_has_the_area_that_the_page_states() -> None:
+    # Every code block is a deck or commands.
     assert PAGE.count("```") == 2 * (len(DECKS) + len(blocks("sh")))
     assert all(deck.endswith("\n.end\n") for deck in DECKS)
-
-
-def test_the_finger_has_the_area_that_the_page_states() -> None:
     solution = run(FINGER)
     assert solution.area[0] == pytest.approx(area_at_rest(0.5), rel=1e-12)
     assert f"{1e6 * solution.area[0]:.2f} mm²" in " ".join(PAGE.split())
@@ -152,10 +150,8 @@ def test_every_device_source_and_directive_is_named() -> None:
     assert DEVICES.keys() <= words
     assert {name.upper() for name in SOURCES} <= words
     assert {word for word in (*DIRECTIVES, *ELSEWHERE) if word not in words} == set()
-    assert {unit: (usual.least, usual.most) for unit, usual in USUAL_OF_SOURCES.items()} == {
-        "V": (0.0, 10e3),
-        "Hz": (10e-3, 10e6),
-    }
+    ranges = {unit: (usual.least, usual.most) for unit, usual in USUAL_OF_SOURCES.items()}
+    assert ranges == {"V": (0.0, 10e3), "Hz": (10e-3, 10e6)}
     assert "Usual are up to 10 kV, and 10 mHz to 10 MHz." in " ".join(PAGE.split())
     assert {f"`{scale}`" for scale in SCALES if scale != "μ"} <= set(re.findall(r"`[^`]*`", PAGE))
 
@@ -171,16 +167,6 @@ def test_the_sources_are_read(row: list[str], tmp_path: Path) -> None:
         warnings.simplefilter("error")
         circuit = fs.parse_netlist(FINGER.replace("SIN(0 200 100)", row[0].strip("`")), tmp_path / "finger.cir")
     assert fs.simulate(circuit, t_stop=2e-3).success
-
-
-@pytest.mark.parametrize(
-    ("written", "value"),
-    [("0.2meg", 2e5), ("200kOhm", 2e5), ("{2*0.1meg}", 2e5), ("'2*0.1meg'", 2e5), ("0.2e12µ", 2e5), ("inf", math.inf)],
-)
-def test_numbers_mean_what_the_page_says(written: str, value: float) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        assert fs.parse_netlist(FINGER.replace("0.2meg", written))["Xcoat"].values["r"] == value
 
 
 @pytest.mark.parametrize(
@@ -205,6 +191,14 @@ def test_what_the_page_calls_refused_is_refused(old: str, new: str, said: str) -
         warnings.simplefilter("ignore")
         with pytest.raises(fs.InputError, match=re.escape(said)):
             fs.parse_netlist(FINGER.replace(old, new))
+
+
+def test_numbers_mean_what_the_page_says() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for written in ("0.2meg", "200kOhm", "{2*0.1meg}", "'2*0.1meg'", "0.2e12µ"):
+            assert fs.parse_netlist(FINGER.replace("0.2meg", written))["Xcoat"].values["r"] == 2e5
+        assert fs.parse_netlist(FINGER.replace("0.2meg", "inf"))["Xcoat"].values["r"] == math.inf
 
 
 def test_the_page_of_the_house_names_every_package_and_only_files_and_names_that_exist() -> None:

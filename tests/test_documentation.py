@@ -18,6 +18,7 @@ import pytest
 import fingerspice as fs
 from commands import Command
 from fingerspice.explorer.examples import EXAMPLES
+from scenes import cases
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -82,6 +83,8 @@ RUNNING = [p for p in PAGES if any(b.language in ("python", "sh") for b in block
 def test_the_code_of_a_page_runs_from_its_start_to_its_end(page: Path, command: Command, tmp_path: Path) -> None:
     os.environ["MPLBACKEND"] = "Agg"
     shutil.copytree(ROOT / "circuits", tmp_path / "circuits")
+    population = tmp_path / "circuits" / "population.toml"
+    population.write_text(population.read_text().replace("n = 16384", f"n = {cases(16384, 256)}"))
     names: dict[str, object] = {"__name__": "__main__"}
     printed = ""
     for block in blocks(page.read_text(encoding="utf-8")):

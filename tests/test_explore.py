@@ -12,11 +12,12 @@ import struct
 import subprocess
 import sys
 import time
-import urllib.error
+import urllib.parse
 import urllib.request
 import warnings
 import wave
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +32,10 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.examples import EXAMPLES
 from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS
-from fingerspice.explorer.scene import as_deck, as_python, means, scene
+from fingerspice.explorer.scene import as_deck, as_python, scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
 from fingerspice.explorer.sliders import WAVEFORMS
+from scenes import cases
 
 ROOT = Path(__file__).parents[1]
 SINE = EXAMPLES[0].deck
@@ -65,16 +67,31 @@ def packed(values: list[float]) -> str:
     return base64.b64encode(np.array(values, "<f8").tobytes()).decode()
 
 
+TWO = packed([1.0, 2.0])
+
+
+def recorded(recording: Any) -> dict[str, Any]:
+    """A request whose source is a recording."""
+    return {"deck": SINE, "source": "RECORDING(150)", "recording": recording}
+
+
 def asked(explorer: Explorer, what: str, body: bytes | None, **headers: str) -> tuple[int, dict[str, Any]]:
-    """Status and answer of one request, whether refused or not, with all its parts."""
-    request = urllib.request.Request(f"{explorer.url}{what}", body, headers)
-    try:
-        with urllib.request.urlopen(request, timeout=60) as answer:
-            framed = answer.headers["Content-Type"].startswith("application/octet-stream")
-            return answer.status, unframed(answer.read()) if framed else json.load(answer)
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, json.load(error)
+    """Status and answer of one request below the token, whether refused or not, with all its parts."""
+    return raw(explorer, "GET" if body is None else "POST", f"/{explorer.token}/{what}", body, **headers)
+
+
+def raw(
+    explorer: Explorer, method: str, path: str, body: bytes | None = None, **headers: str
+) -> tuple[int, dict[str, Any]]:
+    """Status and answer of one request; of a file of the page only its length."""
+    connection = http.client.HTTPConnection("127.0.0.1", explorer.port, timeout=60)
+    connection.request(method, path, body, {key.replace("_", "-"): value for key, value in headers.items()})
+    answer = connection.getresponse()
+    content, kind = answer.read(), str(answer.headers["Content-Type"])
+    connection.close()
+    if kind.startswith("application/octet-stream"):
+        return answer.status, unframed(content)
+    return answer.status, json.loads(content) if kind.startswith("application/json") else {"length": len(content)}
 
 
 def unframed(content: bytes) -> dict[str, Any]:
@@ -170,10 +187,6 @@ def test_every_example_shows_what_it_promises(example: Any) -> None:
     assert ".tran" in as_deck({"deck": example.deck, **example.asked})
 
 
-def test_there_are_examples_of_all_that_the_page_is_for() -> None:
-    assert len(BY_NAME) == len(EXAMPLES) >= 12
-
-
 @pytest.mark.parametrize("kind", WAVEFORMS)
 def test_every_waveform_of_the_menu_runs_as_the_menu_writes_it(kind: str) -> None:
     numbers = " ".join(f"{a.value:g}" for a in WAVEFORMS[kind][1])
@@ -186,7 +199,8 @@ def test_every_waveform_of_the_menu_runs_as_the_menu_writes_it(kind: str) -> Non
     assert peak == pytest.approx(150.0 if kind in ("CHIRP", "RECORDING") else 200.0, rel=4e-3)
 
 
-def test_sliders_show_every_parameter_within_its_range() -> None:
+def test_sliders_show_every_parameter_within_its_range_and_say_what_they_move() -> None:
+    assert len(BY_NAME) == len(EXAMPLES) >= 12
     answer = scene({"deck": BY_NAME["ungrounded"].deck, "overrides": {"Xgap.d": "4u"}})
     sliders = {s["path"]: s for group in answer["sliders"] for s in group["sliders"]}
     circuit = fs.parse_netlist(BY_NAME["ungrounded"].deck)
@@ -201,15 +215,10 @@ def test_sliders_show_every_parameter_within_its_range() -> None:
     unmoved = scene({"deck": BY_NAME["ungrounded"].deck})
     ranges = {s["path"]: (s["low"], s["high"]) for group in unmoved["sliders"] for s in group["sliders"]}
     assert ranges == {path: (s["low"], s["high"]) for path, s in sliders.items()}
-
-
-def test_every_slider_of_an_element_says_what_it_moves() -> None:
     for name, spec in DEVICES.items():
         assert spec.what, name
         assert all(p.meaning for p in spec.parameters), name
-    groups = scene({"deck": BY_NAME["ungrounded"].deck})["sliders"]
-    meanings = {s["path"]: s["meaning"] for group in groups for s in group["sliders"]}
-    assert (meanings["Xgap.d"], meanings["Cbody.value"]) == ("gap height", "capacitance")
+    assert (sliders["Xgap.d"]["meaning"], sliders["Cbody.value"]["meaning"]) == ("gap height", "capacitance")
 
 
 def test_both_ends_of_every_slider_give_a_run_or_a_sentence() -> None:
@@ -273,6 +282,16 @@ def test_unknown_names_are_said_and_the_rest_is_shown() -> None:
         ({"deck": SINE, "source": "TABLE(/etc/passwd)"}, "no folder to look in"),
         ({"deck": SINE, "source": "PWL FILE=/etc/passwd"}, "no folder to look in"),
         ({"deck": SINE, "overrides": {"Vdrive": "WAVEFILE(/etc/hostname 1)"}}, "is not a number"),
+        (recorded(None), "which a link does not carry"),
+        (recorded(5), "an object with the keys"),
+        (recorded({"name": "a"}), "not base64 of doubles"),
+        (recorded({"name": "a", "values": "é"}), "not base64 of doubles"),
+        (recorded({"name": "a", "values": packed([1.0])}), "allowed: 2 to 200,000"),
+        (recorded({"name": "a", "values": TWO}), "samples per second"),
+        (recorded({"name": 7, "values": TWO}), "a file's name"),
+        (recorded({"name": "a", "values": TWO, "times": packed([1.0, 2.0, 3.0])}), "as many of each"),
+        (recorded({"name": "a", "values": TWO, "times": packed([2.0, 1.0])}), "PWL times decrease"),
+        (recorded({"name": "a", "values": packed([1.0, float("nan")]), "rate": 100}), "allowed: finite numbers"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
@@ -364,33 +383,15 @@ def test_a_recording_is_the_source_that_its_file_gives(tmp_path: Path, monkeypat
         np.testing.assert_allclose(names["solution"].f_el, answer["traces"][2]["values"], atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("recording", "words"),
-    [
-        (None, "which a link does not carry"),
-        (5, "an object with the keys"),
-        ({"name": "a"}, "not base64 of doubles"),
-        ({"name": "a", "values": "é"}, "not base64 of doubles"),
-        ({"name": "a", "values": packed([1.0])}, "allowed: 2 to 200,000"),
-        ({"name": "a", "values": packed([1.0, 2.0])}, "samples per second"),
-        ({"name": 7, "values": packed([1.0, 2.0])}, "a file's name"),
-        ({"name": "a", "values": packed([1.0, 2.0]), "times": packed([1.0, 2.0, 3.0])}, "as many of each"),
-        ({"name": "a", "values": packed([1.0, 2.0]), "times": packed([2.0, 1.0])}, "PWL times decrease"),
-        ({"name": "a", "values": packed([1.0, float("nan")]), "rate": 100}, "allowed: finite numbers"),
-    ],
-)  # fmt: skip
-def test_a_wrong_recording_is_refused_in_a_sentence(recording: Any, words: str) -> None:
-    answer = scene({"deck": SINE, "source": "RECORDING(150)", "recording": recording})
-    assert (answer["ok"], answer["status"]) == (False, "BAD_INPUT")
-    assert words in answer["message"]
-
-
-def test_the_mean_force_against_frequency_is_that_of_large_signal() -> None:
-    found = means({"deck": SINE, "frequencies": [100, 1000]})
+def test_the_mean_force_against_frequency_is_that_of_large_signal(explorer: Explorer) -> None:
+    found = post(explorer, {"deck": SINE, "frequencies": [100, 1000]}, "means")
     (expected,) = fs.large_signal(fs.parse_netlist(SINE), [100, 1000], rtol=1e-5)
     np.testing.assert_allclose(found["force"], expected.f_el_mean)
-    for wrong in ({}, {"frequencies": []}, {"frequencies": ["x"]}, {"frequencies": [1.0] * 17}, []):
-        assert "at most 16 numbers" in means({"deck": SINE, **wrong} if isinstance(wrong, dict) else wrong)["message"]  # type: ignore[dict-item, arg-type]
+    for wrong in ({}, {"frequencies": []}, {"frequencies": ["x"]}, {"frequencies": [1.0] * 17}):
+        assert "at most 16 numbers" in post(explorer, {"deck": SINE, **wrong}, "means")["message"]
+    refused(200, post(explorer, [], "means"), 200, "at most 16 numbers")
+    fold = {"deck": SINE, "charge_law": "mobile", "overrides": {"Xgap.d": "10n"}, "frequencies": [100]}
+    refused(200, post(explorer, fold, "means"), 200, "the mobile charge law")
 
 
 def test_the_page_and_its_files_come_with_headers_that_shut_it_in(explorer: Explorer) -> None:
@@ -418,29 +419,19 @@ def framed() -> Iterator[Explorer]:
     running.stop()
 
 
-def loaded(explorer: Explorer, what: str, **headers: str) -> int:
-    """Status of a request that another site's page makes."""
-    request = urllib.request.Request(f"{explorer.url}{what}", None, {"Sec-Fetch-Site": "cross-site", **headers})
-    try:
-        with urllib.request.urlopen(request) as answer:
-            return answer.status
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code
-
-
 def test_another_page_may_frame_the_explorer_only_where_a_notebook_asked_for_it(
     explorer: Explorer, framed: Explorer
 ) -> None:
-    frame = {"Sec-Fetch-Dest": "iframe", "Sec-Fetch-Mode": "navigate"}
-    assert loaded(framed, "", **frame) == 200
-    assert loaded(explorer, "", **frame) == 403
+    frame = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Dest": "iframe", "Sec_Fetch_Mode": "navigate"}
+    assert asked(framed, "", None, **frame)[0] == 200
+    assert asked(explorer, "", None, **frame)[0] == 403
     # A frame is all: no data, no script, no page in a window, nothing without the token.
-    assert loaded(framed, "start", **frame) == 403
-    assert loaded(framed, "app.js", **{"Sec-Fetch-Dest": "script"}) == 403
-    assert loaded(framed, "", **{"Sec-Fetch-Dest": "document"}) == 403
-    assert loaded(framed, "../", **frame) == 403
-    assert raw(framed, "POST", "/x/", b"{}", **{"Sec-Fetch-Site": "cross-site", **frame})[0] == 403
+    for what, headers in (
+        ("start", frame), ("../", frame), ("app.js", frame | {"Sec_Fetch_Dest": "script"}),
+        ("", frame | {"Sec_Fetch_Dest": "document"}),
+    ):  # fmt: skip
+        assert asked(framed, what, None, **headers)[0] == 403
+    assert raw(framed, "POST", "/x/", b"{}", **frame)[0] == 403
     for one, allowed in ((explorer, "'none'"), (framed, "http://127.0.0.1:* http://localhost:* ")):
         with urllib.request.urlopen(one.url) as answer:
             ancestors = answer.headers["Content-Security-Policy"].partition("frame-ancestors ")[2]
@@ -455,9 +446,14 @@ def test_a_solution_opens_the_page_as_it_was_run(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("webbrowser.open", opened.append)
     circuit = fs.parse_netlist(SINE).replace({"Xgap.d": 5e-6})
     solution = fs.simulate(circuit, charge_law="mobile", area="frozen", rtol=1e-5, t_stop=0.03)
+    alone = circuit.explore()
+    assert alone.circuit is circuit
+    alone.stop()
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(alone.url)
     running = solution.explore()
     try:
-        assert opened == [running.url]
+        assert opened == [alone.url, running.url]
         start = asked(running, "start", None)[1]
         assert start["own"]["request"] == {
             "deck": SINE, "charge_law": "mobile", "area": "frozen", "rtol": 1e-5, "periods": 3.0,
@@ -470,54 +466,37 @@ def test_a_solution_opens_the_page_as_it_was_run(monkeypatch: pytest.MonkeyPatch
         running.stop()
 
 
-def test_the_server_listens_on_the_loopback_address_alone(explorer: Explorer) -> None:
+def test_whoever_lacks_the_token_is_refused(explorer: Explorer) -> None:
     assert explorer._server.server_address[0] == "127.0.0.1"
     assert explorer.url.startswith(f"http://127.0.0.1:{explorer.port}/")
     assert len(explorer.token) >= 32
-
-
-def raw(explorer: Explorer, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, dict[str, Any]]:
-    connection = http.client.HTTPConnection("127.0.0.1", explorer.port, timeout=60)
-    names = {key.replace("_", "-"): value for key, value in headers.items()}
-    connection.request(method, path, body, names)
-    answer = connection.getresponse()
-    content = answer.read()
-    found = answer.status, unframed(content) if answer.status == 200 else json.loads(content)
-    connection.close()
-    return found
-
-
-def test_whoever_lacks_the_token_is_refused(explorer: Explorer) -> None:
     body = json.dumps({"deck": SINE}).encode()
     for path in ("/", "/scene", "/start", f"/{explorer.token[:-1]}x/scene", f"/x/{explorer.token}/scene", "/ä/"):
-        refused(*raw(explorer, "GET", urllib.request.quote(path)), 403, "token")  # type: ignore[attr-defined]
-        refused(*raw(explorer, "POST", urllib.request.quote(path), body), 403, "token")  # type: ignore[attr-defined]
+        refused(*raw(explorer, "GET", urllib.parse.quote(path)), 403, "token")
+        refused(*raw(explorer, "POST", urllib.parse.quote(path), body), 403, "token")
 
 
 def test_another_host_or_page_is_refused(explorer: Explorer) -> None:
-    path, body = f"/{explorer.token}/scene", json.dumps({"deck": SINE}).encode()
-    refused(*raw(explorer, "POST", path, body, Host="evil.example"), 403, "host")
-    refused(*raw(explorer, "POST", path, body, Host=f"127.0.0.1:{explorer.port + 1}"), 403, "host")
-    refused(*raw(explorer, "POST", path, body, Origin="http://evil.example"), 403, "another page")
-    refused(*raw(explorer, "POST", path, body, Origin="null"), 403, "another page")
-    refused(*raw(explorer, "POST", path, body, Sec_Fetch_Site="cross-site"), 403, "another page")
-    status, answer = raw(explorer, "POST", path, body, Origin=f"http://localhost:{explorer.port}")
+    body = json.dumps({"deck": SINE}).encode()
+    for word, headers in (
+        ("host", {"Host": "evil.example"}), ("host", {"Host": f"127.0.0.1:{explorer.port + 1}"}),
+        ("another page", {"Origin": "http://evil.example"}), ("another page", {"Origin": "null"}),
+        ("another page", {"Sec_Fetch_Site": "cross-site"}),
+    ):  # fmt: skip
+        refused(*asked(explorer, "scene", body, **headers), 403, word)
+    status, answer = asked(explorer, "scene", body, Origin=f"http://localhost:{explorer.port}")
     assert (status, answer["ok"]) == (200, True)
 
 
 def test_bodies_that_are_too_large_or_no_json_are_refused(explorer: Explorer) -> None:
     refused(*asked(explorer, "scene", b" " * (MOST_BYTES + 1)), 413, "bytes; allowed: at most")
-    path = f"/{explorer.token}/scene"
     for body in (b"", b"{", b"\xff\xfe", b"[" * 100_000, b'{"deck": 1e'):
-        refused(*raw(explorer, "POST", path, body), 400, "not JSON")
-    refused(*raw(explorer, "POST", path, b"{}", Transfer_Encoding="chunked"), 411, "no length")
-    refused(*raw(explorer, "POST", f"/{explorer.token}/nothing", b"{}"), 404, "allowed: scene")
-    refused(*raw(explorer, "GET", f"/{explorer.token}/../server.py"), 404)
-    refused(*raw(explorer, "GET", f"/{explorer.token}/%2e%2e/server.py"), 404)
+        refused(*asked(explorer, "scene", body), 400, "not JSON")
+    refused(*asked(explorer, "scene", b"{}", Transfer_Encoding="chunked"), 411, "no length")
+    refused(*asked(explorer, "nothing", b"{}"), 404, "allowed: scene")
+    for path in ("../server.py", "%2e%2e/server.py"):
+        refused(*asked(explorer, path, None), 404)
     assert "the request is list" in post(explorer, [])["message"]
-
-
-def test_a_port_that_is_taken_or_none_is_refused(explorer: Explorer) -> None:
     with pytest.raises(fs.InputError, match="cannot be used"):
         Explorer(port=explorer.port)
     with pytest.raises(fs.InputError, match="allowed: 0 to 65535"):
@@ -545,7 +524,7 @@ _REQUESTS = st.fixed_dictionaries(
 )  # fmt: skip
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=cases(150, 40), deadline=None, suppress_health_check=list(HealthCheck))
 @given(request=_REQUESTS | _ANY)
 def test_no_request_gives_a_fault_a_hang_or_a_file(request: Any, explorer: Explorer) -> None:
     begin = time.monotonic()
@@ -556,79 +535,60 @@ def test_no_request_gives_a_fault_a_hang_or_a_file(request: Any, explorer: Explo
     assert time.monotonic() - begin < 60.0
 
 
-def test_many_interrupts_at_once_end_the_command() -> None:
-    # An event that a handler sets would be waited for by itself, where the second signal comes during the first.
-    for pause in (0.0, 2e-5, 1e-4):
-        words = [sys.executable, "-m", "fingerspice", "explore", "--no-browser", "--json"]
-        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
-            try:
-                assert process.stdout is not None
-                while process.stdout.readline() not in ("}\n", ""):
-                    pass
-                for _ in range(5):
-                    process.send_signal(signal.SIGINT)
-                    time.sleep(pause)
-                assert process.wait(20) == 0
-            finally:
-                process.kill()
+@contextmanager
+def serving(folder: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
+    """The command in a process of its own, and the answer that it prints."""
+    command = [sys.executable, "-m", "fingerspice", "explore", *words, "--no-browser", "--json"]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            said = ""
+            while not said.endswith("}\n"):
+                line = process.stdout.readline()
+                assert line, "the command ended"
+                said += line
+            yield process, json.loads(said)
+        finally:
+            process.kill()
 
 
-def test_the_command_serves_until_it_is_interrupted_and_leaves_no_file(tmp_path: Path) -> None:
+# An event that a handler sets would be waited for by itself, where the second signal comes during the first.
+@pytest.mark.parametrize("pauses", [(0.0,), 5 * (0.0,), 5 * (2e-5,), 5 * (1e-4,)], ids=str)
+def test_the_command_serves_until_it_is_interrupted_and_leaves_no_file(
+    tmp_path: Path, pauses: tuple[float, ...]
+) -> None:
     (tmp_path / "pad.cir").write_text(SINE)
-    words = [sys.executable, "-m", "fingerspice", "explore", "pad.cir", "--no-browser", "--json"]
-    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        lines = []
-        while not lines or lines[-1] != "}\n":
-            lines.append(process.stdout.readline())
-            assert lines[-1], "the command ended"
-        said = json.loads("".join(lines))
+    with serving(tmp_path, "pad.cir") as (process, said):
         assert (said["command"], said["success"], said["title"]) == ("explore", True, "Table 1, sine of 100 Hz")
         with urllib.request.urlopen(said["url"] + "start") as answer:
             assert json.load(answer)["own"]["request"]["deck"] == SINE
-        process.send_signal(signal.SIGINT)
-        try:
-            out, err = process.communicate(timeout=20)
-        finally:
-            process.kill()
+        for pause in pauses:
+            process.send_signal(signal.SIGINT)
+            time.sleep(pause)
+        out, err = process.communicate(timeout=20)
     assert (process.returncode, out, err) == (0, "", "")
     assert os.listdir(tmp_path) == ["pad.cir"]
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
 def test_the_memory_of_the_command_stays_as_it_is_while_a_slider_moves(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "fingerspice", "explore", "--no-browser", "--json"]
-    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-        assert process.stdout is not None
-        said = ""
-        while not said.endswith("}\n"):
-            said += process.stdout.readline()
-        _, _, host, token, _ = json.loads(said)["url"].split("/")
+    with serving(tmp_path) as (process, said):
+        _, _, host, token, _ = said["url"].split("/")
         connection = http.client.HTTPConnection(host)
 
-        def memory() -> float:
+        def memory_after(start: int, stop: int) -> float:
             """Resident memory, MB."""
-            status = Path(f"/proc/{process.pid}/status").read_text()
-            return int(status.partition("VmRSS:")[2].split()[0]) / 1024.0
-
-        def move(start: int, stop: int) -> None:
             for i in range(start, stop):
                 request = {"deck": SINE, "overrides": {"Xgap.d": 3e-6 + 1e-10 * i}, "last": 2}
                 connection.request("POST", f"/{token}/scene", json.dumps(request))
                 assert connection.getresponse().read()
+            status = Path(f"/proc/{process.pid}/status").read_text()
+            return int(status.partition("VmRSS:")[2].split()[0]) / 1024.0
 
-        move(0, 200)
-        before = memory()
-        move(200, 800)
         # An answer holds 0.1 MB of arrays, and its run 0.5 MB.
-        assert memory() - before < 60.0
+        count = cases(200, 100)
+        assert -memory_after(0, count) + memory_after(count, cases(800, 300)) < 60.0
         connection.close()
-        process.send_signal(signal.SIGINT)
-
-
-def test_the_command_refuses_a_deck_that_is_none(command: Command) -> None:
-    result = command("explore", "none.cir", "--no-browser", "--json")
-    assert (result.code, json.loads(result.out)["status"]) == (2, "BAD_INPUT")
 
 
 def test_the_static_page_needs_no_other_file_and_holds_the_run(command: Command, tmp_path: Path) -> None:
@@ -646,17 +606,5 @@ def test_the_static_page_needs_no_other_file_and_holds_the_run(command: Command,
         array(data["scenes"]["own"]["traces"][1]["values"]), scene({"deck": SINE, "last": 2})["traces"][1]["values"]
     )
     assert command("explore", "pad.cir", "--static", "pad.cir").code == 2
-
-
-def test_a_circuit_shows_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    opened: list[str] = []
-    monkeypatch.setattr("webbrowser.open", opened.append)
-    circuit = fs.parse_netlist(SINE)
-    running = circuit.explore()
-    try:
-        assert opened == [running.url]
-        assert running.circuit is circuit
-    finally:
-        running.stop()
-    with pytest.raises(OSError, match="refused"):
-        urllib.request.urlopen(running.url)
+    result = command("explore", "none.cir", "--no-browser", "--json")
+    assert (result.code, json.loads(result.out)["status"]) == (2, "BAD_INPUT")

@@ -68,12 +68,20 @@ class Page:
         """The figures of a signal as the page writes them."""
         return self.page.locator("#figures tr", has_text=signal).locator("td").all_inner_texts()[1:]  # type: ignore[no-any-return]
 
+    def force(self) -> str:
+        return self.shown("electroadhesive force")[1]
+
     def status(self) -> str:
         return self.page.inner_text("#status")  # type: ignore[no-any-return]
 
     def close(self) -> None:
         assert self.errors == []
         self.page.context.close()
+
+
+def mean(circuit: fs.Circuit, **how: Any) -> str:
+    """The mean force in the periodic state as the page writes it."""
+    return f"{float(f'{1e3 * fs.simulate(circuit, rtol=1e-6, **how).f_el_mean_periodic:.5g}')} mN"
 
 
 @pytest.fixture
@@ -84,16 +92,29 @@ def page(browser: Any, explorer: fs.Explorer) -> Iterator[Page]:
 
 
 def test_the_page_shows_what_simulate_gives_and_asks_nobody_else(page: Page, explorer: fs.Explorer) -> None:
-    expected = fs.simulate(SINE, rtol=1e-6)
-    assert page.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
+    assert page.force() == mean(SINE)
     page.typed("Xgap.d", "4.2u")
-    expected = fs.simulate(SINE.replace({"Xgap.d": 4.2e-6}), rtol=1e-6)
-    assert page.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
+    assert page.force() == mean(SINE.replace({"Xgap.d": 4.2e-6}))
     assert page.page.locator("#plots canvas").count() == 4
     assert all(url.startswith((explorer.url, "data:")) for url in page.asked)
+    field = page.page.locator('input[type=text][data-path="Xgap.d"]')
+    field.fill("3,5u")
+    field.press("Enter")
+    assert page.status() == 'Xgap.d is "3,5u"; allowed: a number such as 3.5u, 0.2meg, 1e-6 or inf'
+    page.typed("Xgap.d", "4um")
+    assert page.force() == mean(SINE.replace({"Xgap.d": 4e-6}))
 
 
-def test_nothing_on_the_page_shuts_anybody_out(page: Page) -> None:
+def test_nothing_on_the_page_shuts_anybody_out_and_what_is_saved_is_what_is_shown(page: Page, tmp_path: Path) -> None:
+    for button, name in (("#csv", "a.csv"), ("#png", "a.png"), ("#deck", "a.cir")):
+        with page.page.expect_download() as download:
+            page.page.click(button)
+        download.value.save_as(tmp_path / name)
+    head, *rows = (tmp_path / "a.csv").read_text().splitlines()
+    assert head == "t (s),u_source (V),u_gap (V),f_el (N),area (m^2),friction (1)"
+    assert len(rows) == 2000
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert "Vdrive drive 0 SIN(" in (tmp_path / "a.cir").read_text()
     axe = pytest.importorskip("axe_playwright_python.sync_playwright")
     found = axe.Axe().run(page.page).response
     assert len(found["passes"]) > 20
@@ -141,9 +162,7 @@ def test_a_fold_shows_its_sentence_and_keeps_the_last_good_traces(page: Page) ->
     assert "before" not in page.page.inner_text("#plots")
     assert page.page.evaluate(grey, [".three", "#figures"]) == ["none"] * 2
     assert page.status().startswith("Table 1")
-
-
-def test_a_scene_that_fails_at_once_shows_its_run_until_then_and_nothing_of_the_scene_before(page: Page) -> None:
+    # A scene that fails at once shows its run until then, and nothing of the scene before.
     page.page.wait_for_selector("#means canvas")
     page.after(lambda: page.page.select_option("#scene", "fold"))
     assert "no solution" in page.status()
@@ -157,32 +176,7 @@ def test_a_scene_that_fails_at_once_shows_its_run_until_then_and_nothing_of_the_
     assert page.shown("gap voltage")
 
 
-@pytest.mark.parametrize(("width", "height"), [(1280, 800), (1920, 1080)])
-def test_all_traces_and_the_first_sliders_are_seen_at_once(page: Page, width: int, height: int) -> None:
-    page.page.set_viewport_size({"width": width, "height": height})
-    page.page.click("#pin")
-    page.typed("Xgap.d", "4u")
-    seen = """(selectors) => selectors.every((one) => {
-      const box = document.querySelector(one).getBoundingClientRect();
-      return box.top >= 0 && box.bottom <= innerHeight && box.left >= 0 && box.right <= innerWidth;
-    })"""
-    sliders = [f'input[data-path="{path}"]' for path in ("Vdrive.amplitude", "Xgap.d", "Xgap.fn", "Xcoat.d", "Xskin.d")]
-    assert page.page.evaluate(seen, ["#drop", "#kind", "#plots", *sliders])
-    # With pinned traces the table has most columns.
-    assert page.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
-def test_a_mistyped_value_is_told_with_what_is_allowed_and_a_unit_is_taken(page: Page) -> None:
-    field = page.page.locator('input[type=text][data-path="Xgap.d"]')
-    field.fill("3,5u")
-    field.press("Enter")
-    assert page.status() == 'Xgap.d is "3,5u"; allowed: a number such as 3.5u, 0.2meg, 1e-6 or inf'
-    page.typed("Xgap.d", "4um")
-    expected = fs.simulate(SINE.replace({"Xgap.d": 4e-6}), rtol=1e-6)
-    assert page.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
-
-
-def test_pinned_traces_stay_with_the_difference(page: Page) -> None:
+def test_pinned_traces_stay_with_the_difference_and_all_are_seen_at_once(page: Page) -> None:
     page.page.click("#pin")
     page.typed("Xgap.d", "4u")
     assert "gap voltage, pinned" in page.page.inner_text("#plots")
@@ -192,9 +186,31 @@ def test_pinned_traces_stay_with_the_difference(page: Page) -> None:
     assert [marker.evaluate(shape) for marker in lines.all()] == [["solid", "2px"]] * 2 + [["dashed", "2px"]] * 2
     a, b = (fs.simulate(SINE.replace({"Xgap.d": d}), rtol=1e-6).f_el_mean for d in (3.5e-6, 4e-6))
     assert page.shown("electroadhesive force")[-1] == f"{100 * (b / a - 1):.2f} %"
+    # All traces and the first sliders are seen at once.
+    seen = """(selectors) => selectors.every((one) => {
+      const box = document.querySelector(one).getBoundingClientRect();
+      return box.top >= 0 && box.bottom <= innerHeight && box.left >= 0 && box.right <= innerWidth;
+    })"""
+    sliders = [f'input[data-path="{path}"]' for path in ("Vdrive.amplitude", "Xgap.d", "Xgap.fn", "Xcoat.d", "Xskin.d")]
+    for width, height in ((1280, 800), (1920, 1080)):
+        page.page.set_viewport_size({"width": width, "height": height})
+        page.page.wait_for_timeout(300)
+        assert page.page.evaluate(seen, ["#drop", "#kind", "#plots", *sliders])
+        # With pinned traces the table has most columns.
+        assert page.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 
-def test_the_waveforms_text_follows_the_scene(page: Page) -> None:
+def test_the_mean_force_says_of_which_sine_it_is_and_the_waveforms_text_follows_the_scene(page: Page) -> None:
+    page.page.wait_for_selector("#means canvas")
+    assert page.page.inner_text("#means h2") == "mean force of a sine of 200 V against its frequency"
+    page.after(lambda: page.page.select_option("#kind", "SQUARE"))
+    said = "mean force of a sine of 254.6 V, the source's fundamental, against its frequency"
+    page.page.wait_for_function("(said) => document.querySelector('#means h2')?.textContent === said", arg=said)
+    assert 4.0 / np.pi * 200.0 == pytest.approx(254.6, abs=0.05)
+    # Another scene has nothing of the one before.
+    page.after(lambda: page.page.select_option("#scene", "chirp"))
+    assert "254.6 V" not in page.page.inner_text("#means")
+    page.after(lambda: page.page.select_option("#scene", "sine"))
     source = page.page.locator("#source")
     assert source.get_attribute("placeholder") == "SIN(0 200 100)"
     page.typed("Vdrive.amplitude", "150")
@@ -211,33 +227,20 @@ def test_the_waveforms_text_follows_the_scene(page: Page) -> None:
     assert page.page.input_value("#source") == "SQ"
 
 
-def test_the_mean_force_says_of_which_sine_it_is(page: Page) -> None:
-    page.page.wait_for_selector("#means canvas")
-    assert page.page.inner_text("#means h2") == "mean force of a sine of 200 V against its frequency"
-    page.after(lambda: page.page.select_option("#kind", "SQUARE"))
-    said = "mean force of a sine of 254.6 V, the source's fundamental, against its frequency"
-    page.page.wait_for_function("(said) => document.querySelector('#means h2')?.textContent === said", arg=said)
-    assert 4.0 / np.pi * 200.0 == pytest.approx(254.6, abs=0.05)
-    # Another scene has nothing of the one before.
-    page.after(lambda: page.page.select_option("#scene", "chirp"))
-    assert "254.6 V" not in page.page.inner_text("#means")
-
-
 def test_sets_are_applied_from_the_menu_with_their_caveats_and_the_link_has_their_values(
     page: Page, browser: Any
 ) -> None:
     for name in ("moist", "Fig4-5kHz"):
         page.after(lambda name=name: page.page.select_option("#apply", name))
     moist = fs.parameters("moist")
-    circuit = fs.parameters("Fig4-5kHz").apply(moist.apply(SINE))
-    expected = f"{float(f'{1e3 * fs.simulate(circuit, rtol=1e-6, t_stop=1e-3).f_el_mean_periodic:.5g}')} mN"
-    assert page.shown("electroadhesive force")[1] == expected
+    expected = mean(fs.parameters("Fig4-5kHz").apply(moist.apply(SINE)), t_stop=1e-3)
+    assert page.force() == expected
     assert moist.not_claimed in page.page.inner_text("#sets")
     assert "Assumed, not published: gap.r, gap.mu." in page.page.inner_text("#sets")
     assert page.page.input_value("#source") == "SIN(0 200 5k)"
     page.page.wait_for_timeout(500)
     other = Page(browser, page.page.url)
-    assert other.shown("electroadhesive force")[1] == expected
+    assert other.force() == expected
     assert other.page.inner_text("#sets") == page.page.inner_text("#sets")
     other.close()
     page.typed("Xgap.r", "0.3meg")
@@ -264,8 +267,7 @@ def test_traces_follow_a_slider_while_it_moves_and_the_last_place_is_shown(page:
     # Answers come while it moves, and there are fewer requests than events.
     assert 2 <= counts[0] <= counts[1] < 60
     shown = page.page.input_value('input[type=text][data-path="Xgap.d"]')
-    expected = fs.simulate(SINE.replace({"Xgap.d": shown}), rtol=1e-6)
-    assert page.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
+    assert page.force() == mean(SINE.replace({"Xgap.d": shown}))
 
 
 def test_a_recording_is_taken_and_a_wrong_file_refused(page: Page, tmp_path: Path) -> None:
@@ -287,36 +289,15 @@ def test_a_recording_is_taken_and_a_wrong_file_refused(page: Page, tmp_path: Pat
     assert page.status() == "wrong.csv, row 3: allowed: two numbers, time in s and voltage in V"
 
 
-def test_what_is_saved_is_what_is_shown(page: Page, tmp_path: Path) -> None:
-    for button, name in (("#csv", "a.csv"), ("#png", "a.png"), ("#deck", "a.cir")):
-        with page.page.expect_download() as download:
-            page.page.click(button)
-        download.value.save_as(tmp_path / name)
-    head, *rows = (tmp_path / "a.csv").read_text().splitlines()
-    assert head == "t (s),u_source (V),u_gap (V),f_el (N),area (m^2),friction (1)"
-    assert len(rows) == 2000
-    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-    assert "Vdrive drive 0 SIN(" in (tmp_path / "a.cir").read_text()
-
-
 def test_the_static_page_shows_its_scenes_from_the_disk(browser: Any, tmp_path: Path) -> None:
     (tmp_path / "page.html").write_text(static_page())
     opened = Page(browser, (tmp_path / "page.html").as_uri())
-    expected = fs.simulate(SINE, rtol=1e-6)
-    assert opened.shown("electroadhesive force")[1] == f"{float(f'{1e3 * expected.f_el_mean_periodic:.5g}')} mN"
+    assert opened.force() == mean(SINE)
     opened.after(lambda: opened.page.select_option("#scene", "two-fingers"))
     assert opened.status().startswith("Two fingers")
     assert opened.page.locator("#sliders input[type=range]").first.is_disabled()
     assert all(url.startswith(("file:", "data:")) for url in opened.asked)
     opened.close()
-
-
-def test_without_its_token_there_is_no_page(browser: Any, explorer: fs.Explorer) -> None:
-    page = browser.new_page()
-    answer = page.goto(f"http://127.0.0.1:{explorer.port}/")
-    assert answer.status == 403
-    assert "token" in page.inner_text("body")
-    page.close()
 
 
 class Notebook(BaseHTTPRequestHandler):
@@ -338,9 +319,11 @@ class Notebook(BaseHTTPRequestHandler):
 def test_a_page_of_this_computer_shows_the_explorer_in_a_frame_where_a_notebook_asked_for_it(browser: Any) -> None:
     framed, alone = fs.Explorer(SINE, framed=True), fs.Explorer(SINE)
     Notebook.body = f"{framed._repr_html_()}<iframe src='{alone.url}' id='refused'></iframe>".encode()
+    page = browser.new_context().new_page()
+    answer = page.goto(alone.url.replace(alone.token, ""))
+    assert (answer.status, "token" in page.inner_text("body")) == (403, True)
     server = ThreadingHTTPServer(("127.0.0.1", 0), Notebook)
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    page = browser.new_context().new_page()
     try:
         for host in ("localhost", "127.0.0.1"):
             page.goto(f"http://{host}:{server.server_port}/")

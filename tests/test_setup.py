@@ -26,17 +26,8 @@ def bare(folder: Path, *commands: str, **scripts: str) -> dict[str, str]:
 
 
 def suite(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-p",
-        "no:cacheprovider",
-        "-x",
-        "tests/test_export.py",
-        "-k",
-        "needs_no_other_file",
-    ]
+    words = ("-m", "pytest", "-p", "no:cacheprovider", "-x", "tests/test_export.py", "-k", "needs_no_other_file")
+    command = [sys.executable, *words]
     return subprocess.run(command, cwd=TESTS.parent, env=environment, capture_output=True, text=True, timeout=120)
 
 
@@ -53,26 +44,16 @@ def test_without_ngspice_the_last_line_says_what_was_not_run(tmp_path: Path) -> 
     assert "ngspice is not installed, which CI asks for" in failed.stdout
 
 
+ROOT = {"id": "echo 0"}
+INSTALL = "echo $@ >> {{log}}; [ $1 = update ] || cp {{true}} {{here}}/{}"
+
+
 @pytest.mark.parametrize(
     ("scripts", "said"),
     [
-        (
-            {"id": "echo 0", "apt_get": "echo $@ >> {log}; [ $1 = update ] || cp {true} {here}/ngspice"},
-            "installing ngspice",
-        ),
-        (
-            {"id": "echo 0", "apt_get": "exit 100"},
-            "ngspice could not be installed; what needs it is left out",
-        ),
-        (
-            {
-                "ngspice": "exit 0",
-                "chromium": "",
-                "id": "echo 0",
-                "apt_get": "echo $@ >> {log}; [ $1 = update ] || cp {true} {here}/chromium",
-            },
-            "installing chromium",
-        ),
+        (ROOT | {"apt_get": INSTALL.format("ngspice")}, "installing ngspice"),
+        (ROOT | {"apt_get": "exit 100"}, "ngspice could not be installed; what needs it is left out"),
+        (ROOT | {"apt_get": INSTALL.format("chromium"), "ngspice": "exit 0", "chromium": ""}, "installing chromium"),
         ({"id": "echo 1000"}, "ngspice is not installed, and installing it takes a password: sudo apt-get install"),
         ({"id": "echo 1000", "sudo": "exit 1"}, "takes a password"),
         ({"ngspice": "exit 0"}, ""),

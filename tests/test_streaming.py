@@ -9,6 +9,7 @@ import random
 import re
 import signal
 import struct
+import sys
 import time
 import tracemalloc
 import warnings
@@ -21,12 +22,11 @@ import pytest
 import fingerspice as fs
 import recording_errors
 from commands import Command, tree
-from fingerspice.cli.store import Store
 from fingerspice.solve.recordings import pieces
 from fingerspice.solve.recordings import run as recordings
 from fingerspice.waveforms import samples
 from processes import ended, no_room, start
-from scenes import table1_deck
+from scenes import cases, table1, table1_deck
 from test_source_files import wav as wav_bytes
 
 RATE = 48_000.0
@@ -34,7 +34,8 @@ NAMES = ("t", "u_gap", "f_el", "q_source", "i_source", "u_source", "u_layer", "f
 
 
 @pytest.fixture(autouse=True)
-def _without_warnings() -> Iterator[None]:
+def _without_warnings_in_short_pieces(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(pieces, "PIECE", 1 << 15)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fs.FingerspiceWarning)
         yield
@@ -52,17 +53,8 @@ def wav(path: Path, count: int, high: float = 4000.0) -> Path:
 
 def deck(path: Path, recording: Path, seconds: float) -> Path:
     """Table 1 under a recording at 150 V."""
-    text = table1_deck()
-    (source,) = (line for line in text.splitlines() if line.startswith("Vdrive"))
-    (tran,) = (line for line in text.splitlines() if line.startswith(".tran"))
-    text = text.replace(source, f"Vdrive drive 0 WAVEFILE({recording.name} 150)")
-    path.write_text(text.replace(tran, f".tran 50u {seconds!r} uic"))
+    path.write_text(table1_deck(f"WAVEFILE({recording.name} 150)", tran=f"50u {seconds!r} uic"))
     return path
-
-
-@pytest.fixture(autouse=True)
-def _short_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pieces, "PIECE", 1 << 15)
 
 
 def joined(chunks: list[fs.Solution], name: str) -> np.ndarray:
@@ -75,9 +67,8 @@ def test_chunks_are_the_whole_to_the_last_bit(law: str, skin: str, tmp_path: Pat
     count = 2 * pieces.PIECE + 1234
     path = wav(tmp_path / "a.wav", count)
     text = table1_deck()
-    circuit = fs.parse_netlist(
-        re.sub(r"SKIN (d=\S+) f=\S+", r"SKIN_DISPERSIVE \1", text) if skin == "dispersive" else text
-    )
+    text = re.sub(r"SKIN (d=\S+) f=\S+", r"SKIN_DISPERSIVE \1", text) if skin == "dispersive" else text
+    circuit = fs.parse_netlist(text)
     assert bool(circuit.by_device("SKIN_DISPERSIVE")) == (skin == "dispersive")
     drive, stop = fs.Samples.from_wav(path, 150.0), (count - 1.4) / RATE
     how = {"t_stop": stop, "rtol": 1e-4, "charge_law": law, "start": "uncharged"}
@@ -99,7 +90,7 @@ def test_chunks_are_the_whole_to_the_last_bit(law: str, skin: str, tmp_path: Pat
 @pytest.mark.parametrize("step", [1e-3, 1.7e-5])
 def test_outputs_between_samples_are_those_of_the_whole_too(step: float) -> None:
     values = 150.0 * recording_errors.noise(5, pieces.PIECE + 500, RATE, 50.0, 4000.0)
-    samples, circuit = fs.Samples(values, RATE, start=0.3 / RATE), fs.parse_netlist(table1_deck())
+    samples, circuit = fs.Samples(values, RATE, start=0.3 / RATE), table1()
     how = {"sources": samples, "t_stop": (values.size - 3) / RATE, "rtol": 1e-5, "start": "uncharged"}
     chunks = list(fs.stream(circuit, chunk=0.31, step=step, **how))
     t = joined(chunks, "t")
@@ -112,8 +103,14 @@ def test_outputs_between_samples_are_those_of_the_whole_too(step: float) -> None
 def test_a_quiet_beginning_is_followed_to_its_own_scale() -> None:
     values = 150.0 * recording_errors.noise(5, 2 * pieces.PIECE, RATE, 50.0, 4000.0)
     values[: pieces.PIECE] *= 0.05
-    samples, circuit = fs.Samples(values, RATE), fs.parse_netlist(table1_deck())
-    how = {"sources": samples, "t_stop": (values.size - 1) / RATE, "rtol": 1e-4, "start": "uncharged", "charge": False}
+    circuit = table1()
+    how = {
+        "sources": fs.Samples(values, RATE),
+        "t_stop": (values.size - 1) / RATE,
+        "rtol": 1e-4,
+        "start": "uncharged",
+        "charge": False,
+    }
     first = next(fs.stream(circuit, count=pieces.PIECE, **how))
     exact = fs.simulate(circuit, t_eval=first.t[:4000], **how | {"t_stop": 0.1, "rtol": 1e-10})
     peak = np.abs(first.u_gap).max()
@@ -138,8 +135,8 @@ def test_what_cannot_be_followed_by_samples_goes_on_by_other_steps() -> None:
     values = 100.0 * recording_errors.noise(5, pieces.PIECE + 600, RATE, 50.0, 2000.0)
     # Beyond the range of the area's polynomial, in the second piece only.
     values[pieces.PIECE + 300 :] *= 40.0
-    samples, circuit = fs.Samples(values, RATE), fs.parse_netlist(table1_deck())
-    how = {"sources": samples, "t_stop": (values.size - 1) / RATE, "rtol": 1e-4, "start": "uncharged"}
+    circuit = table1()
+    how = {"sources": fs.Samples(values, RATE), "t_stop": (values.size - 1) / RATE, "rtol": 1e-4, "start": "uncharged"}
     chunks = list(fs.stream(circuit, count=pieces.PIECE // 2, **how))
     assert chunks[-1].success
     tail = fs.simulate(circuit, t_eval=chunks[-1].t, **how)
@@ -148,7 +145,7 @@ def test_what_cannot_be_followed_by_samples_goes_on_by_other_steps() -> None:
 
 def test_a_stream_goes_on_from_a_mark() -> None:
     values = 150.0 * recording_errors.noise(5, 2 * pieces.PIECE, RATE, 50.0, 4000.0)
-    circuit = fs.parse_netlist(table1_deck())
+    circuit = table1()
     for sources in (fs.Samples(values, RATE), fs.Square(200.0, 100.0)):
         how = {"sources": sources, "t_stop": 2.7, "rtol": 1e-4, "step": 3e-5, "count": 20_011, "start": "uncharged"}
         whole = list(fs.stream(circuit, **how))
@@ -165,7 +162,7 @@ def test_a_stream_goes_on_from_a_mark() -> None:
 
 
 def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
-    circuit, most = fs.parse_netlist(table1_deck()), []
+    circuit, most = table1(), []
     # The first makes what later runs through the same circuit use again.
     for seconds in (75, 75, 150):
         path = wav(tmp_path / f"{seconds}.wav", 48_000 * seconds)
@@ -193,11 +190,11 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
 )
 def test_a_stream_that_cannot_be_is_refused_at_once(given: dict[str, object], said: str) -> None:
     with pytest.raises(fs.InputError, match=said.replace("(", r"\(")):
-        fs.stream(fs.parse_netlist(table1_deck()), **given)
+        fs.stream(table1(), **given)
 
 
 def test_a_run_that_fails_gives_what_came_before() -> None:
-    circuit = fs.parse_netlist(table1_deck())
+    circuit = table1()
     source = fs.Function(lambda t: np.where(t < 0.12345, 100.0 * np.sin(700.0 * t), np.nan))
     found = []
     with pytest.raises(fs.SolveError) as caught:
@@ -266,7 +263,7 @@ def test_a_file_that_is_not_sound_is_refused_as_ever(tmp_path: Path) -> None:
 def test_a_file_that_becomes_shorter_ends_a_stream_in_one_sentence(tmp_path: Path) -> None:
     path = wav(tmp_path / "a.wav", 3 * pieces.PIECE)
     drive = fs.Samples.from_wav(path, 150.0, at_once=False)
-    stream = fs.stream(fs.parse_netlist(table1_deck()), sources=drive, t_stop=2.0, rtol=1e-3, count=pieces.PIECE)
+    stream = fs.stream(table1(), sources=drive, t_stop=2.0, rtol=1e-3, count=pieces.PIECE)
     next(stream)
     path.write_bytes(path.read_bytes()[: 3 * pieces.PIECE])
     with pytest.raises(fs.InputError, match="has become shorter while it was read"):
@@ -285,6 +282,16 @@ def scene(tmp_path: Path) -> Path:
 
 
 STREAM = ("run", "long.cir", "--stream", "--rtol", "1e-4", "--chunk", "0.1", "--signals", "u_gap,f_el,u_layer")
+FEW = ("run", "long.cir", "--stream", "--stop", "0.3", "--rtol", "1e-4", "--chunk", "0.1")
+PATH = Path("out/long.zarr")
+
+
+@pytest.fixture
+def few(scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """The command in the folder of a store that `FEW` has written, in four pieces."""
+    monkeypatch.chdir(scene)
+    assert command(*FEW).code == 0
+    return command
 
 
 def test_a_store_holds_the_run(scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,15 +307,11 @@ def test_a_store_holds_the_run(scene: Path, command: Command, monkeypatch: pytes
     whole = fs.simulate(circuit, t_eval=np.arange(192_001) / RATE, rtol=1e-4, charge=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for given in (
-            xarray.open_dataset("out/long.zarr", engine="zarr", consolidated=False),
-            xarray.open_dataset("out/long.nc"),
-        ):
-            np.testing.assert_array_equal(given["time"], whole.t)
-            np.testing.assert_array_equal(given["f_el"], whole.f_el)
-            np.testing.assert_array_equal(given["u_layer"], whole.u_layer)
-            assert given["u_gap"].attrs["units"] == "V"
-            given.close()
+        for file, how in ((PATH, {"engine": "zarr", "consolidated": False}), ("out/long.nc", {})):
+            with xarray.open_dataset(file, **how) as given:
+                for name, values in (("time", whole.t), ("f_el", whole.f_el), ("u_layer", whole.u_layer)):
+                    np.testing.assert_array_equal(given[name], values)
+                assert given["u_gap"].attrs["units"] == "V"
     # Once more: everything is there.
     again = json.loads(command(*STREAM, "--json").out)
     assert again["stream"]["found"] == 41
@@ -318,7 +321,7 @@ def test_a_store_holds_the_run(scene: Path, command: Command, monkeypatch: pytes
 def test_a_killed_run_goes_on_to_the_same_bytes(scene: Path) -> None:
     assert ended(start(scene, *STREAM, "--out", "whole"))[0] == 0
     written, killed = scene / "parts" / "long.zarr" / "f_el" / "c", 0
-    for pieces_there in (1, 9, 17, 25, 33, 40):
+    for pieces_there in (*range(1, 34, cases(8, 16)), 40):
         process = start(scene, *STREAM, "--out", "parts")
         while process.poll() is None and (not written.is_dir() or len(os.listdir(written)) < pieces_there):
             time.sleep(1e-3)
@@ -345,129 +348,94 @@ def test_a_full_disk_loses_nothing(scene: Path) -> None:
     assert ended(start(scene, *STREAM, "--netcdf"))[0] == 0
 
 
-def test_a_store_of_another_run_is_refused(scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(scene)
-    few = ("run", "long.cir", "--stream", "--stop", "0.3", "--rtol", "1e-4", "--chunk", "0.1")
-    assert command(*few).code == 0
-    before = tree(scene / "out")
+def test_a_store_of_another_run_is_refused(few: Command) -> None:
+    before = tree(Path("out"))
     others = {
-        "rtol": (*few[:5], "--rtol", "1e-5", "--chunk", "0.1"),
-        "chunk": (*few[:-1], "0.2"),
-        "end": (*few[:4], "0.25", *few[5:]),
-        "charge law": (*few, "--charge-law", "mobile"),
-        "circuit": (*few, "--set", "Xgap.d=3u"),
-        "signals": (*few, "--signals", "u_gap"),
-        "source": (*few, "--source", "WAV(a.wav gain=100)"),
+        "rtol": (*FEW[:5], "--rtol", "1e-5", "--chunk", "0.1"),
+        "chunk": (*FEW[:-1], "0.2"),
+        "end": (*FEW[:4], "0.25", *FEW[5:]),
+        "charge law": (*FEW, "--charge-law", "mobile"),
+        "circuit": (*FEW, "--set", "Xgap.d=3u"),
+        "signals": (*FEW, "--signals", "u_gap"),
+        "source": (*FEW, "--source", "WAV(a.wav gain=100)"),
     }
     for what, arguments in others.items():
-        result = command(*arguments)
+        result = few(*arguments)
         (line,) = [line for line in result.lines if not line.startswith("fingerspice: warning")]
         assert result.code == 2
         assert f"out/long.zarr holds a run of {'other' if what == 'signals' else 'another'} {what}" in line
-        assert tree(scene / "out") == before
-    assert command(*others["rtol"], "--overwrite").code == 0
+        assert tree(Path("out")) == before
+    assert few(*others["rtol"], "--overwrite").code == 0
 
 
-def test_a_damaged_store_is_refused(scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(scene)
-    few = ("run", "long.cir", "--stream", "--stop", "0.3", "--rtol", "1e-4", "--chunk", "0.1")
-    assert command(*few).code == 0
-    piece, head = scene / "out/long.zarr/f_el/c/1", scene / "out/long.zarr/zarr.json"
+def test_a_damaged_store_is_refused(few: Command) -> None:
+    piece, head = PATH / "f_el/c/1", PATH / "zarr.json"
     piece.write_bytes(piece.read_bytes()[:-8])
-    said = command(*few)
+    said = few(*FEW)
     assert said.code == 2
-    assert (
-        "out/long.zarr is damaged: out/long.zarr/f_el/c/1 is missing or cut short; allowed: --overw" in said.lines[-1]
-    )
+    assert f"{PATH} is damaged: {piece} is missing or cut short; allowed: --overw" in said.lines[-1]
     head.write_bytes(head.read_bytes()[:200])
-    said = command(*few, "--overwrite")
+    said = few(*FEW, "--overwrite")
     assert said.code == 2
-    assert "out/long.zarr is there already and is no whole store of a run" in said.lines[-1]
+    assert f"{PATH} is there already and is no whole store of a run" in said.lines[-1]
     assert piece.exists()
 
 
-def flipped(file: Path, place: int, bit: int) -> None:
-    """Change one bit of a file."""
-    content = bytearray(file.read_bytes())
-    content[place] ^= 1 << bit
-    file.write_bytes(content)
-
-
-def test_a_flipped_bit_of_a_store_is_found(scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flipped_bit_of_a_store_is_found(few: Command) -> None:
     import zarr
 
-    monkeypatch.chdir(scene)
-    few = ("run", "long.cir", "--stream", "--stop", "0.3", "--rtol", "1e-4", "--chunk", "0.1")
-    assert command(*few).code == 0
-    store, rng = Path("out/long.zarr"), random.Random(3)
-    sound = tree(store)
-    assert command("check", str(store)).out == f"{store}: 12 chunks of 3 arrays are as they were written\n"
-    assert json.loads(command("check", str(store), "--json").out)["chunks"] == {"f_el": 4, "time": 4, "u_gap": 4}
-    for name in ("f_el", "u_gap", "time"):
-        for chunk in range(4):
-            file = store / name / "c" / str(chunk)
-            flipped(file, rng.randrange(file.stat().st_size), rng.randrange(8))
-            said = f"{store} is damaged: {file} has changed since it was written; allowed: "
-            for words in (few, ("check", str(store))):
-                result = command(*words)
-                assert result.code == 2
-                assert said in result.lines[-1]
-            with pytest.raises(ValueError, match="checksum"):
-                zarr.open_group(store, mode="r")[name][:]
-            file.write_bytes(sound[str(file.relative_to(store))])
+    rng, sound, head = random.Random(3), tree(PATH), PATH / "zarr.json"
+    assert few("check", str(PATH)).out == f"{PATH}: 12 chunks of 3 arrays are as they were written\n"
+    assert json.loads(few("check", str(PATH), "--json").out)["chunks"] == {"f_el": 4, "time": 4, "u_gap": 4}
+    for name, chunk in [(name, chunk) for name in ("f_el", "u_gap", "time") for chunk in range(4)]:
+        file = PATH / name / "c" / str(chunk)
+        content = bytearray(file.read_bytes())
+        content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+        file.write_bytes(content)
+        for words in (FEW, ("check", str(PATH))):
+            result = few(*words)
+            assert result.code == 2
+            assert f"{PATH} is damaged: {file} has changed since it was written; allowed: " in result.lines[-1]
+        with pytest.raises(ValueError, match="checksum"):
+            zarr.open_group(PATH, mode="r")[name][:]
+        file.write_bytes(sound[str(file.relative_to(PATH))] or b"")
     # The state from which the run goes on is not in a chunk.
-    head = store / "zarr.json"
     head.write_text(head.read_text().replace('"chunks_done": 4', '"chunks_done": 3'))
-    assert "is no whole store of a run" in command(*few).lines[-1]
-    assert f"is damaged: {head} has changed" in command("check", str(store)).lines[-1]
-    (store / "f_el/c/2").unlink()
-    assert command("check", str(store)).code == 2
-    assert command("check", "out").lines == [
-        "fingerspice: out is no whole store; allowed: one that --stream or --store wrote"
-    ]
+    assert "is no whole store of a run" in few(*FEW).lines[-1]
+    assert f"is damaged: {head} has changed" in few("check", str(PATH)).lines[-1]
+    (PATH / "f_el/c/2").unlink()
+    assert few("check", str(PATH)).code == 2
+    said = "fingerspice: out is no whole store; allowed: one that --stream or --store wrote"
+    assert few("check", "out").lines == [said]
 
 
-def test_a_store_of_an_earlier_version_says_that_it_has_no_checksums(
-    scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(scene)
-    few = ("run", "long.cir", "--stream", "--stop", "0.3", "--rtol", "1e-4", "--chunk", "0.1")
-    assert command(*few).code == 0
-    for file in Path("out/long.zarr").rglob("zarr.json"):
+def test_a_store_of_an_earlier_version_says_that_it_has_no_checksums(few: Command) -> None:
+    for file in PATH.rglob("zarr.json"):
         about = json.loads(file.read_text())
         about["codecs"] = [one for one in about.get("codecs", ()) if one["name"] != "crc32c"]
         about["attributes"].get("run", {}).pop("kind of checksum", None)
         about["attributes"].pop("checksum", None)
         file.write_text(json.dumps(about))
-    for file in Path("out/long.zarr").glob("*/c/*"):
+    for file in PATH.glob("*/c/*"):
         file.write_bytes(file.read_bytes()[:-4])
-    assert (
-        "out/long.zarr has no checksums, as an earlier version wrote it" in command("check", "out/long.zarr").lines[-1]
-    )
-    said = "out/long.zarr holds a run of another kind of checksum (None, and this one crc32c); allowed: --name NAME"
-    assert said in command(*few).lines[-1]
+    assert f"{PATH} has no checksums, as an earlier version wrote it" in few("check", str(PATH)).lines[-1]
+    said = f"{PATH} holds a run of another kind of checksum (None, and this one crc32c); allowed: --name NAME"
+    assert said in few(*FEW).lines[-1]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--chunk", "1"), "--chunk, --signals and --netcdf go with --stream"),
-        (("--stream", "--csv"), "--csv does not go with --stream"),
-        (("--stream", "--chunk", "soon"), "--chunk 'soon'"),
-        (("--stream", "--signals", "u_gap,loudness"), "--signals names 'loudness'; allowed: "),
-    ],
-)
-def test_options_of_streams_are_checked(
-    arguments: tuple[str, ...], said: str, scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+def test_options_of_streams_are_checked_and_without_zarr_a_store_says_how_to_get_it(
+    scene: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(scene)
-    result = command("run", "long.cir", *arguments)
-    assert result.code == 2
-    assert said in result.lines[-1]
+    for arguments, said in (
+        ("--chunk 1", "--chunk, --signals and --netcdf go with --stream"),
+        ("--stream --csv", "--csv does not go with --stream"),
+        ("--stream --chunk soon", "--chunk 'soon'"),
+        ("--stream --signals u_gap,loudness", "--signals names 'loudness'; allowed: "),
+    ):
+        result = command("run", "long.cir", *arguments.split())
+        assert result.code == 2
+        assert said in result.lines[-1]
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    assert "pip install 'fingerspice[stream]'" in command(*STREAM).lines[-1]
     assert not (scene / "out").exists()
-
-
-def test_without_zarr_a_store_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "zarr", None)
-    with pytest.raises(fs.InputError, match=r"pip install 'fingerspice\[stream\]'"):
-        Store(tmp_path / "a.zarr", {}, 10, 3)

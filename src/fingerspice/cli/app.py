@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import gc
-import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -18,13 +15,8 @@ from fingerspice.cli import fit as fits
 from fingerspice.cli import sweep as sweeps
 from fingerspice.cli.options import area_from_text, read_circuit
 from fingerspice.cli.result_files import Results
-from fingerspice.cli.terminal import Answering, answer_usage, listen, plain_errors, progress, say
+from fingerspice.cli.terminal import Answering, answer_usage, complain, is_input, listen, progress, said_of, say
 from fingerspice.results.outcome import SolveError
-
-if TYPE_CHECKING:
-    from fingerspice.results.solution import Solution
-    from fingerspice.studies.feel import Feel
-
 
 app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
@@ -42,18 +34,21 @@ def main() -> None:
     # fifth of a run.
     gc.set_threshold(500_000)
     listen()
-    with plain_errors():
-        try:
-            app(standalone_mode=True)
-        except SystemExit as exit_:
-            # typer has refused the usage with a message on stderr; with --json print an answer as well.
-            refused = getattr(exit_.__context__, "format_message", None)
-            if refused is not None:
-                answer_usage(refused())
-            raise
-        finally:
-            # Flush the text that typer has printed.
-            say(end="")
+    try:
+        app(standalone_mode=True)
+    except SystemExit as exit_:
+        # typer has refused the usage with a message on stderr; with --json print an answer as well.
+        refused = getattr(exit_.__context__, "format_message", None)
+        if refused is not None:
+            answer_usage(refused())
+        raise
+    except Exception as error:
+        # One sentence instead of a traceback: exit code 2 for wrong input, 1 for any other error.
+        complain(said_of(error))
+        raise SystemExit(2 if is_input(error) else 1) from None
+    finally:
+        # Flush the text that typer has printed.
+        say(end="")
 
 
 @app.command()
@@ -110,8 +105,10 @@ def run(
 
       fingerspice run long.cir --stream --rtol 1e-5 --signals u_gap,f_t
     """
+    from fingerspice.plots.schematic import put_beside
     from fingerspice.results.report import summary_table
     from fingerspice.solve.simulation import check_arguments, simulate
+    from fingerspice.studies.feel import feel as felt
 
     with Answering("run", as_json, charge_law=charge_law, method=method, rtol=rtol, area=area) as answer:
         circuit = read_circuit(deck, changes, source, finger=finger, coating=coating, drive=drive)
@@ -122,75 +119,50 @@ def run(
         t_stop = None if stop is None else circuit.tran.stop
         fixed = area_from_text(area)
         check_arguments(rtol, method, fixed, start, jumps)
+        how: dict[str, Any] = {"charge_law": charge_law, "area": fixed, "rtol": rtol}
+        how |= {"method": method, "start": start, "t_stop": t_stop}
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         if stream or chunk or signals or netcdf:
             from fingerspice.cli.store import run_streamed
 
-            options.check_streamed(stream, csv=csv, feel=feel, schematic=schematic)
-            how = {"charge_law": charge_law, "area": fixed, "rtol": rtol}
-            how |= {"method": method, "start": start, "t_stop": t_stop}
+            if not stream:
+                raise InputError("--chunk, --signals and --netcdf go with --stream")
+            for option in [key for key, on in (("csv", csv), ("feel", feel), ("schematic", schematic)) if on]:
+                raise InputError(
+                    f"--{option} does not go with --stream, which writes Zarr; allowed: --netcdf beside it"
+                )
             run_streamed(answer, results, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
             return
-        _name_files(results, lambda: solution, csv=csv, no_plot=no_plot, schematic=schematic)
+        if csv:
+            results.will_write(".csv", lambda file: solution.to_csv(file))
+        else:
+            results.will_write(".nc", lambda file: solution.to_netcdf(file))
+        results.will_draw(
+            ".png", lambda: put_beside(solution.plot(), circuit) if schematic else solution.plot(), unless=no_plot
+        )
+        if schematic:
+            results.will_write_schematic()
         if feel and not circuit.by_device("GAP"):
             raise InputError("--feel: the circuit has no GAP, so there is no friction to feel")
         image = results.file("_feel.png") if feel and not no_plot else None
         with progress() as update:
-            solution = simulate(
-                circuit, t_stop=t_stop, charge_law=charge_law, area=fixed, rtol=rtol, method=method,
-                start=start, jumps=jumps, throw=False, progress=update,
-            )  # fmt: skip
+            solution = simulate(circuit, **how, jumps=jumps, throw=False, progress=update)
         if as_json:
             answer.update(**answers.of_run(solution))
-        writes = results.ready() if solution.t.size else []
-        fingers, unfelt = _felt(solution) if feel and solution.success else (None, None)
-        if fingers is not None:
-            answer.update(feel=[one.to_dict() for one in fingers])
-        if fingers:
-            writes += results.pictures(image, lambda: fingers[0].plot(fingers[1:]))
-        answer.give(lambda: "\n\n".join([summary_table(solution), *map(str, fingers or ())]), writes)
+        writes, fingers, unfelt = results.ready() if solution.t.size else [], [], None
+        if feel and solution.success:
+            try:
+                fingers = [felt(solution, name) for name in solution.all_signals.names("f_t")]
+                answer.update(feel=[one.to_dict() for one in fingers])
+                writes += results.pictures(image, lambda: fingers[0].plot(fingers[1:]))
+            except InputError as error:
+                # The outputs are too few or uneven, which is told after the files of the run have been written.
+                unfelt = error
+        answer.give(lambda: "\n\n".join([summary_table(solution), *map(str, fingers)]), writes)
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
         if unfelt is not None:
             raise unfelt
-
-
-def _name_files(
-    results: Results, solution: Callable[[], Solution], *, csv: bool, no_plot: bool, schematic: bool
-) -> None:
-    """Check the files of a run, which has not begun, and say how its solution is written."""
-
-    def drawn() -> Any:
-        from fingerspice.plots.schematic import put_beside
-
-        picture = solution().plot()
-        return put_beside(picture, results.circuit) if schematic else picture
-
-    def symbols(file: Path) -> Path:
-        # An SVG file knows no names of our own, and keeps all of them as one text.
-        results.circuit.draw().write(file, {"Description": json.dumps(results.about)})
-        return file
-
-    if csv:
-        results.will_write(".csv", lambda file: solution().to_csv(file))
-    else:
-        results.will_write(".nc", lambda file: solution().to_netcdf(file))
-    results.will_draw(".png", drawn, unless=no_plot)
-    if schematic:
-        results.will_write("_schematic.svg", symbols)
-
-
-def _felt(solution: Solution) -> tuple[list[Feel] | None, InputError | None]:
-    """What each finger feels of a run; None, and why, if its outputs are too few or uneven.
-
-    The reason is told later, after the files of the run have been written.
-    """
-    from fingerspice.studies.feel import feel
-
-    try:
-        return [feel(solution, name) for name in solution.all_signals.names("f_t")], None
-    except InputError as error:
-        return None, error
 
 
 @app.command()
@@ -229,6 +201,7 @@ def ac(
     """
     from fingerspice.plots.traces import plot_phasor
     from fingerspice.results.phasor_solution import phasor_csv, phasor_tables
+    from fingerspice.sets.parameters import parameters
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.comparison import large_signal
     from fingerspice.studies.phasors import phasor, sweep_frequencies
@@ -237,7 +210,11 @@ def ac(
     with Answering("ac", as_json, charge_law=charge_law, method=how, rtol=rtol, area=area, skin=skin) as answer:
         circuit = read_circuit(deck, changes, source)
         answer.update(**answers.of_circuit(circuit, charge_law))
-        options.check_finger(finger, circuit)
+        gaps = [e.name.lower() for e in circuit.by_device("GAP")]
+        if finger is not None and finger.lower() not in gaps and finger.lower() in map(str.lower, parameters()):
+            raise InputError(
+                f"--finger {finger!r} is a set of parameters, and here a GAP is meant; allowed: --set {finger}"
+            )
         check_arguments(rtol)
         frequencies = sweep_frequencies(options.sweep(sweep, circuit))
         if area == "coupled" and skin != "swept":

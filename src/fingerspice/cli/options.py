@@ -37,9 +37,11 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
         warnings.simplefilter("always", FingerspiceWarning)
         circuit = read_netlist(deck)
     given = circuit.warnings
+    # A path has a dot, and the name of a set none.
+    named = [change for change in changes or () if change and not set("=.") & set(change)]
     try:
-        circuit = _with_sets(circuit, changes or [], sets)
-        circuit = _with_changes(circuit, changes or [])
+        circuit = _with_sets(circuit, {"set": named, **sets})
+        circuit = _with_changes(circuit, changes or [], named)
         circuit = _with_sources(circuit, sources or [])
         given = circuit.warnings
     finally:
@@ -56,13 +58,11 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
     return circuit
 
 
-def _with_sets(circuit: Circuit, changes: list[str], by_kind: Mapping[str, list[str] | None]) -> Circuit:
-    """The circuit with the sets that ``--set`` and the options of their kinds name, in this order."""
+def _with_sets(circuit: Circuit, asked: Mapping[str, list[str] | None]) -> Circuit:
+    """The circuit with the sets that each option names, in this order."""
     from fingerspice.sets.parameters import parameters
 
-    asked = [("set", change) for change in changes if _is_name(change)]
-    asked += [(kind, text) for kind, texts in by_kind.items() for text in texts or []]
-    for option, text in asked:
+    for option, text in [(option, text) for option, texts in asked.items() for text in texts or ()]:
         element, equals, name = (part.strip() for part in text.rpartition("="))
         try:
             circuit = parameters(name, None if option == "set" else option).apply(circuit, element if equals else None)
@@ -72,34 +72,16 @@ def _with_sets(circuit: Circuit, changes: list[str], by_kind: Mapping[str, list[
     return circuit
 
 
-def check_finger(finger: str | None, circuit: Circuit) -> None:
-    """Refuse the name of a set of parameters where the name of a GAP is asked for."""
-    from fingerspice.sets.parameters import parameters
-
-    gaps = {e.name.lower() for e in circuit.by_device("GAP")}
-    if finger is not None and finger.lower() not in gaps and finger.lower() in map(str.lower, parameters()):
-        raise InputError(
-            f"--finger {finger!r} is a set of parameters, and here a GAP is meant; allowed: --set {finger}"
-        )
-
-
-def _is_name(change: str) -> bool:
-    """Whether a ``--set`` names a set of parameters; a path has a dot."""
-    return bool(change) and not set("=.") & set(change)
-
-
-def _with_changes(circuit: Circuit, changes: list[str]) -> Circuit:
-    """The circuit with all ``--set`` changes applied together, as two exponents may only be legal together."""
+def _with_changes(circuit: Circuit, changes: list[str], named: list[str]) -> Circuit:
+    """The circuit with all ``--set`` values applied together, as two exponents may only be legal together."""
     values: dict[str, str] = {}
-    for change in (change for change in changes if not _is_name(change)):
+    for change in (change for change in changes if change not in named):
         path, equals, text = (part.strip() for part in change.partition("="))
         if not equals or not path:
             raise InputError(f"--set {change!r} is not understood; allowed: PATH=VALUE, such as Xgap.d=3u")
         values[path] = text
-    if not values:
-        return circuit
     try:
-        return circuit.replace(values)
+        return circuit.replace(values) if values else circuit
     except InputError as error:
         # Leave out the place in the deck, because the error is in the option.
         raise InputError(f"--set {' '.join(map(repr, changes))}: {error.message}") from None
@@ -172,15 +154,6 @@ def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple
     return dataclasses.replace(circuit, tran=dataclasses.replace(old, stop=last, start=first)), start
 
 
-def check_streamed(stream: bool, **others: bool) -> None:
-    """Refuse options that do not go together with ``--stream``, and its own options without it."""
-    if not stream:
-        raise InputError("--chunk, --signals and --netcdf go with --stream")
-    for name, given in others.items():
-        if given:
-            raise InputError(f"--{name} does not go with --stream, which writes Zarr; allowed: --netcdf beside it")
-
-
 def time_from_text(option: str, text: str | None) -> float | None:
     """A time in s, such as ``50m``."""
     try:
@@ -206,31 +179,27 @@ def area_from_text(text: str) -> str | float:
 
 def check_output(file: Path, deck: Path | None = None) -> None:
     """Before a run, refuse an output file that cannot be written or is the deck itself; writes nothing."""
+    folder, names, allowed = file.parent, [file.name], "allowed: a folder that can be written"
     try:
-        _check_output(file, deck)
+        while not folder.exists() and folder != folder.parent and not folder.is_symlink():
+            names.append(folder.name)
+            folder = folder.parent
+        # This raises OSError if a name is too long; the check needs a folder that exists.
+        for one in names:
+            (folder / one).exists()
+        if not folder.is_dir():
+            raise InputError(f"cannot write {file}: {folder} is not a folder; {allowed}")
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise InputError(f"cannot write {file}: no permission in {folder}; {allowed}")
+        # Some folders, such as those of /proc, take nothing new whatever their permissions say.
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        if file.is_dir():
+            raise InputError(f"cannot write {file}: it is a folder; allowed: a file's name")
+        if deck is not None and file.exists() and deck.exists() and file.samefile(deck):
+            raise InputError(f"cannot write {file}: it is the deck itself; allowed: another name or folder")
     except OSError as error:
-        raise InputError(f"cannot write {file}: {error.strerror}; allowed: a folder that can be written") from None
-
-
-def _check_output(file: Path, deck: Path | None) -> None:
-    folder, names = file.parent, [file.name]
-    while not folder.exists() and folder != folder.parent and not folder.is_symlink():
-        names.append(folder.name)
-        folder = folder.parent
-    # This raises OSError if a name is too long; the check needs a folder that exists.
-    for one in names:
-        (folder / one).exists()
-    if not folder.is_dir():
-        raise InputError(f"cannot write {file}: {folder} is not a folder; allowed: a folder that can be written")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise InputError(f"cannot write {file}: no permission in {folder}; allowed: a folder that can be written")
-    # Some folders, such as those of /proc, take nothing new whatever their permissions say.
-    with tempfile.TemporaryFile(dir=folder):
-        pass
-    if file.is_dir():
-        raise InputError(f"cannot write {file}: it is a folder; allowed: a file's name")
-    if deck is not None and file.exists() and deck.exists() and file.samefile(deck):
-        raise InputError(f"cannot write {file}: it is the deck itself; allowed: another name or folder")
+        raise InputError(f"cannot write {file}: {error.strerror}; {allowed}") from None
 
 
 def sweep(text: str | None, circuit: Circuit) -> AcSweep:

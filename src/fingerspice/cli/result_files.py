@@ -26,8 +26,6 @@ _HEADS = (
     b"t [s],u_source", b"frequency [Hz],gain [1],", b"parameter,value [SI],unit,", b"time (s),drive (V)",
     b"time (s),wanted force (N),",
 )  # fmt: skip
-#: Attributes by which a file identifies its circuit.
-_KNOWN = ("deck_sha256", "overrides", "charge_law")
 
 
 class Results:
@@ -80,6 +78,14 @@ class Results:
     def will_draw(self, end: str, draw: Callable[[], Any], *, unless: bool) -> None:
         """As `will_write`, of the picture that a function draws, unless none is wanted."""
         self._writes += self.pictures(None if unless else self.file(end), draw)
+
+    def will_write_schematic(self) -> None:
+        """As `will_write`, of the circuit's schematic."""
+        # An SVG file knows no names of our own, and keeps all of them as one text.
+        self.will_write(
+            "_schematic.svg",
+            lambda file: self.circuit.draw().write(file, {"Description": json.dumps(self.about)}),
+        )
 
     def ready(self) -> list[Callable[[], Path]]:
         """The functions that write the files, for which there is a folder now."""
@@ -142,13 +148,36 @@ def _hash(text: str) -> str:
 def _held(file: Path) -> dict[str, str] | None:
     """Attributes of a file that name its deck, changes and charge law; None if it has none."""
     try:
-        found = {".nc": _of_data, ".svg": _of_drawing}.get(file.suffix, _of_picture)(file)
-        if found is None or not all(isinstance(found.get(key), str) for key in _KNOWN):
-            return None
-        return found if isinstance(json.loads(found["overrides"]), dict) else None
+        found = _attributes(file)
+        known = all(isinstance(found.get(key), str) for key in ("deck_sha256", "overrides", "charge_law"))
+        return found if known and isinstance(json.loads(found["overrides"]), dict) else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, SyntaxError):
         # The file was not written by this package.
         return None
+
+
+def _attributes(file: Path) -> dict[str, Any]:
+    """Texts kept in a file; of a table, those in the picture of the same name, if it lists the table's file."""
+    if file.suffix == ".nc":
+        import h5netcdf
+
+        with h5netcdf.File(file, "r") as data:
+            attributes = {str(key): str(value) for key, value in data.attrs.items()}
+        return {**attributes, "deck_sha256": _hash(attributes["deck"])}
+    if file.suffix == ".svg":
+        # A schematic has them as its description.
+        found = re.search(r"<dc:description>(.*?)</dc:description>", file.read_text(encoding="utf-8"), re.DOTALL)
+        return {} if found is None else dict(json.loads(html.unescape(found[1])))
+    from PIL import Image
+
+    picture = file.with_suffix(".png")
+    if not picture.is_file():
+        # `design` writes NAME_drive.wav, NAME_drive.csv and NAME_friction.csv with the picture NAME_design.png.
+        picture = file.with_name(f"{file.stem.rpartition('_')[0]}_design.png")
+    with Image.open(picture) as image:
+        image.load()
+        text: dict[str, Any] = dict(getattr(image, "text", {}))
+    return text if file.name in json.loads(text.get("files", "[]")) else {}
 
 
 def _is_table(file: Path) -> bool:
@@ -156,33 +185,3 @@ def _is_table(file: Path) -> bool:
     with suppress(OSError), (file.with_suffix(".csv") if file.suffix == ".wav" else file).open("rb") as stream:
         return stream.read(100).startswith(_HEADS)
     return False
-
-
-def _of_data(file: Path) -> dict[str, str]:
-    import h5netcdf
-
-    with h5netcdf.File(file, "r") as data:
-        attributes = {str(key): str(value) for key, value in data.attrs.items()}
-    return {**attributes, "deck_sha256": _hash(attributes["deck"])}
-
-
-def _of_drawing(file: Path) -> dict[str, str] | None:
-    """Attributes of a schematic, which are its description."""
-    found = re.search(r"<dc:description>(.*?)</dc:description>", file.read_text(encoding="utf-8"), re.DOTALL)
-    return None if found is None else dict(json.loads(html.unescape(found[1])))
-
-
-def _of_picture(file: Path) -> dict[str, str] | None:
-    """Attributes of a picture; for a table, those of the picture of the same name, if it lists the table's file."""
-    from PIL import Image
-
-    picture = file.with_suffix(".png")
-    if not picture.is_file():
-        # `design` writes NAME_drive.wav, NAME_drive.csv and NAME_friction.csv with the picture NAME_design.png.
-        picture = file.with_name(f"{file.stem.rpartition('_')[0]}_design.png")
-    if not picture.is_file():
-        return None
-    with Image.open(picture) as image:
-        image.load()
-        text: dict[str, Any] = dict(getattr(image, "text", {}))
-    return text if file.name in json.loads(text.get("files", "[]")) else None

@@ -51,14 +51,10 @@ class Store:
         self.zarr = zarr_library()
         self.run = json.loads(json.dumps({**run, "kind of checksum": CHECKSUM}))
         self.path, self.total, self.count = path, total, count
+        self.chunks = -(-total // count)  # Of the whole run
         self.done = 0
         self.mark: dict[str, Any] = {}
         self.so_far: dict[str, Any] = {}
-
-    @property
-    def chunks(self) -> int:
-        """Number of chunks of the whole run."""
-        return -(-self.total // self.count)
 
     def open(self, overwrite: bool) -> None:
         """Open an existing store of the same run, to continue it; with `overwrite` remove any store.
@@ -67,9 +63,14 @@ class Store:
         """
         if not os.path.lexists(self.path):
             return
-        ways = "allowed: --name NAME, another --out, or --overwrite"
-        attributes = self._attributes()
-        if attributes is None:
+        try:
+            attributes = attributes_of(self.path)
+            whole = all(isinstance(attributes[key], dict) for key in (RUN, MARK, SO_FAR, COLUMNS))
+            sound = attributes.get(SIGNATURE, "") in ("", signature(attributes))
+            whole = whole and sound and isinstance(attributes[DONE], int) and attributes[DONE] >= 0
+        except (OSError, ValueError, KeyError, TypeError):
+            whole = False
+        if not whole:
             raise InputError(f"{self.path} is there already and is no whole store of a run; allowed: --name or --out")
         if overwrite:
             shutil.rmtree(self.path)
@@ -78,40 +79,29 @@ class Store:
             held = attributes[RUN].get(key)
             if held != own:
                 said = "" if len(f"{held}{own}") > 80 else f" ({held}, and this one {own})"
-                other = "other" if key == "signals" else "another"
-                raise InputError(f"{self.path} holds a run of {other} {key.replace('_', ' ')}{said}; {ways}")
+                what = f"{'other' if key == 'signals' else 'another'} {key.replace('_', ' ')}{said}"
+                ways = "allowed: --name NAME, another --out, or --overwrite"
+                raise InputError(f"{self.path} holds a run of {what}; {ways}")
         self.done, self.mark, self.so_far = attributes[DONE], attributes[MARK], attributes[SO_FAR]
-        arrays = [self._array(name, columns) for name, columns in attributes[COLUMNS].items()]
-        written = [(one, self._place(one, chunk)) for one in arrays for chunk in range(self.done)]
-        for one, place in written:
-            what = one.fault(place)
-            if what is not None:
-                raise InputError(f"{self.path} is damaged: {one.file(place)} {what}; allowed: --overwrite")
+        written: set[Path] = set()
+        for array in (self._array(name, columns) for name, columns in attributes[COLUMNS].items()):
+            for chunk in range(self.done):
+                place = _place(array, chunk)
+                fault = array.fault(place)
+                if fault is not None:
+                    raise InputError(f"{self.path} is damaged: {array.file(place)} {fault}; allowed: --overwrite")
+                written.add(array.file(place))
         # What a call that was killed has left.
         tidy(self.path)
-        whole = {one.file(place) for one, place in written}
         for file in self.path.glob("*/c/**/*"):
-            if file not in whole and file.is_file():
+            if file not in written and file.is_file():
                 file.unlink()
-
-    def _attributes(self) -> dict[str, Any] | None:
-        """Attributes of the group; None if it is not a store of this program, or they have changed."""
-        try:
-            found = attributes_of(self.path)
-            whole = all(isinstance(found[key], dict) for key in (RUN, MARK, SO_FAR, COLUMNS))
-            sound = found.get(SIGNATURE, "") in ("", signature(found))
-            return found if whole and sound and isinstance(found[DONE], int) and found[DONE] >= 0 else None
-        except (OSError, ValueError, KeyError, TypeError):
-            return None
 
     def _array(
         self, name: str, columns: int, dims: tuple[str, ...] = (), attributes: Mapping[str, Any] | None = None
     ) -> Array:
         more = (columns,) if columns else ()
         return Array(self.path / name, dims, (self.total, *more), (self.count, *more), attributes or {})
-
-    def _place(self, array: Array, chunk: int) -> tuple[int, ...]:
-        return chunk, *(0 for _ in array.shape[1:])
 
     def write(self, chunk: int, solution: Solution, signals: list[str], about: dict[str, Any], mark: Any) -> None:
         """Write a chunk, then record it as finished; `mark` is the state from which the run continues."""
@@ -123,32 +113,28 @@ class Store:
             name: self._array(name, columns[name], dims, said | {d: names[d] for d in dims[1:]})
             for name, (dims, _, said) in data.items()
         }
+        self.so_far = {
+            "method": solution.method, "area": solution.area_mode, "tier": solution.plan.tier,
+            "t_stop": solution.t_stop, "error": vars(solution.error), "fold_margin_min": solution.fold_margin_min,
+        }  # fmt: skip
         try:
             if not self.path.exists():
                 attributes = {**about, RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, COLUMNS: columns}
                 create(self.path, attributes, arrays, {}, self.path.name)
             for name, one in arrays.items():
-                place = self._place(one, chunk)
+                place = _place(one, chunk)
                 one.put(place, data[name][1])
                 settle_on_disk(one.file(place).parent)
-            self._note(chunk + 1, mark, solution)
+            head = json.loads((self.path / "zarr.json").read_text())
+            head["attributes"] |= {DONE: chunk + 1, MARK: mark, SO_FAR: self.so_far}
+            head["attributes"][SIGNATURE] = signature(head["attributes"])
+            write_durably(self.path / "zarr.json", json.dumps(head, indent=1).encode())
         except OSError as error:
             raise InputError(
                 f"cannot write {self.path}: {error.strerror or error}; {self.done} of {self.chunks} pieces are "
                 "written, and the same command goes on from there"
             ) from None
         self.done = chunk + 1
-
-    def _note(self, done: int, mark: Any, solution: Solution) -> None:
-        self.so_far = {
-            "method": solution.method, "area": solution.area_mode, "tier": solution.plan.tier,
-            "t_stop": solution.t_stop, "error": vars(solution.error), "fold_margin_min": solution.fold_margin_min,
-        }  # fmt: skip
-        file = self.path / "zarr.json"
-        about = json.loads(file.read_text())
-        about["attributes"] |= {DONE: done, MARK: mark, SO_FAR: self.so_far}
-        about["attributes"][SIGNATURE] = signature(about["attributes"])
-        write_durably(file, json.dumps(about, indent=1).encode())
 
     def to_netcdf(self, path: Path) -> Path:
         """Write the whole run as NetCDF, piece by piece."""
@@ -167,27 +153,29 @@ class Store:
                 elif shutil.disk_usage(target.parent).free < size:
                     raise OSError(f"it takes {size / 1e9:.3g} GB, which the disk has not")
             with h5netcdf.File(target, "w") as file:
-                self._copy(group, arrays, file)
+                file.dimensions["time"] = self.total
+                for name, array in arrays.items():
+                    self._copy(name, array, file)
+                file.attrs.update({k: value for k, value in group.attrs.asdict().items() if isinstance(value, str)})
 
         return write_aside(path, write)
 
-    def _copy(self, group: Any, arrays: dict[str, Any], file: Any) -> None:
-        """Copy all arrays and texts into a NetCDF file."""
-        file.dimensions["time"] = self.total
-        for name, array in arrays.items():
-            names = array.metadata.dimension_names
-            for dimension, length in zip(names[1:], array.shape[1:], strict=True):
-                if dimension not in file.dimensions:
-                    file.dimensions[dimension] = length
-            variable = file.create_variable(name, names, dtype="f8")
-            for key, value in array.attrs.asdict().items():
-                variable.attrs[key] = value if isinstance(value, str) else json.dumps(value)
-            rows = max(1, _PIECE // (8 * max(1, int(np.prod(array.shape[1:])))))
-            for at in range(0, self.total, rows):
-                variable[at : at + rows] = array[at : at + rows]
-        for key, value in group.attrs.asdict().items():
-            if isinstance(value, str):
-                file.attrs[key] = value
+    def _copy(self, name: str, array: Any, file: Any) -> None:
+        """Copy an array into a NetCDF file."""
+        names = array.metadata.dimension_names
+        for dimension, length in zip(names[1:], array.shape[1:], strict=True):
+            if dimension not in file.dimensions:
+                file.dimensions[dimension] = length
+        variable = file.create_variable(name, names, dtype="f8")
+        for key, value in array.attrs.asdict().items():
+            variable.attrs[key] = value if isinstance(value, str) else json.dumps(value)
+        rows = max(1, _PIECE // (8 * max(1, int(np.prod(array.shape[1:])))))
+        for at in range(0, self.total, rows):
+            variable[at : at + rows] = array[at : at + rows]
+
+
+def _place(array: Array, chunk: int) -> tuple[int, ...]:
+    return chunk, *(0 for _ in array.shape[1:])
 
 
 def run_streamed(
@@ -210,22 +198,20 @@ def run_streamed(
     if store.done and store.done < store.chunks:
         run.go_to(store.mark, store.done * store.count)
     results.open()
-    begun, first = time.perf_counter(), store.done
+    begun, first, total = time.perf_counter(), store.done, run.outputs.total
     answer.data["files"].append(str(path))
     if first < store.chunks:
         _fill(run, store, names, results)
-    answer.update(**store.so_far)
-    took, made = time.perf_counter() - begun, (store.chunks - first) / store.chunks
-    span = run.problem.t_stop - run.problem.t_start
-    pieces = f"{store.chunks:,} piece{'s' if store.chunks > 1 else ''}"
-    said = [f"{run.outputs.total:,} outputs of {span:g} s in {pieces}: {path}"]
-    if made > 0.0:
-        said.append(f"{made * span / took:,.3g} times real time")
+    took, span = time.perf_counter() - begun, run.problem.t_stop - run.problem.t_start
+    said = [f"{total:,} outputs of {span:g} s in {store.chunks:,} piece{'s' if store.chunks > 1 else ''}: {path}"]
+    if first < store.chunks:
+        said.append(f"{(store.chunks - first) / store.chunks * span / took:,.3g} times real time")
     error = store.so_far["error"]
     said.append(f"stated error {error['u_gap']:.2g} V of the gap voltage, {error['f_el']:.2g} N of the force")
     if first:
         said.append(f"the first {first:,} were there already")
-    answer.update(stream={"chunks": store.chunks, "found": first, "outputs": run.outputs.total, "seconds": took})
+    found = {"chunks": store.chunks, "found": first, "outputs": total, "seconds": took}
+    answer.update(**store.so_far, stream=found)
     answer.give(lambda: "; ".join(said), results.ready())
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 import sys
 import traceback
@@ -31,15 +30,8 @@ def say(text: str = "", end: str = "\n") -> None:
 
 def say_json(data: dict[str, Any]) -> None:
     """Print data as JSON in ASCII, with null for NaN and infinities, which JSON lacks."""
-
-    def clean(x: Any) -> Any:
-        if isinstance(x, dict):
-            return {k: clean(v) for k, v in x.items()}
-        if isinstance(x, list | tuple):
-            return [clean(v) for v in x]
-        return None if isinstance(x, float) and not math.isfinite(x) else x
-
-    _print(json.dumps(clean(data), indent=2, allow_nan=False), "\n")
+    finite = json.loads(json.dumps(data), parse_constant=lambda _: None)
+    _print(json.dumps(finite, indent=2), "\n")
 
 
 def _print(text: str, end: str) -> None:
@@ -76,16 +68,6 @@ def listen() -> None:
     logger = logging.getLogger("fingerspice")
     logger.setLevel(logging.INFO)
     logger.addHandler(_NOTES)
-
-
-@contextmanager
-def plain_errors() -> Iterator[None]:
-    """End with one sentence instead of a traceback: exit code 2 for wrong input, 1 for any other error."""
-    try:
-        yield
-    except Exception as error:
-        complain(said_of(error))
-        raise SystemExit(2 if is_input(error) else 1) from None
 
 
 def is_input(error: Exception) -> bool:

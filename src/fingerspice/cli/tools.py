@@ -6,7 +6,7 @@ import signal
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -16,9 +16,6 @@ from fingerspice.cli import answers
 from fingerspice.cli.options import check_output, read_circuit, with_times
 from fingerspice.cli.result_files import FOLDER
 from fingerspice.cli.terminal import Answering, progress
-
-if TYPE_CHECKING:
-    from fingerspice.circuit.circuit import Circuit
 
 
 def sets(
@@ -118,7 +115,13 @@ def explore(
 
     ended: list[int] = []
     with Answering("explore", as_json) as answer:
-        circuit = _circuit(answer, deck, changes, finger=finger, coating=coating, drive=drive)
+        circuit, sets = None, {"finger": finger, "coating": coating, "drive": drive}
+        if deck is not None:
+            circuit = read_circuit(deck, changes, None, **sets)
+            answer.update(**answers.of_circuit(circuit, None))
+        for option, given in {"set": changes, **sets}.items():
+            if given and deck is None:
+                raise InputError(f"--{option} {given[0]!r} is given without a deck; allowed: a netlist file before it")
         if static is not None:
             from fingerspice.explorer.gallery import static_page
 
@@ -137,20 +140,6 @@ def explore(
     while not ended:
         time.sleep(0.1)
     explorer.stop()
-
-
-def _circuit(
-    answer: Answering, deck: Path | None, changes: list[str] | None, **sets: list[str] | None
-) -> Circuit | None:
-    """The deck's circuit with its changes, of which the answer tells; None without a deck."""
-    if deck is not None:
-        circuit = read_circuit(deck, changes, None, **sets)
-        answer.update(**answers.of_circuit(circuit, None))
-        return circuit
-    for option, given in {"set": changes, **sets}.items():
-        if given:
-            raise InputError(f"--{option} {given[0]!r} is given without a deck; allowed: a netlist file before it")
-    return None
 
 
 def figures(
@@ -172,33 +161,29 @@ def figures(
     """
     folder = out or FOLDER
     with Answering("figures", as_json) as answer:
+        if gallery and only:
+            raise InputError("--only and --gallery are both given; allowed: one of them")
+        files: list[Path] = []
         if gallery:
-            if only:
-                raise InputError("--only and --gallery are both given; allowed: one of them")
-            _gallery(folder / "gallery", answer)
-            return
-        from fingerspice.studies.figures import FIGURES, make_figures
+            from fingerspice.explorer.gallery import decks, draw, scenes
 
-        for number in only or FIGURES:
-            for kind in ("png", "csv"):
-                check_output(folder / f"fig{number}.{kind}")
-        with progress("drawing") as update:
-            files = make_figures(folder, only=only, progress=update)
+            # The decks are those of `circuits` below the current folder.
+            entries, folder = [*decks(Path("circuits")), *scenes()], folder / "gallery"
+            files = [folder / f"{one.name}.png" for one in entries]
+            for file in files:
+                check_output(file)
+            with progress("drawing") as update:
+                folder.mkdir(parents=True, exist_ok=True)
+                for i, (one, file) in enumerate(zip(entries, files, strict=True), 1):
+                    draw(one, file)
+                    if update is not None:
+                        update(i / len(files))
+        else:
+            from fingerspice.studies.figures import FIGURES, make_figures
+
+            for number in only or FIGURES:
+                for kind in ("png", "csv"):
+                    check_output(folder / f"fig{number}.{kind}")
+            with progress("drawing") as update:
+                files += make_figures(folder, only=only, progress=update)
         answer.give(str, [partial(Path, file) for file in files])
-
-
-def _gallery(folder: Path, answer: Answering) -> None:
-    """Draw the scenes of the explorer and the decks of `circuits` below the current folder."""
-    from fingerspice.explorer.gallery import decks, draw, scenes
-
-    entries = [*decks(Path("circuits")), *scenes()]
-    files = [folder / f"{one.name}.png" for one in entries]
-    for file in files:
-        check_output(file)
-    with progress("drawing") as update:
-        folder.mkdir(parents=True, exist_ok=True)
-        for i, (one, file) in enumerate(zip(entries, files, strict=True)):
-            draw(one, file)
-            if update is not None:
-                update((i + 1) / len(files))
-    answer.give(str, [partial(Path, file) for file in files])

@@ -17,10 +17,9 @@ from fingerspice import __version__
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Tran
-from fingerspice.circuit.describe import in_force
 from fingerspice.explorer import changed, sliders
 from fingerspice.explorer.examples import EXAMPLES
-from fingerspice.explorer.request import Request, circuits_of, points_of, request_of, times_of, waveform_of
+from fingerspice.explorer.request import Asked
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
@@ -58,16 +57,11 @@ def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -
     ]
     own = None
     if circuit is not None:
-        before = changed.before(circuit)
-        asked = {"deck": circuit.text, **before, **(asked or {})}
-        own = {"title": circuit.title, "request": asked, "unsaid": changed.unsaid(circuit)}
+        before, unsaid = changed.before(circuit)
+        own = {"title": circuit.title, "request": {"deck": circuit.text, **before, **(asked or {})}, "unsaid": unsaid}
     return {
-        "version": __version__,
-        "own": own,
-        "examples": examples,
-        "waveforms": sliders.menu(),
-        "sets": changed.menu(),
-    }
+        "version": __version__, "own": own, "examples": examples, "waveforms": sliders.menu(), "sets": changed.menu(),
+    }  # fmt: skip
 
 
 def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[str, Any]]:
@@ -76,19 +70,18 @@ def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[st
     The traces can be drawn while the figures are computed, which takes longer than the run.
     """
     answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
-    more: Callable[[], dict[str, Any]] = dict
+    solution = None
     with _noticing(answer):
         try:
-            request = request_of(given)
-            base, circuit, lost = circuits_of(request, own)
-            circuit, without = changed.marked(circuit, base, request)
+            asked = Asked(given, own)
+            sets, _, without = changed.in_scene(asked)
             answer |= {
-                "title": circuit.title, "sliders": sliders.sliders(base, circuit),
-                "sets": changed.sentences(circuit, request), "unknown": [*request.unknown, *lost, *without],
+                "title": asked.circuit.title, "sliders": sliders.sliders(asked.base, asked.circuit), "sets": sets,
+                "unknown": [*asked.unknown, *without],
             }  # fmt: skip
-            answer["waveform"] = sliders.text_of(waveform_of(circuit))
-            run, more = _run(circuit, request)
-            answer |= run
+            answer["waveform"] = sliders.text_of(asked.source)
+            solution = _shown(asked)
+            answer |= _traces(asked, solution)
         except InputError as error:
             answer["message"] = str(error)
         except SolveError as error:
@@ -97,8 +90,17 @@ def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[st
             answer["message"] = "not enough memory for this scene; allowed: fewer periods or elements"
     yield answer
     rest = {"warnings": answer["warnings"]}
-    with _noticing(rest):
-        rest |= more()
+    if solution is not None and answer["ok"]:
+        with _noticing(rest):
+            rest |= {
+                "figures": [
+                    {key: trace[key] for key in ("name", "label", "element", "unit")}
+                    | {figure: solution._figures.value(trace["name"], figure) for figure in _FIGURES}
+                    for trace in answer["traces"]
+                ],
+                "harmonics": _harmonics(solution, answer["period"]),
+                "stacks": _stacks(solution),
+            }
     yield rest
 
 
@@ -129,49 +131,45 @@ def deadline(seconds: float = LONGEST_RUN) -> Callable[[float], None]:
     return check
 
 
-def _run(circuit: Circuit, request: Request) -> tuple[dict[str, Any], Callable[[], dict[str, Any]]]:
-    """The part of an answer that a run gives, in the two parts of `parts`."""
-    first, stop, period = times_of(circuit, request)
-    solution = _simulated(circuit, request, stop, first, stop)
+def _shown(asked: Asked) -> Solution:
+    """The run that is asked for, with outputs where it is shown."""
+
+    def run(first: float, last: float) -> Solution:
+        request, times = asked.request, np.linspace(first, last, asked.points(first, last)[0])
+        return simulate(
+            asked.circuit, t_stop=stop, t_eval=times, charge_law=request.charge_law, area=request.area,
+            rtol=request.rtol, charge=False, throw=False, progress=deadline(),
+        )  # fmt: skip
+
+    first, stop, _ = asked.times
+    solution = run(first, stop)
     if solution.failure is not None and solution.failure.t and solution.t.size < 2:
         # The run has failed before the part of it that is shown: then what there is of it is shown.
-        solution = _simulated(circuit, request, stop, 0.0, solution.failure.t)
-    _, too_few = points_of(circuit, first, stop)
-    cautions = [*solution.warnings, *([too_few] if too_few else [])]
-    keys = _SHOWN if solution.gaps else _WITHOUT_GAP
-    traces = [one for key in keys for one in _traces(solution, key)]
-    answer: dict[str, Any] = {
+        solution = run(0.0, solution.failure.t)
+    return solution
+
+
+def _traces(asked: Asked, solution: Solution) -> dict[str, Any]:
+    """The first part of an answer, as far as a run gives it: each column of a signal is one trace."""
+    first, stop, period = asked.times
+    too_few, error = asked.points(first, stop)[1], solution.error
+    voltage, force = format_si(error.u_gap, "V", 2), format_si(error.f_el, "N", 2)
+    said = f"{voltage} in the gap voltage, {force} in the force" if solution.gaps else f"{voltage} in the voltages"
+    traces = [
+        {"name": name, "signal": key, "element": name.partition(":")[2], "unit": SIGNALS[key][0],
+         "label": SIGNALS[key][1], "values": values}
+        for key in (_SHOWN if solution.gaps else _WITHOUT_GAP)
+        for name, values in list(solution.by_name(key).items())[:MOST_TRACES]
+    ]  # fmt: skip
+    return {
         "ok": solution.success, "status": solution.status.name, "message": solution.message, "t": solution.t,
-        "traces": traces, "warnings": cautions, "period": period, "t_stop": stop,
+        "traces": traces, "warnings": [*solution.warnings, *filter(None, [too_few])], "period": period, "t_stop": stop,
         "frequency": None if solution.fundamental is None else solution.fundamental.frequency,
         "charge_law": solution.charge_law, "method": solution.method, "area": solution.area_mode,
-        "error": {"u_gap": solution.error.u_gap, "f_el": solution.error.f_el, "text": _error_text(solution)},
+        "error": {"u_gap": error.u_gap, "f_el": error.f_el, "text": f"stated error {said}".replace(" u", " µ")},
         "plan": {"tier": solution.plan.tier, "text": "; ".join(solution.plan.reasons)},
         "failed_at": solution.failure.t if solution.failure is not None else None,
     }  # fmt: skip
-    if not solution.success:
-        return answer, dict
-    return answer, lambda: {
-        "figures": _figures(solution, traces), "harmonics": _harmonics(solution, period), "stacks": _stacks(solution)
-    }  # fmt: skip
-
-
-def _simulated(circuit: Circuit, request: Request, stop: float, first: float, last: float) -> Solution:
-    """A run to `stop` as the page asks for it, with outputs between two times (all in s)."""
-    times = np.linspace(first, last, points_of(circuit, first, last)[0])
-    return simulate(
-        circuit, t_stop=stop, t_eval=times, charge_law=request.charge_law, area=request.area, rtol=request.rtol,
-        charge=False, throw=False, progress=deadline(),
-    )  # fmt: skip
-
-
-def _traces(solution: Solution, key: str) -> list[dict[str, Any]]:
-    """The columns of a signal, each as one trace."""
-    unit, label = SIGNALS[key][:2]
-    return [
-        {"name": name, "signal": key, "element": name.partition(":")[2], "unit": unit, "label": label, "values": values}
-        for name, values in list(solution.by_name(key).items())[:MOST_TRACES]
-    ]
 
 
 def _stacks(solution: Solution) -> list[dict[str, Any]]:
@@ -186,22 +184,6 @@ def _stacks(solution: Solution) -> list[dict[str, Any]]:
         values = voltages[f"u_layer:{name}"]
         stack["layers"].append({"name": name, "device": e.device, "d": e.values["d"], "values": values})
     return [stack for stack in stacks.values() if stack["gap"] is not None][:MOST_TRACES]
-
-
-def _error_text(solution: Solution) -> str:
-    error = solution.error
-    voltage, force = format_si(error.u_gap, "V", 2), format_si(error.f_el, "N", 2)
-    said = f"{voltage} in the gap voltage, {force} in the force" if solution.gaps else f"{voltage} in the voltages"
-    return f"stated error {said}".replace(" u", " µ")
-
-
-def _figures(solution: Solution, traces: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mean, largest and smallest value of each trace's signal over the run, and the mean over the last period."""
-    return [
-        {key: trace[key] for key in ("name", "label", "element", "unit")}
-        | {figure: solution._figures.value(trace["name"], figure) for figure in _FIGURES}
-        for trace in traces
-    ]
 
 
 def _harmonics(solution: Solution, period: float | None) -> list[dict[str, Any]]:
@@ -225,7 +207,6 @@ def _harmonics(solution: Solution, period: float | None) -> list[dict[str, Any]]
 _LONGEST_EXPORT = 20_000_000
 #: Largest error of the means against frequency: a picture shows no more.
 _RTOL = 1e-5
-_INFINITE = 'float("inf")'
 _AS_CODE = re.compile(r"\b([A-Z][A-Za-z]*)\(")
 _DISPERSIVE = """\
 def dispersive(e):
@@ -239,12 +220,11 @@ def as_deck(given: dict[str, Any], own: Circuit | None = None) -> str:
     """The scene as one deck that fingerspice and ngspice run, with the length of the page's run and its outputs."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        request = request_of(given)
-        _, circuit, _ = circuits_of(request, own)
-        first, stop, _ = times_of(circuit, request)
-        step = (stop - first) / points_of(circuit, first, stop)[0]
+        asked = Asked(given, own)
+        circuit, (first, stop, _) = asked.circuit, asked.times
+        step = (stop - first) / asked.points(first, stop)[0]
         tran = Tran(step, stop, uic=circuit.tran is None or circuit.tran.uic)
-        text = export_netlist(dataclasses.replace(circuit, tran=tran), charge_law=request.charge_law)
+        text = export_netlist(dataclasses.replace(circuit, tran=tran), charge_law=asked.request.charge_law)
     if len(text) > _LONGEST_EXPORT:
         raise InputError(f"the deck would have {len(text):,} characters; allowed: at most {_LONGEST_EXPORT:,}")
     return text
@@ -254,21 +234,23 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     """The scene as Python that gives the page's solution."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        request = request_of(given)
-        base, circuit, _ = circuits_of(request, own)
-        circuit, _ = changed.marked(circuit, base, request)
-        first, stop, _ = times_of(circuit, request)
-    by_sets = {path.lower() for kept, _ in in_force(circuit).values() for path in kept}
-    name, waveform = sliders.read_source(request.source, base, request.recording) if request.source else ("", None)
+        asked = Asked(given, own)
+        sets, by_sets, _ = changed.in_scene(asked)
+        first, stop, _ = asked.times
+    request, circuit = asked.request, asked.circuit
+    name, waveform = "", None
+    if request.source:
+        name, waveform = sliders.read_source(request.source, asked.base, request.recording)
     lines, changes = _beginning(request.deck, own, name)
     if request.skin == "dispersive":
         lines += _DISPERSIVE.splitlines()
-    for one, to in changed.entries(circuit, request):
-        lines.append(f"circuit = fs.parameters({one!r}).apply(circuit{'' if to is None else f', {to!r}'})")
+    for one in sets:
+        to = f", {one['to']!r}" if one["to"] else ""
+        lines.append(f"circuit = fs.parameters({one['name']!r}).apply(circuit{to})")
     if waveform is not None and name.lower() not in by_sets:
-        gain = sliders.gain_of(request.source)
-        recorded = request.recording.python(gain) if request.recording is not None and gain is not None else None
-        code = recorded or _AS_CODE.sub(r"fs.\1(", repr(waveform))
+        gain, code = sliders.gain_of(request.source), _AS_CODE.sub(r"fs.\1(", repr(waveform))
+        if request.recording is not None and gain is not None:
+            code = request.recording.python(gain)
         lines.append(f"circuit = circuit.replace({{{name!r}: {code}}})")
     known = {path.lower() for path in circuit.parameters}
     changes |= {path: x for path, x in request.overrides.items() if path.lower() in known}
@@ -276,11 +258,12 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     if request.skin == "follow":
         changes |= {f"{e.name}.f": e.values["f"] for e in circuit.by_device("SKIN")}
     if changes:
-        inside = ", ".join(f"{path!r}: {_INFINITE if x == math.inf else repr(x)}" for path, x in changes.items())
+        numbers = {path: 'float("inf")' if x == math.inf else repr(x) for path, x in changes.items()}
+        inside = ", ".join(f"{path!r}: {number}" for path, number in numbers.items())
         lines.append(f"circuit = circuit.replace({{{inside}}})")
     lines += [
         "solution = fs.simulate(",
-        f"    circuit, t_stop={stop!r}, t_eval=np.linspace({first!r}, {stop!r}, {points_of(circuit, first, stop)[0]}),",
+        f"    circuit, t_stop={stop!r}, t_eval=np.linspace({first!r}, {stop!r}, {asked.points(first, stop)[0]}),",
         f"    charge_law={request.charge_law!r}, area={request.area!r}, rtol={request.rtol!r},",
         ")",
         "print(solution)",
@@ -316,30 +299,24 @@ def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     """Mean force of the periodic state under sines of the source's amplitude, at frequencies that the request names.
 
     Its key ``frequencies`` (Hz) has at most 16. The answer has ``ok`` and ``message``; ``frequency`` and ``force`` (Hz
-    and N, arrays), and ``gap`` and ``amplitude``, in words.
+    and N, arrays), and ``gap`` and ``amplitude``, in words. `InputError` and `SolveError` say why there is none.
     """
     frequencies = given.get("frequencies") if isinstance(given, dict) else None
-    try:
-        good = isinstance(frequencies, list) and 0 < len(frequencies) <= 16
-        if not good or not all(isinstance(x, (int, float)) and 1e-2 <= x <= 1e6 for x in frequencies or ()):
-            raise InputError("frequencies: allowed: a list of at most 16 numbers from 0.01 to 1e6 Hz")
-        asked = {key: value for key, value in given.items() if key != "frequencies"}
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            request = request_of(asked)
-            _, circuit, _ = circuits_of(request, own)
-            gaps = circuit.by_device("GAP")
-            if not gaps:
-                raise InputError("the circuit has no GAP, and so no force")
-            wave = waveform_of(circuit)
-            if wave.fundamental is None:
-                raise InputError("the source has no one amplitude that sines could have; allowed: a periodic source")
-            (found,) = large_signal(
-                circuit, np.asarray(frequencies, float), charge_law=request.charge_law, finger=gaps[0].name,
-                rtol=max(request.rtol, _RTOL), progress=deadline(),
-            )  # fmt: skip
-    except (InputError, SolveError) as error:
-        return {"ok": False, "message": str(error)}
+    good = isinstance(frequencies, list) and 0 < len(frequencies) <= 16
+    if not good or not all(isinstance(x, (int, float)) and 1e-2 <= x <= 1e6 for x in frequencies or ()):
+        raise InputError("frequencies: allowed: a list of at most 16 numbers from 0.01 to 1e6 Hz")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        asked = Asked({key: value for key, value in given.items() if key != "frequencies"}, own)
+        gaps, wave = asked.circuit.by_device("GAP"), asked.source
+        if not gaps:
+            raise InputError("the circuit has no GAP, and so no force")
+        if wave.fundamental is None:
+            raise InputError("the source has no one amplitude that sines could have; allowed: a periodic source")
+        (found,) = large_signal(
+            asked.circuit, np.asarray(frequencies, float), charge_law=asked.request.charge_law,
+            finger=gaps[0].name, rtol=max(asked.request.rtol, _RTOL), progress=deadline(),
+        )  # fmt: skip
     amplitude = format_si(float(np.max(found.amplitude)), "V")
     if not (isinstance(wave, Sine) and wave.offset == 0.0):
         amplitude += ", the source's fundamental,"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import hmac
 import json
 import secrets
 import socket
+import struct
 import threading
 import webbrowser
 from collections import deque
@@ -16,11 +18,15 @@ from importlib import resources
 from itertools import chain
 from typing import Any, ClassVar
 
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError, printable
 from fingerspice.base.pages import in_notebook
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.explorer import changed, scene
-from fingerspice.explorer.request import as_json, asked_by, framed
+from fingerspice.explorer.request import asked_by
+from fingerspice.results.outcome import SolveError
 from fingerspice.results.solution import Solution
 
 ADDRESS = "127.0.0.1"
@@ -42,8 +48,6 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-Answer = tuple[HTTPStatus, str, Iterator[bytes]]
-"""Status, type of content, and its parts as they are found."""
 #: Explorers that this notebook shows, the oldest first: a cell that is run again starts another one.
 _FRAMES: deque[Explorer] = deque()
 
@@ -194,7 +198,7 @@ def _whole(make: Callable[[Any, Circuit | None], dict[str, Any] | str]) -> Actio
     def parts(given: Any, own: Circuit | None) -> Iterator[dict[str, Any]]:
         try:
             found = make(given, own)
-        except InputError as error:
+        except (InputError, SolveError) as error:
             found = {"ok": False, "message": str(error)}
         yield {"ok": True, "text": found} if isinstance(found, str) else found
 
@@ -206,6 +210,43 @@ _ACTIONS: dict[str, Action] = {
     "scene": scene.parts, "set": _whole(changed.applied), "means": _whole(scene.means),
     "deck": _whole(scene.as_deck), "python": _whole(scene.as_python),
 }  # fmt: skip
+
+
+def as_json(data: Any) -> bytes:
+    """Data as JSON: arrays of numbers as base64 of little-endian doubles, and null for what is not finite."""
+    return _dumped(data, lambda x: {"f64": base64.b64encode(np.ascontiguousarray(x, "<f8").tobytes()).decode("ascii")})
+
+
+def framed(data: Any) -> bytes:
+    """Data as the JSON's length and the number of doubles (four bytes each), the JSON, and the doubles of all arrays.
+
+    All numbers are little-endian. In the JSON an array is its place among the doubles, and its size. The doubles begin
+    at a multiple of eight bytes, so that the page need not copy them.
+    """
+    arrays: list[bytes] = []
+    places: dict[int, dict[str, list[int]]] = {}
+    end = 0
+
+    def place(x: FloatArray) -> dict[str, list[int]]:
+        nonlocal end
+        if id(x) not in places:
+            arrays.append(np.ascontiguousarray(x, "<f8").tobytes())
+            places[id(x)] = {"f64": [end, x.size]}
+            end += x.size
+        return places[id(x)]
+
+    text = _dumped(data, place)
+    text += b" " * (-len(text) % 8)
+    return b"".join([struct.pack("<II", len(text), end), text, *arrays])
+
+
+def _dumped(data: Any, array: Callable[[FloatArray], Any]) -> bytes:
+    """Data as JSON, with `array` for its arrays, and null for what is not finite."""
+    text = json.dumps(data, default=array)
+    if "NaN" in text or "Infinity" in text:
+        # Seldom, and all data have to be gone through.
+        text = json.dumps(json.loads(text, parse_constant=lambda _: None))
+    return text.encode()
 
 
 class _Server(ThreadingHTTPServer):
@@ -255,84 +296,21 @@ class _Handler(BaseHTTPRequestHandler):
         """Nothing is logged: the token stands in every line."""
 
     def do_GET(self) -> None:
-        self._answered(self._got)
+        self._answer(self._file)
 
     def do_POST(self) -> None:
         self._read = False
-        self._answered(self._run)
+        self._answer(self._run)
 
-    def _answered(self, make: Callable[[str], Answer]) -> None:
+    def _answer(self, make: Callable[[str], tuple[str, Iterator[bytes]]]) -> None:
+        """Send the kind and the parts of what is asked for, each part as soon as it is made."""
+        status = HTTPStatus.OK
         try:
-            answer = make(self._allowed())
+            kind, parts = make(self._allowed())
         except _Refused as error:
             self._discard()
             status, text = error.args
-            answer = status, "application/json", iter([as_json({"ok": False, "message": text})])
-        self._send(*answer)
-
-    def _run(self, what: str) -> Answer:
-        if what not in _ACTIONS:
-            raise _Refused(HTTPStatus.NOT_FOUND, f"nothing of that name; allowed: {', '.join(_ACTIONS)}")
-        return HTTPStatus.OK, "application/octet-stream", self._parts(what, self._body())
-
-    def _parts(self, what: str, given: Any) -> Iterator[bytes]:
-        """The parts of an answer, the last of which says what went wrong if this program did."""
-        try:
-            yield from self.explorer.answers(what, given)
-        except Exception as error:
-            text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
-            yield framed({"ok": False, "status": "FAULT", "message": text})
-
-    def _allowed(self) -> str:
-        """What is asked for, of a request that may ask."""
-        hosts = (f"{ADDRESS}:{self.explorer.port}", f"localhost:{self.explorer.port}")
-        if self.headers.get("Host") not in hosts:
-            raise _Refused(HTTPStatus.FORBIDDEN, f"the host is not {hosts[0]}")
-        origin = self.headers.get("Origin")
-        if origin is not None and origin not in [f"http://{host}" for host in hosts]:
-            raise _Refused(HTTPStatus.FORBIDDEN, "another page may not ask")
-        token, _, what = self.path.lstrip("/").partition("?")[0].partition("/")
-        # A notebook's page is another site; it may load this one into a frame, and nothing else.
-        frame = self.command == "GET" and what == "" and self.headers.get("Sec-Fetch-Dest") == "iframe"
-        own = self.headers.get("Sec-Fetch-Site", "same-origin") in ("same-origin", "none")
-        if not own and not (frame and self.explorer.framed):
-            raise _Refused(HTTPStatus.FORBIDDEN, "another page may not ask")
-        if not hmac.compare_digest(token.encode(), self.explorer.token.encode()):
-            raise _Refused(HTTPStatus.FORBIDDEN, "the link's token is missing or wrong; open the link that was printed")
-        return what
-
-    def _got(self, what: str) -> Answer:
-        if what == "start":
-            start = as_json(scene.beginning(self.explorer.circuit, self.explorer.asked))
-            return HTTPStatus.OK, "application/json", iter([start])
-        name = what or "index.html"
-        if name not in self.explorer.files:
-            raise _Refused(HTTPStatus.NOT_FOUND, "there is no such file")
-        return HTTPStatus.OK, _TYPES[name.rpartition(".")[2]], iter([self.explorer.files[name]])
-
-    def _body(self) -> Any:
-        length = self.headers.get("Content-Length", "")
-        if not (length.isascii() and length.isdigit()) or "Transfer-Encoding" in self.headers:
-            raise _Refused(HTTPStatus.LENGTH_REQUIRED, "the request has no length")
-        if len(length) > 12 or int(length) > MOST_BYTES:
-            text = f"the request has {length[:12]} bytes; allowed: at most {MOST_BYTES:,}"
-            raise _Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, text)
-        try:
-            self._read = True
-            return json.loads(self.rfile.read(int(length)))
-        except (ValueError, RecursionError):
-            raise _Refused(HTTPStatus.BAD_REQUEST, "the request is not JSON") from None
-
-    def _discard(self) -> None:
-        """Read what was sent with a refused request, up to a limit, so that the browser takes the answer."""
-        self.close_connection = True
-        length = self.headers.get("Content-Length", "")
-        left = min(int(length), 4 * MOST_BYTES) if length.isascii() and length.isdigit() and len(length) < 12 else 0
-        while left > 0 and not self._read:
-            piece = self.rfile.read(min(left, 65_536))
-            left = left - len(piece) if piece else 0
-
-    def _send(self, status: HTTPStatus, kind: str, parts: Iterator[bytes]) -> None:
+            kind, parts = "application/json", iter([as_json({"ok": False, "message": text})])
         part = next(parts)
         self.send_response(status)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
@@ -346,3 +324,61 @@ class _Handler(BaseHTTPRequestHandler):
         for more in chain([part], parts):
             self.wfile.write(b"%x\r\n%b\r\n" % (len(more), more))
         self.wfile.write(b"0\r\n\r\n")
+
+    def _allowed(self) -> str:
+        """What is asked for, of a request that may ask."""
+        hosts = (f"{ADDRESS}:{self.explorer.port}", f"localhost:{self.explorer.port}")
+        if self.headers.get("Host") not in hosts:
+            raise _Refused(HTTPStatus.FORBIDDEN, f"the host is not {hosts[0]}")
+        token, _, what = self.path.lstrip("/").partition("?")[0].partition("/")
+        # A notebook's page is another site; it may load this one into a frame, and nothing else.
+        frame = self.command == "GET" and what == "" and self.headers.get("Sec-Fetch-Dest") == "iframe"
+        own = self.headers.get("Sec-Fetch-Site", "same-origin") in ("same-origin", "none")
+        mine = self.headers.get("Origin") in (None, *(f"http://{host}" for host in hosts))
+        if not mine or not (own or (frame and self.explorer.framed)):
+            raise _Refused(HTTPStatus.FORBIDDEN, "another page may not ask")
+        if not hmac.compare_digest(token.encode(), self.explorer.token.encode()):
+            raise _Refused(HTTPStatus.FORBIDDEN, "the link's token is missing or wrong; open the link that was printed")
+        return what
+
+    def _file(self, what: str) -> tuple[str, Iterator[bytes]]:
+        if what == "start":
+            start = as_json(scene.beginning(self.explorer.circuit, self.explorer.asked))
+            return "application/json", iter([start])
+        name = what or "index.html"
+        if name not in self.explorer.files:
+            raise _Refused(HTTPStatus.NOT_FOUND, "there is no such file")
+        return _TYPES[name.rpartition(".")[2]], iter([self.explorer.files[name]])
+
+    def _run(self, what: str) -> tuple[str, Iterator[bytes]]:
+        if what not in _ACTIONS:
+            raise _Refused(HTTPStatus.NOT_FOUND, f"nothing of that name; allowed: {', '.join(_ACTIONS)}")
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdigit()) or "Transfer-Encoding" in self.headers:
+            raise _Refused(HTTPStatus.LENGTH_REQUIRED, "the request has no length")
+        if len(length) > 12 or int(length) > MOST_BYTES:
+            text = f"the request has {length[:12]} bytes; allowed: at most {MOST_BYTES:,}"
+            raise _Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, text)
+        try:
+            self._read = True
+            given = json.loads(self.rfile.read(int(length)))
+        except (ValueError, RecursionError):
+            raise _Refused(HTTPStatus.BAD_REQUEST, "the request is not JSON") from None
+        return "application/octet-stream", self._parts(what, given)
+
+    def _parts(self, what: str, given: Any) -> Iterator[bytes]:
+        """The parts of an answer, the last of which says what went wrong if this program did."""
+        try:
+            yield from self.explorer.answers(what, given)
+        except Exception as error:
+            text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
+            yield framed({"ok": False, "status": "FAULT", "message": text})
+
+    def _discard(self) -> None:
+        """Read what was sent with a refused request, up to a limit, so that the browser takes the answer."""
+        self.close_connection = True
+        length = self.headers.get("Content-Length", "")
+        left = min(int(length), 4 * MOST_BYTES) if length.isascii() and length.isdigit() and len(length) < 12 else 0
+        while left > 0 and not self._read:
+            piece = self.rfile.read(min(left, 65_536))
+            left = left - len(piece) if piece else 0

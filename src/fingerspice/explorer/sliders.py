@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import parse_number, spice_text
@@ -46,54 +46,41 @@ def sliders(base: Circuit, shown: Circuit) -> list[dict[str, Any]]:
     """
     driving = {e.name for e in driving_sources(shown)}
     before = {e.name: e for e in base.elements}
-    groups = [_group(before[e.name], e, e.name in driving) for e in shown.elements]
     order = {"V": 0, "I": 0, "GAP": 1, "LAYER": 2, "SLAB": 2, "SKIN": 3, "SKIN_DISPERSIVE": 3}
-    groups.sort(key=lambda group: order.get(group["device"], 4))
+    groups = [
+        {"element": e.name, "device": e.device, "what": e.spec.what or e.device,
+         "sliders": list(_sliders(before[e.name], e, e.name in driving))}
+        for e in sorted(shown.elements, key=lambda e: order.get(e.device, 4))
+    ]  # fmt: skip
     return [group for group in groups if group["sliders"]]
 
 
-def _group(base: Element, e: Element, drives: bool) -> dict[str, Any]:
-    """The sliders of one element; `base` is the element in the deck."""
-    found = []
+def _sliders(base: Element, e: Element, drives: bool) -> Iterator[dict[str, Any]]:
+    """The sliders of one element; `base` is the element in the deck, and a source that does not drive gives an area."""
+    rows: list[tuple[str, str, float, bool, str, tuple[float, float, bool]]] = []
     for spec in e.spec.parameters:
-        value, own = e.values[spec.name], base.values.get(spec.name, e.values[spec.name])
-        limits = _of_parameter(spec, own)
-        found.append(_slider(f"{e.name}.{spec.name}", spec.unit, value, spec.first, limits, spec.meaning))
-    if e.waveform is not None:
-        same = type(base.waveform) is type(e.waveform)
-        for name, unit in type(e.waveform).units.items():
-            now = getattr(e.waveform, name, None)
-            if not isinstance(now, (int, float)):
-                continue
-            own = getattr(base.waveform, name) if same else now
+        limits = _of_parameter(spec, base.values.get(spec.name, e.values[spec.name]))
+        rows.append((spec.name, spec.unit, e.values[spec.name], spec.first, spec.meaning, limits))
+    same = type(base.waveform) is type(e.waveform)
+    for name, unit in type(e.waveform).units.items() if e.waveform is not None else ():
+        value = getattr(e.waveform, name, None)
+        if isinstance(value, (int, float)):
+            own = getattr(base.waveform, name) if same else value
             limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
-            first = name in _FIRST_OF_SOURCES
-            meaning = MEANINGS_OF_WAVEFORMS.get(name, "")
-            found.append(_slider(f"{e.name}.{name}", _unit(e, unit, drives), now, first, limits, meaning))
-    return {"element": e.name, "device": e.device, "what": e.spec.what or e.device, "sliders": found}
-
-
-def _unit(e: Element, unit: str, drives: bool) -> str:
-    """The unit of a source's value: a source on an area node gives mm^2."""
-    if unit != "V":
-        return unit
-    return ("A" if e.device == "I" else "V") if drives else "mm^2"
+            # A source on an area node gives mm^2.
+            unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
+            rows.append((name, unit, value, name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, ""), limits))
+    for name, unit, value, first, meaning, (low, high, log) in rows:
+        yield {
+            "path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
+            "text": value_text(value, unit), "low": low, "high": high, "log": log, "first": first, "meaning": meaning,
+        }  # fmt: skip
 
 
 def value_text(value: float, unit: str) -> str:
     """A value for a field of the page: in SPICE's notation if its unit takes a prefix and that is the same double."""
     text = spice_text(value) if unit in _PREFIXED and math.isfinite(value) else f"{value:.12g}"
     return text if not math.isfinite(value) or parse_number(text) == value else repr(float(value))
-
-
-def _slider(
-    path: str, unit: str, value: float, first: bool, limits: tuple[float, float, bool], meaning: str
-) -> dict[str, Any]:
-    low, high, log = limits
-    return {
-        "path": path, "unit": unit, "value": value if math.isfinite(value) else None, "text": value_text(value, unit),
-        "low": low, "high": high, "log": log, "first": first, "meaning": meaning,
-    }  # fmt: skip
 
 
 def _of_parameter(spec: ParameterSpec, value: float) -> tuple[float, float, bool]:
@@ -134,8 +121,7 @@ _CALL = re.compile(r"\s*([A-Za-z]+)\s*\(([^()]*)\)\s*")
 _NAMED = re.compile(r"\s*([\w.]+)\s*=\s*(.*)", re.DOTALL)
 
 
-@dataclass(frozen=True)
-class Argument:
+class Argument(NamedTuple):
     """One number of a waveform, with its slider's range; an optional one may be left out, and then has its `value`."""
 
     name: str
@@ -157,45 +143,31 @@ def _volt(name: str = "amplitude", value: float = 200.0) -> Argument:
 
 #: The source that stands for the file dropped on the page.
 RECORDING = "RECORDING"
-_AMPLITUDE, _FREQUENCY, _FAST = _volt(), _hz("frequency", 100.0), _hz("frequency", 5e3)
+_AMPLITUDE, _FREQUENCY = _volt(), _hz("frequency", 100.0)
 #: By function: its name on the page, and its numbers in their order.
 WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
     "SIN": ("Sine", (_volt("offset", 0.0), _AMPLITUDE, _FREQUENCY)),
     "SQUARE": ("Square wave", (_AMPLITUDE, _FREQUENCY, Argument("duty", "", 0.5, 0.01, 0.99, optional=True))),
     "TRIANGLE": ("Triangle", (_AMPLITUDE, _FREQUENCY)),
     "SAWTOOTH": ("Sawtooth", (_AMPLITUDE, _FREQUENCY)),
-    "AM": (
-        "Carrier with envelope",
-        (
-            *(_AMPLITUDE, _hz("carrier", 5e3), _hz("envelope", 50.0)),
-            Argument("depth", "", 1.0, 0.0, 1.0, optional=True),
-        ),
-    ),
-    "BURST": (
-        "Bursts",
-        (
-            *(_AMPLITUDE, _FAST, Argument("cycles", "", 10.0, 1.0, 100.0)),
-            Argument("every", "s", 10e-3, 1e-3, 1.0, True),
-        ),
-    ),
-    "CHIRP": (
-        "Chirp",
-        (
-            *(_volt(value=150.0), _hz("from", 20.0), _hz("to", 1e3)),
-            Argument("duration", "s", 0.05, 1e-2, 3.0, True),
-        ),
-    ),
-    "EXP": (
-        "Step that rises and falls",
-        (
-            *(_volt("low", 0.0), _volt("high", 200.0), Argument("start", "s", 1e-3, 0.0, 0.05)),
-            Argument("rise", "s", 1e-3, 1e-5, 0.1, True),
-            *(Argument("end", "s", 20e-3, 0.0, 0.1), Argument("fall", "s", 2e-3, 1e-5, 0.1, True)),
-        ),
-    ),
+    "AM": ("Carrier with envelope", (
+        *(_AMPLITUDE, _hz("carrier", 5e3), _hz("envelope", 50.0)), Argument("depth", "", 1.0, 0.0, 1.0, optional=True)
+    )),
+    "BURST": ("Bursts", (
+        *(_AMPLITUDE, _hz("frequency", 5e3), Argument("cycles", "", 10.0, 1.0, 100.0)),
+        Argument("every", "s", 10e-3, 1e-3, 1.0, True),
+    )),
+    "CHIRP": ("Chirp", (
+        _volt(value=150.0), _hz("from", 20.0), _hz("to", 1e3), Argument("duration", "s", 0.05, 1e-2, 3.0, True)
+    )),
+    "EXP": ("Step that rises and falls", (
+        *(_volt("low", 0.0), _volt("high", 200.0), Argument("start", "s", 1e-3, 0.0, 0.05)),
+        *(Argument("rise", "s", 1e-3, 1e-5, 0.1, True), Argument("end", "s", 20e-3, 0.0, 0.1)),
+        Argument("fall", "s", 2e-3, 1e-5, 0.1, True),
+    )),
     RECORDING: ("Recording or table, dropped here", (Argument("gain", "V", 150.0, 0.0, 400.0),)),
     "DC": ("Constant", (_volt("level", 200.0),)),
-}
+}  # fmt: skip
 #: Waveforms that the page can say as text; their numbers are those of the menu, one of them by another name.
 _TEXTS = {Sine: "SIN", Square: "SQUARE", Triangle: "TRIANGLE", Sawtooth: "SAWTOOTH", AM: "AM", DC: "DC"}
 _FIELDS = {"envelope": "modulation"}
@@ -204,7 +176,7 @@ _FIELDS = {"envelope": "modulation"}
 def menu() -> list[dict[str, Any]]:
     """The menu as plain data."""
     return [
-        {"kind": kind, "title": title, "arguments": [vars(a) for a in arguments]}
+        {"kind": kind, "title": title, "arguments": [a._asdict() for a in arguments]}
         for kind, (title, arguments) in WAVEFORMS.items()
     ]
 

@@ -11,27 +11,21 @@ import { Parts, quantity, unbaked } from "./units.js";
 const $ = (id) => document.getElementById(id);
 let examples = [];
 let state = null;
+/** Sentences about names in the link that mean nothing. */
 let unknownInLink = [];
-let inFlight = false;
-let again = false;
-let now = null;
-let good = null;
-let pinned = null;
-let traces = null;
-let harmonics = null;
-let means = null;
-let stack = null;
-let sliders = null;
-let waveforms = null;
-let sets = null;
+/** Whether a request is in flight, and whether another one waits for it. */
+let [inFlight, again] = [false, false];
+/** Answers: the last one, the last one of a run that did not fail, and the one that is pinned. */
+let [now, good, pinned] = [null, null, null];
+/** Parts of the page, made at the start. */
+let traces, harmonics, means, stack, sliders, waveforms, sets;
 let sweep = { key: "", points: [], message: "", level: 0, left: [] };
-let idle = 0;
-/** Timer of the sentence about an answer that takes long. */
-let slow = 0;
+/** Timers: of the means against frequency, of the sentence about an answer that takes long, of the address. */
+let [idle, slow, address] = [0, 0, 0];
 /** Counts the scenes chosen: an answer that comes after another choice belongs to none. */
 let shown = 0;
 let recording = null;
-let address = 0;
+/** The address as it was last written. */
 let written = "";
 
 /** What a page without a server holds; null of a page with one. */
@@ -47,11 +41,6 @@ async function ask(what, body) {
   const response = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
   if (response.ok) return new Parts(response);
   throw new Error((await response.json()).message);
-}
-
-/** Ask for something that comes in one part. */
-async function askOnce(what, body) {
-  return (await ask(what, body)).next();
 }
 
 /** The request of now, with the recording where the source is one. */
@@ -115,12 +104,16 @@ function say(text, failed = false) {
 function show(answer) {
   now = answer;
   if (answer.ok) good = answer;
-  const usable = answer.t.length > 1;
-  if (answer.ok) traces.show(answer, null, pinned);
-  else if (good) traces.show(answer, good, pinned);
-  else if (usable) traces.show(answer, null, pinned);
+  if (answer.ok || good || answer.t.length > 1) traces.show(answer, answer.ok ? null : good, pinned);
   else traces.clear();
-  if (!answer.ok && !good) clear();
+  if (!answer.ok && !good) {
+    // What is left on the page belongs to another scene.
+    harmonics.show([]);
+    stack.show({});
+    means.clear();
+    $("figures").replaceChildren();
+    $("facts").textContent = "";
+  }
   document.body.classList.toggle("before", !answer.ok && Boolean(good));
   const values = (of) => JSON.stringify([of.set, of.options.source]);
   const changed = values(state) !== values(reset(state, examples));
@@ -132,15 +125,6 @@ function show(answer) {
   document.body.dataset.answers = Number(document.body.dataset.answers || 0) + 1;
 }
 
-/** Take away what belongs to another scene. */
-function clear() {
-  harmonics.show([]);
-  stack.show({});
-  means.clear();
-  $("figures").replaceChildren();
-  $("facts").textContent = "";
-}
-
 function warn(answer) {
   const said = [...unknownInLink, ...(answer.unknown || []), ...(answer.warnings || [])];
   $("warnings").replaceChildren(...said.map((textContent) => make("li", { textContent })));
@@ -148,7 +132,11 @@ function warn(answer) {
 
 /** Show what comes after the traces: harmonics, the stack, figures and facts. */
 function showFigures(answer) {
-  if (baked) still();
+  if (baked) {
+    // A page without a server shows the values, and cannot move them.
+    const controls = "#controls input, #controls select, #controls textarea, #run, #deck, #python, #reset";
+    for (const control of document.querySelectorAll(controls)) control.disabled = true;
+  }
   if (answer.ok && answer.figures) {
     warn(answer);
     harmonics.show(answer.harmonics);
@@ -174,13 +162,6 @@ function replacedSource(answer) {
   const sources = answer.sliders.filter((g) => g.device === "V" || g.device === "I");
   const found = named && sources.find((g) => g.element.toLowerCase() === named[1].toLowerCase());
   return found ? found.element : sources.length ? sources[0].element : null;
-}
-
-/** A page without a server shows the values, and cannot move them. */
-function still() {
-  for (const control of document.querySelectorAll("#controls input, #controls select, #controls textarea, #run, #deck, #python, #reset")) {
-    control.disabled = true;
-  }
 }
 
 function table() {
@@ -211,7 +192,6 @@ function table() {
 /** Mean force against frequency: a few points at first, then those between them. */
 async function sweepMore() {
   if (baked || inFlight || !now || !now.ok || !now.figures || !now.figures.some((f) => f.name.startsWith("f_el"))) return;
-  const asked = asking();
   const key = JSON.stringify(request(state, examples));
   if (sweep.key !== key) sweep = { key, points: [], message: "", level: 0, left: [] };
   if (sweep.message || (!sweep.left.length && sweep.level > 3)) {
@@ -228,7 +208,7 @@ async function sweepMore() {
   const mine = sweep;
   inFlight = true;
   try {
-    const found = await askOnce("means", { ...asked, frequencies });
+    const found = await (await ask("means", { ...asking(), frequencies })).next();
     if (found.ok) {
       mine.points.push(...Array.from(found.frequency, (f, i) => [f, found.force[i]]));
       mine.points.sort((a, b) => a[0] - b[0]);
@@ -260,9 +240,8 @@ function drawMeans() {
 
 function controls() {
   const option = (key) => state.options[key] || "";
-  for (const id of ["charge_law", "area", "skin", "last", "rtol"]) {
-    const select = $(id);
-    const value = option(id);
+  for (const select of ["charge_law", "area", "skin", "last", "rtol"].map($)) {
+    const value = option(select.id);
     if (![...select.options].some((o) => o.value === value)) select.append(new Option(value, value));
     select.value = value;
   }
@@ -276,9 +255,8 @@ function controls() {
 
 function keepAddress() {
   const hash = toHash(state, examples);
-  if (hash === written) return;
+  if (hash !== written) history.replaceState(null, "", hash);
   written = hash;
-  history.replaceState(null, "", hash);
 }
 
 function set(key, value) {
@@ -301,7 +279,7 @@ function setSource(text) {
 /** Apply a named set of parameters, `entry`: its values become those of the page. */
 async function apply(entry) {
   const of = shown;
-  const answer = await askOnce("set", { ...asking(), apply: entry });
+  const answer = await (await ask("set", { ...asking(), apply: entry })).next();
   if (of !== shown) return;
   if (!answer.ok) {
     say(answer.message, true);
@@ -315,19 +293,14 @@ async function apply(entry) {
 }
 
 function open(hash) {
-  [state, unknownInLink] = fromHash(hash, examples);
   written = "";
-  another();
-}
-
-function choose(next) {
-  state = next;
-  unknownInLink = [];
-  another();
+  choose(...fromHash(hash, examples));
 }
 
 /** Ask for another scene. */
-function another() {
+function choose(next, unknown = []) {
+  state = next;
+  unknownInLink = unknown;
   good = null;
   shown += 1;
   means.clear();
@@ -364,7 +337,7 @@ function share() {
 }
 
 async function text(what, use) {
-  const answer = await askOnce(what, asking());
+  const answer = await (await ask(what, asking())).next();
   if (answer.ok) use(answer.text);
   else say(answer.message, true);
 }

@@ -39,10 +39,7 @@ export function slider(s, name, changed, wrong) {
   const row = make("div", { className: "slider" });
   const id = `slider${(count += 1)}`;
   const label = make("label", { htmlFor: id, title: s.meaning ? `${name}: ${s.meaning}` : name }, row);
-  if (s.meaning) {
-    label.append(`${s.meaning} `);
-    make("code", { textContent: s.name }, label);
-  } else label.textContent = s.name;
+  label.append(...(s.meaning ? [`${s.meaning} `, make("code", { textContent: s.name })] : [s.name]));
   const range = make("input", { type: "range", id, min: 0, max: STEPS, step: 1 }, row);
   const field = make("input", { type: "text", autocomplete: "off", spellcheck: false }, row);
   field.setAttribute("aria-label", `${name}, typed`);
@@ -79,11 +76,7 @@ export function slider(s, name, changed, wrong) {
 /** The sliders of all elements, made anew where their names or ranges have changed. */
 export class Sliders {
   constructor(parent, changed, wrong) {
-    this.parent = parent;
-    this.changed = changed;
-    this.wrong = wrong;
-    this.key = "";
-    this.byPath = new Map();
+    Object.assign(this, { parent, changed, wrong, key: "", byPath: new Map() });
   }
 
   /** Show the groups of a scene but that of the source whose waveform is chosen on the page. */
@@ -126,16 +119,10 @@ export class Sliders {
 /** The menu of waveforms with the sliders of the one chosen, which are the numbers in the source's text. */
 export class Waveforms {
   constructor(menu, changed, wrong) {
-    this.menu = menu;
-    this.changed = changed;
-    this.wrong = wrong;
-    this.kind = document.getElementById("kind");
-    this.field = document.getElementById("source");
-    this.box = document.getElementById("arguments");
-    this.shown = null;
-    make("option", { value: "", textContent: "the deck's own" }, this.kind);
-    for (const w of menu) make("option", { value: w.kind, textContent: w.title }, this.kind);
-    make("option", { value: "?", textContent: "as the text says" }, this.kind);
+    const [kind, field, box] = ["kind", "source", "arguments"].map((id) => document.getElementById(id));
+    Object.assign(this, { menu, changed, wrong, kind, field, box, shown: null });
+    const options = menu.map((w) => new Option(w.title, w.kind));
+    kind.append(new Option("the deck's own", ""), ...options, new Option("as the text says", "?"));
     this.kind.addEventListener("change", () => this.choose(this.kind.value));
     this.field.addEventListener("change", () => {
       this.field.dataset.text = this.field.value.trim();

@@ -39,10 +39,7 @@ const name = (trace) => (trace.element ? `${trace.label} ${trace.element}` : tra
 /** The panels of traces: the run of now, the last good one in grey where that failed, and the pinned one dashed. */
 export class Traces {
   constructor(parent) {
-    this.parent = parent;
-    this.plots = [];
-    this.key = "";
-    this.failedAt = null;
+    Object.assign(this, { parent, plots: [], key: "", failedAt: null });
     new ResizeObserver(() => this.resize()).observe(parent);
   }
 
@@ -115,12 +112,8 @@ export class Traces {
     // A run that failed before what is shown has its line at the left edge.
     const x = Math.min(Math.max(at, left), left + width);
     u.ctx.save();
-    u.ctx.strokeStyle = "#a11212";
-    u.ctx.lineWidth = 2;
-    u.ctx.beginPath();
-    u.ctx.moveTo(x, top);
-    u.ctx.lineTo(x, top + height);
-    u.ctx.stroke();
+    u.ctx.fillStyle = "#a11212";
+    u.ctx.fillRect(x - 1, top, 2, height);
     u.ctx.restore();
   }
 
@@ -169,10 +162,11 @@ export class Traces {
 
 /** A small plot against frequency with a title, in a panel of its own. */
 class Small {
-  constructor(parent, title) {
+  title = "";
+  plot = null;
+
+  constructor(parent) {
     this.parent = parent;
-    this.title = title;
-    this.plot = null;
     new ResizeObserver(() => this.plot && this.plot.width !== this.width() && this.plot.setSize({ width: this.width(), height: 190 })).observe(parent);
   }
 
@@ -207,9 +201,7 @@ class Small {
 
 /** Amplitudes of the friction force at the harmonics of the source. */
 export class Harmonics extends Small {
-  constructor(parent) {
-    super(parent, "harmonics of the friction force");
-  }
+  title = "harmonics of the friction force";
 
   show(harmonics) {
     if (!harmonics || !harmonics.length) {
@@ -231,10 +223,6 @@ export class Harmonics extends Small {
 
 /** Mean force against frequency, with a dot at the run of now. */
 export class Means extends Small {
-  constructor(parent) {
-    super(parent, "");
-  }
-
   /** `points` are pairs of frequency (Hz) and force (N), ascending; `here` is one such pair or null. */
   show(points, here, text, amplitude, finger) {
     const title = `mean force${finger ? ` at ${finger}` : ""} of a sine${amplitude ? ` of ${amplitude}` : ""} against its frequency`;

@@ -9,9 +9,7 @@ const GIVEN = ["GAP", "LAYER", "SKIN", "SKIN_DISPERSIVE", "V"];
 export class Sets {
   /** `apply(entry)` applies a set: NAME, or ELEMENT=NAME. */
   constructor(menu, apply) {
-    this.menu = document.getElementById("apply");
-    this.to = document.getElementById("to");
-    this.list = document.getElementById("sets");
+    [this.menu, this.to, this.list] = ["apply", "to", "sets"].map((id) => document.getElementById(id));
     this.key = "";
     this.menu.append(new Option("choose a set", ""));
     for (const [kind, label] of Object.entries(KINDS)) {

@@ -19,18 +19,12 @@ function colour(share) {
   return `rgb(${[r, g, b].map((c) => Math.round(255 - s * (255 - c))).join(",")})`;
 }
 
-function largestOf(values) {
-  return values.reduce((most, u) => Math.max(most, Math.abs(u)), 0);
-}
+const largestOf = (values) => values.reduce((most, u) => Math.max(most, Math.abs(u)), 0);
 
 /** Layers as bars: height by thickness (logarithmic), colour by voltage, width by the ridge contact area. */
 export class Stack {
   constructor(parent, point) {
-    this.parent = parent;
-    this.point = point;
-    this.stacks = [];
-    this.playing = false;
-    this.canvas = make("canvas");
+    Object.assign(this, { parent, point, stacks: [], playing: false, canvas: make("canvas") });
     this.canvas.setAttribute("role", "img");
     this.button = make("button", { type: "button", textContent: "Play in slow motion" });
     this.button.addEventListener("click", () => this.play(!this.playing));
@@ -53,7 +47,7 @@ export class Stack {
     if (!this.canvas.isConnected) this.parent.replaceChildren(this.title, this.canvas, this.note, this.button);
     const layers = this.stacks.flatMap((s) => s.layers);
     this.largest = Math.max(1e-12, ...layers.map((layer) => largestOf(layer.values)));
-    this.widest = Math.max(...this.stacks.map((s) => s.area.reduce((most, a) => Math.max(most, a), 0)));
+    this.widest = Math.max(...this.stacks.map((s) => largestOf(s.area)));
     this.canvas.setAttribute("aria-label", `The finger above, the screen below; layers: ${layers.map((l) => `${l.name}, ${quantity(l.d, "m")}`).join("; ")}`);
     if (this.playing) return;
     // At rest the drawing shows the moment at which the first gap has most voltage.
