@@ -18,9 +18,10 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
+from fingerspice.solve.planning import make_plan
 from fingerspice.solve.problem import Problem, check_length, check_outputs
 from fingerspice.solve.recordings.run import BySamples, ByWindows, Mark, Outputs, outputs_of, within
-from fingerspice.solve.simulation import asked, check_arguments, planned, solution_of
+from fingerspice.solve.simulation import asked, check_arguments, solution_of
 from fingerspice.waveforms.waveform import require
 
 # Default length of a chunk, s.
@@ -206,5 +207,4 @@ def stream(
         count = max(1, round((CHUNK if chunk is None else chunk) / spacing))
     count = min(count, outputs.total)
     check_outputs(circuit, count)
-    plan = planned(problem, rtol, method, tier, start if isinstance(start, str) else "given")
-    return Stream(problem, plan, outputs, count, rtol, method)
+    return Stream(problem, make_plan(problem, rtol, tier, method), outputs, count, rtol, method)
