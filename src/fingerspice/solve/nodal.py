@@ -59,6 +59,8 @@ FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
 # Limit of accepted and rejected steps: at the start, and over the whole run. A run that needs more has a cause that
 # smaller steps do not remove.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
+# Least area that the scale of the charge counts with, over that at 0 V: with less, rounding may ask for minutes.
+LEAST_SHARE = 1e-3
 
 
 @cache
@@ -75,10 +77,6 @@ def radau_scheme(stages: int) -> Scheme:
         np.ascontiguousarray(back[upper].astype(complex)),
         np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
     )  # fmt: skip
-
-
-# Least area that the scale of the charge counts with, over that at 0 V: with less, rounding may ask for minutes.
-LEAST_SHARE = 1e-3
 
 
 class Collocation(NetworkIntegration):
@@ -113,20 +111,13 @@ class Collocation(NetworkIntegration):
         return float(self.control[implicit.BASE] + self.control[implicit.T])
 
     @property
-    def steps(self) -> int:
-        """Number of accepted and rejected steps."""
-        return int(self.counters[implicit.ACCEPTED] + self.counters[implicit.REJECTED])
-
-    @property
     def done(self) -> float:
         """Fraction of the run that is done."""
         return (self.t - self.problem.t_start) / (self.problem.t_stop - self.problem.t_start)
 
     def nodal(self, sources: Sources) -> Nodal:
         """The network with these sources, as the compiled steps take it."""
-        return Nodal(
-            self.net, self.room, self.scheme, self.work, sources, False, self.sign, self.scale, self.tol
-        )  # fmt: skip
+        return Nodal(self.net, self.room, self.scheme, self.work, sources, False, self.sign, self.scale, self.tol)
 
     def through(self, sources: Sources, t_end: float) -> Status:
         while True:
@@ -138,7 +129,8 @@ class Collocation(NetworkIntegration):
             if code == implicit.DONE:
                 return Status.SUCCESS
             if code == implicit.PAUSED:
-                if self.steps > FIRST_STEPS + self.done * MOST_STEPS:
+                steps = int(self.counters[implicit.ACCEPTED] + self.counters[implicit.REJECTED])
+                if steps > FIRST_STEPS + self.done * MOST_STEPS:
                     return Status.TOO_MANY_STEPS
                 if self.progress is not None:
                     self.progress(self.done)
@@ -164,16 +156,20 @@ def pass_through(
     problem: Problem, sources: Sources, tol: float, u_scale: float
 ) -> tuple[Status, Collocation, FloatArray]:
     """Integrate a problem without outputs: its status, the run, and its final error, estimated by a coarser run."""
-    longest, none = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step), np.zeros(0)
-    ends = []
-    for stages, share in ((STAGES_BESIDE, BESIDE), (STAGES, 1.0)):
-        scheme = radau_scheme(stages)._replace(h_max=longest)
+    none, ends = np.zeros(0), []
+    for scheme, share in zip(_schemes(problem), (BESIDE, 1.0), strict=True):
         one = Collocation(problem, scheme, max(share * tol, FINEST), u_scale, none, none.astype(bool))
         status = one.through(sources, problem.t_stop)
         ends.append(one.y)
         if status is not Status.SUCCESS:
             break
     return status, one, ends[-1] - ends[0]
+
+
+def _schemes(problem: Problem) -> tuple[Scheme, Scheme]:
+    """The coarser run's method and the run's."""
+    longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
+    return radau_scheme(STAGES_BESIDE)._replace(h_max=longest), radau_scheme(STAGES)._replace(h_max=longest)
 
 
 def _integrate(
@@ -201,15 +197,13 @@ def solve_coupled(
     method took over from another; a run that takes long is announced with it, and with its expected time.
     """
     progress = _announced(progress, f"{reason}: " if reason else "")
-    longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
-    fine, coarse = (radau_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
+    coarse, fine = _schemes(problem)
     at, side, probed = _with_probes(problem, t_out, left)
     u_scale = problem.largest
     if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
         u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
     finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
-    tol, nfev = max(LOCAL_SHARE * rtol, finest), 0
-    folded = math.inf
+    tol, nfev, folded = max(LOCAL_SHARE * rtol, finest), 0, math.inf
     nearest: tuple[float, Run] | None = None
     for attempt in range(ATTEMPTS):
         taken = tol

@@ -67,8 +67,7 @@ class Stream:
         wanted = min(self.count, self.outputs.total - self.done)
         while sum(t.size for t, _ in self._ready) < wanted and not self._source.over:
             self._advance()
-        given = self._take(wanted)
-        solution = self._solution(*given)
+        solution = self._solution(*self._take(wanted))
         if solution.failure is not None:
             self.done = self.outputs.total
             raise SolveError(solution.failure, solution)

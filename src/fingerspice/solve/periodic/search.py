@@ -21,9 +21,8 @@ from fingerspice.engine.collocation import readout
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import SolveError, State, Status
 from fingerspice.solve.many_areas import March
-from fingerspice.solve.marching import GUESS
+from fingerspice.solve.marching import GUESS, stepping
 from fingerspice.solve.nodal import pass_through
-from fingerspice.solve.one_area import Track, prepare_system
 from fingerspice.solve.periodic.period import Period, Stopped
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import period_failure
@@ -148,8 +147,7 @@ class Search:
         initial = dataclasses.replace(period.problem.initial, y=y)
         problem = dataclasses.replace(period.problem, initial=initial)
         self.passes += 1
-        march = self._marched if problem.scene.stack is None else self._tracked
-        made = None if self.implicit else march(problem, tol)
+        made = None if self.implicit else self._stepped(problem, tol)
         if made is None:
             # The exponential steps failed: the implicit method either succeeds or tells that no solution exists.
             self.implicit, made = True, self._collocated(problem, tol)
@@ -158,33 +156,26 @@ class Search:
         error = np.append(period.modes.inverse @ made.error[:n], made.error[n : z.size])
         return made._replace(end=period.turned * np.append(x, made.end[n : z.size]), error=error)
 
-    def _marched(self, problem: Problem, tol: float) -> _Pass | None:
-        """One pass of a network by exponential steps; None where they fail before the end."""
-        none, n = np.zeros(0), self.period.n
-        one = March(problem, max(tol, FINEST), self.rtol, self.scale, none, none.astype(bool), False)
-        if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
-            return None
-        error = np.append(one.form.shape @ one.error[:n], one.error[n:])
-        magnified = max(1.0, float(one.control["magnified"]))
-        return _Pass(one.y, one.s_before, error, one.peaks.copy(), magnified, one.references.magnified)
-
-    def _tracked(self, problem: Problem, tol: float) -> _Pass | None:
-        """One pass of a stack by exponential steps; None where they fail before the end."""
-        none, scene = np.zeros(0), problem.scene
+    def _stepped(self, problem: Problem, tol: float) -> _Pass | None:
+        """One pass by exponential steps; None where they fail before the end."""
+        none, scene, n = np.zeros(0), problem.scene, self.period.n
+        outputs = none, none.astype(bool)
         while True:
-            prepared = prepare_system(scene, self.rtol, self.top)
-            one = Track(problem, prepared, max(tol, FINEST) * self.scale, none, none.astype(bool), False)
+            one = stepping(problem, self.rtol, max(tol, FINEST), self.scale, self.top, *outputs, False)
             try:
                 if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
                     return None
                 break
             except OutOfRangeError as left:
                 self.top = 1.5 * left.top
-        end, n, model = one.state(), self.period.n, prepared.system.model
-        error = prepared.system.live[int(one.error[n])] @ one.error[:n]
+        magnified = max(1.0, float(one.control["magnified"]))
+        if isinstance(one, March):
+            error = np.append(one.form.shape @ one.error[:n], one.error[n:])
+            return _Pass(one.y, one.s_before, error, one.peaks.copy(), magnified, one.references.magnified)
+        end, system = one.state(), one.prepared.system
+        model, error = system.model, system.live[int(one.error[n])] @ one.error[:n]
         if model.mobile:
             error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
-        magnified = max(1.0, float(one.control["magnified"]))
         return _Pass(end.y, end.s_before, scene.turn * error, one.peaks, magnified, np.array([model.k_gap]))
 
     def _collocated(self, problem: Problem, tol: float) -> _Pass:
