@@ -79,14 +79,14 @@ class _Answer(NamedTuple):
 
 
 def _answer(
-    problem: Problem, tables: Tables, modes: Modes, v0: FloatArray, t_out: FloatArray, left: BoolArray
+    problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray, t_out: FloatArray, left: BoolArray
 ) -> tuple[_Answer, _Answer, float]:
-    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s."""
-    n, n_s = modes.gains.shape
-    # The charge needs the integrals of the sources: each is one more mode, with rate 0 and gain 1.
-    rates, gains = np.append(modes.rates, 0.0), np.vstack([modes.gains, np.ones(n_s)])
+    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s.
+
+    Without modes it is that of the sources alone, and not their integrals.
+    """
+    n, n_s, size = v0.size, len(problem.waveforms), t_out.size
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
-    size = t_out.size
     v, s, integral, slope = (np.zeros((size + 1, k)) for k in (n, n_s, n_s, n_s))
     v[size], s[size], end, first = v0, problem.initial.s_before, problem.t_start, 0
     sources = None
@@ -100,9 +100,12 @@ def _answer(
         v[size] = 0.0
         for j, table in enumerate(window):
             given = table.edges, table.terms, table.series
-            rows, states[j] = linear.respond(rates, gains[:, j], *given, states[j], t, side)
-            v[at] += rows[:, :n]
-            integral[at, j] = rows[:, n]
+            if modes is not None:
+                # The charge needs the integrals of the sources: each is one more mode, with rate 0 and gain 1.
+                rates, gains = np.append(modes.rates, 0.0), np.append(modes.gains[:, j], 1.0)
+                rows, states[j] = linear.respond(rates, gains, *given, states[j], t, side)
+                v[at] += rows[:, :n]
+                integral[at, j] = rows[:, n]
             s[at, j], slope[at, j] = source_at(*given, t, side)
         first = at.size - 1 + first
     if tables.not_finite is None and first < size and sources is not None:
@@ -219,35 +222,17 @@ def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run
     scene = problem.scene
     model, start = model_of(scene), problem.inner
     tables = Tables(problem, 1e-12, t_out=t_out)
-    rows, ended = np.empty((t_out.size, row_width(scene))), np.empty((1, row_width(scene)))
-    done, end, u_end, sources, charge_error = 0, problem.t_start, start.u_before, None, 0.0
-
-    def along(u: FloatArray, slope: FloatArray, into: FloatArray) -> float:
-        return float(follow(model, u, slope, start.y, start.u_before, into))
-
-    for (table,) in tables:
-        if table.edges.size < 2:
-            break
-        sources, end = joined([table]), float(table.edges[-1])
-        at = slice(done, _upto(t_out, left, end))
-        t, side = np.append(t_out[at], end), np.append(left[at], True)
-        u, slope = source_at(table.edges, table.terms, table.series, t, side)
-        charge_error = max(charge_error, along(u[:-1], slope[:-1], rows[at]))
-        done, u_end = at.stop, float(u[-1])
-    if tables.not_finite is None and done < t_out.size and sources is not None:
-        after, last = after_the_end(problem) or sources, np.empty((2, 1))
-        at_sources(after, segment_index(after, end, "right"), end, 0.0, last[0], last[1])
-        u, slope = np.repeat(last, t_out.size - done, axis=1)
-        charge_error = max(charge_error, along(u, slope, rows[done:]))
-        done = t_out.size
+    answer, last, end = _answer(problem, tables, None, np.zeros(0), t_out, left)
+    done, rows, ended = len(answer.s), np.empty((len(answer.s), row_width(scene))), np.empty((1, row_width(scene)))
+    charge_error = follow(model, answer.s[:, 0], answer.slope[:, 0], start.y, start.u_before, rows)
     # The final state is the left-hand one: it does not include a jump at the end.
-    along(np.array([u_end]), np.zeros(1), ended)
+    follow(model, last.s[:, 0], np.zeros(1), start.y, start.u_before, ended)
     y = np.append(start.y[:-1], ended[0, -1])
-    state = from_stack(scene, StackState(end, y, u_end, float(ended[0, 1]), start.offset))
-    shown = from_written(scene, rows[:done], start.offset, by_layer=False)
+    state = from_stack(scene, StackState(end, y, float(last.s[0, 0]), float(ended[0, 1]), start.offset))
+    shown = from_written(scene, rows, start.offset, by_layer=False)
     run = _finished(problem, tables, t_out[:done], left[:done], shown, state, 0.0, solve_algebraic)
     if problem.charge:
-        moved, held = rows[:done, -1], rows[:done, 0] / rows[:done, 2] / model.s
+        moved, held = rows[:, -1], rows[:, 0] / rows[:, 2] / model.s
         most = float(np.abs(moved).max(initial=0.0) + np.abs(held).max(initial=0.0))
-        run.charge_error = charge_error + ROUNDING * most
+        run.charge_error = float(charge_error) + ROUNDING * most
     return run

@@ -209,13 +209,15 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
     """State just before the start from cell voltages u (n_cell,) V; without `s`, the sources are fitted to them."""
     network, net = scene.network, scene.net
     if s is None and not u.any() and not np.any(net.slow >= 0):
-        y, before = np.zeros(sum(network.b.shape)), np.zeros(len(network.sources))
-        return State(0.0, y, before, np.zeros(len(network.areas)), scene.charge_law)
+        y, still = np.zeros(sum(network.b.shape)), np.zeros(len(network.sources))
+        return State(0.0, y, still, np.zeros(len(network.areas)), scene.charge_law)
     slow = (area / net.area0)[net.slow >= 0]
     x: FloatArray = u[list(network.live)]
     charge: FloatArray = np.zeros(len(network.sources))
-    before, rest, q = s, u - network.p @ x, network.q
-    if before is None:
+    rest, q = u - network.p @ x, network.q
+    if s is not None:
+        before = s
+    else:
         # The values that agree with the cell voltages in the least-squares sense.
         fits = q.size and np.any(rest)
         before = np.asarray(np.linalg.lstsq(q, rest, rcond=None)[0], float) if fits else np.zeros(q.shape[1])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 import time
@@ -211,7 +210,7 @@ def solve_coupled(
         run = _integrate(problem, fine, tol, u_scale, at, side, progress)
         nfev += beside.nfev + run.nfev
         run.nfev = nfev
-        worst = _stated(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
+        worst = _stated(problem, run, run.only(probed), beside, u_scale, ALIKE * tol) / rtol
         last = tol <= finest or attempt == ATTEMPTS - 1
         if problem.scene.net.mobile and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
             # A step has crossed a fold onto a branch of the area equation that no continuous path reaches.
@@ -240,7 +239,7 @@ def solve_coupled(
         run.status, run.nfev = Status.FOLD if believed else Status.ERROR_NOT_MET, nfev
     if problem.scene.net.mobile:
         run.margin = float(run.record(problem).fold_margin.min(initial=1.0))
-    run = _only(run, ~probed)
+    run = run.only(~probed)
     run.end_where_it_stopped()
     if problem.scene.net.mobile and run.t.size:
         run.margin = min(run.margin, float(run.record(problem).fold_margin[-1]))
@@ -306,12 +305,6 @@ def _with_probes(problem: Problem, t: FloatArray, left: BoolArray) -> tuple[Floa
     side = np.concatenate([left, ~np.isin(probes, edges)])
     order = np.lexsort((~side, every))
     return every[order], side[order], (np.arange(every.size) >= t.size)[order]
-
-
-def _only(run: Run, keep: BoolArray) -> Run:
-    """A copy of a run that has only the outputs with `keep`."""
-    keep = keep[: run.t.size]
-    return dataclasses.replace(run, t=run.t[keep], left=run.left[keep], rows=run.rows[keep])
 
 
 def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float, alike: float) -> float:

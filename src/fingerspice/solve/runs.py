@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -69,10 +69,10 @@ class Run:
         scene = problem.scene.shown if self.by_layer else problem.scene
         return Record(scene.network, scene.net, self.t, self.left, self.rows, problem.charge)
 
-    def end_before(self, t: float) -> None:
-        """Remove the outputs at time t (s) and later."""
-        kept = self.t < t
-        self.t, self.left, self.rows = self.t[kept], self.left[kept], self.rows[kept]
+    def only(self, kept: BoolArray) -> Run:
+        """A copy that has only the outputs that are `kept`."""
+        kept = kept[: self.t.size]
+        return replace(self, t=self.t[kept], left=self.left[kept], rows=self.rows[kept])
 
     def end_where_it_stopped(self) -> None:
         """Append a left-hand output at the time that a failed run reached, unless it has one there already."""

@@ -346,7 +346,8 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
         # At this output the user's function differs from the table that was integrated.
         run.t_failed, off = run.unseen[:2]
         run.status = Status.SOURCE_UNSEEN if math.isfinite(off) else Status.SOURCE_NOT_FINITE
-        run.end_before(run.t_failed)
+        kept = run.t < run.t_failed
+        run.t, run.left, run.rows = run.t[kept], run.left[kept], run.rows[kept]
     # Of a function that gives coarser numbers than doubles, their rounding is part of the stated error, and no failure.
     coarse = run.rough if any(wave.precision > DOUBLE for wave in problem.waveforms) else 0.0
     if run.rough > 0.0:

@@ -91,10 +91,6 @@ class Period:
         """Live voltages just before the period begins, V, shape (n,)."""
         return np.asarray(self.modes.shape @ z[: self.n] - self.modes.follow @ self.before)
 
-    def modes_of(self, x: FloatArray) -> FloatArray:
-        """Modes (n,) from live voltages (V) just before the period begins."""
-        return np.asarray(self.modes.inverse @ (x + self.modes.follow @ self.before))
-
     def charges(self, z: FloatArray, held: IntArray) -> FloatArray:
         """Conserved charges of the state z, projected on the neutral modes with the indices `held`.
 

@@ -118,7 +118,8 @@ class Search:
                 assert contact is not None
                 u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
                 area[i] = float(np.mean(contact.area(np.abs(u))))
-        v = period.modes_of(modes.shape @ start - modes.follow @ period.before)
+        v = modes.shape @ start - modes.follow @ period.before
+        v = period.modes.inverse @ (v + period.modes.follow @ period.before)
         v = np.where(period.neutral[: period.n], period.kept, v)
         # Transform this decay from the modes at the mean areas to the modes at 0 V.
         turn = period.modes.inverse @ modes.shape
