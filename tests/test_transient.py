@@ -113,19 +113,6 @@ def test_work_of_adhesion_at_total_voltage_held(law):
     assert np.abs(solution.u_gap - plain.u_gap).max() > 1e-5 * np.abs(expected.u_gap).max()
 
 
-@pytest.mark.parametrize("method", ["exponential", "radau"])
-@pytest.mark.parametrize("rtol", [1e-3, 1e-9])
-def test_the_error_asked_for_is_met_by_every_own_stepper(method, rtol):
-    segments = ref.square_segments(200.0, 100.0, 2)
-    t = output_times(segments)
-    expected = ref.transient(segments, t, law="local", freq=100.0)
-    solution = fs.simulate(
-        table1(), sources={"Vdrive": fs.Square(200.0, 100.0)}, t_eval=t, t_stop=0.02, rtol=rtol, method=method
-    )
-    assert np.abs(solution.u_gap - expected.u_gap).max() <= rtol * np.abs(expected.u_gap).max()
-    assert np.abs(solution.f_el - expected.force).max() <= rtol * expected.force.max()
-
-
 @pytest.mark.parametrize("deck", ["fingerpad.cir", "amplifier.cir"])
 @pytest.mark.parametrize("options", [{}, {"area": "frozen"}, {"method": "radau"}, {"charge_law": "mobile"}], ids=str)
 @pytest.mark.parametrize("periods", [3, 7])
