@@ -9,6 +9,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.studies.steady import steady_state
 from scenes import deck, table1
+from test_steady import alone
 
 AREA = 34.9715871843e-6
 
@@ -42,9 +43,7 @@ def outside_band(f):
 def test_periodic_square_equals_the_matrix_exponential(f, duty, law):
     circuit = table1(f"SQUARE(200 {f!r} {duty!r})", f)
     solution = steady_state(circuit, area=AREA, charge_law=law, rtol=1e-12, points=200).solution
-    inside = np.ones(solution.t.size, bool)
-    inside[:-1] &= np.diff(solution.t) > 0.0
-    inside[1:] &= np.diff(solution.t) > 0.0
+    inside = alone(solution.t)
     inside[[0, -1]] = False
     phase = solution.t[inside] - solution.t[0]
     expected = ref.square_frozen(f, 200.0, AREA, phase, layers=ref.table1_layers(f), duty=duty)
@@ -90,21 +89,22 @@ def test_a_pure_capacitor_stack_follows_the_source_without_delay():
     assert solution.u_gap is None
 
 
-@pytest.mark.parametrize("layers", [1, 2, 5, 12])
-def test_any_number_of_layers(layers):
+@pytest.mark.parametrize("law", ["local", "mobile"])
+@pytest.mark.parametrize("layers", [1, 2, 6, 12])
+def test_any_number_of_layers_from_rest_and_in_the_periodic_state(layers, law):
     rng = np.random.default_rng(layers)
-    d = rng.uniform(1e-6, 1e-4, layers)
-    eps = rng.uniform(1.0, 50.0, layers)
-    r = 10.0 ** rng.uniform(5.0, 7.0, layers)
+    d, eps, r = rng.uniform(1e-6, 1e-4, layers), rng.uniform(1.0, 50.0, layers), 10.0 ** rng.uniform(5.0, 7.0, layers)
     nodes = ["in", *(f"n{i}" for i in range(layers - 1)), "0"]
     lines = [
         f"X{i} {nodes[i]} {nodes[i + 1]} area LAYER d={d[i]:.17g} eps_r={eps[i]:.17g} r={r[i]:.17g}"
         for i in range(layers)
     ]
-    t = np.linspace(0.0, 5e-3, 41)
-    solution = fs.simulate(
-        deck("V1 in 0 SIN(0 10 500)", *lines, "Varea area 0 40", ".tran 10u 5m uic"), t_eval=t, rtol=1e-10
-    )
+    circuit = deck("V1 in 0 SIN(0 10 500)", *lines, "Varea area 0 40", ".tran 10u 5m uic")
     stack = [ref.Layer(8.854e-12 * e / x, r_total=y) for e, x, y in zip(eps, d, r, strict=True)]
-    expected = ref.sine_frozen_from_rest(500.0, 10.0, 40e-6, t, stack)
-    assert np.abs(solution.u_layer - expected).max() <= 1e-9 * 10.0
+    t = np.linspace(0.0, 5e-3, 41)
+    run = fs.simulate(circuit, t_eval=t, rtol=1e-10, charge_law=law)
+    assert np.abs(run.u_layer - ref.sine_frozen_from_rest(500.0, 10.0, 40e-6, t, stack)).max() <= 1e-9 * 10.0
+    state = steady_state(circuit, charge_law=law, rtol=1e-11)
+    assert state.multipliers.shape == (layers - 1,)
+    want = ref.periodic_sine_frozen(500.0, 10.0, 40e-6, layers=stack).u(state.solution.t)
+    assert np.abs(state.solution.u_layer - want).max() <= 1e-11 * 10.0

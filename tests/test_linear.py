@@ -244,37 +244,6 @@ def test_no_output_depends_on_which_others_are_asked_for():
     assert np.array_equal(rows[-1], w_end)
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
-@given(rates_strategy, exponents.filter(lambda a: a > -1e3), st.floats(-3.0, 4.0), st.floats(0.05, 0.95))
-def test_a_segment_split_in_two_gives_the_same(rate, a, decades, at):
-    omega = 10.0**decades
-    whole = [term(2.0, 0, a, omega, 0.4), term(1.0, 1), term(0.5)]
-    rest = [term(2.0 * np.exp(a * at), 0, a, omega, 0.4 + omega * at), term(1.0, 1), term(0.5 + at)]
-    t = np.linspace(0.0, 1.0, 8)
-    once, end_once = respond([rate], [1.0], [0.0, 1.0], [whole], NO_SERIES, [0.3], t)
-    twice, end_twice = respond([rate], [1.0], [0.0, at, 1.0], [whole, rest], np.zeros((2, 0)), [0.3], t)
-    tolerance = (1e-14 + 1e-15 * omega) * max(np.abs(once).max(), np.abs(end_once).max())
-    assert np.abs(once - twice).max() <= tolerance
-    assert abs(end_once - end_twice)[0] <= tolerance
-
-
-def test_the_response_is_linear_in_input_and_state():
-    rng = np.random.default_rng(2)
-    rates, gains, edges = 10.0 ** rng.uniform(-2.0, 8.0, 6), rng.standard_normal(6), np.array([0.0, 0.4, 1.0])
-    terms = np.zeros((2, 4, 6))
-    terms[:, :, 0] = rng.standard_normal((2, 4))
-    terms[:, :, 1:5] = [[0, 0.0, 20.0, 1.0], [2, -3.0, 0.0, 0.0], [1, -300.0, 4.0, 0.0], [0, 0.0, 0.0, 0.0]]
-    series, w0, t = rng.standard_normal((2, 9)), rng.standard_normal(6), np.sort(rng.random(30))
-    whole = respond(rates, gains, edges, terms, series, w0, t)[0]
-    total = respond(rates, gains, edges, 0.0 * terms, 0.0 * series, w0, t)[0]
-    total += respond(rates, gains, edges, 0.0 * terms, series, 0.0 * w0, t)[0]
-    for i in range(4):
-        only = np.zeros_like(terms)
-        only[:, i] = -2.0 * np.eye(6)[0] * terms[:, i, :1] + terms[:, i] * (np.arange(6) > 0)
-        total += -0.5 * respond(rates, gains, edges, only, 0.0 * series, 0.0 * w0, t)[0]
-    assert np.all(np.abs(whole - total) <= 1e-14 * np.abs(whole).max(axis=0))
-
-
 def test_a_hundred_thousand_segments_add_up_no_rounding():
     m = 100_000
     edges = np.arange(m + 1) * 1e-4

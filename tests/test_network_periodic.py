@@ -43,32 +43,28 @@ def shipped(name: str) -> fs.Circuit:
 
 
 @every_law
-@pytest.mark.parametrize("rtol", [1e-6, 1e-9])
-@pytest.mark.parametrize(
-    "source", [fs.Sine(200.0, 5000.0), fs.Square(200.0, 5000.0), fs.Square(150.0, 5000.0, duty=0.3)]
-)
+@pytest.mark.parametrize("source", WAVES)
 @pytest.mark.parametrize("name", SHIPPED)
-def test_it_is_where_a_long_run_ends_within_the_error_stated(
-    name: str, source: fs.Waveform, rtol: float, law: str
-) -> None:
+def test_it_is_where_a_long_run_ends_within_the_error_stated(name: str, source: fs.Waveform, law: str) -> None:
     circuit = shipped(name).replace({"Vdrive": source})
-    state = fs.steady_state(circuit, charge_law=law, rtol=rtol)
-    period = state.period
+    states = [fs.steady_state(circuit, charge_law=law, rtol=rtol) for rtol in (1e-6, 1e-9)]
+    period = states[0].period
     t = (np.arange(100) + 0.37) / 100.0 * period
-    run = fs.simulate(circuit, start="periodic", t_eval=t, t_stop=period, charge_law=law, rtol=rtol)
-    later = math.ceil(math.log(1e-13) / math.log(state.multipliers.max())) * period
+    later = math.ceil(math.log(1e-13) / math.log(states[1].multipliers.max())) * period
     # Every period stepped: a period that repeats others would carry its own error along.
     long = fs.simulate(
         circuit, t_eval=later + t, t_stop=later + period, charge_law=law, rtol=1e-11, method="exponential", charge=False
     )
-    true_u, true_f = (np.abs(getattr(run, key) - getattr(long, key)).max() for key in ("u_gap", "f_el"))
-    assert true_u <= run.error.u_gap + long.error.u_gap
-    assert true_f <= run.error.f_el + long.error.f_el
-    assert run.error.u_gap <= rtol * np.abs(long.u_gap).max()
-    assert state.error.u_gap <= 0.5 * rtol * np.abs(long.u_gap).max()
-    assert state.defect <= rtol * 200.0
-    assert run.error.q_source is None
-    assert run.plan.start == "periodic"
+    for state in states:
+        run = fs.simulate(circuit, start="periodic", t_eval=t, t_stop=period, charge_law=law, rtol=state.rtol)
+        true_u, true_f = (np.abs(getattr(run, key) - getattr(long, key)).max() for key in ("u_gap", "f_el"))
+        assert true_u <= run.error.u_gap + long.error.u_gap
+        assert true_f <= run.error.f_el + long.error.f_el
+        assert run.error.u_gap <= state.rtol * np.abs(long.u_gap).max()
+        assert state.error.u_gap <= 0.5 * state.rtol * np.abs(long.u_gap).max()
+        assert state.defect <= state.rtol * 200.0
+        assert run.error.q_source is None
+        assert run.plan.start == "periodic"
 
 
 @every_law
@@ -89,10 +85,7 @@ def test_an_independent_integration_leads_back_to_it_and_has_its_multipliers(law
     scale = np.array([200.0] * 4 + [35e-6] * bool(tau))
     back = mapped(begin)
     assert np.abs((back - begin) / scale).max() <= 3e-9
-    columns = []
-    for k in range(begin.size):
-        move = 1e-3 * scale[k] * np.eye(begin.size)[k]
-        columns.append((mapped(begin + move) - mapped(begin - move)) / (2e-3 * scale[k]))
+    columns = [(mapped(begin + move) - back) / move.sum() for move in 1e-5 * np.diag(scale)]
     want = np.sort(np.abs(np.linalg.eigvals(np.array(columns).T)))
     np.testing.assert_allclose(np.sort(state.multipliers), want, rtol=0, atol=2e-4)
     assert state.stability_margin == pytest.approx(1.0 - want[-1], abs=2e-4)
@@ -109,18 +102,6 @@ def test_a_stack_with_a_resistor_beside_it_has_the_stacks_state(source: str, law
     assert np.abs(one.solution.u_gap - other.solution.u_gap).max() <= 2e-10 * peak
     assert np.abs(one.solution.f_el - other.solution.f_el).max() <= 2e-10 * one.solution.f_el.max()
     np.testing.assert_allclose(np.sort(other.multipliers), np.sort(one.multipliers), rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("name", SHIPPED)
-@pytest.mark.parametrize("tone", [fs.Sine(200.0, 5000.0, phase_deg=30.0), fs.Square(200.0, 5000.0)])
-def test_a_state_found_by_half_a_period_is_that_of_the_whole_one(name: str, tone: fs.Waveform) -> None:
-    circuit = shipped(name)
-    half = fs.steady_state(circuit, sources=tone, rtol=1e-10)
-    # A product with a constant is a source whose half waves nobody vouches for.
-    whole = fs.steady_state(circuit, sources=tone * 1.0, rtol=1e-10)
-    assert half.periods < whole.periods
-    assert np.abs(half.solution.u_layer - whole.solution.u_layer).max() <= 2e-10 * 200.0
-    np.testing.assert_allclose(half.multipliers, whole.multipliers, rtol=0, atol=1e-4)
 
 
 def test_two_sources_with_a_common_period_have_a_state_of_that_period() -> None:
@@ -230,13 +211,6 @@ def test_a_charge_that_the_areas_ripple_pumps_for_ever_has_no_periodic_state() -
 # What has none ----------------------------------------------------------------------------------------------
 
 
-def test_sources_without_a_common_period_have_no_periodic_state() -> None:
-    circuit = shipped("amplifier").replace({"Vdrive": fs.Sine(100.0, 100.0) + fs.Sine(50.0, 100.0 * math.sqrt(2.0))})
-    for call in (fs.steady_state, lambda c: fs.simulate(c, start="periodic")):
-        with pytest.raises(fs.InputError, match="the source has no period, so there is no periodic state to find"):
-            call(circuit)
-
-
 def test_a_current_that_charges_what_nothing_drains_has_no_periodic_state() -> None:
     circuit = deck("I1 0 a SIN(1u 1u 1k)", "C1 a 0 1n", "R1 a b 1k", "C2 b 0 1n")
     with pytest.raises(fs.SolveError, match="charges, from period to period, what nothing drains"):
@@ -331,6 +305,12 @@ def test_the_plan_says_how_far_the_areas_change_and_that_it_is_stepped() -> None
 # Sources at fault -------------------------------------------------------------------------------------------
 
 
+def between_two_sources() -> fs.Circuit:
+    return deck(
+        "Vdrive amp 0 SIN(0 100 1k)", "Rout amp drive 47k", *finger("drive", "body"), "Vbody body 0 SIN(0 10 1k)"
+    )
+
+
 def spiked(t: Any) -> Any:
     """A tone with a spike that no sampling finds."""
     t = np.asarray(t)
@@ -340,9 +320,7 @@ def spiked(t: Any) -> Any:
 @pytest.mark.parametrize("area", ["coupled", "frozen"])
 @pytest.mark.parametrize("guilty", ["Vdrive", "Vbody"])
 def test_a_source_that_was_not_seen_as_it_is_is_named(guilty: str, area: str) -> None:
-    circuit = deck(
-        "Vdrive amp 0 SIN(0 100 1k)", "Rout amp drive 47k", *finger("drive", "body"), "Vbody body 0 SIN(0 10 1k)"
-    )
+    circuit = between_two_sources()
     good = "Vbody" if guilty == "Vdrive" else "Vdrive"
     given = {guilty: spiked, good: fs.Sine(10.0, 1e3)}
     with pytest.raises(fs.SolveError) as caught:
@@ -355,9 +333,7 @@ def test_a_source_that_was_not_seen_as_it_is_is_named(guilty: str, area: str) ->
 
 @pytest.mark.parametrize("guilty", ["Vdrive", "Vbody"])
 def test_a_source_that_is_no_number_within_its_period_is_named(guilty: str) -> None:
-    circuit = deck(
-        "Vdrive amp 0 SIN(0 100 1k)", "Rout amp drive 47k", *finger("drive", "body"), "Vbody body 0 SIN(0 10 1k)"
-    )
+    circuit = between_two_sources()
 
     def broken(t: Any) -> Any:
         return np.where(np.asarray(t) > 5e-4, np.nan, 10.0 * np.sin(2e3 * np.pi * np.asarray(t)))
@@ -375,7 +351,7 @@ def test_a_rough_function_counts_in_both_errors_and_in_what_is_asked(area: str) 
         # Its own rounding: a part in 1e11, anew at every time.
         return 200.0 * math.sin(3e3 * t) * (1.0 + 1e-11 * table.setdefault(t, rng.uniform(-1.0, 1.0)))
 
-    given = {"sources": rough, "t_stop": 1e-3, "area": area}
+    given = {"sources": rough, "t_stop": 4e-4, "area": area}
     met = fs.simulate(shipped("amplifier"), rtol=1e-8, **given)
     tight = fs.simulate(shipped("amplifier"), rtol=1e-13, throw=False, **given)
     assert met.success

@@ -27,30 +27,32 @@ SOURCES = {
 every_source = pytest.mark.parametrize("source", SOURCES.values(), ids=SOURCES.keys())
 
 
-def both(source: fs.Waveform, periods: float, law: str, rtol: float, t: np.ndarray | None = None, **changes: str):
+def both(circuit: fs.Circuit, stop: float, law: str, rtol: float, t: np.ndarray | None = None):
     """The run that may repeat, and the one that steps every period."""
-    circuit = table1().replace({"Vdrive": source, **changes})
-    assert source.period is not None
-    stop = periods * source.period
     times = np.linspace(0.0, stop, 4001) if t is None else t
     options = {"t_stop": stop, "t_eval": times, "rtol": rtol, "charge_law": law}
     return fs.simulate(circuit, **options), fs.simulate(circuit, method="exponential", **options)
+
+
+def alike(run: fs.Solution, stepped: fs.Solution, grown: float) -> None:
+    """Two runs are one to `rtol`, their charge and current to `grown` times that, and to the errors they state."""
+    for name in ("u_gap", "f_el", "area", "i_source", "q_source"):
+        a, b = getattr(run, name), getattr(stepped, name)
+        # A current is a slope, and a charge adds up what every period is off.
+        assert np.abs(a - b).max() <= (1.0 if name in ("u_gap", "f_el") else grown) * run.rtol * np.abs(b).max(), name
+    assert np.abs(run.u_gap - stepped.u_gap).max() <= run.error.u_gap + stepped.error.u_gap
+    assert np.abs(run.q_source - stepped.q_source).max() <= run.error.q_source + stepped.error.q_source
 
 
 @every_law
 @every_source
 @pytest.mark.parametrize("rtol", [1e-4, 1e-9])
 def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: fs.Waveform, law: str, rtol: float) -> None:
-    run, stepped = both(source, 60.4, law, rtol)
+    run, stepped = both(table1().replace({"Vdrive": source}), 60.4 * source.period, law, rtol)
     assert run.stats["repeated"] > 20
     assert stepped.stats["repeated"] == 0
     assert run.stats["steps"] < 0.7 * stepped.stats["steps"]
-    for name in ("u_gap", "f_el", "area", "i_source", "q_source"):
-        a, b = getattr(run, name), getattr(stepped, name)
-        # A current is a slope, and a charge adds up what every period is off.
-        assert np.abs(a - b).max() <= (1.0 if name in ("u_gap", "f_el") else 10.0) * rtol * np.abs(b).max(), name
-    assert np.abs(run.u_gap - stepped.u_gap).max() <= run.error.u_gap + stepped.error.u_gap
-    assert np.abs(run.q_source - stepped.q_source).max() <= run.error.q_source + stepped.error.q_source
+    alike(run, stepped, 10.0)
 
 
 @every_law
@@ -88,9 +90,9 @@ def test_outputs_anywhere_are_of_one_curve() -> None:
     rng = np.random.default_rng(5)
     stop = 50.0 / 100.0
     scattered = np.sort(rng.uniform(0.0, stop, 3000))
-    run, stepped = both(SOURCES["sine"], 50.0, "local", 1e-8, scattered)
+    run, stepped = both(table1(), stop, "local", 1e-8, scattered)
     assert np.abs(run.u_gap - stepped.u_gap).max() <= 1e-8 * np.abs(run.u_gap).max()
-    few, _ = both(SOURCES["sine"], 50.0, "local", 1e-8, scattered[1::7])
+    few, _ = both(table1(), stop, "local", 1e-8, scattered[1::7])
     assert np.array_equal(few.u_gap, run.u_gap[1::7])
 
 
@@ -99,8 +101,8 @@ def test_outputs_anywhere_are_of_one_curve() -> None:
 def test_a_state_that_creeps_is_not_taken_for_settled(leak: str, law: str) -> None:
     # The coating's charge follows an offset over seconds to hours: 200 periods of it move the mean.
     source = fs.Sine(100.0, 1000.0, offset=80.0)
-    r = {"Xcoat.r": float("inf") if leak == "none" else float(leak)}
-    run, stepped = both(source, 200.0, law, 1e-7, **r)
+    r = float("inf") if leak == "none" else float(leak)
+    run, stepped = both(table1().replace({"Vdrive": source, "Xcoat.r": r}), 0.2, law, 1e-7)
     peak = np.abs(stepped.u_gap).max()
     assert np.abs(run.u_gap - stepped.u_gap).max() <= 1e-7 * peak
 
@@ -118,14 +120,9 @@ def test_a_run_goes_on_from_the_end_of_a_repeated_one(law: str) -> None:
     assert rest.q_source[-1] == pytest.approx(whole.q_source[-1], abs=1e-7 * np.abs(whole.q_source).max())
 
 
-def test_a_source_without_a_period_is_stepped() -> None:
-    circuit = table1().replace({"Vdrive": fs.Chirp(200.0, 50.0, 500.0, 0.1)})
-    assert fs.simulate(circuit, t_stop=0.1, rtol=1e-4).stats["repeated"] == 0
-
-
-def test_a_short_run_is_stepped() -> None:
-    circuit = table1().replace({"Vdrive": fs.Sine(200.0, 100.0)})
-    assert fs.simulate(circuit, t_stop=0.05, rtol=1e-4).stats["repeated"] == 0
+@pytest.mark.parametrize(("source", "stop"), [(fs.Chirp(200.0, 50.0, 500.0, 0.1), 0.1), (fs.Sine(200.0, 100.0), 0.05)])
+def test_a_source_without_a_period_and_a_short_run_are_stepped(source: fs.Waveform, stop: float) -> None:
+    assert fs.simulate(table1(), sources=source, t_stop=stop, rtol=1e-4).stats["repeated"] == 0
 
 
 DECK = (Path(__file__).parents[1] / "circuits" / "fingerpad.cir").read_text(encoding="utf-8")
@@ -145,16 +142,9 @@ FAST = {
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8])
 def test_a_skin_that_remembers_for_many_periods_settles(source: fs.Waveform, law: str, rtol: float) -> None:
     # Its slowest branch remembers for 7 ms, 28 to 48 periods.
-    circuit, stop = DISPERSIVE.replace({"Vdrive": source}), 0.40023
-    options = {"t_stop": stop, "t_eval": np.linspace(0.0, stop, 4001), "rtol": rtol, "charge_law": law}
-    run, stepped = fs.simulate(circuit, **options), fs.simulate(circuit, method="exponential", **options)
-    assert run.stats["repeated"] > 0.25 * stop / source.period
-    for name in ("u_gap", "f_el", "area", "i_source", "q_source"):
-        a, b = getattr(run, name), getattr(stepped, name)
-        # A current is a slope, and a charge adds up what every period is off.
-        assert np.abs(a - b).max() <= (1.0 if name in ("u_gap", "f_el") else 30.0) * rtol * np.abs(b).max(), name
-    assert np.abs(run.u_gap - stepped.u_gap).max() <= run.error.u_gap + stepped.error.u_gap
-    assert np.abs(run.q_source - stepped.q_source).max() <= run.error.q_source + stepped.error.q_source
+    run, stepped = both(DISPERSIVE.replace({"Vdrive": source}), 0.40023, law, rtol)
+    assert run.stats["repeated"] > 0.25 * 0.40023 / source.period
+    alike(run, stepped, 30.0)
 
 
 @pytest.mark.parametrize("circuit", ["stack", "dispersive", "network"])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.circuit.network import Modes, Network
+from fingerspice.circuit.network import Modes
 from fingerspice.engine.network import at_sources
 from fingerspice.engine.one_area.model import follow, source_at
 from fingerspice.numerics import hold, linear
@@ -18,7 +18,8 @@ from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.solve.initial import StackState, from_stack, from_written, model_of, row_width
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Run, closed_form, gap_signals, kept_with
+from fingerspice.solve.runs import Run, closed_form, gap_signals
+from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import on_grid, same_time
@@ -35,16 +36,8 @@ def solve_linear(
 ) -> Run:
     """Outputs of a circuit with its areas fixed: the modes' responses to the single sources, superposed.
 
-    Parameters
-    ----------
-    problem : Problem
-        It may ask for charge only if the areas are fixed by the circuit.
-    t_out, left : ndarray, shape (n_out,)
-        Output times (s, ascending), and whether the left-hand limit is wanted there.
-    area : ndarray, shape (n_area,), optional
-        Areas, m^2; the scene's areas by default.
-    bound : float
-        Error from holding the areas at these values, relative to the peaks; 0 where they are exact or have no effect.
+    Areas (n_area,) in m^2 are the scene's by default, and a problem may ask for charge only if the circuit fixes them.
+    `bound` is the error from holding them, relative to the peaks; 0 where they are exact or have no effect.
     """
     scene, start = problem.scene, problem.initial
     area = scene.area0 if area is None else area
@@ -61,16 +54,15 @@ def solve_linear(
         answer, last, end = _answer(problem, tables, modes, v0, t_out, left)
         t, side, rows = t_out[: len(answer.v)], left[: len(answer.v)], answer.x(modes)
         if problem.charge:
-            flow = _Charge(problem.network, area, modes, v0, start, problem.t_start)
-            rows = np.hstack([rows, *flow.at(t, answer)])
-            z_end = flow.at(np.array([end]), last)[0][0]
+            flow = partial(_charge, problem, area, modes, v0)
+            rows = np.hstack([rows, *flow(t, answer)])
+            z_end = flow(np.array([end]), last)[0][0]
     y = np.concatenate([last.x(modes)[0], z_end])
     state = State(end, y, last.s[0], np.zeros(area.size), scene.charge_law)
     return _finished(problem, tables, t, side, rows, state, bound, partial(solve_linear, area=area))
 
 
-@dataclass(frozen=True)
-class _Answer:
+class _Answer(NamedTuple):
     """Response at n_t times: modes (n_t, n), and the sources, their integrals and their slopes (n_t, n_s)."""
 
     v: FloatArray
@@ -87,14 +79,14 @@ class _Answer:
 
 
 def _answer(
-    problem: Problem, tables: Tables, modes: Modes, v0: FloatArray, t_out: FloatArray, left: BoolArray
+    problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray, t_out: FloatArray, left: BoolArray
 ) -> tuple[_Answer, _Answer, float]:
-    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s."""
-    n, n_s = modes.gains.shape
-    # The charge needs the integrals of the sources: each is one more mode, with rate 0 and gain 1.
-    rates, gains = np.append(modes.rates, 0.0), np.vstack([modes.gains, np.ones(n_s)])
+    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s.
+
+    Without modes it is that of the sources alone, and not their integrals.
+    """
+    n, n_s, size = v0.size, len(problem.waveforms), t_out.size
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
-    size = t_out.size
     v, s, integral, slope = (np.zeros((size + 1, k)) for k in (n, n_s, n_s, n_s))
     v[size], s[size], end, first = v0, problem.initial.s_before, problem.t_start, 0
     sources = None
@@ -108,9 +100,12 @@ def _answer(
         v[size] = 0.0
         for j, table in enumerate(window):
             given = table.edges, table.terms, table.series
-            rows, states[j] = linear.respond(rates, gains[:, j], *given, states[j], t, side)
-            v[at] += rows[:, :n]
-            integral[at, j] = rows[:, n]
+            if modes is not None:
+                # The charge needs the integrals of the sources: each is one more mode, with rate 0 and gain 1.
+                rates, gains = np.append(modes.rates, 0.0), np.append(modes.gains[:, j], 1.0)
+                rows, states[j] = linear.respond(rates, gains, *given, states[j], t, side)
+                v[at] += rows[:, :n]
+                integral[at, j] = rows[:, n]
             s[at, j], slope[at, j] = source_at(*given, t, side)
         first = at.size - 1 + first
     if tables.not_finite is None and first < size and sources is not None:
@@ -152,41 +147,32 @@ def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatAr
     return live.T, _Answer(end[None], s, np.zeros((1, 1)), np.zeros((1, 1)))
 
 
-@dataclass(frozen=True)
-class _Charge:
-    """Charge (C) and regular current (A) that each source delivers to a circuit with fixed areas."""
+def _charge(
+    problem: Problem, area: FloatArray, modes: Modes, v0: FloatArray, t: FloatArray, answer: _Answer
+) -> list[FloatArray]:
+    """Charge (C) and regular current (A) that each source has delivered at times t, both (n_t, n_s)."""
+    net, start = problem.network, problem.initial
+    n, x, s = modes.rates.size, answer.x(modes), answer.s
+    capacitance, leak = net.capacitance(area)[:, None], net.leak(area)[:, None]
+    stored_x, stored_s = net.through @ (capacitance * net.p), net.through @ (capacitance * net.q)
+    lost_x = net.through @ (leak * net.p) + net.delivered[:, :n]
+    lost_s = net.through @ (leak * net.q) + net.delivered[:, n:]
+    draining = modes.rates > 0.0
+    passed = np.einsum("kj,tj->tk", modes.gains, answer.integral) - (answer.v - v0)
+    held = np.outer(t - problem.t_start, v0)
+    # A mode with rate 0 has no leakage current, so that any value of its integral will do.
+    integral = np.where(draining, passed / np.where(draining, modes.rates, 1.0), held)
+    x_integral = answer._replace(v=integral, s=answer.integral).x(modes)
+    rate = np.einsum("kj,tj->tk", modes.gains, s) - modes.rates * answer.v
+    dx = answer._replace(v=rate, s=answer.slope).x(modes)
 
-    network: Network
-    area: FloatArray
-    modes: Modes
-    v_start: FloatArray
-    start: State
-    t_start: float
+    def along(matrix: FloatArray, values: FloatArray) -> FloatArray:
+        return np.asarray(np.einsum("kj,tj->tk", matrix, values))
 
-    def at(self, t: FloatArray, answer: _Answer) -> list[FloatArray]:
-        """Charges and currents (n_t, n_s) at times t."""
-        net, modes = self.network, self.modes
-        n, x, s = modes.rates.size, answer.x(modes), answer.s
-        capacitance, leak = net.capacitance(self.area)[:, None], net.leak(self.area)[:, None]
-        stored_x, stored_s = net.through @ (capacitance * net.p), net.through @ (capacitance * net.q)
-        lost_x = net.through @ (leak * net.p) + net.delivered[:, :n]
-        lost_s = net.through @ (leak * net.q) + net.delivered[:, n:]
-        draining = modes.rates > 0.0
-        passed = np.einsum("kj,tj->tk", modes.gains, answer.integral) - (answer.v - self.v_start)
-        held = np.outer(t - self.t_start, self.v_start)
-        # A mode with rate 0 has no leakage current, so that any value of its integral will do.
-        integral = np.where(draining, passed / np.where(draining, modes.rates, 1.0), held)
-        x_integral = _Answer(integral, answer.integral, s, s).x(modes)
-        rate = np.einsum("kj,tj->tk", modes.gains, s) - modes.rates * answer.v
-        dx = _Answer(rate, answer.slope, s, s).x(modes)
-
-        def along(matrix: FloatArray, values: FloatArray) -> FloatArray:
-            return np.asarray(np.einsum("kj,tj->tk", matrix, values))
-
-        moved = along(stored_x, x - self.start.y[:n]) + along(stored_s, s - self.start.s_before)
-        charge = self.start.y[n:] + moved + along(lost_x, x_integral) + along(lost_s, answer.integral)
-        current = along(stored_x, dx) + along(stored_s, answer.slope) + along(lost_x, x) + along(lost_s, s)
-        return [charge, current]
+    moved = along(stored_x, x - start.y[:n]) + along(stored_s, s - start.s_before)
+    charge = start.y[n:] + moved + along(lost_x, x_integral) + along(lost_s, answer.integral)
+    current = along(stored_x, dx) + along(stored_s, answer.slope) + along(lost_x, x) + along(lost_s, s)
+    return [charge, current]
 
 
 def _finished(
@@ -209,9 +195,12 @@ def _finished(
     run.node_error = rounding + bound * largest
     if not problem.scene.is_sampled:
         # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
-        look = partial(_look, dataclasses.replace(problem, charge=False), solve)
-        run.continuous = closed_form(problem, look)
+        run.continuous = closed_form(problem, partial(_look, dataclasses.replace(problem, charge=False), solve))
     return run
+
+
+def _look(problem: Problem, solve: Callable[..., Run], t: FloatArray, left: BoolArray) -> Record:
+    return solve(problem, t, left).record(problem)
 
 
 def _peaks(record: Record) -> Iterator[tuple[float, float]]:
@@ -228,46 +217,22 @@ def _peaks(record: Record) -> Iterator[tuple[float, float]]:
         yield from ((float(np.abs(u).max(initial=0.0)), 0.0) for u, _ in gap_signals(record))
 
 
-def _look(problem: Problem, solve: Callable[..., Run], t: FloatArray, left: BoolArray) -> Record:
-    return solve(problem, t, left).record(problem)
-
-
 def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run:
     """Outputs of a stack without leakage: the layers share each change of the source's voltage in fixed ratios."""
     scene = problem.scene
     model, start = model_of(scene), problem.inner
     tables = Tables(problem, 1e-12, t_out=t_out)
-    rows, ended = np.empty((t_out.size, row_width(scene))), np.empty((1, row_width(scene)))
-    done, end, u_end, sources, charge_error = 0, problem.t_start, start.u_before, None, 0.0
-
-    def along(u: FloatArray, slope: FloatArray, into: FloatArray) -> float:
-        return float(follow(model, u, slope, start.y, start.u_before, into))
-
-    for (table,) in tables:
-        if table.edges.size < 2:
-            break
-        sources, end = joined([table]), float(table.edges[-1])
-        at = slice(done, _upto(t_out, left, end))
-        t, side = np.append(t_out[at], end), np.append(left[at], True)
-        u, slope = source_at(table.edges, table.terms, table.series, t, side)
-        charge_error = max(charge_error, along(u[:-1], slope[:-1], rows[at]))
-        done, u_end = at.stop, float(u[-1])
-    if tables.not_finite is None and done < t_out.size and sources is not None:
-        after, last = after_the_end(problem) or sources, np.empty((2, 1))
-        at_sources(after, segment_index(after, end, "right"), end, 0.0, last[0], last[1])
-        u, slope = np.repeat(last, t_out.size - done, axis=1)
-        charge_error = max(charge_error, along(u, slope, rows[done:]))
-        done = t_out.size
+    answer, last, end = _answer(problem, tables, None, np.zeros(0), t_out, left)
+    done, rows, ended = len(answer.s), np.empty((len(answer.s), row_width(scene))), np.empty((1, row_width(scene)))
+    charge_error = follow(model, answer.s[:, 0], answer.slope[:, 0], start.y, start.u_before, rows)
     # The final state is the left-hand one: it does not include a jump at the end.
-    along(np.array([u_end]), np.zeros(1), ended)
+    follow(model, last.s[:, 0], np.zeros(1), start.y, start.u_before, ended)
     y = np.append(start.y[:-1], ended[0, -1])
-    state = from_stack(scene, StackState(end, y, u_end, float(ended[0, 1]), start.offset))
-    shown = from_written(scene, rows[:done], start.offset, by_layer=False)
+    state = from_stack(scene, StackState(end, y, float(last.s[0, 0]), float(ended[0, 1]), start.offset))
+    shown = from_written(scene, rows, start.offset, by_layer=False)
     run = _finished(problem, tables, t_out[:done], left[:done], shown, state, 0.0, solve_algebraic)
     if problem.charge:
-        most = (
-            np.abs(rows[:done, -1]).max(initial=0.0)
-            + np.abs(rows[:done, 0] / rows[:done, 2]).max(initial=0.0) / model.s
-        )
-        run.charge_error = charge_error + ROUNDING * float(most)
+        moved, held = rows[:, -1], rows[:, 0] / rows[:, 2] / model.s
+        most = float(np.abs(moved).max(initial=0.0) + np.abs(held).max(initial=0.0))
+        run.charge_error = float(charge_error) + ROUNDING * most
     return run

@@ -8,7 +8,6 @@ m = 0, or comes to rest there.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
@@ -48,14 +47,7 @@ class _LostError(Exception):
 
 
 def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
-    """A run under the `mobile` law up to the fold that it reaches or jumps past; None where it reaches no fold.
-
-    Parameters
-    ----------
-    problem : Problem
-    t_out, left : ndarray, shape (n_out,)
-        Output times (s, ascending), and whether the left-hand limit is wanted there.
-    """
+    """A run under the `mobile` law up to the fold that it reaches or jumps past; None where it reaches no fold."""
     run = solve_marching(problem, FINEST_RTOL, t_out, left, repeat=False)
     run.gaps[:, 2:] *= SAFETY
     jumped = run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size > 0
@@ -70,12 +62,9 @@ def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | N
 def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray) -> Run | None:
     """Continue a run that stopped near a fold until it reaches the fold; None where it does not reach it."""
     state = to_stack(problem.scene, run.state)
-    begun = _start(problem, state)
-    if run.margin <= 0.0 or math.isnan(begun.u):
-        return run
-    path = _ahead(problem, state, begun, run.margin, FINEST_RTOL)
+    reached, path = _ahead(problem, run, state, FINEST_RTOL)
     if path is None:
-        return None
+        return run if reached else None
     # The last row of the run may be the point where the steps stopped, which is not an output time.
     stopped = run.t.size > 0 and (run.t.size > t_out.size or run.t[-1] != t_out[run.t.size - 1])
     done = run.t.size - int(stopped)
@@ -113,13 +102,10 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
     if run.status is not Status.FOLD:
         tried = last_tried(run.tried)
         raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=tried))
-    state = to_stack(problem.scene, run.state)
-    begun = _start(problem, state)
-    return run.margin <= 0.0 or math.isnan(begun.u) or _ahead(problem, state, begun, run.margin, rtol) is not None
+    return _ahead(problem, run, to_stack(problem.scene, run.state), rtol)[0]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Path:
+class _Path(NamedTuple):
     """State (n + 1,), time since `begin` (s) and gap voltage (V) as functions of the variable s, up to the fold."""
 
     begin: float
@@ -149,15 +135,12 @@ class _Path:
 
 
 class _Start(NamedTuple):
-    """Start of a path: the segment of the source, the segment's end (s), the area's branch, and the gap voltage (V).
+    """Start of a path."""
 
-    The voltage is NaN where the start is at the fold or past it, as after a jump of the source.
-    """
-
-    segment: Segment
-    end: float
-    sign: float
-    u: float
+    segment: Segment  # Of the source
+    end: float  # Of the segment, s
+    sign: float  # Branch of the area
+    u: float  # Gap voltage, V; NaN where the start is at the fold or past it, as after a jump of the source
 
 
 def _start(problem: Problem, state: StackState) -> _Start:
@@ -179,15 +162,19 @@ def _start(problem: Problem, state: StackState) -> _Start:
     return _Start(segment, end, sign, u)
 
 
-def _ahead(problem: Problem, state: StackState, begun: _Start, margin: float, rtol: float) -> _Path | None:
-    """The path from a state at distance `margin` to a fold in the same segment of the source; None if not found."""
-    tries = (rtol, LOOSER_RTOL, LOOSEST_RTOL) if margin < NEAR else (rtol, LOOSER_RTOL)
+def _ahead(problem: Problem, run: Run, state: StackState, rtol: float) -> tuple[bool, _Path | None]:
+    """Whether a run that stopped in this state reaches a fold, and the path to it where it is not there already."""
+    begun = _start(problem, state)
+    if run.margin <= 0.0 or math.isnan(begun.u):
+        return True, None
+    tries = (rtol, LOOSER_RTOL, LOOSEST_RTOL) if run.margin < NEAR else (rtol, LOOSER_RTOL)
     for tried in sorted({max(rtol, x) for x in tries}):
         try:
-            return _path(problem, state, begun, tried)
+            path = _path(problem, state, begun, tried)
         except _LostError:
             continue
-    return None
+        return path is not None, path
+    return False, None
 
 
 def _jacobian(slope: Callable[[float, FloatArray], FloatArray], s: float, z: FloatArray) -> FloatArray:
@@ -228,19 +215,12 @@ def _path(problem: Problem, state: StackState, begun: _Start, rtol: float) -> _P
         along: FloatArray = np.concatenate([dy * margin, [margin, speed]]) * pace / scale
         return along
 
-    def distance(_: float, z: FloatArray) -> float:
-        return at(z)[0] - NOTHING_LEFT
-
-    def ahead(_: float, z: FloatArray) -> float:
-        return end - t - float(z[n]) * pace
-
     begin = np.concatenate([y, [0.0, u]]) / scale
     far = 3.0 * at(begin)[0]
-
-    def away(_: float, z: FloatArray) -> float:
-        return far - at(z)[0]
-
-    events: list[Any] = [distance, ahead, away]
+    # At the fold, at the end of the segment, and too far from the fold again.
+    events: list[Any] = [
+        lambda _, z: at(z)[0] - NOTHING_LEFT, lambda _, z: end - t - float(z[n]) * pace, lambda _, z: far - at(z)[0]
+    ]  # fmt: skip
     for event in events:
         event.terminal = True
 

@@ -24,7 +24,7 @@ from fingerspice.results.record import Record
 from fingerspice.solve.nodal import STAGES, Collocation, radau_scheme, solve_coupled
 from fingerspice.solve.problem import ROUNDING, Problem
 from fingerspice.solve.runs import Progress, Run, closed_form, gap_signals, integrate, nodes_apart
-from fingerspice.solve.sources import Tables, values_at
+from fingerspice.solve.sources import Tables, segment_index, values_at
 
 _QUIET = threading.Lock()
 SCIPY_METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
@@ -33,7 +33,6 @@ _TORCH_FIXED = {"rk4": 4, "midpoint": 2, "euler": 1}
 # Tolerances of our reference run and of the library's first run, relative to the error asked for; and the number of
 # runs with the library's tolerance reduced each time.
 REFERENCE, FIRST, ATTEMPTS = 0.03, 0.1, 6
-
 
 Rate = Callable[[float, FloatArray], FloatArray]
 
@@ -65,9 +64,7 @@ def _by_scipy(
     with _QUIET, warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"scipy\.")
         try:
-            result = solve_ivp(
-                rate, (0.0, times[-1]), y, method=name, t_eval=times, rtol=max(tol, 3e-14), atol=tol * scale
-            )
+            result = solve_ivp(rate, (0.0, times[-1]), y, name, times, rtol=max(tol, 3e-14), atol=tol * scale)
         except ValueError as error:
             # Past a fold y' is NaN, and scipy's implicit methods refuse to factor a matrix with NaN.
             raise _FailedError(f"scipy: {error}") from None
@@ -117,11 +114,11 @@ class Foreign(Collocation):
     """One integration by a library, piece by piece; jumps of the sources are integrated as in `Collocation`."""
 
     def __init__(
-        self, problem: Problem, library: str, name: str, tol: float, u_scale: float, t_out: FloatArray,
-        left: BoolArray,
-    ) -> None:  # fmt: skip
+        self, problem: Problem, method: str, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray
+    ) -> None:
         super().__init__(problem, radau_scheme(STAGES), tol, u_scale, t_out, left)
-        self.by, self.name, self.detail = _by_torch if library == "torchdiffeq" else _by_scipy, name, ""
+        library, _, self.name = method.partition(":")
+        self.by, self.detail = _by_scipy if library == "scipy" else _by_torch, ""
         # Without a request for charge its scale is infinite, which libraries cannot take: 1 C is as good as infinite.
         self.scale = np.where(np.isfinite(self.scale), self.scale, 1.0)
         self.tau = 1.0 / max(float(problem.scene.rates.max(initial=0.0)), 1e-300)
@@ -142,13 +139,10 @@ class Foreign(Collocation):
 
     def _piece(self, sources: Sources, stop: float) -> None:
         """Integrate to `stop` (s)."""
-        net, room, base, n_s, first = self.net, self.room, self.t, self.s_before.size, sources.first
-        index = np.array([
-            np.searchsorted(sources.edges[first[i] : first[i + 1]], base, side="right") - 1 for i in range(n_s)
-        ])  # fmt: skip
+        base, n_s, index = self.t, self.s_before.size, segment_index(sources, self.t, "right")
 
         def rate(t: float, y: FloatArray) -> FloatArray:
-            return np.asarray(_rate(net, room, sources, index, base, t, np.ascontiguousarray(y), self.sign))
+            return np.asarray(_rate(self.net, self.room, sources, index, base, t, np.ascontiguousarray(y), self.sign))
 
         done = int(self.counters[implicit.OUTPUT])
         inside = (self.t_out < stop) | ((self.t_out == stop) & self.left)
@@ -165,7 +159,7 @@ class Foreign(Collocation):
         self.y[:] = states[-1]
         # The last call leaves the branches as they are at the end.
         rate(stop - base, self.y)
-        self.s_before[:] = room.s
+        self.s_before[:] = self.room.s
         self.control[implicit.BASE] = stop
 
 
@@ -191,8 +185,8 @@ def solve_foreign(
     ours = list(gap_signals(reference.record(problem)))
     u_scale = float(reference.gaps[:, 0].max(initial=0.0)) or 1.0
     tol, nfev = FIRST * rtol, 0
-    for attempt in range(ATTEMPTS):
-        one = Foreign(problem, library, name, tol, u_scale, t_out, left)
+    for _ in range(ATTEMPTS):
+        one = Foreign(problem, method, tol, u_scale, t_out, left)
         run = integrate(one, Tables(problem, tol, t_out=t_out), progress)
         nfev += run.nfev
         run.nfev, run.margin, run.detail = nfev, reference.margin, one.detail
@@ -210,12 +204,11 @@ def solve_foreign(
         if worst <= 1.0:
 
             def look(t: FloatArray, left: BoolArray, tol: float = tol) -> Record:
-                again = Foreign(problem, library, name, tol, u_scale, t, left)
-                return integrate(again, Tables(problem, tol), None).record(problem)
+                again = Foreign(problem, method, tol, u_scale, t, left)
+                return integrate(again, Tables(problem, tol)).record(problem)
 
             run.continuous = closed_form(problem, look, rtol)
             return run
-        if attempt < ATTEMPTS - 1:
-            tol = max(tol * min(0.3, 0.5 / worst), 1e-16)
+        tol = max(tol * min(0.3, 0.5 / worst), 1e-16)
     run.status = Status.ERROR_NOT_MET
     return run

@@ -23,7 +23,7 @@ from fingerspice.engine.one_area.model import Model, choose_branch, gap_voltage
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
-from fingerspice.solve.scenes import Scene
+from fingerspice.solve.scenes import Scene, kept_with
 from fingerspice.solve.starting import (
     PAST_FOLD,
     ROUNDING,
@@ -152,30 +152,22 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
             )
         return start.state
     require(start in ("deck", "uncharged", "dc"), "start", repr(start), "'deck', 'uncharged', 'dc' or a Solution")
-    if ("initial", start) not in scene.prepared:
-        if start == "uncharged" or (start == "deck" and starts_uncharged(circuit)):
-            u, area, s = _given(circuit, scene, start == "deck")
-        else:
-            u, area, s = _at_rest(circuit, scene, circuit.initial if start == "deck" else {})
-        scene.prepared["initial", start] = _state(scene, u, area, s)
-    found: State = scene.prepared["initial", start]
+    asked = start == "deck"
+
+    def make() -> State:
+        if start == "dc" or (asked and not starts_uncharged(circuit)):
+            return _state(scene, *_at_rest(circuit, scene, circuit.initial if asked else {}))
+        # An area is NaN if it follows its voltage without delay, or if it starts in equilibrium with it.
+        u, area = np.zeros(len(network.cells)), np.full(len(network.areas), np.nan)
+        if asked and (circuit.initial or any(cell.element.initial is not None for cell in network.cells)):
+            u = start_voltages([c.element for c in network.cells], scene.net.c, circuit.initial)
+            for i, one in enumerate(network.areas):
+                if scene.net.slow[i] >= 0:
+                    area[i] = 1e-6 * circuit.initial.get(one.node, math.nan)
+        return _state(scene, u, area, None)
+
+    found: State = kept_with(scene.prepared, ("initial", start), 3, make)
     return found
-
-
-def _given(circuit: Circuit, scene: Scene, asked: bool) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Cell voltages (V) and areas (m^2) of a start with ``uic``, and None: the sources start with their values at 0+.
-
-    An area is NaN if it follows its voltage without delay, or if it starts in equilibrium with it.
-    """
-    network = scene.network
-    area = np.full(len(network.areas), np.nan)
-    cells = network.cells
-    if not asked or not (circuit.initial or any(cell.element.initial is not None for cell in cells)):
-        return np.zeros(len(cells)), area, None
-    for i, one in enumerate(network.areas):
-        if scene.net.slow[i] >= 0:
-            area[i] = 1e-6 * circuit.initial.get(one.node, math.nan)
-    return start_voltages([c.element for c in cells], scene.net.c, circuit.initial), area, None
 
 
 def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -188,17 +180,17 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
     contacts = [c if gap >= 0 else None for c, gap in zip(network.contacts, net.gap, strict=True)]
     # The reduced network of a series loop has no nodes, so the operating point needs the unreduced network.
     whole = network if stack is None else build_network(replace(circuit, work="gap"))
-    point = operating_point(circuit, whole, scene.area0, contacts, initial)
-    u = point.u.copy() if stack is None else _cells_of(network, whole, u=point.u)
+    u, area, held = operating_point(circuit, whole, scene.area0, contacts, initial)
+    u = u if stack is None else _cells_of(network, whole, u)
     if net.mobile:
-        for i in np.flatnonzero(point.held & (net.slow < 0)):
+        for i in np.flatnonzero(held & (net.slow < 0)):
             # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.
             gap = net.gap[i]
-            own = at_own_area(float(u[gap]), point.area[i], net.curves[i])
+            own = at_own_area(float(u[gap]), area[i], net.curves[i])
             rest = 1.0 / inverse_area(abs(own), net.curves[i])[0]
-            u[net.place == i] *= point.area[i] / rest
+            u[net.place == i] *= area[i] / rest
             u[gap] = own
-    return u, point.area, s
+    return u, area, s
 
 
 def _cells_of(network: Network, whole: Network, u: FloatArray) -> FloatArray:
@@ -217,39 +209,32 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
     """State just before the start from cell voltages u (n_cell,) V; without `s`, the sources are fitted to them."""
     network, net = scene.network, scene.net
     if s is None and not u.any() and not np.any(net.slow >= 0):
-        y, before = np.zeros(sum(network.b.shape)), np.zeros(len(network.sources))
-        return State(0.0, y, before, np.zeros(len(network.areas)), scene.charge_law)
+        y, still = np.zeros(sum(network.b.shape)), np.zeros(len(network.sources))
+        return State(0.0, y, still, np.zeros(len(network.areas)), scene.charge_law)
     slow = (area / net.area0)[net.slow >= 0]
-    x, charge = u[list(network.live)], np.zeros(len(network.sources))
-    before = _fitting(network, u - network.p @ x) if s is None else s
-    off = float(np.abs(u - network.p @ x - network.q @ before).max(initial=0.0))
-    if off > ROUNDING * float(np.abs(u).max(initial=0.0)):
-        before = _after(scene) if s is None else s
-        settled = settle(net, u, slow, before)
-        x, slow, charge = settled.x, settled.slow, settled.charge
+    x: FloatArray = u[list(network.live)]
+    charge: FloatArray = np.zeros(len(network.sources))
+    rest, q = u - network.p @ x, network.q
+    if s is not None:
+        before = s
+    else:
+        # The values that agree with the cell voltages in the least-squares sense.
+        fits = q.size and np.any(rest)
+        before = np.asarray(np.linalg.lstsq(q, rest, rcond=None)[0], float) if fits else np.zeros(q.shape[1])
+    after = np.array([float(w.value(0.0)) for w in scene.waveforms])
+    # The run itself reports a source that is not finite.
+    after[~np.isfinite(after)] = 0.0
+    if float(np.abs(rest - q @ before).max(initial=0.0)) > ROUNDING * float(np.abs(u).max(initial=0.0)):
+        before = after if s is None else s
+        x, slow, charge = settle(net, u, slow, before)
     elif np.any(np.isnan(slow)):
         # Areas with a time constant start in equilibrium with the voltages after the sources' first jump.
-        slow = settle(net, u, slow, _after(scene)).slow
+        _, slow, _ = settle(net, u, slow, after)
     sign = np.zeros(len(network.areas))
     state = State(0.0, np.concatenate([x, slow, charge]), before, sign, scene.charge_law)
     if scene.model is not None and np.any(u) and unreachable(scene, to_stack(scene, state), float(np.abs(u).max())):
         raise InputError(f"the start has {u[scene.measured[0]]:.4g} V across the gap, {PAST_FOLD}")
     return state
-
-
-def _after(scene: Scene) -> FloatArray:
-    """Values of the sources at 0+, after a jump at the start (V or A)."""
-    after = np.array([float(w.value(0.0)) for w in scene.waveforms])
-    # The run itself reports a source that is not finite.
-    after[~np.isfinite(after)] = 0.0
-    return after
-
-
-def _fitting(network: Network, u: FloatArray) -> FloatArray:
-    """Values of the sources that agree with the cell voltages u (n_cell,) V, in the least-squares sense."""
-    if not network.q.size or not np.any(u):
-        return np.zeros(network.q.shape[1])
-    return np.asarray(np.linalg.lstsq(network.q, u, rcond=None)[0], float)
 
 
 def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
@@ -276,15 +261,11 @@ def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
 
     if stack.gap is None or not model.coupled:
         return split(model.area0)
-    lo, hi = 0.0, abs(u_source)
+    low, high = 0.0, abs(u_source)
     for _ in range(200):
-        middle = 0.5 * (lo + hi)
-        inverse, _ = inverse_area(middle, model.curve)
-        if abs(split(1.0 / inverse)[stack.gap]) > middle:
-            lo = middle
-        else:
-            hi = middle
-        if not lo < 0.5 * (lo + hi) < hi:
+        middle = 0.5 * (low + high)
+        if not low < middle < high:
             break
-    inverse, _ = inverse_area(hi, model.curve)
-    return split(1.0 / inverse)
+        more = abs(split(1.0 / inverse_area(middle, model.curve)[0])[stack.gap]) > middle
+        low, high = (middle, high) if more else (low, middle)
+    return split(1.0 / inverse_area(high, model.curve)[0])

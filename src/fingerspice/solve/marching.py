@@ -9,11 +9,24 @@ from fingerspice.solve.one_area import Track, prepare_system, scale_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, integrate
 from fingerspice.solve.sources import Tables
-from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
+from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError
 
 ATTEMPTS = 6
 # Voltage scale of a circuit whose sources give none, before any voltage has been computed, V.
 GUESS = 1.0
+
+
+def stepping(
+    problem: Problem, rtol: float, tol: float, u_scale: float, top: float, t_out: FloatArray, left: BoolArray,
+    repeat: bool,
+) -> Track | March:  # fmt: skip
+    """An integration with an error of `tol` times `u_scale` (V) in every step, in a run that is asked for `rtol`.
+
+    A stack's area curve reaches `top` (V) if that is above 0.
+    """
+    if problem.scene.stack is None:
+        return March(problem, tol, rtol, u_scale, t_out, left, repeat)
+    return Track(problem, prepare_system(problem.scene, rtol, top), tol * u_scale, t_out, left, repeat)
 
 
 def solve(
@@ -28,17 +41,7 @@ def solve(
     """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
 
     The tolerance of the first attempt is a guess; each further one follows from the previous attempt's stated error.
-
-    Parameters
-    ----------
-    problem : Problem
-    rtol : float
-    t_out, left : ndarray, shape (n_out,)
-        Output times (s, ascending), and whether the left-hand limit is wanted there.
-    progress : callable, optional
-        Called with the fraction of the run that is done.
-    repeat : bool
-        Whether later periods may repeat one period, once the state no longer changes from one to the next.
+    With `repeat`, later periods may repeat one period, once the state no longer changes from one to the next.
     """
     tables = Tables(problem, LOCAL_SHARE * rtol, t_out=t_out)
     is_stack = problem.scene.stack is not None
@@ -48,12 +51,7 @@ def solve(
     # The voltages of sources that cancel are rounding errors of those of their parts.
     finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
     while True:
-        one: Stepping
-        if is_stack:
-            prepared = prepare_system(problem.scene, rtol, top)
-            one = Track(problem, prepared, max(tol, finest) * u_scale, t_out, left, repeat)
-        else:
-            one = March(problem, max(tol, finest), rtol, u_scale, t_out, left, repeat)
+        one = stepping(problem, rtol, max(tol, finest), u_scale, top, t_out, left, repeat)
         if tries_out:
             one.try_out(rtol)
         try:

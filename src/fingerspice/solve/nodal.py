@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 import time
@@ -59,6 +58,8 @@ FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
 # Limit of accepted and rejected steps: at the start, and over the whole run. A run that needs more has a cause that
 # smaller steps do not remove.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
+# Least area that the scale of the charge counts with, over that at 0 V: with less, rounding may ask for minutes.
+LEAST_SHARE = 1e-3
 
 
 @cache
@@ -75,10 +76,6 @@ def radau_scheme(stages: int) -> Scheme:
         np.ascontiguousarray(back[upper].astype(complex)),
         np.ascontiguousarray((vectors[:, upper] * twice).astype(complex)), np.inf,
     )  # fmt: skip
-
-
-# Least area that the scale of the charge counts with, over that at 0 V: with less, rounding may ask for minutes.
-LEAST_SHARE = 1e-3
 
 
 class Collocation(NetworkIntegration):
@@ -113,20 +110,13 @@ class Collocation(NetworkIntegration):
         return float(self.control[implicit.BASE] + self.control[implicit.T])
 
     @property
-    def steps(self) -> int:
-        """Number of accepted and rejected steps."""
-        return int(self.counters[implicit.ACCEPTED] + self.counters[implicit.REJECTED])
-
-    @property
     def done(self) -> float:
         """Fraction of the run that is done."""
         return (self.t - self.problem.t_start) / (self.problem.t_stop - self.problem.t_start)
 
     def nodal(self, sources: Sources) -> Nodal:
         """The network with these sources, as the compiled steps take it."""
-        return Nodal(
-            self.net, self.room, self.scheme, self.work, sources, False, self.sign, self.scale, self.tol
-        )  # fmt: skip
+        return Nodal(self.net, self.room, self.scheme, self.work, sources, False, self.sign, self.scale, self.tol)
 
     def through(self, sources: Sources, t_end: float) -> Status:
         while True:
@@ -138,7 +128,8 @@ class Collocation(NetworkIntegration):
             if code == implicit.DONE:
                 return Status.SUCCESS
             if code == implicit.PAUSED:
-                if self.steps > FIRST_STEPS + self.done * MOST_STEPS:
+                steps = int(self.counters[implicit.ACCEPTED] + self.counters[implicit.REJECTED])
+                if steps > FIRST_STEPS + self.done * MOST_STEPS:
                     return Status.TOO_MANY_STEPS
                 if self.progress is not None:
                     self.progress(self.done)
@@ -164,16 +155,20 @@ def pass_through(
     problem: Problem, sources: Sources, tol: float, u_scale: float
 ) -> tuple[Status, Collocation, FloatArray]:
     """Integrate a problem without outputs: its status, the run, and its final error, estimated by a coarser run."""
-    longest, none = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step), np.zeros(0)
-    ends = []
-    for stages, share in ((STAGES_BESIDE, BESIDE), (STAGES, 1.0)):
-        scheme = radau_scheme(stages)._replace(h_max=longest)
+    none, ends = np.zeros(0), []
+    for scheme, share in zip(_schemes(problem), (BESIDE, 1.0), strict=True):
         one = Collocation(problem, scheme, max(share * tol, FINEST), u_scale, none, none.astype(bool))
         status = one.through(sources, problem.t_stop)
         ends.append(one.y)
         if status is not Status.SUCCESS:
             break
     return status, one, ends[-1] - ends[0]
+
+
+def _schemes(problem: Problem) -> tuple[Scheme, Scheme]:
+    """The coarser run's method and the run's."""
+    longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
+    return radau_scheme(STAGES_BESIDE)._replace(h_max=longest), radau_scheme(STAGES)._replace(h_max=longest)
 
 
 def _integrate(
@@ -201,15 +196,13 @@ def solve_coupled(
     method took over from another; a run that takes long is announced with it, and with its expected time.
     """
     progress = _announced(progress, f"{reason}: " if reason else "")
-    longest = min(LONGEST_STEP * problem.waveform.shortest_time(), problem.max_step)
-    fine, coarse = (radau_scheme(stages)._replace(h_max=longest) for stages in (STAGES, STAGES_BESIDE))
+    coarse, fine = _schemes(problem)
     at, side, probed = _with_probes(problem, t_out, left)
     u_scale = problem.largest
     if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
         u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
     finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
-    tol, nfev = max(LOCAL_SHARE * rtol, finest), 0
-    folded = math.inf
+    tol, nfev, folded = max(LOCAL_SHARE * rtol, finest), 0, math.inf
     nearest: tuple[float, Run] | None = None
     for attempt in range(ATTEMPTS):
         taken = tol
@@ -217,7 +210,7 @@ def solve_coupled(
         run = _integrate(problem, fine, tol, u_scale, at, side, progress)
         nfev += beside.nfev + run.nfev
         run.nfev = nfev
-        worst = _stated(problem, run, _only(run, probed), beside, u_scale, ALIKE * tol) / rtol
+        worst = _stated(problem, run, run.only(probed), beside, u_scale, ALIKE * tol) / rtol
         last = tol <= finest or attempt == ATTEMPTS - 1
         if problem.scene.net.mobile and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
             # A step has crossed a fold onto a branch of the area equation that no continuous path reaches.
@@ -246,7 +239,7 @@ def solve_coupled(
         run.status, run.nfev = Status.FOLD if believed else Status.ERROR_NOT_MET, nfev
     if problem.scene.net.mobile:
         run.margin = float(run.record(problem).fold_margin.min(initial=1.0))
-    run = _only(run, ~probed)
+    run = run.only(~probed)
     run.end_where_it_stopped()
     if problem.scene.net.mobile and run.t.size:
         run.margin = min(run.margin, float(run.record(problem).fold_margin[-1]))
@@ -312,12 +305,6 @@ def _with_probes(problem: Problem, t: FloatArray, left: BoolArray) -> tuple[Floa
     side = np.concatenate([left, ~np.isin(probes, edges)])
     order = np.lexsort((~side, every))
     return every[order], side[order], (np.arange(every.size) >= t.size)[order]
-
-
-def _only(run: Run, keep: BoolArray) -> Run:
-    """A copy of a run that has only the outputs with `keep`."""
-    keep = keep[: run.t.size]
-    return dataclasses.replace(run, t=run.t[keep], left=run.left[keep], rows=run.rows[keep])
 
 
 def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float, alike: float) -> float:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import Element
 from fingerspice.circuit.notices import circuit_warnings, course_warnings
 from fingerspice.circuit.spectrum import spectrum_warning
 from fingerspice.circuit.topology import driving
@@ -21,7 +20,8 @@ from fingerspice.physics.contact import inverse_area, inverse_area_range
 from fingerspice.results.outcome import Plan, Status
 from fingerspice.results.record import Record
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import Run, kept_with
+from fingerspice.solve.runs import Run
+from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.sources import shortest_event
 from fingerspice.solve.stepping import FEWEST_PERIODS
 from fingerspice.waveforms.sampling import Function
@@ -34,20 +34,18 @@ TIERS = ("algebraic", "linear", "coupled")
 # limit the steps of an explicit method.
 STIFF = 300.0
 REPEATS = "periodic: once a period no longer changes the state, later ones repeat it"
+BREAKDOWN_VOLTAGE = 300.0
+# Smallest contact area without a warning, relative to the area at 0 V.
+LEAST_AREA = 0.2
+# Smallest distance to the fold of the mobile law without a warning: a voltage a few percent larger reaches the fold.
+NEAR_FOLD = 0.2
+# Shortest event (s) in a user's function that may be missed without a warning, half a period of 10 kHz: drives of a
+# screen have few that are shorter.
+_EVENT = 0.5 / 10e3
 
 
-def make_plan(problem: Problem, rtol: float, tier: str = "auto", start: str = "deck") -> Plan:
-    """Choose the model for a problem.
-
-    Parameters
-    ----------
-    problem : Problem
-    rtol : float
-        Error asked for.
-    tier : str
-        ``"auto"``, or the tier to force.
-    start : str
-        Start of the run, as given to `simulate`; it is copied into the plan.
+def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "auto") -> Plan:
+    """The model for a problem with this error and tier asked for; a method that is named steps the coupled one.
 
     Raises
     ------
@@ -56,13 +54,13 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", start: str = "d
     """
     if tier not in ("auto", *TIERS):
         raise InputError(f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
-    key = ("plan", rtol, tier, start, problem.charge, _stores(problem), problem.t_start, problem.t_stop)
-    plan: Plan = kept_with(problem.scene.prepared, key, MOST_PLANS, lambda: _plan(problem, rtol, tier, start))
+    asked = "coupled" if tier == "auto" and method != "auto" else tier
+    key = ("plan", rtol, asked, problem.start, problem.charge, _stores(problem), problem.t_start, problem.t_stop)
+    plan: Plan = kept_with(problem.scene.prepared, key, MOST_PLANS, lambda: _plan(problem, rtol, asked))
     return plan
 
 
-@dataclass(frozen=True)
-class _Choice:
+class _Choice(NamedTuple):
     """The lightest valid tier and its reason; the largest relative change of 1/A, and the area it refers to (m^2)."""
 
     tier: str
@@ -71,7 +69,7 @@ class _Choice:
     area: float
 
 
-def _plan(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
+def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     scene, span = problem.scene, problem.t_stop - problem.t_start
     best = _of_network(problem) if scene.model is None else _of_stack(problem, scene.model, rtol)
     chosen, reason = (best.tier, best.reason) if tier == "auto" else (tier, best.reason)
@@ -88,7 +86,7 @@ def _plan(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
     if chosen == "linear" and scene.model is not None and scene.coupled and np.any(scene.model.rate0 > 0.0):
         needed = best.sensitivity
     if scene.skin is not None:
-        f, error = scene.skin.frequency, scene.skin.error
+        f, error = scene.skin
         reasons.append(f"skin at {f:g} Hz: its dispersion moves the gap voltage by {error:.1g}")
         needed += error
     elif scene.stack is not None and problem.circuit.by_device("SKIN_DISPERSIVE"):
@@ -97,16 +95,11 @@ def _plan(problem: Problem, rtol: float, tier: str, start: str) -> Plan:
         event = format_si(shortest_event(problem), "s")
         reasons.append(f"a source is a function: an event in it shorter than {event} may be missed without breaks=")
     found = tuple(sorted(map(float, rates)))
-    return Plan(chosen, tuple(reasons), start, found, stiff, best.sensitivity, needed, best.area)
+    return Plan(chosen, tuple(reasons), problem.start, found, stiff, best.sensitivity, needed, best.area)
 
 
 def _refuse(problem: Problem, tier: str, best: str) -> None:
-    """Refuse a tier that cannot describe the circuit.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a tier that cannot describe the circuit."""
     stack, mobile = problem.scene.stack, problem.scene.charge_law == "mobile"
     if stack is None and tier != "coupled":
         raise InputError(f"the {tier} tier is not for this network; allowed: auto, {best} or coupled")
@@ -180,38 +173,32 @@ def _change(curve: FloatArray, u_peak: float) -> tuple[float, float]:
     return max(middle / least, largest / middle) - 1.0, 1.0 / middle
 
 
-BREAKDOWN_VOLTAGE = 300.0
-# Smallest contact area without a warning, relative to the area at 0 V.
-LEAST_AREA = 0.2
-# Smallest distance to the fold of the mobile law without a warning: a voltage a few percent larger reaches the fold.
-NEAR_FOLD = 0.2
-# Shortest event (s) in a user's function that may be missed without a warning, half a period of 10 kHz: drives of a
-# screen have few that are shorter.
-_EVENT = 0.5 / 10e3
-
-
 def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
     """Warnings for every limit of the model that the run exceeds."""
+    success, several = run.status is Status.SUCCESS, len(record.fingers) > 1
     yield from (*problem.circuit.warnings, *circuit_warnings(problem.circuit, problem.t_stop))
     key = ("source", problem.t_start, problem.t_stop, problem.by_deck)
     yield from problem.circuit.remember(key, lambda: tuple(_source_warnings(problem)))
-    yield from _off_warning(problem, run)
-    if run.note and run.status is Status.SUCCESS:
+    if success and problem.waveforms and not run.gaps[:, 0].any():
+        yield from _off_warning(problem)
+    if run.note and success:
         yield run.note
-    net, several = problem.scene.net, len(record.fingers) > 1
     for finger, (name, contact) in enumerate(record.fingers):
-        i, (u_peak, f_peak, u_error, _) = problem.network.fingers[finger], run.gaps[finger].tolist()
-        where, unloaded = f" of {name}" if several else "", float(net.area0[i])
-        least, largest = math.inf, unloaded
-        if net.slow[i] >= 0:
-            area = record.finger_area(finger)
-            least, largest = float(area.min(initial=math.inf)), float(area.max(initial=0.0))
-        elif net.gap[i] >= 0:
-            least = float(1.0 / inverse_area(u_peak, net.curves[i])[0])
-            largest = max(unloaded, least)
-        yield from _gap_warnings(where, u_peak, unloaded, least)
+        u_peak, f_peak, u_error, _ = run.gaps[finger].tolist()
+        where, unloaded = f" of {name}" if several else "", record.net.area0[problem.network.fingers[finger]]
+        least, largest = _areas_met(problem, record, finger, u_peak)
+        if u_peak > BREAKDOWN_VOLTAGE:
+            yield (
+                f"the gap voltage{where} reaches {u_peak:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "
+                "(Paschen minimum 327 V), which the model does not contain"
+            )
+        if least < LEAST_AREA * unloaded:
+            yield (
+                f"the contact area{where} falls to {1e6 * least:.3g} mm^2, below {100.0 * LEAST_AREA:g} % of the "
+                f"{1e6 * unloaded:.3g} mm^2 at 0 V: the contact model was not made for so little"
+            )
         yield from beyond_fingers(where, f_peak, float(contact.stress(u_peak)), largest)
-        if run.status is Status.SUCCESS and 0.0 < u_peak <= u_error and not several:
+        if success and 0.0 < u_peak <= u_error and not several:
             yield (
                 f"the gap takes no more than rounding of the source's voltage: of its {u_peak:.2g} V nothing is "
                 "known but that they are as good as 0"
@@ -222,8 +209,33 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
                 f"the source function of {e.name} gives numbers rounded to {e.waveform.precision:.2g} of their size, "
                 f"not doubles: it is rough by {run.rough:.2g} V, which the stated errors contain"
             )
-    yield from _fold_warning(run)
-    yield from _strength_warnings(problem.network.layers, record)
+    if run.margin < NEAR_FOLD and success:
+        yield (
+            f"the fold of the mobile charge law is near: the distance to it falls to {run.margin:.2g} (1 far, 0 at the "
+            "fold)"
+        )
+    for i, layer in enumerate(problem.network.layers):
+        strength = layer.values.get("e_max", math.inf)
+        if math.isfinite(strength) and record.t.size:
+            field = float(np.abs(record.u_layer[:, i]).max()) / layer.values["d"]
+            if field > strength:
+                yield (
+                    f"the field in {layer.name} reaches {field:.3g} V/m at the outputs; its dielectric strength is "
+                    f"{strength:.3g} V/m"
+                )
+
+
+def _areas_met(problem: Problem, record: Record, finger: int, u_peak: float) -> tuple[float, float]:
+    """Least area of a finger in the run, infinite where it is fixed, and the largest that its stress acts on, m^2."""
+    net, i = problem.scene.net, problem.network.fingers[finger]
+    unloaded = float(net.area0[i])
+    if net.slow[i] >= 0:
+        area = record.finger_area(finger)
+        return float(area.min(initial=math.inf)), float(area.max(initial=0.0))
+    if net.gap[i] < 0:
+        return math.inf, unloaded
+    least = float(1.0 / inverse_area(u_peak, net.curves[i])[0])
+    return least, max(unloaded, least)
 
 
 def _source_warnings(problem: Problem) -> Iterator[str]:
@@ -241,53 +253,18 @@ def _source_warnings(problem: Problem) -> Iterator[str]:
         yield outside
 
 
-def _off_warning(problem: Problem, run: Run) -> Iterator[str]:
+def _off_warning(problem: Problem) -> Iterator[str]:
     """A warning about sources that are 0 in the whole run, unless a charge of the start drives it."""
-    if run.status is not Status.SUCCESS or not problem.waveforms or run.gaps[:, 0].any():
-        return
     currents = problem.waveforms[problem.network.n_voltage :]
-    if not any((problem.scene.u_peak, *(wave.peak(problem.t_start, problem.t_stop) for wave in currents))):
-        small = ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None)
-        if small:
-            yield (
-                f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine "
-                "in time is SIN(VO VA FREQ)"
-            )
-        elif not problem.initial.y.any() and not any(
-            problem.t_stop <= wave.course[0] < math.inf for wave in problem.waveforms
-        ):
-            yield "the sources are 0 all the time, and nothing is charged: every voltage is 0"
-
-
-def _gap_warnings(where: str, peak: float, unloaded: float, least: float) -> Iterator[str]:
-    """Warnings about a gap, given its largest voltage (V), its area at 0 V and its smallest area (m^2)."""
-    if peak > BREAKDOWN_VOLTAGE:
+    if any((problem.scene.u_peak, *(wave.peak(problem.t_start, problem.t_stop) for wave in currents))):
+        return
+    small = ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None)
+    if small:
         yield (
-            f"the gap voltage{where} reaches {peak:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "
-            "(Paschen minimum 327 V), which the model does not contain"
+            f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine "
+            "in time is SIN(VO VA FREQ)"
         )
-    if least < LEAST_AREA * unloaded:
-        yield (
-            f"the contact area{where} falls to {1e6 * least:.3g} mm^2, below {100.0 * LEAST_AREA:g} % of the "
-            f"{1e6 * unloaded:.3g} mm^2 at 0 V: the contact model was not made for so little"
-        )
-
-
-def _fold_warning(run: Run) -> Iterator[str]:
-    if run.margin < NEAR_FOLD and run.status is Status.SUCCESS:
-        yield (
-            f"the fold of the mobile charge law is near: the distance to it falls to {run.margin:.2g} (1 far, 0 at the "
-            "fold)"
-        )
-
-
-def _strength_warnings(layers: tuple[Element, ...], record: Record) -> Iterator[str]:
-    for i, layer in enumerate(layers):
-        strength = layer.values.get("e_max", math.inf)
-        if math.isfinite(strength) and record.t.size:
-            field = float(np.abs(record.u_layer[:, i]).max()) / layer.values["d"]
-            if field > strength:
-                yield (
-                    f"the field in {layer.name} reaches {field:.3g} V/m at the outputs; its dielectric strength is "
-                    f"{strength:.3g} V/m"
-                )
+    elif not problem.initial.y.any() and not any(
+        problem.t_stop <= wave.course[0] < math.inf for wave in problem.waveforms
+    ):
+        yield "the sources are 0 all the time, and nothing is charged: every voltage is 0"

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray, real_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import area_given
 from fingerspice.circuit.circuit import Circuit
@@ -18,7 +18,7 @@ from fingerspice.circuit.notices import time_slip
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
 from fingerspice.solve.initial import StackState, initial_state, to_stack
-from fingerspice.solve.scenes import Scene, scene_of
+from fingerspice.solve.scenes import Scene, kept_with, scene_of
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import misses, on_breakpoint, same_time
 from fingerspice.waveforms.waveform import DC, Waveform, require
@@ -27,97 +27,15 @@ from fingerspice.waveforms.waveform import DC, Waveform, require
 MOST_PERIODS, MOST_BREAKPOINTS = 1e10, 4e9
 #: Most bytes of the signals at the deck's own output times; writing a file needs three times as much memory.
 MOST_BYTES = 2e9
-
-
-def run_times(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None) -> tuple[float, float]:
-    """End of the run and output spacing, s; times of `t_eval` that pass an end by rounding are set to it, in place."""
-    tran = circuit.tran
-    if t_stop is None:
-        if tran is not None:
-            t_stop = t_start + tran.stop
-        elif t_eval is not None and t_eval.size:
-            t_stop = float(t_eval[-1])
-        else:
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
-    require(math.isfinite(t_stop) and t_stop > t_start, "t_stop", f"{t_stop:g} s", f"more than {t_start:g} s")
-    if t_eval is not None:
-        require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
-        require(bool(np.all(t_eval[1:] >= t_eval[:-1])), "t_eval", "not in order", "ascending times")
-        to_ends(t_eval, t_start, t_stop)
-        first, last = float(t_eval[0]), float(t_eval[-1])
-        require(
-            first >= t_start and last <= t_stop,
-            "t_eval",
-            f"{first:g} s to {last:g} s",
-            f"times from {t_start:g} s to t_stop = {t_stop:g} s{time_slip(first, last, t_stop)}",
-        )
-    step = tran.step if tran is not None else (t_stop - t_start) / 1000.0
-    return t_stop, step
-
-
-def to_ends(t: FloatArray, t_start: float, t_stop: float) -> None:
-    """Set times (s, ascending) that pass an end of the run by rounding to that end, in place."""
-    slack = same_time(t_stop)
-    t[slice(*t.searchsorted([t_start - slack, t_start]))] = t_start
-    t[slice(*t.searchsorted([t_stop, t_stop + slack], "right"))] = t_stop
-
-
-# Most signals that one element adds to the outputs: a GAP adds most, with its two nodes and its area.
-_MOST_COLUMNS = 12
-
-
-def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
-    """Refuse a run with more periods or breakpoints than can be computed.
-
-    Raises
-    ------
-    InputError
-        Its message tells their number.
-    """
-    span = t_stop - t_start
-    periods = span / waveform.shortest_time()
-    require(
-        periods <= MOST_PERIODS,
-        "the run",
-        f"{span:g} s long, {periods:.3g} periods or time constants of its source",
-        f"at most {MOST_PERIODS:.0e} of them",
-    )
-    breakpoints = span * waveform.breakpoint_rate()
-    require(
-        breakpoints <= MOST_BREAKPOINTS,
-        "the run",
-        f"{span:g} s long, {breakpoints:.3g} breakpoints of its source",
-        f"at most {MOST_BREAKPOINTS:.0e} of them",
-    )
-
-
-def check_outputs(circuit: Circuit, count: float) -> None:
-    """Refuse a number of output times for whose signals memory is too small.
-
-    Raises
-    ------
-    InputError
-        Its message tells the memory needed.
-    """
-    if 8.0 * count * _MOST_COLUMNS * len(circuit.elements) <= MOST_BYTES:
-        return
-    devices = [element.device for element in circuit.elements]
-    layers = sum(element.spec.is_layer for element in circuit.elements)
-    nodes = len({node for element in circuit.elements for node in element.nodes})
-    columns = layers + nodes + 7 * devices.count("GAP") + 3 * (devices.count("V") + devices.count("I")) + 1
-    size = 8.0 * columns * count
-    require(
-        size <= MOST_BYTES,
-        "the run",
-        f"one of {count:.3g} outputs with {columns} signals, {size / 1e9:.3g} GB",
-        f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning",
-    )
-
-
 # Round-off of a gap voltage relative to the voltages that cancel in it; finer steps cannot reduce the error below that.
 ROUNDING = 2e-14
-# Largest number of breakpoints cached with a waveform (64 kB).
-KEPT_BREAKPOINTS = 8192
+# Largest number of breakpoints (64 kB) and of output times (0.3 MB) cached with a waveform.
+KEPT_BREAKPOINTS, KEPT_OUTPUTS = 8192, 32_768
+# Resolution of a time in units of its rounding error; a difference of a source's two limits at an edge is no jump if
+# the source changes as much within this resolution beside the edge.
+_RESOLVED = 8.0
+# Breakpoints held in memory at a time, so that memory does not grow with the length of the run.
+_BREAKPOINTS_AT_ONCE = 65_536
 
 
 @dataclass(frozen=True)
@@ -164,23 +82,16 @@ class Problem:
 
     @cached_property
     def inner(self) -> StackState:
-        """The start of a stack in the form of its own equations; the scene caches the last one."""
-        state, inner = self.scene.prepared.get("inner", (None, None))
-        if state is not self.initial:
-            state, inner = self.scene.prepared["inner"] = self.initial, to_stack(self.scene, self.initial)
-        assert isinstance(inner, StackState)
-        return inner
+        """The start of a stack in the form of its own equations."""
+        return to_stack(self.scene, self.initial)
 
     def breakpoints(self) -> FloatArray:
         """The sources' breakpoints in the run, s; the waveform caches them if they are few."""
-        span = self.t_start, self.t_stop
-        # Key and value are one entry, because another thread may replace it at any time.
-        kept, edges = self.waveform.kept.get("breakpoints", (None, np.empty(0)))
-        if kept != span:
-            edges = self.waveform.breakpoints(*span)
-            if edges.size <= KEPT_BREAKPOINTS:
-                self.waveform.kept["breakpoints"] = span, edges
-        return np.asarray(edges)
+        kept, key = self.waveform.kept, ("breakpoints", self.t_start, self.t_stop)
+        edges: FloatArray = kept_with(kept, key, 1, lambda: self.waveform.breakpoints(self.t_start, self.t_stop))
+        if edges.size > KEPT_BREAKPOINTS:
+            kept.pop(key, None)
+        return edges
 
     @property
     def max_step(self) -> float:
@@ -200,35 +111,87 @@ def prepare(
     charge: bool = True,
     rtol: float = 0.0,
 ) -> Problem:
-    """Prepare a run, or refuse it; `rtol` decides whether a dispersive skin's data may be taken at one frequency.
+    """Prepare a run, or refuse it; times of `t_eval` that pass an end of the run by rounding are set to it, in place.
+
+    `rtol` decides whether a dispersive skin's data may be taken at one frequency. A run from the periodic state is
+    prepared from the uncharged start.
 
     Raises
     ------
     InputError
         For anything in the request that cannot be run.
     """
+    t_stop = None if t_stop is None else real_number("t_stop", t_stop, "a number in s")
+    if isinstance(start, Solution) and start.stored is not None:
+        raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
-    stop, step = run_times(circuit, t_start, t_stop, t_eval)
-    # Key and value are one entry, because another thread may replace it at any time.
-    kept = scene.waveform.kept
-    asked, ends = kept.get("end", (math.nan, math.nan))
-    if asked != stop:
-        asked, ends = kept["end"] = stop, on_breakpoint(scene.waveform, stop)
-    first = t_start + (circuit.tran.start if circuit.tran else 0.0)
-    how, initial = start if isinstance(start, str) else "given", initial_state(circuit, scene, start)
-    by_deck = t_stop is None and circuit.tran is not None
-    return Problem(circuit, scene, t_start, ends, first, step, initial, charge, how, by_deck)
+    stop = _end(circuit, t_start, t_stop, t_eval)
+    tran, wave = circuit.tran, scene.waveform
+    end: float = kept_with(wave.kept, ("end", stop), 1, lambda: on_breakpoint(wave, stop))
+    return Problem(
+        circuit, scene, t_start, end, t_start + (tran.start if tran else 0.0),
+        tran.step if tran else (stop - t_start) / 1000.0,
+        initial_state(circuit, scene, "uncharged" if start == "periodic" else start), charge,
+        start if isinstance(start, str) else "given", t_stop is None and tran is not None,
+    )  # fmt: skip
 
 
-# Resolution of a time in units of its rounding error; a difference of a source's two limits at an edge is no jump if
-# the source changes as much within this resolution beside the edge.
-_RESOLVED = 8.0
-# Breakpoints held in memory at a time, so that memory does not grow with the length of the run.
-_BREAKPOINTS_AT_ONCE = 65_536
-# Output times (0.3 MB) that a waveform keeps.
-KEPT_OUTPUTS = 32_768
-_NONE = np.empty(0)
+def _end(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None) -> float:
+    """End of the run, s, with its output times checked against it."""
+    if t_stop is None:
+        if circuit.tran is not None:
+            t_stop = t_start + circuit.tran.stop
+        elif t_eval is not None and t_eval.size:
+            t_stop = float(t_eval[-1])
+        else:
+            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+    require(math.isfinite(t_stop) and t_stop > t_start, "t_stop", f"{t_stop:g} s", f"more than {t_start:g} s")
+    if t_eval is not None:
+        require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
+        require(bool(np.all(t_eval[1:] >= t_eval[:-1])), "t_eval", "not in order", "ascending times")
+        to_ends(t_eval, t_start, t_stop)
+        first, last = float(t_eval[0]), float(t_eval[-1])
+        allowed = f"times from {t_start:g} s to t_stop = {t_stop:g} s{time_slip(first, last, t_stop)}"
+        require(first >= t_start and last <= t_stop, "t_eval", f"{first:g} s to {last:g} s", allowed)
+    return t_stop
+
+
+def to_ends(t: FloatArray, t_start: float, t_stop: float) -> None:
+    """Set times (s, ascending) that pass an end of the run by rounding to that end, in place."""
+    slack = same_time(t_stop)
+    t[slice(*t.searchsorted([t_start - slack, t_start]))] = t_start
+    t[slice(*t.searchsorted([t_stop, t_stop + slack], "right"))] = t_stop
+
+
+def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
+    """Refuse a run with more periods or breakpoints than can be computed."""
+    span = t_stop - t_start
+    for count, what, most in (
+        (span / waveform.shortest_time(), "periods or time constants", MOST_PERIODS),
+        (span * waveform.breakpoint_rate(), "breakpoints", MOST_BREAKPOINTS),
+    ):
+        told = f"{span:g} s long, {count:.3g} {what} of its source"
+        require(count <= most, "the run", told, f"at most {most:.0e} of them")
+
+
+def check_outputs(circuit: Circuit, count: float) -> None:
+    """Refuse a number of output times for whose signals memory is too small."""
+
+    def columns() -> int:
+        devices = [element.device for element in circuit.elements]
+        layers = sum(element.spec.is_layer for element in circuit.elements)
+        nodes = len({node for element in circuit.elements for node in element.nodes})
+        return layers + nodes + 7 * devices.count("GAP") + 3 * (devices.count("V") + devices.count("I")) + 1
+
+    signals = circuit.remember("columns", columns)
+    size = 8.0 * signals * count
+    require(
+        size <= MOST_BYTES,
+        "the run",
+        f"one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB",
+        f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning",
+    )
 
 
 def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
@@ -246,16 +209,13 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
         near = edges[misses(t, edges, same_time(1.0))] if edges.size else edges
         moved = t.copy() if near.size and moved is t else moved
         slack = same_time(1.0) * np.abs(near)
-        for edge, first, last in zip(
-            near, t.searchsorted(near - slack), t.searchsorted(near + slack, "right"), strict=True
-        ):
+        spans = zip(near, t.searchsorted(near - slack), t.searchsorted(near + slack, "right"), strict=True)
+        for edge, first, last in spans:
             moved[first:last] = edge
     return moved
 
 
-def asked_for(
-    problem: Problem, t_eval: FloatArray | None, jumps: str
-) -> tuple[FloatArray, BoolArray]:  # fmt: skip
+def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[FloatArray, BoolArray]:
     """Output times (s) and whether each is left-hand: the given times, all right-hand, or the deck's.
 
     Raises
@@ -267,20 +227,16 @@ def asked_for(
     if t_eval is not None:
         return t_eval, np.zeros(t_eval.size, bool)
     check_outputs(problem.circuit, (problem.t_stop - problem.first) / problem.step)
-    key, kept = (problem.t_start, problem.t_stop, problem.first, problem.step, jumps), problem.waveform.kept
-    # One entry with its key: another thread may put its own there at any time.
-    known, t_out, left = kept.get("outputs", (None, _NONE, _NONE))
-    if known != key:
-        t_out, left = output_times(problem, jumps)
-        t_out.flags.writeable = left.flags.writeable = False
-        if t_out.size <= KEPT_OUTPUTS:
-            kept["outputs"] = key, t_out, left
+    kept, key = problem.waveform.kept, ("outputs", problem.t_start, problem.t_stop, problem.first, problem.step, jumps)
+    t_out, left = kept_with(kept, key, 1, lambda: _output_times(problem, jumps))
+    if t_out.size > KEPT_OUTPUTS:
+        kept.pop(key, None)
     # Check again, because each jump adds two outputs.
     check_outputs(problem.circuit, t_out.size)
     return t_out, left
 
 
-def output_times(problem: Problem, jumps: str = "both") -> tuple[FloatArray, BoolArray]:
+def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
     """Times TSTART:TSTEP:TSTOP (s) and whether each is left-hand; unless `jumps` is "none", two more at each jump.
 
     A jump at t = 0 has no left-hand output.
@@ -290,39 +246,35 @@ def output_times(problem: Problem, jumps: str = "both") -> tuple[FloatArray, Boo
     grid = np.asarray(first + step * np.arange(count + 1), float)
     if grid.size and abs(grid[-1] - problem.t_stop) <= 1e-9 * step:
         grid[-1] = problem.t_stop
-    if jumps == "none":
-        return grid, np.zeros(grid.size, bool)
-    at = _jumps(problem)
+    at = np.empty(0) if jumps == "none" else _jumps(problem)
     if at.size:
         near = np.clip(np.searchsorted(at, grid), 1, max(at.size - 1, 1))
         distance = np.minimum(np.abs(grid - at[near - 1]), np.abs(grid - at[np.minimum(near, at.size - 1)]))
         grid = grid[distance > 1e-9 * step]
     t = np.concatenate([grid, at, at])
-    left = np.concatenate([np.zeros(grid.size, bool), np.ones(at.size, bool), np.zeros(at.size, bool)])
+    left = np.zeros(t.size, bool)
+    left[grid.size : grid.size + at.size] = True
     order = np.lexsort((~left, t))
-    return np.ascontiguousarray(t[order]), np.ascontiguousarray(left[order])
+    t, left = t[order], left[order]
+    t.flags.writeable = left.flags.writeable = False
+    return t, left
 
 
 def _jumps(problem: Problem) -> FloatArray:
-    """Times (s, ascending) of the jumps of any source in the run, after its start."""
-    stop = problem.t_stop
+    """Times (s, ascending) of the jumps of any source in the run, after its start.
+
+    A jump is an edge at which both limits differ by more than the source changes beside it, within the resolution of
+    time, so that a steep but continuous flank is no jump.
+    """
+    stop, found = problem.t_stop, [np.empty(0)]
     rounding = same_time(stop)
-    found = []
     for wave in problem.waveforms:
         edges = wave.breakpoints(problem.t_start, stop + rounding)
         edges = edges[(edges > problem.t_start + same_time(problem.t_start)) & (edges >= problem.first)]
         if edges.size:
-            edges = edges[_is_jump(wave, edges)]
+            right, left = wave.value(edges), wave.value(edges, "left")
+            late = _RESOLVED * same_time(1.0) * np.abs(edges)
+            moved = np.abs(wave.value(edges + late) - right) + np.abs(left - wave.value(edges - late, "left"))
+            edges = edges[np.abs(right - left) > moved + 1e-12 * np.maximum(np.abs(right), np.abs(left))]
             found.append(np.where(edges > stop - rounding, stop, edges))
-    return np.unique(np.concatenate(found)) if found else np.empty(0)
-
-
-def _is_jump(wave: Waveform, edges: FloatArray) -> BoolArray:
-    """Whether a waveform jumps at its edges (s): its limits differ by more than it changes beside the edge.
-
-    That change is taken over the resolution of time, so that a steep but continuous flank is no jump.
-    """
-    right, left = wave.value(edges), wave.value(edges, "left")
-    late = _RESOLVED * same_time(1.0) * np.abs(edges)
-    moved = np.abs(wave.value(edges + late) - right) + np.abs(left - wave.value(edges - late, "left"))
-    return np.asarray(np.abs(right - left) > moved + 1e-12 * np.maximum(np.abs(right), np.abs(left)))
+    return np.unique(np.concatenate(found))

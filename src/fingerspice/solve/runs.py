@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status, l
 from fingerspice.results.record import Record
 from fingerspice.results.steps import ClosedForm, Recorded
 from fingerspice.solve.problem import Problem
+from fingerspice.solve.scenes import kept_with as kept_with
 from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index, values_at
 from fingerspice.waveforms.sampling import breakpoints_at
 
@@ -25,21 +26,6 @@ Progress = Callable[[float], None]
 PAST_FOLD = -0.01
 # Smallest force (N) whose error is judged; the error of a smaller one may be a denormal number with too few digits.
 LEAST_FORCE = 1e-290
-
-
-def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], Any]) -> Any:
-    """The entry of a scene's cache `prepared` under a key; `make` computes it if it is missing.
-
-    At most `most` entries share the first part of the key; when there would be more, all of them are removed first.
-    Other threads may remove entries at any time, so that the entry is looked up only once.
-    """
-    found = prepared.get(key)
-    if found is None:
-        kept = [name for name in list(prepared) if name[0] == key[0]]
-        for name in kept if len(kept) >= most else ():
-            prepared.pop(name, None)
-        found = prepared[key] = make()
-    return found
 
 
 @dataclass
@@ -83,10 +69,10 @@ class Run:
         scene = problem.scene.shown if self.by_layer else problem.scene
         return Record(scene.network, scene.net, self.t, self.left, self.rows, problem.charge)
 
-    def end_before(self, t: float) -> None:
-        """Remove the outputs at time t (s) and later."""
-        kept = self.t < t
-        self.t, self.left, self.rows = self.t[kept], self.left[kept], self.rows[kept]
+    def only(self, kept: BoolArray) -> Run:
+        """A copy that has only the outputs that are `kept`."""
+        kept = kept[: self.t.size]
+        return replace(self, t=self.t[kept], left=self.left[kept], rows=self.rows[kept])
 
     def end_where_it_stopped(self) -> None:
         """Append a left-hand output at the time that a failed run reached, unless it has one there already."""
@@ -129,29 +115,19 @@ def closed_form(problem: Problem, look: Callable[[FloatArray, BoolArray], Record
 
 
 class Integration(ABC):
-    """One integration in progress.
+    """One integration in progress, with outputs at `t_out` (s), as left-hand limits where `left` is true."""
 
-    Attributes
-    ----------
-    t_out, left : ndarray, shape (n_out,)
-        Output times (s), and whether the left-hand limit is wanted there.
-    y, sign, s_before : ndarray
-        The state reached, as in `State`.
-    counters : ndarray of int
-        Counters with the indices of `engine.collocation.readout`.
-    tried : ndarray, shape (TRIED, 4)
-        The last attempted steps, see `last_tried`.
-    """
-
-    counters: IntArray
+    counters: IntArray  # With the indices of `engine.collocation.readout`
 
     def __init__(self, problem: Problem, t_out: FloatArray, left: BoolArray) -> None:
         self.problem, self.net, self.t_out, self.left = problem, problem.scene.net, read_only(t_out), read_only(left)
         self.n, n_s = map(int, self.net.b.shape)
+        # The state reached, as in `State`.
         self.y, self.sign = problem.initial.y.copy(), problem.initial.sign.copy()
         self.s_before = problem.initial.s_before.copy()
         self.n_slow = self.y.size - self.n - n_s
         self.width = self.y.size + (n_s if problem.charge else 0)
+        # The last attempted steps, see `last_tried`.
         self.tried = np.zeros((TRIED, 4))
 
     @property
@@ -271,10 +247,8 @@ ROUGH = "the source function itself is rough by {:.2g} V"
 
 def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
     """The failure of a run. At a fold, the gap with the smallest area relative to its area at 0 V is named."""
-    status, cause = run.status, run.status.cause
-    names = _measured(problem)
-    element = ", ".join(names)
-    u_gap = area = margin = None
+    status, cause, names = run.status, run.status.cause, _measured(problem)
+    element, u_gap, area, margin = ", ".join(names), None, None, None
     if status is Status.SOURCE_NOT_FINITE and run.t_failed is not None:
         element = _not_finite_at(problem, run.t_failed)
     elif status is Status.SOURCE_UNSEEN and run.unseen is not None:
@@ -287,9 +261,8 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
             cause += " (the source jumps past the fold at this time)"
         shrunk = [record.finger_area(i)[-1] / problem.scene.area0[j] for i, j in enumerate(problem.network.fingers)]
         i = int(np.argmin(shrunk))
-        element = names[i]
-        u_gap, area = float(record.finger_voltage(i)[-1]), float(record.finger_area(i)[-1])
-        margin = float(record.fold_margin[-1])
+        signals = record.finger_voltage(i), record.finger_area(i), record.fold_margin
+        element, (u_gap, area, margin) = names[i], (float(x[-1]) for x in signals)
     detail = run.detail or (ROUGH.format(run.rough) if run.rough > 0.0 else "")
     if detail:
         cause += f" ({detail})"
@@ -298,7 +271,12 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         worst = int(np.argmax(run.gaps[:, 2] / np.where(peaks > 0.0, peaks, np.inf)))
         element = names[worst] if names else element
         cause += f" (estimate {run.gaps[worst, 2]:.3g} V of {peaks[worst]:.3g} V peak"
-        cause += _little(peaks[worst], max(problem.scene.u_peak, float(peaks.max()))) + ")"
+        largest = max(problem.scene.u_peak, float(peaks.max()))
+        if peaks[worst] < 1e-4 * largest:
+            cause += (
+                f"; the gap takes almost nothing of the {largest:.3g} V of the source, and rounding of these limits it"
+            )
+        cause += ")"
     return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, last_tried(run.tried))
 
 
@@ -326,10 +304,3 @@ def _not_finite_at(problem: Problem, t: float) -> str:
     """Names of the sources without a finite value at time t, s."""
     broken = [i for i, wave in enumerate(problem.waveforms) if not np.isfinite(wave.value(t))]
     return ", ".join(name for i in broken for name in _written(problem, i))
-
-
-def _little(peak: float, largest: float) -> str:
-    """Reason why `rtol` cannot be met for a gap with a tiny share of the circuit's largest voltage (V), or ""."""
-    if not peak < 1e-4 * largest:
-        return ""
-    return f"; the gap takes almost nothing of the {largest:.3g} V of the source, and rounding of these limits it"

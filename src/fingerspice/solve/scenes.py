@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from fingerspice.circuit.spectrum import COUPLING, freezing_error
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.engine.network import Net
 from fingerspice.engine.one_area.model import Model
-from fingerspice.engine.one_area.system import System, build_system
+from fingerspice.engine.one_area.system import build_system
 from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import fixed_area_curve
 from fingerspice.waveforms.combinations import Sum
@@ -38,12 +39,25 @@ BEYOND_PEAK = 1.3
 DRIVEN_BY_CURRENT = 300.0
 
 
-@dataclass(frozen=True)
-class Freezing:
+class Freezing(NamedTuple):
     """The single frequency at which a dispersive skin's data are taken, and the error of doing so."""
 
     frequency: float  # Hz
     error: float  # Error of the gap voltage, relative to its peak
+
+
+def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], Any]) -> Any:
+    """The entry of a cache under a key, of which at most `most` share the first part; else all of these make room.
+
+    Other threads may remove entries at any time, so that the entry is looked up only once.
+    """
+    found = prepared.get(key)
+    if found is None:
+        kept = [name for name in list(prepared) if name[0] == key[0]]
+        for name in kept if len(kept) >= most else ():
+            prepared.pop(name, None)
+        found = prepared[key] = make()
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +110,37 @@ class Scene:
     @cached_property
     def net(self) -> Net:
         """The network with its area curves, for compiled code."""
-        return _net(self)
+        network, model, count = self.network, self.model, len(self.fixed)
+        gap, tau, curves = np.full(count, -1), np.zeros(count), [np.zeros(1)] * count
+        area0 = np.array(self.fixed, float)
+        parts = zip(self.fixed, network.contacts, network.gaps, network.areas, strict=True)
+        for i, (fixed, contact, cell, area) in enumerate(parts):
+            if fixed is None and contact is not None and cell is not None and area.gap is not None:
+                gap[i], tau[i] = cell, area.gap.values["tau"]
+                area0[i] = contact.area_at_rest if model is None else model.area0
+                curves[i] = contact.curve(self.u_top) if model is None else model.curve
+        padded = np.zeros((count, max((c.size for c in curves), default=1)))
+        for row, curve in zip(padded, curves, strict=True):
+            row[: curve.size] = curve
+        cells = network.cells
+        return Net(
+            mobile=self.charge_law == "mobile",
+            p=np.ascontiguousarray(network.p),
+            q=np.ascontiguousarray(network.q),
+            c=np.array([c.c for c in cells], float),
+            g_total=np.array([c.g_total for c in cells], float),
+            g_area=np.array([c.g_area for c in cells], float),
+            place=np.array([-1 if c.area is None else c.area for c in cells], np.int64),
+            k=np.ascontiguousarray(network.k),
+            b=np.ascontiguousarray(network.b),
+            through=np.ascontiguousarray(network.through),
+            delivered=np.ascontiguousarray(network.delivered),
+            gap=gap,
+            area0=area0,
+            tau=tau,
+            slow=np.where(tau > 0.0, np.cumsum(tau > 0.0) - 1, -1),
+            curves=padded,
+        )
 
     @property
     def shown(self) -> Scene:
@@ -131,7 +175,9 @@ class Scene:
         """Modes of the circuit at areas (n_area,) in m^2."""
         if self.model is None:
             return network_modes(self.network, area)
-        system, turn = fixed_system(self.model, float(area[0])), self.turn
+        fixed, turn, n = float(area[0]), self.turn, self.model.gap.size
+        model = self.model._replace(coupled=False, mobile=False, area0=fixed, curve=fixed_area_curve(fixed))
+        system = build_system(model, 1e-13, (1.0 / fixed, 1.0 / fixed), np.eye(n), np.zeros((0, n + 1)))
         return Modes(
             system.rates[0], system.gain[0][:, None], turn[:, None] * system.live[0], system.project[0] * turn,
             -(turn * self.model.k[:-1])[:, None], np.zeros((turn.size, turn.size + 1)),
@@ -157,14 +203,6 @@ class Scene:
         return (int(np.argmin(self.network.capacitance(self.area0))),)
 
 
-def fixed_system(model: Model, area: float) -> System:
-    """The modal system of a stack with its area fixed, m^2."""
-    model = model._replace(coupled=False, mobile=False, area0=area, curve=fixed_area_curve(area))
-    return build_system(
-        model, 1e-13, (1.0 / area, 1.0 / area), np.eye(model.gap.size), np.zeros((0, model.gap.size + 1))
-    )
-
-
 def scene_of(
     circuit: Circuit, charge_law: str | None, area: str | float, t_stop: float | None, rtol: float = 0.0
 ) -> Scene:
@@ -181,21 +219,19 @@ def scene_of(
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     stop = t_stop or (circuit.tran.stop if circuit.tran else 1.0)
     skin = _freezing(circuit, stop, rtol)
-    scene: Scene = circuit.remember(("scene", law, area, stop, skin), lambda: _scene(circuit, law, area, stop, skin))
-    return scene
 
+    def make() -> Scene:
+        network = network_of(circuit, None if skin is None else skin.frequency)
+        fixed, mode = _fixed_areas(network, area)
+        waves = network.waveforms[: network.n_voltage]
+        u_peak = sum(_largest_voltage(wave, stop, network.stack is not None) for wave in waves)
+        u_size = max(u_peak, sum(wave.cancelling(0.0, stop) for wave in waves))
+        by_current = DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage else 0.0
+        top = BEYOND_PEAK * u_peak + by_current or PEAK_UNKNOWN
+        model = None if network.stack is None else _model(network.stack, law, fixed[0], top)
+        return Scene(network, law, mode, fixed, u_peak, u_size, top, model, skin)
 
-def _scene(circuit: Circuit, law: str, area: str | float, stop: float, skin: Freezing | None) -> Scene:
-    network = network_of(circuit, None if skin is None else skin.frequency)
-    fixed, mode = _fixed_areas(network, area)
-    whole = network.stack is not None
-    waves = network.waveforms[: network.n_voltage]
-    u_peak = sum(_largest_voltage(waveform, stop, whole) for waveform in waves)
-    u_size = max(u_peak, sum(wave.cancelling(0.0, stop) for wave in waves))
-    by_current = DRIVEN_BY_CURRENT if len(network.sources) > network.n_voltage else 0.0
-    top = BEYOND_PEAK * u_peak + by_current or PEAK_UNKNOWN
-    model = None if network.stack is None else _model(network.stack, law, fixed[0], top)
-    return Scene(network, law, mode, fixed, u_peak, u_size, top, model, skin)
+    return circuit.remember(("scene", law, area, stop, skin), make)
 
 
 def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
@@ -232,8 +268,7 @@ def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> flo
     # Key and value are one entry, because another thread may replace it at any time.
     kept, peak = waveform.kept.get("peak", (None, 0.0))
     if kept != stop:
-        peak = waveform.peak(0.0, stop)
-        waveform.kept["peak"] = stop, peak
+        _, peak = waveform.kept["peak"] = stop, waveform.peak(0.0, stop)
     require(not 0.0 < peak < LEAST_PEAK, "the source's peak", f"{peak:g} V", f"0, or {LEAST_PEAK:g} V or more")
     return peak if math.isfinite(peak) else 0.0
 
@@ -257,15 +292,13 @@ def _fixed_areas(network: Network, area: str | float) -> tuple[tuple[float | Non
 def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
     """The model of a stack for compiled code; only the range of the area's curve depends on the source."""
     if fixed is not None:
-        area0 = fixed
-        curve = fixed_area_curve(fixed)
+        area0, curve = fixed, fixed_area_curve(fixed)
     else:
         assert stack.contact is not None
-        area0 = stack.contact.area_at_rest
-        curve = stack.contact.curve(u_top)
-    before: Model | None = None if fixed is not None else stack.kept.get(("model", law))
-    if before is not None:
-        return before._replace(curve=curve)
+        area0, curve = stack.contact.area_at_rest, stack.contact.curve(u_top)
+        before: Model | None = stack.kept.get(("model", law))
+        if before is not None:
+            return before._replace(curve=curve)
     order = list(stack.state_order)
     probe = int(np.argmin(stack.c)) if stack.gap is None else stack.gap
     k = stack.k[order]
@@ -297,49 +330,3 @@ def _row(order: list[int], layer: int) -> FloatArray:
     place = order.index(layer)
     n = len(order) - 1
     return np.full(n, -1.0) if place == n else np.eye(n)[place]
-
-
-def _net(scene: Scene) -> Net:
-    network, model = scene.network, scene.model
-    area0: list[float | None] = []
-    tau, curves, gaps = [], [], []
-    for x, contact, gap, area in zip(scene.fixed, network.contacts, network.gaps, network.areas, strict=True):
-        if x is None and contact is not None and gap is not None and area.gap is not None:
-            gaps.append(gap)
-            area0.append(contact.area_at_rest if model is None else model.area0)
-            tau.append(area.gap.values["tau"])
-            curves.append(contact.curve(scene.u_top) if model is None else model.curve)
-        else:
-            gaps.append(-1)
-            area0.append(x)
-            tau.append(0.0)
-            curves.append(np.zeros(1))
-    width = max((c.size for c in curves), default=1)
-    slow, count = [], 0
-    for t in tau:
-        slow.append(count if t > 0.0 else -1)
-        count += t > 0.0
-    cells = network.cells
-    return Net(
-        mobile=scene.charge_law == "mobile",
-        p=np.ascontiguousarray(network.p),
-        q=np.ascontiguousarray(network.q),
-        c=np.array([c.c for c in cells], float),
-        g_total=np.array([c.g_total for c in cells], float),
-        g_area=np.array([c.g_area for c in cells], float),
-        place=np.array([-1 if c.area is None else c.area for c in cells], np.int64),
-        k=np.ascontiguousarray(network.k),
-        b=np.ascontiguousarray(network.b),
-        through=np.ascontiguousarray(network.through),
-        delivered=np.ascontiguousarray(network.delivered),
-        gap=np.array(gaps, np.int64),
-        area0=np.array(area0, float),
-        tau=np.array(tau, float),
-        slow=np.array(slow, np.int64),
-        curves=np.array([_padded(c, width) for c in curves]).reshape(len(curves), width),
-    )
-
-
-def _padded(curve: FloatArray, width: int) -> FloatArray:
-    """A curve padded with zeros to a common length."""
-    return curve if curve.size == width else np.pad(curve, (0, width - curve.size))

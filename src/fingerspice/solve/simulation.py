@@ -23,7 +23,7 @@ from fingerspice.results.solution import Solution
 from fingerspice.solve.closed_form import solve_algebraic, solve_linear
 from fingerspice.solve.marching import solve as solve_exponential
 from fingerspice.solve.nodal import solve_coupled
-from fingerspice.solve.periodic.state import close_period
+from fingerspice.solve.periodic.search import close_period
 from fingerspice.solve.planning import make_plan, run_warnings
 from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare, to_ends
 from fingerspice.solve.runs import ROUGH, Progress, Run, run_failure
@@ -120,24 +120,26 @@ def simulate(
     circuit = overridden(circuit, sources, parameters)
     wanted: dict[str, Any] = {"t_stop": t_stop, "charge_law": charge_law, "area": area, "start": start}
     problem = asked(circuit, t_eval=times, charge=charge, rtol=rtol, **wanted)
-    how = start if isinstance(start, str) else "given"
-    compared = check_request(problem, sensitivities, method, how) if sensitivities else method
-    solution = run_problem(problem, times, rtol, method, progress, tier, how, jumps)
+    compared = check_request(problem, sensitivities, method, problem.start) if sensitivities else method
+    solution = run_problem(problem, times, rtol, method, progress, tier, jumps)
 
     def run(other: Circuit, finer: float) -> Solution:
         at = None if times is None else times.copy()
         varied = asked(other, t_eval=at, charge=False, rtol=finer, **wanted)
-        return run_problem(varied, at, finer, compared, None, tier, how, jumps)
+        return run_problem(varied, at, finer, compared, None, tier, jumps)
 
     if sensitivities and solution.success:
         solution = dataclasses.replace(solution, sensitivities=sensitivities_of(problem, solution, sensitivities, run))
-    return _given_back(solution, throw)
+    if solution.failure is not None and throw:
+        raise SolveError(solution.failure, solution)
+    for text in solution.warnings:
+        # Those of the circuit itself were issued when it was read.
+        if text not in solution.circuit.warnings:
+            warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    return solution
 
 
-def asked(
-    circuit: Circuit, *, t_stop: float | None, t_eval: FloatArray | None, start: str | Solution, rtol: float,
-    area: str | float, **how: Any,
-) -> Problem:  # fmt: skip
+def asked(circuit: Circuit, *, t_eval: FloatArray | None, rtol: float, **how: Any) -> Problem:
     """The problem that a call of `simulate` asks for, with arguments as `check_arguments` leaves them.
 
     Raises
@@ -145,13 +147,9 @@ def asked(
     InputError
         For a request that cannot be run.
     """
-    t_stop = None if t_stop is None else real_number("t_stop", t_stop, "a number in s")
-    if isinstance(start, Solution) and start.stored is not None:
-        raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
-    first = "uncharged" if start == "periodic" else start
-    problem = prepare(circuit, t_stop=t_stop, t_eval=t_eval, start=first, rtol=rtol, area=area, **how)
-    if start == "periodic":
-        problem = close_period(problem, 0.5 * rtol).problem
+    problem = prepare(circuit, t_eval=t_eval, rtol=rtol, **how)
+    if problem.start == "periodic":
+        problem, _ = close_period(problem, 0.5 * rtol)
         if t_eval is not None:
             to_ends(t_eval, problem.t_start, problem.t_stop)
             allowed = f"from {problem.t_start:g} s on, where the source has settled and its periodic state exists"
@@ -182,32 +180,15 @@ def check_arguments(
         For the first of them.
     """
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
-    check_method(method)
-    area_given(area)
-    known = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
-    require(known, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
-    return rtol_given(rtol)
-
-
-def check_method(method: str) -> None:
     require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
     library, _, name = method.partition(":")
     if method not in METHODS and not (library in LIBRARIES and name):
         known = [*METHODS, *(f"{library}:NAME" for library in LIBRARIES)]
         raise InputError(f"unknown method {method!r}; allowed: {', '.join(known)}")
-
-
-def _given_back(solution: Solution, throw: bool) -> Solution:
-    """Issue a solution's warnings and return it, or raise a failed run's error.
-
-    The warnings of the circuit itself are left out, because they were issued when it was read.
-    """
-    if solution.failure is not None and throw:
-        raise SolveError(solution.failure, solution)
-    for text in solution.warnings:
-        if text not in solution.circuit.warnings:
-            warnings.warn(text, FingerspiceWarning, stacklevel=3)
-    return solution
+    area_given(area)
+    known_start = isinstance(start, Solution) or (isinstance(start, str) and start in STARTS)
+    require(known_start, "start", repr(start), f"{', '.join(map(repr, STARTS))} or a Solution")
+    return rtol_given(rtol)
 
 
 def plan(
@@ -247,28 +228,21 @@ def run_problem(
     method: str = "auto",
     progress: Progress | None = None,
     tier: str = "auto",
-    start: str = "deck",
     jumps: str = "both",
 ) -> Solution:
     """Integrate a prepared problem; arguments as in `simulate`. A failed run raises no error."""
-    plan = planned(problem, rtol, method, tier, start)
+    plan = make_plan(problem, rtol, tier, method)
     t_out, left = asked_for(problem, t_eval, jumps)
     run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
     begin = time.perf_counter()
     run, name = integrated(problem, plan, run_at, left, rtol, method, progress)
     run.stats["wall_s"] = time.perf_counter() - begin  # type: ignore[assignment]
-    record = run.record(problem)
     # Report the times asked for, not the breakpoints to which `at_breakpoints` has moved some of them.
     if run.status is not Status.SUCCESS:
         t = run.t.copy()
     else:
         t = t_out if run.t.size == t_out.size else np.concatenate([t_out[: run.t.size], run.t[t_out.size :]])
-    return solution_of(problem, plan, run, record, t, rtol, name)
-
-
-def planned(problem: Problem, rtol: float, method: str, tier: str, start: str) -> Plan:
-    """The plan of a run; a method named explicitly integrates by steps, which only the coupled tier does."""
-    return make_plan(problem, rtol, "coupled" if tier == "auto" and method != "auto" else tier, start)
+    return solution_of(problem, plan, run, run.record(problem), t, rtol, name)
 
 
 def integrated(
@@ -372,7 +346,8 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
         # At this output the user's function differs from the table that was integrated.
         run.t_failed, off = run.unseen[:2]
         run.status = Status.SOURCE_UNSEEN if math.isfinite(off) else Status.SOURCE_NOT_FINITE
-        run.end_before(run.t_failed)
+        kept = run.t < run.t_failed
+        run.t, run.left, run.rows = run.t[kept], run.left[kept], run.rows[kept]
     # Of a function that gives coarser numbers than doubles, their rounding is part of the stated error, and no failure.
     coarse = run.rough if any(wave.precision > DOUBLE for wave in problem.waveforms) else 0.0
     if run.rough > 0.0:

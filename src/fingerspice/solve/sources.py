@@ -11,6 +11,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.solve.problem import Problem, check_length
+from fingerspice.solve.scenes import kept_with
 from fingerspice.waveforms.refining import WIDEST
 from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, is_sampled, source_table
 from fingerspice.waveforms.waveform import Waveform
@@ -28,17 +29,6 @@ class Tables:
 
     A user's function is expensive to evaluate, so its tables are cached for the run. The tables of library waveforms
     are cached with the waveform if the run has few windows; in a longer run they are computed anew, in constant memory.
-
-    Attributes
-    ----------
-    rough : float
-        Largest interpolation error (V) of a table that a finer table would not reduce.
-    unseen : tuple of float, float and int, or None
-        First output time (s) at which a user's function differs from its table, the difference (V), and its number.
-    not_finite : float or None
-        Time (s) at which a source stops being finite, once the iteration has reached it.
-    done : float
-        An iteration skips windows that end by this time (s), except the last window.
     """
 
     def __init__(
@@ -46,10 +36,14 @@ class Tables:
     ) -> None:
         self.problem, self.no_chirps, self.t_out = problem, no_chirps, t_out
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
-        self.edges = windows(problem)
+        self.edges = _windows(problem)
+        # An iteration skips windows that end by this time (s), except the last window.
         self.done = -np.inf
+        # Largest interpolation error (V) of a table that a finer table would not reduce.
         self.rough = 0.0
+        # First output time (s) at which a user's function differs from its table, the difference (V), and its number.
         self.unseen: tuple[float, float, int] | None = None
+        # Time (s) at which a source stops being finite, once the iteration has reached it.
         self.not_finite: float | None = None
         # Largest value (V or A) of each source in the windows so far, and among a few of its samples: a function that
         # rises out of next to nothing would be followed there beyond its own digits.
@@ -80,13 +74,14 @@ class Tables:
                 return
 
     def _table(self, wave: Waveform, w0: float, w1: float, place: int) -> SourceTable:
-        step, scale = self.problem.step, self.scales[place]
-        table = source_table(wave, w0, w1, self.tol, step, no_chirps=self.no_chirps, scale=scale,
-                             shortest=shortest_event(self.problem))  # fmt: skip
-        if self.t_out is not None and self.problem.scene.is_sampled and is_sampled(wave):
+        problem = self.problem
+        table = source_table(
+            wave, w0, w1, self.tol, problem.step, no_chirps=self.no_chirps, scale=self.scales[place],
+            shortest=shortest_event(problem),
+        )  # fmt: skip
+        if self.t_out is not None and problem.scene.is_sampled and is_sampled(wave):
             off = table.unseen(wave, self.t_out, self.tol)
-            found = [one for one in (self.unseen, off and (*off, place)) if one]
-            self.unseen = min(found, default=None)
+            self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
         return table
 
     def peak(self) -> float:
@@ -106,7 +101,7 @@ def shortest_event(problem: Problem) -> float:
     return min(met, (problem.t_stop - problem.t_start) / LOOKS)
 
 
-def windows(problem: Problem) -> list[float]:
+def _windows(problem: Problem) -> list[float]:
     """Limits (s) of the windows for the sources' tables: short windows bound memory and the phases' round-off."""
     check_length(problem.waveform, problem.t_start, problem.t_stop)
     span = problem.t_stop - problem.t_start
@@ -132,20 +127,17 @@ def joined(tables: list[SourceTable]) -> Sources:
     return Sources(first, np.concatenate([t.edges for t in tables]), np.concatenate(terms), np.concatenate(series))
 
 
-def ramp(before: FloatArray, after: FloatArray) -> Sources:
-    """A jump of every source as a ramp over [0, 1]."""
+def ramp(before: FloatArray, after: FloatArray, t: float = 0.0) -> Sources:
+    """A jump of every source as a ramp over a second from time t (s) on."""
     terms = np.zeros((before.size, 2, 6))
     terms[:, 0, 0], terms[:, 1, 0], terms[:, 1, 1] = before, after - before, 1.0
-    edges = np.tile([0.0, 1.0], before.size)
+    edges = np.tile([t, t + 1.0], before.size)
     return Sources(2 * np.arange(before.size + 1, dtype=np.int64), edges, terms, np.zeros((before.size, 0)))
 
 
 def held(t: float, values: FloatArray) -> Sources:
     """Sources that are constant at these values (V or A) from time t (s) on."""
-    terms = np.zeros((values.size, 1, 6))
-    terms[:, 0, 0] = values
-    edges = np.tile([t, t + 1.0], values.size)
-    return Sources(2 * np.arange(values.size + 1, dtype=np.int64), edges, terms, np.zeros((values.size, 0)))
+    return ramp(values, values, t)
 
 
 def values_at(sources: Sources, t: float) -> FloatArray:
@@ -160,13 +152,11 @@ def after_the_end(problem: Problem) -> Sources | None:
     stop = problem.t_stop
     if not any(breakpoints_at(wave, stop).size for wave in problem.waveforms):
         return None
-    span = stop, problem.step
-    # Key and value are one entry, because another thread may replace it at any time.
-    kept, after = problem.waveform.kept.get("after", (None, None))
-    if kept != span:
-        after = joined([source_table(w, stop, stop + problem.step, 1e-10, problem.step) for w in problem.waveforms])
-        problem.waveform.kept["after"] = span, after
-    assert isinstance(after, Sources)
+
+    def make() -> Sources:
+        return joined([source_table(w, stop, stop + problem.step, 1e-10, problem.step) for w in problem.waveforms])
+
+    after: Sources = kept_with(problem.waveform.kept, ("after", stop, problem.step), 1, make)
     return after
 
 

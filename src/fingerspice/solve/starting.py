@@ -18,13 +18,13 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Network, build_network
@@ -85,28 +85,17 @@ def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Elemen
     return tuple(out)
 
 
-@dataclass(frozen=True)
-class OperatingPoint:
-    """Voltages of all cells (n_cell,) in V and areas (n_area,) in m^2 at the operating point.
-
-    `held` marks the areas that ``.ic`` holds.
-    """
-
-    u: FloatArray
-    area: FloatArray
-    held: NDArray[np.bool_]
-
-
 def operating_point(
     circuit: Circuit,
     network: Network,
     area0: FloatArray,
     contacts: Sequence[Contact | None],
     initial: Mapping[str, float],
-) -> OperatingPoint:
-    """The DC operating point with the sources at 0-, and with the nodes in `initial` held.
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Voltages of all cells (V) and areas (m^2) at the DC operating point, and which areas ``.ic`` holds.
 
-    Areas follow their gaps by `contacts`; an area without contact is fixed at `area0` (m^2).
+    The sources have their values at 0-, and the nodes in `initial` are held. Areas follow their gaps by `contacts`; an
+    area without contact is fixed at `area0` (m^2).
 
     Raises
     ------
@@ -136,7 +125,7 @@ def operating_point(
         off = float(np.max(np.abs(new / area - 1.0), initial=0.0))
         # The iteration has converged, or round-off lets it come no nearer.
         if off <= 4e-16 or 0.8 * before < off <= 1e-13:
-            return OperatingPoint(u, area, asked)
+            return u, area, asked
         # Damping, because leaks that scale with the area may make the iteration oscillate.
         part *= 0.7 if off > 0.8 * before else 1.0
         area, before = area + part * (new - area), off
@@ -187,32 +176,22 @@ def at_own_area(u: float, area: float, curve: FloatArray) -> float:
     return math.copysign(high, u)
 
 
-@dataclass(frozen=True)
-class Settled:
-    """Consistent start voltages, and the charges that have flowed to make them so."""
+def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Live voltages (n,) V, areas with a time constant over those at 0 V (n_slow,), and delivered charges (n_s,) C.
 
-    x: FloatArray  # (n,): Live voltages, V
-    slow: FloatArray  # (n_slow,): Areas with a time constant, relative to their values at 0 V
-    charge: FloatArray  # (n_s,): Charge that each source delivered, C
-
-
-def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> Settled:
-    """Make the cells' start voltages u (n_cell,) V consistent with Kirchhoff's law, with the sources at `s` (n_s,).
-
-    Areas with a time constant that are NaN in `slow` are set to their equilibrium at the consistent voltages.
+    These are what the cells' start voltages u (n_cell,) V come to by Kirchhoff's law, with the sources at `s` (n_s,).
+    Areas that are NaN in `slow` are set to their equilibrium at the consistent voltages.
 
     Raises
     ------
     InputError
         Where this leads past a fold.
     """
-    n = net.k.shape[0]
-    free = np.isnan(slow)
+    n, free = net.k.shape[0], np.isnan(slow)
     area = np.where(free, 1.0, slow)
-    end = _along(_Loops(net, u - net.q @ s, s, area))
-    for _ in range(60):
-        at_end = net.p @ end[:n] + net.q @ s
-        new = area.copy()
+    for _ in range(61):
+        end = _along(net, u - net.q @ s, s, area)
+        at_end, new = net.p @ end[:n] + net.q @ s, area.copy()
         for i in np.flatnonzero(net.slow >= 0):
             if free[net.slow[i]]:
                 rest = 1.0 / inverse_area(abs(float(at_end[net.gap[i]])), net.curves[i])[0]
@@ -220,84 +199,70 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> Settled:
         if np.all(np.abs(new - area) <= 1e-15):
             break
         area = new
-        end = _along(_Loops(net, u - net.q @ s, s, area))
-    return Settled(end[:n], area, end[n:])
+    return end[:n], area, end[n:]
 
 
-@dataclass(frozen=True)
-class _Loops:
-    """The homotopy to u = P x + Q s: the residual of Kirchhoff's law falls from `off` (n_cell,) V linearly to 0."""
+def _along(net: Net, off: FloatArray, s: FloatArray, slow: FloatArray) -> FloatArray:
+    """Live voltages (V) and delivered charges (C) at the end of the homotopy to u = P x + Q s.
 
-    net: Net
-    off: FloatArray
-    s: FloatArray
-    slow: FloatArray
-
-    @property
-    def follows(self) -> list[int]:
-        """Indices of the areas that change during the homotopy: those that follow their gaps without delay."""
-        return [int(i) for i in np.flatnonzero((self.net.gap >= 0) & (self.net.slow < 0))]
-
-    def rate(self, theta: float, y: FloatArray) -> FloatArray:
-        """Derivative of (x, charges) by the homotopy's parameter `theta` in [0, 1]; NaN past a fold."""
-        net, n = self.net, self.net.k.shape[0]
-        u = net.p @ y[:n] + net.q @ self.s + (1.0 - theta) * self.off
-        area, slope = self._areas(u)
-        held = net.c * np.append(area, 1.0)[net.place]
-        met = net.p.T @ (held[:, None] * net.p)
-        if not np.linalg.slogdet(met)[0] > 0.0:
-            return np.full(y.size, math.nan)
-        x = np.linalg.solve(met, net.p.T @ (held * self.off))
-        along = net.p @ x - self.off
-        current = held * along
-        if net.mobile and self.follows:
-            # The derivatives of the areas add to the capacitance matrix, in the columns of the gaps that they follow.
-            more = np.zeros((net.c.size, area.size))
-            gaps = net.gap[self.follows]
-            for i, gap in zip(self.follows, gaps, strict=True):
-                at = net.place == i
-                # At 0 V the direction of the change decides on the branch.
-                more[at, i] = (net.c * u)[at] * slope[i] * (np.sign(u[gap]) or np.sign(along[gap]))
-            more = more[:, self.follows]
-            met += net.p.T @ more @ net.p[gaps]
-            if not np.linalg.slogdet(met)[0] > 0.0:
-                return np.full(y.size, math.nan)
-            x = np.linalg.solve(met, net.p.T @ (held * self.off + more @ self.off[gaps]))
-            along = net.p @ x - self.off
-            current = held * along + more @ along[gaps]
-        return np.concatenate([x, net.through @ current])
-
-    def _areas(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Areas (m^2) at cell voltages `u` (V), and their derivatives by |u_gap| (m^2/V)."""
-        net = self.net
-        area, slope = net.area0.copy(), np.zeros(net.area0.size)
-        for i in range(area.size):
-            if net.slow[i] >= 0:
-                area[i] *= self.slow[net.slow[i]]
-            elif net.gap[i] >= 0:
-                inverse, change = inverse_area(abs(float(u[net.gap[i]])), net.curves[i])
-                area[i], slope[i] = 1.0 / inverse, -change / inverse**2
-        return area, slope
-
-
-def _along(loops: _Loops) -> FloatArray:
-    """Live voltages (V) and delivered charges (C) at the end of the homotopy."""
-    net = loops.net
-    y = np.zeros(net.k.shape[0] + net.q.shape[1])
-    if not np.any(loops.off):
+    Along it the residual of Kirchhoff's law falls from `off` (n_cell,) V linearly to 0.
+    """
+    n, follows = net.k.shape[0], np.flatnonzero((net.gap >= 0) & (net.slow < 0))
+    y = np.zeros(n + net.q.shape[1])
+    if not np.any(off):
         return y
-    if not loops.follows:
-        return loops.rate(0.0, y)
+    rate = partial(_rate, net, off, s, slow, follows)
+    if not follows.size:
+        return rate(0.0, y)
     from scipy.integrate import solve_ivp
 
-    scale = np.concatenate([np.ones(net.k.shape[0]), np.full(net.q.shape[1], math.inf)]) * np.abs(loops.off).max()
+    scale = np.concatenate([np.ones(n), np.full(net.q.shape[1], math.inf)]) * np.abs(off).max()
     with warnings.catch_warnings():
         # Past a fold the derivative is NaN, of which numpy and scipy would warn; `status` tells of it.
         warnings.simplefilter("ignore")
         found = solve_ivp(
-            loops.rate, (0.0, 1.0), y, "DOP853", first_step=0.1, rtol=STEP_RTOL, atol=STEP_ERROR * scale, t_eval=[1.0]
+            rate, (0.0, 1.0), y, "DOP853", first_step=0.1, rtol=STEP_RTOL, atol=STEP_ERROR * scale, t_eval=[1.0]
         )
     if found.status != 0:
         where = PAST_FOLD if net.mobile else "where no area is left; allowed: less voltage"
         raise InputError(f"the capacitors' start voltages settle {where}")
     return np.asarray(found.y[:, -1])
+
+
+def _rate(
+    net: Net, off: FloatArray, s: FloatArray, slow: FloatArray, follows: IntArray, theta: float, y: FloatArray
+) -> FloatArray:
+    """Derivative of (x, charges) by the homotopy's parameter `theta` in [0, 1]; NaN past a fold.
+
+    `follows` are the areas that change during the homotopy: those that follow their gaps without delay.
+    """
+    u = net.p @ y[: net.k.shape[0]] + net.q @ s + (1.0 - theta) * off
+    area, slope = net.area0.copy(), np.zeros(net.area0.size)
+    delayed = net.slow >= 0
+    area[delayed] *= slow[net.slow[delayed]]
+    for i in follows:
+        inverse, change = inverse_area(abs(float(u[net.gap[i]])), net.curves[i])
+        area[i], slope[i] = 1.0 / inverse, -change / inverse**2
+    held = net.c * np.append(area, 1.0)[net.place]
+    met = net.p.T @ (held[:, None] * net.p)
+    x = _solved(met, net.p.T @ (held * off))
+    along = net.p @ x - off
+    current = held * along
+    if net.mobile and follows.size:
+        # The derivatives of the areas add to the capacitance matrix, in the columns of the gaps that they follow.
+        gaps, more = net.gap[follows], np.zeros((net.c.size, follows.size))
+        for column, i, gap in zip(more.T, follows, gaps, strict=True):
+            at = net.place == i
+            # At 0 V the direction of the change decides on the branch.
+            column[at] = (net.c * u)[at] * slope[i] * (np.sign(u[gap]) or np.sign(along[gap]))
+        x = _solved(met + net.p.T @ more @ net.p[gaps], net.p.T @ (held * off + more @ off[gaps]))
+        along = net.p @ x - off
+        current = held * along + more @ along[gaps]
+    return np.concatenate([x, net.through @ current])
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution of a linear system; NaN where its determinant is not positive, as past a fold."""
+    if not np.linalg.slogdet(matrix)[0] > 0.0:
+        return np.full(right.size, math.nan)
+    return np.asarray(np.linalg.solve(matrix, right))

@@ -18,9 +18,10 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
+from fingerspice.solve.planning import make_plan
 from fingerspice.solve.problem import Problem, check_length, check_outputs
 from fingerspice.solve.recordings.run import BySamples, ByWindows, Mark, Outputs, outputs_of, within
-from fingerspice.solve.simulation import asked, check_arguments, planned, solution_of
+from fingerspice.solve.simulation import asked, check_arguments, solution_of
 from fingerspice.waveforms.waveform import require
 
 # Default length of a chunk, s.
@@ -49,9 +50,8 @@ class Stream:
             if method == "auto" and BySamples.serve(problem, plan, rtol)
             else ByWindows(problem, outputs, plan, rtol, method)
         )
-        # Outputs of integrated pieces that no chunk has contained yet, and the mark before each of these pieces.
-        self._ready: list[tuple[FloatArray, FloatArray]] = []
-        self._marks: list[Mark] = []
+        # Integrated pieces whose outputs no chunk has contained yet: the mark before each, times (s) and rows.
+        self._ready: list[tuple[Mark, FloatArray, FloatArray]] = []
 
     def __iter__(self) -> Iterator[Solution]:
         return self
@@ -64,10 +64,9 @@ class Stream:
         if self.done == self.outputs.total:
             raise StopIteration
         wanted = min(self.count, self.outputs.total - self.done)
-        while sum(t.size for t, _ in self._ready) < wanted and not self._source.over:
+        while sum(t.size for _, t, _ in self._ready) < wanted and not self._source.over:
             self._advance()
-        given = self._take(wanted)
-        solution = self._solution(*given)
+        solution = self._solution(*self._take(wanted))
         if solution.failure is not None:
             self.done = self.outputs.total
             raise SolveError(solution.failure, solution)
@@ -76,7 +75,8 @@ class Stream:
 
     def mark(self) -> Mark:
         """The state before the piece that contains the next chunk's first output, as plain data; see `go_to`."""
-        return [m for m in [*self._marks, self._source.mark()] if m["written"] <= self.done][-1]
+        marks = [*(mark for mark, _, _ in self._ready), self._source.mark()]
+        return [mark for mark in marks if mark["written"] <= self.done][-1]
 
     def go_to(self, mark: Mark, done: int) -> None:
         """Continue a stream from its mark, after `done` outputs; allowed before this stream's first chunk only."""
@@ -86,8 +86,7 @@ class Stream:
         self.done = done
         while self._source.written <= done and not self._source.over:
             self._advance()
-        first = self._marks[0]["written"] if self._marks else done
-        self._take(done - first)
+        self._take(done - (self._ready[0][0]["written"] if self._ready else done))
 
     def _stepped(self) -> ByWindows:
         """The method for a recording that the one for recordings fails on."""
@@ -105,21 +104,17 @@ class Stream:
             other.written, other.state = mark["written"], self._source.march.state()
             self._source = other
             mark, found = other.mark(), other.advance()
-        self._marks.append(mark)
-        self._ready.append(found)
+        self._ready.append((mark, *found))
 
     def _take(self, count: int) -> tuple[FloatArray, FloatArray]:
         """Take the next `count` outputs, or all if there are fewer: times (s) and rows."""
         times, rows, left = [np.empty(0)], [], count
         while left > 0 and self._ready:
-            t, r = self._ready[0]
+            mark, t, r = self._ready.pop(0)
             times.append(t[:left])
             rows.append(r[:left])
-            if t.size <= left:
-                self._ready.pop(0)
-                self._marks.pop(0)
-            else:
-                self._ready[0] = t[left:], r[left:]
+            if t.size > left:
+                self._ready.insert(0, (mark, t[left:], r[left:]))
             left -= times[-1].size
         width = max(self.problem.initial.y.size, 1)
         return np.concatenate(times), np.concatenate(rows) if rows else np.empty((0, width))
@@ -206,5 +201,4 @@ def stream(
         count = max(1, round((CHUNK if chunk is None else chunk) / spacing))
     count = min(count, outputs.total)
     check_outputs(circuit, count)
-    plan = planned(problem, rtol, method, tier, start if isinstance(start, str) else "given")
-    return Stream(problem, plan, outputs, count, rtol, method)
+    return Stream(problem, make_plan(problem, rtol, tier, method), outputs, count, rtol, method)

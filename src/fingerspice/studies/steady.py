@@ -22,7 +22,7 @@ from fingerspice.results.report import summary_table
 from fingerspice.results.sensitivity import Sensitivity
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Figured, Figures
-from fingerspice.solve.periodic.state import close_period
+from fingerspice.solve.periodic.search import close_period
 from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.sensitivities import check_request, period_of, sensitivities_of
 from fingerspice.solve.simulation import rtol_given, run_problem
@@ -114,10 +114,9 @@ class SteadyState(Shown, Figured):
         one = self.problem
         other = prepare(
             circuit, t_stop=self.period, t_eval=None, charge_law=one.scene.charge_law, area=self.area,
-            start="uncharged", charge=False,
+            start="periodic", charge=False,
         )  # fmt: skip
-        closed = close_period(dataclasses.replace(other, first=0.0, step=one.step), 0.5 * rtol)
-        return run_problem(closed.problem, rtol=rtol, start="periodic")
+        return run_problem(close_period(dataclasses.replace(other, first=0.0, step=one.step), 0.5 * rtol)[0], rtol=rtol)
 
     @cached_property
     def solution(self) -> Solution:
@@ -128,7 +127,7 @@ class SteadyState(Shown, Figured):
         SolveError
             If the integration fails.
         """
-        solution = run_problem(self.problem, rtol=self.rtol, start="periodic")
+        solution = run_problem(self.problem, rtol=self.rtol)
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
         if self.asked:
@@ -186,12 +185,12 @@ def steady_state(
     if period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
     problem = prepare(
-        circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="uncharged", charge=charge
+        circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="periodic", charge=charge
     )
     if sensitivities:
         check_request(problem, sensitivities, "auto", "periodic")
-    closed = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)
+    problem, found = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)
+    error = ErrorEstimate(*map(float, found.gap_errors.max(axis=0, initial=0.0)))
     return SteadyState(
-        closed.problem, rtol, closed.defect, closed.map_slope, closed.memory, closed.error, closed.periods,
-        area, tuple(sensitivities),
-    )  # fmt: skip
+        problem, rtol, found.defect, found.map_slope, found.memory, error, found.periods, area, tuple(sensitivities)
+    )

@@ -7,13 +7,11 @@ voltages of the tree capacitors, and gives the periodic state of the circuit wit
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.circuit.network import Modes
-from fingerspice.engine.network import Sources
 from fingerspice.numerics import linear
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.problem import Problem
@@ -28,20 +26,6 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
 
 
-CHARGING = "a current source charges, from period to period, what nothing drains"
-
-
-@dataclass(frozen=True)
-class Found:
-    """Figures of a periodic state for `Closed`; `gap_errors` (n_gap, 2): errors of gap voltage (V) and force (N)."""
-
-    defect: float
-    map_slope: FloatArray
-    memory: float
-    gap_errors: FloatArray
-    periods: float
-
-
 class Stopped(Exception):
     """A period that could not be integrated."""
 
@@ -49,94 +33,63 @@ class Stopped(Exception):
         self.status, self.t = status, t
 
 
-def first_period(problem: Problem) -> float:
-    """Start (s) of the first whole period after the source has become periodic, and not before the run's start."""
-    waveform = problem.waveform
-    assert waveform.period is not None
-    return waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
-
-
 class Period:
-    """One period of a problem, or only its first half if the second half is the first with opposite sign.
-
-    Attributes
-    ----------
-    begin, end, span : float
-        Limits and length of the integrated span, s; the period consists of `parts` such spans.
-    parts : int
-        1, or 2 where half a period is enough.
-    modes : Modes
-        Modes of the circuit with its areas at 0 V.
-    before : ndarray, shape (n_s,)
-        Sources just before the period, V or A.
-    rates : ndarray, shape (n + n_slow,)
-        Decay rates of the modes and of the areas with a time constant, 1/s.
-    n : int
-        Number of modes.
-    neutral : ndarray of bool, shape (n + n_slow,)
-        True for modes that do not decay: charges that nothing drains.
-    kept : ndarray, shape (n,)
-        Amplitudes of the neutral modes when the period begins; 0 for all other modes.
-    turned : ndarray, shape (n + n_slow,)
-        Sign of each entry of a periodic state at the end of the span, relative to its start.
-    problem : Problem
-        The problem restricted to the span, without charge.
-    """
+    """One period of a problem, or only its first half if the second half is the first with opposite sign."""
 
     def __init__(self, problem: Problem) -> None:
         waveform, scene, net = problem.waveform, problem.scene, problem.scene.net
         assert waveform.period is not None
-        self.begin = first_period(problem)
+        # The first whole period after the sources have become periodic, and not before the run's start, s.
+        self.begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
+        # Modes of the circuit with its areas at 0 V, and their number.
         self.modes: Modes = scene.modes
+        n = self.n = self.modes.rates.size
+        # (n_s,): Sources just before the period, V or A.
         self.before = np.array([float(w.value(self.begin, "left")) for w in scene.waveforms])
-        slow = net.slow >= 0
-        self.rates = np.append(self.modes.rates, 1.0 / net.tau[slow])
-        self.n = self.modes.rates.size
+        # (n + n_slow,): Decay rates of the modes and of the areas with a time constant, 1/s, and which of them are 0:
+        # charges that nothing drains.
+        self.rates = np.append(self.modes.rates, 1.0 / net.tau[net.slow >= 0])
         self.neutral: BoolArray = self.rates == 0.0
-        kept = self.modes.inverse @ (problem.initial.y[: self.n] + self.modes.follow @ problem.initial.s_before)
-        self.kept = np.where(self.neutral[: self.n], kept, 0.0)
-        pushed = np.any(self.modes.gains[self.neutral[: self.n]] != 0.0)
-        half = _turns(problem) and not pushed and not np.any(self.kept)
-        self.parts = 2 if half else 1
+        # (n,): Amplitudes of the neutral modes when the period begins; 0 for all other modes.
+        kept = self.modes.inverse @ (problem.initial.y[:n] + self.modes.follow @ problem.initial.s_before)
+        self.kept = np.where(self.neutral[:n], kept, 0.0)
+        pushed = np.any(self.modes.gains[self.neutral[:n]] != 0.0)
+        # The integrated span is one of so many parts of the period; its length, s.
+        self.parts = 2 if _turns(problem) and not pushed and not np.any(self.kept) else 1
         self.span = waveform.period / self.parts
-        end = self.begin + self.span
-        self.tables: list[SourceTable] = problem.scene.prepared.get(self._key(problem), [])
+        # A function's table depends on the output step as well.
+        key = "period", self.begin, self.span, problem.step if scene.is_sampled else 0.0
+        self.tables: list[SourceTable] = scene.prepared.get(key, [])
         if not self.tables:
+            end = self.begin + self.span
             self.tables = [source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.waveforms]
-            problem.scene.prepared[self._key(problem)] = self.tables
+            scene.prepared[key] = self.tables
         broken = [table.not_finite for table in self.tables if table.not_finite is not None]
         if broken:
             raise Stopped(Status.SOURCE_NOT_FINITE, min(broken))
-        self.sources: Sources = joined(self.tables)
+        self.sources = joined(self.tables)
         self.end = float(min(table.edges[-1] for table in self.tables))
         if pushed and self.begin > problem.t_start:
-            self._push(problem)
-        self.turned = np.where(np.arange(self.rates.size) < self.n, 1.0 if self.parts == 1 else -1.0, 1.0)
+            # Add the charge that sources drive into the neutral modes between the run's start and the period.
+            for j, wave in enumerate(scene.waveforms):
+                table = source_table(wave, problem.t_start, self.begin, 1e-13, problem.step)
+                gains, still = np.where(self.neutral[:n], self.modes.gains[:, j], 0.0), np.zeros(n)
+                self.kept = (
+                    self.kept + linear.respond(still, gains, table.edges, table.terms, table.series, still, [])[1]
+                )
+        # (n + n_slow,): Sign of each entry of a periodic state at the end of the span, relative to its start.
+        self.turned = np.where(np.arange(self.rates.size) < n, 1.0 if self.parts == 1 else -1.0, 1.0)
+        # The problem restricted to the span, without charge.
         self.problem = dataclasses.replace(
             problem, t_start=self.begin, t_stop=self.end, first=self.begin, charge=False,
             initial=State(self.begin, problem.initial.y, self.before, np.zeros(net.gap.size), scene.charge_law),
         )  # fmt: skip
-
-    def _key(self, problem: Problem) -> tuple[object, ...]:
-        """Key of the sources' tables in the scene's cache; a function's table depends on the output step as well."""
-        return "period", self.begin, self.span, problem.step if problem.scene.is_sampled else 0.0
-
-    def _push(self, problem: Problem) -> None:
-        """Add to `kept` the charge that sources drive into the neutral modes between the run's start and the period."""
-        for j, wave in enumerate(problem.scene.waveforms):
-            table = source_table(wave, problem.t_start, self.begin, 1e-13, problem.step)
-            gains = np.where(self.neutral[: self.n], self.modes.gains[:, j], 0.0)
-            start = np.zeros(self.n)
-            _, moved = linear.respond(np.zeros(self.n), gains, table.edges, table.terms, table.series, start, [])
-            self.kept = self.kept + moved
+        # (SAMPLES,): Times of `linear_state`, s.
+        self.times = self.begin + (self.end - self.begin) * (np.arange(SAMPLES) + 0.5) / SAMPLES
 
     def voltages(self, z: FloatArray) -> FloatArray:
         """Live voltages just before the period begins, V, shape (n,)."""
         return np.asarray(self.modes.shape @ z[: self.n] - self.modes.follow @ self.before)
-
-    def modes_of(self, x: FloatArray) -> FloatArray:
-        """Modes (n,) from live voltages (V) just before the period begins."""
-        return np.asarray(self.modes.inverse @ (x + self.modes.follow @ self.before))
 
     def charges(self, z: FloatArray, held: IntArray) -> FloatArray:
         """Conserved charges of the state z, projected on the neutral modes with the indices `held`.
@@ -163,7 +116,6 @@ class Period:
         A neutral mode starts from the amplitude that it keeps; NaN where a current charges it from period to period.
         """
         rates = modes.rates
-        t = self.begin + (self.end - self.begin) * (np.arange(SAMPLES) + 0.5) / SAMPLES
         start, end, along = np.zeros(self.n), np.zeros(self.n), np.zeros((SAMPLES, self.n))
         for j, table in enumerate(self.tables):
             gains = np.ascontiguousarray(modes.gains[:, j])
@@ -173,14 +125,9 @@ class Period:
             else:
                 _, moved = linear.respond(rates, gains, *given, np.zeros(self.n), [])
                 v = -moved / (1.0 + np.exp(-rates * (table.edges[-1] - table.edges[0])))
-            rows, last = linear.respond(rates, gains, *given, v, t)
+            rows, last = linear.respond(rates, gains, *given, v, self.times)
             start, end, along = start + v, end + last, along + rows
         return start, end, along
-
-    def sampled(self) -> FloatArray:
-        """Sources (V or A) at the times of `linear_state`, shape (SAMPLES, n_s)."""
-        t = self.begin + (self.end - self.begin) * (np.arange(SAMPLES) + 0.5) / SAMPLES
-        return np.column_stack([wave.value(t) for wave in self.problem.scene.waveforms])
 
 
 def _turns(problem: Problem) -> bool:

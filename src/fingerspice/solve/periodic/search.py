@@ -10,20 +10,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.base.errors import InputError
 from fingerspice.circuit.network import network_modes
 from fingerspice.engine.collocation import readout
 from fingerspice.physics.contact import inverse_area
-from fingerspice.results.outcome import SolveError, Status
+from fingerspice.results.outcome import SolveError, State, Status
 from fingerspice.solve.many_areas import March
-from fingerspice.solve.marching import GUESS
+from fingerspice.solve.marching import GUESS, stepping
 from fingerspice.solve.nodal import pass_through
-from fingerspice.solve.one_area import Track, prepare_system
-from fingerspice.solve.periodic.period import CHARGING, Found, Period, Stopped
+from fingerspice.solve.periodic.period import Period, Stopped
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import period_failure
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
@@ -46,25 +46,37 @@ _LONG = 0.1
 _ASTRAY = 1e3
 # Fixed-point iterations for the mean areas of the linear circuit's period.
 _AVERAGES = 3
+CHARGING = "a current source charges, from period to period, what nothing drains"
 
 
-@dataclass(frozen=True)
-class _Pass:
-    """Result of one pass over the period: the image of z, its signed error, and the figures of the pass.
+class Found(NamedTuple):
+    """A periodic state."""
 
-    `met` (n_area, 4) has the columns of `LoopState.peaks`; `rounding` (n_area,) is the round-off of the gap voltages in
-    units of the machine precision times the largest voltage.
+    start: FloatArray  # (n + n_slow,): Live voltages just before the period, V, and relative areas
+    defect: float  # Largest change of a live voltage over a further period, V
+    # (n + n_slow, n + n_slow): Jacobian matrix of the period map, to about 1e-5; its variables are the modes and the
+    # areas with a time constant
+    map_slope: FloatArray
+    # Error of the periodic state relative to the error of one period: a slow mode accumulates the errors of the periods
+    # within its memory
+    memory: float
+    gap_errors: FloatArray  # (n_gap, 2): Error of the state, as its effect on every gap's voltage and force, V and N
+    periods: float  # Number of periods integrated
+
+
+class _Pass(NamedTuple):
+    """One pass over the period: state and sources at its end, the signed error of that state, and its figures.
+
+    State and error are first the live voltages and relative areas, and in the answer of `Search.passed` the image of z.
     """
 
     end: FloatArray
+    sources: FloatArray
     error: FloatArray
-    met: FloatArray
+    met: FloatArray  # (n_area, 4): Columns of `LoopState.peaks`
     magnified: float
+    # (n_area,): Round-off of the gap voltages in units of the machine precision times the largest voltage
     rounding: FloatArray
-
-
-# State and sources at the end of a pass, the error of the state, and the figures of the pass.
-_Made = tuple[FloatArray, FloatArray, FloatArray, _Pass]
 
 
 class Search:
@@ -93,8 +105,8 @@ class Search:
     def _guess(self) -> tuple[FloatArray, FloatArray]:
         """The periodic state with every area held at its mean over the period, and the map's derivative there."""
         period, problem = self.period, self.period.problem
-        network, net = problem.network, problem.scene.net
-        area, s = problem.scene.area0.copy(), period.sampled()
+        network, net, area = problem.network, problem.scene.net, problem.scene.area0.copy()
+        s = np.column_stack([wave.value(period.times) for wave in problem.waveforms])
         for _ in range(_AVERAGES):
             modes = network_modes(network, area)
             start, _, along = period.linear_state(modes)
@@ -106,7 +118,8 @@ class Search:
                 assert contact is not None
                 u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
                 area[i] = float(np.mean(contact.area(np.abs(u))))
-        v = period.modes_of(modes.shape @ start - modes.follow @ period.before)
+        v = modes.shape @ start - modes.follow @ period.before
+        v = period.modes.inverse @ (v + period.modes.follow @ period.before)
         v = np.where(period.neutral[: period.n], period.kept, v)
         # Transform this decay from the modes at the mean areas to the modes at 0 V.
         turn = period.modes.inverse @ modes.shape
@@ -135,49 +148,40 @@ class Search:
         initial = dataclasses.replace(period.problem.initial, y=y)
         problem = dataclasses.replace(period.problem, initial=initial)
         self.passes += 1
-        march = self._marched if problem.scene.stack is None else self._tracked
-        made = None if self.implicit else march(problem, tol)
+        made = None if self.implicit else self._stepped(problem, tol)
         if made is None:
             # The exponential steps failed: the implicit method either succeeds or tells that no solution exists.
             self.implicit, made = True, self._collocated(problem, tol)
-        x, s, error_x, figures = made
         # Use the sources at the end of the pass: they equal those at the start only up to the sign and round-off.
-        end = np.append(period.modes.inverse @ (x[:n] + period.modes.follow @ s), x[n : z.size])
-        error = np.append(period.modes.inverse @ error_x[:n], error_x[n : z.size])
-        return dataclasses.replace(figures, end=period.turned * end, error=error)
+        x = period.modes.inverse @ (made.end[:n] + period.modes.follow @ made.sources)
+        error = np.append(period.modes.inverse @ made.error[:n], made.error[n : z.size])
+        return made._replace(end=period.turned * np.append(x, made.end[n : z.size]), error=error)
 
-    def _marched(self, problem: Problem, tol: float) -> _Made | None:
+    def _stepped(self, problem: Problem, tol: float) -> _Pass | None:
         """One pass by exponential steps; None where they fail before the end."""
-        none, n = np.zeros(0), self.period.n
-        one = March(problem, max(tol, FINEST), self.rtol, self.scale, none, none.astype(bool), False)
-        if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
-            return None
-        error = np.append(one.form.shape @ one.error[:n], one.error[n:])
-        magnified = max(1.0, float(one.control["magnified"]))
-        return one.y, one.s_before, error, _Pass(none, none, one.peaks.copy(), magnified, one.references.magnified)
-
-    def _tracked(self, problem: Problem, tol: float) -> _Made | None:
-        """One pass of a stack; None where it fails before the end."""
-        none, scene = np.zeros(0), problem.scene
+        none, scene, n = np.zeros(0), problem.scene, self.period.n
+        outputs = none, none.astype(bool)
         while True:
-            prepared = prepare_system(scene, self.rtol, self.top)
-            one = Track(problem, prepared, max(tol, FINEST) * self.scale, none, none.astype(bool), False)
+            one = stepping(problem, self.rtol, max(tol, FINEST), self.scale, self.top, *outputs, False)
             try:
                 if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
                     return None
                 break
             except OutOfRangeError as left:
                 self.top = 1.5 * left.top
-        end, n, model = one.state(), self.period.n, prepared.system.model
-        error = prepared.system.live[int(one.error[n])] @ one.error[:n]
+        magnified = max(1.0, float(one.control["magnified"]))
+        if isinstance(one, March):
+            error = np.append(one.form.shape @ one.error[:n], one.error[n:])
+            return _Pass(one.y, one.s_before, error, one.peaks.copy(), magnified, one.references.magnified)
+        end, system = one.state(), one.prepared.system
+        model, error = system.model, system.live[int(one.error[n])] @ one.error[:n]
         if model.mobile:
             error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
-        figures = _Pass(none, none, one.peaks, max(1.0, float(one.control["magnified"])), np.array([model.k_gap]))
-        return end.y, end.s_before, scene.turn * error, figures
+        return _Pass(end.y, end.s_before, scene.turn * error, one.peaks, magnified, np.array([model.k_gap]))
 
-    def _collocated(self, problem: Problem, tol: float) -> _Made:
+    def _collocated(self, problem: Problem, tol: float) -> _Pass:
         """One pass by the implicit method, with its error from a coarser pass."""
-        none, scene, network = np.zeros(0), problem.scene, problem.network
+        scene, network = problem.scene, problem.network
         status, one, error = pass_through(problem, self.period.sources, tol, self.scale)
         if status is not Status.SUCCESS:
             raise Stopped(status, one.t)
@@ -189,15 +193,15 @@ class Search:
             met[i, :2] = peak, float(contact.stress(peak)) * area
         gap = np.array([network.p[0 if cell is None else cell] for cell in network.gaps]) @ self.period.modes.shape
         rounding = (np.abs(gap) @ np.abs(self.period.modes.inverse)).sum(axis=1)
-        return one.y, one.s_before, error, _Pass(none, none, met, 1.0, 10.0 + rounding)
+        return _Pass(one.y, one.s_before, error, met, 1.0, 10.0 + rounding)
 
-    def close(self) -> tuple[FloatArray, FloatArray, Found]:
-        """The periodic state's live voltages (V) and relative areas, to `rtol` or as far as round-off permits."""
+    def close(self) -> Found:
+        """The periodic state, to `rtol` or as far as round-off permits."""
         period = self.period
         tol = LOCAL_SHARE * self.rtol
         while True:
             last, step, defect = self._newton(tol)
-            errors, memory, excess, rounding = self._errors(last, step)
+            errors, excess, rounding = self._errors(last, step)
             if excess <= 1.0:
                 break
             if excess > 2.0 * rounding and tol > FINEST:
@@ -207,10 +211,10 @@ class Search:
                 self.implicit, tol = True, LOCAL_SHARE * self.rtol
             else:
                 break
-        slope = self._slope()
+        memory, slope = self._memory(), self._slope()
         slope = slope @ slope if period.parts == 2 else slope
-        found = Found(period.parts * defect, slope, memory, errors, self.passes / period.parts)
-        return period.voltages(self.z), self.z[period.n :], found
+        start = np.append(period.voltages(self.z), self.z[period.n :])
+        return Found(start, period.parts * defect, slope, memory, errors, self.passes / period.parts)
 
     def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
         """Solve for the periodic z; returns the last pass, the last step of z, and the defect of that pass, V."""
@@ -225,9 +229,13 @@ class Search:
             change = last.end - self.z
             if change_before is not None:
                 fell = change_before - np.where(self.free, change, 0.0)
-                # Skip the update if the change is within the errors of the two passes.
+                # Skip Broyden's update of the solver if the change is within the errors of the two passes.
                 if self._largest(fell) > before * self.scale:
-                    self._update(step, fell)
+                    answered = self.solver @ fell
+                    along = float(step @ answered)
+                    # A tiny denominator means that round-off dominates the step: it would spoil the solver.
+                    if abs(along) > 1e-3 * float(step @ step) > 0.0:
+                        self.solver = self.solver + np.outer((step - answered) / along, step @ self.solver)
             if count % _PATIENCE == 0:
                 self.solver = self._inverse(self._slope())
             change_before, before = np.where(self.free, change, 0.0), here
@@ -238,8 +246,7 @@ class Search:
                 self.solver = self._inverse(self._slope())
                 step = self.solver @ change_before
             self.z = self._holding(self.z + step)
-            moved = self._largest(step)
-            defect = self._largest(change)
+            moved, defect = self._largest(step), self._largest(change)
             if not moved < _ASTRAY * self.scale:
                 break
             # Round-off may prevent smaller steps; the size of the last step is then part of the stated error.
@@ -257,14 +264,6 @@ class Search:
         n, modes = self.period.n, self.period.modes
         grown = modes.shape @ self.solver[:n, :n] @ modes.inverse
         return max(1.0, float(np.abs(grown).sum(axis=1).max(initial=0.0)))
-
-    def _update(self, step: FloatArray, fell: FloatArray) -> None:
-        """Broyden's update of the solver from the last step and the reduction `fell` of the map's defect by it."""
-        answered = self.solver @ fell
-        along = float(step @ answered)
-        # A tiny denominator means that round-off dominates the step: such an update would spoil the solver.
-        if abs(along) > 1e-3 * float(step @ step) > 0.0:
-            self.solver = self.solver + np.outer((step - answered) / along, step @ self.solver)
 
     def _mind_wandering(self, last: _Pass, change: FloatArray, tol: float) -> None:
         """Refuse a state whose conserved charges change over the period: an area's ripple would pump them for ever.
@@ -312,36 +311,73 @@ class Search:
             slope[:, k] = (self.passed(self.z + by * unit, tol).end - base) / by
         return slope
 
-    def _errors(self, last: _Pass, step: FloatArray) -> tuple[FloatArray, float, float, float]:
-        """Errors of the gaps' voltages and forces (n_gap, 2), the memory, and the largest error relative to `rtol`.
+    def _errors(self, last: _Pass, step: FloatArray) -> tuple[FloatArray, float, float]:
+        """Errors of the gaps' voltages and forces (n_gap, 2); their largest share of `rtol`, and that of round-off.
 
-        The last figure is the same ratio for round-off alone. An error made in every period leads to an error of the
-        periodic state equal to the solver times it.
+        An error made in every period leads to an error of the periodic state equal to the solver times it.
         """
         period, solver = self.period, np.abs(self.solver)
-        memory = self._memory()
         grown = solver @ np.abs(last.error)
         met = last.met[self.fingers]
         peak, force = met[:, readout.PEAK_U], met[:, readout.PEAK_F]
-        largest = float(peak.max(initial=0.0))
         gap = np.abs(self.gap)
         # Add round-off, and the last Newton step as a bound of the error that remains after it.
         once = np.abs(period.modes.inverse).sum(axis=1)
         often = solver[: period.n, : period.n] @ once
         grows = np.maximum(1.0, (gap[:, : period.n] @ often) / (gap[:, : period.n] @ once))
-        floor = 4e-16 * grows * (last.rounding[self.fingers] * (largest + self.scale) + peak)
+        largest = float(peak.max(initial=0.0)) + self.scale
+        floor = 4e-16 * grows * (last.rounding[self.fingers] * largest + peak)
         u_error = last.magnified * (SAFETY * (gap @ grown) + gap @ np.abs(step)) + floor
         f_error = 2.0 * force / np.where(peak > 0.0, peak, math.inf) * u_error
         slow = period.problem.scene.net.slow[self.fingers]
-        off = (SAFETY * grown + np.abs(step))[period.n :]
-        share = np.array([off[i] if i >= 0 else 0.0 for i in slow])
+        # An area without a time constant has the place -1, the 0 at the end.
+        share = np.append((SAFETY * grown + np.abs(step))[period.n :], 0.0)[slow]
         u_error, f_error = u_error + peak * share, f_error + 3.0 * force * share
         live = peak > 4e-15 * self.scale
         over = np.append((u_error / np.where(live, peak, 1.0))[live], (f_error / np.where(live, force, 1.0))[live])
         rounding = float((2.0 * floor / np.where(live, peak, 1.0))[live].max(initial=0.0))
-        return (
-            np.column_stack([u_error, f_error]),
-            memory,
-            float(over.max(initial=0.0)) / self.rtol,
-            rounding / self.rtol,
-        )
+        return np.column_stack([u_error, f_error]), float(over.max(initial=0.0)) / self.rtol, rounding / self.rtol
+
+
+def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
+    """A problem, with its length, that starts from its periodic state, when the source has become periodic.
+
+    `rtol` bounds the error of the state alone, relative to the peaks over the period. Where round-off exceeds it, the
+    stated error is larger than `rtol`, and no error is raised.
+
+    Raises
+    ------
+    InputError
+        For sources without a common period.
+    SolveError
+        Where a period cannot be integrated, or Newton's method does not converge.
+    """
+    if problem.waveform.period is None:
+        raise InputError("the source has no period, so there is no periodic state to find")
+    try:
+        period = Period(problem)
+        found = Search(period, rtol).close() if problem.scene.coupled else _closed_form(period)
+    except Stopped as stopped:
+        raise SolveError(period_failure(problem, stopped.status, stopped.t)) from None
+    y = np.append(found.start, np.zeros(period.before.size))
+    initial = State(period.begin, y, period.before, np.zeros(problem.scene.net.gap.size), problem.scene.charge_law)
+    moved = period.begin - problem.t_start
+    started = dataclasses.replace(
+        problem, t_start=period.begin, t_stop=problem.t_stop + moved, first=problem.first + moved, initial=initial,
+        begun=found.gap_errors,
+    )  # fmt: skip
+    return started, found
+
+
+def _closed_form(period: Period) -> Found:
+    """The periodic state of a circuit with fixed areas."""
+    modes = period.modes
+    start, end, _ = period.linear_state(modes)
+    if not np.all(np.isfinite(start)):
+        raise SolveError(period_failure(period.problem, Status.NOT_PERIODIC, None, CHARGING))
+    sign = 1.0 if period.parts == 1 else -1.0
+    defect = float(np.abs(modes.shape @ (sign * end - start)).max(initial=0.0))
+    slope = np.diag(np.exp(-period.rates * period.span * period.parts))
+    # The only error of the closed form is round-off, which the run adds to its stated error itself.
+    none = np.zeros((len(period.problem.network.fingers), 2))
+    return Found(period.voltages(start + period.kept), period.parts * defect, slope, 1.0, none, 1)
