@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.one_area.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, Work, evaluate, moved
+from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
+from fingerspice.engine.many_areas.rows import evaluate_many, probe_many
+from fingerspice.engine.one_area.rows import DQ, SOURCE, X_GAP, Q, U, Work, evaluate_one, probe_one
 from fingerspice.engine.one_area.system import System
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 
@@ -90,67 +91,86 @@ def respond(forcing: FloatArray, phi: FloatArray, base: FloatArray, w: FloatArra
             w[k, i] = total + other
 
 
-@jit_rows
-def _linear(
-    gain: FloatArray, decay: FloatArray, phi: FloatArray, w0: FloatArray, source: FloatArray, base: FloatArray,
-    w: FloatArray,
-) -> None:  # fmt: skip
-    """Response to the start values and the source, with the area held at its reference, into `base` and `w`."""
-    for k in range(w0.size):
-        factor = gain[k]
-        start = w0[k]
-        for i in range(ROWS):
-            total = 0.0
-            for j in range(NODES):
-                total += phi[k, j, i] * source[j]
-            base[k, i] = decay[k, i] * start + factor * total
-        for i in range(ROWS):
-            w[k, i] = base[k, i]
+class Iterates(NamedTuple):
+    """Arrays of the iteration, shape (m, ROWS) for the modes."""
+
+    # w, base, pull, used: The modes, and those without the nonlinear term; this term at them, and as used for them
+    w: FloatArray
+    base: FloatArray
+    pull: FloatArray
+    used: FloatArray
+    # pull_before, left_before: Nonlinear term and what was left of it an iteration before (see `mix`)
+    pull_before: FloatArray
+    left_before: FloatArray
+    weight: FloatArray  # (m,): See `weigh`
+    # u, guess (n_area, ROWS): Gap voltages now and an iteration before, V
+    u: FloatArray
+    guess: FloatArray
+
+
+@jit_by_kind(OneArea=evaluate_one, ManyAreas=evaluate_many)
+def _evaluate(circuit: Any, state: Any) -> bool:
+    """The nonlinear term at the modes of the step at hand; False beyond a fold."""
+    raise NotImplementedError
+
+
+@jit_by_kind(OneArea=probe_one, ManyAreas=probe_many)
+def _probe(circuit: Any, state: Any, w: FloatArray, pull: FloatArray) -> bool:
+    """The same at other modes w, into `pull`; both are rows of `work.spare`."""
+    raise NotImplementedError
 
 
 @jit_within
-def converge(
-    system: System, tables: Tables, work: Work, slot: int, level: int, sign: float, tol: float
-) -> tuple[int, bool]:  # fmt: skip
-    """Fill `work.w` with the collocation solution of a step, iterating on the nonlinear term.
+def converge(circuit: Any, state: Any, x: Iterates, tol: float) -> tuple[int, bool, float]:
+    """Fill `x.w` with the collocation solution of a step, iterating on the nonlinear term.
 
-    Returns the number of evaluations at all rows, and whether the iteration converged to `tol` (V). `work.pull` is the
-    nonlinear term at that solution, `work.used` the term from which the solution was computed. Their difference is
-    measured, with `work.weight` for each mode, by how far it moves the gap voltage.
+    Returns the number of evaluations at all rows, whether the iteration converged to `tol` (V), and the factor by which
+    the first iteration reduced the change of the nonlinear term: how strongly the areas answer to a change of the
+    modes. `x.pull` is the nonlinear term at that solution, `x.used` the term from which the solution was computed.
+    Their difference is measured, with the weight of each mode, by how far it moves the gap voltages.
     """
-    r, base, w, pull, used, weight = work.r, work.base, work.w, work.pull, work.used, work.weight
-    decay, phi = tables.decay[slot], tables.phi[slot]
-    _linear(system.gain[level], decay, phi, work.w0, r[SOURCE], base, w)
-    for k in range(work.w0.size):
+    pull, used, phi = x.pull, x.used, circuit.tables.phi[state.step[0].slot]
+    for k in range(used.shape[0]):
         for i in range(ROWS):
+            x.w[k, i] = x.base[k, i]
             used[k, i] = 0.0
     slow = False
-    step = 0.0
+    step, answer = 0.0, 0.0
     # The loop includes the first evaluation: `evaluate` is inlined at each call, so that one call compiles once.
     for iteration in range(1, 41):
         if iteration > 1:
             if slow:
-                step = mix(pull, used, weight, work.pull_before, work.left_before)
+                step = mix(pull, used, x.weight, x.pull_before, x.left_before)
             else:
-                step = plain(pull, used, weight, work.pull_before, work.left_before)
-            respond(used, phi, base, w)
-        if not evaluate(system, work, level, sign):
-            return iteration, False
-        if not system.model.coupled:
-            return 1, True
+                step = plain(pull, used, x.weight, x.pull_before, x.left_before)
+            respond(used, phi, x.base, x.w)
+        if not _evaluate(circuit, state):
+            return iteration, False, answer
+        change = moved(x.u, x.guess)
         if iteration == 1:
-            for i in range(ROWS):
-                r[GUESS, i] = r[U, i]
             continue
-        # Estimate the next change of the gap voltage: its last one, times the ratio of the nonlinear term's changes.
-        change = moved(r[U], r[GUESS])
-        left = distance(pull, used, weight)
+        # The next change of the gap voltages: their last one, times the ratio of the nonlinear term's changes.
+        left = distance(pull, used, x.weight)
+        if iteration == 2 and step > 0.0:
+            answer = left / step
         if not left < math.inf:
-            return iteration, False
+            return iteration, False, answer
         if change * left <= tol * step:
-            return iteration, True
+            return iteration, True, answer
         slow = left > 0.15 * step
-    return 40, False
+    return 40, False, answer
+
+
+@jit_rows
+def moved(u: FloatArray, before: FloatArray) -> float:
+    """Euclidean norm of u - before; then `before` becomes u."""
+    total = 0.0
+    for a in range(u.shape[0]):
+        for i in range(ROWS):
+            change = u[a, i] - before[a, i]
+            total += change * change
+            before[a, i] = u[a, i]
+    return math.sqrt(total)
 
 
 @jit
@@ -265,6 +285,71 @@ def largest(first: float, second: float, third: float) -> float:
     return out if abs(out) > abs(third) else third
 
 
+# Shift of the modes for the difference, over the largest mode: half of the digits are left for the difference.
+_SHIFT = 1e-7
+# Answer of the areas up to which it is neglected: the error carried changes by at most 6 times as much of itself.
+_SLIGHT = 0.01
+# Most iterations, and the relative change below which the next iteration does not matter.
+_PASSES, _ENOUGH = 6, 0.1
+
+
+@jit_rows
+def _shift(w: FloatArray, step: float, off: FloatArray, out: FloatArray) -> None:
+    for k in range(out.shape[0]):
+        for i in range(ROWS):
+            out[k, i] = w[k, i] + step * off[k, i]
+
+
+@jit_rows
+def _difference(a: FloatArray, b: FloatArray, factor: float, out: FloatArray) -> None:
+    for k in range(out.shape[0]):
+        for i in range(ROWS):
+            out[k, i] = factor * (a[k, i] - b[k, i])
+
+
+@jit_within
+def carry(circuit: Any, state: Any, w: FloatArray, pull: FloatArray, answer: float) -> None:
+    """Carry the error of the modes from the start of a converged step to the points between and the end.
+
+    With the areas held it decays with the modes. But an error of a gap voltage also changes 1/A, which forces the
+    modes. This may oppose the error or amplify it: near an instability of the circuit (a layer's leakage that rises
+    with the area, or an area that the stored charge drives on) errors grow thousandfold within a few steps. So the
+    nonlinear term `pull` is evaluated once more at modes shifted by the error, and the response to its change is
+    iterated a few times. `answer` is how strongly the areas answered to the last change of the modes (see `converge`):
+    where they hardly do, the error decays with the modes. The result is `work.carried`.
+    """
+    work, error, slot, m = circuit.work, state.error, state.step[0].slot, w.shape[0]
+    base, forced, off, shifted, other = work.spare[0], work.spare[1], work.spare[2], work.spare[3], work.spare[4]
+    decay, phi, carried = circuit.tables.decay[slot], circuit.tables.phi[slot], work.carried
+    largest_one, size = 0.0, 0.0
+    for k in range(m):
+        largest_one = max(largest_one, abs(error[k]))
+        for i in range(ROWS):
+            base[k, i] = decay[k, i] * error[k]
+            off[k, i] = base[k, i]
+            size = max(size, abs(w[k, i]))
+    step = _SHIFT * size / largest_one if largest_one > 0.0 else 0.0
+    if answer > _SLIGHT and 0.0 < step < math.inf:
+        for _ in range(_PASSES):
+            before, change = 0.0, 0.0
+            _shift(w, step, off, shifted)
+            if not _probe(circuit, state, shifted, other):
+                break
+            _difference(other, pull, 1.0 / step, forced)
+            for k in range(m):
+                before = max(before, abs(off[k, END]))
+                shifted[k, 0] = off[k, END]
+            respond(forced, phi, base, off)
+            for k in range(m):
+                change = max(change, abs(off[k, END] - shifted[k, 0]))
+            if not change > _ENOUGH * before:
+                break
+    for k in range(m):
+        for p in range(3):
+            carried[k, p] = off[k, NODES + p]
+        carried[k, 3] = off[k, END]
+
+
 @jit_within
 def assess(
     system: System, tables: Tables, work: Work, slot: int, level: int, error: FloatArray
@@ -275,7 +360,7 @@ def assess(
     ----------
     system, tables, work, slot, level
         As in `converge`. `work.carried` is the error of the modes propagated to the points between nodes and to the end
-        (see `engine.one_area.growth`); `work.places` is filled with their error at the start, the points between and
+        (see `carry`); `work.places` is filled with their error at the start, the points between and
         the end, that of the dense output included.
     error : ndarray, shape (n,)
         Error of the modes at the start of the step, signed.

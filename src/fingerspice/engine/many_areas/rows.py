@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
@@ -9,9 +11,10 @@ from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.many_areas import form as blocks
 from fingerspice.engine.many_areas.coupling import STIFF
 from fingerspice.engine.many_areas.currents import Moving, answer_alone, answer_mobile, answer_together
-from fingerspice.engine.many_areas.form import Form, Leaks, Work
+from fingerspice.engine.many_areas.form import Form, Leaks, Work, leaks_of
 from fingerspice.engine.one_area.rows import polynomial_rows
 from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, ROWS
+from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
 
 # From values at the nodes to slopes at all rows, per step length: slopes = values @ TO_RATES.
@@ -210,3 +213,26 @@ def follow_sources(form: Form, work: Work, gain: FloatArray) -> None:
     combine(coupling.from_slopes, s, cells[blocks.CHI_S])
     clear(areas[blocks.U_S])
     combine(form.gap_s, s, areas[blocks.U_S])
+
+
+@jit_within
+def evaluate_many(c: Any, s: Any) -> bool:
+    """The forcing at the modes of the step at hand."""
+    work, modes, several, h = c.work, c.work.modes, s.step[0].several > 0, s.step[0].length
+    return evaluate(
+        c.form, work, leaks_of(c, s), several, h, c.sign, modes[blocks.W], modes[blocks.D], modes[blocks.PULL],
+        work.cells, work.areas, work.room[3],
+    )  # fmt: skip
+
+
+@jit_within
+def probe_many(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
+    """The forcing at other modes w than those of the step at hand, whose own rows stay as they are."""
+    work, cells, areas = c.work, c.work.spare_cells, c.work.spare_areas
+    for part in (blocks.ETA_S, blocks.CHI_S, blocks.RHO):
+        copy_to(cells[part], work.cells[part])
+    copy_to(areas[blocks.U_S], work.areas[blocks.U_S])
+    several, h = s.step[0].several > 0, s.step[0].length
+    return evaluate(
+        c.form, work, leaks_of(c, s), several, h, c.sign, w, work.spare[5], pull, cells, areas, work.room[1]
+    )  # fmt: skip

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.collocation.exponential import Tables, distance, mix, plain, respond
 from fingerspice.engine.many_areas import form as blocks
 from fingerspice.engine.many_areas.charge import charge_rows
 from fingerspice.engine.many_areas.currents import cell_currents
-from fingerspice.engine.many_areas.error import moved
 from fingerspice.engine.many_areas.form import Form, Leaks, Work
-from fingerspice.engine.many_areas.rows import clear, combine, evaluate, mode_rates, wanted
+from fingerspice.engine.many_areas.rows import clear, combine, mode_rates, wanted
 from fingerspice.engine.network import Sources
 from fingerspice.engine.one_area import rows
 from fingerspice.engine.one_area import rows as stack_work
@@ -45,64 +41,11 @@ def ramp_rows(t: float, h: float, before: FloatArray, after: FloatArray, s: Floa
 
 
 @jit_rows
-def _free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
+def free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
     """Decay of the modes from their values at the start of a step."""
     for k in range(w0.size):
         for i in range(ROWS):
             out[k, i] = decay[k, i] * w0[k]
-
-
-@jit_within
-def solve_step(
-    form: Form, work: Work, leaks: Leaks, tables: Tables, slot: int, several: bool, h: float, sign: FloatArray,
-    tol: float,
-) -> tuple[int, bool, float]:  # fmt: skip
-    """Collocation solution of a step from the modes `work.w0`, by iteration on the currents that the areas add.
-
-    Returns the number of evaluations, whether the gap voltages are settled to `tol` (V), and the factor by which the
-    first iteration reduced the change of the currents: how strongly the areas answer to a change of the modes.
-    """
-    modes, cells, areas, weight = work.modes, work.cells, work.areas, work.weight
-    w, base, lin, pull, used = (
-        modes[blocks.W], modes[blocks.BASE], modes[blocks.LIN], modes[blocks.PULL], modes[blocks.USED]
-    )  # fmt: skip
-    pull_before, left_before = modes[blocks.PULL_BEFORE], modes[blocks.LEFT_BEFORE]
-    u, guess = areas[blocks.U], areas[blocks.GUESS]
-    decay, phi = tables.decay[slot], tables.phi[slot]
-    clear(used)
-    clear(guess)
-    clear(cells[blocks.RHO])
-    _free(decay, work.w0, w)
-    respond(lin, phi, w, base)
-    current = base
-    slowly = False
-    step = 0.0
-    answer = 0.0
-    for iteration in range(1, 41):
-        if iteration > 1:
-            if slowly:
-                step = mix(pull, used, weight, pull_before, left_before)
-            else:
-                step = plain(pull, used, weight, pull_before, left_before)
-            respond(used, phi, base, w)
-            current = w
-        if not evaluate(
-            form, work, leaks, several, h, sign, current, modes[blocks.D], pull, cells, areas, work.room[3]
-        ):  # fmt: skip
-            return iteration, False, answer
-        change = moved(u, guess)
-        if iteration == 1:
-            continue
-        # The next change of the gap voltages, estimated from their change for the last change of the currents.
-        off = distance(pull, used, weight)
-        if iteration == 2 and step > 0.0:
-            answer = off / step
-        if not off < math.inf:
-            return iteration, False, answer
-        if change * off <= tol * step:
-            return iteration, True, answer
-        slowly = off > 0.15 * step
-    return 40, False, answer
 
 
 @jit_within
