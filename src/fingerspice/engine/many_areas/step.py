@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 from fingerspice.base.compiled import jit_within
-from fingerspice.engine.collocation.exponential import Iterates, carry, converge, make_tables, respond, weigh
+from fingerspice.engine.collocation.exponential import carry, make_tables
+from fingerspice.engine.collocation.iteration import Iterates, converge, respond, weigh
 from fingerspice.engine.collocation.loopstate import (
     AGAIN,
     GO_ON,
@@ -34,7 +35,7 @@ from fingerspice.engine.collocation.step_control import AFTER_ZERO, Pace
 from fingerspice.engine.collocation.zeros import farthest_off, first_wrong
 from fingerspice.engine.many_areas import form as blocks
 from fingerspice.engine.many_areas.begin import ManyAreas, branch_of, resume_time
-from fingerspice.engine.many_areas.charge import charge_error
+from fingerspice.engine.many_areas.charge import charge_error, step_charges
 from fingerspice.engine.many_areas.coupling import take_coupling
 from fingerspice.engine.many_areas.currents import Moving, answer_mobile
 from fingerspice.engine.many_areas.error import (
@@ -47,8 +48,7 @@ from fingerspice.engine.many_areas.error import (
     write_columns,
 )
 from fingerspice.engine.many_areas.form import leaks_of
-from fingerspice.engine.many_areas.rows import clear, combine, follow_sources
-from fingerspice.engine.many_areas.solution import free, ramp_rows, source_rows, step_charges
+from fingerspice.engine.many_areas.rows import clear, combine, follow_sources, free, ramp_rows, source_rows
 from fingerspice.engine.network import at_sources
 from fingerspice.numerics.lobatto import END, NODES, POINTS
 

@@ -31,9 +31,9 @@ class Work(NamedTuple):
         See above.
     base, w, pull, used, pull_before, left_before : ndarray, shape (n, ROWS)
         The modes without and with the nonlinear term, this term at them and as it was used for them, and both of the
-        iteration before (see `exponential.converge`).
+        iteration before (see `iteration.converge`).
     w0, weight : ndarray, shape (n,)
-        The modes at the start of the step; effect of each on the gap voltage (see `exponential.weigh`).
+        The modes at the start of the step; effect of each on the gap voltage (see `iteration.weigh`).
     places, carried : ndarray, shape (n, N_PLACES) and (n, N_PLACES - 1)
         Errors of the modes, and those carried over from earlier steps.
     run : ndarray, shape (N_PLACES,)

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit_rows, jit_within
-from fingerspice.engine.collocation.exponential import Iterates, Tables, assess, carry, converge, make_tables, weigh
+from fingerspice.engine.collocation.exponential import Tables, assess, carry, make_tables
+from fingerspice.engine.collocation.iteration import Iterates, converge, weigh
 from fingerspice.engine.collocation.loopstate import (
     AGAIN,
     DONE,
