@@ -153,7 +153,7 @@ def carry(circuit: Any, state: Any, w: FloatArray, pull: FloatArray, answer: flo
     modes. This may oppose the error or amplify it: near an instability of the circuit (a layer's leakage that rises
     with the area, or an area that the stored charge drives on) errors grow thousandfold within a few steps. So the
     nonlinear term `pull` is evaluated once more at modes shifted by the error, and the response to its change is
-    iterated a few times. `answer` is how strongly the areas answered to the last change of the modes (see `iteration.converge`):
+    iterated a few times. `answer` is how strongly the areas answered to a change of the modes (`iteration.converge`):
     where they hardly do, the error decays with the modes. The result is `work.carried`.
     """
     work, error, slot, m = circuit.work, state.error, state.step[0].slot, w.shape[0]
@@ -197,9 +197,9 @@ def assess(
     Parameters
     ----------
     system, tables, work, slot, level
-        Of the step at hand. `work.carried` is the error of the modes propagated to the points between nodes and to the end
-        (see `carry`); `work.places` is filled with their error at the start, the points between and
-        the end, that of the dense output included.
+        Of the step at hand. `work.carried` is the error of the modes propagated to the points between nodes and to
+        the end (see `carry`); `work.places` is filled with their error at the start, the points between and the end,
+        that of the dense output included.
     error : ndarray, shape (n,)
         Error of the modes at the start of the step, signed.
 
