@@ -1,15 +1,17 @@
-"""One step of exponential collocation: exact linear part, iteration on the area's nonlinear term, error estimate."""
+"""A step of exponential collocation: tables for its exact linear part, and the estimate of its error."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.one_area.rows import DQ, GUESS, SOURCE, X_GAP, Q, U, Work, evaluate, moved
+from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
+from fingerspice.engine.collocation.iteration import respond
+from fingerspice.engine.many_areas.rows import probe_many
+from fingerspice.engine.one_area.rows import DQ, SOURCE, X_GAP, Q, U, Work, probe_one
 from fingerspice.engine.one_area.system import System
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 
@@ -77,156 +79,6 @@ def make_tables(
 
 
 @jit_rows
-def respond(forcing: FloatArray, phi: FloatArray, base: FloatArray, w: FloatArray) -> None:
-    """w = base + response to `forcing` (n, ROWS), of which only the values at the nodes are used."""
-    for k in range(w.shape[0]):
-        for i in range(ROWS):
-            # Two independent sums: in a single one every addition would wait for the result of the last.
-            total = base[k, i] + phi[k, NODES - 1, i] * forcing[k, NODES - 1]
-            other = 0.0
-            for j in range(0, NODES - 1, 2):
-                total += phi[k, j, i] * forcing[k, j]
-                other += phi[k, j + 1, i] * forcing[k, j + 1]
-            w[k, i] = total + other
-
-
-@jit_rows
-def _linear(
-    gain: FloatArray, decay: FloatArray, phi: FloatArray, w0: FloatArray, source: FloatArray, base: FloatArray,
-    w: FloatArray,
-) -> None:  # fmt: skip
-    """Response to the start values and the source, with the area held at its reference, into `base` and `w`."""
-    for k in range(w0.size):
-        factor = gain[k]
-        start = w0[k]
-        for i in range(ROWS):
-            total = 0.0
-            for j in range(NODES):
-                total += phi[k, j, i] * source[j]
-            base[k, i] = decay[k, i] * start + factor * total
-        for i in range(ROWS):
-            w[k, i] = base[k, i]
-
-
-@jit_within
-def converge(
-    system: System, tables: Tables, work: Work, slot: int, level: int, sign: float, tol: float
-) -> tuple[int, bool]:  # fmt: skip
-    """Fill `work.w` with the collocation solution of a step, iterating on the nonlinear term.
-
-    Returns the number of evaluations at all rows, and whether the iteration converged to `tol` (V). `work.pull` is the
-    nonlinear term at that solution, `work.used` the term from which the solution was computed. Their difference is
-    measured, with `work.weight` for each mode, by how far it moves the gap voltage.
-    """
-    r, base, w, pull, used, weight = work.r, work.base, work.w, work.pull, work.used, work.weight
-    decay, phi = tables.decay[slot], tables.phi[slot]
-    _linear(system.gain[level], decay, phi, work.w0, r[SOURCE], base, w)
-    for k in range(work.w0.size):
-        for i in range(ROWS):
-            used[k, i] = 0.0
-    slow = False
-    step = 0.0
-    # The loop includes the first evaluation: `evaluate` is inlined at each call, so that one call compiles once.
-    for iteration in range(1, 41):
-        if iteration > 1:
-            if slow:
-                step = mix(pull, used, weight, work.pull_before, work.left_before)
-            else:
-                step = plain(pull, used, weight, work.pull_before, work.left_before)
-            respond(used, phi, base, w)
-        if not evaluate(system, work, level, sign):
-            return iteration, False
-        if not system.model.coupled:
-            return 1, True
-        if iteration == 1:
-            for i in range(ROWS):
-                r[GUESS, i] = r[U, i]
-            continue
-        # Estimate the next change of the gap voltage: its last one, times the ratio of the nonlinear term's changes.
-        change = moved(r[U], r[GUESS])
-        left = distance(pull, used, weight)
-        if not left < math.inf:
-            return iteration, False
-        if change * left <= tol * step:
-            return iteration, True
-        slow = left > 0.15 * step
-    return 40, False
-
-
-@jit
-def weigh(rates: FloatArray, gap: FloatArray, decay: FloatArray, h: float, weight: FloatArray) -> None:
-    """Move of the gap voltage over a step by a unit forcing of each mode, into `weight` (n,)."""
-    for k in range(rates.size):
-        weight[k] = gap[k] * (h if rates[k] * h < 1e-9 else (1.0 - decay[k, END]) / rates[k])
-
-
-@jit_rows
-def plain(
-    pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
-) -> float:
-    """Picard step of the iteration, remembered for a later Anderson step (`mix`); returns the size of the move."""
-    total = 0.0
-    for k in range(pull.shape[0]):
-        size = 0.0
-        for i in range(ROWS):
-            left = pull[k, i] - used[k, i]
-            size += left * left
-            left_before[k, i] = left
-            pull_before[k, i] = pull[k, i]
-            used[k, i] = pull[k, i]
-        total += weight[k] * weight[k] * size
-    return math.sqrt(total)
-
-
-@jit_rows
-def mix(
-    pull: FloatArray, used: FloatArray, weight: FloatArray, pull_before: FloatArray, left_before: FloatArray
-) -> float:
-    """Next nonlinear term from the last two (Anderson 1965, one step back), into `used`; returns the size of the move.
-
-    In a stiff stack a Picard step reduces the residual by a factor, the area's share of the leakage. Mixing squares it.
-    """
-    across = 0.0
-    along = 0.0
-    for k in range(pull.shape[0]):
-        mine = 0.0
-        size = 0.0
-        for i in range(ROWS):
-            left = pull[k, i] - used[k, i]
-            difference = left - left_before[k, i]
-            mine += left * difference
-            size += difference * difference
-        across += weight[k] * weight[k] * mine
-        along += weight[k] * weight[k] * size
-    share = across / along if along > 0.0 else 0.0
-    share = min(max(share, -1.0), 0.9)
-    total = 0.0
-    for k in range(pull.shape[0]):
-        size = 0.0
-        for i in range(ROWS):
-            left_before[k, i] = pull[k, i] - used[k, i]
-            new = pull[k, i] - share * (pull[k, i] - pull_before[k, i])
-            pull_before[k, i] = pull[k, i]
-            move = new - used[k, i]
-            size += move * move
-            used[k, i] = new
-        total += weight[k] * weight[k] * size
-    return math.sqrt(total)
-
-
-@jit_rows
-def distance(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:
-    """Norm of the difference of two nonlinear terms, with the weight of each mode from `weigh`."""
-    total = 0.0
-    for k in range(a.shape[0]):
-        size = 0.0
-        for i in range(ROWS):
-            size += (a[k, i] - b[k, i]) ** 2
-        total += weight[k] * weight[k] * size
-    return math.sqrt(total)
-
-
-@jit_rows
 def between(values: FloatArray) -> tuple[float, float, float]:
     """Interpolation error at the three points between nodes: values there less the polynomial through the nodes."""
     first = 0.0
@@ -265,6 +117,77 @@ def largest(first: float, second: float, third: float) -> float:
     return out if abs(out) > abs(third) else third
 
 
+# Shift of the modes for the difference, over the largest mode: half of the digits are left for the difference.
+_SHIFT = 1e-7
+# Answer of the areas up to which it is neglected: the error carried changes by at most 6 times as much of itself.
+_SLIGHT = 0.01
+# Most iterations, and the relative change below which the next iteration does not matter.
+_PASSES, _ENOUGH = 6, 0.1
+
+
+@jit_by_kind(OneArea=probe_one, ManyAreas=probe_many)
+def _probe(circuit: Any, state: Any, w: FloatArray, pull: FloatArray) -> bool:
+    """The nonlinear term at other modes w, into `pull`; both are rows of `work.spare`. False beyond a fold."""
+    raise NotImplementedError
+
+
+@jit_rows
+def _shift(w: FloatArray, step: float, off: FloatArray, out: FloatArray) -> None:
+    for k in range(out.shape[0]):
+        for i in range(ROWS):
+            out[k, i] = w[k, i] + step * off[k, i]
+
+
+@jit_rows
+def _difference(a: FloatArray, b: FloatArray, factor: float, out: FloatArray) -> None:
+    for k in range(out.shape[0]):
+        for i in range(ROWS):
+            out[k, i] = factor * (a[k, i] - b[k, i])
+
+
+@jit_within
+def carry(circuit: Any, state: Any, w: FloatArray, pull: FloatArray, answer: float) -> None:
+    """Carry the error of the modes from the start of a converged step to the points between and the end.
+
+    With the areas held it decays with the modes. But an error of a gap voltage also changes 1/A, which forces the
+    modes. This may oppose the error or amplify it: near an instability of the circuit (a layer's leakage that rises
+    with the area, or an area that the stored charge drives on) errors grow thousandfold within a few steps. So the
+    nonlinear term `pull` is evaluated once more at modes shifted by the error, and the response to its change is
+    iterated a few times. `answer` is how strongly the areas answered to a change of the modes (`iteration.converge`):
+    where they hardly do, the error decays with the modes. The result is `work.carried`.
+    """
+    work, error, slot, m = circuit.work, state.error, state.step[0].slot, w.shape[0]
+    base, forced, off, shifted, other = work.spare[0], work.spare[1], work.spare[2], work.spare[3], work.spare[4]
+    decay, phi, carried = circuit.tables.decay[slot], circuit.tables.phi[slot], work.carried
+    largest_one, size = 0.0, 0.0
+    for k in range(m):
+        largest_one = max(largest_one, abs(error[k]))
+        for i in range(ROWS):
+            base[k, i] = decay[k, i] * error[k]
+            off[k, i] = base[k, i]
+            size = max(size, abs(w[k, i]))
+    step = _SHIFT * size / largest_one if largest_one > 0.0 else 0.0
+    if answer > _SLIGHT and 0.0 < step < math.inf:
+        for _ in range(_PASSES):
+            before, change = 0.0, 0.0
+            _shift(w, step, off, shifted)
+            if not _probe(circuit, state, shifted, other):
+                break
+            _difference(other, pull, 1.0 / step, forced)
+            for k in range(m):
+                before = max(before, abs(off[k, END]))
+                shifted[k, 0] = off[k, END]
+            respond(forced, phi, base, off)
+            for k in range(m):
+                change = max(change, abs(off[k, END] - shifted[k, 0]))
+            if not change > _ENOUGH * before:
+                break
+    for k in range(m):
+        for p in range(3):
+            carried[k, p] = off[k, NODES + p]
+        carried[k, 3] = off[k, END]
+
+
 @jit_within
 def assess(
     system: System, tables: Tables, work: Work, slot: int, level: int, error: FloatArray
@@ -274,9 +197,9 @@ def assess(
     Parameters
     ----------
     system, tables, work, slot, level
-        As in `converge`. `work.carried` is the error of the modes propagated to the points between nodes and to the end
-        (see `engine.one_area.growth`); `work.places` is filled with their error at the start, the points between and
-        the end, that of the dense output included.
+        Of the step at hand. `work.carried` is the error of the modes propagated to the points between nodes and to
+        the end (see `carry`); `work.places` is filled with their error at the start, the points between and the end,
+        that of the dense output included.
     error : ndarray, shape (n,)
         Error of the modes at the start of the step, signed.
 

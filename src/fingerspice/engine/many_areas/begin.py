@@ -19,7 +19,7 @@ from fingerspice.engine.collocation.readout import (
 from fingerspice.engine.collocation.step_control import AFTER_EDGE, NOT_FRESH, Pace, choose_step
 from fingerspice.engine.many_areas import form as blocks
 from fingerspice.engine.many_areas.error import load
-from fingerspice.engine.many_areas.form import Form, Leaks, Work
+from fingerspice.engine.many_areas.form import Form, Work, leaks_of
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
@@ -115,15 +115,6 @@ class ManyAreas(NamedTuple):
     sign: FloatArray
     s_before: FloatArray
     branch: FloatArray  # (n_area, 2): Time at which each area's branch began, and length of the branch before, s
-
-
-@jit_within
-def leaks_of(c: ManyAreas, s: LoopState) -> Leaks:
-    """What leaks at present: nothing within a jump of the sources."""
-    form, none = c.form, c.work.jump.leaks
-    if s.step[0].in_jump > 0:
-        return Leaks(none.rates, none.gain, none.g, none.pace, none.lost, none.lost_s)
-    return Leaks(form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s)
 
 
 @jit_within

@@ -14,7 +14,10 @@ from fingerspice.engine.collocation.readout import (
     Control,
     row_of,
 )
+from fingerspice.engine.many_areas import form as blocks
+from fingerspice.engine.many_areas.currents import cell_currents
 from fingerspice.engine.many_areas.form import AREA, CELL_U, MORE, SLOPE, D, Form, J, Leaks, W, Work
+from fingerspice.engine.many_areas.rows import clear, combine, mode_rates, wanted
 from fingerspice.engine.one_area.charge import LOBE
 from fingerspice.numerics.lobatto import DERIVATIVE, NODES, POINTS, ROWS
 
@@ -256,3 +259,26 @@ def _way(values: FloatArray) -> float:
     for i in range(1, NODES):
         total += abs(values[i] - values[i - 1])
     return total
+
+
+@jit_within
+def step_charges(
+    form: Form, work: Work, leaks: Leaks, h: float, integral: FloatArray, sign: FloatArray, z: FloatArray,
+    current: FloatArray,
+) -> None:  # fmt: skip
+    """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
+    modes, cells, areas = work.modes, work.cells, work.areas
+    w, cell_u = modes[blocks.W], cells[blocks.CELL_U]
+    mode_rates(h, leaks.rates, w, modes[blocks.LIN], modes[blocks.PULL], False, modes[blocks.D])
+    clear(cell_u)
+    combine(form.tap, w[: form.shape.shape[0]], cell_u)
+    combine(form.tap_s, work.s, cell_u)
+    cell_currents(work.own.root, cells[blocks.RHO], cells[blocks.J])
+    if not form.mobile:
+        for a in range(form.cell.size):
+            if form.cell[a] >= 0 and form.slow[a] < 0:
+                wanted(
+                    True, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a],
+                    areas[blocks.U, a], areas[blocks.AREA, a], areas[blocks.SLOPE, a],
+                )  # fmt: skip
+    charge_rows(form, work, leaks, h, integral, z, current)

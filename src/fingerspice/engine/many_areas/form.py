@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.compiled import jit_within
 from fingerspice.engine.collocation.readout import CONTROL, N_PLACES, WRITTEN_AT_ONCE
 from fingerspice.engine.many_areas.coupling import Coupling, new_coupling
 from fingerspice.engine.one_area.rows import N_FLAT
@@ -236,3 +237,12 @@ def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: 
         np.zeros(NODES),
         _new_jump(n, modes, cells, areas, sources),
     )
+
+
+@jit_within
+def leaks_of(c: Any, s: Any) -> Leaks:
+    """What leaks at present: nothing within a jump of the sources."""
+    form, none = c.form, c.work.jump.leaks
+    if s.step[0].in_jump > 0:
+        return Leaks(none.rates, none.gain, none.g, none.pace, none.lost, none.lost_s)
+    return Leaks(form.rates, form.gain, form.g, form.pace, form.lost, form.lost_s)

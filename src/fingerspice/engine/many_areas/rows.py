@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.many_areas import form as blocks
 from fingerspice.engine.many_areas.coupling import STIFF
 from fingerspice.engine.many_areas.currents import Moving, answer_alone, answer_mobile, answer_together
-from fingerspice.engine.many_areas.form import Form, Leaks, Work
+from fingerspice.engine.many_areas.form import Form, Leaks, Work, leaks_of
+from fingerspice.engine.network import Sources
+from fingerspice.engine.one_area import rows as stack_rows
 from fingerspice.engine.one_area.rows import polynomial_rows
-from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, ROWS
+from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, POINTS, ROWS
+from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
 
 # From values at the nodes to slopes at all rows, per step length: slopes = values @ TO_RATES.
@@ -210,3 +215,59 @@ def follow_sources(form: Form, work: Work, gain: FloatArray) -> None:
     combine(coupling.from_slopes, s, cells[blocks.CHI_S])
     clear(areas[blocks.U_S])
     combine(form.gap_s, s, areas[blocks.U_S])
+
+
+@jit_within
+def evaluate_many(c: Any, s: Any) -> bool:
+    """The forcing at the modes of the step at hand."""
+    work, modes, several, h = c.work, c.work.modes, s.step[0].several > 0, s.step[0].length
+    return evaluate(
+        c.form, work, leaks_of(c, s), several, h, c.sign, modes[blocks.W], modes[blocks.D], modes[blocks.PULL],
+        work.cells, work.areas, work.room[3],
+    )  # fmt: skip
+
+
+@jit_within
+def probe_many(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
+    """The forcing at other modes w than those of the step at hand, whose own rows stay as they are."""
+    work, cells, areas = c.work, c.work.spare_cells, c.work.spare_areas
+    for part in (blocks.ETA_S, blocks.CHI_S, blocks.RHO):
+        copy_to(cells[part], work.cells[part])
+    copy_to(areas[blocks.U_S], work.areas[blocks.U_S])
+    several, h = s.step[0].several > 0, s.step[0].length
+    return evaluate(
+        c.form, work, leaks_of(c, s), several, h, c.sign, w, work.spare[5], pull, cells, areas, work.room[1]
+    )  # fmt: skip
+
+
+@jit
+def source_rows(
+    sources: Sources, index: IntArray, t: float, h: float, slopes: bool, r: FloatArray, s: FloatArray, ds: FloatArray
+) -> None:
+    """Values of the sources at all rows of a step and, if wanted, their slopes."""
+    for e in range(s.shape[0]):
+        row = sources.first[e] + index[e]
+        start = sources.edges[row]
+        stack_rows.source_rows(
+            sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, slopes, r[e]
+        )
+        for i in range(ROWS):
+            s[e, i] = r[e, stack_rows.SOURCE, i]
+            ds[e, i] = r[e, stack_rows.SLOPE, i]
+
+
+@jit
+def ramp_rows(t: float, h: float, before: FloatArray, after: FloatArray, s: FloatArray, ds: FloatArray) -> None:
+    """Values and slopes of the sources at all rows of a step within a jump, which starts at the fraction t."""
+    for e in range(before.size):
+        for i in range(ROWS):
+            ds[e, i] = after[e] - before[e]
+            s[e, i] = before[e] + (t + POINTS[i] * h) * ds[e, i]
+
+
+@jit_rows
+def free(decay: FloatArray, w0: FloatArray, out: FloatArray) -> None:
+    """Decay of the modes from their values at the start of a step."""
+    for k in range(w0.size):
+        for i in range(ROWS):
+            out[k, i] = decay[k, i] * w0[k]

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 from fingerspice.base.compiled import jit_within
-from fingerspice.engine.collocation.exponential import make_tables, weigh
+from fingerspice.engine.collocation.exponential import carry, make_tables
+from fingerspice.engine.collocation.iteration import Iterates, converge, respond, weigh
 from fingerspice.engine.collocation.loopstate import (
     AGAIN,
     GO_ON,
@@ -33,22 +34,21 @@ from fingerspice.engine.collocation.readout import (
 from fingerspice.engine.collocation.step_control import AFTER_ZERO, Pace
 from fingerspice.engine.collocation.zeros import farthest_off, first_wrong
 from fingerspice.engine.many_areas import form as blocks
-from fingerspice.engine.many_areas.begin import ManyAreas, branch_of, leaks_of, resume_time
-from fingerspice.engine.many_areas.charge import charge_error
+from fingerspice.engine.many_areas.begin import ManyAreas, branch_of, resume_time
+from fingerspice.engine.many_areas.charge import charge_error, step_charges
 from fingerspice.engine.many_areas.coupling import take_coupling
 from fingerspice.engine.many_areas.currents import Moving, answer_mobile
 from fingerspice.engine.many_areas.error import (
     account_nodes,
     assess,
-    carry,
     charged,
     first_zero,
     store,
     turn_at_start,
     write_columns,
 )
-from fingerspice.engine.many_areas.rows import clear, combine, follow_sources
-from fingerspice.engine.many_areas.solution import ramp_rows, solve_step, source_rows, step_charges
+from fingerspice.engine.many_areas.form import leaks_of
+from fingerspice.engine.many_areas.rows import clear, combine, follow_sources, free, ramp_rows, source_rows
 from fingerspice.engine.network import at_sources
 from fingerspice.numerics.lobatto import END, NODES, POINTS
 
@@ -75,9 +75,7 @@ def _take_coupling(c: ManyAreas, s: LoopState) -> None:
 def attempt_many(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
     form, work, step, tables, tol = c.form, c.work, s.step[0], c.tables, pace.tol
-    leaks, branch, t, in_jump, several = (
-        leaks_of(c, s), branch_of(c, s), s.control[0].t, s.step[0].in_jump > 0, s.step[0].several > 0
-    )  # fmt: skip
+    leaks, branch, t, in_jump = leaks_of(c, s), branch_of(c, s), s.control[0].t, s.step[0].in_jump > 0
     h = step.length
     if h != step.tabled:
         step.slot = make_tables(
@@ -94,21 +92,26 @@ def attempt_many(c: ManyAreas, pace: Pace, s: LoopState) -> int:
         slopes = pace.charge or step.smooth == 0
         source_rows(c.sources, work.segment, t, h, slopes, work.r, work.s, work.ds)
     follow_sources(form, work, leaks.gain)
-    passes, closed, answer = solve_step(
-        form, work, leaks, tables, step.slot, several, h, c.sign, 0.3 * tol
-    )  # fmt: skip
+    modes, u, guess = work.modes, work.areas[blocks.U], work.areas[blocks.GUESS]
+    w, base, pull = modes[blocks.W], modes[blocks.BASE], modes[blocks.PULL]
+    clear(guess)
+    clear(work.cells[blocks.RHO])
+    free(tables.decay[step.slot], work.w0, w)
+    respond(modes[blocks.LIN], tables.phi[step.slot], w, base)
+    used, pull_before, left_before = modes[blocks.USED], modes[blocks.PULL_BEFORE], modes[blocks.LEFT_BEFORE]
+    iterates = Iterates(w, base, pull, used, pull_before, left_before, work.weight, u, guess)
+    passes, closed, answer = converge(c, s, iterates, 0.3 * tol)
     s.counters[NFEV] += passes * NODES
     step.converged, step.step_error, step.grown = int(closed), math.inf, 1.0
     # An iteration that has not converged says nothing about the sign of the gap voltage.
     if not closed:
         return GO_ON
-    u = work.areas[blocks.U]
     if step.flips <= c.sign.size and turn_at_start(form.cell, u, c.sign, tol, t, branch):
         step.flips += 1
         return RETRY
     if form.mobile:
         step.grown = 1.0 / work.room[3].min()
-    carry(form, work, leaks, tables, step.slot, several, h, s.error, c.sign, answer)
+    carry(c, s, w, pull, answer)
     error = assess(form, work, leaks, tables, step.slot, h, s.error, step.grown)
     step.step_error = max(error, charged(form.cell, u, work.areas[blocks.AREA])) if pace.charge else error
     return GO_ON

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from fingerspice.engine.collocation.readout import N_PLACES, WRITTEN_AT_ONCE
 from fingerspice.engine.one_area.system import DEGREE, System
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
+from fingerspice.numerics.small import copy_to
 from fingerspice.physics.contact import inverse_area
 
 # Rows of `Work.r`: source (V) and its slope (V/s), k_gap U, gap voltage and its guess (V), gap w, 1/A (1/m^2), its
@@ -30,9 +31,9 @@ class Work(NamedTuple):
         See above.
     base, w, pull, used, pull_before, left_before : ndarray, shape (n, ROWS)
         The modes without and with the nonlinear term, this term at them and as it was used for them, and both of the
-        iteration before (see `exponential.converge`).
+        iteration before (see `iteration.converge`).
     w0, weight : ndarray, shape (n,)
-        The modes at the start of the step; effect of each on the gap voltage (see `exponential.weigh`).
+        The modes at the start of the step; effect of each on the gap voltage (see `iteration.weigh`).
     places, carried : ndarray, shape (n, N_PLACES) and (n, N_PLACES - 1)
         Errors of the modes, and those carried over from earlier steps.
     run : ndarray, shape (N_PLACES,)
@@ -41,8 +42,8 @@ class Work(NamedTuple):
         Output columns and their Chebyshev coefficients.
     tapped : ndarray, shape (n + 1, ROWS)
         Leaks that do not scale with the area.
-    outputs, sums, basis : ndarray
-        Scratch.
+    outputs, sums, basis, spare, spare_r : ndarray
+        Scratch; the last two as five times `w`, and as `r`.
     """
 
     r: FloatArray
@@ -63,6 +64,8 @@ class Work(NamedTuple):
     weight: FloatArray
     basis: FloatArray
     tapped: FloatArray
+    spare: FloatArray
+    spare_r: FloatArray
 
 
 def new_work(n: int) -> Work:
@@ -86,6 +89,8 @@ def new_work(n: int) -> Work:
         np.zeros(n),
         np.zeros(NODES),
         np.zeros((n + 1, ROWS)),
+        np.zeros((5, n, ROWS)),
+        np.zeros((N_FLAT, ROWS)),
     )
 
 
@@ -285,13 +290,15 @@ def _push(push: FloatArray, q0: float, area0: float, source: FloatArray, q: Floa
 
 
 @jit_within
-def evaluate(system: System, work: Work, level: int, sign: float) -> bool:
-    """Gap voltage, 1/A and nonlinear term, into `work.r` and `work.pull`, from the modes `work.w`.
+def evaluate(
+    system: System, work: Work, level: int, sign: float, w: FloatArray, r: FloatArray, pull: FloatArray
+) -> bool:  # fmt: skip
+    """Gap voltage, 1/A and nonlinear term, into `r` and `pull`, from the modes w, all as in `Work`.
 
     If `system.scale` is 0 the area comes from Eq. 4, else from the polynomial or series. Under `mobile`, r[GUESS] holds
     a guess of the gap voltage; False where the area equation was not solved on the branch connected to it.
     """
-    model, r, w, pull = system.model, work.r, work.w, work.pull
+    model = system.model
     mobile, q0 = model.mobile, system.q0[level]
     _gap_voltage(model.k_gap, system.gap[level], w, r[SOURCE], r[X_GAP], r[U])
     if mobile:
@@ -307,6 +314,22 @@ def evaluate(system: System, work: Work, level: int, sign: float) -> bool:
     if mobile:
         _push(system.push[level], q0, model.area0, r[SOURCE], r[Q], pull)
     return True
+
+
+@jit_within
+def evaluate_one(c: Any, s: Any) -> bool:
+    """The nonlinear term at the modes of the step at hand."""
+    work = c.work
+    return evaluate(c.system, work, s.step[0].level, s.control[0].sign, work.w, work.r, work.pull)
+
+
+@jit_within
+def probe_one(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
+    """The nonlinear term at other modes w than those of the step at hand, whose own rows stay as they are."""
+    work = c.work
+    copy_to(work.spare_r, work.r)
+    copy_to(work.spare_r[GUESS], work.r[U])
+    return evaluate(c.system, work, s.step[0].level, s.control[0].sign, w, work.spare_r, pull)
 
 
 @jit
@@ -355,14 +378,3 @@ def largest_size(values: FloatArray) -> float:
     for i in range(values.size):
         largest = max(largest, abs(values[i]))
     return largest
-
-
-@jit_rows
-def moved(u: FloatArray, before: FloatArray) -> float:
-    """Euclidean norm of u - before; then `before` becomes u."""
-    total = 0.0
-    for i in range(ROWS):
-        change = u[i] - before[i]
-        total += change * change
-        before[i] = u[i]
-    return math.sqrt(total)

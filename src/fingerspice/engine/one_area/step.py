@@ -10,8 +10,9 @@ import math
 from typing import NamedTuple
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_within
-from fingerspice.engine.collocation.exponential import Tables, assess, converge, make_tables, weigh
+from fingerspice.base.compiled import jit_rows, jit_within
+from fingerspice.engine.collocation.exponential import Tables, assess, carry, make_tables
+from fingerspice.engine.collocation.iteration import Iterates, converge, weigh
 from fingerspice.engine.collocation.loopstate import (
     AGAIN,
     DONE,
@@ -28,7 +29,6 @@ from fingerspice.engine.collocation.readout import (
     FIRST_PASSES,
     MOST_PASSES,
     MOST_STEPS,
-    N_PLACES,
     NFEV,
     RECORDED,
     REJECTED,
@@ -46,9 +46,8 @@ from fingerspice.engine.collocation.step_control import (
 )
 from fingerspice.engine.collocation.zeros import dip, first_wrong
 from fingerspice.engine.network import Segment, Sources, segment_at, source
-from fingerspice.engine.one_area.growth import SLIGHT, carry, loop_gain
 from fingerspice.engine.one_area.model import branch_area, turns_at_zero
-from fingerspice.engine.one_area.rows import DQ, GUESS, X_GAP, U, Work, largest_size, source_rows
+from fingerspice.engine.one_area.rows import DQ, GUESS, SOURCE, X_GAP, U, Work, largest_size, source_rows
 from fingerspice.engine.one_area.system import System
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 
@@ -169,6 +168,21 @@ def _take_level(c: OneArea, s: LoopState) -> None:
     step.level, s.step[0].tabled = now, 0.0
 
 
+@jit_rows
+def _linear(
+    gain: FloatArray, decay: FloatArray, phi: FloatArray, w0: FloatArray, source: FloatArray, base: FloatArray
+) -> None:
+    """Response of the modes to their start values and the source, with the area held at its reference."""
+    for k in range(w0.size):
+        factor = gain[k]
+        start = w0[k]
+        for i in range(ROWS):
+            total = 0.0
+            for j in range(NODES):
+                total += phi[k, j, i] * source[j]
+            base[k, i] = decay[k, i] * start + factor * total
+
+
 @jit_within
 def attempt_one(c: OneArea, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
@@ -188,7 +202,12 @@ def attempt_one(c: OneArea, pace: Pace, s: LoopState) -> int:
     if model.mobile:
         for i in range(ROWS):
             r[GUESS, i] = control.u_gap
-    passes, closed = converge(system, c.tables, work, step.slot, level, sign, 0.3 * tol)
+    _linear(system.gain[level], c.tables.decay[step.slot], c.tables.phi[step.slot], work.w0, r[SOURCE], work.base)
+    iterates = Iterates(
+        work.w, work.base, work.pull, work.used, work.pull_before, work.left_before, work.weight, r[U : U + 1],
+        r[GUESS : GUESS + 1],
+    )  # fmt: skip
+    passes, closed, answer = converge(c, s, iterates, 0.3 * tol)
     counters[NFEV] += passes * NODES
     step.wrong = first_wrong(u_rows, sign, tol) if model.coupled else 0
     # Node 1 may be off its branch only because the iteration did not converge: also require a start near 0 V.
@@ -209,7 +228,8 @@ def attempt_one(c: OneArea, pace: Pace, s: LoopState) -> int:
         return RETRY
     step.converged, step.step_error = int(closed), math.inf
     if closed:
-        _assess(c, s)
+        carry(c, s, work.w, work.pull, answer)
+        step.step_error, step.grown = assess(system, c.tables, work, step.slot, level, s.error)
     return GO_ON
 
 
@@ -219,20 +239,6 @@ def flip(s: LoopState) -> int:
     s.control[0].sign = -s.control[0].sign
     s.step[0].flips += 1
     return AGAIN
-
-
-@jit_within
-def _assess(c: OneArea, s: LoopState) -> None:
-    """Errors of a converged step, and of the run so far."""
-    system, work, step, level, slot = c.system, c.work, s.step[0], s.step[0].level, s.step[0].slot
-    decay = c.tables.decay[slot]
-    for k in range(work.w0.size):
-        for p in range(N_PLACES - 1):
-            work.carried[k, p] = decay[k, NODES + p if p < N_PLACES - 2 else END] * s.error[k]
-    grown = loop_gain(system, work, level)
-    if grown > SLIGHT:
-        carry(system, work, level, decay, step.length, s.control[0].sign, grown, s.error)
-    step.step_error, step.grown = assess(system, c.tables, work, slot, level, s.error)
 
 
 @jit_within
