@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--scenes", type=int, default=20000)
     options = parser.parse_args(arguments)
-    n, repeats = (64, 1) if options.quick else (options.scenes, 7)
+    n, repeats = (16, 1) if options.quick else (options.scenes, 7)
     sine = fs.read_netlist(HERE.parent / "circuits" / "fingerpad.cir")
     square = sine.replace({"Vdrive": fs.Square(200.0, 100.0)})
     with warnings.catch_warnings():

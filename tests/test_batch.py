@@ -11,14 +11,15 @@ from scipy.integrate import quad
 import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.statespace import build_stack
 from fingerspice.engine.lockstep.step import marks_of
 from fingerspice.engine.lockstep.weights import moment_integrals, weigh
-from fingerspice.studies.batch.form import LockstepForm, lockstep_form, table_of
-from scenes import table1
+from scenes import cases, table1
 
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 OUTPUTS = ("f_el_mean", "f_el_mean_periodic", "f_t_rms", "u_gap_rms")
+# A loop is compiled, in ten seconds, for every number of modes, tones, moments and powers of the area's polynomial, of
+# which there are 24 at 4e-7, 8 or 24 at 1e-4, and 12 or 24 at 1e-6.
+ONE_DEGREE = (4e-7, 1e-4, 1e-6)[: cases(3, 1)]
 
 
 def square() -> Circuit:
@@ -38,31 +39,32 @@ def population(n: int, seed: int) -> dict[str, np.ndarray]:
     }
 
 
-def scene(circuit: Circuit, parameters: dict[str, Any], i: int, skin: bool = True) -> Circuit:
+def scene(circuit: Circuit, parameters: dict[str, Any], i: int) -> Circuit:
     changes = {path: float(values[i]) for path, values in parameters.items()}
-    if skin:
-        changes["Xskin.f"] = changes["Vdrive.frequency"]
-    return circuit.varied(changes)
+    followed = {"Xskin.f": changes["Vdrive.frequency"]} if "Vdrive.frequency" in changes else {}
+    return circuit.varied({**followed, **changes})
 
 
-def singly(circuit: Circuit, parameters: dict[str, Any], outputs: tuple[str, ...], periods: float) -> np.ndarray:
+def singly(
+    circuit: Circuit, parameters: dict[str, Any], outputs: tuple[str, ...], periods: float | None = None
+) -> np.ndarray:
     """The outputs of single runs at a tolerance far below any here, shape (n_output, n_scene)."""
     rows = []
-    for i in range(parameters["Vdrive.frequency"].size):
-        stop = periods / parameters["Vdrive.frequency"][i]
-        run = fs.simulate(scene(circuit, parameters, i), t_stop=stop, rtol=1e-11, charge=False)
-        summary = run.summary()
+    for i in range(next(iter(parameters.values())).size):
+        stop = None if periods is None else periods / parameters["Vdrive.frequency"][i]
+        summary = fs.simulate(scene(circuit, parameters, i), t_stop=stop, rtol=1e-11, charge=False).summary()
         rows.append([summary[name] for name in outputs])
     return np.array(rows).T
 
 
 @pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
 def test_a_wide_population_meets_what_was_asked_and_states_its_error(circuit: Circuit) -> None:
-    parameters = population(60, seed=11)
-    expected = singly(circuit, parameters, OUTPUTS, 5)
-    for rtol in (1e-3, 1e-4, 1e-6):
-        found = fs.batch(circuit, parameters, outputs=OUTPUTS, periods=5, skin="follow", rtol=rtol)
-        off = np.abs(np.array([found[name].values for name in OUTPUTS]) / expected - 1.0)
+    # Root mean squares under squares are below, with a dispersive skin.
+    parameters, outputs = population(60, seed=11), OUTPUTS if circuit["Vdrive"] == table1()["Vdrive"] else OUTPUTS[:2]
+    expected = singly(circuit, parameters, outputs, 5)
+    for rtol in (1e-3, 1e-4, 4e-7, 1e-6)[: cases(4, 3)]:
+        found = fs.batch(circuit, parameters, outputs=outputs, periods=5, skin="follow", rtol=rtol)
+        off = np.abs(np.array([found[name].values for name in outputs]) / expected - 1.0)
         assert off.max() <= rtol
         assert found.error.max() <= rtol
         assert np.mean(np.all(off <= found.error.values, axis=0)) >= 0.95
@@ -130,29 +132,49 @@ def test_the_periodic_state_is_that_of_steady_state() -> None:
             assert found.f_el_mean[i] == pytest.approx(state.f_el_mean, rel=1e-5)
 
 
+FINE = (1e-6, 4e-7)[cases(0, 1)]
+
+
+# Voltages at times are hardly to be had in lockstep at 4e-7; they show which way round the gap is.
 @pytest.mark.parametrize(
-    "layers",
+    ("layers", "rtol"),
     [
-        "Xcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg\nXgap 0 top area GAP r=1meg\n",
-        "X1 drive a area LAYER d=1u eps_r=3.9 r=0.2meg\nX2 a b area SLAB d=5u eps_r=3 rho=1e8\n"
-        "Xgap b c area GAP r=1meg\nXskin c 0 area SKIN d=350u f=100\n",
-        "X1 drive a area LAYER d=1u eps_r=3.9 r=inf\nXgap a c area GAP r=1meg\n"
-        "X2 c 0 area LAYER d=1u eps_r=3.9 r=inf\n",
+        (
+            "Xcoat drive a area LAYER d=1u eps_r=3.9 r=0.2meg\nXgap b a area GAP r=1meg\n"
+            "Xskin b 0 area SKIN d=350u f=100\n",
+            1e-6,
+        ),
+        (
+            "Xcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg\nXgap 0 top area GAP r=1meg\n",
+            FINE,
+        ),
+        (
+            "X1 drive a area LAYER d=1u eps_r=3.9 r=0.2meg\nX2 a b area SLAB d=5u eps_r=3 rho=1e8\n"
+            "Xgap b c area GAP r=1meg\nXskin c 0 area SKIN d=350u f=100\n",
+            FINE,
+        ),
+        (
+            "X1 drive a area LAYER d=1u eps_r=3.9 r=inf\nXgap a c area GAP r=1meg\n"
+            "X2 c 0 area LAYER d=1u eps_r=3.9 r=inf\n",
+            FINE,
+        ),
     ],
-    ids=["two, gap turned", "four", "equal rates"],
+    ids=["gap turned", "two, gap turned", "four", "equal rates"],
 )
-def test_stacks_of_other_layers(layers: str) -> None:
+def test_stacks_of_other_layers(layers: str, rtol: float) -> None:
     text = (
         "stack\n.include fingerspice.lib\nVdrive drive 0 SIN(0 150 100 0 0 40)\n" + layers + ".tran 10u 25m uic\n.end\n"
     )
-    circuit = fs.parse_netlist(text)
-    found = fs.batch(circuit, {"Xgap.d": [3e-6, 4e-6]}, outputs=("f_el_mean", "u_gap_rms", "u_gap"), rtol=1e-6)
+    circuit, outputs = fs.parse_netlist(text), ("f_el_mean", "u_gap_rms", "u_gap")[: 3 if rtol == 1e-6 else 2]
+    found = fs.batch(circuit, {"Xgap.d": [3e-6, 4e-6]}, outputs=outputs, rtol=rtol)
     assert found.attrs["n_ordinary"] == 0
     for i, d in enumerate((3e-6, 4e-6)):
-        run = fs.simulate(circuit.replace({"Xgap.d": d}), t_eval=found.turn.values / 100.0, t_stop=0.025, rtol=1e-10)
-        np.testing.assert_allclose(found.f_el_mean[i], run.f_el_mean, rtol=1e-6)
-        np.testing.assert_allclose(found.u_gap_rms[i], run.u_gap_rms, rtol=1e-6)
-        np.testing.assert_allclose(found.u_gap[i], run.u_gap, rtol=0.0, atol=1e-6 * np.abs(run.u_gap).max())
+        t = found.turn.values / 100.0 if rtol == 1e-6 else None
+        run = fs.simulate(circuit.replace({"Xgap.d": d}), t_eval=t, t_stop=0.025, rtol=1e-10)
+        np.testing.assert_allclose(found.f_el_mean[i], run.f_el_mean, rtol=rtol)
+        np.testing.assert_allclose(found.u_gap_rms[i], run.u_gap_rms, rtol=rtol)
+        if rtol == 1e-6:
+            np.testing.assert_allclose(found.u_gap[i], run.u_gap, rtol=0.0, atol=1e-6 * np.abs(run.u_gap).max())
 
 
 DISPERSIVE = "Xskin skin 0 area SKIN_DISPERSIVE d=350u"
@@ -194,7 +216,7 @@ def test_gap_voltages_of_a_settled_run_are_those_of_its_last_period() -> None:
 
 @pytest.mark.parametrize(
     ("source", "skin"),
-    [("three sines", ""), ("AM", ""), ("AM", DISPERSIVE), ("sine", DISPERSIVE), ("square", DISPERSIVE)],
+    [("three sines", ""), ("AM", ""), ("square", DISPERSIVE), ("sine", DISPERSIVE), ("AM", DISPERSIVE)][: cases(5, 3)],
 )
 def test_tones_and_the_dispersive_skin(source: str, skin: str) -> None:
     text, stop = SOURCES[source]
@@ -211,14 +233,10 @@ def test_tones_and_the_dispersive_skin(source: str, skin: str) -> None:
         parameters |= {"Vdrive.depth": rng.uniform(0.0, 1.0, 20), "Vdrive.phase_deg": rng.uniform(-90.0, 200.0, 20)}
     if source == "three sines":
         parameters |= {"V2.amplitude": rng.uniform(0.0, 80.0, 20), "V3.phase_deg": rng.uniform(-180.0, 180.0, 20)}
-    expected = []
-    for i in range(20):
-        changed = circuit.varied({path: float(values[i]) for path, values in parameters.items()})
-        summary = fs.simulate(changed, rtol=1e-10, charge=False).summary()
-        expected.append([summary[name] for name in OUTPUTS])
-    for rtol in (1e-4, 1e-6):
+    expected = singly(circuit, parameters, OUTPUTS)
+    for rtol in ONE_DEGREE if skin else (1e-4, 4e-7, 1e-6)[: cases(3, 2)]:
         found = fs.batch(circuit, parameters, outputs=OUTPUTS, rtol=rtol)
-        off = np.abs(np.array([found[name].values for name in OUTPUTS]) / np.array(expected).T - 1.0)
+        off = np.abs(np.array([found[name].values for name in OUTPUTS]) / expected - 1.0)
         assert np.all(found.status == 0)
         assert off.max() <= rtol
         assert np.mean(off <= found.error.values) >= 0.95
@@ -248,8 +266,8 @@ SETTLING: dict[str, list[float]] = {"Xgap.r": [3e5, 1e9], "Xcoat.r": [2e5, 1e9]}
 
 @pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
 def test_a_run_that_has_settled_ends_and_one_that_has_not_goes_on(circuit: Circuit) -> None:
-    outputs = ("f_el_mean", "f_el_mean_periodic", "f_t_rms")
-    found = {n: fs.batch(circuit, SETTLING, outputs=outputs, periods=n, rtol=1e-6) for n in (20, 60, 60.5)}
+    outputs = OUTPUTS[: 3 if circuit["Vdrive"] == table1()["Vdrive"] else 2]
+    found = {n: fs.batch(circuit, SETTLING, outputs=outputs, periods=n, rtol=4e-7) for n in (20, 60, 60.5)}
     # The last period is the very same one in a run of 20 and of 60 periods. An odd number of half periods begins with
     # one of them.
     quick, slow = (np.array([found[n].f_el_mean_periodic.values[i] for n in (20, 60, 60.5)]) for i in (0, 1))
@@ -261,7 +279,7 @@ def test_a_run_that_has_settled_ends_and_one_that_has_not_goes_on(circuit: Circu
             one = circuit.varied({path: values[i] for path, values in SETTLING.items()})
             expected = fs.simulate(one, t_stop=n / 100.0, rtol=1e-11, charge=False).summary()
             for name in outputs:
-                assert abs(batch[name][i] / expected[name] - 1.0) <= batch.error[i] <= 1e-6
+                assert abs(batch[name][i] / expected[name] - 1.0) <= batch.error[i] <= 4e-7
 
 
 @pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
@@ -396,26 +414,6 @@ def test_bad_input_is_refused_in_one_sentence(parameters: Any, options: dict[str
     with pytest.raises(fs.InputError, match=message) as caught:
         fs.batch(table1(), parameters, **options)
     assert "\n" not in str(caught.value)
-
-
-def test_a_table_s_columns_are_what_a_circuit_has() -> None:
-    parameters = population(5, seed=9)
-    circuit = fs.parse_netlist(
-        "stack\n.include fingerspice.lib\nVdrive drive 0 SIN(0 150 100)\n"
-        "Xcoat drive a area LAYER d=1u eps_r=3.9 r=0.2meg\nX2 a b area SLAB d=5u eps_r=3 rho=1e8\n"
-        "Xgap b c area GAP r=1meg\nXskin c 0 area SKIN d=350u f=100\n.tran 1m 5m uic\n"
-    )
-    lower = {path.lower(): values for path, values in parameters.items()}
-    form = lockstep_form(circuit, lower)
-    assert isinstance(form, LockstepForm)
-    table = table_of(form, lower)
-    for i in range(5):
-        stack = build_stack(scene(circuit, parameters, i, skin=False))
-        assert stack.contact is not None
-        packed = stack.contact.packed
-        wave = [2.0 * np.pi * parameters["Vdrive.frequency"][i], parameters["Vdrive.amplitude"][i], 0.0]
-        rows = [*stack.c, *stack.g_total, *stack.g_area, *packed[[0, 1, 4, 5, 7]], *wave]
-        np.testing.assert_allclose(table[:, i], rows, rtol=1e-13)
 
 
 @pytest.mark.parametrize("y", [0.0, 1e-9, 0.05, 0.299, 0.3, 0.7, 3.0, 40.0])

@@ -10,7 +10,7 @@ from scipy.signal import butter, sosfilt
 
 import fingerspice as fs
 from fingerspice.base.errors import InputError
-from scenes import table1, table1_deck
+from scenes import cases, table1, table1_deck
 
 RATE, COUNT = 48_000.0, 961
 T_STOP = (COUNT - 1) / RATE
@@ -39,59 +39,50 @@ def people(n: int, seed: int = 2) -> dict[str, np.ndarray]:
     }
 
 
-def off(
-    circuit: fs.Circuit, scenes: dict[str, np.ndarray], found: Any, outputs: tuple[str, ...] = OUTPUTS
-) -> np.ndarray:
-    """Largest relative error of the outputs, for each scene."""
-    worst = np.zeros(found.sizes["scene"])
-    for i in range(worst.size):
+def check(
+    circuit: fs.Circuit, scenes: dict[str, np.ndarray], rtols: tuple[float, ...], outputs: tuple[str, ...] = OUTPUTS,
+    in_lockstep: float = 0.0, rounding: float = 1e-9,
+) -> None:  # fmt: skip
+    """Scenes go in lockstep, with the errors asked for and, 19 of 20, within those stated."""
+    true = []
+    for i in range(scenes["Xgap.d"].size):
         changes = {path: float(values[i]) for path, values in scenes.items()}
         run = fs.simulate(circuit.replace(changes), t_stop=T_STOP, t_eval=[T_STOP], rtol=1e-10, charge=False)
         figures = run.summary()
-        true = {"f_el_mean": run.f_el_mean, "f_t_rms": figures["f_t_rms"], "u_gap_rms": run.u_gap_rms}
-        worst[i] = max(abs(float(found[name][i]) / true[name] - 1.0) for name in outputs)
-    return worst
+        true.append([figures[name] for name in outputs])
+    for rtol in rtols:
+        found = fs.batch(circuit, scenes, outputs=outputs, t_stop=T_STOP, rtol=rtol)
+        assert (found["status"] == 0).mean() > in_lockstep
+        off = np.abs(np.array([found[name].values for name in outputs]).T / true - 1.0).max(axis=1)
+        assert off.max() <= rtol
+        assert (off <= found["error"].to_numpy() + rounding).mean() >= 0.95
 
 
-@pytest.mark.parametrize(("highest", "rtol"), [(1000.0, 1e-4), (1000.0, 1e-6), (8000.0, 1e-3), (8000.0, 1e-5)])
-def test_stated_errors_cover_wide_populations(highest: float, rtol: float) -> None:
-    circuit, scenes = recorded(highest), people(40)
-    found = fs.batch(circuit, scenes, outputs=OUTPUTS, t_stop=T_STOP, rtol=rtol)
-    assert (found["status"] == 0).mean() > 0.9
-    true = off(circuit, scenes, found)
-    assert true.max() <= rtol
-    assert (true <= found["error"].to_numpy() + 1e-9).mean() >= 0.95
+@pytest.mark.parametrize(("highest", "rtols"), [(1000.0, (1e-4, 1e-6)), (8000.0, (1e-3, 1e-5))])
+def test_stated_errors_cover_wide_populations(highest: float, rtols: tuple[float, ...]) -> None:
+    # Root mean squares, for which another loop is compiled, are below, with a dispersive skin.
+    check(recorded(highest), people(cases(40, 20)), rtols, OUTPUTS[: cases(3, 1)], in_lockstep=0.9)
 
 
-@pytest.mark.parametrize("seed", [2, 4, 5])
+@pytest.mark.parametrize("seed", [2, 4, 5][: cases(3, 1)])
 def test_stated_errors_cover_fingers_that_differ_little(seed: int) -> None:
     # Their errors go up and down together, so that an estimate that is small by chance is so for all of them.
     r = np.random.default_rng(1)
     scenes = {"Xgap.d": r.uniform(3e-6, 4e-6, 24), "Xgap.r": 1e6 * 10.0 ** r.uniform(-0.5, 0.5, 24)}
-    circuit = recorded(8000.0, seed=seed)
-    found = fs.batch(circuit, scenes, outputs=("f_el_mean",), t_stop=T_STOP, rtol=1e-6)
-    true = off(circuit, scenes, found, ("f_el_mean",))
-    assert true.max() <= 1e-6
-    assert (true <= found["error"].to_numpy() + 1e-9).mean() >= 0.95
+    check(recorded(8000.0, seed=seed), scenes, (1e-6,), ("f_el_mean",))
 
 
 def test_a_dispersive_skin_states_its_error() -> None:
     text = table1_deck().replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
-    circuit, scenes = recorded(8000.0, fs.parse_netlist(text)), people(16)
-    found = fs.batch(circuit, scenes, outputs=OUTPUTS, t_stop=T_STOP, rtol=1e-3)
-    assert (found["status"] == 0).all()
-    true = off(circuit, scenes, found)
-    assert true.max() <= 1e-3
-    assert (true <= found["error"].to_numpy()).mean() >= 0.95
+    check(recorded(8000.0, fs.parse_netlist(text)), people(cases(16, 6)), (1e-3,), in_lockstep=1.0 - 1e-9, rounding=0.0)
 
 
 def test_threads_and_order_change_no_byte() -> None:
     circuit, scenes = recorded(), people(70)
-    how: dict[str, Any] = {"outputs": OUTPUTS, "t_stop": T_STOP}
-    one = fs.batch(circuit, scenes, threads=1, **how)
+    one = fs.batch(circuit, scenes, threads=1, t_stop=T_STOP)
     order = np.random.default_rng(3).permutation(70)
-    other = fs.batch(circuit, {path: values[order] for path, values in scenes.items()}, threads=2, **how)
-    for name in (*OUTPUTS, "error"):
+    other = fs.batch(circuit, {path: values[order] for path, values in scenes.items()}, threads=2, t_stop=T_STOP)
+    for name in ("f_el_mean", "error"):
         assert one[name].to_numpy()[order].tobytes() == other[name].to_numpy().tobytes()
 
 
@@ -119,9 +110,9 @@ def test_a_turned_source_points_on_a_grid_and_a_constant_after_the_last_sample()
     assert (found["status"] == 0).all()
     np.testing.assert_allclose(found["f_el_mean"], forward, rtol=1e-12)
     # Half of the run is after the recording.
-    longer = fs.batch(recorded(), scenes, t_stop=2.0 * T_STOP, rtol=1e-5)
+    longer = fs.batch(recorded(), scenes, t_stop=2.0 * T_STOP, rtol=1e-6)
     run = fs.simulate(recorded().replace({p: float(v[3]) for p, v in scenes.items()}), t_stop=2.0 * T_STOP, rtol=1e-9)
-    assert longer["f_el_mean"][3] == pytest.approx(run.f_el_mean, rel=1e-5)
+    assert longer["f_el_mean"][3] == pytest.approx(run.f_el_mean, rel=1e-6)
 
 
 def test_derivatives_are_those_of_single_runs() -> None:

@@ -17,20 +17,27 @@ from fingerspice.circuit.statespace import build_stack
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 
 
-def test_run_times_runs_and_writes_nothing_when_quick(monkeypatch, capsys):
+@pytest.fixture(autouse=True)
+def _benchmarks_are_found(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
-    written = FOLDER / "results" / "run_times.json"
-    before = written.stat().st_mtime_ns
-    results = importlib.import_module("run_times").main(["--quick"])
+
+
+def quick(name):
+    """What a benchmark finds in its quick run, which writes nothing."""
+    before = {path: path.stat().st_mtime_ns for path in (FOLDER / "results").iterdir()}
+    found = importlib.import_module(name).main(["--quick"])
+    assert {path: path.stat().st_mtime_ns for path in (FOLDER / "results").iterdir()} == before
+    return found
+
+
+def test_run_times():
+    results = quick("run_times")
     assert {row["deck"] for row in results["as_shipped"]} == {p.stem for p in FOLDER.parent.glob("circuits/*.cir")}
     assert all(row["error_over_peak"] <= row["rtol"] for row in results["as_shipped"])
-    assert written.stat().st_mtime_ns == before
 
 
-def test_the_baseline_runs_and_compares_with_itself(monkeypatch, capsys, tmp_path):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    baseline = importlib.import_module("baseline")
-    results = baseline.main(["--quick"])
+def test_the_baseline_compares_with_itself():
+    results = quick("baseline")
     assert all(scene["status"] == "SUCCESS" and scene["calls"] > 0 for scene in results["scenes"].values())
     for row in results["times"]:
         assert all(row[method]["stated_error_over_peak"] <= 1e-6 for method in ("exponential", "auto"))
@@ -38,19 +45,17 @@ def test_the_baseline_runs_and_compares_with_itself(monkeypatch, capsys, tmp_pat
     moved = json.loads(json.dumps(results))
     name = next(iter(moved["scenes"]))
     moved["scenes"][name]["digest"] = "another"
-    assert [text.split(":")[0] for text in baseline.compare(results, moved) if "digest" in text] == [name]
+    told = importlib.import_module("baseline").compare(results, moved)
+    assert [text.split(":")[0] for text in told if "digest" in text] == [name]
 
 
 @pytest.fixture
-def work_precision(monkeypatch):
-    monkeypatch.syspath_prepend(str(FOLDER))
+def work_precision():
     return importlib.import_module("work_precision")
 
 
-def test_every_contestant_is_as_right_as_its_setting_promises(work_precision, capsys):
-    written = FOLDER / "results" / "work_precision.json"
-    before = written.stat().st_mtime_ns if written.exists() else None
-    points = work_precision.main(["--quick"])
+def test_every_contestant_is_as_right_as_its_setting_promises():
+    points = quick("work_precision")
     assert {p["library"] for p in points} >= {"fingerspice", "scipy"}
     for point in points:
         assert point["status"] == "ok", point
@@ -60,7 +65,6 @@ def test_every_contestant_is_as_right_as_its_setting_promises(work_precision, ca
         # On a stiff network DOP853's steps are as long as is stable, which leaves an error in what it interpolates.
         stiff = point["contestant"] == "scipy DOP853" and point["problem"].startswith("two_fingers")
         assert point["error"] <= (5e-4 if stiff else allowed), point
-    assert (written.stat().st_mtime_ns if written.exists() else None) == before
 
 
 def test_results_are_kept_only_with_all_contestants(work_precision, monkeypatch, capsys):
@@ -161,34 +165,24 @@ def test_the_report_needs_nothing_but_the_results(work_precision, tmp_path):
         assert (tmp_path / picture).stat().st_size > 0
 
 
-def test_throughput_compares_the_same_response_and_writes_nothing_when_quick(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    written = FOLDER / "results" / "throughput.json"
-    before = written.stat().st_mtime_ns if written.exists() else None
-    results = importlib.import_module("throughput").main(["--quick"])
+def test_throughput_compares_the_same_response():
+    results = quick("throughput")
     assert results["samples"]["difference_over_peak"] <= 1e-12, "the filter beside ours solves the same system"
     assert all(row["stated_error"] <= row["rtol"] for row in results["tolerances"])
-    assert (written.stat().st_mtime_ns if written.exists() else None) == before
 
 
-def test_hard_cases_are_judged_and_nothing_is_written_when_quick(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    written = FOLDER / "results" / "hard_cases.json"
-    before = written.stat().st_mtime_ns if written.exists() else None
-    hard_cases = importlib.import_module("hard_cases")
-    results = hard_cases.main(["--quick"])
+def test_hard_cases_are_judged():
+    results = quick("hard_cases")
     assert len(results["cases"]) == 3
     for case in results["cases"].values():
         assert case["tools"]["fingerspice"]["verdict"] == "right", case
     # A pulse that nobody declares falls between the steps of a solver that knows nothing of it.
     assert results["cases"]["undeclared"]["tools"]["scipy DOP853"]["verdict"] == "wrong silently"
     assert results["cases"]["parallel"]["tools"]["scipy DOP853"]["verdict"] == "n/a"
-    assert "| the same, undeclared | ✓ | **wrong** |" in hard_cases.page(results)
-    assert (written.stat().st_mtime_ns if written.exists() else None) == before
+    assert "| the same, undeclared | ✓ | **wrong** |" in importlib.import_module("hard_cases").page(results)
 
 
-def test_a_hard_case_is_right_only_with_the_right_answer_or_the_true_reason(monkeypatch):
-    monkeypatch.syspath_prepend(str(FOLDER))
+def test_a_hard_case_is_right_only_with_the_right_answer_or_the_true_reason():
     judge = importlib.import_module("hard_cases").judge
     scenes = {scene.name: scene for scene in importlib.import_module("hard_scenes").SCENES}
     truth = (np.array([1.0, -2.0]), np.array([0.5, 1.0]))
@@ -210,61 +204,48 @@ def test_a_hard_case_is_right_only_with_the_right_answer_or_the_true_reason(monk
     assert verdict("nan", ("failed", "the source gave NaN at 3 ms")) == "right"
 
 
-def test_the_benchmark_of_batch_gradients_runs_and_meets_its_errors(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    for row in importlib.import_module("batch_gradients").main(["--quick"])["rows"]:
+def test_batch_gradients_meet_their_errors():
+    for row in quick("batch_gradients")["rows"]:
         assert row["largest_error"] <= 10.0 * row["rtol"]
         assert row["largest_stated_error"] <= 10.0 * row["rtol"]
         assert row["n_ordinary"] == 0
 
 
-def test_the_batch_benchmark_runs_and_meets_its_errors(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    results = importlib.import_module("batch").main(["--quick"])
-    checked = [row for row in results["rows"] if "largest_error" in row]
+def test_batches_meet_their_errors():
+    checked = [row for row in quick("batch")["rows"] if "largest_error" in row]
     assert {row["scenes"] for row in checked} == {"sine, narrow", "sine, wide"}
     assert {"fs.batch", "numba RK4, set-up not counted"} <= {row["who"] for row in checked}
     assert all(row["largest_error"] <= row["rtol"] for row in checked)
-
-
-def test_the_benchmark_of_batch_errors_runs_and_meets_them(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    rows = importlib.import_module("batch_errors").main(["--quick"])["rows"]
+    rows = quick("batch_errors")["rows"]
     assert [row["periods"] for row in rows] == [0.5, 1, 5]
     assert all(row["off_over_asked"] <= 1.0 for row in rows)
 
 
-def test_the_benchmark_of_sweeps_finds_the_same_bytes_after_a_kill(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    results = importlib.import_module("sweeps").main(["--quick"])
+def test_sweeps_have_the_same_bytes_after_a_kill():
+    results = quick("sweeps")
     assert {row["who"].split(",")[0] for row in results["rows"]} == {"memory", "store", "Sobol indices"}
     assert results["killed"]["same_bytes"]
 
 
-def test_the_streaming_benchmark_takes_every_sample(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    points = importlib.import_module("streaming").main(["--quick"])
+def test_streaming_takes_every_sample(capsys):
+    points = quick("streaming")
     assert [point["rtol"] for point in points] == [1e-4, 1e-6]
     assert all(point["samples"] == 2 * 48_000 + 1 for point in points)
     assert "times real time" in capsys.readouterr().out
 
 
-def test_the_coverage_of_fits_runs_and_writes_nothing_when_quick(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    results = importlib.import_module("fit_coverage").main(["--quick"])
+def test_the_coverage_of_fits():
+    results = quick("fit_coverage")
     assert set(results["coverage"]) == {"given", "equal", "shares", "contact"}
     assert results["named"]["gap and alpha at one voltage and frequency"] == results["named"]["of"]
     assert results["named"]["gap and resistance at several"] == 0
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
-def test_the_explorers_figures_are_measured_and_the_page_has_those_of_the_file(monkeypatch, capsys):
+def test_the_explorers_figures_are_measured_and_the_page_has_those_of_the_file():
     pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")
-    monkeypatch.syspath_prepend(str(FOLDER))
-    explorer = importlib.import_module("explorer")
-    before = explorer.RESULTS.stat().st_mtime_ns
-    results = explorer.main(["--quick"])
+    results = quick("explorer")
     assert all(0.0 < median <= late for median, late in results["event_ms"].values())
     assert list(results["memory_MB"]) == ["1", "10", "50", "100"]
-    assert explorer.RESULTS.stat().st_mtime_ns == before
+    explorer = importlib.import_module("explorer")
     assert explorer.table(json.loads(explorer.RESULTS.read_text())) in explorer.PAGE.read_text()

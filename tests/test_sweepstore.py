@@ -27,11 +27,11 @@ from fingerspice.studies.sweep import chunks, workers
 from fingerspice.studies.sweep.plan import make_plan
 from fingerspice.studies.sweep.store import SweepStore
 from processes import ended, no_room, start
+from scenes import cases
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
-# How often a whole program is killed, which takes seconds to start: FINGERSPICE_KILLS=20 by hand. Workers are always
-# killed 20 times.
-KILLS = int(os.environ.get("FINGERSPICE_KILLS", "5"))
+# How often a whole program, and a worker, is killed; each takes seconds to start.
+KILLS, KILLS_OF_WORKERS = cases(20, 2), cases(20, 4)
 PARAMETERS: dict[str, Any] = {
     "source.frequency": [100.0, 1000.0, 5000.0],
     "Xgap.d": stats.lognorm(0.1, scale=3.5e-6),
@@ -157,7 +157,7 @@ def test_scenes_without_a_result_are_named_by_their_number_in_the_sweep(circuit:
     np.testing.assert_array_equal(stored.status.values, memory.status.values)
 
 
-def test_workers_that_are_killed_20_times_cost_nothing(
+def test_workers_that_are_killed_again_and_again_cost_nothing(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
 ) -> None:
     path = tmp_path / "s.zarr"
@@ -165,9 +165,9 @@ def test_workers_that_are_killed_20_times_cost_nothing(
     def children() -> list[int]:
         return [one.pid for one in multiprocessing.active_children() if one.pid]
 
-    with killing(children, path, 20) as killed:
+    with killing(children, path, KILLS_OF_WORKERS) as killed:
         found = fs.sweep(circuit, PARAMETERS, store=path, workers=2, **HOW)
-    assert len(killed) == 20
+    assert len(killed) == KILLS_OF_WORKERS
     assert found.attrs["chunks_missing"] == 0
     assert tree(path) == whole
     assert not multiprocessing.active_children()
@@ -290,21 +290,25 @@ def test_shards_by_separate_processes_make_the_whole(
     assert tree(path) == whole
 
 
-def test_dask_workers_that_are_killed_20_times_cost_nothing(
+def cluster_of(workers: int, processes: bool) -> Any:
+    return pytest.importorskip("distributed").LocalCluster(
+        n_workers=workers, threads_per_worker=1, processes=processes, dashboard_address=None,
+        silence_logs=logging.CRITICAL,
+    )  # fmt: skip
+
+
+def test_dask_workers_that_are_killed_again_and_again_cost_nothing(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    distributed = pytest.importorskip("distributed")
     path = tmp_path / "s.zarr"
 
     def workers() -> list[int]:
         return [one.pid for one in cluster.workers.values() if one.pid]
 
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.CRITICAL
-    ) as cluster:
-        with killing(workers, path, 20) as killed:
+    with cluster_of(2, processes=True) as cluster:
+        with killing(workers, path, KILLS_OF_WORKERS) as killed:
             found = fs.sweep(circuit, PARAMETERS, store=path, scheduler=cluster.scheduler_address, **HOW)
-        assert len(killed) == 20
+        assert len(killed) == KILLS_OF_WORKERS
         assert found.attrs["chunks_missing"] == 0
         assert tree(path) == whole
         # What a worker refuses is told as it is.
@@ -316,7 +320,6 @@ def test_dask_workers_that_are_killed_20_times_cost_nothing(
 def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    distributed = pytest.importorskip("distributed")
     path, computed, write = tmp_path / "s.zarr", chunks._computed, SweepStore.write
     begun, written, at_once = 0, 0, 0
 
@@ -338,9 +341,7 @@ def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
 
     monkeypatch.setattr(chunks, "_computed", computing)
     monkeypatch.setattr(SweepStore, "write", writing)
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=logging.CRITICAL
-    ) as cluster:
+    with cluster_of(1, processes=False) as cluster:
         fs.sweep(circuit, PARAMETERS, store=path, scheduler=cluster.scheduler_address, **HOW)
     assert (begun, written) == (192, 192)
     # One is written, one waits to be written, one is computed: not more, however slow the disk is.
@@ -498,7 +499,7 @@ def test_the_command_fills_a_store_shard_by_shard(file: Path, command: Command) 
     }  # fmt: skip
     assert answer["files"] == [str(store)]
     assert "3 pieces of other parts are missing" in command(*words, "--shard", "1/2").out
-    last = command(*words, "--workers", "2", "--json")
+    last = command(*words, "--workers", "1", "--json")
     answer = json.loads(last.out)
     assert last.code == 0, last.err
     assert (answer["failed"], answer["store"]["chunks_found"], answer["store"]["chunks_missing"]) == (0, 3, 0)
@@ -534,11 +535,12 @@ def test_bad_commands_are_refused_in_one_sentence(
     assert tree(file.parent) == before
 
 
-def test_a_full_disk_ends_in_one_sentence_and_the_sweep_goes_on_from_there(file: Path) -> None:
+def test_a_full_disk_ends_in_one_sentence_and_the_sweep_goes_on_from_there(file: Path, command: Command) -> None:
     words = ("sweep", str(file), "--store", "o.zarr")
     code, said, _ = ended(start(file.parent, *words, preexec_fn=no_room(2500), env=_environment()))
     assert code == 2
     assert len(said) == 1
     assert "cannot write" in said[0]
     assert "goes on from there" in said[0]
-    assert ended(start(file.parent, *words, env=_environment()))[:2] == (0, [])
+    again = command(*words)
+    assert (again.code, again.lines) == (0, [])

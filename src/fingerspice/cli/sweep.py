@@ -61,8 +61,7 @@ def sweep(
         from fingerspice.plots.populations import plot_sweep
         from fingerspice.studies.sweep import populations
 
-        asked = _read(file)
-        deck = _beside(file, asked["deck"])
+        asked, deck = _read(file)
         circuit = read_circuit(deck, None, None)
         parameters = {path: _parameter(path, one) for path, one in asked["parameters"].items()}
         options = {key: asked[key] for key in ("n", "seed", *_OPTIONS) if key in asked}
@@ -138,8 +137,8 @@ def _shard(text: str | None) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def _read(file: Path) -> dict[str, Any]:
-    """The file's keys, checked."""
+def _read(file: Path) -> tuple[dict[str, Any], Path]:
+    """The file's keys, checked, and the deck."""
     try:
         if file.stat().st_size > _LARGEST:
             raise InputError(f"{file} has {file.stat().st_size:,} bytes; allowed: at most {_LARGEST:,}")
@@ -153,16 +152,11 @@ def _read(file: Path) -> dict[str, Any]:
         if not isinstance(asked.get(key), kind) or not asked[key]:
             what = "the deck's file name" if key == "deck" else "a table such as [parameters] with Xgap.d = {...}"
             raise InputError(f"{file}: {key} is {asked.get(key)!r}; allowed: {what}")
-    return asked
-
-
-def _beside(file: Path, deck: str) -> Path:
-    """The deck, which stands in the file's folder or below it."""
     folder = file.resolve().parent
-    path = (folder / deck).resolve()
-    if not path.is_relative_to(folder):
-        raise InputError(f"{file}: deck is {deck!r}; allowed: a file in the same folder or below it")
-    return path
+    deck = (folder / asked["deck"]).resolve()
+    if not deck.is_relative_to(folder):
+        raise InputError(f"{file}: deck is {asked['deck']!r}; allowed: a file in the same folder or below it")
+    return asked, deck
 
 
 def _parameter(path: str, one: Any) -> Any:
@@ -196,28 +190,29 @@ def _parameter(path: str, one: Any) -> Any:
     in_order = a < b if kind.endswith("uniform") else b > 0.0
     if not in_order or (kind.startswith("log") and a <= 0.0):
         raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {_KINDS[kind]}, ascending or above 0")
-    if kind == "uniform":
-        return stats.uniform(a, b - a)
-    if kind == "loguniform":
-        return stats.loguniform(a, b)
-    return stats.norm(a, b) if kind == "normal" else stats.lognorm(b, scale=a)
+    if kind.startswith("log"):
+        return stats.loguniform(a, b) if kind == "loguniform" else stats.lognorm(b, scale=a)
+    return stats.uniform(a, b - a) if kind == "uniform" else stats.norm(a, b)
 
 
 def _shared(rows: list[dict[str, Any]], output: str) -> str:
     """Total indices as text: a line for each place, a column for each parameter, and what is largest where."""
-    names = sorted({row["parameter"] for row in rows}, key=str.lower)
+    widths = {name: max(len(name), 16) + 2 for name in sorted({row["parameter"] for row in rows}, key=str.lower)}
     lines: dict[str, dict[str, str]] = {}
     first: dict[str, list[str]] = {}
     for row in rows:
-        place = ", ".join(f"{name} = {_shown(value)}" for name, value in row["place"].items())
+        # A number, or the name of a set.
+        shown = {name: x if isinstance(x, str) else f"{x:.4g}" for name, x in row["place"].items()}
+        place = ", ".join(f"{name} = {text}" for name, text in shown.items())
         if place not in lines:
             first.setdefault(row["parameter"], []).append(place)
         told = f"{row['total']:.2f} ({row['low']:.2f}-{row['high']:.2f})"
         lines.setdefault(place, {})[row["parameter"]] = told
     wide = max(len(place) for place in lines) + 2 * any(lines)
-    head = " " * wide + "".join(f"{name:>{_wide(name)}}" for name in names)
+    head = " " * wide + "".join(f"{name:>{width}}" for name, width in widths.items())
     body = [
-        f"{place:<{wide}}" + "".join(f"{told[name]:>{_wide(name)}}" for name in names) for place, told in lines.items()
+        f"{place:<{wide}}" + "".join(f"{told[name]:>{width}}" for name, width in widths.items())
+        for place, told in lines.items()
     ]
     most = "; ".join(
         name + ("" if len(first) == 1 else f" ({places[0]}{f' to {places[-1]}' if len(places) > 1 else ''})")
@@ -225,16 +220,6 @@ def _shared(rows: list[dict[str, Any]], output: str) -> str:
     )
     title = f"share of the variance of {output} that comes from a parameter, its interactions included (95 % interval)"
     return "\n".join([title, head, *body, f"largest share: {most}"])
-
-
-def _shown(value: float | str) -> str:
-    """A number, or the name of a set."""
-    return value if isinstance(value, str) else f"{value:.4g}"
-
-
-def _wide(name: str) -> int:
-    """Width of a parameter's column."""
-    return max(len(name), 16) + 2
 
 
 def _written(found: Any, indices: Any, about: Mapping[str, str], path: Path) -> Path:

@@ -11,6 +11,7 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,8 +47,7 @@ _AT_ONCE = 1 << 13
 _CLOSED, _SHARE = 1e-14, 1e-2
 
 
-@dataclass(frozen=True)
-class _Weights:
+class _Weights(NamedTuple):
     """The scalar's derivatives by u_gap, force and area at the outputs, shape (n_t,), and by the latter's means."""
 
     u_gap: FloatArray
@@ -58,31 +58,29 @@ class _Weights:
 
 
 def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> _Weights:
+    allowed = ", ".join((*SIGNALS, *MEANS))
     if not of:
-        raise InputError(f"no signal is given; allowed: {', '.join((*SIGNALS, *MEANS))}")
-    signals = {name: np.zeros(run.t.size) for name in SIGNALS}
-    means = dict.fromkeys(MEANS, 0.0)
+        raise InputError(f"no signal is given; allowed: {allowed}")
+    by: dict[str, Any] = dict.fromkeys(SIGNALS, np.zeros(run.t.size)) | dict.fromkeys(MEANS, 0.0)
     for name, given in of.items():
-        known = signals if name in signals else means if name in means else None
-        if known is None:
-            raise InputError(f"unknown signal {name!r}; allowed: {', '.join((*SIGNALS, *MEANS))}")
+        if name not in by:
+            raise InputError(f"unknown signal {name!r}; allowed: {allowed}")
         value = real_numbers(name, given, "numbers, derivatives by the signal")
-        shape = () if known is means else run.t.shape
+        shape = () if name in MEANS else run.t.shape
         if value.shape != shape or not np.isfinite(value).all():
             raise InputError(
                 f"{name} has the shape {value.shape}"
                 + ("" if np.isfinite(value).all() else " and numbers that are not finite")
                 + f"; allowed: the shape {shape}, finite: the derivative of a number by that signal"
             )
-        if known is means:
-            means[name] = float(value)
-        else:
-            signals[name] = value
+        by[name] = value
     ((_, contact),) = run.record.fingers
     # F_t = mu (F_N + F_el), and the friction coefficient is F_t / F_N.
-    force = signals["f_el"] + contact.mu * (signals["f_t"] + signals["friction"] / contact.f_n)
-    mean = means["f_el_mean"] + contact.mu * (means["f_t_mean"] + means["friction_mean"] / contact.f_n)
-    return _Weights(signals["u_gap"], force, signals["area"], mean, means["area_mean"])
+    force, mean = (
+        by[f"f_el{kind}"] + contact.mu * (by[f"f_t{kind}"] + by[f"friction{kind}"] / contact.f_n)
+        for kind in ("", "_mean")
+    )
+    return _Weights(by["u_gap"], force, by["area"], float(mean), float(by["area_mean"]))
 
 
 @dataclass(frozen=True)
@@ -104,19 +102,6 @@ class _Run:
         """Sign of the gap voltage along the loop."""
         stack = self.problem.scene.stack
         return 1.0 if stack is None or stack.gap is None else float(stack.sign[stack.gap])
-
-    @property
-    def h(self) -> FloatArray:
-        """Lengths of the intervals (n,), or their common one (1,), s."""
-        h = np.diff(self.t)
-        return h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
-
-    @property
-    def place(self) -> tuple[IntArray, FloatArray]:
-        """Samples before the times `t`, and how far these are beyond, in samples, both (n + 1,)."""
-        at = np.clip((self.t - self.wave.start) * self.wave.rate, 0.0, self.wave.count - 1.0)
-        first = np.minimum(np.floor(at + 1e-6), self.wave.count - 2.0)
-        return first.astype(np.int64), np.maximum(at - first, 0.0)
 
 
 def _source_of(problem: Problem) -> tuple[str, float, Samples]:
@@ -187,7 +172,9 @@ class _Intervals:
     """The intervals of a run between its times, with the modes at all of these."""
 
     def __init__(self, one: _Run, rtol: float) -> None:
-        self.form, self.rtol, self.h, self.first = one.form, rtol, one.h, 0 if rtol >= _COARSE else 1
+        self.form, self.rtol, self.first, h = one.form, rtol, 0 if rtol >= _COARSE else 1, np.diff(one.t)
+        # Lengths of the intervals (n,), or their common one (1,), s
+        self.h = h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
         self.x, self.m = np.ascontiguousarray(one.problem.waveform.value(one.t)), one.form.lanes.rates.size
         block, form, n = Block(one.form, self.x, self.h, True), one.form, one.t.size - 1
         peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
@@ -276,7 +263,10 @@ def _swept(one: _Run, run: Solution, weights: _Weights) -> FloatArray:
             own = np.ascontiguousarray(means[:, a:b]), np.ascontiguousarray(of_modes[row, :, a:b])
             sum_back(found, *own, of_source[row, a : b + 1], after[row])
     of_source[:, 0] += after @ one.moved
-    out, (first, beyond) = np.zeros((2, one.wave.count)), one.place
+    # Samples before the times, and how far these are beyond, in samples.
+    out, place = np.zeros((2, one.wave.count)), np.clip((t - one.wave.start) * one.wave.rate, 0.0, one.wave.count - 1.0)
+    first = np.minimum(np.floor(place + 1e-6), one.wave.count - 2.0).astype(np.int64)
+    beyond = np.maximum(place - first, 0.0)
     for row in range(2):
         np.add.at(out[row], first, (1.0 - beyond) * of_source[row])
         np.add.at(out[row], np.minimum(first + 1, one.wave.count - 1), beyond * of_source[row])

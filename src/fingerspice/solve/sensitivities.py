@@ -33,17 +33,12 @@ _KNOWN = 1e-2
 _STEP, _CLOSER = 5e-4, (0.03, 1e-3)
 
 
+# The same run of another circuit, with another `rtol`.
 Runner = Callable[[Circuit, float], Solution]
 
 
 class _Parameter:
-    """A parameter by which a run is differentiated.
-
-    Raises
-    ------
-    InputError
-        If it is unknown, or not covered.
-    """
+    """A parameter by which a run is differentiated; refused if it is unknown, or not covered."""
 
     def __init__(self, problem: Problem, path: str) -> None:
         self.circuit, known = problem.circuit, {name.lower(): name for name in problem.circuit.parameters}
@@ -81,10 +76,7 @@ class _Parameter:
     @property
     def longer(self) -> float:
         """Relative change of the sources' common period, per unit of the parameter; NaN where there is none near it."""
-        own, periods = (
-            period_of(self.circuit) or math.nan,
-            [period_of(circuit) or math.nan for circuit in self.circuits()],
-        )
+        own, *periods = (period_of(circuit) or math.nan for circuit in (self.circuit, *self.circuits()))
         if not max(abs(period / own - 1.0) for period in periods) <= 0.01:
             return math.nan
         return float(self.by(periods)) / own if set(periods) != {own} else 0.0
@@ -97,13 +89,7 @@ def period_of(circuit: Circuit) -> float | None:
 
 
 def check_request(problem: Problem, paths: Sequence[str], method: str, start: str) -> str:
-    """Refuse a run that has no sensitivities; the method of the runs that are compared.
-
-    Raises
-    ------
-    InputError
-        With what is allowed.
-    """
+    """Refuse a run that has no sensitivities; the method of the runs that are compared."""
     if isinstance(paths, str) or not all(isinstance(path, str) for path in paths):
         raise InputError(f"sensitivities is {paths!r}; allowed: a sequence of paths such as ('Xgap.d',)")
     what = ""
@@ -164,26 +150,9 @@ def _differentiated(one: _Parameter, run: Runner, solution: Solution) -> dict[st
 def sensitivities_of(
     problem: Problem, solution: Solution, paths: Sequence[str], run: Runner, over_period: bool = False
 ) -> dict[str, Sensitivity]:
-    """Derivatives of a run's signals and means by parameters.
+    """Derivatives of a run's signals and means; `over_period`: of means over a period, which a parameter may change.
 
-    Parameters
-    ----------
-    problem : Problem
-    solution : Solution
-        Its run.
-    paths : sequence of str
-        As in `Circuit.replace`.
-    run : callable
-        The same run of another circuit, with another `rtol`.
-    over_period : bool
-        Whether means are over a period, which a parameter may change.
-
-    Raises
-    ------
-    InputError
-        For an unknown parameter, or one that is not covered.
-    SolveError
-        Where a run with a parameter near its value fails.
+    A run with a parameter near its value that fails is a `SolveError`.
     """
     found = {}
     for one in [_Parameter(problem, path) for path in paths]:

@@ -240,7 +240,14 @@ def compare(
     coupled = steady_state(circuit, charge_law=charge_law, rtol=rtol, points=2000).solution
     mean = steady_state(circuit, charge_law=charge_law, area="mean", rtol=rtol, points=2000).solution
     return Comparison(
-        _phasor_figures([phasors[name] for name in coupled.gaps]),
+        _together(
+            *np.array(
+                [
+                    (abs(p.u_gap[0]), np.degrees(np.angle(p.gain[0])), p.f_el_mean[0], p.area[0])
+                    for p in (phasors[name] for name in coupled.gaps)
+                ]
+            ).T
+        ),
         _figures(mean, fundamental.phase),
         _figures(coupled, fundamental.phase),
         fundamental.frequency,
@@ -248,26 +255,18 @@ def compare(
     )
 
 
-def _phasor_figures(found: list[PhasorSolution]) -> Figures:
-    """Figures from the phasors of every GAP."""
-    amplitude = [float(abs(p.u_gap[0])) for p in found]
-    lead = [float(np.degrees(np.angle(p.gain[0]))) for p in found]
-    return _together(amplitude, lead, [float(p.f_el_mean[0]) for p in found], [float(p.area[0]) for p in found])
-
-
 def _figures(solution: Solution, phase: float) -> Figures:
     """Figures of a period of the transient; `phase` (rad) is that of the source's fundamental."""
-    found = solution._figures
     lead = np.asarray(solution.u_gap_phase_deg, float) - np.degrees(phase)
     return _together(
         solution.u_gap_amplitude,
         (lead + 180.0) % 360.0 - 180.0,
         solution.f_el_mean_periodic,
-        found.value("area", "mean_periodic"),
+        solution._figures.value("area", "mean_periodic"),
     )
 
 
-def _together(*values: Value | list[float]) -> Figures:
+def _together(*values: Value | FloatArray) -> Figures:
     """Figures as arrays over the GAPs, or as numbers if there is one GAP."""
     arrays = [np.atleast_1d(np.asarray(value, float)) for value in values]
     return Figures(*(float(x[0]) if x.size == 1 else x for x in arrays))

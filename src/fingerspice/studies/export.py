@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
@@ -184,7 +185,8 @@ def _element_lines(
         yield f"{name} {nodes} {element.values['value']!r}{initial}"
         return
     # e_max is left out: it only serves a warning of this package.
-    values = " ".join(f"{k}={_number(v)}" for k, v in element.values.items() if k != "e_max")
+    numbers = {k: "1e30" if math.isinf(v) else repr(float(v)) for k, v in element.values.items() if k != "e_max"}
+    values = " ".join(f"{k}={number}" for k, number in numbers.items())
     extra = f" wk={work_ratio!r}" if element.device == "GAP" and work_ratio != 1.0 else ""
     area = start_areas.get(element.nodes[2])
     held = 0.0 if area is None else start_voltage(element, circuit.initial)
@@ -192,19 +194,8 @@ def _element_lines(
     yield from _wrapped(f"{name} {nodes} {element.device} {values}{extra}")
 
 
-def _number(value: float) -> str:
-    return "1e30" if math.isinf(value) else repr(float(value))
-
-
-def _wrapped(line: str, width: int = 100) -> Iterator[str]:
-    current, *words = line.split(" ")
-    for word in words:
-        if len(current) + len(word) + 1 > width:
-            yield current
-            current = "+ " + word
-        else:
-            current += " " + word
-    yield current
+def _wrapped(line: str) -> list[str]:
+    return textwrap.wrap(line, 100, subsequent_indent="+ ", break_long_words=False, break_on_hyphens=False)
 
 
 def _call(name: str, numbers: Iterable[float]) -> str:
@@ -260,10 +251,6 @@ def _starts_empty(circuit: Circuit) -> bool:
     return circuit.tran is not None and starts_uncharged(circuit) and not given
 
 
-def _stop(circuit: Circuit) -> float:
-    return circuit.tran.stop if circuit.tran else 1.0
-
-
 def _edge(circuit: Circuit) -> float:
     """Rise time of an ideal jump, s."""
     return min(EDGE, 1e-3 * circuit.tran.step) if circuit.tran else EDGE
@@ -271,9 +258,10 @@ def _edge(circuit: Circuit) -> float:
 
 def _pulse_numbers(p: Pulse, circuit: Circuit) -> tuple[float, ...] | None:
     """A pulse's numbers in ngspice; None if its edges have no room, or if it should start at 0 V and does not."""
-    if _starts_empty(circuit) and p.value(0.0) != 0.0 and p.breakpoint_rate() * _stop(circuit) < _FEW_POINTS:
+    stop = circuit.tran.stop if circuit.tran else 1.0
+    if _starts_empty(circuit) and p.value(0.0) != 0.0 and p.breakpoint_rate() * stop < _FEW_POINTS:
         return None
-    edge, span = _edge(circuit), _stop(circuit) + abs(p.delay)
+    edge, span = _edge(circuit), stop + abs(p.delay)
     # The rise time of a jump is subtracted from the width, so that the pulse still ends at its time.
     width = p.width - (0.0 if p.rise else edge) if math.isfinite(p.width) else 10.0 * span
     rise, fall = p.rise or edge, p.fall or edge

@@ -51,10 +51,11 @@ class Scenes:
     def values(self, paths: Sequence[str], given: FloatArray) -> FloatArray:
         """The outputs one after the other, shape (n_scene, sum of `sizes`), at values `given` (n_scene, n_path)."""
         if not self.t.size:
-            return self._means(paths, given)
+            found = self._batch(paths, given, ())
+            return np.stack([found[name].to_numpy().reshape(len(given)) for name in self.outputs], axis=1)
         out = np.empty((len(given), sum(self.sizes)))
         for i, row in enumerate(given):
-            with _named(i):
+            with named("scene", i):
                 out[i] = np.concatenate([np.ravel(getattr(run, name)) for name, run in self._runs(paths, row, ())])
         return out
 
@@ -65,19 +66,22 @@ class Scenes:
             return np.stack([found[f"d_{name}"].to_numpy() for name in self.outputs], axis=1)
         out = np.empty((len(given), sum(self.sizes), len(wanted)))
         for i, row in enumerate(given):
-            with _named(i):
+            with named("scene", i):
                 runs = self._runs(paths, row, wanted)
                 for k, path in enumerate(wanted):
-                    parts = [np.ravel(getattr(run.sensitivities[path], name)) for name, run in runs]
-                    out[i, :, k] = np.concatenate(parts)
+                    out[i, :, k] = np.concatenate(
+                        [np.ravel(getattr(run.sensitivities[path], name)) for name, run in runs]
+                    )
         return out
 
-    def _means(self, paths: Sequence[str], given: FloatArray) -> FloatArray:
-        """Means alone, of all scenes at once."""
-        found = self._batch(paths, given, ())
-        return np.stack([found[name].to_numpy().reshape(len(given)) for name in self.outputs], axis=1)
+    def given_back(self, found: Tensor, alone: bool) -> Tensor | dict[str, Tensor]:
+        """The outputs in a tensor (..., sum of `sizes`) by their names; itself for one that was asked for `alone`."""
+        parts = dict(zip(self.outputs, found.split(self.sizes, dim=-1), strict=True))
+        parts = {name: part.squeeze(-1) if name in MEANS else part for name, part in parts.items()}
+        return parts[self.outputs[0]] if alone else parts
 
     def _batch(self, paths: Sequence[str], given: FloatArray, wanted: Sequence[str]) -> Dataset:
+        """The means, and their derivatives, of all scenes at once."""
         found = batch(
             self.circuit, dict(zip(paths, given.T, strict=True)), outputs=self.outputs, rtol=self.rtol,
             periodic=self.periodic, t_stop=None if self.periodic else self.t_stop, gradients=wanted,
@@ -92,31 +96,32 @@ class Scenes:
     ) -> list[tuple[str, Solution | SteadyState]]:
         """Every output of a scene with the run that has it."""
         circuit = self.circuit.varied(dict(zip(paths, row.tolist(), strict=True)))
-        state: SteadyState | None = None
-        run: Solution | None = None
-        found: list[tuple[str, Solution | SteadyState]] = []
-        for name in self.outputs:
-            if self.periodic and name in MEANS:
-                state = state or steady_state(circuit, rtol=self.rtol, points=4, charge=False, sensitivities=wanted)
-                found.append((name, state))
-                continue
-            run = run or simulate(
-                circuit, t_stop=self.t_stop, t_eval=self.t if self.t.size else np.array([self.t_stop]), rtol=self.rtol,
-                charge=False, start="periodic" if self.periodic else "deck", sensitivities=wanted,
-            )  # fmt: skip
-            found.append((name, run))
-        return found
+        of_period = [name for name in self.outputs if self.periodic and name in MEANS]
+        found: dict[str, Solution | SteadyState] = {}
+        if of_period:
+            state = steady_state(circuit, rtol=self.rtol, points=4, charge=False, sensitivities=wanted)
+            found |= dict.fromkeys(of_period, state)
+        if len(of_period) < len(self.outputs):
+            start = "periodic" if self.periodic else "deck"
+            run: Solution | SteadyState = self.run(circuit, start=start, sensitivities=wanted)
+            found = dict.fromkeys(self.outputs, run) | found
+        return list(found.items())
+
+    def run(self, circuit: Circuit, **how: Any) -> Solution:
+        """A run of a circuit, with outputs at the times `t`, or at its end where there are only means."""
+        t = self.t if self.t.size else np.array([self.t_stop])
+        return simulate(circuit, t_stop=self.t_stop, t_eval=t, rtol=self.rtol, charge=False, **how)
 
 
 @contextmanager
-def _named(scene: int) -> Iterator[None]:
-    """Names the scene in an error, and leaves out warnings about values that an optimiser has chosen."""
+def named(what: str, number: int) -> Iterator[None]:
+    """Names the scene or drive in an error, and leaves out warnings about values that an optimiser has chosen."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FingerspiceWarning)
             yield
     except (InputError, SolveError) as error:
-        raise InputError(f"scene {scene}: {error}") from error
+        raise InputError(f"{what} {number}: {error}") from error
 
 
 def request(
@@ -152,30 +157,6 @@ def tensor_of(path: str, one: Tensor | ArrayLike) -> Tensor:
     if one.is_complex() or one.dtype == torch.bool:
         raise InputError(f"{path} is a tensor of {one.dtype}; allowed: real numbers")
     return one.to("cpu", torch.float64)
-
-
-@dataclass(frozen=True)
-class _Driven:
-    """Runs of a circuit under other recordings of one source."""
-
-    scenes: Scenes
-    source: str
-    rate: float
-
-    def runs(self, given: FloatArray) -> list[Solution]:
-        """A run for each row of samples, shape (n_scene, n)."""
-        one, found = self.scenes, []
-        times = one.t if one.t.size else np.array([one.t_stop])
-        for i, row in enumerate(given):
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", FingerspiceWarning)
-                    sources = {self.source: Samples(row, self.rate)}
-                    how = {"t_stop": one.t_stop, "t_eval": times, "rtol": one.rtol, "charge": False}
-                    found.append(simulate(one.circuit, sources=sources, **how))  # type: ignore[arg-type]
-            except (InputError, SolveError) as error:
-                raise InputError(f"drive {i}: {error}") from error
-        return found
 
 
 class Drive(torch.nn.Module):
@@ -230,9 +211,8 @@ class Drive(torch.nn.Module):
         require(source.lower() in known, "source", repr(source), f"one of {', '.join(names)}")
         self._alone = isinstance(outputs, str)
         wanted = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-        self._driven = _Driven(
-            request(circuit, wanted, t, t_stop, False, rtol), known[source.lower()], positive_number("rate", rate, "Hz")
-        )
+        self._scenes = request(circuit, wanted, t, t_stop, False, rtol)
+        self._source, self._rate = known[source.lower()], positive_number("rate", rate, "Hz")
         self.samples = torch.nn.Parameter(tensor_of("samples", samples).detach().clone())
 
     def forward(self, samples: Tensor | ArrayLike | None = None) -> Tensor | dict[str, Tensor]:
@@ -256,16 +236,22 @@ class Drive(torch.nn.Module):
         """
         given = self.samples if samples is None else tensor_of("samples", samples)
         require(given.ndim > 0, "samples", "one number", "a row of two or more")
-        scenes = self._driven.scenes
-        found: Tensor = _Run.apply(self._driven, given)
-        parts = dict(zip(scenes.outputs, found.split(scenes.sizes, dim=-1), strict=True))
-        parts = {name: part.squeeze(-1) if name in MEANS else part for name, part in parts.items()}
-        return parts[scenes.outputs[0]] if self._alone else parts
+        found: Tensor = _Run.apply(self, given)
+        return self._scenes.given_back(found, self._alone)
+
+    def _runs(self, given: FloatArray) -> list[Solution]:
+        """A run for each row of samples, shape (n_scene, n)."""
+        found = []
+        for i, row in enumerate(given):
+            with named("drive", i):
+                sources = {self._source: Samples(row, self._rate)}
+                found.append(self._scenes.run(self._scenes.circuit, sources=sources))
+        return found
 
 
 def _backward(ctx: Any, by_output: Tensor) -> tuple[None, Tensor]:
     """Derivatives by the samples, from one way back through every run."""
-    scenes, out = ctx.driven.scenes, np.zeros((len(ctx.runs), ctx.shape[-1]))
+    scenes, out = ctx.scenes, np.zeros((len(ctx.runs), ctx.shape[-1]))
     edges = np.cumsum([0, *scenes.sizes])
     for i, (run, row) in enumerate(zip(ctx.runs, by_output.reshape(len(ctx.runs), -1).numpy(), strict=True)):
         parts = zip(scenes.outputs, edges, edges[1:], strict=False)
@@ -279,10 +265,10 @@ class _Run(torch.autograd.Function):
     """The outputs of drives of shape (..., n): a tensor of shape (..., number of outputs)."""
 
     @staticmethod
-    def forward(ctx: Any, driven: _Driven, samples: Tensor) -> Tensor:
-        runs = driven.runs(samples.detach().numpy().reshape(-1, samples.shape[-1]))
-        ctx.driven, ctx.runs, ctx.shape = driven, runs, samples.shape
-        rows = [np.concatenate([np.ravel(getattr(run, name)) for name in driven.scenes.outputs]) for run in runs]
+    def forward(ctx: Any, drive: Drive, samples: Tensor) -> Tensor:
+        runs = drive._runs(samples.detach().numpy().reshape(-1, samples.shape[-1]))
+        ctx.scenes, ctx.runs, ctx.shape = drive._scenes, runs, samples.shape
+        rows = [np.concatenate([np.ravel(getattr(run, name)) for name in drive._scenes.outputs]) for run in runs]
         return torch.from_numpy(np.stack(rows)).reshape(*samples.shape[:-1], -1)
 
     # Not a decorator: without torch, types are not known.

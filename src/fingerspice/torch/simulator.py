@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -13,7 +12,6 @@ from torch import Tensor
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.results.sensitivity import MEANS
 from fingerspice.studies.batch.task import own_path
 from fingerspice.torch.scenes import Scenes, request, tensor_of
 
@@ -129,9 +127,7 @@ class Simulator(torch.nn.Module):
             shapes = ", ".join(f"{tuple(one.shape)} ({path})" for path, one in every.items())
             raise InputError(f"the values have shapes {shapes}; allowed: shapes that broadcast") from None
         found: Tensor = _Run.apply(self._scenes, tuple(every), *shaped)
-        parts = dict(zip(self._scenes.outputs, found.split(self._scenes.sizes, dim=-1), strict=True))
-        parts = {name: part.squeeze(-1) if name in MEANS else part for name, part in parts.items()}
-        return parts[self._scenes.outputs[0]] if self._alone else parts
+        return self._scenes.given_back(found, self._alone)
 
 
 def _initial(circuit: Circuit, parameters: Sequence[str] | Mapping[str, ArrayLike]) -> dict[str, Tensor]:
@@ -146,11 +142,6 @@ def _initial(circuit: Circuit, parameters: Sequence[str] | Mapping[str, ArrayLik
         one = parameters[path] if isinstance(parameters, Mapping) else circuit.parameters[name].value
         found[name] = tensor_of(path, one).detach().clone()
     return found
-
-
-def _rows(tensors: Sequence[Tensor]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Values as an array, shape (n_scene, n_path)."""
-    return np.stack([one.detach().numpy().ravel() for one in tensors], axis=1)
 
 
 def _in_front(size: int, dims: Sequence[int | None], tensors: Sequence[Tensor]) -> list[Tensor]:
@@ -169,8 +160,8 @@ class _Run(torch.autograd.Function):
 
     @staticmethod
     def forward(scenes: Scenes, paths: tuple[str, ...], *values: Tensor) -> Tensor:
-        found = torch.from_numpy(scenes.values(paths, _rows(values)))
-        return found.reshape(*values[0].shape, -1)
+        found = scenes.values(paths, torch.stack([one.flatten() for one in values], dim=1).numpy(force=True))
+        return torch.from_numpy(found).reshape(*values[0].shape, -1)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -209,8 +200,8 @@ class _Slopes(torch.autograd.Function):
 
     @staticmethod
     def forward(scenes: Scenes, paths: tuple[str, ...], wanted: tuple[str, ...], *values: Tensor) -> Tensor:
-        found = torch.from_numpy(scenes.slopes(paths, wanted, _rows(values)))
-        return found.reshape(*values[0].shape, -1, len(wanted))
+        rows = torch.stack([one.flatten() for one in values], dim=1).numpy(force=True)
+        return torch.from_numpy(scenes.slopes(paths, wanted, rows)).reshape(*values[0].shape, -1, len(wanted))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

@@ -121,13 +121,7 @@ def task_of(
 
 
 def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
-    """Values by path, all of one shape (n_scene,).
-
-    Raises
-    ------
-    InputError
-        If a path is unknown, lengths are unequal, or a value is NaN or out of range.
-    """
+    """Values by path, all of one shape (n_scene,); refused where a path is unknown or a value NaN or out of range."""
     if not isinstance(parameters, Mapping) or not parameters:
         raise InputError(f"parameters is {parameters!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
     given: dict[str, FloatArray] = {}
@@ -192,10 +186,7 @@ def _check_values(circuit: Circuit, path: str, array: FloatArray) -> None:
 def frequencies(circuit: Circuit, scenes: Mapping[str, FloatArray], of_skin: bool = False) -> FloatArray:
     """The source's frequency in every scene, Hz: that of several sources together, or the one that a SKIN follows.
 
-    Raises
-    ------
-    InputError
-        If no source has a period, or several have none in common; a SKIN can follow one source only.
+    Refused if no source has a period, or several have none in common; a SKIN can follow one source only.
     """
     n = next(iter(scenes.values())).size
     on = [e for e in driving_sources(circuit) if e.waveform is not None and e.waveform.period is not None]
@@ -213,13 +204,7 @@ def frequencies(circuit: Circuit, scenes: Mapping[str, FloatArray], of_skin: boo
 
 
 def gradients_of(task: Task, gradients: Sequence[str], scenes: Mapping[str, FloatArray], skin: str) -> Gradients | None:
-    """The checked request of derivatives in scenes with these values by path; None for none.
-
-    Raises
-    ------
-    InputError
-        If the circuit, an output or a parameter has no derivatives.
-    """
+    """The checked request of derivatives in scenes with these values by path; None for none."""
     circuit = task.circuit
     if isinstance(gradients, str):
         raise InputError(f"gradients is {gradients!r}; allowed: a sequence of paths such as ('Xgap.d',)")
@@ -229,8 +214,7 @@ def gradients_of(task: Task, gradients: Sequence[str], scenes: Mapping[str, Floa
     outputs = tuple(name for name in task.outputs if name in MEANS)
     if not outputs:
         raise InputError(f"gradients are asked for, and outputs has no mean; allowed: one of {', '.join(MEANS)}")
-    if len(circuit.by_device("GAP")) != 1:
-        number = len(circuit.by_device("GAP"))
+    if (number := len(circuit.by_device("GAP"))) != 1:
         raise InputError(f"gradients are asked for, and the circuit has {number} GAPs; allowed: one")
     if len(set(paths)) < len(paths):
         raise InputError(f"gradients is {paths!r}; allowed: every parameter once")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -164,11 +164,17 @@ class Plan:
 
     def draws(self) -> dict[str, FloatArray]:
         """All values of the drawn parameters, shape (n,) each."""
-        return self.quantiles(_sobol(len(self.drawn), self.seed).random(self.n)) if self.drawn else {}
+        return self.quantiles(self.engine().random(self.n)) if self.drawn else {}
+
+    def engine(self) -> Any:
+        """The sequence of points of the unit cube, from its beginning."""
+        from scipy.stats import qmc
+
+        return qmc.Sobol(len(self.drawn), scramble=True, bits=BITS, rng=self.seed)
 
     def sequence(self, count: int) -> Sequence:
         """The draws, to be had in parts of `count` (a power of two, at most `n`)."""
-        engine, steps, at = _sobol(len(self.drawn), self.seed), [], count
+        engine, steps, at = self.engine(), [], count
         first = _bits(engine.random(1))[0]
         while at < self.n:
             engine.fast_forward(at - engine.num_generated)
@@ -182,39 +188,27 @@ class Sequence:
     """The draws of a plan in parts of `count`, each of which costs the same.
 
     The bits of a Sobol point are a linear function of those of its index: point i + j, of two indices without a common
-    bit, is the sum (exclusive or) of points i, j and 0. `steps` are the sums of point 0 and the points `count`,
-    2 `count`, 4 `count`, ..., shape (n_drawn,) each.
+    bit, is the sum (exclusive or) of points i, j and 0.
     """
 
     plan: Plan
     count: int
-    steps: list[NDArray[np.int64]]
+    steps: list[NDArray[np.int64]]  # Sums of point 0 and the points `count`, 2 `count`, ..., (n_drawn,) each
 
+    @cached_property
+    def _first(self) -> NDArray[np.int64]:
+        """Bits of the first part, shape (count, n_drawn): a process that is sent a sequence makes them once."""
+        return _bits(self.plan.engine().random(self.count))
+
+    # Two chunks may run at once, and those after them mostly have the same draws.
+    @lru_cache(2)  # noqa: B019
     def part(self, number: int) -> dict[str, FloatArray]:
         """Values of the drawn parameters in the part with this number, shape (count,) each."""
-        return _part(self, number)
-
-
-# Two chunks may run at once, and those after them mostly have the same draws.
-@lru_cache(2)
-def _part(sequence: Sequence, number: int) -> dict[str, FloatArray]:
-    bits = _first_part(len(sequence.plan.drawn), sequence.plan.seed, sequence.count)
-    for i, step in enumerate(sequence.steps):
-        if number >> i & 1:
-            bits = bits ^ step
-    return sequence.plan.quantiles(np.asarray(bits * 2.0**-BITS, float))
-
-
-def _sobol(dimensions: int, seed: int) -> Any:
-    from scipy.stats import qmc
-
-    return qmc.Sobol(dimensions, scramble=True, bits=BITS, rng=seed)
-
-
-@lru_cache(1)
-def _first_part(dimensions: int, seed: int, count: int) -> NDArray[np.int64]:
-    """Bits of the first points of a sequence, shape (count, dimensions)."""
-    return _bits(_sobol(dimensions, seed).random(count))
+        bits = self._first
+        for i, step in enumerate(self.steps):
+            if number >> i & 1:
+                bits = bits ^ step
+        return self.plan.quantiles(np.asarray(bits * 2.0**-BITS, float))
 
 
 def _bits(points: FloatArray) -> NDArray[np.int64]:
@@ -231,13 +225,14 @@ def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int
     require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
     tables = {kind: value for kind, value in parameters.items() if isinstance(value, SetTable)}
     plan = Plan({}, {}, {}, {}, {}, n, seed, tables)
-    taken = [path for value in tables.values() for path in value.columns]
+    taken = Counter(path for value in tables.values() for path in value.columns)
+    _refuse_twice(taken)
     for given, value in parameters.items():
         if given in tables:
             plan.grid[given] = np.arange(len(tables[given].names), dtype=float)
             continue
         paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
-        taken += paths
+        taken.update(paths)
         _refuse_twice(taken)
         path = ",".join(paths)
         alone = len(paths) == 1
@@ -250,11 +245,9 @@ def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int
         array = real_numbers(path, value, allowed)
         require(array.ndim < 2 and array.size > 0, path, f"of shape {array.shape}", "numbers in one row")
         (plan.grid if array.ndim else plan.fixed)[path] = array
-    _refuse_twice(taken)
     return plan
 
 
-def _refuse_twice(paths: list[str]) -> None:
-    twice = [path for path, count in Counter(paths).items() if count > 1]
-    if twice:
+def _refuse_twice(paths: Counter[str]) -> None:
+    if twice := [path for path, count in paths.items() if count > 1]:
         raise InputError(f"{twice[0]} is given twice, where sets that differ in it count; allowed: once")
