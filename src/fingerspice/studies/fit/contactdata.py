@@ -172,11 +172,6 @@ class Pool(NamedTuple):
     # does not follow from the residuals
     freedom: float
 
-    @property
-    def estimated(self) -> bool:
-        """Whether the standard deviation follows from the residuals."""
-        return self.freedom < np.inf
-
 
 def _pools(task: ContactTask, best: Fitted) -> list[Pool]:
     """The relations by what they have been measured with: ridge areas against the load come from one set of images.
@@ -208,7 +203,7 @@ def solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
         best = followed(task.residuals, task.bounds, begin)
         pools, scale = _pools(task, best), task.scale.copy()
         for pool in pools:
-            if pool.estimated and pool.freedom >= FEWEST:
+            if FEWEST <= pool.freedom < np.inf:
                 spread = float(np.sqrt(np.sum(best.residual[pool.at] ** 2) / pool.freedom))
                 scale[pool.at] = np.maximum(scale[pool.at] * spread, _LEAST)
         if np.abs(np.log(scale / task.scale)).max() < _SETTLED:

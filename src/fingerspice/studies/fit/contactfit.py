@@ -296,7 +296,7 @@ def _further_notes(task: ContactTask, best: Fitted, pools: Sequence[Pool]) -> li
                 f"Of the {pool.name} there are hardly more values ({pool.at.size}) than parameters, which leaves no "
                 "measure of their errors: measure more of them, or give sigma."
             )
-        if not pool.estimated:
+        if math.isinf(pool.freedom):
             own = misfit_note(float(np.sum(best.residual[pool.at] ** 2)), pool.at.size)
             found += [note.replace("The residuals", f"The residuals of the {pool.name}", 1) for note in own]
     fitted = {path.rpartition(".")[2] for path in task.names}

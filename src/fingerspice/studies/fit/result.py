@@ -276,31 +276,12 @@ def misfit_note(square: float, freedom: int) -> list[str]:
 
 def profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profile:
     """The profile of a parameter; in its interval the objective is at most by `room` worse than the best."""
-    place, limit = task.names.index(one.path), best.objective + room
-    here, error = math.log(best.values[place]), one.error / one.value
-    known = {here: best.objective}
-    ends = [_end(task, best, place, error, limit, side, known) for side in (0, 1)]
-    low, high = (float(task.bounds[place, side]) if end is None else end for side, end in enumerate(ends))
-    opened = [word for word, end in zip(("below", "above"), ends, strict=True) if end is None]
-    if opened:
-        shape = "open" if len(opened) == 2 else f"open {opened[0]}"
-    else:
-        reach = here - math.log(low), math.log(high) - here
-        shape = "skewed" if max(reach) > _SKEWED * min(reach) else "symmetric"
-    at = sorted(known)
-    return Profile(one.path, np.exp(at), np.array([known[x] for x in at]), limit, low, high, shape)
-
-
-def _end(
-    task: Problem, best: Fitted, place: int, error: float, limit: float, side: int, known: dict[float, float]
-) -> float | None:
-    """The end of the interval below (`side` 0) or above (1), or None where it is open.
-
-    Adds the least objectives on the way to `known`, by the parameter's logarithm.
-    """
     from scipy.optimize import brentq
 
-    here, begin, sign = math.log(best.values[place]), np.delete(best.values, place), 2 * side - 1
+    place, limit = task.names.index(one.path), best.objective + room
+    here, error = math.log(best.values[place]), one.error / one.value
+    # The least objectives that were looked for, by the parameter's logarithm, and the others' values at the last.
+    known, begin = {here: best.objective}, np.delete(best.values, place)
 
     def look(x: float) -> float:
         nonlocal begin
@@ -318,15 +299,30 @@ def _end(
             known[x] = float(residual @ residual)
         return known[x]
 
-    def beyond(far: float) -> float:
+    def beyond(far: float, sign: int) -> float:
         # About linear in the distance, as the objective is about a parabola.
         return math.sqrt(max(look(here + sign * far) - best.objective, 0.0)) - math.sqrt(limit - best.objective)
 
-    with np.errstate(divide="ignore"):
-        farthest = min(math.log(FARTHEST), abs(float(np.log(task.bounds[place, side])) - here))
-    near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
-    while look(here + sign * far) <= limit:
-        if far >= farthest:
-            return None
-        near, far = far, min(_GROWTH * far, farthest)
-    return math.exp(here + sign * brentq(beyond, near, far, xtol=_END * far, rtol=1e-6))
+    ends, opened = [], []
+    for sign, word, bound in zip((-1, 1), ("below", "above"), task.bounds[place].tolist(), strict=True):
+        begin = np.delete(best.values, place)
+        with np.errstate(divide="ignore"):
+            farthest = min(math.log(FARTHEST), abs(float(np.log(bound)) - here))
+        near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
+        while look(here + sign * far) <= limit:
+            if far >= farthest:
+                opened.append(word)
+                ends.append(bound)
+                break
+            near, far = far, min(_GROWTH * far, farthest)
+        else:
+            away = brentq(beyond, near, far, args=(sign,), xtol=_END * far, rtol=1e-6)
+            ends.append(math.exp(here + sign * away))
+    low, high = ends
+    if opened:
+        shape = "open" if len(opened) == 2 else f"open {opened[0]}"
+    else:
+        reach = here - math.log(low), math.log(high) - here
+        shape = "skewed" if max(reach) > _SKEWED * min(reach) else "symmetric"
+    at = sorted(known)
+    return Profile(one.path, np.exp(at), np.array([known[x] for x in at]), limit, low, high, shape)
