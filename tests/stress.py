@@ -19,6 +19,8 @@ import signal
 import sys
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -142,8 +144,23 @@ def _late(*_: object) -> None:
     raise SlowError
 
 
+@contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """Raise `SlowError` once so much processor time is used."""
+    signal.signal(signal.SIGPROF, _late)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+
+
 class WrongError(AssertionError):
     """A scene was neither right nor refused for a true reason."""
+
+
+# How the reference gives up.
+GIVES_UP = (RuntimeError, ValueError, ZeroDivisionError, np.linalg.LinAlgError, SlowError)
 
 
 @lru_cache(1)
@@ -159,47 +176,26 @@ def compiled() -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """How a scene ended.
+    """How a scene ended."""
 
-    Attributes
-    ----------
-    end : str
-        "right", or why it was refused or could not be judged.
-    over : dict
-        Of a scene that is right: true error over the stated one of each quantity that has one, both beyond what the
-        reference itself may be off; 0 where the reference cannot tell.
-    unsure : bool
-        Whether the scene would have been wrong, or its stated error too small, had not two references differed by
-        half as much or more from each other: what is over soon after a jump leaves a charge that they know badly.
-    """
-
-    end: str
+    end: str  # "right", or why it was refused or could not be judged
+    # Of a scene that is right: true error over the stated one of each quantity that has one, both beyond what the
+    # reference itself may be off; 0 where the reference cannot tell
     over: dict[str, float] = dataclasses.field(default_factory=dict)
+    # Whether the scene would have been wrong, or its stated error too small, had not two references differed by half as
+    # much or more from each other: what is over soon after a jump leaves a charge that they know badly
     unsure: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class Quantity:
-    """One signal of a run beside its reference, off the jumps.
-
-    Attributes
-    ----------
-    name : str
-    off : float
-        Largest difference.
-    allowed : float
-        What it may be.
-    floor : float
-        What the reference itself may be off.
-    stated : float or None
-        The run's own error, where it states one.
-    """
+    """One signal of a run beside its reference, off the jumps."""
 
     name: str
-    off: float
-    allowed: float
-    floor: float
-    stated: float | None
+    off: float  # Largest difference
+    allowed: float  # What it may be
+    floor: float  # What the reference itself may be off
+    stated: float | None  # The run's own error, where it states one
 
     @property
     def over(self) -> float:
@@ -308,39 +304,32 @@ def mean_force(expected: ref.Transient, stop: float) -> float:
 def judge(scene: Scene) -> Verdict:
     """How a scene ended; raises `WrongError`."""
     compiled()
-    signal.signal(signal.SIGPROF, _late)
-    signal.setitimer(signal.ITIMER_PROF, LONGEST)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", fs.FingerspiceWarning)
         try:
-            solution = fs.simulate(scene.circuit, charge_law=scene.law, rtol=RTOL, throw=False)
+            with within(LONGEST):
+                solution = fs.simulate(scene.circuit, charge_law=scene.law, rtol=RTOL, throw=False)
         except fs.InputError as error:
             if "contact" in str(error) and not scene.touches:
                 return Verdict("refused: no contact")
             raise WrongError(f"refused, though it is legal: {error}") from None
         except SlowError:
             raise WrongError(f"no answer within {LONGEST} s of processor time") from None
-        finally:
-            signal.setitimer(signal.ITIMER_PROF, 0.0)
     tried = solution.stats.get("steps", 0) + solution.stats.get("rejected", 0)
     if tried > MOST_STEPS:
         raise WrongError(f"{tried} steps")
-    with np.errstate(all="ignore"):
+    try:
         # The reference may take its time, on slow processors too.
-        signal.setitimer(signal.ITIMER_PROF, 6.0 * LONGEST)
-        try:
+        with np.errstate(all="ignore"), within(6.0 * LONGEST):
             expected = scene.expected(solution.t)
-        except ref.NoStepError as error:
-            # By the rounding of some processors the reference finds no step just before a fold, and does not see it.
-            t = solution.failure.t if solution.failure is not None else None
-            if solution.status is fs.Status.FOLD and t is not None and abs(t - error.t) <= 1e-9 / scene.frequency:
-                return Verdict("refused: fold")
-            return Verdict(f"not judged: the reference gave up, ours says {solution.status.name}")
-        except (RuntimeError, ValueError, ZeroDivisionError, np.linalg.LinAlgError, SlowError):
-            return Verdict(f"not judged: the reference gave up, ours says {solution.status.name}")
-        finally:
-            signal.setitimer(signal.ITIMER_PROF, 0.0)
+    except GIVES_UP as error:
+        # By the rounding of some processors the reference finds no step just before a fold, and does not see it.
+        t = solution.failure.t if solution.failure is not None else None
+        lost = isinstance(error, ref.NoStepError) and solution.status is fs.Status.FOLD and t is not None
+        if lost and abs(t - error.t) <= 1e-9 / scene.frequency:
+            return Verdict("refused: fold")
+        return Verdict(f"not judged: the reference gave up, ours says {solution.status.name}")
     period = 1.0 / scene.frequency
     peak = float(np.nanmax(np.abs(expected.u_gap), initial=0.0))
     if solution.status is fs.Status.ERROR_NOT_MET:
@@ -362,14 +351,8 @@ def judge(scene: Scene) -> Verdict:
     found = quantities(scene, solution, expected)
     doubtful = any(not x.off <= x.allowed or x.over > 1.0 for x in found)
     if doubtful:
-        signal.setitimer(signal.ITIMER_PROF, LONGEST)
-        try:
-            with np.errstate(all="ignore"):
-                found = quantities(scene, solution, expected, scene.expected(solution.t, 1e-13))
-        except (RuntimeError, ValueError, ZeroDivisionError, np.linalg.LinAlgError, SlowError):
-            pass
-        finally:
-            signal.setitimer(signal.ITIMER_PROF, 0.0)
+        with suppress(*GIVES_UP), np.errstate(all="ignore"), within(LONGEST):
+            found = quantities(scene, solution, expected, scene.expected(solution.t, 1e-13))
     for x in found:
         if not x.off <= x.allowed:
             raise WrongError(f"{x.name} is off by {x.off:.3g}, {x.off / x.allowed:.3g} times what it may be")
@@ -379,29 +362,16 @@ def judge(scene: Scene) -> Verdict:
     return Verdict("right", {x.name: x.over for x in found if x.stated is not None}, doubtful and sure)
 
 
-class Stated:
-    """How often the stated errors of a quantity covered the true ones."""
-
-    def __init__(self) -> None:
-        self.judged = 0
-        self.over: dict[int, float] = {}
-
-    def count(self, number: int, over: float) -> None:
-        """Count a scene with its true error over the stated one."""
-        self.judged += 1
-        if over > 1.0:
-            self.over[number] = over
-
-    def to_dict(self) -> dict[str, object]:
-        """Counts, and the scenes by how far they exceed what was stated."""
-        worst = sorted(self.over, key=lambda number: -self.over[number])[:20]
-        return {
-            "judged": self.judged,
-            "exceeded": len(self.over),
-            "exceeded_twice": sum(x > 2.0 for x in self.over.values()),
-            "exceeded_ten_times": sum(x > 10.0 for x in self.over.values()),
-            "worst": {str(number): float(f"{self.over[number]:.3g}") for number in worst},
-        }
+def counted(over: dict[int, float]) -> dict[str, object]:
+    """How often the stated errors of a quantity covered the true ones, from each scene's true error over its stated."""
+    worst = sorted((number for number in over if over[number] > 1.0), key=lambda number: -over[number])[:20]
+    return {
+        "judged": len(over),
+        "exceeded": sum(x > 1.0 for x in over.values()),
+        "exceeded_twice": sum(x > 2.0 for x in over.values()),
+        "exceeded_ten_times": sum(x > 10.0 for x in over.values()),
+        "worst": {str(number): float(f"{over[number]:.3g}") for number in worst},
+    }
 
 
 def _judged(seed: int, number: int) -> tuple[int, Verdict | None, str, float]:
@@ -445,7 +415,9 @@ def main(arguments: list[str] | None = None) -> int:
     if options.again is not None:
         return again(options.again)
     counts: collections.Counter[str] = collections.Counter()
-    stated = {name: Stated() for name in ("u_gap", "f_el", "q_source", "u_gap_peak", "f_el_max", "f_el_mean")}
+    stated: dict[str, dict[int, float]] = {
+        name: {} for name in ("u_gap", "f_el", "q_source", "u_gap_peak", "f_el_max", "f_el_mean")
+    }
     wrong: dict[str, str] = {}
     unsure: list[int] = []
     slowest = (0.0, 0)
@@ -461,12 +433,12 @@ def main(arguments: list[str] | None = None) -> int:
                 if verdict.unsure:
                     unsure.append(number)
                 for name, over in verdict.over.items():
-                    stated[name].count(number, over)
+                    stated[name][number] = over
             slowest = max(slowest, (took, number))
     for name, count in counts.most_common():
         print(f"{count:7d} {name}")
     for name, of in stated.items():
-        found = of.to_dict()
+        found = counted(of)
         print(
             f"stated error of {name}: exceeded by the true one in {found['exceeded']} of {found['judged']} scenes, "
             f"twice in {found['exceeded_twice']}, ten times in {found['exceeded_ten_times']}"
@@ -477,7 +449,7 @@ def main(arguments: list[str] | None = None) -> int:
         data = {
             "seed": options.seed, "first": options.first, "scenes": options.scenes, "rtol": RTOL,
             "counts": dict(counts.most_common()), "wrong": wrong,
-            "stated": {name: of.to_dict() for name, of in stated.items()}, "reference_unsure": unsure,
+            "stated": {name: counted(of) for name, of in stated.items()}, "reference_unsure": unsure,
         }  # fmt: skip
         options.json.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
     return 1 if counts["WRONG"] else 0
