@@ -112,7 +112,11 @@ def _divided(plan: plans.Plan, first: Dataset, path: Path) -> SweepStore:
         name: Array(path / name, ("scene",), plan.sizes[-1:], block[-1:], {"units": plan.units[name]})
         for name in plan.drawn
     }
-    return SweepStore(path, plan.dims, plan.sizes, block, outputs, drawn)
+    grid = {
+        name: Array(path / name, (name,), values.shape, values.shape, plan.told(name), fill=0.0)
+        for name, values in plan.grid.items()
+    }
+    return SweepStore(path, plan.dims, plan.sizes, block, outputs, drawn, grid)
 
 
 def _check_values(circuit: Circuit, plan: plans.Plan) -> None:

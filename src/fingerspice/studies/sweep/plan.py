@@ -82,6 +82,8 @@ def _applied(circuit: Circuit, kind: str, entry: str) -> tuple[Circuit, str, Map
     return changed, f"{to}={one.name}" if to else one.name, changed.sets[one.name]
 
 
+#: Attribute of a coordinate that counts named sets of parameters: their names.
+NAMES = "names"
 # Bits of a Sobol point, and so the largest number of draws of all.
 BITS = 30
 # Quantiles are taken no nearer to 0 and 1 than this, so that a distribution without bounds gives finite values.
@@ -139,6 +141,10 @@ class Plan:
         """Attributes of a sweep of the circuit: its draws, and the named sets in it."""
         drawn = {"n": self.n, "seed": self.seed} if self.drawn else {}
         return drawn | ({"sets": list(circuit.sets)} if circuit.sets else {})
+
+    def told(self, name: str) -> dict[str, Any]:
+        """Attributes of a parameter of the grid in a store: its unit, or the names of its sets."""
+        return {NAMES: list(self.tables[name].names)} if name in self.tables else {"units": self.units[name]}
 
     @property
     def coordinates(self) -> dict[str, Any]:

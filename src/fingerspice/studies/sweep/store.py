@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.results.store import CHECKSUM, Array, attributes_of, create
+from fingerspice.studies.sweep.plan import NAMES
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
 #: The array that marks chunks as done.
 STATUS = "status"
-#: Attribute of a coordinate that counts named sets of parameters: their names.
-NAMES = "names"
 #: Attribute of the group with the identity of the sweep, as JSON.
 RUN = "sweep"
 
@@ -51,6 +50,7 @@ class SweepStore:
     block: tuple[int, ...]  # Scenes of a chunk along each dimension
     outputs: dict[str, Array]  # With ``error`` and ``status``
     drawn: dict[str, Array]  # Parameters along ``scene``
+    grid: dict[str, Array]  # Parameters along the other dimensions
 
     @property
     def chunks(self) -> int:
@@ -94,26 +94,17 @@ class SweepStore:
                 "goes on from there"
             ) from None
 
-    def open(
-        self, run: Mapping[str, Any], about: Mapping[str, Any], grid: Mapping[str, tuple[FloatArray, dict[str, Any]]]
-    ) -> None:
+    def open(self, run: Mapping[str, Any], about: Mapping[str, Any], grid: Mapping[str, FloatArray]) -> None:
         """Create the store, or make sure that the one there is of this sweep.
 
         `run` is all that determines the bytes, as plain data, and `about` has further attributes of the store; `grid`
-        has the values and attributes (the unit, or `NAMES`) of each parameter of the grid. Anything else there, or a
-        store of another sweep, is refused and left as it is.
+        has the values of its parameters. Anything else there, or the store of another sweep, is refused and stays.
         """
         own = json.loads(json.dumps({**run, "kind of checksum": CHECKSUM}, default=float))
         if not os.path.lexists(self.path):
-            places = {
-                name: Array(self.path / name, (name,), values.shape, values.shape, said, fill=0.0)
-                for name, (values, said) in grid.items()
-            }
+            arrays = self.outputs | self.drawn | self.grid
             try:
-                create(
-                    self.path, {**about, RUN: json.dumps(own)}, self.outputs | self.drawn | places,
-                    {name: values for name, (values, _) in grid.items()}, os.urandom(6).hex(),
-                )  # fmt: skip
+                create(self.path, {**about, RUN: json.dumps(own)}, arrays, grid, os.urandom(6).hex())
             except OSError as error:
                 raise InputError(f"cannot write {self.path}: {error.strerror or error}") from None
         held = identity(self.path)

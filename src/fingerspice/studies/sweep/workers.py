@@ -25,7 +25,7 @@ from fingerspice.results.store import tidy
 from fingerspice.studies.batch.batch import MESSAGES
 from fingerspice.studies.sweep.chunks import Done, Work, identity_of, make_work, run_chunk
 from fingerspice.studies.sweep.plan import Plan
-from fingerspice.studies.sweep.store import NAMES, identity
+from fingerspice.studies.sweep.store import identity
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -56,12 +56,8 @@ def stored(
     work, about = make_work(circuit, plan, options, path)
     if workers is not None or scheduler is not None:
         work = replace(work, options={"threads": 1, **options})
-    grid = {
-        name: (values, {NAMES: list(plan.tables[name].names)} if name in plan.tables else {"units": plan.units[name]})
-        for name, values in plan.grid.items()
-    }
     with at_work(None if workers is None else min(workers, work.store.chunks), scheduler) as client:
-        work.store.open(identity_of(work), about, grid)
+        work.store.open(identity_of(work), about, plan.grid)
         told = _run_chunks(work, shard, client)
     found = work.store.dataset()
     found.attrs |= told
