@@ -1,4 +1,5 @@
-# The one list of commands. `make run` and `make test` set themselves up.
+# The one list of commands. `make run` and `make test` set themselves up. `make stress` runs many random scenes, and the
+# tests whose statistics take few of their cases in the suite.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -44,6 +45,7 @@ test: $(VENV)/.test
 
 stress: $(VENV)/.test
 	$(BIN)/python tests/stress.py --scenes 10000 --json benchmarks/results/stress.json
+	STRESS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal $$(grep -l '\bcases(' tests/test_*.py)
 
 fuzz: $(VENV)/.test
 	$(BIN)/python tests/fuzz.py --inputs 1000000

@@ -24,8 +24,8 @@ from fingerspice.engine.one_area.system import area_error, area_missed, area_pol
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import NetworkIntegration, kept_with
-from fingerspice.solve.scenes import Scene
+from fingerspice.solve.runs import NetworkIntegration
+from fingerspice.solve.scenes import Scene, kept_with
 from fingerspice.solve.sources import held as held_at
 from fingerspice.solve.stepping import Stepping, looks_of
 

@@ -35,8 +35,7 @@ from fingerspice.solve.initial import (
     row_width,
 )
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import kept_with
-from fingerspice.solve.scenes import Scene
+from fingerspice.solve.scenes import Scene, kept_with
 from fingerspice.solve.sources import segment_index
 from fingerspice.solve.stepping import OutOfRangeError, Stepping, looks_of
 

@@ -16,7 +16,6 @@ from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status, l
 from fingerspice.results.record import Record
 from fingerspice.results.steps import ClosedForm, Recorded
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.scenes import kept_with as kept_with
 from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index, values_at
 from fingerspice.waveforms.sampling import breakpoints_at
 

@@ -23,7 +23,8 @@ from fingerspice.solve.recordings.form import LaneForm, rounded_peak, stack
 from fingerspice.solve.recordings.march import LaneMarch, Outcome
 from fingerspice.solve.recordings.networks import finger
 from fingerspice.solve.recordings.pieces import Piece, pieces_of
-from fingerspice.solve.runs import Progress, Run, closed_form, kept_with
+from fingerspice.solve.runs import Progress, Run, closed_form
+from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.simulation import integrated, own_rtol, state_error
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import on_breakpoint
