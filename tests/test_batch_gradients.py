@@ -213,6 +213,14 @@ def test_bad_input_is_refused_in_one_sentence(gradients: Any, options: dict[str,
         fs.batch(table1(), {"Xgap.r": [1e6]}, gradients=gradients, periods=1, **options)
 
 
+def test_points_at_uneven_times_have_them() -> None:
+    t = np.linspace(0.0, 0.05, 701)
+    times = np.sort(np.append(t, t[:-1] + 0.3 * np.diff(t)))
+    v = 150.0 * np.sin(2.0 * np.pi * 150.0 * times)
+    circuit = table1().replace({"Vdrive": fs.PWL(times, v)})
+    check(circuit, {"Xgap.d": [3e-6]}, ("Xgap.d", "Xgap.r"), 1e-5, of_deck, status=1)
+
+
 def test_two_fingers_are_refused() -> None:
     two = fs.read_netlist(CIRCUITS / "two_fingers.cir")
     gap = two.by_device("GAP")[0].name

@@ -13,6 +13,7 @@ import pytest
 
 import fingerspice as fs
 import fuzz
+from deck_edits import evaluate
 from fingerspice.base.errors import LONGEST_MESSAGE, FingerspiceWarning, InputError, Where
 from fingerspice.circuit import topology
 from fingerspice.netlist import reader
@@ -229,3 +230,13 @@ def test_included_files_are_bounded_in_number_depth_and_size(tmp_path: Path) -> 
     deck.write_text("t\n" + ".include large.lib\n" * 8)
     with pytest.raises(InputError, match="the included files are larger than 64 MiB in all"):
         fs.read_netlist(deck)
+
+
+def test_messages_are_short_and_printable_whatever_was_given() -> None:
+    with pytest.raises(InputError) as caught:
+        evaluate("\x1b[31m" + "x" * 10, {}, Where("deck.cir", 1))
+    assert caught.value.message.startswith("'\\x1b' does not belong")
+    said = refusal(f"R1 a 0 {'x' * 10**6}\u202e\n")
+    assert len(said) < LONGEST_MESSAGE
+    assert said.isprintable()
+    assert said.endswith("allowed: a number ohm")

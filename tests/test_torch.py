@@ -120,6 +120,23 @@ def test_values_and_derivatives_are_those_of_differences_of_runs(law: str) -> No
         assert float(grad) * value == pytest.approx(expected * value, abs=2e-9), path
 
 
+def test_points_at_uneven_times_have_derivatives() -> None:
+    # Two steps of time in turn: with every other point alone, on the same lines, the times are even.
+    t = np.linspace(0.0, T_STOP, 601)
+    v = 150.0 * np.sin(2.0 * np.pi * 150.0 * t)
+    between = t[:-1] + 0.3 * np.diff(t)
+    times = np.sort(np.append(t, between))
+    found = []
+    for source in (fs.PWL(times, np.interp(times, t, v)), fs.PWL(t, v)):
+        simulator = fs.torch.Simulator(
+            table1().replace({"Vdrive": source}), ("Xgap.d",), ("u_gap", "f_el_mean"), t=TIMES, t_stop=T_STOP, rtol=1e-7
+        )
+        out = simulator()
+        (out["f_el_mean"] + out["u_gap"].sum()).backward()
+        found.append(float(simulator.Xgap_d.grad) * 3.5e-6)
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("law", "source", "adjoint"), [("local", "square", False), ("local", "square", True), ("mobile", "sine", False)]
 )
