@@ -39,8 +39,9 @@ from fingerspice.solve.scenes import BEYOND_PEAK
 
 # Number of lanes, each with a piece of a recording.
 PIECES = 64
-# Numbers of active modes that code is compiled for, as a new one takes 15 to 30 s: others get modes that stay at 0.
-SIZES = (1, 2, 3, 4, 7, 10, 14, 20, 28, 40, 56)
+# Numbers of active modes that code is compiled for, as a new one takes 15 to 30 s: others get modes that stay at 0; and
+# fewest leaks, of which the rest stays at 0, too.
+SIZES, LEAST_LEAKS = (2, 4, 7, 10, 14, 20, 28, 40, 56), 2
 # Relative error from which on steps in a stack have Simpson's nodes, and need two evaluations in the place of three.
 BY_SIMPSON = 1e-5
 # Largest degree of the polynomial for 1/A.
@@ -243,6 +244,8 @@ def _chebyshev(x: FloatArray, count: int) -> FloatArray:
 
 # Ratio of reference areas, so large that there is one.
 _ONE_REFERENCE = 1e12
+# A column of zeros behind rows.
+_ONE_MORE = ((0, 0), (0, 1))
 
 
 @dataclass(frozen=True)
@@ -312,10 +315,13 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
     if problem.charge:
         column, stored, gain_of, feed_of, moved = _charge(system, stack)
         rates, gain, feed = np.append(rates, 0.0), np.append(gain, gain_of), np.vstack([feed, feed_of])
-        columns = np.vstack([_wider(columns), np.append(column, 1.0)])
-        k, moves, nodes = np.append(k, stored), np.append(moves, moved), _wider(nodes)
-        taps, shape = _wider(taps), np.append(shape, 0.0)
+        columns = np.vstack([np.pad(columns, _ONE_MORE), np.append(column, 1.0)])
+        k, moves, nodes = np.append(k, stored), np.append(moves, moved), np.pad(nodes, _ONE_MORE)
+        taps, shape = np.pad(taps, _ONE_MORE), np.append(shape, 0.0)
     active, wide = roomy(n)
+    more = [tap_s.size] * max(LEAST_LEAKS - tap_s.size, 0)
+    taps, tap_s, kinks = np.insert(taps, more, 0.0, axis=0), np.insert(tap_s, more, 0.0), np.insert(kinks, more, 0.0)
+    feed = np.insert(feed, more, 0.0, axis=1)
     lanes = Lanes(
         wide(rates), wide(gain), wide(shape), float(model.k_gap), wide(taps), tap_s, np.zeros(tap_s.size),
         wide(feed.T).T.copy(), area, slope, bend, scale, -1.0, q0, 0.0, kinks, rest, steep, 0,
@@ -338,11 +344,6 @@ def roomy(n: int, least: int = 1) -> tuple[int, Callable[[FloatArray], FloatArra
         return np.concatenate([rows[..., :n], still, rows[..., n:]], axis=-1)
 
     return active, wide
-
-
-def _wider(rows: FloatArray) -> FloatArray:
-    """Rows (n, m) with a column of zeros behind them."""
-    return np.hstack([rows, np.zeros((len(rows), 1))])
 
 
 def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:

@@ -32,7 +32,7 @@ from fingerspice.engine.lanes.rows import FADED, Lanes
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.form import LaneForm, Shown, curves, roomy, slopes
+from fingerspice.solve.recordings.form import LEAST_LEAKS, LaneForm, Shown, curves, roomy, slopes
 from fingerspice.solve.scenes import Scene
 from fingerspice.waveforms.samples import Samples, as_samples
 from fingerspice.waveforms.waveform import DC
@@ -189,8 +189,8 @@ _FREQUENCIES = 65
 # Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
 # what they leave together is known but for about 1e-8.
 OF_MANY, ACTING = 1e-7, 0.05
-# Fewest active modes and leaks that code is compiled for (`solve.recordings.form`).
-LEAST_MODES, LEAST_LEAKS = 4, 2
+# Fewest active modes that code is compiled for.
+LEAST_MODES = 4
 # Reference area: that at this share of the largest gap voltage to expect.
 _TYPICAL = 0.5
 
