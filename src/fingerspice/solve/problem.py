@@ -6,6 +6,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
@@ -83,7 +84,10 @@ class Problem:
     @cached_property
     def inner(self) -> StackState:
         """The start of a stack in the form of its own equations."""
-        return to_stack(self.scene, self.initial)
+        state, inner = self.scene.prepared.get("inner", (None, None))
+        if state is not self.initial:
+            _, inner = self.scene.prepared["inner"] = self.initial, to_stack(self.scene, self.initial)
+        return cast("StackState", inner)
 
     def breakpoints(self) -> FloatArray:
         """The sources' breakpoints in the run, s; the waveform caches them if they are few."""
