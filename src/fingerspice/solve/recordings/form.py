@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.polynomial import chebyshev as series_of
@@ -53,8 +53,7 @@ _AREA_SHARE, _COARSEST = 0.003, 1e-5
 _POINTS = 64
 
 
-@dataclass(frozen=True)
-class Shown:
+class Shown(NamedTuple):
     """Quantities k s + columns z + bends N; under `mobile` k s + columns z / A for voltages, columns z + bends A s."""
 
     columns: FloatArray  # (C, m)
@@ -62,10 +61,6 @@ class Shown:
     k: FloatArray
     bends: FloatArray
     by_area: BoolArray  # (C,): Whether the modes' part has the factor 1/A
-
-    def behind(self, first: int) -> Shown:
-        """The quantities from number `first` on."""
-        return Shown(self.columns[first:], self.k[first:], self.bends[first:], self.by_area[first:])
 
 
 @dataclass(frozen=True)
@@ -184,11 +179,6 @@ def _marks(kind: type[Marks], *sizes: int) -> Marks:
     return kind(*((0,) * size for size in sizes))
 
 
-def slopes(area: FloatArray, scale: float) -> FloatArray:
-    """Derivative by xi of a polynomial in `scale` xi, with as many terms."""
-    return np.append(scale * polyder(area), 0.0)
-
-
 def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
     """A Chebyshev series in powers, of a degree 4 k, and what that lacks; empty if more than `tol`."""
     for degree in range(4, MOST_DEGREE + 1, 4):
@@ -202,13 +192,23 @@ def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
     return np.empty(0), 0.0
 
 
-def curves(
-    curve: FloatArray, q0: float, kappa: float, top: float, rtol: float
-) -> tuple[FloatArray, FloatArray, float, float, float] | None:
-    """1/A - q0 and N as polynomials in `scale` xi - 1, the scale, and their errors (of 1/A relative, and V m^2).
+class Curves(NamedTuple):
+    """1/A - q0, its derivative and N as polynomials of xi (`engine.lanes.rows.Lanes`)."""
 
-    They reach the gap voltage `top` (V). None where no allowed degree is enough for errors of `rtol`.
-    """
+    area: FloatArray
+    slope: FloatArray
+    bend: FloatArray
+    scale: float
+    # missed, missed_bend: See `LaneForm`
+    missed: float
+    missed_bend: float
+    # rest, steep: See `engine.lanes.rows.Lanes`
+    rest: float
+    steep: float
+
+
+def curves(curve: FloatArray, q0: float, kappa: float, top: float, rtol: float) -> Curves | None:
+    """Polynomials up to the gap voltage `top` (V); None where no allowed degree is enough for errors of `rtol`."""
     tol = _AREA_SHARE * min(rtol, _COARSEST)
     at = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
     to_series = np.linalg.inv(_chebyshev(at, _POINTS))
@@ -234,7 +234,10 @@ def curves(
         return None
     one[0] -= q0
     other[0] -= polyval(-1.0, other)
-    return one, other, 2.0 / xi_top, off_one / abs(float(inverse[0])), off_other
+    scale = 2.0 / xi_top
+    slope = np.append(scale * polyder(one), 0.0)
+    rest, steep = float(polyval(-1.0, one)), float(polyval(-1.0, slope))
+    return Curves(one, slope, other, scale, off_one / abs(float(inverse[0])), off_other, rest, steep)
 
 
 def _chebyshev(x: FloatArray, count: int) -> FloatArray:
@@ -244,8 +247,6 @@ def _chebyshev(x: FloatArray, count: int) -> FloatArray:
 
 # Ratio of reference areas, so large that there is one.
 _ONE_REFERENCE = 1e12
-# A column of zeros behind rows.
-_ONE_MORE = ((0, 0), (0, 1))
 
 
 @dataclass(frozen=True)
@@ -298,39 +299,40 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
     peak = rounded_peak(scene.u_peak)
     system = system_of(scene, decade, BEYOND_PEAK * peak, _ONE_REFERENCE, peak)
     model, q0, stack = system.model, float(system.q0[0]), scene.stack
-    found = curves(model.curve, q0, 0.0, system.u_top, rtol)
+    curve = curves(model.curve, q0, 0.0, system.u_top, rtol)
     assert stack is not None
-    if found is None or stack.gap is None or (stack.g_area[stack.gap] > 0.0 and not model.mobile):
+    if curve is None or stack.gap is None or (stack.g_area[stack.gap] > 0.0 and not model.mobile):
         return None
-    area, bend, scale, missed, missed_bend = found
-    slope = slopes(area, scale)
-    rest, steep = float(polyval(-1.0, area)), float(polyval(-1.0, slope))
     rates, gain, feed, taps, tap_s = system.rates[0], system.gain[0], system.feed[0], system.tap[0], system.tap_k
-    n, area0, shape, kinks, by = rates.size, model.area0, system.gap[0], np.full(tap_s.size, steep), 1.0
+    n, area0, shape, kinks, by = rates.size, model.area0, system.gap[0], np.full(tap_s.size, curve.steep), 1.0
+    missed_bend = curve.missed_bend
     if model.mobile:
         # The last drive is A - 1/q0 times the source.
-        feed, kinks = np.column_stack([feed, system.push[0] / area0]), np.append(kinks, -steep / (q0 + rest) ** 2)
-        shape, by, missed_bend = area0 * q0 * shape, area0, missed * peak / q0
+        feed = np.column_stack([feed, system.push[0] / area0])
+        kinks = np.append(kinks, -curve.steep / (q0 + curve.rest) ** 2)
+        shape, by, missed_bend = area0 * q0 * shape, area0, curve.missed * peak / q0
     columns, k, moves, nodes = by * system.shown[0], system.k_shown, np.zeros(system.k_shown.size), by * system.node[0]
     if problem.charge:
         column, stored, gain_of, feed_of, moved = _charge(system, stack)
         rates, gain, feed = np.append(rates, 0.0), np.append(gain, gain_of), np.vstack([feed, feed_of])
-        columns = np.vstack([np.pad(columns, _ONE_MORE), np.append(column, 1.0)])
-        k, moves, nodes = np.append(k, stored), np.append(moves, moved), np.pad(nodes, _ONE_MORE)
-        taps, shape = np.pad(taps, _ONE_MORE), np.append(shape, 0.0)
+        columns, nodes, taps = (np.pad(rows, ((0, 0), (0, 1))) for rows in (columns, nodes, taps))
+        columns, shape = np.vstack([columns, np.append(column, 1.0)]), np.append(shape, 0.0)
+        k, moves = np.append(k, stored), np.append(moves, moved)
     active, wide = roomy(n)
     more = [tap_s.size] * max(LEAST_LEAKS - tap_s.size, 0)
     taps, tap_s, kinks = np.insert(taps, more, 0.0, axis=0), np.insert(tap_s, more, 0.0), np.insert(kinks, more, 0.0)
     feed = np.insert(feed, more, 0.0, axis=1)
     lanes = Lanes(
         wide(rates), wide(gain), wide(shape), float(model.k_gap), wide(taps), tap_s, np.zeros(tap_s.size),
-        wide(feed.T).T.copy(), area, slope, bend, scale, -1.0, q0, 0.0, kinks, rest, steep, 0,
+        wide(feed.T).T.copy(), curve.area, curve.slope, curve.bend, curve.scale, -1.0, q0, 0.0, kinks, curve.rest,
+        curve.steep, 0,
     )  # fmt: skip
-    voltages, columns, nodes = np.arange(k.size) < system.k_shown.size, wide(columns), wide(nodes)
+    voltages = np.arange(k.size) < system.k_shown.size
     return StackForm(
-        lanes, active, 1 if rtol >= BY_SIMPSON else 2, model.mobile, Shown(columns, k, moves, voltages & model.mobile),
-        Shown(nodes, system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile)),
-        int(problem.charge), system.stress, float(model.k_gap), system.u_top, missed, missed_bend,
+        lanes, active, 1 if rtol >= BY_SIMPSON else 2, model.mobile,
+        Shown(wide(columns), k, moves, voltages & model.mobile),
+        Shown(wide(nodes), system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile)),
+        int(problem.charge), system.stress, float(model.k_gap), system.u_top, curve.missed, missed_bend,
         float(model.slow[-3]) * area0, system,
     )  # fmt: skip
 

@@ -19,154 +19,84 @@ charge that a source has delivered is one more mode, of rate zero, and a sum of 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 
-from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.network import Modes, network_modes
+from fingerspice.circuit.network import network_modes
 from fingerspice.engine.lanes.rows import FADED, Lanes
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.form import LEAST_LEAKS, LaneForm, Shown, curves, roomy, slopes
+from fingerspice.solve.recordings.form import LEAST_LEAKS, LaneForm, Shown, curves, roomy
 from fingerspice.solve.scenes import Scene
 from fingerspice.waveforms.samples import Samples, as_samples
 from fingerspice.waveforms.waveform import DC
 
 
-@dataclass(frozen=True)
-class Modal:
-    """Modes w of a network and, behind them, the charges of its sources where these are wanted."""
-
-    # rates, gain (m,): w' = -rates w + gain s + drives g, for the one source that is not 0
-    rates: FloatArray
-    gain: FloatArray
-    drives: FloatArray  # (m, T): By (q - q0) times each tap, and last by N
-    # taps, tap_s (1 + T, m): xi, the voltages of the cells with a fixed leak, and xi again for N
-    taps: FloatArray
-    tap_s: FloatArray
-    # columns, bends, k (C, m): State voltages and charges from w, N and the source
-    columns: FloatArray
-    bends: FloatArray
-    k: FloatArray
-    nodes: FloatArray  # (n_node, m): Voltages of the nodes from w
-
-
-@dataclass(frozen=True)
 class Reduced:
-    """A network with one moving area, at a reference area."""
+    """A network with one moving area, in modes w at reference areas `area0`; behind them the charges, if wanted.
 
-    scene: Scene
-    source: int  # Number of the source that is not 0
-    area0: FloatArray  # Every area, m^2; `q0` is the inverse of the one that moves
+    Only source number `source` is not 0.
+    """
 
-    @cached_property
-    def moving(self) -> int:
-        """Number of the area that moves."""
-        return int(np.flatnonzero(self.scene.net.gap >= 0)[0])
+    def __init__(self, scene: Scene, source: int, area0: FloatArray, charge: bool) -> None:
+        net, network = scene.net, scene.network
+        self.scene, self.source, self.area0, modes = scene, source, area0, network_modes(network, area0)
+        # The area that moves, and the cell whose voltage it follows.
+        self.moving = int(np.flatnonzero(net.gap >= 0)[0])
+        self.gap, self.q0, self.modes = int(net.gap[self.moving]), 1.0 / float(area0[self.moving]), modes
+        n, n_s = modes.rates.size, modes.gains.shape[1] if charge else 0
+        none = np.zeros((n, n_s))
+        # Voltages of all cells from v, and from the sources.
+        tap, tap_s = network.p @ modes.shape, network.q - network.p @ modes.follow
+        # The cells whose area moves, and the direction of each along their path, relative to that of the gap.
+        fed = np.flatnonzero(net.place == self.moving)
+        turn = _turns([network.cells[i].nodes for i in fed], int(np.flatnonzero(fed == self.gap)[0]))
+        # f c_gap of the module: v = w + absorbed N. Behind an ideal source kappa is 0, or rounding.
+        self.absorbed = -modes.take[:, fed] @ turn * net.c[self.gap]
+        self.kappa = max(-float(tap[self.gap] @ self.absorbed), 0.0)
+        # The voltages of those of them that have a fixed leak, from w and the source: what 1/A - q0 multiplies.
+        leaking = fed[net.g_total[fed] > 0.0]
+        wide = (0, max(LEAST_LEAKS - leaking.size, 0)), (0, 0)
+        taps, self.tap_s = np.pad(tap[leaking], wide), np.pad(tap_s[leaking, source], wide[0])
+        self.taps, self.bent = np.pad(taps, ((0, 0), (0, n_s))), taps @ self.absorbed
 
-    @property
-    def gap(self) -> int:
-        """The cell whose voltage it follows."""
-        return int(self.scene.net.gap[self.moving])
+        def leaks(through: FloatArray) -> FloatArray:
+            """Forcing by (q - q0) times each of these voltages; `through` (rows, n_f) is that by the currents."""
+            own = through[:, net.g_total[fed] > 0.0] - np.outer(through @ turn, leaking == self.gap)
+            return np.pad(own * (net.g_total[leaking] / self.q0), ((0, 0), wide[0]))
 
-    @property
-    def q0(self) -> float:
-        return 1.0 / float(self.area0[self.moving])
-
-    @cached_property
-    def modes(self) -> Modes:
-        return network_modes(self.scene.network, self.area0)
-
-    @cached_property
-    def tap(self) -> FloatArray:
-        """Voltages of all cells from v."""
-        return np.asarray(self.scene.network.p @ self.modes.shape)
-
-    @cached_property
-    def tap_s(self) -> FloatArray:
-        """The same from the sources."""
-        return np.asarray(self.scene.network.q - self.scene.network.p @ self.modes.follow)
-
-    @cached_property
-    def fed(self) -> IntArray:
-        """The cells whose area moves."""
-        return np.flatnonzero(self.scene.net.place == self.moving)
-
-    @cached_property
-    def turn(self) -> FloatArray:
-        """Direction of each of these cells along their path, relative to that of the gap."""
-        nodes = [self.scene.network.cells[i].nodes for i in self.fed]
-        return _turns(nodes, int(np.flatnonzero(self.fed == self.gap)[0]))
-
-    @cached_property
-    def absorbed(self) -> FloatArray:
-        """f c_gap of the module: v = w + absorbed N."""
-        return np.asarray(-self.modes.take[:, self.fed] @ self.turn * self.scene.net.c[self.gap])
-
-    @property
-    def kappa(self) -> float:
-        # Behind an ideal source it is 0, or rounding.
-        return max(-float(self.tap[self.gap] @ self.absorbed), 0.0)
-
-    @cached_property
-    def leaking(self) -> IntArray:
-        """Those of the cells that have a fixed leak, as places in `fed`."""
-        return np.flatnonzero(self.scene.net.g_total[self.fed] > 0.0)
-
-    def _leaks(self, through: FloatArray) -> FloatArray:
-        """Forcing by (q - q0) times the voltage of each leaking cell; `through` (rows, n_f) is that by the currents."""
-        together = through @ self.turn
-        own = [through[:, i] - (together if self.fed[i] == self.gap else 0.0) for i in self.leaking]
-        strength = self.scene.net.g_total[self.fed[self.leaking]] / self.q0
-        return np.array(own).reshape(len(own), len(through)).T * strength
-
-    def modal(self) -> Modal:
-        """The modes without charges."""
-        modes, network, source = self.modes, self.scene.network, self.source
-        n, cells = modes.rates.size, self.fed[self.leaking]
-        drives = np.column_stack([self._leaks(-modes.take[:, self.fed]), -modes.rates * self.absorbed])
-        return Modal(
-            rates=modes.rates, gain=modes.gains[:, source], drives=drives,
-            taps=np.vstack([self.tap[self.gap], self.tap[cells], self.tap[self.gap]]),
-            tap_s=self.tap_s[[self.gap, *cells, self.gap], source],
-            columns=modes.shape, bends=modes.shape @ self.absorbed, k=-modes.follow[:, source],
-            nodes=network.nodes[:, :n] @ modes.shape,
-        )  # fmt: skip
-
-    def with_charges(self, one: Modal) -> Modal | None:
-        """The modes with the charge of each source; None where a mode that does not decay takes part in a current.
-
-        A charge is z = stored v + stored_s s + passed c_gap N + y, where y' = lost v + lost_s s and the change of the
-        leaks. One more mode is y + sum over k of lost_k / rate_k w_k, which no other mode drives.
-        """
-        network, modes, source = self.scene.network, self.modes, self.source
-        n, n_s = modes.gains.shape
-        capacitance, leak = network.capacitance(self.area0)[:, None], network.leak(self.area0)[:, None]
-        at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
-        lost = network.through @ (leak * self.tap) + at_x @ modes.shape
-        lost_s = network.through @ (leak * self.tap_s) - at_x @ modes.follow + at_s
-        if np.any(lost[:, modes.rates == 0.0] != 0.0):
-            return None
+        # A charge is z = stored v + stored_s s + passed c_gap N + y, where y' = lost v + lost_s s and the change of the
+        # leaks. One more mode is y + sum over k of lost_k / rate_k w_k, which no other mode drives.
+        capacitance, leak = network.capacitance(area0)[:, None], network.leak(area0)[:, None]
+        through, at_x, at_s = network.through[:n_s], network.delivered[:n_s, :n], network.delivered[:n_s, n:]
+        lost = through @ (leak * tap) + at_x @ modes.shape
+        lost_s = through @ (leak * tap_s) - at_x @ modes.follow + at_s
+        # Whether no mode that does not decay takes part in a current; else there is no such mode.
+        self.decays = not np.any(lost[:, modes.rates == 0.0])
         over = np.divide(lost, modes.rates, out=np.zeros_like(lost), where=modes.rates > 0.0)
-        through = network.through[:, self.fed]
-        stored = network.through @ (capacitance * self.tap)
-        stored_s = network.through @ (capacitance * self.tap_s)
-        moved = stored @ self.absorbed + through @ self.turn * self.scene.net.c[self.gap]
-        # N cancels in the additional modes.
-        drives = np.column_stack([self._leaks(through) + over @ one.drives[:, :-1], np.zeros(n_s)])
-        return replace(
-            one, rates=np.append(one.rates, np.zeros(n_s)),
-            gain=np.append(one.gain, lost_s[:, source] + over @ one.gain), drives=np.vstack([one.drives, drives]),
-            taps=np.hstack([one.taps, np.zeros((len(one.taps), n_s))]),
-            columns=np.block([[one.columns, np.zeros((n, n_s))], [stored - over, np.eye(n_s)]]),
-            bends=np.append(one.bends, moved), k=np.append(one.k, stored_s[:, source]),
-            nodes=np.hstack([one.nodes, np.zeros((len(one.nodes), n_s))]),
+        stored, stored_s = through @ (capacitance * tap), through @ (capacitance * tap_s)
+        # w' = -rates w + gain s + feed g, by (q - q0) times each tap, and last by N, which cancels in the charges.
+        self.rates, gain = np.append(modes.rates, np.zeros(n_s)), modes.gains[:, source]
+        by_leaks = leaks(-modes.take[:, fed])
+        self.gain = np.append(gain, lost_s[:, source] + over @ gain)
+        by_bend = np.append(-modes.rates * self.absorbed, np.zeros(n_s))
+        self.feed = np.column_stack([np.vstack([by_leaks, leaks(through[:, fed]) + over @ by_leaks]), by_bend])
+        # xi from w and the source; state voltages and charges from w, N and the source; voltages of the nodes.
+        self.shape, self.k = np.append(tap[self.gap], np.zeros(n_s)), float(tap_s[self.gap, source])
+        moved = stored @ self.absorbed + through[:, fed] @ turn * net.c[self.gap]
+        self.rows = Shown(
+            np.block([[modes.shape, none], [stored - over, np.eye(n_s)]]),
+            np.append(-modes.follow[:, source], stored_s[:, source]),
+            np.append(modes.shape @ self.absorbed, moved), np.zeros(n + n_s, bool),
         )  # fmt: skip
+        nodes = network.nodes[:, :n] @ modes.shape
+        still = np.zeros(len(nodes))
+        self.nodes = Shown(np.pad(nodes, ((0, 0), (0, n_s))), still, nodes @ self.absorbed, still > 0.0)
 
 
 def _turns(nodes: list[tuple[str, str]], first: int) -> FloatArray:
@@ -280,49 +210,39 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
     if found is None or not is_followed(scene, problem.circuit):
         return None
     source, wave = found
-    share = _largest_share(Reduced(scene, source, scene.area0), wave.rate, problem.t_stop)
+    share = _largest_share(Reduced(scene, source, scene.area0, False), wave.rate, problem.t_stop)
     (moving,) = np.flatnonzero(scene.net.gap >= 0)
     # The peak of a current is not known to the scene; that of a voltage has been looked up in the file already.
     typical = _TYPICAL * min(scene.u_top, share * (scene.u_peak or wave.peak(0.0, problem.t_stop)))
     area0 = scene.area0.copy()
     area0[moving] = 1.0 / inverse_area(typical, scene.net.curves[moving])[0]
-    reduced = Reduced(scene, source, area0)
-    one = reduced.modal()
-    modal = reduced.with_charges(one) if problem.charge else one
-    found_curves = curves(scene.net.curves[moving], reduced.q0, reduced.kappa, scene.u_top, rtol)
+    one = Reduced(scene, source, area0, problem.charge)
+    curve = curves(scene.net.curves[moving], one.q0, one.kappa, scene.u_top, rtol)
     contact = problem.network.contacts[moving]
-    if modal is None or found_curves is None or contact is None:
+    if not one.decays or curve is None or contact is None:
         return None
-    area, bend, scale, missed, missed_bend = found_curves
-    slope, n, m = slopes(area, scale), reduced.absorbed.size, modal.rates.size
-    # 1/A - q0 has the kink of 1/A, and N the part N''(0) xi |xi| / 2.
-    active, wide = roomy(n, LEAST_MODES)
-    more = [-1] * max(LEAST_LEAKS - reduced.leaking.size, 0)
-    taps, feed = np.insert(modal.taps[1:], more, 0.0, axis=0), np.insert(modal.drives, more, 0.0, axis=1)
-    tap_s, bent = np.insert(modal.tap_s[1:], more, 0.0)[:-1], (taps[:, :n] @ reduced.absorbed)[:-1]
-    kinks = np.full(tap_s.size + 1, polyval(-1.0, slope))
-    kinks[-1] = 0.5 * scale**2 * polyval(-1.0, polyder(bend, 2))
-    shares = np.abs(modal.taps[0, :n] * reduced.absorbed)
-    fading = (reduced.modes.rates > FADED * wave.rate) & (shares > ACTING * reduced.kappa)
+    shares = np.abs(one.shape[: one.absorbed.size] * one.absorbed)
+    fading = (one.modes.rates > FADED * wave.rate) & (shares > ACTING * one.kappa)
     if rtol < OF_MANY and np.count_nonzero(fading) > 1:
         return None
+    active, wide = roomy(one.absorbed.size, LEAST_MODES)
+    # 1/A - q0 has the kink of 1/A, and N the part N''(0) xi |xi| / 2.
+    kinks = np.full(one.tap_s.size + 1, curve.steep)
+    kinks[-1] = 0.5 * curve.scale**2 * polyval(-1.0, polyder(curve.bend, 2))
     lanes = Lanes(
-        wide(modal.rates), wide(modal.gain), wide(modal.taps[0]), float(modal.tap_s[0]), wide(taps[:-1]), tap_s, bent,
-        wide(feed.T).T.copy(), area, slope, bend, scale, -1.0, reduced.q0, reduced.kappa, kinks,
-        float(polyval(-1.0, area)), float(polyval(-1.0, slope)), int(np.argmax(shares * reduced.modes.rates)),
+        wide(one.rates), wide(one.gain), wide(one.shape), one.k, wide(one.taps), one.tap_s, one.bent,
+        wide(one.feed.T).T.copy(), curve.area, curve.slope, curve.bend, curve.scale, -1.0, one.q0, one.kappa, kinks,
+        curve.rest, curve.steep, int(np.argmax(shares * one.modes.rates)),
     )  # fmt: skip
-    still, moved = np.zeros(len(modal.nodes)), modal.nodes[:, :n] @ reduced.absorbed
-    rows = Shown(wide(modal.columns), modal.k, modal.bends, np.zeros(modal.k.size, bool))
+    rows, nodes = (shown._replace(columns=wide(shown.columns)) for shown in (one.rows, one.nodes))
     return NetworkForm(
-        lanes, active, 2, False, rows, Shown(wide(modal.nodes), still, moved, still > 0.0), m - n,
-        float(contact.stress(1.0)), share, scene.u_top, missed, missed_bend,
-        float(problem.network.capacitance(reduced.area0).sum()), reduced,
+        lanes, active, 2, False, rows, nodes, one.rates.size - one.absorbed.size, float(contact.stress(1.0)), share,
+        scene.u_top, curve.missed, curve.missed_bend, float(problem.network.capacitance(area0).sum()), one,
     )  # fmt: skip
 
 
-def _largest_share(reduced: Reduced, rate: float, stop: float) -> float:
+def _largest_share(one: Reduced, rate: float, stop: float) -> float:
     """The gap's largest share of a sine of the source, over the frequencies that a recording may have."""
     omega = 2.0 * np.pi * np.geomspace(min(1.0 / stop, 0.4 * rate), 0.5 * rate, _FREQUENCIES)
-    one = reduced.modal()
-    response = one.tap_s[0] + (one.taps[0] * one.gain / (1j * omega[:, None] + one.rates)).sum(axis=1)
+    response = one.k + (one.shape * one.gain / (1j * omega[:, None] + one.rates)).sum(axis=1)
     return float(np.abs(response).max())
