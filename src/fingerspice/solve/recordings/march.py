@@ -113,7 +113,7 @@ def judge(block: Block, parts: int, peak: float, alike: FloatArray, chance: Floa
         return np.asarray(np.maximum(by_chance, there - LUCK * by_chance) + swept @ left[:active])
 
     least = 1e-9 * peak + 1e-300
-    errors, charges = np.zeros(4), Shown(*(part[form.rows.k.size - form.flows :] for part in form.rows))
+    errors, charges = np.zeros(4), Shown._make(part[form.rows.k.size - form.flows :] for part in form.rows)
     over, *others = added(np.vstack([c.shape, form.nodes.columns, charges.columns]), np.ones(own.shape))
     top = np.maximum(block.peaks, least)
     steep, xi = _steep(form, block, top), window.xi + np.einsum("k,kij->ij", form.xi[1], window.off)
