@@ -19,10 +19,10 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 400
 # Lines of all files together and of each package: as many as there are, rounded up. They are only ever lowered; what
 # moves from one package to another takes its lines along.
-ALL_LINES = 44_185
+ALL_LINES = 44_180
 PACKAGE_LINES = {
     "base": 1_101, "circuit": 2_582, "cli": 1_948, "engine": 9_342, "explorer": 1_603, "netlist": 2_565,
-    "numerics": 1_293, "physics": 514, "plots": 1_490, "results": 2_917, "sets": 399, "solve": 7_206,
+    "numerics": 1_293, "physics": 514, "plots": 1_490, "results": 2_917, "sets": 399, "solve": 7_201,
     "studies": 7_897, "torch": 513, "waveforms": 2_641,
 }  # fmt: skip
 

@@ -133,8 +133,15 @@ def test_what_has_no_such_derivatives_is_refused() -> None:
     ):
         with pytest.raises(InputError, match=said):
             run.sample_gradient(**of)
-    with pytest.raises(InputError, match="0 sources of the circuit are recordings"):
+    with pytest.raises(InputError, match=r"of the circuit's 1 sources 0 are recordings; .* beside constant ones"):
         fs.simulate(table1()).sample_gradient(f_el_mean=1.0)
+    wave = fs.Samples(volts, RATE)
+    both = fs.parse_netlist(
+        "two\nV1 a 0 0\nV2 b 0 0\nR1 a top 47k\nR2 b top 47k\n.include fingerspice.lib\n"
+        "Xcoat top g area LAYER d=1u eps_r=3.9 r=0.2meg\nXgap g 0 area GAP r=1meg\n.end\n"
+    )
+    with pytest.raises(InputError, match=r"of the circuit's 2 sources 2 are recordings; .* beside sources of 0"):
+        fs.simulate(both, sources={"V1": wave, "V2": wave}, **how).sample_gradient(f_el_mean=1.0)
     further = fs.simulate(table1(), sources=fs.Samples(volts, RATE), start=run, t_stop=2.0 * T_STOP)
     with pytest.raises(InputError, match="goes on from another one"):
         further.sample_gradient(f_el_mean=1.0)

@@ -28,7 +28,6 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block
 from fingerspice.solve.recordings.form import PIECES, LaneForm
 from fingerspice.solve.recordings.march import LEAST_MARGIN
-from fingerspice.solve.recordings.networks import recording_of
 from fingerspice.solve.recordings.pieces import driving
 from fingerspice.solve.recordings.run import ready
 from fingerspice.solve.simulation import asked
@@ -112,18 +111,14 @@ def _source_of(problem: Problem) -> tuple[str, float, Samples]:
             "derivatives by samples are asked for, and the circuit has no single GAP whose area is coupled; allowed: "
             "one"
         )
-    if stack is None:
-        found = recording_of(problem)
-        known = [] if found is None else [(problem.network.sources[found[0]].name, 1.0, found[1])]
-    else:
-        waves = [
-            (e.name, float(sign), None if e.waveform is None else as_samples(e.waveform)) for e, sign in stack.sources
-        ]
-        known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
+    sources = [(e, 1.0) for e in problem.network.sources] if stack is None else stack.sources
+    waves = [(e.name, float(sign), None if e.waveform is None else as_samples(e.waveform)) for e, sign in sources]
+    known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
     if len(known) != 1 or not isinstance(driving(problem), Samples):
+        others = "sources of 0" if stack is None else "constant ones"
         raise InputError(
-            f"derivatives by samples are asked for, and {len(known)} sources of the circuit are recordings; allowed: "
-            "one, such as fs.Samples, or a PWL on an even grid, beside constant ones"
+            f"derivatives by samples are asked for, and of the circuit's {len(waves)} sources {len(known)} are "
+            f"recordings; allowed: one, such as fs.Samples, or a PWL on an even grid, beside {others}"
         )
     return known[0]
 
