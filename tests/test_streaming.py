@@ -436,6 +436,11 @@ def test_options_of_streams_are_checked_and_without_zarr_a_store_says_how_to_get
         result = command("run", "long.cir", *arguments.split())
         assert result.code == 2
         assert said in result.lines[-1]
+    (scene / "flat.cir").write_text("rc\nV1 a 0 SIN(0 1 50)\nR1 a b 1k\nC1 b 0 1u\n.tran 1m 40m\n.end\n")
+    for name in ("u_layer", "f_el"):
+        result = command("run", "flat.cir", "--stream", "--signals", f"v,{name}")
+        assert result.code == 2
+        assert f"--signals names '{name}'; allowed: u_source, q_source" in result.lines[-1]
     monkeypatch.setitem(sys.modules, "zarr", None)
     assert "pip install 'fingerspice[stream]'" in command(*STREAM).lines[-1]
     assert not (scene / "out").exists()

@@ -216,16 +216,16 @@ def run_streamed(
 
 
 def _names(signals: str | None, circuit: Circuit) -> list[str]:
-    """Keys of the signals that are written."""
+    """Keys of the signals that are written, of those that the circuit has."""
     from fingerspice.results.signals import SIGNALS
 
+    has = {"gap": circuit.by_device("GAP"), "layer": [e for e in circuit.elements if e.spec.is_layer]}
+    allowed = [name for name, signal in SIGNALS.items() if has.get(signal.of, True)]
     if signals is None:
-        layers = any(element.spec.is_layer for element in circuit.elements)
-        return ["u_gap", "f_el"] if circuit.by_device("GAP") else ["u_layer"] if layers else ["v"]
+        return ["u_gap", "f_el"] if has["gap"] else ["u_layer"] if has["layer"] else ["v"]
     names = [name.strip() for name in signals.split(",")]
-    for name in names:
-        if name not in SIGNALS:
-            raise InputError(f"--signals names {name!r}; allowed: {', '.join(SIGNALS)}")
+    if unknown := [name for name in names if name not in allowed]:
+        raise InputError(f"--signals names {unknown[0]!r}; allowed: {', '.join(allowed)}")
     return sorted(set(names), key=list(SIGNALS).index)
 
 
