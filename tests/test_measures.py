@@ -93,7 +93,7 @@ def test_figures_are_the_same_whatever_tstep(law, source, name):
         circuit, sources={drive: waveform}, t_stop=3e-3, t_eval=np.linspace(0.0, 3e-3, 60_001), charge_law=law,
         rtol=1e-10, throw=False,
     )  # fmt: skip
-    signals = {name: fine.all_signals.one(name) for name in fine._figures.shown}
+    signals = {name: fine.record.one(name) for name in fine._figures.shown}
     for key in (k for k in signals if k.startswith(("u_gap", "f_el"))):
         x = signals[key]
         error = fine.error.u_gap + 1e-7 * np.abs(x).max()

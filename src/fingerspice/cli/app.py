@@ -152,7 +152,7 @@ def run(
         writes, fingers, unfelt = results.ready() if solution.t.size else [], [], None
         if feel and solution.success:
             try:
-                fingers = [felt(solution, name) for name in solution.all_signals.names("f_t")]
+                fingers = [felt(solution, name) for name in solution.record.names("f_t")]
                 answer.update(feel=[one.to_dict() for one in fingers])
                 writes += results.pictures(image, lambda: fingers[0].plot(fingers[1:]))
             except InputError as error:

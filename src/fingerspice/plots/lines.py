@@ -77,7 +77,7 @@ def end_of(solution: Solution) -> float:
 def signal_of(solution: Solution, key: str) -> dict[str, FloatArray]:
     """A signal by name; empty if this run lacks the element, which another run of the picture may have."""
     kind, colon, _ = key.partition(":")
-    return solution.by_name(key) if not colon or key in solution.all_signals.names(kind) else {}
+    return solution.by_name(key) if not colon or key in solution.record.names(kind) else {}
 
 
 def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:

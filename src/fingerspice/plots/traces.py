@@ -117,10 +117,10 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
 
 def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[tuple[Quantity, list[str]]]:
     """Panels from top to bottom, each with the names of its signals."""
-    every = [run.solution.all_signals for run in runs]
+    every = [run.solution.record for run in runs]
     if signals is None:
         contact = any(s.gaps for s in every)
-        layers = any(s.record.layers for s in every)
+        layers = any(s.layers for s in every)
         signals = (
             ["u_source", "u_gap", "f_el", "area", "f_t"] if contact else ["u_source", "u_layer" if layers else "v"]
         )

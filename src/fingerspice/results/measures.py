@@ -12,8 +12,8 @@ from numpy.polynomial import legendre
 from fingerspice.base.arrays import FloatArray
 from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS
-from fingerspice.results.signals import AnyRecord
-from fingerspice.results.steps import Panels, Read, Recorded
+from fingerspice.results.signals import Signals
+from fingerspice.results.steps import Panels, Recorded
 
 _NODES = POINTS[:NODES]
 #: Smallest tolerance of the interpolation error of a panel, relative to the signal's peak.
@@ -63,9 +63,9 @@ class Stretch:
             self.panels = _joined([self.panels.take(~long), self.panels.take(long).halved()])
         self._share, self._shares = _shares(self.panels)
 
-    def weigh(self, read: Read) -> Weighed:
+    def weigh(self, name: str) -> Weighed:
         """A signal with weights for its means."""
-        t, x = self.run.at_points(read, self.panels)
+        t, x = self.run.at_points(name, self.panels)
         peak = float(np.abs(x).max(initial=0.0)) or 1.0
         missed = _missed(x) / peak
         # Gauss-Lobatto weights integrate polynomials up to twice the degree of the interpolant exactly. If the terms of
@@ -73,33 +73,33 @@ class Stretch:
         # on the safe side.
         if float((self._share * missed**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
             return Weighed(t[:, :NODES], self._shares, x[:, :NODES])
-        return self._cut(read, t, x, _FINEST)[0]
+        return self._cut(name, t, x, _FINEST)[0]
 
-    def extremes(self, read: Read) -> tuple[float, float]:
+    def extremes(self, name: str) -> tuple[float, float]:
         """Smallest and largest value of a signal, evaluated where its polynomials have their extremes."""
         # An interpolation error shifts the place of an extreme, which changes the signal there by its square only.
-        weighed, panels = self._cut(read, *self.run.at_points(read, self.panels), max(_FINEST, 1e-3 * self.rtol))
+        weighed, panels = self._cut(name, *self.run.at_points(name, self.panels), max(_FINEST, 1e-3 * self.rtol))
         found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
         panel, place = np.array([p for p, _, _ in found]), np.array([x for _, x, _ in found])
         panels = panels.take(panel)
-        _, exact = self.run.values_at(read, panels.step, panels.fractions(place[:, None]))
+        _, exact = self.run.values_at(name, panels.step, panels.fractions(place[:, None]))
         low, high = exact[:, 0].tolist()
         return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
 
-    def at_nodes(self, reads: Sequence[Read], tol: float) -> list[FloatArray]:
+    def at_nodes(self, names: Sequence[str], tol: float) -> list[FloatArray]:
         """Times (s) and these signals at the nodes of panels on which each misses its polynomial by `tol` of its peak.
 
         All have the shape (p, NODES). Panels on which the rounding of the time alone is as much, as on an edge of 1 ns,
         are not cut.
         """
         shortest = np.finfo(float).eps * abs(self.span[1]) / tol
-        for read in reads:
-            self.panels = self._cut(read, *self.run.at_points(read, self.panels), tol, shortest)[1]
-        found = [self.run.at_points(read, self.panels) for read in reads]
+        for name in names:
+            self.panels = self._cut(name, *self.run.at_points(name, self.panels), tol, shortest)[1]
+        found = [self.run.at_points(name, self.panels) for name in names]
         return [x[:, :NODES] for x in (found[0][0], *(x for _, x in found))]
 
     def _cut(
-        self, read: Read, t: FloatArray, x: FloatArray, tol: float, shortest: float = 0.0
+        self, name: str, t: FloatArray, x: FloatArray, tol: float, shortest: float = 0.0
     ) -> tuple[Weighed, Panels]:
         """A signal, and panels on which its interpolation error is at most `tol` of its peak, or as short as told."""
         smooth = tol * float(np.abs(x).max(initial=0.0))
@@ -115,7 +115,7 @@ class Stretch:
                 break
             panels = panels.take(wrong).halved()
             most -= panels.step.size
-            t, x = self.run.at_points(read, panels)
+            t, x = self.run.at_points(name, panels)
         every = _joined([part[0] for part in parts])
         t, x = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
         return Weighed(t, _shares(every)[1], x), every
@@ -139,22 +139,22 @@ def _shares(panels: Panels) -> tuple[FloatArray, FloatArray]:
 class Outputs:
     """Outputs of a record from number `first` on; after interpolated ones at a time `start` (s) if that is given."""
 
-    def __init__(self, record: AnyRecord, first: int = 0, start: float | None = None) -> None:
+    def __init__(self, record: Signals, first: int = 0, start: float | None = None) -> None:
         self.record, self.first, self.start = record, first, start
 
-    def _values(self, read: Read) -> tuple[FloatArray, FloatArray]:
-        t, x = self.record.t, read(self.record)
+    def _values(self, name: str) -> tuple[FloatArray, FloatArray]:
+        t, x = self.record.t, self.record.one(name)
         if self.start is None:
             return t[self.first :], x[self.first :]
         return np.append(self.start, t[self.first :]), np.append(np.interp(self.start, t, x), x[self.first :])
 
-    def weigh(self, read: Read) -> Weighed:
+    def weigh(self, name: str) -> Weighed:
         """A signal with weights for its means."""
-        return weigh_outputs(*self._values(read))
+        return weigh_outputs(*self._values(name))
 
-    def extremes(self, read: Read) -> tuple[float, float]:
+    def extremes(self, name: str) -> tuple[float, float]:
         """Smallest and largest value of a signal."""
-        _, x = self._values(read)
+        _, x = self._values(name)
         return float(x.min()), float(x.max())
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -13,27 +11,8 @@ from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.network import Network
 from fingerspice.engine.network import Net
 from fingerspice.physics.contact import Contact, areas, forces, inverse_area_array
+from fingerspice.results.signals import Signals, sealed, side_by_side
 from fingerspice.waveforms.waveform import Waveform
-
-
-def sealed(x: FloatArray) -> FloatArray:
-    """The same array, read-only."""
-    x.flags.writeable = False
-    return x
-
-
-class Sealed:
-    """A result whose arrays are read-only, also after copying or unpickling, which both make writable arrays."""
-
-    def __post_init__(self) -> None:
-        for value in vars(self).values():
-            for array in value.values() if isinstance(value, dict) else (value,):
-                if isinstance(array, np.ndarray):
-                    sealed(array)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        Sealed.__post_init__(self)
 
 
 def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
@@ -49,7 +28,7 @@ def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Record(Sealed):
+class Record(Signals):
     """Outputs of a run as they were computed, and the signals that follow from them.
 
     Signals of gaps and of sources have the shape (n_t,) where there is one of them, else (n_t, n).
@@ -64,18 +43,18 @@ class Record(Sealed):
     rows: FloatArray
     has_charge: bool
 
-    @property
-    def layers(self) -> tuple[str, ...]:
+    @cached_property
+    def layers(self) -> tuple[str, ...]:  # type: ignore[override]
         """Names of the layers, in the order of `u_layer`."""
         return tuple(e.name for e in self.network.layers)
 
-    @property
-    def sources(self) -> tuple[str, ...]:
+    @cached_property
+    def sources(self) -> tuple[str, ...]:  # type: ignore[override]
         """Names of the sources, in the order of the columns of their signals."""
         return tuple(e.name for e in self.network.sources)
 
     @cached_property
-    def fingers(self) -> tuple[tuple[str, Contact], ...]:
+    def fingers(self) -> tuple[tuple[str, Contact], ...]:  # type: ignore[override]
         """Each GAP's name and contact."""
         found = ((self.network.areas[i].gap, self.network.contacts[i]) for i in self.network.fingers)
         return tuple((gap.name, contact) for gap, contact in found if gap is not None and contact is not None)
@@ -208,17 +187,11 @@ class Record(Sealed):
         return sealed(np.linalg.det(held + met) / np.linalg.det(held))
 
     @cached_property
-    def node_voltages(self) -> dict[str, FloatArray]:
+    def node_voltages(self) -> dict[str, FloatArray]:  # type: ignore[override]
         """Voltage of every node against ground, V, shape (n_t,) each."""
         n = self._x.shape[1]
         rows = zip(self.network.node_names, self.network.nodes, strict=True)
         return {name: sealed(self._voltage(row[:n], row[n:])) for name, row in rows}
-
-
-def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray:
-    """Signals (n_t,) of several elements as a table, that of one as it is."""
-    # A view of a run's rows is copied, so that it does not seal them.
-    return sealed(np.column_stack([*columns]) if len(columns) != 1 else np.array(columns[0]))
 
 
 def bare_record(network: Network, net: Net, t: FloatArray, left: BoolArray, rows: FloatArray) -> Record:

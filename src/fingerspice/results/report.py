@@ -33,7 +33,7 @@ def summary_table(solution: Solution) -> Page:
         "",
     ]
     if solution.t.size >= 2:
-        names = [name for key in _ROWS for name in solution.all_signals.names(key) if f"{name}_max" in s]
+        names = [name for key in _ROWS for name in solution.record.names(key) if f"{name}_max" in s]
         out.append(Table(("", *_COLUMNS), [_row(name, s) for name in names]))
         if any(s.get(f"{name}_mean_periodic") is not None for name in ("u_source", "f_el")):
             out.append("last period: the mean over it; rms and ripple (max - min) are those of the last period, too")

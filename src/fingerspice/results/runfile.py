@@ -22,7 +22,7 @@ from fingerspice.circuit.loop import checked
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.physics.contact import Contact
 from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, State, Status
-from fingerspice.results.signals import kept_rows, stored_record, variables
+from fingerspice.results.signals import StoredRecord, kept_rows, variables
 from fingerspice.results.solution import Solution
 from fingerspice.results.steps import Block, Recorded
 from fingerspice.waveforms import combinations, periodic, ramps, samples
@@ -188,7 +188,7 @@ def _solution(file: Any) -> Solution:
     if np.any(np.diff(t) < 0.0):
         raise ValueError("its times do not ascend")
     fingers = tuple((str(name), Contact(**values)) for name, values in run["contacts"])
-    of_names = partial(stored_record, sources=tuple(map(str, run["sources"])), fingers=fingers)
+    sources = tuple(map(str, run["sources"]))
     continuous = None
     if "between" in group.variables:
         # The last period, of which each panel is a step.
@@ -196,11 +196,11 @@ def _solution(file: Any) -> Solution:
         begin, end = period[::NODES, 0], period[NODES - 1 :: NODES, 0]
         values = period[:, 1:].reshape(begin.size, NODES, -1).transpose(0, 2, 1)
         steps = Block(np.column_stack([begin, end - begin, end, np.ones(begin.size)]), values)
-        make = partial(of_names, tuple(map(str, run["between"])))
+        make = partial(StoredRecord, tuple(map(str, run["between"])), sources, fingers)
         continuous = Recorded((steps,), float(run["t_stop"]) - float(run["period"]), make)
     return Solution(
         t=t,
-        record=of_names(signals, t, None, table[:, 1:].T),
+        record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:].T),
         circuit=_circuit(file, run),
         continuous=continuous,
         stored=dict(run["summary"]),

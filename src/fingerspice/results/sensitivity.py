@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.results.record import Sealed
+from fingerspice.results.signals import Sealed
 
 #: Signals and means that have derivatives.
 SIGNALS = ("u_gap", "area", "f_el", "f_t", "friction")

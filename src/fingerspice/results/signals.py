@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +11,6 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.physics.contact import Contact
-from fingerspice.results.record import Record, Sealed, side_by_side
 from fingerspice.waveforms.waveform import require
 
 
@@ -57,70 +54,66 @@ def signal_of(name: str) -> Signal:
     return SIGNALS[name.partition(":")[0]]
 
 
-@dataclass(frozen=True, eq=False)
-class StoredRecord(Sealed):
-    """Outputs of a run as they were read from a file."""
+def sealed(x: FloatArray) -> FloatArray:
+    """The same array, read-only."""
+    x.flags.writeable = False
+    return x
+
+
+class Sealed:
+    """A result whose arrays are read-only, also after copying or unpickling, which both make writable arrays."""
+
+    def __post_init__(self) -> None:
+        for value in vars(self).values():
+            for array in value.values() if isinstance(value, dict) else (value,):
+                if isinstance(array, np.ndarray):
+                    sealed(array)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        Sealed.__post_init__(self)
+
+
+def side_by_side(columns: Sequence[FloatArray] | FloatArray) -> FloatArray:
+    """Signals (n_t,) of several elements as a table, that of one as it is."""
+    # A view of a run's rows is copied, so that it does not seal them.
+    return sealed(np.column_stack([*columns]) if len(columns) != 1 else np.array(columns[0]))
+
+
+class Signals(Sealed):
+    """Outputs of a run, with signals by name, each computed when it is first asked for; shapes as in `Solution`."""
 
     t: FloatArray  # (n_t,): s; at a jump two entries share a time
-    sources: tuple[str, ...]
+    sources: tuple[str, ...]  # Names of the sources, in the order of the columns of their signals
     fingers: tuple[tuple[str, Contact], ...]  # Each GAP's name and contact
-    layers: tuple[str, ...]
-    values: dict[str, FloatArray]  # Signals that the run has, by name, shaped as those of `Record`
+    layers: tuple[str, ...]  # Names of the layers, in the order of `u_layer`
     node_voltages: dict[str, FloatArray]
-
-
-def stored_record(
-    names: Sequence[str], t: FloatArray, left: BoolArray | None, columns: FloatArray, *, sources: tuple[str, ...],
-    fingers: tuple[tuple[str, Contact], ...],
-) -> StoredRecord:  # fmt: skip
-    """A record at times (s), left-hand values or not, of signals ``key`` or ``key:element`` of shape (n, n_t)."""
-    own: dict[str, dict[str, FloatArray]] = {key: {} for key in SIGNALS}
-    for name, column in zip(names, columns, strict=True):
-        key, _, element = name.partition(":")
-        own[key][element] = np.ascontiguousarray(column)
-    nodes, layers = own.pop("v"), own.pop("u_layer")
-    values = {key: side_by_side([*one.values()]) for key, one in own.items() if one and not SIGNALS[key].base}
-    values["u_layer"] = np.column_stack([np.zeros((t.size, 0)), *layers.values()])
-    return StoredRecord(t, sources, fingers, tuple(layers), values, nodes)
-
-
-AnyRecord = Record | StoredRecord
-
-
-class Signals:
-    """Signals of a record by name, each computed when it is first asked for; shapes and units as in `Solution`."""
-
-    def __init__(self, record: AnyRecord) -> None:
-        self.record = record
-        self._derived: dict[str, FloatArray] = {}
 
     @property
     def gaps(self) -> tuple[str, ...]:
         """Names of the GAPs."""
-        return tuple(name for name, _ in self.record.fingers)
+        return tuple(name for name, _ in self.fingers)
 
     def value(self, key: str) -> FloatArray | None:
         """A signal, shape (n_t,), or (n_t, n) where n elements have it; None where the run has no such signal."""
         signal = SIGNALS[key]
-        if signal.of == "gap" and key != "area" and not self.gaps:
+        if signal.of == "gap" and key != "area" and not self.fingers:
             return None
-        if signal.make is None:
-            found = self.record.values if isinstance(self.record, StoredRecord) else {key: getattr(self.record, key)}
-            return found.get(key)
-        if key not in self._derived:
-            base, contacts = self.value(signal.base), [contact for _, contact in self.record.fingers]
+        if signal.make is not None and key not in vars(self):
+            base = self.value(signal.base)
             assert base is not None
-            columns = [base] if len(contacts) == 1 else base.T
-            made = [signal.make(contact, x) for contact, x in zip(contacts, columns, strict=True)]
-            self._derived[key] = side_by_side(made)
-        return self._derived[key]
+            columns = [base] if len(self.fingers) == 1 else base.T
+            made = [signal.make(contact, x) for (_, contact), x in zip(self.fingers, columns, strict=True)]
+            vars(self)[key] = side_by_side(made)
+        found: FloatArray | None = getattr(self, key, None)
+        return found
 
     def columns(self, key: str) -> tuple[str, ...]:
         """Names of the layers, gaps, sources or nodes to which the columns of a signal belong."""
-        record, of = self.record, SIGNALS[key].of
+        of = SIGNALS[key].of
         if of == "node":
-            return tuple(record.node_voltages)
-        return {"": (), "source": record.sources, "layer": record.layers, "gap": self.gaps}[of]
+            return tuple(self.node_voltages)
+        return {"": (), "source": self.sources, "layer": self.layers, "gap": self.gaps}[of]
 
     def names(self, key: str) -> tuple[str, ...]:
         """``key`` itself, or ``key:element`` for each of several elements; empty where the run has no such signal.
@@ -148,10 +141,28 @@ class Signals:
         """The signal of one of the `names`, shape (n_t,)."""
         key, colon, element = name.partition(":")
         if key == "v":
-            return self.record.node_voltages[element]
+            return self.node_voltages[element]
         value = self.value(key)
         assert value is not None
         return value[:, self.columns(key).index(element)] if colon else value
+
+
+class StoredRecord(Signals):
+    """Outputs of a run as they were read from a file: signals ``key`` or ``key:element`` as columns (n, n_t)."""
+
+    def __init__(
+        self, names: Sequence[str], sources: tuple[str, ...], fingers: tuple[tuple[str, Contact], ...], t: FloatArray,
+        left: BoolArray | None, columns: FloatArray,
+    ) -> None:  # fmt: skip
+        own: dict[str, dict[str, FloatArray]] = {key: {} for key in SIGNALS}
+        for name, column in zip(names, columns, strict=True):
+            key, _, element = name.partition(":")
+            own[key][element] = np.ascontiguousarray(column)
+        self.t, self.sources, self.fingers = t, sources, fingers
+        self.node_voltages, layers = own.pop("v"), own.pop("u_layer")
+        self.layers, self.u_layer = tuple(layers), np.column_stack([np.zeros((t.size, 0)), *layers.values()])
+        vars(self).update({k: side_by_side([*x.values()]) for k, x in own.items() if x and not SIGNALS[k].base})
+        self.__post_init__()
 
 
 def attribute(get: Callable[[Any], Any], doc: str) -> Any:
@@ -161,39 +172,34 @@ def attribute(get: Callable[[Any], Any], doc: str) -> Any:
 
 def _given(key: str, doc: str) -> FloatArray | None:
     """A property: a signal; None where the run has no such signal."""
-    return attribute(lambda result: result.all_signals.value(key), doc)  # type: ignore[no-any-return]
+    return attribute(lambda result: result.record.value(key), doc)  # type: ignore[no-any-return]
 
 
 class Signalled:
     """A result with the signals of a record."""
 
     t: FloatArray
-    record: AnyRecord
-
-    @cached_property
-    def all_signals(self) -> Signals:
-        """The signals by name, with the elements to which their columns belong."""
-        return Signals(self.record)
+    record: Signals
 
     layers: tuple[str, ...] = attribute(lambda result: result.record.layers, "Names of the columns of `u_layer`.")
-    gaps: tuple[str, ...] = attribute(lambda result: result.all_signals.gaps, "Names of the GAPs.")
+    gaps: tuple[str, ...] = attribute(lambda result: result.record.gaps, "Names of the GAPs.")
     sources: tuple[str, ...] = attribute(
         lambda result: result.record.sources,
         "Names of the sources of a network; of a series stack there is one, its loop.",
     )
     u_source: FloatArray = attribute(
-        lambda result: result.all_signals.one("u_source"),
+        lambda result: result.record.one("u_source"),
         "Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,).",
     )
     u_layer: FloatArray = attribute(
-        lambda result: result.all_signals.one("u_layer"),
+        lambda result: result.record.one("u_layer"),
         "Voltage of each layer from its p to its n node, V, shape (n_t, n_layer).",
     )
     node_voltages: dict[str, FloatArray] = attribute(
         lambda result: result.record.node_voltages, "Node name to its voltage, V, shape (n_t,)."
     )
     fold_margin: FloatArray = attribute(
-        lambda result: result.all_signals.one("fold_margin"),
+        lambda result: result.record.one("fold_margin"),
         "Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`.",
     )
     area = _given("area", "Ridge contact area, m^2, shape (n_t,); None for a circuit without any.")
@@ -226,7 +232,7 @@ class Signalled:
         InputError
             For a name that no signal has.
         """
-        return {name: self.all_signals.one(name) for name in self.all_signals.names(key)}
+        return {name: self.record.one(name) for name in self.record.names(key)}
 
     @property
     def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
@@ -264,7 +270,7 @@ def variables(
         several = key in ("u_layer", "v")
         about = {"units": signal.unit, "long_name": signal.text}
         if len(columns) > 1 or (several and key in wanted):
-            coords[signal.of] = ((signal.of,), np.array(solution.all_signals.columns(key), dtype=object), {})
+            coords[signal.of] = ((signal.of,), np.array(solution.record.columns(key), dtype=object), {})
             table = np.column_stack([np.zeros((int(keep.sum()), 0)), *columns])
             data[key] = (("time", signal.of), table, about)
         elif columns:

@@ -15,9 +15,8 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown
 from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status
-from fingerspice.results.record import Sealed
 from fingerspice.results.report import summary_table
-from fingerspice.results.signals import AnyRecord, Signalled, kept_rows, variables
+from fingerspice.results.signals import Sealed, Signalled, Signals, kept_rows, variables
 from fingerspice.results.summary import Figured, Figures
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ class Solution(Sealed, Shown, Signalled, Figured):
     """
 
     t: FloatArray
-    record: AnyRecord
+    record: Signals
     status: Status
     failure: Failure | None
     nfev: int
@@ -125,7 +124,7 @@ class Solution(Sealed, Shown, Signalled, Figured):
         return Figures(copy(self))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in vars(self).items() if key not in ("_figures", "all_signals")}
+        return {key: value for key, value in vars(self).items() if key != "_figures"}
 
     def summary(self) -> dict[str, Any]:
         """Figures of the run: peak, rms, mean, ripple, amplitude and phase at the fundamental; SI units.

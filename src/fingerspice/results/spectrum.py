@@ -15,8 +15,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.spectrum import NOTABLE, energy_outside
-from fingerspice.results.record import Sealed
-from fingerspice.results.signals import signal_of
+from fingerspice.results.signals import Sealed, signal_of
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -120,7 +119,7 @@ def spectrum_of(
     highest = None if highest is None else positive_number("highest", highest, "Hz")
     resolution = None if resolution is None else positive_number("resolution", resolution, "Hz")
     since = None if since is None else real_number("since", since, "a number in s")
-    names = solution.all_signals.names(signal)
+    names = solution.record.names(signal)
     if len(names) != 1:
         known = ", ".join(names) or "signals of elements that the circuit has"
         raise InputError(f"signal {signal!r} has {len(names)} columns and a spectrum is of one; allowed: {known}")
@@ -215,7 +214,7 @@ def _density(
 
 def _even_outputs(solution: Solution, name: str, since: float | None) -> tuple[FloatArray, FloatArray]:
     """Times (s) and values of a signal's outputs, evenly spaced, without the additional ones at jumps of the source."""
-    t, x = solution.t, solution.all_signals.one(name)
+    t, x = solution.t, solution.record.one(name)
     require(since is None or (t.size > 0 and since < t[-1]), "since", since, "a time before the end of the run, s")
     # Of the two rows of a jump keep the right-hand one if the jump is at an even output time, else none.
     kept = np.append(np.diff(t) > 0.0, True)[: t.size] & (t >= (-math.inf if since is None else since))

@@ -5,10 +5,10 @@ Steps are recorded as the run is made, or chosen for a run that can be computed 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -17,13 +17,12 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.collocation.readout import RECORDED, Steps, new_steps
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS, TO_SERIES
 from fingerspice.results.record import Record, bare_record
+from fingerspice.results.signals import Signals
 from fingerspice.waveforms.sampling import same_time
 from fingerspice.waveforms.waveform import Waveform
 
-#: From the record of a run to one of its signals, shape (n_t,).
-Read = Callable[[Any], FloatArray]
 #: From times (s), a mask of left-hand values and states as columns to a record.
-Make = Callable[[FloatArray, BoolArray, FloatArray], Any]
+Make = Callable[[FloatArray, BoolArray, FloatArray], Signals]
 
 #: Most steps recorded by the compiled loop before Python collects them, and most numbers at their nodes.
 CAPACITY, _AT_ONCE = 512, 16_384
@@ -116,9 +115,11 @@ class Recorded:
     first: float
     make: Make
     # Records at places that were asked for, as signals are mostly asked for at the same places one after another
-    _known: dict[tuple[bytes, bytes], tuple[FloatArray, Any]] = field(default_factory=dict, repr=False, compare=False)
+    _known: dict[tuple[bytes, bytes], tuple[FloatArray, Signals]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
-    def run(self, readers: Mapping[str, Read], since: float, until: float) -> Recorded | None:
+    def run(self, names: Sequence[str], since: float, until: float) -> Recorded | None:
         """These steps; None where they begin after `since` (s)."""
         return self if since >= self.first - 1e-9 * (until - since) else None
 
@@ -161,7 +162,7 @@ class Recorded:
         return Panels(index, low, high, weight * (high - low) * length[index]).take(weight > 0.0)
 
     @cached_property
-    def _whole(self) -> tuple[FloatArray, Any]:
+    def _whole(self) -> tuple[FloatArray, Signals]:
         """Times (k, ROWS) and the record at the points of every step, up to the end that it reached."""
         columns = np.concatenate([self.values, self.values @ BETWEEN], axis=2)
         reach = self.times[3]
@@ -171,26 +172,26 @@ class Recorded:
             columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], _basis(fraction[short]))
         return self._record(slice(None), fraction, columns.transpose(1, 0, 2))
 
-    def _record(self, index: IntArray | slice, fraction: FloatArray, columns: FloatArray) -> tuple[FloatArray, Any]:
+    def _record(self, index: IntArray | slice, fraction: FloatArray, columns: FloatArray) -> tuple[FloatArray, Signals]:
         """Times at fractions of steps, and the record there of states, shape (n_column, *fraction.shape)."""
         start, length, reached, reach = self.times[:, index, None]
         left = fraction >= reach
         t = np.where(left, reached, start + fraction * length)
         return t, self.make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size))
 
-    def at_points(self, read: Read, panels: Panels) -> tuple[FloatArray, FloatArray]:
+    def at_points(self, name: str, panels: Panels) -> tuple[FloatArray, FloatArray]:
         """Times (s) and a signal at the `POINTS` of panels, shape (p, ROWS) each."""
         own = (panels.low == 0.0) & (panels.high == self.times[3, panels.step])
         if not own.any():
-            return self.values_at(read, panels.step, panels.fractions(POINTS))
+            return self.values_at(name, panels.step, panels.fractions(POINTS))
         # Panels that are whole steps share one record for all signals.
         t_own, record = self._whole
-        t, x = t_own[panels.step], read(record).reshape(t_own.shape)[panels.step]
+        t, x = t_own[panels.step], record.one(name).reshape(t_own.shape)[panels.step]
         if not own.all():
-            t[~own], x[~own] = self.values_at(read, panels.step[~own], panels.fractions(POINTS)[~own])
+            t[~own], x[~own] = self.values_at(name, panels.step[~own], panels.fractions(POINTS)[~own])
         return t, x
 
-    def values_at(self, read: Read, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def values_at(self, name: str, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Times (s) and a signal at fractions (p, n) of the steps with these indices (p,), shape (p, n) each."""
         key = index.tobytes(), fraction.tobytes()
         found = self._known.get(key)
@@ -202,7 +203,7 @@ class Recorded:
                     self._known.pop(next(iter(self._known)), None)
                 self._known[key] = found
         t, record = found
-        return t, read(record).reshape(t.shape)
+        return t, record.one(name).reshape(t.shape)
 
 
 def _basis(fraction: FloatArray) -> FloatArray:
@@ -237,11 +238,8 @@ class ClosedForm:
     error: float = 0.0
     rounding: float = 0.0  # Round-off of a voltage, V, below which the polynomials need not be accurate
 
-    def run(self, readers: Mapping[str, Read], since: float, until: float) -> Recorded | None:
-        """Steps between two times (s), on each of which a polynomial represents every voltage; None if too many.
-
-        `readers` gives, by name, the functions that read signals from a record.
-        """
+    def run(self, names: Sequence[str], since: float, until: float) -> Recorded | None:
+        """Steps between two times (s), on each of which a polynomial represents every voltage; None if too many."""
         marks = self._marks(since, until)
         if marks is None:
             return None
@@ -249,7 +247,7 @@ class ClosedForm:
         done: list[FloatArray] = []
         peaks: dict[str, float] = {}
         for _ in range(_MOST_ROUNDS):
-            wrong = self._is_rough(readers, begin, end, peaks)
+            wrong = self._is_rough(names, begin, end, peaks)
             done.append(begin[~wrong])
             if not wrong.any():
                 break
@@ -259,7 +257,7 @@ class ClosedForm:
                 return None
         marks = np.append(np.sort(np.concatenate(done)), marks[-1])
         record, place = self._at_points(marks[:-1], marks[1:])
-        if zeros := list(self._zeros(readers, marks, record, place)):
+        if zeros := list(self._zeros(names, marks, record, place)):
             marks = np.unique(np.concatenate([marks, *zeros]))
             record, place = self._at_points(marks[:-1], marks[1:])
         begin, end = marks[:-1], marks[1:]
@@ -296,30 +294,26 @@ class ClosedForm:
         place[order] = np.arange(order.size)
         return self.look(t.ravel()[order], left.ravel()[order]), place.reshape(t.shape)
 
-    def _is_rough(
-        self, readers: Mapping[str, Read], begin: FloatArray, end: FloatArray, peaks: dict[str, float]
-    ) -> BoolArray:
+    def _is_rough(self, names: Sequence[str], begin: FloatArray, end: FloatArray, peaks: dict[str, float]) -> BoolArray:
         """Whether some voltage's interpolation error on a panel is too large, shape (p,)."""
         record, place = self._at_points(begin, end)
         wrong = np.zeros(begin.size, bool)
-        for name, read in readers.items():
+        for name in names:
             if not name.startswith(("u_", "v:")):
                 # Signals that follow from the gap voltage are smooth where it is, except at its zeros.
                 continue
-            values = read(record)[place]
+            values = record.one(name)[place]
             peaks[name] = max(peaks.get(name, 0.0), float(np.abs(values).max(initial=0.0)))
             missed = np.abs(values[:, :NODES] @ BETWEEN - values[:, NODES:]).max(axis=1)
             wrong |= missed > max(max(_MISSED, self.error) * peaks[name], self.rounding)
         return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
 
-    def _zeros(
-        self, readers: Mapping[str, Read], marks: FloatArray, record: Record, place: IntArray
-    ) -> Iterator[FloatArray]:
+    def _zeros(self, names: Sequence[str], marks: FloatArray, record: Record, place: IntArray) -> Iterator[FloatArray]:
         """Zeros of gap voltages (s) within panels, where the area has a kink."""
-        for name, read in readers.items():
+        for name in names:
             if name.partition(":")[0] != "u_gap":
                 continue
-            values = read(record)[place[:, :NODES]]
+            values = record.one(name)[place[:, :NODES]]
             for i in np.flatnonzero((values.max(axis=1) > self.rounding) & (values.min(axis=1) < -self.rounding)):
                 roots = chebyshev.chebroots(values[i] @ TO_SERIES[:, :NODES])
                 inside = roots.real[(np.abs(roots.imag) < 1e-8) & (np.abs(roots.real) < 1.0)]

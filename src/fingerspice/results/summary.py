@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,8 +12,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.measures import Outputs, Stretch, Weighed
-from fingerspice.results.record import sealed
-from fingerspice.results.signals import AnyRecord, Signals, attribute, signal_of
+from fingerspice.results.signals import attribute, sealed, signal_of
 
 if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
@@ -26,16 +25,12 @@ MOST_BETWEEN = 2_000_000
 _BETWEEN, _MISSED = ("u_source", "u_layer", "v", "u_gap", "area", "f_el", "fold_margin"), 1e-10
 
 
-def _read(name: str, record: AnyRecord) -> FloatArray:
-    return Signals(record).one(name)
-
-
 class Figures:
     """Figures of a solution, each computed on first use and cached, or those that its file holds."""
 
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
-        self.signals = solution.all_signals
+        self.signals = solution.record
         self._kept: dict[tuple[str, str], Any] = {}
 
     def value(self, key: str, kind: str) -> Value:
@@ -60,17 +55,16 @@ class Figures:
         span = self.last if periodic or kind in ("ripple", "amplitude", "phase_deg") else self.whole
         if span is None:
             return None
-        read = partial(_read, name)
         if kind in ("mean", "rms"):
-            return span.weigh(read).mean() if kind == "mean" else math.sqrt(span.weigh(read).mean(2))
+            return span.weigh(name).mean() if kind == "mean" else math.sqrt(span.weigh(name).mean(2))
         if kind in ("amplitude", "phase_deg"):
             if self.solution.fundamental is None:
                 return None
-            p = span.weigh(read).phasor(self.solution.fundamental.frequency)
+            p = span.weigh(name).phasor(self.solution.fundamental.frequency)
             return abs(p) if kind == "amplitude" else math.degrees(cmath.phase(p))
         key = name, f"extremes {span is self.whole}"
         if key not in self._kept:
-            self._kept[key] = span.extremes(read)
+            self._kept[key] = span.extremes(name)
         low, high = self._kept[key]
         figures: dict[str, float] = {"min": low, "max": high, "peak": max(high, -low), "ripple": high - low}
         return figures[kind]
@@ -78,8 +72,7 @@ class Figures:
     def _between(self, since: float, until: float) -> Stretch | None:
         """The run between two times (s); None where it is not known between its outputs."""
         continuous = self.solution.continuous
-        readers = {name: partial(_read, name) for name in self.shown}
-        run = None if continuous is None else continuous.run(readers, since, until)
+        run = None if continuous is None else continuous.run(self.shown, since, until)
         return None if run is None else Stretch(run, since, until, self.solution.rtol)
 
     @cached_property
@@ -127,10 +120,9 @@ class Figures:
         """
         # Charges and currents are those of the outputs alone.
         last = self._last_outputs if self.last is not None and name.startswith(("q_", "i_")) else self.last
-        read = partial(_read, name)
         if isinstance(last, Stretch):
-            return Stretch(last.run, *last.span, last.rtol, longest).weigh(read), True
-        return None if last is None else (last.weigh(read), False)
+            return Stretch(last.run, *last.span, last.rtol, longest).weigh(name), True
+        return None if last is None else (last.weigh(name), False)
 
     def between(self) -> tuple[list[str], FloatArray] | None:
         """Names of the voltages, areas and forces, and a table of the last period: times (s), then these signals.
@@ -144,7 +136,7 @@ class Figures:
         names = [name for key in _BETWEEN for name in self.signals.names(key)]
         if fine.panels.step.size * NODES * len(names) > MOST_BETWEEN:
             return None
-        columns = fine.at_nodes([partial(_read, x) for x in names], _MISSED)
+        columns = fine.at_nodes(names, _MISSED)
         table = np.column_stack([x.ravel() for x in columns])
         return (names, table) if table.size <= MOST_BETWEEN else None
 

@@ -134,16 +134,11 @@ class _Path(NamedTuple):
         return rows
 
 
-class _Start(NamedTuple):
-    """Start of a path."""
+def _start(problem: Problem, state: StackState) -> tuple[Segment, float, float, float]:
+    """Start of a path: segment of the source and its end (s), sign of the area's branch, and gap voltage (V).
 
-    segment: Segment  # Of the source
-    end: float  # Of the segment, s
-    sign: float  # Branch of the area
-    u: float  # Gap voltage, V; NaN where the start is at the fold or past it, as after a jump of the source
-
-
-def _start(problem: Problem, state: StackState) -> _Start:
+    The voltage is NaN where the start is at the fold or past it, as after a jump of the source.
+    """
     t, model = state.t, model_of(problem.scene)
     tables = [table for (table,) in Tables(problem, FINEST_RTOL)]
     table = next((table for table in tables if table.edges[-1] > t), tables[-1])
@@ -159,13 +154,13 @@ def _start(problem: Problem, state: StackState) -> _Start:
         u_source, slope = source(segment, t - start)
         margin, _ = voltage_by_time(model, u_source, slope, state.y, sign, u, np.empty(state.y.size))
         u = u if margin > 0.0 else math.nan
-    return _Start(segment, end, sign, u)
+    return segment, end, sign, u
 
 
 def _ahead(problem: Problem, run: Run, state: StackState, rtol: float) -> tuple[bool, _Path | None]:
     """Whether a run that stopped in this state reaches a fold, and the path to it where it is not there already."""
     begun = _start(problem, state)
-    if run.margin <= 0.0 or math.isnan(begun.u):
+    if run.margin <= 0.0 or math.isnan(begun[-1]):
         return True, None
     tries = (rtol, LOOSER_RTOL, LOOSEST_RTOL) if run.margin < NEAR else (rtol, LOOSER_RTOL)
     for tried in sorted({max(rtol, x) for x in tries}):
@@ -187,7 +182,7 @@ def _jacobian(slope: Callable[[float, FloatArray], FloatArray], s: float, z: Flo
     return np.array(columns).T
 
 
-def _path(problem: Problem, state: StackState, begun: _Start, rtol: float) -> _Path | None:
+def _path(problem: Problem, state: StackState, begun: tuple[Segment, float, float, float], rtol: float) -> _Path | None:
     t, y, model, n = state.t, state.y, model_of(problem.scene), state.y.size
     segment, end, sign, u = begun
     if u == 0.0:

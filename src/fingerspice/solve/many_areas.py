@@ -24,7 +24,6 @@ from fingerspice.engine.one_area.system import area_error, area_missed, area_pol
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.runs import NetworkIntegration
 from fingerspice.solve.scenes import Scene, kept_with
 from fingerspice.solve.sources import held as held_at
 from fingerspice.solve.stepping import Stepping, looks_of
@@ -228,7 +227,7 @@ def _magnified(
 MOST_STEPS = 100
 
 
-class March(Stepping, NetworkIntegration):
+class March(Stepping):
     """One integration in progress, with an error of at most `tol` times `u_scale` (V) in every step."""
 
     def __init__(

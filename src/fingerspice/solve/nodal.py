@@ -23,7 +23,7 @@ from fingerspice.results.record import Record
 from fingerspice.solve.problem import ROUNDING, Problem
 from fingerspice.solve.runs import (
     PAST_FOLD,
-    NetworkIntegration,
+    Integration,
     Progress,
     Run,
     closed_form,
@@ -78,7 +78,7 @@ def radau_scheme(stages: int) -> Scheme:
     )  # fmt: skip
 
 
-class Collocation(NetworkIntegration):
+class Collocation(Integration):
     """One integration in progress; see `engine.implicit.run.advance`."""
 
     def __init__(

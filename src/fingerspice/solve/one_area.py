@@ -24,7 +24,8 @@ from fingerspice.engine.one_area.system import LEVEL_RATIO, System, area_error, 
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import State, Status
-from fingerspice.results.record import Record, sided
+from fingerspice.results.record import sided
+from fingerspice.results.signals import Signals
 from fingerspice.results.steps import Recorded
 from fingerspice.solve.initial import (
     StackState,
@@ -256,8 +257,8 @@ def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray)
 
 
 def _turned(
-    make: Callable[..., Record], turn: FloatArray, t: FloatArray, left: BoolArray, columns: FloatArray
-) -> Record:  # fmt: skip
+    make: Callable[..., Signals], turn: FloatArray, t: FloatArray, left: BoolArray, columns: FloatArray
+) -> Signals:  # fmt: skip
     """A record from live voltages counted along the loop."""
     return make(t, left, turn[:, None] * columns)
 

@@ -117,6 +117,9 @@ class Integration(ABC):
     """One integration in progress, with outputs at `t_out` (s), as left-hand limits where `left` is true."""
 
     counters: IntArray  # With the indices of `engine.collocation.readout`
+    rows: (
+        FloatArray  # (n_out, width): Rows of the outputs, as in `Record`; of networks, whose steps have the same state
+    )
 
     def __init__(self, problem: Problem, t_out: FloatArray, left: BoolArray) -> None:
         self.problem, self.net, self.t_out, self.left = problem, problem.scene.net, read_only(t_out), read_only(left)
@@ -145,32 +148,15 @@ class Integration(ABC):
         """Status of a run in which no step is short enough; a coupled `mobile` scene is then taken to be at a fold."""
         return Status.FOLD if self.net.mobile and self.problem.scene.coupled else Status.STEP_UNDERFLOW
 
-    @abstractmethod
+    def jump(self, after: FloatArray) -> bool:
+        """Apply a jump of the sources to their values `after`; False where the jump goes past a fold."""
+        raise NotImplementedError
+
     def finish(self, sources: Sources, after: Sources | None) -> None:
         """Write the right-hand outputs at the end of the run, which `after` (the sources there) may begin with a jump.
 
         Nothing is written if that jump goes past a fold.
         """
-
-    @abstractmethod
-    def written(self) -> FloatArray:
-        """The rows written so far."""
-
-    @abstractmethod
-    def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
-        """The row at the time reached, with left- or right-hand values of the sources; NaN past a fold."""
-
-
-class NetworkIntegration(Integration):
-    """An integration whose steps use the same state as the outputs."""
-
-    rows: FloatArray  # (n_out, width): Rows of the outputs, as in `Record`
-
-    @abstractmethod
-    def jump(self, after: FloatArray) -> bool:
-        """Apply a jump of the sources to their values `after`; False where the jump goes past a fold."""
-
-    def finish(self, sources: Sources, after: Sources | None) -> None:
         if after is not None:
             values = values_at(after, self.problem.t_stop)
             if np.any(values != self.s_before) and not self.jump(values):
@@ -179,9 +165,11 @@ class NetworkIntegration(Integration):
         self.counters[OUTPUT] = self.t_out.size
 
     def written(self) -> FloatArray:
+        """The rows written so far."""
         return self.rows[: int(self.counters[OUTPUT])]
 
     def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
+        """The row at the time reached, with left- or right-hand values of the sources; NaN past a fold."""
         if not self.problem.charge:
             return self.y.copy()
         room, n_s = new_room(self.net, self.y.size), self.s_before.size

@@ -7,7 +7,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,21 +54,12 @@ class Figures:
         return {name: float(np.atleast_1d(value)[i]) for name, value in vars(self).items()}
 
 
-class _Kind(NamedTuple):
-    """A figure in a table."""
-
-    unit: str
-    factor: float  # From SI to that unit
-    # text, title: Its name on the page and in the picture
-    text: str
-    title: str
-
-
+# Of every figure: its unit in tables, the factor from SI to that unit, and its name on the page and in the picture.
 _FIGURES = {
-    "amplitude": _Kind("V", 1.0, "gap voltage amplitude", "Gap voltage at the fundamental"),
-    "phase_deg": _Kind("deg", 1.0, "lead over the source", "Its lead over the source"),
-    "f_el_mean": _Kind("N", 1.0, "mean force", "Mean electroadhesive force"),
-    "area_mean": _Kind("mm^2", 1e6, "mean area", "Mean ridge area"),
+    "amplitude": ("V", 1.0, "gap voltage amplitude", "Gap voltage at the fundamental"),
+    "phase_deg": ("deg", 1.0, "lead over the source", "Its lead over the source"),
+    "f_el_mean": ("N", 1.0, "mean force", "Mean electroadhesive force"),
+    "area_mean": ("mm^2", 1e6, "mean area", "Mean ridge area"),
 }
 
 
@@ -100,7 +91,7 @@ class Comparison(Shown):
         rows = []
         for what, unit, *numbers in self.rows():
             name, _, gap = what.partition(":")
-            rows.append((f"{_FIGURES[name].text} {gap}".rstrip() + f" [{unit}]", *(f"{x:.6g}" for x in numbers)))
+            rows.append((f"{_FIGURES[name][2]} {gap}".rstrip() + f" [{unit}]", *(f"{x:.6g}" for x in numbers)))
         head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
         said = []
         for i, gap in enumerate(self.gaps):
@@ -153,7 +144,7 @@ class Comparison(Shown):
         cells = []
         for what, unit, *numbers in self.rows():
             name, _, gap = what.partition(":")
-            label = f"{_FIGURES[name].title} {gap}".rstrip()
+            label = f"{_FIGURES[name][3]} {gap}".rstrip()
             texts = [*(f"{x:.5g}" for x in numbers[:3]), *(f"{x:+.2g}" for x in numbers[3:])]
             marks = unit.replace("deg", "°").replace("^2", "²")
             cells.append([f"{label} [{marks}]", *(text.replace("-", "−") for text in texts)])
@@ -180,9 +171,9 @@ class Comparison(Shown):
         """
         out = []
         for i, gap in enumerate(self.gaps):
-            for name, kind in _FIGURES.items():
-                p, m, c = (kind.factor * f.of_gap(i)[name] for f in (self.phasor, self.mean, self.coupled))
-                out.append((name if len(self.gaps) == 1 else f"{name}:{gap}", kind.unit, p, m, c, c - p, c - m))
+            for name, (unit, factor, *_) in _FIGURES.items():
+                p, m, c = (factor * f.of_gap(i)[name] for f in (self.phasor, self.mean, self.coupled))
+                out.append((name if len(self.gaps) == 1 else f"{name}:{gap}", unit, p, m, c, c - p, c - m))
         return out
 
     @property
@@ -192,7 +183,6 @@ class Comparison(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The figures as plain data, in SI units."""
-
         parts = {"phasor": self.phasor, "transient_mean_area": self.mean, "transient_coupled": self.coupled}
         return {
             "frequency": self.frequency,
@@ -239,15 +229,10 @@ def compare(
     phasors = {name: phasor(circuit, finger=name) for name in names}
     coupled = steady_state(circuit, charge_law=charge_law, rtol=rtol, points=2000).solution
     mean = steady_state(circuit, charge_law=charge_law, area="mean", rtol=rtol, points=2000).solution
+    found = [phasors[name] for name in coupled.gaps]
+    figures = [(abs(p.u_gap[0]), np.degrees(np.angle(p.gain[0])), p.f_el_mean[0], p.area[0]) for p in found]
     return Comparison(
-        _together(
-            *np.array(
-                [
-                    (abs(p.u_gap[0]), np.degrees(np.angle(p.gain[0])), p.f_el_mean[0], p.area[0])
-                    for p in (phasors[name] for name in coupled.gaps)
-                ]
-            ).T
-        ),
+        _together(*np.array(figures).T),
         _figures(mean, fundamental.phase),
         _figures(coupled, fundamental.phase),
         fundamental.frequency,

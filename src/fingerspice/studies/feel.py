@@ -15,7 +15,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.plots import drawing
 from fingerspice.plots.traces import stems
-from fingerspice.results.record import Sealed
+from fingerspice.results.signals import Sealed
 from fingerspice.studies.perception import (
     DIFFERENCE_DB,
     FASTEST_FELT,

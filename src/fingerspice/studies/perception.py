@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, positive_number, real_number, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.results.record import Sealed, sealed
+from fingerspice.results.signals import Sealed, sealed
 from fingerspice.waveforms.waveform import require
 
 #: Standard gravity, m/s^2.

@@ -92,18 +92,6 @@ def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -
     return positive_row("frequency", frequency, "Hz")
 
 
-def _check_area(area: str | float, amplitude: float, fixed: bool) -> None:
-    """Refuse an unknown mode of the area, and ``"mean"`` without an amplitude."""
-    if not isinstance(area, str):
-        return
-    require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
-    if area == "mean" and math.isnan(amplitude) and not fixed:
-        raise InputError(
-            "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
-            "'frozen' or an area in m^2"
-        )
-
-
 def _refuse_no_number(f: FloatArray, *results: NDArray[np.inexact]) -> None:
     """Refuse a sweep with results that are not finite."""
     bad = ~np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
@@ -161,7 +149,13 @@ def phasor(
     scene = linear_scene(circuit if skin == "swept" else with_skin_held(circuit), finger)
     f = _frequencies(frequency, scene.fundamental)
     drive = sweep_drive(scene.sources, scene.fundamental, frequency is not None)
-    _check_area(area, drive.amplitude, scene.fixed)
+    if isinstance(area, str):
+        require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
+    if area == "mean" and math.isnan(drive.amplitude) and not scene.fixed:
+        raise InputError(
+            "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
+            "'frozen' or an area in m^2"
+        )
     with np.errstate(all="ignore"):
         areas = np.array([scene.areas(float(x), area, drive.amplitude) for x in f])
         layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])

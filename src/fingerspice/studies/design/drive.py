@@ -17,7 +17,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import head_lines, heading
 from fingerspice.plots import drawing
-from fingerspice.results.record import Sealed
+from fingerspice.results.signals import Sealed
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 

@@ -256,6 +256,8 @@ def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
     elif freedom > 0:
         variance, reach = best.objective / freedom, float(t.ppf(0.975, freedom))
     covariance, remedy = covariance_of(best.by_log), data.remedy(task.circuit)
+    values = best.values.tolist()
+    each = list(zip(task.unknowns, values, strict=True))
     found = Fit(
         **estimated(
             task, best, covariance, np.sqrt(np.diag(covariance) * variance), [reach] * len(task.unknowns),
@@ -266,7 +268,11 @@ def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
         sigma=data.sigma if data.sigma is not None else math.sqrt(variance) * task.scale[:n],
         objectives=tuple(end.objective for end in ends),
         freedom=freedom,
-        **_fitted_circuits(task, best.values.tolist()),
+        circuit=task.circuit.varied({path: _geometric_mean(values, own) for path, own in task.places.items()}),
+        circuits={
+            label: task.circuit.varied({one.path: x for one, x in each if one.label in (None, label)})
+            for label in (data.groups.labels if data.groups is not None else ())
+        },
     )  # fmt: skip
     # Of chi squared and F with one degree of freedom, quantiles are the squares of those of the normal distribution
     # and of Student's (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
@@ -275,6 +281,10 @@ def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
         for name in wanted
     )
     return found
+
+
+def _geometric_mean(values: list[float], own: list[int]) -> float:
+    return values[own[0]] if len(own) == 1 else math.exp(sum(math.log(values[k]) for k in own) / len(own))
 
 
 def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[Task, list[Fitted]]:
@@ -289,27 +299,8 @@ def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[
     others = [followed(shares.residuals, shares.bounds, end.values) for end in ends]
     least, n = min(end.objective for end in others), predicted.size
     equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
-    return (
-        (shares, others)
-        if 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY
-        else (task, ends)
-    )
-
-
-def _fitted_circuits(task: Task, values: list[float]) -> dict[str, Any]:
-    """`circuit` and `circuits` of a `Fit`."""
-    mean = {path: values[own[0]] for path, own in task.places.items()}
-    for path, own in task.places.items():
-        if len(own) > 1:
-            mean[path] = math.exp(sum(math.log(values[k]) for k in own) / len(own))
-    found = list(zip(task.unknowns, values, strict=True))
-    return {
-        "circuit": task.circuit.varied(mean),
-        "circuits": {
-            label: task.circuit.varied({one.path: value for one, value in found if one.label in (None, label)})
-            for label in (task.data.groups.labels if task.data.groups is not None else ())
-        },
-    }
+    likelier = 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY
+    return (shares, others) if likelier else (task, ends)
 
 
 def _request(
