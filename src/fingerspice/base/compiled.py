@@ -26,6 +26,8 @@ from numba.core.compiler import Flags, compile_extra
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.datamodel import models
 from numba.core.datamodel.registry import register_default
+from numba.core.targetconfig import ConfigStack
+from numba.core.types.functions import BaseFunction
 from numba.core.typing.templates import AttributeTemplate, make_concrete_template
 from numba.extending import infer_getattr, intrinsic, lower_getattr_generic
 from numba.np.arrayobj import make_array
@@ -129,29 +131,31 @@ class _Body(JITCodeLibrary):
         return
 
 
-class _Flags(Flags):
-    """numba's flags of a function, compared by those that are set: it compares all of them 100,000 times."""
+_FOUND: dict[Any, Any] = {}
+_find: Any = BaseFunction.get_call_type
 
-    _HASH = hash(cast(Any, Flags)())
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Flags):
-            return False
-        mine, its = cast(Any, self)._values, cast(Any, other)._values
-        return mine == its or all(getattr(self, name) == getattr(other, name) for name in mine.keys() | its.keys())
-
-    def __hash__(self) -> int:
-        return self._HASH
+def _call_type(function: Any, context: Any, args: Any, kws: Any) -> Any:
+    """What numba finds for a call of its own functions, kept by types: it tries all that a `+` may mean, each time."""
+    flags: Any = ConfigStack.top_or_none()
+    kind = flags and (flags.error_model, *sorted(flags.fastmath.flags))
+    key = (context, function.typing_key, args, tuple(kws.items()), kind)
+    found = _FOUND.get(key)
+    if found is None or found.args not in function._impl_keys:
+        found = _FOUND[key] = _find(function, context, args, kws)
+    return found
 
 
 @contextmanager
-def _without_collection() -> Iterator[None]:
-    """Context without garbage collection of cycles: compilation makes millions of objects that live until it ends."""
+def _swiftly() -> Iterator[None]:
+    """Context of a compilation, without collection of cycles: it makes millions of objects that live until it ends."""
     looking = gc.isenabled()
     gc.disable()
+    cast(Any, BaseFunction).get_call_type = _call_type
     try:
         yield
     finally:
+        cast(Any, BaseFunction).get_call_type = _find
         if looking:
             gc.enable()
 
@@ -183,7 +187,7 @@ class _Called:
 
     def _compile(self, args: Any) -> tuple[object, Any]:
         of, context = self.of, self.of.targetctx
-        flags = cast(Any, _Flags)()
+        flags: Any = cast(Any, Flags)()
         of.targetdescr.options.parse_as_flags(flags, of.targetoptions)
         flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
         flags.noalias = self.noalias
@@ -204,11 +208,10 @@ def _cached(*, noalias: bool = False, **options: Any) -> Callable[[Function], Fu
         compile_signature = compiled.compile
 
         def announced(signature: Any) -> Any:
-            with _COMPILER.around(), _without_collection():
+            with _COMPILER.around(), _swiftly():
                 return compile_signature(signature)
 
         compiled.compile = announced
-        compiled._compiler._customize_flags = _Flags
         called = _Called(compiled, noalias)
         compiled.get_call_template, compiled.get_overload = called.get_call_template, called.get_overload
         return cast(Function, compiled)
