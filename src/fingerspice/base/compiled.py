@@ -137,7 +137,7 @@ _find: Any = BaseFunction.get_call_type
 
 def _call_type(function: Any, context: Any, args: Any, kws: Any) -> Any:
     """What numba finds for a call of its own functions, kept by types: it tries all that a `+` may mean, each time."""
-    flags: Any = ConfigStack.top_or_none()
+    flags = cast(Any, ConfigStack).top_or_none()
     kind = flags and (flags.error_model, *sorted(flags.fastmath.flags))
     key = (context, function.typing_key, args, tuple(kws.items()), kind)
     found = _FOUND.get(key)

@@ -56,31 +56,17 @@ class Work(NamedTuple):
 
 
 class Nodal(NamedTuple):
-    """A network and its sources, as the implicit steps take them.
-
-    Attributes
-    ----------
-    net, scheme, sources
-        The network, the Runge-Kutta scheme and the sources; `room` and `work` are scratch arrays.
-    jump : bool
-        Whether the sources' "time" is the fraction of a jump.
-    sign : ndarray, shape (n_area,)
-        Branch of each area; 0: to be chosen.
-    scale : ndarray, shape (size,)
-        Size of each entry of the state, to which its error is relative.
-    tol : float
-        Error allowed in a step, as a fraction of `scale`.
-    """
+    """A network and its sources, as the implicit steps take them; `room` and `work` are scratch arrays."""
 
     net: Net
     room: Room
     scheme: Scheme
     work: Work
     sources: Sources
-    jump: bool
-    sign: FloatArray
-    scale: FloatArray
-    tol: float
+    jump: bool  # Whether the sources' "time" is the fraction of a jump
+    sign: FloatArray  # (n_area,): Branch of each area; 0: to be chosen
+    scale: FloatArray  # (size,): Size of each entry of the state, to which its error is relative
+    tol: float  # Error allowed in a step, as a fraction of `scale`
 
 
 @jit

@@ -36,86 +36,55 @@ AREA, SLOPE, RATE, MORE, KNOWN, U, GUESS, U_S = range(8)
 
 
 class Form(NamedTuple):
-    """See the module. n live voltages, m modes with those of slow areas behind, n_f cells whose area moves.
+    """See the module. n live voltages, m modes with those of slow areas behind, n_f cells whose area moves."""
 
-    Attributes
-    ----------
-    numbers : ndarray, shape (size,)
-        All numbers that depend on the reference areas; the arrays named in `REFERRED` are views of it, so that a change
-        of the reference areas is one copy.
-    rates : ndarray, shape (m,)
-    gain : ndarray, shape (m, n_s)
-    shape, inverse : ndarray, shape (n, n)
-        v = inverse (x + follow s).
-    follow : ndarray, shape (n, n_s)
-    feed : ndarray, shape (m, n_f)
-    tap, tap_s : ndarray, shape (n_f, n) and (n_f, n_s)
-    c, g : ndarray, shape (n_f,)
-        Capacitance and leak of the cells per area.
-    home : ndarray of int, shape (n_f,)
-        The area of each of these cells, ascending.
-    first : ndarray of int, shape (n_area + 1,)
-        First of these cells of each area.
-    cell : ndarray of int, shape (n_area,)
-        The cell whose voltage the area follows; -1 if the area is fixed.
-    area0, unit : ndarray, shape (n_area,)
-        Reference area, and the area at 0 V, m^2: areas with a time constant are states in units of it.
-    slow : ndarray of int, shape (n_area,)
-        The mode of each area that has a time constant, else -1; `pace` (n_area,) is its rate, 1/s.
-    gap, gap_s : ndarray, shape (n_area, n) and (n_area, n_s)
-        Voltage of each area's GAP from x and s; zero without one.
-    node, node_s : ndarray, shape (n_node, n) and (n_node, n_s)
-        Voltage of each node from the same.
-    size : ndarray, shape (n,)
-        Euclidean norm of the state voltages (V) for one unit of each mode.
-    mobile : bool
-        Charge law.
-    stress : ndarray, shape (n_area,)
-        Force per area and squared gap voltage, Pa/V^2.
-    powers, slopes : ndarray, shape (n_area, DEGREE + 1)
-        1/A as in `engine.one_area.system.System`, with `lo`, `scale` (n_area,); `curves` solve Eq. 4 where these do not
-        reach.
-    stored, stored_s, lost, lost_s : ndarray, shape (n_s, n) and (n_s, n_s)
-        Current that each source delivers at the reference areas: stored v' + stored_s s' + lost v + lost_s s.
-    through : ndarray, shape (n_s, n_f)
-        Share of the current j of each cell that the source delivers in addition.
-    """
-
+    # (size,): All numbers that depend on the reference areas; the arrays named in `REFERRED` are views of it, so that a
+    # change of the reference areas is one copy
     numbers: FloatArray
-    rates: FloatArray
-    gain: FloatArray
+    rates: FloatArray  # (m,)
+    gain: FloatArray  # (m, n_s)
+    # shape, inverse (n, n): v = inverse (x + follow s)
     shape: FloatArray
     inverse: FloatArray
-    follow: FloatArray
-    feed: FloatArray
+    follow: FloatArray  # (n, n_s)
+    feed: FloatArray  # (m, n_f)
+    # tap, tap_s (n_f, n) and (n_f, n_s)
     tap: FloatArray
     tap_s: FloatArray
-    area0: FloatArray
+    area0: FloatArray  # (n_area,): Reference area, m^2
+    # gap, gap_s (n_area, n) and (n_area, n_s): Voltage of each area's GAP from x and s; zero without one
     gap: FloatArray
     gap_s: FloatArray
+    # node, node_s (n_node, n) and (n_node, n_s): Voltage of each node from the same
     node: FloatArray
     node_s: FloatArray
-    size: FloatArray
+    size: FloatArray  # (n,): Euclidean norm of the state voltages (V) for one unit of each mode
+    # stored, stored_s, lost, lost_s (n_s, n) and (n_s, n_s): Current that each source delivers at the reference areas:
+    # stored v' + stored_s s' + lost v + lost_s s
     stored: FloatArray
     stored_s: FloatArray
     lost: FloatArray
     lost_s: FloatArray
-    mobile: bool
+    mobile: bool  # Charge law
+    # c, g (n_f,): Capacitance and leak of the cells per area
     c: FloatArray
     g: FloatArray
-    home: IntArray
-    first: IntArray
-    cell: IntArray
-    unit: FloatArray
+    home: IntArray  # (n_f,): The area of each of these cells, ascending
+    first: IntArray  # (n_area + 1,): First of these cells of each area
+    cell: IntArray  # (n_area,): The cell whose voltage the area follows; -1 if the area is fixed
+    unit: FloatArray  # (n_area,): The area at 0 V, m^2: areas with a time constant are states in units of it
+    # slow, pace (n_area,): The mode of each area that has a time constant, else -1, and its rate, 1/s
     slow: IntArray
     pace: FloatArray
-    stress: FloatArray
+    stress: FloatArray  # (n_area,): Force per area and squared gap voltage, Pa/V^2
+    # powers, slopes, lo, scale (n_area, DEGREE + 1) and (n_area,): 1/A as in `engine.one_area.system.System`; `curves`
+    # solve Eq. 4 where these do not reach
     powers: FloatArray
     slopes: FloatArray
     lo: FloatArray
     scale: FloatArray
     curves: FloatArray
-    through: FloatArray
+    through: FloatArray  # (n_s, n_f): Share of the current j of each cell that the source delivers in addition
 
 
 #: The fields of a `Form` that belong to its reference areas, in the order in which they stand in its `numbers`.
@@ -147,13 +116,7 @@ class Jump(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Arrays that steps work in; those with ROWS behind hold one value for each row of a step.
-
-    `own` is the coupling of the step at hand, and `at` (1,) the number of the reference in use. `segment` (n_s,) is the
-    segment of each source at hand; `now` and `slopes_now` (n_s,) are the sources' values and slopes at the start of the
-    step, `here` (n_area,) are the areas there. `size` (m,) is that of the form, with the voltage scale behind. `gained`
-    (n_s,) are the charges of a step, `run` (n_area, N_PLACES) the errors of the gaps' voltages in it.
-    """
+    """Arrays that steps work in; those with ROWS behind hold one value for each row of a step."""
 
     r: FloatArray
     s: FloatArray
@@ -163,8 +126,8 @@ class Work(NamedTuple):
     areas: FloatArray
     matrix: FloatArray
     mixed: FloatArray
-    own: Coupling
-    at: IntArray
+    own: Coupling  # Of the step at hand
+    at: IntArray  # (1,): Number of the reference in use
     w0: FloatArray
     places: FloatArray
     weight: FloatArray
@@ -179,64 +142,32 @@ class Work(NamedTuple):
     spare: FloatArray
     spare_cells: FloatArray
     spare_areas: FloatArray
+    # segment, now, slopes_now (n_s,): Segment of each source at hand; values and slopes at the start of the step
     segment: IntArray
     now: FloatArray
     slopes_now: FloatArray
-    here: FloatArray
-    size: FloatArray
-    gained: FloatArray
-    run: FloatArray
+    here: FloatArray  # (n_area,): Areas at the start of the step
+    size: FloatArray  # (m,): As that of the form, with the voltage scale behind
+    gained: FloatArray  # (n_s,): Charges of a step
+    run: FloatArray  # (n_area, N_PLACES): Errors of the gaps' voltages
     basis: FloatArray
     jump: Jump
 
 
-def _new_jump(n: int, modes: int, cells: int, areas: int, sources: int) -> Jump:
-    leaks = Leaks(
-        np.zeros(modes), np.zeros((modes, sources)), np.zeros(cells), np.zeros(areas), np.zeros((sources, n)),
-        np.zeros((sources, sources)),
-    )  # fmt: skip
-    return Jump(
-        np.zeros(sources), np.zeros(sources), np.zeros(2, CONTROL), np.zeros(areas), np.zeros((areas, 2)), leaks
-    )  # fmt: skip
-
-
 def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: int) -> Work:
     """Work arrays for so many live voltages, modes, cells whose area moves, areas, sources and output columns."""
+    z, whole = np.zeros, np.int64
+    leaks = Leaks(z(modes), z((modes, sources)), z(cells), z(areas), z((sources, n)), z((sources, sources)))
+    jump = Jump(z(sources), z(sources), z(2, CONTROL), z(areas), z((areas, 2)), leaks)
     return Work(
-        np.zeros((sources, N_FLAT, ROWS)),
-        np.zeros((sources, ROWS)),
-        np.zeros((sources, ROWS)),
-        np.zeros((8, modes, ROWS)),
-        np.zeros((8, cells, ROWS)),
-        np.zeros((8, areas, ROWS)),
-        np.zeros((cells, cells + 1, ROWS)),
-        np.zeros((cells, areas + 1, ROWS)),
-        new_coupling(n, cells, sources),
-        np.zeros(1, np.int64),
-        np.zeros(modes),
-        np.zeros((modes, N_PLACES)),
-        np.zeros(modes),
-        np.zeros((columns, ROWS)),
-        np.zeros((columns, ROWS)),
-        np.zeros((2, WRITTEN_AT_ONCE)),
-        np.zeros((4, ROWS)),
-        np.zeros((N_PLACES, modes + sources)),
-        np.zeros((2, modes, N_PLACES)),
-        np.zeros((2, N_PLACES, cells + areas)),
-        np.zeros((modes, N_PLACES - 1)),
-        np.zeros((6, modes, ROWS)),
-        np.zeros((8, cells, ROWS)),
-        np.zeros((8, areas, ROWS)),
-        np.zeros(sources, np.int64),
-        np.zeros(sources),
-        np.zeros(sources),
-        np.zeros(areas),
-        np.zeros(modes),
-        np.zeros(sources),
-        np.zeros((areas, N_PLACES)),
-        np.zeros(NODES),
-        _new_jump(n, modes, cells, areas, sources),
-    )
+        z((sources, N_FLAT, ROWS)), z((sources, ROWS)), z((sources, ROWS)), z((8, modes, ROWS)), z((8, cells, ROWS)),
+        z((8, areas, ROWS)), z((cells, cells + 1, ROWS)), z((cells, areas + 1, ROWS)), new_coupling(n, cells, sources),
+        z(1, whole), z(modes), z((modes, N_PLACES)), z(modes), z((columns, ROWS)), z((columns, ROWS)),
+        z((2, WRITTEN_AT_ONCE)), z((4, ROWS)), z((N_PLACES, modes + sources)), z((2, modes, N_PLACES)),
+        z((2, N_PLACES, cells + areas)), z((modes, N_PLACES - 1)), z((6, modes, ROWS)), z((8, cells, ROWS)),
+        z((8, areas, ROWS)), z(sources, whole), z(sources), z(sources), z(areas), z(modes), z(sources),
+        z((areas, N_PLACES)), z(NODES), jump,
+    )  # fmt: skip
 
 
 @jit_within

@@ -23,75 +23,45 @@ N_FLAT = 10
 
 
 class Work(NamedTuple):
-    """Arrays that a stack's steps work in; those with ROWS behind hold one value for each row of a step.
+    """Arrays that a stack's steps work in; those with ROWS behind hold one value for each row of a step."""
 
-    Attributes
-    ----------
-    r : ndarray, shape (N_FLAT, ROWS)
-        See above.
-    base, w, pull, used, pull_before, left_before : ndarray, shape (n, ROWS)
-        The modes without and with the nonlinear term, this term at them and as it was used for them, and both of the
-        iteration before (see `iteration.converge`).
-    w0, weight : ndarray, shape (n,)
-        The modes at the start of the step; effect of each on the gap voltage (see `iteration.weigh`).
-    places, carried : ndarray, shape (n, N_PLACES) and (n, N_PLACES - 1)
-        Errors of the modes, and those carried over from earlier steps.
-    run : ndarray, shape (N_PLACES,)
-        Errors of the gap voltage, V.
-    values, coefficients : ndarray, shape (n + 2, ROWS)
-        Output columns and their Chebyshev coefficients.
-    tapped : ndarray, shape (n + 1, ROWS)
-        Leaks that do not scale with the area.
-    outputs, sums, basis, spare, spare_r : ndarray
-        Scratch; the last two as five times `w`, and as `r`.
-    """
-
-    r: FloatArray
+    r: FloatArray  # (N_FLAT, ROWS): See above
+    # base, w, pull, used, pull_before, left_before (n, ROWS): The modes without and with the nonlinear term, this term
+    # at them and as it was used for them, and both of the iteration before (see `iteration.converge`)
     base: FloatArray
     w: FloatArray
     pull: FloatArray
     used: FloatArray
     pull_before: FloatArray
     left_before: FloatArray
+    # w0, weight (n,): The modes at the start of the step; effect of each on the gap voltage (see `iteration.weigh`)
     w0: FloatArray
+    weight: FloatArray
+    # places, carried (n, N_PLACES) and (n, N_PLACES - 1): Errors of the modes, and those carried over from earlier
+    # steps
     places: FloatArray
     carried: FloatArray
-    run: FloatArray
+    run: FloatArray  # (N_PLACES,): Errors of the gap voltage, V
+    # values, coefficients (n + 2, ROWS): Output columns and their Chebyshev coefficients
     values: FloatArray
     coefficients: FloatArray
+    tapped: FloatArray  # (n + 1, ROWS): Leaks that do not scale with the area
+    # Scratch; the last two as five times `w`, and as `r`
     outputs: FloatArray
     sums: FloatArray
-    weight: FloatArray
     basis: FloatArray
-    tapped: FloatArray
     spare: FloatArray
     spare_r: FloatArray
 
 
 def new_work(n: int) -> Work:
     """Work arrays for n modes."""
-    return Work(
-        np.zeros((N_FLAT, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros((n, ROWS)),
-        np.zeros(n),
-        np.zeros((n, N_PLACES)),
-        np.zeros((n, N_PLACES - 1)),
-        np.zeros(N_PLACES),
-        np.zeros((n + 2, ROWS)),
-        np.zeros((n + 2, ROWS)),
-        np.zeros((2, WRITTEN_AT_ONCE)),
-        np.zeros((4, 4)),
-        np.zeros(n),
-        np.zeros(NODES),
-        np.zeros((n + 1, ROWS)),
-        np.zeros((5, n, ROWS)),
-        np.zeros((N_FLAT, ROWS)),
-    )
+    rows, flat, columns = (n, ROWS), (N_FLAT, ROWS), (n + 2, ROWS)
+    shapes: tuple[Any, ...] = (
+        flat, rows, rows, rows, rows, rows, rows, n, n, (n, N_PLACES), (n, N_PLACES - 1), N_PLACES, columns, columns,
+        (n + 1, ROWS), (2, WRITTEN_AT_ONCE), (4, 4), NODES, (5, n, ROWS), flat,
+    )  # fmt: skip
+    return Work(*map(np.zeros, shapes))
 
 
 _PI_HIGH = 3.141592653589793
