@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fingerspice.numerics.linear import periodic_state, respond, respond_into
+from fingerspice.numerics.linear import periodic_state, respond
 
 NO_SERIES = np.zeros((1, 0))
 
@@ -310,55 +310,17 @@ def test_a_mode_without_decay_has_a_periodic_state_where_the_mean_is_zero(start)
     assert np.isfinite(got[1])
 
 
-def test_constant_and_integer_arguments_and_a_given_place_for_the_rows():
+def test_constant_and_integer_arguments():
     edges = np.array([0.0, 1.0])
     edges.flags.writeable = False
-    place = np.full((3, 2), np.nan)
     # The second term has no coefficient: what else it says does not matter.
     terms = np.broadcast_to(np.array([[term(2), [0, -1, 0.5, 3, 4, 5]]]), (1, 2, 6))
-    rows, w_end = respond((0, 1), np.array([1, 1]), edges, terms, NO_SERIES, [0, 0], [0, 0.5, 1], rows=place)
-    assert rows is place
+    rows, w_end = respond((0, 1), np.array([1, 1]), edges, terms, NO_SERIES, [0, 0], [0, 0.5, 1])
     expected = np.array([[0.0, 0.0], [1.0, -2.0 * np.expm1(-0.5)], [2.0, -2.0 * np.expm1(-1.0)]])
     assert np.abs(rows - expected).max() <= 1e-15
     assert np.array_equal(w_end, rows[-1])
 
 
-def test_compiled_code_gets_nan_for_times_outside():
-    t = np.array([-1.0, 0.0, 1.0, 1.5])
-    rows, w = np.empty((4, 1)), np.array([2.0])
-    terms = np.array([[term(1.0)]])
-    respond_into(np.zeros(1), np.ones(1), np.array([0.0, 1.0]), terms, NO_SERIES, w, t, np.zeros(4, bool), rows)
-    assert np.array_equal(rows[:, 0], [np.nan, 2.0, 3.0, np.nan], equal_nan=True)
-    assert w[0] == 3.0
-
-
 def test_a_window_without_segments_keeps_the_state():
     rows, w_end = respond([1.0], [1.0], [2.0], np.zeros((0, 1, 6)), np.zeros((0, 0)), [0.5], [2.0])
     assert rows[0, 0] == w_end[0] == 0.5
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"rates": [-1.0]}, "rates"),
-        ({"rates": [np.inf]}, "rates"),
-        ({"rates": [1.0, 2.0]}, "shape"),
-        ({"terms": [[[1.0, 0.0, 0.0, 0.0, 0.0]]]}, "shape"),
-        ({"terms": [[[1.0, 0.0, 0.0, 1.0, 0.0, 2.0]]]}, "with beta"),
-        ({"terms": [[term(1.0, 0.5)]]}, "whole number"),
-        ({"terms": [[term(1.0, -1)]]}, "whole number"),
-        ({"edges": [1.0, 0.0]}, "ascend"),
-        ({"t_out": [0.5, 0.2]}, "ascend"),
-        ({"t_out": [np.nan]}, "outputs"),
-        ({"t_out": [-0.1, 0.2]}, "outputs from -0.1"),
-        ({"t_out": [0.2, 1.1]}, "outputs"),
-        ({"left": [True]}, "shape"),
-        ({"rows": np.empty((2, 1), np.float32)}, "double precision"),
-        ({"rows": np.empty((2, 2))[:, :1]}, "contiguous"),
-    ],
-)
-def test_what_cannot_be_answered_is_refused(change, message):
-    modes = {"rates": [1.0], "gains": [1.0], "w0": [0.0]}
-    source = {"edges": [0.0, 1.0], "terms": [[term(1.0)]], "series": NO_SERIES}
-    with pytest.raises(ValueError, match=message):
-        respond(**(modes | source | {"t_out": [0.2, 0.5]} | change))

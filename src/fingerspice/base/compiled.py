@@ -222,11 +222,8 @@ def _cached(*, noalias: bool = False, **options: Any) -> Callable[[Function], Fu
 def jit_by_kind(**functions: Callable[..., Any]) -> Callable[[Function], Function]:
     """A function that stands for one of several in compiled code, chosen by the class of its first argument.
 
-    Parameters
-    ----------
-    **functions
-        Compiled functions by the names of the classes, which are named tuples. All take the same arguments as the
-        function decorated, whose body is never run.
+    These are given by the names of the classes, which are named tuples. All take the same arguments as the function
+    decorated, whose body is never run.
     """
 
     def stands_for(function: Function) -> Function:

@@ -12,13 +12,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.physics.contact import inverse_area
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Where a limit holds the source, the secant method finds the gap voltage: tolerance of the source voltage (V), and most
 # iterations.

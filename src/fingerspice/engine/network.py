@@ -51,38 +51,37 @@ def segment_at(edges: FloatArray, t: float) -> int:
 
 
 @jit
+def term_at(term: FloatArray, tau: float) -> tuple[float, float]:
+    """Value and slope of one term of a `Segment`, tau seconds into it."""
+    value, slope, n, a = term[0], 0.0, term[1], term[2]
+    if n == 1.0:
+        slope = value
+        value *= tau
+    elif n > 1.0:
+        slope = value * n * tau ** (n - 1.0)
+        value *= tau**n
+    if a != 0.0:
+        e = math.exp(a * tau)
+        slope = (slope + a * value) * e
+        value *= e
+    omega, phi, beta = term[3], term[4], term[5]
+    if omega != 0.0 or phi != 0.0 or beta != 0.0:
+        phase = phi + (omega + 0.5 * beta * tau) * tau
+        c = math.cos(phase)
+        slope = slope * c - value * (omega + beta * tau) * math.sin(phase)
+        value *= c
+    return value, slope
+
+
+@jit
 def source(segment: Segment, tau: float) -> tuple[float, float]:
     """Source voltage (V) and its slope (V/s), tau seconds into a segment."""
-    u = 0.0
-    du = 0.0
-    terms = segment.terms
-    for i in range(terms.shape[0]):
-        value = terms[i, 0]
-        if value == 0.0:
-            continue
-        slope = 0.0
-        n = terms[i, 1]
-        if n == 1.0:
-            slope = value
-            value *= tau
-        elif n > 1.0:
-            slope = value * n * tau ** (n - 1.0)
-            value *= tau**n
-        a = terms[i, 2]
-        if a != 0.0:
-            e = math.exp(a * tau)
-            slope = (slope + a * value) * e
-            value *= e
-        omega = terms[i, 3]
-        phi = terms[i, 4]
-        beta = terms[i, 5]
-        if omega != 0.0 or phi != 0.0 or beta != 0.0:
-            phase = phi + (omega + 0.5 * beta * tau) * tau
-            c = math.cos(phase)
-            slope = slope * c - value * (omega + beta * tau) * math.sin(phase)
-            value *= c
-        u += value
-        du += slope
+    u, du = 0.0, 0.0
+    for i in range(segment.terms.shape[0]):
+        if segment.terms[i, 0] != 0.0:
+            value, slope = term_at(segment.terms[i], tau)
+            u += value
+            du += slope
     if segment.series.size > 0:
         value, slope = chebyshev.evaluate(segment.series, 2.0 * tau / segment.length - 1.0)
         u += value

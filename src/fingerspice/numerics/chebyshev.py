@@ -39,23 +39,9 @@ def _transform(n: int) -> FloatArray:
 def fit(
     function: Callable[[FloatArray], FloatArray], lo: float, hi: float, tol: float, sizes: tuple[int, ...]
 ) -> FloatArray | None:
-    """Coefficients of the shortest interpolant, of the given sizes, whose tail is below `tol`.
+    """Coefficients of the shortest interpolant on [lo, hi], of the given sizes (ascending), whose tail is below `tol`.
 
-    Parameters
-    ----------
-    function : callable
-        Takes and returns arrays of shape (n,).
-    lo, hi : float
-        Interval.
-    tol : float
-        Bound of the last two coefficients relative to the largest.
-    sizes : tuple of int
-        Numbers of points to try, ascending.
-
-    Returns
-    -------
-    ndarray or None
-        None where no size met `tol`.
+    This bounds the last two coefficients relative to the largest one. None where no size met it.
     """
     for size in sizes:
         c = coefficients(function(nodes(size, lo, hi)))
@@ -231,14 +217,9 @@ def _clenshaw(c: FloatArray, x: FloatArray, lo: float, scale: float, out: FloatA
 
 @jit
 def largest(values: FloatArray, sign: float) -> tuple[int, float, float]:
-    """Panel, place in it (0 to 1) and value of the largest of sign times the polynomials.
+    """Panel, place in it (0 to 1) and value of the largest of sign times the polynomials through `values` (p, NODES).
 
-    Parameters
-    ----------
-    values : ndarray, shape (p, NODES)
-        At the nodes of each panel.
-    sign : float
-        -1 for the smallest value, which is returned times -1.
+    With the sign -1 it is the smallest value, times -1.
     """
     panel, place, best = 0, 0.0, -np.inf
     series = np.zeros(NODES)

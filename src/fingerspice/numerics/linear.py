@@ -63,16 +63,7 @@ def _convolution(
 ) -> complex:
     """Integral over s in [0, tau] of exp(-rate (tau - s)) s^p exp(sigma s): real where sigma is.
 
-    Parameters
-    ----------
-    p : int
-    exponent : float or complex
-        rate + sigma; its magnitude is `size` and its inverse `inverse`.
-    tau : float
-    decay : float
-        exp(-rate tau).
-    wave : float or complex
-        exp(sigma tau).
+    `exponent` is rate + sigma, of the magnitude `size`, `decay` is exp(-rate tau) and `wave` exp(sigma tau).
     """
     reach = size * tau
     if reach <= p + 1:
@@ -176,21 +167,11 @@ def _prepare_series(
 
 
 @jit
-def respond_into(
-    rates: FloatArray,
-    gains: FloatArray,
-    edges: FloatArray,
-    terms: FloatArray,
-    series: FloatArray,
-    w: FloatArray,
-    t_out: FloatArray,
-    left: NDArray[np.bool_],
-    rows: FloatArray,
-) -> None:
-    """`respond` for compiled code: arguments unchecked, outputs written into `rows`, w taken from start to end.
-
-    Arrays are C-contiguous and writeable. Rows of times outside the segments become NaN.
-    """
+def _respond(
+    rates: FloatArray, gains: FloatArray, edges: FloatArray, terms: FloatArray, series: FloatArray, w: FloatArray,
+    t_out: FloatArray, left: NDArray[np.bool_], rows: FloatArray,
+) -> None:  # fmt: skip
+    """`respond` compiled: outputs written into `rows`, w taken from start to end."""
     n = rates.size
     n_terms = terms.shape[1]
     decay = np.zeros(n)
@@ -205,10 +186,6 @@ def respond_into(
     at_start = np.zeros(n)
     poly = np.zeros((n + 2, _room(series.shape[1])))
     i = 0
-    while i < t_out.size and not t_out[i] >= edges[0]:
-        for k in range(n):
-            rows[i, k] = np.nan
-        i += 1
     for s in range(edges.size - 1):
         stop = edges[s + 1]
         length, length_rest = _difference(stop, edges[s])
@@ -276,91 +253,36 @@ def respond_into(
                 i += 1
     while i < t_out.size:
         for k in range(n):
-            rows[i, k] = w[k] if t_out[i] == edges[-1] else np.nan
+            rows[i, k] = w[k]
         i += 1
 
 
 def respond(
-    rates: ArrayLike,
-    gains: ArrayLike,
-    edges: ArrayLike,
-    terms: ArrayLike,
-    series: ArrayLike,
-    w0: ArrayLike,
-    t_out: ArrayLike,
-    left: ArrayLike | None = None,
-    rows: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """State of the modes at given times, and at the end.
+    rates: ArrayLike, gains: ArrayLike, edges: ArrayLike, terms: ArrayLike, series: ArrayLike, w0: ArrayLike,
+    t_out: ArrayLike, left: ArrayLike | None = None,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """State (n_out, n) of n modes at the output times (s, ascending, within the edges), and (n,) at the end.
 
-    Parameters
-    ----------
-    rates, gains : array_like, shape (n,)
-        Decay rates (>= 0, 1/s) and input gains (1/s for a w in the unit of U).
-    edges : array_like, shape (m + 1,)
-        Segment edges, ascending, s.
-    terms : array_like, shape (m, k, 6)
-        c, p, a, omega, phi, beta of each term; p is a whole number, beta is 0. c = 0 is no term.
-    series : array_like, shape (m, l)
-        Chebyshev coefficients of the input on each segment; l = 0 for none.
-    w0 : array_like, shape (n,)
-        State at edges[0].
-    t_out : array_like, shape (n_out,)
-        Output times, ascending, in [edges[0], edges[-1]], s.
-    left : array_like of bool, shape (n_out,), optional
-        Whether an output on an edge belongs to the segment that ends there. The state is the same to the bit.
-    rows : ndarray, shape (n_out, n), optional
-        Where to write the outputs: double precision, contiguous.
-
-    Returns
-    -------
-    rows : ndarray, shape (n_out, n)
-        State at the output times. None depends on which other times are asked for.
-    w_end : ndarray, shape (n,)
-        State at edges[-1].
+    `rates` (1/s, 0 or more) and `gains` (1/s for a w in the unit of U) are of the modes, whose state at edges[0] is
+    `w0`. `edges` (m + 1,) are those of the segments, ascending, s; `terms` (m, k, 6) are c, p, a, omega, phi, beta of
+    each term, of which p is a whole number and beta 0, and c = 0 is no term; `series` (m, l) are the Chebyshev
+    coefficients of the input on each segment, if any. `left` tells whether an output on an edge belongs to the segment
+    that ends there: the state is the same to the bit. No output depends on which other times are asked for.
     """
     rates, gains, edges, terms, series, w, t_out = (_plain(x) for x in (rates, gains, edges, terms, series, w0, t_out))
-    w = w.copy()
-    n, m = rates.size, edges.size - 1
+    rows, w = np.empty((t_out.size, rates.size)), w.copy()
     left = np.zeros(t_out.size, bool) if left is None else np.require(left, bool, ["C", "W"])
-    if rows is None:
-        rows = np.empty((t_out.size, n))
-    shapes = (rates, (n,)), (gains, (n,)), (w, (n,)), (edges, (m + 1,)), (t_out, (t_out.size,)), (left, t_out.shape)
-    tables = (terms, (m, *terms.shape[1:2], 6)), (series, (m, *series.shape[1:2])), (rows, (t_out.size, n))
-    for array, shape in (*shapes, *tables):
-        if array.shape != shape:
-            raise ValueError(f"an array of shape {array.shape} where {shape} is due")
-    if not (rows.dtype == np.float64 and rows.flags.carray):
-        raise ValueError("rows that are no contiguous double precision")
-    if not np.all((rates >= 0.0) & (rates < math.inf)):
-        raise ValueError(f"rates {rates} 1/s; allowed: finite, >= 0")
-    if not (np.all(np.diff(edges) >= 0.0) and np.all(np.diff(t_out) >= 0.0)):
-        raise ValueError("edges and output times must ascend")
-    if t_out.size and not (t_out[0] >= edges[0] and t_out[-1] <= edges[-1]):
-        raise ValueError(f"outputs from {t_out[0]} to {t_out[-1]} s; allowed: {edges[0]} to {edges[-1]} s")
-    c, p, beta = terms[..., 0], terms[..., 1], terms[..., 5]
-    if np.any((c != 0.0) & ((beta != 0.0) | (p < 0.0) | (p % 1.0 != 0.0))):
-        raise ValueError("a term with beta, or with p that is no whole number; neither has a closed form here")
-    respond_into(rates, gains, edges, terms, series, w, t_out, left, rows)
+    _respond(rates, gains, edges, terms, series, w, t_out, left, rows)
     return rows, w
 
 
 def periodic_state(
     rates: ArrayLike, gains: ArrayLike, edges: ArrayLike, terms: ArrayLike, series: ArrayLike
 ) -> FloatArray:
-    """State at edges[0] to which one pass over the segments leads back.
+    """State (n,) at edges[0] to which one pass over the segments leads back; the arguments are those of `respond`.
 
     A mode without decay has one only where its mean input is zero, and then has many: it starts from 0. With an input
     whose mean is not zero it has none: NaN. The error of a slow mode is that of the mean input over rate x period.
-
-    Parameters
-    ----------
-    rates, gains, edges, terms, series
-        As for `respond`.
-
-    Returns
-    -------
-    ndarray, shape (n,)
     """
     rates, gains, edges, terms, series = (_plain(x) for x in (rates, gains, edges, terms, series))
     _, w = respond(rates, gains, edges, terms, series, np.zeros(rates.size), np.empty(0))

@@ -70,19 +70,8 @@ def _ascending(r: FloatArray, order: NDArray[np.int64]) -> None:
 def modes(r: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Modal form of x' = -h + k sum(h) + (-p + k sum(p)).
 
-    Parameters
-    ----------
-    r, k : ndarray, shape (n + 1,)
-        Rates (1/s, >= 0) and shares (> 0, of sum 1).
-
-    Returns
-    -------
-    rates : ndarray, shape (n,)
-        w' = -rates w + gain U + p @ feed.
-    gain : ndarray, shape (n,)
-    feed : ndarray, shape (n + 1, n)
-    shape : ndarray, shape (n + 1, n)
-        x = shape @ w.
+    Of r (1/s, >= 0) and k (> 0, of sum 1), both (n + 1,). Returns `rates` and `gain` (n,), `feed` and `shape` (n + 1,
+    n): w' = -rates w + gain U + p @ feed, and x = shape @ w.
     """
     n = r.size - 1
     rates, gain, feed, shape = np.empty(n), np.empty(n), np.empty((n + 1, n)), np.empty((n + 1, n))

@@ -194,21 +194,11 @@ def assess(
 ) -> tuple[float, float]:  # fmt: skip
     """Error of a converged step: interpolation error between the nodes, residual of the iteration, earlier error.
 
-    Parameters
-    ----------
-    system, tables, work, slot, level
-        Of the step at hand. `work.carried` is the error of the modes propagated to the points between nodes and to
-        the end (see `carry`); `work.places` is filled with their error at the start, the points between and the end,
-        that of the dense output included.
-    error : ndarray, shape (n,)
-        Error of the modes at the start of the step, signed.
-
-    Returns
-    -------
-    step, magnified : float
-        Largest error of the gap voltage in the step by this step's interpolation alone, which the step length controls,
-        V. Largest ratio of a move of the gap voltage to the move of a state voltage that causes it. `work.run` takes
-        the whole error at the places, with the residual of the iteration and the errors of earlier steps.
+    `work.carried` is the error of the modes propagated to the points between nodes and to the end (see `carry`), and
+    `error` (n,) that at the start, signed; `work.places` is filled with their error at the start, the points between
+    and the end, that of the dense output included. `work.run` takes the whole error of the gap voltage there. Returned
+    are the largest error of the gap voltage by this step's interpolation alone (V), which controls the step's length,
+    and the largest ratio of a move of the gap voltage to the move of a state voltage that causes it.
     """
     r, w, pull, used, carried, places, sums = (
         work.r, work.w, work.pull, work.used, work.carried, work.places, work.sums

@@ -210,23 +210,10 @@ def march_on(circuit: Circuit, pace: Pace, state: LoopState, looks: Looks, t_end
 
 @jit_within
 def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
-    """Step to `t_end` (s) through the source's segments, writing outputs on the way.
+    """Step to `t_end` (s; not past the last edge of the sources), writing outputs on the way.
 
-    Parameters
-    ----------
-    circuit : OneArea or ManyAreas
-        The circuit, its sources, tables and scratch arrays.
-    pace : Pace
-        Rules for the lengths of the steps.
-    state : LoopState
-        The integration so far, updated.
-    t_end : float
-        Where to stop, s; not past the last edge of the sources.
-
-    Returns
-    -------
-    int
-        A code of `engine.collocation.loopstate`.
+    `pace` has the rules for the lengths of the steps, `state` is the integration so far, which is updated. Returns a
+    code of `engine.collocation.loopstate`.
     """
     # Arrays without a reference count: it would cost an atomic operation at every access to a tuple.
     circuit, state = borrow(circuit), borrow(state)

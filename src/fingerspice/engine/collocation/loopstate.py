@@ -7,7 +7,6 @@ each of which hands its state to the next, let Python react to Ctrl-C, and no re
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,50 +50,19 @@ def new_kept(steps: int, columns: int) -> Kept:
     return Kept(np.zeros((steps, 3)), np.zeros((steps, columns, ROWS)))
 
 
-class _Walk(NamedTuple):
-    """State handed from call to call: each step's outputs in the period before, and whether it is in powers of x."""
-
-    held: NDArray[np.int64]
-    as_powers: NDArray[np.bool_]
-
-
-def _new_walk(steps: int) -> _Walk:
-    return _Walk(np.zeros(steps, np.int64), np.zeros(steps, np.bool_))
-
-
-def _calls(periods: int, steps: int) -> Iterator[tuple[int, int]]:
-    """Division of periods 0, 1, ... into calls: the first period of each call, and the first of the next one."""
-    most = max(1, AT_ONCE // max(1, steps))
-    for begin in range(0, periods, most):
-        yield begin, min(begin + most, periods)
-
-
 def repeat(
     kept: Kept, count: int, period: float, periods: int, drifts: FloatArray, first: int, outputs: Outputs
 ) -> int:  # fmt: skip
-    """Write the outputs of the periods that follow the kept one.
+    """Write the outputs, from number `first` on, of so many periods (s) that follow the kept one of `count` steps.
 
-    Parameters
-    ----------
-    kept : Kept
-        `count` steps that make one period; its series are used up.
-    period : float
-        s.
-    periods : int
-        How often to repeat it.
-    drifts : ndarray, shape (n_column,)
-        Gain of each column in a period; only charges have one, C.
-    first, outputs
-        As `readout.write_outputs`.
-
-    Returns
-    -------
-    int
-        The first output that is left.
+    `drifts` (n_column,) are the gains of the columns in a period; only charges have one, C. The kept series are used
+    up. Returns the first output that is left.
     """
-    walk = _new_walk(count)
-    for begin, end in _calls(periods, count):
-        first = _repeat(kept, walk, period, begin + 1, end + 1, drifts, first, outputs)
+    # Of each step: its outputs in the period before, and whether it is in powers of x.
+    held, as_powers, most = np.zeros(count, np.int64), np.zeros(count, np.bool_), max(1, AT_ONCE // max(1, count))
+    for begin in range(0, periods, most):
+        end = min(begin + most, periods)
+        first = _repeat(kept, held, as_powers, period, begin + 1, end + 1, drifts, first, outputs)
         if first >= outputs.t.size:
             break
     return first
@@ -102,13 +70,14 @@ def repeat(
 
 @jit
 def _repeat(
-    kept: Kept, walk: _Walk, period: float, begin: int, end: int, drifts: FloatArray, first: int, outputs: Outputs
+    kept: Kept, held: IntArray, as_powers: NDArray[np.bool_], period: float, begin: int, end: int, drifts: FloatArray,
+    first: int, outputs: Outputs,
 ) -> int:  # fmt: skip
     """As `repeat`, of the periods from `begin` to before `end`."""
     times, series = borrow(kept.times), borrow(kept.series)
     outputs, drifts = borrow(outputs), borrow(drifts)
     t_out, out = outputs.t, outputs.columns
-    held, as_powers = borrow(walk.held), borrow(walk.as_powers)
+    held, as_powers = borrow(held), borrow(as_powers)
     if begin == 1:
         _make_powers(series, as_powers)
     work = np.zeros((2, WRITTEN_AT_ONCE))
@@ -255,12 +224,8 @@ def is_wanted(s: LoopState, t_new: float) -> bool:
 def write_step(s: LoopState, t: float, values: FloatArray, coefficients: FloatArray, work: FloatArray) -> None:
     """Record a finished step that began at t (s), keep it for repetition, and write its outputs.
 
-    Parameters
-    ----------
-    values, coefficients : ndarray, shape (n_column, ROWS)
-        The columns at the rows of the step; takes their Chebyshev coefficients.
-    work : ndarray, shape (2, WRITTEN_AT_ONCE)
-        Scratch.
+    `values` (n_column, ROWS) are the columns at the rows of the step; `coefficients` takes their Chebyshev
+    coefficients.
     """
     counters, kept_times = s.counters, s.kept.times
     h, theta, t_new = s.step[0].length, s.step[0].theta, s.step[0].t_new

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, SECOND, THIRD, TO_SERIES
+from fingerspice.numerics.lobatto import BARYCENTRIC, END, FIRST, NODES, POINTS, ROWS, TO_SERIES
 
 CONTROL = np.dtype([
     ("t", float),  # s
@@ -36,9 +36,10 @@ NFEV, ACCEPTED, REJECTED, ZEROS, OUTPUT, KEPT, RECORDED = 0, 1, 2, 3, 4, 5, 6
 N_COUNTERS = 7
 # Columns of `LoopState.peaks`.
 PEAK_U, PEAK_F, ERROR_U, ERROR_F = range(4)
-# Places of a step at which the error is known: its start, the three points between nodes, its end; and for each, the
-# first and the last node between its neighbours.
+# Places of a step at which the error is known: its start, the three points between nodes, its end; as fractions of the
+# step; and for each, the first and the last node between its neighbours.
 N_PLACES = 5
+_AT = np.array([0.0, *POINTS[NODES:], 1.0])
 _NEAR = ((0, 1), (0, 5), (1, 9), (6, END), (10, END))
 # Number of last steps tried that are kept, as rows: start and length (s), error over the one allowed, number.
 TRIED = 8
@@ -147,21 +148,9 @@ def row_of(place: int) -> int:
 def error_at(places: FloatArray, theta: float, error: FloatArray) -> None:
     """Error of the modes at the end of a step that is cut short, interpolated between the places where it is known."""
     p = 0
-    left = 0.0
-    right = POINTS[FIRST]
-    if theta > POINTS[THIRD]:
-        p = 3
-        left = POINTS[THIRD]
-        right = 1.0
-    elif theta > POINTS[SECOND]:
-        p = 2
-        left = POINTS[SECOND]
-        right = POINTS[THIRD]
-    elif theta > POINTS[FIRST]:
-        p = 1
-        left = POINTS[FIRST]
-        right = POINTS[SECOND]
-    share = (theta - left) / (right - left)
+    while p < N_PLACES - 2 and theta > _AT[p + 1]:
+        p += 1
+    share = (theta - _AT[p]) / (_AT[p + 1] - _AT[p])
     for k in range(places.shape[0]):
         error[k] = (1.0 - share) * places[k, p] + share * places[k, p + 1]
 

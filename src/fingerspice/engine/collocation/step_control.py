@@ -139,23 +139,12 @@ def allowed_factor(error: float, tol: float) -> float:
 
 @jit
 def accept(h: float, wanted: float, factor: float, tries: int, fresh: int, closed: bool, control: Control) -> None:
-    """Choose the length after that of a step within its error.
+    """Choose the length after that of a step, h (s), within its error; `control` is updated.
 
-    Parameters
-    ----------
-    h, wanted : float
-        Length of the step, and that wanted before a boundary or a zero cut it short, s.
-    factor : float
-        See `allowed_factor`.
-    tries : int
-        Lengths that were tried.
-    fresh : int
-        Whether it is the first after an edge or a zero (NOT_FRESH and so on).
-    closed : bool
-        False if the last rejected length was one at which the iteration did not converge: the error of a shorter step
-        says nothing about that.
-    control : ndarray
-        Bookkeeping, updated in place.
+    `wanted` (s) is the length before a boundary or a zero cut it short, `factor` that of `allowed_factor`, `tries` the
+    number of lengths that were tried, and `fresh` whether it is the first after an edge or a zero (NOT_FRESH and so
+    on). `closed` is false if the last rejected length was one at which the iteration did not converge: the error of a
+    shorter step says nothing about that.
     """
     # A step cut short by a boundary says little about the next one. After a jump the decays die away one by one, and
     # the length allowed grows from step to step as it did.

@@ -3,26 +3,10 @@
 from __future__ import annotations
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_fused, jit_rows
+from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.collocation.readout import series_of
+from fingerspice.numerics.chebyshev import evaluate
 from fingerspice.numerics.lobatto import DERIVATIVE, NODES, POINTS
-
-
-@jit_fused
-def _value_and_slope(series: FloatArray, x: float) -> tuple[float, float]:
-    """Value and derivative of a Chebyshev series at x in [-1, 1] (Clenshaw)."""
-    b1 = 0.0
-    b2 = 0.0
-    d1 = 0.0
-    d2 = 0.0
-    for d in range(NODES - 1, 0, -1):
-        d0 = 2.0 * (b1 + x * d1) - d2
-        b0 = 2.0 * x * b1 + (series[d] - b2)
-        d2 = d1
-        d1 = d0
-        b2 = b1
-        b1 = b0
-    return x * b1 + (series[0] - b2), b1 + x * d1 - d2
 
 
 @jit_rows
@@ -55,12 +39,12 @@ def dip(u: FloatArray, sign: float, tol: float, wrong: int, series: FloatArray) 
         series_of(u, series)
         for _ in range(40):
             mid = 0.5 * (lo + hi)
-            _, slope = _value_and_slope(series, 2.0 * mid - 1.0)
+            _, slope = evaluate(series, 2.0 * mid - 1.0)
             if sign * slope < 0.0:
                 lo = mid
             else:
                 hi = mid
-        lowest, _ = _value_and_slope(series, lo + hi - 1.0)
+        lowest, _ = evaluate(series, lo + hi - 1.0)
         if sign * lowest < -tol:
             return float(0.5 * (lo + hi))
     return 0.0
@@ -105,7 +89,7 @@ def zero(u: FloatArray, sign: float, last: int, below: float, series: FloatArray
     # be below rounding.
     before = hi - lo
     for _ in range(60):
-        value, slope = _value_and_slope(series, 2.0 * theta - 1.0)
+        value, slope = evaluate(series, 2.0 * theta - 1.0)
         if sign * value > 0.0:
             lo = theta
         else:

@@ -243,11 +243,8 @@ def _move(c: Nodal, run: Passage, t: float, h: float, stop: float, last: bool) -
 def advance(c: Nodal, run: Passage, t_end: float) -> int:
     """Step a network to `t_end` (s) through the segments of its sources, writing outputs on the way.
 
-    Returns
-    -------
-    int
-        DONE; JUMP: a source jumps at the time reached, and the caller must apply the jump first; STEP_UNDERFLOW; or
-        PAUSED: call again.
+    Returns DONE; JUMP: a source jumps at the time reached, and the caller must apply the jump first; STEP_UNDERFLOW; or
+    PAUSED: call again.
     """
     c, run = borrow(c), borrow(run)
     work, control, counters, y, sign = c.work, run.control, run.counters, run.y, c.sign

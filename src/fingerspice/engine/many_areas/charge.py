@@ -18,21 +18,12 @@ from fingerspice.engine.many_areas import form as blocks
 from fingerspice.engine.many_areas.currents import cell_currents
 from fingerspice.engine.many_areas.form import AREA, CELL_U, MORE, SLOPE, D, Form, J, Leaks, W, Work
 from fingerspice.engine.many_areas.rows import clear, combine, mode_rates, wanted
-from fingerspice.engine.one_area.charge import LOBE
+from fingerspice.engine.one_area.charge import LOBE, integrate
 from fingerspice.numerics.lobatto import DERIVATIVE, NODES, POINTS, ROWS
 
 # Largest integral within a step of a function that changes its sign at every node, as the node polynomial does, over
 # the function's size and the step's length.
 _HALF_LOBE = 0.041
-
-
-@jit_rows
-def _integrate(integral: FloatArray, h: float, rate: FloatArray, out: FloatArray) -> None:
-    """out += the integral of `rate` from the start of the step to each node."""
-    for m in range(NODES):
-        share = h * rate[m]
-        for i in range(ROWS):
-            out[i] += integral[m, i] * share
 
 
 @jit_rows
@@ -96,7 +87,7 @@ def charge_rows(
                 current[a, i] += share * j[b, i]
                 collected[i] += share * leak[i]
                 z[a, i] += share * moved[i]
-        _integrate(integral, h, collected, z[a])
+        integrate(integral, h, collected, z[a])
 
 
 @jit
@@ -111,19 +102,10 @@ def charge_error(
     Interpolation errors change their sign at every node: they are stored, but over a whole step nothing of them leaks.
     If a step is cut short, the lobe between the last two nodes lasts.
 
-    Parameters
-    ----------
-    form, h, lost, g, theta
-        Form, length (s) and fraction of the step that counts; `g` (n_f,) are the leaks, which are zero within a jump.
-    work : Work
-        Its `places` (m, N_PLACES) are the errors of the modes, and `off` (5, m + n_s) the interpolation errors of this
-        step among them; see `error.assess`.
-    u, areas, z : ndarray
-        Rows of the cells' voltages (n_f, ROWS), blocks of the areas', and charges gained (n_s, ROWS).
-    collected : ndarray, shape (2, n_s)
-        Lasting errors so far: the sum of those with a known sign, and the sum of squares of the others.
-    control : ndarray
-        See `readout`.
+    `work.places` (m, N_PLACES) are the errors of the modes, and `work.off` the interpolation errors of this step among
+    them (see `error.assess`). The leaks `g` are zero within a jump. `u` (n_f, ROWS) are the cells' voltages, and `z`
+    (n_s, ROWS) the charges gained. `collected` (2, n_s) has the lasting errors so far: the sum of those with a known
+    sign, and the sum of squares of the others.
     """
     places, missed, cell_slips = work.places, work.off, work.cell_slips
     lasting, brief = work.slips[0], work.slips[1]

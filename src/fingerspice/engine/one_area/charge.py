@@ -17,7 +17,7 @@ from fingerspice.engine.collocation.readout import (
 from fingerspice.engine.one_area.model import Model
 from fingerspice.engine.one_area.rows import DQ, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.engine.one_area.system import System
-from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POINTS
+from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, FIRST, NODES, POINTS, ROWS
 
 # The interpolation error of a rate changes its sign at every node, so that its integral is at most this fraction of its
 # largest value times the step length. The fraction is 0.03 to 0.14 where the error is a Chebyshev polynomial of degree
@@ -45,7 +45,7 @@ def charge_step(
     rates, gain, gap, slow_share = system.rates[level], system.gain[level], system.gap[level], system.slow[level]
     n = rates.size
     slow = model.slow
-    voltage = np.empty(NODES)
+    voltage, leak = np.empty(NODES), np.empty(NODES)
     for j in range(NODES):
         dv = 0.0
         v = 0.0
@@ -60,8 +60,7 @@ def charge_step(
         lam = slow[n + 1] * dv * scale + (slow[n + 2] + q * slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
         # The voltage whose change, times the capacitance A_0 c (`mobile`) or A c (`local`), is stored charge.
         voltage[j] = v if model.mobile else slow[n] * r[SOURCE, j] + v
-        # The leakage current alone; `_integrate` makes charge of it.
-        z[j] = (slow[n + 2] / q + slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
+        leak[j] = (slow[n + 2] / q + slow[n + 3]) * (slow[n] * r[SOURCE, j] + v * scale)
         if model.mobile:
             # i = Q' with Q = A U / S + z, and u' from the area equation.
             margin = 1.0 - r[X_GAP, j] * model.area0 * r[DQ, j]
@@ -72,9 +71,11 @@ def charge_step(
     start = model.area0 if model.mobile else 1.0 / r[Q, 0]
     if not model.mobile and model.coupled:
         # Charge A c dv: exact with A at the start of the step; the change of A is integrated along the polynomial.
-        _add_moves(slow[n + 1] / h, voltage, r[Q], z)
-    missed, kept = _missed(model, slow_share, w, r, h, voltage, z)
-    _integrate(integral, h, z0, z)
+        _add_moves(slow[n + 1] / h, voltage, r[Q], leak)
+    missed, kept = _missed(model, slow_share, w, r, h, voltage, leak)
+    for i in range(ROWS):
+        z[i] = z0
+    integrate(integral, h, leak, z)
     for j in range(NODES):
         z[j] += slow[n + 1] * start * (voltage[j] - voltage[0])
         control.peak_q = max(control.peak_q, abs(z[j]))
@@ -102,14 +103,12 @@ def _add_moves(factor: float, voltage: FloatArray, q: FloatArray, rate: FloatArr
 
 
 @jit_rows
-def _integrate(integral: FloatArray, h: float, z0: float, z: FloatArray) -> None:
-    """Replace z' at the nodes by z there: its integral from the start of the step, plus z0."""
-    total = np.zeros(NODES)
+def integrate(integral: FloatArray, h: float, rate: FloatArray, out: FloatArray) -> None:
+    """out += the integral of `rate` from the start of the step to each node."""
     for m in range(NODES):
-        for j in range(NODES):
-            total[j] += integral[m, j] * z[m]
-    for j in range(NODES):
-        z[j] = z0 + h * total[j]
+        share = h * rate[m]
+        for i in range(ROWS):
+            out[i] += integral[m, i] * share
 
 
 @jit

@@ -223,50 +223,31 @@ def choose_branch(model: Model, u_source: float, y: FloatArray) -> float:
 
 
 @jit
-def fold_margin(model: Model, x_gap: float, u: float, sign: float) -> float:
-    """Distance to the fold of the `mobile` area equation: 1 without stored charge, 0 at the fold."""
-    if not model.mobile:
-        return 1.0
-    _, dq = branch_area(model, sign, u)
-    return 1.0 - x_gap * model.area0 * dq
+def voltage_by_time(
+    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, u: float, dy: FloatArray
+) -> tuple[float, float]:
+    """Distance to the fold, and its product with the gap voltage's rate (V/s), which both stay finite at the fold.
 
-
-@jit
-def rates_at(
-    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, u: float, out: FloatArray
-) -> None:
-    """Write y' into `out` (n + 1,), from the source's voltage and slope and the gap voltage u (V).
-
-    `sign` chooses the branch A(|u|) = A(sign u), continued analytically through 0 V.
+    The distance is that of the `mobile` area equation: 1 without stored charge, 0 at the fold. `dy` (n + 1,) takes y',
+    from the source's voltage and slope and the gap voltage u (V); `sign` chooses the branch A(|u|) = A(sign u),
+    continued analytically through 0 V.
     """
     n = model.gap.size
-    q, _ = branch_area(model, sign, u)
+    q, dq = branch_area(model, sign, u)
     scale = model.area0 * q if model.mobile else 1.0
     rest = 0.0
     total = 0.0
     for i in range(n):
         rest -= y[i]
         leak = (model.rate[i] + q * model.rate0[i]) * (model.k[i] * u_source + y[i] * scale)
-        out[i] = -leak
+        dy[i] = -leak
         total += leak
     total += (model.rate[n] + q * model.rate0[n]) * (model.k[n] * u_source + rest * scale)
     for i in range(n):
-        out[i] = (out[i] + model.k[i] * total) / scale
+        dy[i] = (dy[i] + model.k[i] * total) / scale
     lam = total / model.s
-    out[n] = lam / q if model.mobile else (lam + du_source / model.s) / q
-
-
-@jit
-def voltage_by_time(
-    model: Model, u_source: float, du_source: float, y: FloatArray, sign: float, u: float, dy: FloatArray
-) -> tuple[float, float]:
-    """Distance to the fold, and its product with the gap voltage's rate (V/s), which both stay finite at the fold.
-
-    `dy` takes y'.
-    """
-    rates_at(model, u_source, du_source, y, sign, u, dy)
-    q, _ = branch_area(model, sign, u)
-    margin = fold_margin(model, dot(model.gap, y), u, sign)
+    dy[n] = lam / q if model.mobile else (lam + du_source / model.s) / q
+    margin = 1.0 - dot(model.gap, y) * model.area0 * dq if model.mobile else 1.0
     return margin, model.k_gap * du_source + dot(model.gap, dy) * model.area0 * q
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_fused, jit_rows, jit_within
 from fingerspice.engine.collocation.readout import N_PLACES, WRITTEN_AT_ONCE
+from fingerspice.engine.network import term_at
 from fingerspice.engine.one_area.system import DEGREE, System
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
@@ -123,7 +124,10 @@ def source_rows(
                 for i in range(ROWS):
                     slope[i] += rate[i] * (omega + beta * (t0 + POINTS[i] * h))
         elif waves or terms[m, 1] != 0.0 or terms[m, 2] != 0.0:
-            _add_general(terms[m], waves, t0, h, out, slope)
+            for i in range(ROWS):
+                value, rate_here = term_at(terms[m], t0 + POINTS[i] * h)
+                out[i] += value
+                slope[i] += rate_here
         else:
             for i in range(ROWS):
                 out[i] += c
@@ -133,34 +137,6 @@ def source_rows(
             value, rate_here = chebyshev.evaluate(series, 2.0 * tau / length - 1.0)
             out[i] += value
             slope[i] += rate_here * 2.0 / length
-
-
-@jit
-def _add_general(term: FloatArray, waves: bool, t0: float, h: float, out: FloatArray, slope: FloatArray) -> None:
-    """Add one term with a power or an exponential in it."""
-    n = term[1]
-    a = term[2]
-    for i in range(ROWS):
-        tau = t0 + POINTS[i] * h
-        value = term[0]
-        rate = 0.0
-        if n == 1.0:
-            rate = value
-            value *= tau
-        elif n > 1.0:
-            rate = value * n * tau ** (n - 1.0)
-            value *= tau**n
-        if a != 0.0:
-            e = math.exp(a * tau)
-            rate = (rate + a * value) * e
-            value *= e
-        if waves:
-            phase = term[4] + (term[3] + 0.5 * term[5] * tau) * tau
-            c = math.cos(phase)
-            rate = rate * c - value * (term[3] + term[5] * tau) * math.sin(phase)
-            value *= c
-        out[i] += value
-        slope[i] += rate
 
 
 @jit_rows

@@ -77,23 +77,11 @@ def build_system(
     model: Model, tol: float, q_range: tuple[float, float], grouping: FloatArray, nodes: FloatArray,
     stress: float = 0.0, ratio: float = LEVEL_RATIO,
 ) -> System:  # fmt: skip
-    """Modal form of a model.
+    """Modal form of a model for 1/A (1/m^2) within `q_range`, with 1/A to the relative error `tol`.
 
-    Parameters
-    ----------
-    model : Model
-    tol : float
-        Relative error allowed of 1/A.
-    q_range : tuple of float
-        Smallest and largest 1/A (1/m^2) to expect.
-    grouping : ndarray, shape (n_column, n)
-        Which state voltages add up to each recorded one.
-    nodes : ndarray, shape (n_node, n + 1)
-        Voltages of the nodes from the live ones and U.
-    stress : float
-        Force per area and squared gap voltage, Pa/V^2.
-    ratio : float
-        Largest ratio of neighbouring reference areas.
+    `grouping` (n_column, n) tells which state voltages add up to each recorded one, and `nodes` (n_node, n + 1) has the
+    voltages of the nodes from the live ones and U. `stress` is the force per area and squared gap voltage (Pa/V^2),
+    `ratio` the largest one of neighbouring reference areas.
     """
     forms = _forms(
         model.mobile, model.area0, q_range[0], q_range[1], model.rate, model.rate0, model.k, model.gap, model.slow,
