@@ -71,7 +71,7 @@ class Trace(NamedTuple):
 
 def end_of(solution: Solution) -> float:
     """Time at which the run stopped, s."""
-    return float(max(solution.state.t, solution.t[-1])) if solution.t.size else float(solution.state.t)
+    return float(max([solution.state.t, *solution.t[-1:]]))
 
 
 def signal_of(solution: Solution, key: str) -> dict[str, FloatArray]:
@@ -106,15 +106,11 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
                     color = QUANTITIES[kind].color
                 else:
                     color = drawing.CYCLE[above % len(drawing.CYCLE)]
-                style: dict[str, Any] = {"color": color}
-                if source:
-                    style |= _PALE
-                else:
-                    style |= {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
-                    above += 1
+                style = _PALE if source else {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
+                above += not source
                 if run.label and not (source and shared):
                     label = f"{label}, {run.label}"
-                out.append(Trace(run.solution, label, x, style))
+                out.append(Trace(run.solution, label, x, {"color": color, **style}))
     return out
 
 
@@ -148,8 +144,7 @@ def draw_line(
     middle, spans = _envelope_spans(t, start, stop, envelope)
     low, high = np.minimum.reduceat(x, spans)[::2], np.maximum.reduceat(x, spans)[::2]
     pale = "alpha" in trace.style
-    color = trace.style["color"]
-    ax.fill_between(scale * middle, low, high, color=color, alpha=0.3 if pale else 0.2, linewidth=0.0)
+    ax.fill_between(scale * middle, low, high, color=trace.style["color"], alpha=0.3 if pale else 0.2, linewidth=0.0)
     edge = {**trace.style, "linewidth": 1.6 if pale else 0.7 * trace.style["linewidth"]}
     ax.plot(scale * middle, low, **edge)
     ax.plot(scale * middle, high, **edge, label=trace.label)
@@ -178,11 +173,9 @@ def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray)
 def draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:
     """Draw the mean force as a horizontal line; with `told` the legend names it."""
     summary = trace.solution.summary()
-    periodic = summary.get("f_el_mean_periodic")
-    mean = periodic if periodic is not None else summary.get("f_el_mean")
-    if mean is not None:
-        text = f"mean {'of the last period' if periodic is not None else 'of the run'}, {factor * mean:.4g} {unit}"
-        label = text if told else "_"
+    means = {"of the last period": summary.get("f_el_mean_periodic"), "of the run": summary.get("f_el_mean")}
+    for of, mean in [(of, mean) for of, mean in means.items() if mean is not None][:1]:
+        label = f"mean {of}, {factor * mean:.4g} {unit}" if told else "_"
         ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
 
 
@@ -229,24 +222,23 @@ def time_axis(axes: Sequence[Axes], runs: Sequence[Drawn], start: float, stop: f
                 ax.axvspan(factor * end, factor * (start + wide * span), color="#EEEEEE", zorder=0.5)
             ax.axvline(factor * end, color=drawing.VERMILION, linewidth=1.2, linestyle=drawing.DASHES[3])
     if early:
-        place: dict[str, Any] = {"transform": axes[0].get_xaxis_transform(), "ha": "right", "va": "top"}
-        place |= {"fontsize": drawing.FONT - 0.5, "color": drawing.VERMILION}
-        axes[0].text(factor * end_of(early[0]), 0.98, "stopped ", **place)
+        axes[0].text(
+            factor * end_of(early[0]), 0.98, "stopped ", transform=axes[0].get_xaxis_transform(), ha="right", va="top",
+            fontsize=drawing.FONT - 0.5, color=drawing.VERMILION,
+        )  # fmt: skip
     axes[-1].set_xlabel(f"Time [{unit}]", fontsize=drawing.FONT)
 
 
 def _facts(solution: Solution) -> list[str]:
     """Facts of a run for its caption, each always at the same index; an empty text if a fact does not apply."""
-    error = f"error estimate {solution.error.u_gap:.2g} V"
-    if solution.gaps:
-        error += f", {solution.error.f_el:.2g} N"
+    area, force = (f"area: {solution.area_mode}", f", {solution.error.f_el:.2g} N") if solution.gaps else ("", "")
     return [
         heading(solution.circuit),
         drive_text(solution.circuit),
         f"{solution.charge_law} charge law",
-        f"area: {solution.area_mode}" if solution.gaps else "",
+        area,
         f"method {solution.method}, rtol {solution.rtol:.2g}",
-        error,
+        f"error estimate {solution.error.u_gap:.2g} V{force}",
     ]
 
 

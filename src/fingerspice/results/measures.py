@@ -61,24 +61,23 @@ class Stretch:
         self.panels = run.panels(since, until)
         while (long := self.panels.duration > longest).any():
             self.panels = _joined([self.panels.take(~long), self.panels.take(long).halved()])
-        self._share, self._shares = _shares(self.panels)
 
     def weigh(self, name: str) -> Weighed:
         """A signal with weights for its means."""
         t, x = self.run.at_points(name, self.panels)
-        peak = float(np.abs(x).max(initial=0.0)) or 1.0
-        missed = _missed(x) / peak
+        missed = _missed(x) / (float(np.abs(x).max(initial=0.0)) or 1.0)
+        share = self.panels.duration / self.panels.duration.sum()
         # Gauss-Lobatto weights integrate polynomials up to twice the degree of the interpolant exactly. If the terms of
         # the series fall geometrically, the quadrature error is about the interpolation error to the power 1.85; 1.5 is
         # on the safe side.
-        if float((self._share * missed**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
-            return Weighed(t[:, :NODES], self._shares, x[:, :NODES])
-        return self._cut(name, t, x, _FINEST)[0]
+        if float((share * missed**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
+            return Weighed(t[:, :NODES], share[:, None] * _WEIGHTS, x[:, :NODES])
+        return self._cut(name, _FINEST)[0]
 
     def extremes(self, name: str) -> tuple[float, float]:
         """Smallest and largest value of a signal, evaluated where its polynomials have their extremes."""
         # An interpolation error shifts the place of an extreme, which changes the signal there by its square only.
-        weighed, panels = self._cut(name, *self.run.at_points(name, self.panels), max(_FINEST, 1e-3 * self.rtol))
+        weighed, panels = self._cut(name, max(_FINEST, 1e-3 * self.rtol))
         found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
         panel, place = np.array([p for p, _, _ in found]), np.array([x for _, x, _ in found])
         panels = panels.take(panel)
@@ -94,16 +93,15 @@ class Stretch:
         """
         shortest = np.finfo(float).eps * abs(self.span[1]) / tol
         for name in names:
-            self.panels = self._cut(name, *self.run.at_points(name, self.panels), tol, shortest)[1]
+            self.panels = self._cut(name, tol, shortest)[1]
         found = [self.run.at_points(name, self.panels) for name in names]
         return [x[:, :NODES] for x in (found[0][0], *(x for _, x in found))]
 
-    def _cut(
-        self, name: str, t: FloatArray, x: FloatArray, tol: float, shortest: float = 0.0
-    ) -> tuple[Weighed, Panels]:
+    def _cut(self, name: str, tol: float, shortest: float = 0.0) -> tuple[Weighed, Panels]:
         """A signal, and panels on which its interpolation error is at most `tol` of its peak, or as short as told."""
-        smooth = tol * float(np.abs(x).max(initial=0.0))
         panels, parts = self.panels, []
+        t, x = self.run.at_points(name, panels)
+        smooth = tol * float(np.abs(x).max(initial=0.0))
         most = _MOST_CUT + 4 * panels.step.size
         for left in range(_MOST_ROUNDS, 0, -1):
             wrong = (_missed(x) > smooth) & (panels.duration > shortest)
@@ -118,7 +116,8 @@ class Stretch:
             t, x = self.run.at_points(name, panels)
         every = _joined([part[0] for part in parts])
         t, x = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
-        return Weighed(t, _shares(every)[1], x), every
+        share = every.duration / every.duration.sum()
+        return Weighed(t, share[:, None] * _WEIGHTS, x), every
 
 
 def _joined(parts: Sequence[Panels]) -> Panels:
@@ -128,12 +127,6 @@ def _joined(parts: Sequence[Panels]) -> Panels:
 def _missed(x: FloatArray) -> FloatArray:
     """Largest interpolation error found between the nodes of each panel, from values (p, ROWS), shape (p,)."""
     return np.asarray(np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1, initial=0.0))
-
-
-def _shares(panels: Panels) -> tuple[FloatArray, FloatArray]:
-    """Weight of each panel, shape (p,), and of the values at its nodes, shape (p, NODES), in a mean."""
-    share = panels.duration / panels.duration.sum()
-    return share, share[:, None] * _WEIGHTS
 
 
 class Outputs:

@@ -67,32 +67,24 @@ class Block:
     # (k, n_column, NODES): Values at the nodes of the whole step, which may extend beyond the end reached
     values: FloatArray
     count: int = 1  # Number of equal periods
-    # shift, period: The first of these periods is `shift` (s) after the steps' own times, each further one `period` (s)
-    # later
-    shift: float = 0.0
+    # s: The first of these periods is so much after the steps' own times, and each further one after the one before
     period: float = 0.0
 
 
-@dataclass
 class Recorder:
     """Collects the steps of one integration after each call of its compiled loop."""
 
-    columns: int
-    room: Steps = field(init=False)
-    parts: list[Block] = field(default_factory=list)
-    numbers: int = 0
-    full: bool = False
-
-    def __post_init__(self) -> None:
-        self.room = new_steps(min(CAPACITY, 1 + _AT_ONCE // max(self.columns, 1)), self.columns)
+    def __init__(self, columns: int) -> None:
+        self.columns, self.numbers = columns, 0
+        self.room: Steps = new_steps(min(CAPACITY, 1 + _AT_ONCE // max(columns, 1)), columns)
+        self.parts: list[Block] = []
 
     def drain(self, counters: IntArray) -> None:
         """Collect the steps that the loop has recorded, as a block; none of them where there are too many."""
         count = int(counters[RECORDED])
         counters[RECORDED] = 0
         self.numbers += count * self.columns * NODES
-        self.full = self.full or self.numbers > MOST_NUMBERS
-        if self.full:
+        if self.numbers > MOST_NUMBERS:
             self.parts.clear()
         elif count > 0:
             self.parts.append(Block(self.room.times[:count].copy(), self.room.values[:count].copy()))
@@ -100,11 +92,11 @@ class Recorder:
     def repeat(self, since: int, periods: int, period: float) -> None:
         """Let the blocks from number `since` on also represent the `periods` periods that follow them."""
         if periods > 0:
-            self.parts += [Block(b.times, b.values, periods, period, period) for b in self.parts[since:]]
+            self.parts += [Block(b.times, b.values, periods, period) for b in self.parts[since:]]
 
     def finish(self, first: float, make: Make) -> Recorded | None:
         """The run recorded since `first` (s); None where nothing, or too much, was recorded."""
-        return None if self.full or not self.parts else Recorded(tuple(self.parts), first, make)
+        return Recorded(tuple(self.parts), first, make) if self.parts else None
 
 
 @dataclass(frozen=True)
@@ -136,11 +128,9 @@ class Recorded:
     def panels(self, since: float, until: float) -> Panels:
         """Parts of the steps between two times (s); equal periods are one panel with the duration of all of them."""
         sizes = [len(b.times) for b in self.parts]
-        count, shift, period = (
-            np.repeat(x, sizes) for x in zip(*((b.count, b.shift, b.period) for b in self.parts), strict=True)
-        )
+        count, period = (np.repeat([getattr(b, x) for b in self.parts], sizes) for x in ("count", "period"))
         start, length, reached, reach = self.times
-        begin, end = start + shift, reached + shift
+        begin, end = start + period, reached + period
         slack = same_time(1.0) * np.abs(end)
         index = np.arange(start.size)
         if ((begin >= since - slack) & (end + (count - 1) * period <= until + slack)).all():
