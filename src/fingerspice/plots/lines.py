@@ -128,10 +128,7 @@ def draw_line(
     ax: Axes, trace: Trace, factor: float, start: float, stop: float, runs: Sequence[Drawn],
     envelope: FloatArray | None = None,
 ) -> None:  # fmt: skip
-    """Draw a line from `start` to `stop` (s) with a factor from its SI unit, beside the other `runs` of the picture.
-
-    With the times (s) of its turning points, two per oscillation, an envelope is drawn.
-    """
+    """Draw a line from `start` to `stop` (s), or with the times (s) of its turning points `envelope` its envelope."""
     t = trace.solution.t
     # One output beyond each end of the window is drawn too, so that the line reaches the edges of the picture.
     first, last = max(int(np.searchsorted(t, start)) - 1, 0), int(np.searchsorted(t, stop, side="right")) + 1

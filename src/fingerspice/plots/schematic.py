@@ -6,11 +6,12 @@ Symbols are strokes: points in inches around the symbol's centre, the first node
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import image, rc_context
@@ -37,12 +38,10 @@ _RADIUS = 0.17
 
 def symbol(element: Element) -> tuple[list[Stroke], float, float]:
     """Strokes of an element's symbol, half its height, and half its width."""
-    if element.device == "R":
-        return [*_resistor(0.0, 0.0)], HALF, 0.08
-    if element.device == "C":
-        return [*_capacitor(0.0, 0.0)], HALF, 0.12
+    if element.device in "RC":
+        return (_resistor(0.0, 0.0), HALF, 0.08) if element.device == "R" else (_capacitor(0.0, 0.0), HALF, 0.12)
     if element.device in "VI":
-        return [*_source(element.device)], HALF, _RADIUS
+        return _source(element.device), HALF, _RADIUS
     if element.device == "SKIN_DISPERSIVE":
         # Two cells stand for the many of the ladder, with dots in between.
         away = HALF + 0.1
@@ -137,19 +136,9 @@ class Schematic(Picture):
         return write_aside(path, lambda target: self._write_svg(target, about or {}))
 
 
-class _Sheet(NamedTuple):
-    """Where columns and rows lie, inches."""
-
-    x: list[float]
-    y: list[float]
-    width: float
-    height: float
-
-
 def put_beside(picture: Figure, circuit: Circuit) -> Figure:
     """The picture of a run with the circuit's schematic, small, on its right."""
-    schematic = draw_circuit(circuit)
-    content = io.BytesIO()
+    schematic, content = draw_circuit(circuit), io.BytesIO()
     schematic.savefig(content, format="png", dpi=_SMALL_DPI)
     content.seek(0)
     width, height = picture.get_size_inches()
@@ -161,10 +150,8 @@ def put_beside(picture: Figure, circuit: Circuit) -> Figure:
     engine: Any = picture.get_layout_engine()
     engine.set(rect=(0.0, 0.0, width / total, 1.0))
     # Axes without a grid take no part in the layout.
-    ax = picture.add_axes(
-        (width / total, 0.5 - 0.5 * shrunk * high / height, shrunk * wide / total, shrunk * high / height),
-        label="schematic",
-    )
+    share = shrunk * high / height
+    ax = picture.add_axes((width / total, 0.5 - 0.5 * share, shrunk * wide / total, share), label="schematic")
     ax.set_axis_off()
     ax.imshow(image.imread(content), aspect="auto", interpolation="antialiased")
     return picture
@@ -192,23 +179,22 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     title = textwrap.wrap(drawing.drawable(circuit.title), 60) or [""]
     widths = {node: size(name, False) for node, name in names.items()}
     wide = {name: max(size(line, k == 0) for k, line in enumerate(lines)) for name, lines in labels.items()}
-    sheet = _sheet(placed, labels, wide, widths, max(size(line, True) for line in title), len(title))
-    figure.set_size_inches(sheet.width, sheet.height)
+    x, y, width, height = _sheet(placed, labels, wide, widths, max(size(line, True) for line in title), len(title))
+    figure.set_size_inches(width, height)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    ax.set(xlim=(0.0, sheet.width), ylim=(0.0, sheet.height))
+    ax.set(xlim=(0.0, width), ylim=(0.0, height))
     ax.set_axis_off()
     for k, line in enumerate(title):
-        _write(ax, _MARGIN, sheet.height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, bold=True)
-    strokes, dots = _wires(placed, sheet)
+        _write(ax, _MARGIN, height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, bold=True)
+    strokes, dots = _wires(placed, x, y)
     for p in placed.places:
-        strokes += _draw_element(ax, sheet, p, labels[p.element.name])
+        strokes += _draw_element(ax, x, y, p, labels[p.element.name])
     for node, name in names.items():
-        x, y = sheet.x[placed.extents[node][0]] + 0.07, sheet.y[placed.rows[node]] + 0.08
-        _write(ax, x, y, name, color=drawing.BLUE)
+        _write(ax, x[placed.extents[node][0]] + 0.07, y[placed.rows[node]] + 0.08, name, color=drawing.BLUE)
     for stroke in strokes:
         ax.plot(*zip(*stroke, strict=True), color=drawing.BLACK, linewidth=1.0, solid_capstyle="round")
-    for x, y in dots:
-        ax.plot([x], [y], "o", color=drawing.BLACK, markersize=3.5)
+    for dot in dots:
+        ax.plot(*dot, "o", color=drawing.BLACK, markersize=3.5)
     if path is not None:
         figure.write(path)
     return figure
@@ -259,8 +245,8 @@ def _quantity(value: float, unit: str) -> str:
 def _sheet(
     placed: Placement, labels: Mapping[str, tuple[str, ...]], widths: Mapping[str, float], names: Mapping[str, float],
     title: float, lines: int,
-) -> _Sheet:  # fmt: skip
-    """Columns so wide and rows so high that nothing meets, from the widths (inches) of labels, nodes and title."""
+) -> tuple[list[float], list[float], float, float]:  # fmt: skip
+    """Places of columns and rows, between which nothing meets, width and height (inches), from the widths of texts."""
     columns = 1 + max(p.column for p in placed.places)
     gaps = max(p.bottom for p in placed.places)
     left, right, high = [0.2] * columns, [0.3] * columns, [0.0] * gaps
@@ -274,8 +260,8 @@ def _sheet(
         column = placed.extents[node][0]
         right[column] = max(right[column], 0.07 + width)
     x = [_MARGIN + left[0]]
-    for k in range(1, columns):
-        x.append(x[-1] + right[k - 1] + _MARGIN + left[k])
+    for before, own in itertools.pairwise(zip(left, right, strict=True)):
+        x.append(x[-1] + before[1] + _MARGIN + own[0])
     width = max(x[-1] + right[-1] + _MARGIN, title + 2.0 * _MARGIN)
     # Names of nodes stand above their rows, also above the first one; ground hangs below the last.
     above = [_MARGIN + 1.2 * _LINE * lines + _ROOM + _LINE, *(h + 2.0 * _ROOM + _LINE for h in high)]
@@ -283,38 +269,37 @@ def _sheet(
     y = [height - above[0]]
     for step in above[1:]:
         y.append(y[-1] - step)
-    return _Sheet(x, y, width, height)
+    return x, y, width, height
 
 
-def _draw_element(ax: Axes, sheet: _Sheet, p: Place, label: Sequence[str]) -> list[Stroke]:
+def _draw_element(
+    ax: Axes, columns: Sequence[float], rows: Sequence[float], p: Place, label: Sequence[str]
+) -> list[Stroke]:
     """Write an element's label; gives the strokes of its symbol and of its wires."""
     strokes, tall, wide = symbol(p.element)
-    x = sheet.x[p.column]
     # The name of the node below needs the lowest line.
-    y = 0.5 * (sheet.y[p.gap] + sheet.y[p.gap + 1] + _LINE)
-    tint = _TINTS.get(p.element.device)
-    if tint is not None:
+    x, y = columns[p.column], 0.5 * (rows[p.gap] + rows[p.gap + 1] + _LINE)
+    if tint := _TINTS.get(p.element.device):
         corner = (x - wide - 0.02, y - tall)
         ax.add_patch(Rectangle(corner, 2.0 * wide + 0.04, 2.0 * tall, color=tint, alpha=0.2, linewidth=0))
     for k, line in enumerate(label):
         _write(ax, x + wide + _BESIDE, y + 0.5 * _LINE * len(label) - (k + 0.5) * _LINE, line, bold=k == 0)
     up = 1.0 if p.upright else -1.0
     moved: list[Stroke] = [[(x + dx, y + up * dy) for dx, dy in stroke] for stroke in strokes]
-    return [*moved, [(x, sheet.y[p.top]), (x, y + tall)], [(x, y - tall), (x, sheet.y[p.bottom])]]
+    return [*moved, [(x, rows[p.top]), (x, y + tall)], [(x, y - tall), (x, rows[p.bottom])]]
 
 
-def _wires(placed: Placement, sheet: _Sheet) -> tuple[list[Stroke], Stroke]:
+def _wires(placed: Placement, x: Sequence[float], y: Sequence[float]) -> tuple[list[Stroke], Stroke]:
     """The rows of nodes with ground, and the points where three wires or more meet."""
     rows: list[Stroke] = []
     dots = []
     for node, (first, last) in placed.extents.items():
-        y = sheet.y[placed.rows[node]]
+        height = y[placed.rows[node]]
         if last > first:
-            rows.append([(sheet.x[first], y), (sheet.x[last], y)])
+            rows.append([(x[first], height), (x[last], height)])
         ends = [p.column for p in placed.places if node in p.element.nodes[:2]]
         for column in sorted(set(ends)):
             meeting = ends.count(column) + (column > first) + (column < last)
             if meeting + (node == GROUND and column == first) >= 3:
-                dots.append((sheet.x[column], y))
-    column = placed.extents[GROUND][0]
-    return [*rows, *ground(sheet.x[column], sheet.y[placed.rows[GROUND]])], dots
+                dots.append((x[column], height))
+    return [*rows, *ground(x[placed.extents[GROUND][0]], y[placed.rows[GROUND]])], dots

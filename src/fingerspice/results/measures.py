@@ -47,13 +47,10 @@ class Weighed:
 
 
 class Stretch:
-    """A run between two times (s), with weights and extremes of every signal.
+    """A run between two times (s), with weights and extremes of every signal, more exact than its error `rtol`.
 
-    A panel is halved where the polynomial through its nodes differs from the signal between them: steps are chosen to
-    resolve the gap voltage, and the area may change within a small part of the voltage's range.
-
-    `rtol` is the error of the run relative to its peaks, than which means and extremes are more exact; no panel is
-    longer than `longest` (s).
+    A panel is halved where it is longer than `longest` (s), or the polynomial through its nodes differs from the signal
+    between them: steps resolve the gap voltage, and the area may change within a small part of the voltage's range.
     """
 
     def __init__(self, run: Recorded, since: float, until: float, rtol: float, longest: float = math.inf) -> None:
@@ -86,11 +83,8 @@ class Stretch:
         return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
 
     def at_nodes(self, names: Sequence[str], tol: float) -> list[FloatArray]:
-        """Times (s) and these signals at the nodes of panels on which each misses its polynomial by `tol` of its peak.
-
-        All have the shape (p, NODES). Panels on which the rounding of the time alone is as much, as on an edge of 1 ns,
-        are not cut.
-        """
+        """Times (s) and signals at the nodes (p, NODES) of panels on which each misses its polynomial by `tol`."""
+        # Panels on which the rounding of the time alone is as much, as on an edge of 1 ns, are not cut.
         shortest = np.finfo(float).eps * abs(self.span[1]) / tol
         for name in names:
             self.panels = self._cut(name, tol, shortest)[1]

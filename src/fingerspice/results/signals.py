@@ -114,13 +114,7 @@ class Signals(Sealed):
         return () if not of else tuple(self.node_voltages if of == "node" else getattr(self, f"{of}s"))
 
     def names(self, key: str) -> tuple[str, ...]:
-        """``key`` itself, or ``key:element`` for each of several elements; empty where the run has no such signal.
-
-        Raises
-        ------
-        InputError
-            For a name that no signal has.
-        """
+        """``key`` itself, or ``key:element`` for each of several elements; empty where the run has no such signal."""
         base, colon, _ = key.partition(":")
         if base not in SIGNALS or (colon and key not in self.names(base)):
             raise InputError(f"unknown signal {key!r}; allowed: {', '.join(SIGNALS)}")

@@ -43,10 +43,7 @@ class Figures:
         self._kept: dict[tuple[str, str], Any] = {}
 
     def value(self, key: str, kind: str) -> Value:
-        """A figure of a signal: one number, an array where several gaps or sources have it, or None.
-
-        `kind` is mean, rms, min, max, peak, ripple, amplitude, phase_deg, or one of the first two with ``_periodic``.
-        """
+        """A figure of a kind that `_made` knows: a number, an array of several gaps or sources, or None."""
         values = [self._one(name, kind) for name in self.signals.names(key)]
         if len(values) < 2:
             return values[0] if values else None
@@ -121,8 +118,7 @@ class Figures:
     def last_finely(self, name: str, longest: float) -> tuple[Weighed, bool] | None:
         """A signal with weights over the last period, and whether it is known between the outputs; None without one.
 
-        If it is known, its panels are no longer than `longest` (s), so that the weights also integrate the product of
-        the signal with an oscillation of that period.
+        Then the weights also integrate its product with an oscillation of the period `longest` (s).
         """
         # Charges and currents are those of the outputs alone.
         last = self._last_outputs if self.last is not None and name.startswith(("q_", "i_")) else self.last
@@ -131,10 +127,9 @@ class Figures:
         return None if last is None else (last.weigh(name), False)
 
     def between(self) -> tuple[list[str], FloatArray] | None:
-        """Names of the voltages, areas and forces, and a table of the last period: times (s), then these signals.
+        """Names of signals, and a table of times (s) and these signals at the nodes of the last period's panels.
 
-        Its rows are the nodes of panels on which all are polynomials. None where the run is not known between its
-        outputs, or the table is larger than `MOST_BETWEEN`.
+        None where the run is not known between its outputs, or the table is larger than `MOST_BETWEEN`.
         """
         if not isinstance(self.last, Stretch):
             return None
