@@ -122,8 +122,7 @@ def test_a_run_of_many_periods_has_the_figures_of_its_stepped_twin(law):
 
 
 def test_the_last_period_may_begin_in_the_middle_of_steps_and_of_repeated_periods():
-    whole = table1_run(fs.Sine(200.0, 100.0), 100.0, 40, rtol=1e-9)
-    odd = table1_run(fs.Sine(200.0, 100.0), 100.0, 40.37, rtol=1e-9)
+    whole, odd = (table1_run(fs.Sine(200.0, 100.0), 100.0, periods, rtol=1e-9) for periods in (40, 40.37))
     assert odd.stats["repeated"] > 20
     for key in ("f_el_mean_periodic", "u_gap_amplitude", "u_gap_phase_deg", "u_source_phase_deg", "f_el_ripple"):
         assert odd.summary()[key] == pytest.approx(whole.summary()[key], rel=1e-7, abs=1e-7)

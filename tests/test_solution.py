@@ -138,14 +138,8 @@ def test_a_jump_of_one_source_is_not_hidden_by_that_of_another() -> None:
 
 
 def test_arrays_are_read_only_and_the_result_is_frozen(square: fs.Solution) -> None:
-    arrays = [value for value, _, _ in square.signals.values()]
-    for array in (
-        square.t,
-        square.u_layer,
-        *arrays,
-        *square.node_voltages.values(),
-        fs.Samples([1.0, 2.0], 1.0).values,
-    ):
+    arrays = [*(value for value, _, _ in square.signals.values()), fs.Samples([1.0, 2.0], 1.0).values]
+    for array in (square.t, square.u_layer, *arrays, *square.node_voltages.values()):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1.0
     with pytest.raises(dataclasses.FrozenInstanceError):

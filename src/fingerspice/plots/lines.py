@@ -12,7 +12,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.circuit.describe import drive_text, heading
 from fingerspice.plots import drawing
 from fingerspice.results.outcome import Status
-from fingerspice.results.signals import SIGNALS
+from fingerspice.results.signals import SIGNALS, Signal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,28 +29,12 @@ _WIDTHS = (2.0, 1.5, 1.2, 1.0)
 _PALE: dict[str, Any] = {"linewidth": 3.2, "alpha": 0.45, "linestyle": "-", "solid_capstyle": "butt"}
 
 
-class Quantity(NamedTuple):
-    """The physical quantity of a panel."""
-
-    label: str
-    unit: str
-    least: float  # The unit's prefix is chosen so that the peak is at least this number; 0 means no prefix
-    color: str
-    from_zero: bool  # Whether the scale starts at 0
-
-
-VOLTAGE = Quantity("Voltage", "V", 2.0, drawing.BLUE, False)
-QUANTITIES = {
-    **dict.fromkeys(("u_source", "u_gap", "u_layer", "v"), VOLTAGE),
-    "f_el": Quantity("Force", "N", 0.05, drawing.VERMILION, True),
-    "area": Quantity("Ridge area", "mm²", 0.0, drawing.GREEN, False),
-    "f_t": Quantity("Friction", "N", 0.05, drawing.PURPLE, True),
-    "friction": Quantity("Friction coefficient", "", 0.0, drawing.PURPLE, True),
-    "sigma_el": Quantity("Stress", "Pa", 2.0, drawing.VERMILION, True),
-    "q_source": Quantity("Charge", "C", 2.0, drawing.BLUE, False),
-    "i_source": Quantity("Current", "A", 2.0, drawing.BLUE, False),
-    "fold_margin": Quantity("Distance to the fold", "", 0.0, drawing.BLACK, True),
-}
+#: Colour of a panel's line where there is one, by its label.
+COLORS = {
+    "Voltage": drawing.BLUE, "Charge": drawing.BLUE, "Current": drawing.BLUE, "Ridge area": drawing.GREEN,
+    "Friction": drawing.PURPLE, "Friction coefficient": drawing.PURPLE, "Distance to the fold": drawing.BLACK,
+    "Force": drawing.VERMILION, "Stress": drawing.VERMILION,
+}  # fmt: skip
 
 
 class Drawn(NamedTuple):
@@ -74,7 +58,7 @@ def end_of(solution: Solution) -> float:
     return float(max([solution.state.t, *solution.t[-1:]]))
 
 
-def signal_of(solution: Solution, key: str) -> dict[str, FloatArray]:
+def columns_of(solution: Solution, key: str) -> dict[str, FloatArray]:
     """A signal by name; empty if this run lacks the element, which another run of the picture may have."""
     kind, colon, _ = key.partition(":")
     return solution.by_name(key) if not colon or key in solution.record.names(kind) else {}
@@ -89,7 +73,7 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
     shared = len({run.solution.u_source.tobytes() for run in runs}) == 1
     for number, run in enumerate(runs):
         for key in keys:
-            found = signal_of(run.solution, key)
+            found = columns_of(run.solution, key)
             for place, (name, x) in enumerate(found.items()):
                 kind, _, element = name.partition(":")
                 source = kind == "u_source"
@@ -103,7 +87,7 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
                 elif source:
                     color = (drawing.GREY, *drawing.CYCLE[::-1])[place % (len(drawing.CYCLE) + 1)]
                 elif len(found) == 1 and len(keys) <= 2:
-                    color = QUANTITIES[kind].color
+                    color = COLORS[SIGNALS[kind].axis]
                 else:
                     color = drawing.CYCLE[above % len(drawing.CYCLE)]
                 style = _PALE if source else {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
@@ -114,14 +98,12 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
     return out
 
 
-def scale_of(quantity: Quantity, traces: list[Trace], start: float, stop: float) -> tuple[float, str]:
+def scale_of(signal: Signal, traces: list[Trace], start: float, stop: float) -> tuple[float, str]:
     """Factor and unit of a panel."""
-    if quantity.unit == "mm²":
-        return 1e6, "mm²"
-    if quantity.least == 0.0:
-        return 1.0, quantity.unit
+    if signal.least == 0.0:
+        return (1e6, "mm²") if signal.unit == "m^2" else (1.0, "")
     peaks = [drawing.peak_of(t.x[(t.solution.t >= start) & (t.solution.t <= stop)]) for t in traces]
-    return drawing.engineering(max(peaks, default=0.0), quantity.unit, quantity.least)
+    return drawing.engineering(max(peaks, default=0.0), signal.unit, signal.least)
 
 
 def draw_line(
@@ -176,10 +158,10 @@ def draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = 
         ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
 
 
-def finish_panel(ax: Axes, quantity: Quantity, unit: str, values: Sequence[FloatArray], room: int = PAGE) -> None:
+def finish_panel(ax: Axes, signal: Signal, unit: str, values: Sequence[FloatArray], room: int = PAGE) -> None:
     """Labels, limits and legend of a panel; `room` is the number of letters that the legend has room for."""
-    drawing.dress(ax, f"{quantity.label} [{unit}]" if unit else quantity.label)
-    if quantity.from_zero:
+    drawing.dress(ax, f"{signal.axis} [{unit}]" if unit else signal.axis)
+    if signal.from_zero:
         drawing.from_zero(ax)
     else:
         ax.ticklabel_format(axis="y", useOffset=False)

@@ -34,56 +34,52 @@ Stroke = Sequence[tuple[float, float]]
 #: Half the height of a part, and half the distance of a resistor from the capacitor beside it.
 HALF, APART = 0.24, 0.17
 _RADIUS = 0.17
+_ZIGZAG: Stroke = [(0.06 * (-1.0) ** k, 0.15 - 0.05 * (k + 0.5)) for k in range(6)]
+_RESISTOR: list[Stroke] = [[(0.0, HALF), (0.0, 0.15), *_ZIGZAG, (0.0, -0.15), (0.0, -HALF)]]
+_CAPACITOR: list[Stroke] = [
+    *([(-0.11, s * 0.035), (0.11, s * 0.035)] for s in (1.0, -1.0)),
+    *([(0.0, s * 0.035), (0.0, s * HALF)] for s in (1.0, -1.0)),
+]
+_CIRCLE: list[Stroke] = [
+    [(float(_RADIUS * np.cos(a)), float(_RADIUS * np.sin(a))) for a in np.linspace(0.0, 2.0 * np.pi, 61)],
+    *([(0.0, s * _RADIUS), (0.0, s * HALF)] for s in (1.0, -1.0)),
+]
+_PLUS_MINUS: list[Stroke] = [
+    [(-0.045, 0.085), (0.045, 0.085)], [(0.0, 0.04), (0.0, 0.13)], [(-0.045, -0.085), (0.045, -0.085)]
+]  # fmt: skip
+_ARROW: list[Stroke] = [[(0.0, 0.11), (0.0, -0.11)], [(-0.045, -0.05), (0.0, -0.11), (0.045, -0.05)]]
+#: Strokes of the parts, and half their width. The arrow of a current points from the first node to the second.
+_PARTS = {
+    "R": (_RESISTOR, 0.08), "C": (_CAPACITOR, 0.12),
+    "V": (_CIRCLE + _PLUS_MINUS, _RADIUS), "I": (_CIRCLE + _ARROW, _RADIUS),
+}  # fmt: skip
 
 
 def symbol(element: Element) -> tuple[list[Stroke], float, float]:
     """Strokes of an element's symbol, half its height, and half its width."""
-    if element.device in "RC":
-        return (_resistor(0.0, 0.0), HALF, 0.08) if element.device == "R" else (_capacitor(0.0, 0.0), HALF, 0.12)
-    if element.device in "VI":
-        return _source(element.device), HALF, _RADIUS
+    if element.device in _PARTS:
+        strokes, wide = _PARTS[element.device]
+        return strokes, HALF, wide
     if element.device == "SKIN_DISPERSIVE":
         # Two cells stand for the many of the ladder, with dots in between.
         away = HALF + 0.1
         dots: list[Stroke] = [[(0.0, y), (0.0, y + 0.02)] for y in (-0.06, -0.01, 0.04)]
         return [*_cell(away, leaks=True), *dots, *_cell(-away, leaks=True)], 2.0 * HALF + 0.1, APART + 0.12
     leak = element.values.get("r", element.values.get("rho", 0.0))
-    return [*_cell(0.0, leaks=bool(np.isfinite(leak)))], HALF, APART + 0.12
-
-
-def ground(x: float, y: float) -> list[Stroke]:
-    """Strokes of a ground whose wire begins at (x, y)."""
-    lines: list[Stroke] = [[(x, y), (x, y - 0.14)]]
-    return lines + [[(x - w, y - d), (x + w, y - d)] for w, d in ((0.13, 0.14), (0.08, 0.19), (0.03, 0.24))]
+    return _cell(0.0, leaks=bool(np.isfinite(leak))), HALF, APART + 0.12
 
 
 def _cell(y: float, *, leaks: bool) -> list[Stroke]:
     """A capacitor, and a resistor beside it where the layer leaks."""
     if not leaks:
-        return _capacitor(0.0, y)
+        return _moved(_CAPACITOR, 0.0, y)
     bars: list[Stroke] = [[(-APART, y + s * HALF), (APART, y + s * HALF)] for s in (1.0, -1.0)]
-    return [*_resistor(-APART, y), *_capacitor(APART, y), *bars]
+    return [*_moved(_RESISTOR, -APART, y), *_moved(_CAPACITOR, APART, y), *bars]
 
 
-def _resistor(x: float, y: float) -> list[Stroke]:
-    zigzag = [(x + 0.06 * (-1.0) ** k, y + 0.15 - 0.05 * (k + 0.5)) for k in range(6)]
-    return [[(x, y + HALF), (x, y + 0.15), *zigzag, (x, y - 0.15), (x, y - HALF)]]
-
-
-def _capacitor(x: float, y: float) -> list[Stroke]:
-    plates: list[Stroke] = [[(x - 0.11, y + s * 0.035), (x + 0.11, y + s * 0.035)] for s in (1.0, -1.0)]
-    return [*plates, *([(x, y + s * 0.035), (x, y + s * HALF)] for s in (1.0, -1.0))]
-
-
-def _source(device: str) -> list[Stroke]:
-    """A circle, with plus and minus for a voltage, and for a current its arrow from the first node to the second."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 61)
-    circle = [(float(_RADIUS * np.cos(a)), float(_RADIUS * np.sin(a))) for a in angle]
-    leads: list[Stroke] = [[(0.0, s * _RADIUS), (0.0, s * HALF)] for s in (1.0, -1.0)]
-    if device == "I":
-        return [circle, *leads, [(0.0, 0.11), (0.0, -0.11)], [(-0.045, -0.05), (0.0, -0.11), (0.045, -0.05)]]
-    plus: list[Stroke] = [[(-0.045, 0.085), (0.045, 0.085)], [(0.0, 0.04), (0.0, 0.13)]]
-    return [circle, *leads, *plus, [(-0.045, -0.085), (0.045, -0.085)]]
+def _moved(strokes: Sequence[Stroke], x: float, y: float, up: float = 1.0) -> list[Stroke]:
+    """Strokes around (x, y), upside down where `up` is -1."""
+    return [[(x + dx, y + up * dy) for dx, dy in stroke] for stroke in strokes]
 
 
 #: Largest number of elements that a picture can show.
@@ -284,8 +280,7 @@ def _draw_element(
         ax.add_patch(Rectangle(corner, 2.0 * wide + 0.04, 2.0 * tall, color=tint, alpha=0.2, linewidth=0))
     for k, line in enumerate(label):
         _write(ax, x + wide + _BESIDE, y + 0.5 * _LINE * len(label) - (k + 0.5) * _LINE, line, bold=k == 0)
-    up = 1.0 if p.upright else -1.0
-    moved: list[Stroke] = [[(x + dx, y + up * dy) for dx, dy in stroke] for stroke in strokes]
+    moved = _moved(strokes, x, y, 1.0 if p.upright else -1.0)
     return [*moved, [(x, rows[p.top]), (x, y + tall)], [(x, y - tall), (x, rows[p.bottom])]]
 
 
@@ -302,4 +297,7 @@ def _wires(placed: Placement, x: Sequence[float], y: Sequence[float]) -> tuple[l
             meeting = ends.count(column) + (column > first) + (column < last)
             if meeting + (node == GROUND and column == first) >= 3:
                 dots.append((x[column], height))
-    return [*rows, *ground(x[placed.extents[GROUND][0]], y[placed.rows[GROUND]])], dots
+    # Ground hangs from the first column of its row.
+    lines: list[Stroke] = [[(0.0, 0.0), (0.0, -0.14)]]
+    lines += [[(-w, -d), (w, -d)] for w, d in ((0.13, 0.14), (0.08, 0.19), (0.03, 0.24))]
+    return [*rows, *_moved(lines, x[placed.extents[GROUND][0]], y[placed.rows[GROUND]])], dots

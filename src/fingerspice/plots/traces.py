@@ -13,8 +13,8 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.describe import changes_text, heading
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.plots import drawing, lines
-from fingerspice.plots.lines import Drawn, Quantity
-from fingerspice.results.signals import SIGNALS
+from fingerspice.plots.lines import Drawn
+from fingerspice.results.signals import SIGNALS, Signal, signal_of
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -46,16 +46,16 @@ def plot_solution(
     marks, heights = _turns(runs, panels, start, stop)
     dense = marks.size > 2 * MOST_DRAWN
     zoomed = _zoom(marks, heights, start, stop)
-    shares = [1.5 if quantity == lines.VOLTAGE else 1.1 for quantity, _ in panels]
+    shares = [1.5 if signal.axis == "Voltage" else 1.1 for signal, _ in panels]
     widths = [1.0] if zoomed is None else [1.5, 1.0]
     figure, axes = drawing.new_figure(
         len(panels), len(widths), height=max(3.4, 0.7 + 1.15 * sum(shares)), height_ratios=shares, width_ratios=widths,
         sharex="col", sharey="row",
     )  # fmt: skip
     left, right = axes[:: len(widths)], [] if zoomed is None else axes[1::2]
-    for row, (quantity, keys) in enumerate(panels):
+    for row, (signal, keys) in enumerate(panels):
         traces = lines.traces_of(runs, keys)
-        factor, unit = lines.scale_of(quantity, traces, start, stop)
+        factor, unit = lines.scale_of(signal, traces, start, stop)
         for trace in traces:
             lines.draw_line(left[row], trace, factor, start, stop, runs, envelope=marks if dense else None)
             if zoomed is not None:
@@ -66,7 +66,7 @@ def plot_solution(
                 lines.draw_mean(right[row], traces[0], factor, unit)
                 drawing.legend_above(right[row], 1)
         room = lines.HALF if right else lines.PAGE
-        lines.finish_panel(left[row], quantity, unit, [factor * t.x for t in traces], room)
+        lines.finish_panel(left[row], signal, unit, [factor * t.x for t in traces], room)
         if keys == ["f_t"] and len(traces) == 1:
             lines.coefficient_axis((right or left)[row], traces[0].solution, factor)
     lines.time_axis(left, runs, start, stop)
@@ -111,8 +111,8 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     return [Drawn(s, label) for s, label in zip(every, labels, strict=True)]
 
 
-def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[tuple[Quantity, list[str]]]:
-    """Panels from top to bottom, each with the names of its signals."""
+def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[tuple[Signal, list[str]]]:
+    """Panels from top to bottom, each with its first signal and the names of all."""
     every = [run.solution.record for run in runs]
     if signals is None:
         inside = "u_layer" if any(s.layers for s in every) else "v"
@@ -120,18 +120,18 @@ def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[tupl
         signals = ["u_source", *(("u_gap", "f_el", "area", "f_t") if contact else (inside,))]
     asked = [signals] if isinstance(signals, str) else list(signals)
     known = {name: None for s in every for key in SIGNALS for name in (key, *s.names(key)) if s.names(key)}
-    panels: list[tuple[Quantity, list[str]]] = []
+    panels: list[tuple[Signal, list[str]]] = []
     for name in asked:
         if name not in known:
             near = get_close_matches(str(name), known, 1, 0.0)
             allowed = ", ".join([*(name for name in known if ":" not in name), "and name:element"])
             raise InputError(f"unknown signal {name!r}; nearest: {near[0]!r}; allowed: {allowed}")
-        quantity = lines.QUANTITIES[name.partition(":")[0]]
-        same = [keys for q, keys in panels if q == quantity]
+        signal = signal_of(name)
+        same = [keys for other, keys in panels if other.axis == signal.axis]
         if same:
             same[0].append(name)
         else:
-            panels.append((quantity, [name]))
+            panels.append((signal, [name]))
     require(bool(panels), "signals", "empty", "one name or more")
     return panels
 
@@ -152,7 +152,7 @@ def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[floa
 
 
 def _turns(
-    runs: list[Drawn], panels: list[tuple[Quantity, list[str]]], start: float, stop: float
+    runs: list[Drawn], panels: list[tuple[Signal, list[str]]], start: float, stop: float
 ) -> tuple[FloatArray, FloatArray]:
     """Times (s) and values of the turning points, two per oscillation, of the first panel's most oscillating signal."""
     best = np.zeros(0), np.zeros(0)
@@ -160,7 +160,7 @@ def _turns(
         t = run.solution.t
         kept = (t >= start) & (t <= stop)
         for key in panels[0][1]:
-            for x in lines.signal_of(run.solution, key).values():
+            for x in lines.columns_of(run.solution, key).values():
                 step = np.diff(x[kept])
                 # Turning points of round-off are not counted.
                 steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
@@ -196,9 +196,9 @@ _DRAWN = 1e-6
 def plot_spectrum(spectrum: Spectrum) -> Picture:
     """Amplitudes of the lines, or the density with its confidence interval, against frequency, on logarithmic axes."""
     figure, (ax,) = drawing.new_figure(1, height=3.4)
-    name = spectrum.signal.partition(":")[0]
-    color, unit = lines.QUANTITIES[name].color, spectrum.unit.replace("^2", "²")
-    label = f"{SIGNALS[name].text.capitalize()} {spectrum.signal.partition(':')[2]}".rstrip()
+    signal = signal_of(spectrum.signal)
+    color, unit = lines.COLORS[signal.axis], spectrum.unit.replace("^2", "²")
+    label = f"{signal.text.capitalize()} {spectrum.signal.partition(':')[2]}".rstrip()
     if spectrum.amplitude is not None:
         least = _DRAWN * drawing.peak_of(spectrum.amplitude)
         stems(ax, spectrum.frequency, spectrum.amplitude, least, color=color)

@@ -11,9 +11,9 @@ from numpy.polynomial import legendre
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.numerics.chebyshev import largest
-from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS
+from fingerspice.numerics.lobatto import NODES, POINTS
 from fingerspice.results.signals import Signals
-from fingerspice.results.steps import Panels, Recorded
+from fingerspice.results.steps import Panels, Recorded, missed
 
 _NODES = POINTS[:NODES]
 #: Smallest tolerance of the interpolation error of a panel, relative to the signal's peak.
@@ -62,12 +62,12 @@ class Stretch:
     def weigh(self, name: str) -> Weighed:
         """A signal with weights for its means."""
         t, x = self.run.at_points(name, self.panels)
-        missed = _missed(x) / (float(np.abs(x).max(initial=0.0)) or 1.0)
+        error = missed(x) / (float(np.abs(x).max(initial=0.0)) or 1.0)
         share = self.panels.duration / self.panels.duration.sum()
         # Gauss-Lobatto weights integrate polynomials up to twice the degree of the interpolant exactly. If the terms of
         # the series fall geometrically, the quadrature error is about the interpolation error to the power 1.85; 1.5 is
         # on the safe side.
-        if float((share * missed**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
+        if float((share * error**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
             return Weighed(t[:, :NODES], share[:, None] * _WEIGHTS, x[:, :NODES])
         return self._cut(name, _FINEST)[0]
 
@@ -98,7 +98,7 @@ class Stretch:
         smooth = tol * float(np.abs(x).max(initial=0.0))
         most = _MOST_CUT + 4 * panels.step.size
         for left in range(_MOST_ROUNDS, 0, -1):
-            wrong = (_missed(x) > smooth) & (panels.duration > shortest)
+            wrong = (missed(x) > smooth) & (panels.duration > shortest)
             if most <= 0 or left == 1:
                 # Panels that are still not smooth hold round-off, or a jump that round-off has shifted across an end.
                 wrong[:] = False
@@ -116,11 +116,6 @@ class Stretch:
 
 def _joined(parts: Sequence[Panels]) -> Panels:
     return Panels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _missed(x: FloatArray) -> FloatArray:
-    """Largest interpolation error found between the nodes of each panel, from values (p, ROWS), shape (p,)."""
-    return np.asarray(np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1, initial=0.0))
 
 
 class Outputs:

@@ -20,32 +20,41 @@ class Signal(NamedTuple):
     unit: str
     text: str  # Its long name
     short: str  # Its name in a legend
+    axis: str  # Label of its panel in a picture, which signals of the same quantity share
+    least: float = 0.0  # A panel's unit has a prefix by which the peak is at least this number; 0 means no prefix
+    from_zero: bool = False  # Whether the scale of a panel starts at 0
     of: str = ""  # "source", "layer", "gap" or "node" where each of these has a column
+    ripple: bool = False  # Whether its summary has a ripple instead of an rms
     # Other signals follow from the record itself: this one from another signal, with the contact of the gap
     base: str = ""
     make: Callable[[Contact, FloatArray], FloatArray] | None = None
-    ripple: bool = False  # Whether its summary has a ripple instead of an rms
 
 
 #: Signals in the order of tables and files; those of layers and nodes are ``u_layer:NAME`` and ``v:NAME``.
 SIGNALS = {
-    "u_source": Signal("V", "source voltage", "source", "source"),
-    "u_layer": Signal("V", "layer voltage", "layer", "layer"),
-    "u_gap": Signal("V", "gap voltage", "gap", "gap"),
-    "area": Signal("m^2", "ridge contact area", "area", "gap", ripple=True),
-    "sigma_el": Signal("Pa", "electroadhesive stress", "electroadhesive stress", "gap", "u_gap", Contact.stress),
-    "f_el": Signal("N", "electroadhesive force", "electroadhesive force", "gap", ripple=True),
+    "u_source": Signal("V", "source voltage", "source", "Voltage", 2.0, of="source"),
+    "u_layer": Signal("V", "layer voltage", "layer", "Voltage", 2.0, of="layer"),
+    "u_gap": Signal("V", "gap voltage", "gap", "Voltage", 2.0, of="gap"),
+    "area": Signal("m^2", "ridge contact area", "area", "Ridge area", of="gap", ripple=True),
+    "sigma_el": Signal(
+        "Pa", "electroadhesive stress", "electroadhesive stress", "Stress", 2.0, True, "gap", False, "u_gap",
+        Contact.stress,
+    ),
+    "f_el": Signal("N", "electroadhesive force", "electroadhesive force", "Force", 0.05, True, "gap", True),
     "f_t": Signal(
-        "N", "friction force", "friction", "gap", "f_el", lambda contact, f: contact.mu * (contact.f_n + f), ripple=True
+        "N", "friction force", "friction", "Friction", 0.05, True, "gap", True, "f_el",
+        lambda contact, f: contact.mu * (contact.f_n + f),
     ),
     "friction": Signal(
-        "1", "friction coefficient f_t / f_n", "coefficient", "gap", "f_t", lambda contact, f: f / contact.f_n,
-        ripple=True,
+        "1", "friction coefficient f_t / f_n", "coefficient", "Friction coefficient", 0.0, True, "gap", True, "f_t",
+        lambda contact, f: f / contact.f_n,
     ),
-    "q_source": Signal("C", "charge delivered by the source", "charge", "source"),
-    "i_source": Signal("A", "source current, regular part", "current", "source"),
-    "fold_margin": Signal("1", "distance to the fold of the mobile law", "distance to the fold"),
-    "v": Signal("V", "node voltage", "node", "node"),
+    "q_source": Signal("C", "charge delivered by the source", "charge", "Charge", 2.0, of="source"),
+    "i_source": Signal("A", "source current, regular part", "current", "Current", 2.0, of="source"),
+    "fold_margin": Signal(
+        "1", "distance to the fold of the mobile law", "distance to the fold", "Distance to the fold", from_zero=True
+    ),
+    "v": Signal("V", "node voltage", "node", "Voltage", 2.0, of="node"),
 }  # fmt: skip
 
 

@@ -202,6 +202,11 @@ def _basis(fraction: FloatArray) -> FloatArray:
     return np.asarray(weight)
 
 
+def missed(x: FloatArray) -> FloatArray:
+    """Largest interpolation error found between the nodes of each panel, from values (p, ROWS), shape (p,)."""
+    return np.asarray(np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1, initial=0.0))
+
+
 #: Largest interpolation error of a panel between its nodes, relative to the signal's peak.
 _MISSED = 1e-11
 #: Largest number of panels, beyond which figures are computed from the outputs; and of halvings of one panel.
@@ -290,8 +295,7 @@ class ClosedForm:
                 continue
             values = record.one(name)[place]
             peaks[name] = max(peaks.get(name, 0.0), float(np.abs(values).max(initial=0.0)))
-            missed = np.abs(values[:, :NODES] @ BETWEEN - values[:, NODES:]).max(axis=1)
-            wrong |= missed > max(max(_MISSED, self.error) * peaks[name], self.rounding)
+            wrong |= missed(values) > max(max(_MISSED, self.error) * peaks[name], self.rounding)
         return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
 
     def _zeros(self, names: Sequence[str], marks: FloatArray, record: Record, place: IntArray) -> Iterator[FloatArray]:

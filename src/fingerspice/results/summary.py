@@ -40,7 +40,8 @@ class Figures:
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
         self.signals = solution.record
-        self._kept: dict[tuple[str, str], Any] = {}
+        self._kept: dict[str, Any] = dict(solution.stored or {})
+        self._extremes: dict[tuple[str, bool], tuple[float, float]] = {}
 
     def value(self, key: str, kind: str) -> Value:
         """A figure of a kind that `_made` knows: a number, an array of several gaps or sources, or None."""
@@ -50,11 +51,10 @@ class Figures:
         return None if None in values else sealed(np.array(values, float))
 
     def _one(self, name: str, kind: str) -> float | None:
-        if self.solution.stored is not None:
-            return self.solution.stored.get(f"{name}_{kind}")
-        if (name, kind) not in self._kept:
-            self._kept[name, kind] = self._made(name, kind)
-        return self._kept[name, kind]  # type: ignore[no-any-return]
+        key = f"{name}_{kind}"
+        if key not in self._kept and self.solution.stored is None:
+            self._kept[key] = self._made(name, kind)
+        return self._kept.get(key)
 
     def _made(self, name: str, kind: str) -> float | None:
         kind, periodic, _ = kind.partition("_periodic")
@@ -68,10 +68,10 @@ class Figures:
                 return None
             p = span.weigh(name).phasor(self.solution.fundamental.frequency)
             return abs(p) if kind == "amplitude" else math.degrees(cmath.phase(p))
-        key = name, f"extremes {span is self.whole}"
-        if key not in self._kept:
-            self._kept[key] = span.extremes(name)
-        low, high = self._kept[key]
+        key = name, span is self.whole
+        if key not in self._extremes:
+            self._extremes[key] = span.extremes(name)
+        low, high = self._extremes[key]
         figures: dict[str, float] = {"min": low, "max": high, "peak": max(high, -low), "ripple": high - low}
         return figures[kind]
 
