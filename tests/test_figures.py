@@ -25,51 +25,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def numbers() -> dict[str, float]:
-    """The numbers that the paper's text gives about its figures, in SI units."""
-    circuit = table1_circuit()
-    out: dict[str, float] = {"area_unloaded": figures.variations()[1].base * 1e-6}
-    p = fs.phasor(circuit, figures.FREQUENCIES)
-    for i, f in enumerate(figures.FREQUENCIES):
-        out[f"gain_{f:g}Hz"] = float(abs(p.gain[i]))
-        out[f"lead_{f:g}Hz"] = float(np.degrees(np.angle(p.gain[i])))
-    low = circuit.replace({"Vdrive.amplitude": figures.U0_FORCE})
-    f100, f2k, f10k = fs.phasor(low, (100.0, 2000.0, 10000.0)).f_el_mean
-    out |= {"rise": float(f10k / f100), "rise_above_2kHz": float(f10k / f2k)}
-    resistance = figures.variations()[2]
-    for value in resistance.values:
-        a, b = fs.phasor(resistance.apply(low, value), (100.0, 10000.0)).f_el_mean
-        out[f"rise_r_a_{value:g}"] = float(b / a)
-    for name, shape in (("sine", fs.Sine), ("square", fs.Square)):
-        for f in figures.FREQUENCIES:
-            s = figures.time_response(shape, f)
-            out[f"{name}_{f:g}Hz_min"], out[f"{name}_{f:g}Hz_max"] = float(s.f_el.min()), float(s.f_el.max())
-            out[f"{name}_{f:g}Hz_mean"] = s.summary()["f_el_mean_periodic"]
-    return out | trends()
-
-
-def trends(frequencies: tuple[float, ...] = (10.0, 100.0, 1000.0, 10000.0)) -> dict[str, float]:
-    """Elasticity, range and curvature of Fig. 3's mean force against each of its parameters, at frequencies (Hz)."""
+def trends() -> dict[tuple[str, float], tuple[float, float]]:
+    """Elasticity and curvature of Fig. 3's mean force against each of its parameters, at frequencies (Hz)."""
+    frequencies = (10.0, 100.0, 1000.0, 10000.0)
     circuit = table1_circuit().replace({"Vdrive.amplitude": figures.U0_FORCE})
     base = fs.phasor(circuit, frequencies).f_el_mean
-    out: dict[str, float] = {}
+    out: dict[tuple[str, float], tuple[float, float]] = {}
     for variation in figures.variations():
-
-        def force(value: float, variation: figures.Variation = variation) -> np.ndarray:
-            return fs.phasor(variation.apply(circuit, value), frequencies).f_el_mean
-
-        step = 1e-3
-        slope = (force(variation.base * (1.0 + step)) - force(variation.base * (1.0 - step))) / (2.0 * step * base)
         x = np.linspace(min(variation.values), max(variation.values), 11)
-        y = np.array([force(v) for v in x])
-        line = np.column_stack([np.ones_like(x), x])
-        off = np.abs(y - line @ np.linalg.lstsq(line, y, rcond=None)[0]).max(axis=0)
-        change = np.abs(y[-1] - y[0])
-        for i, f in enumerate(frequencies):
-            key = f"{variation.name}_{f:g}Hz"
-            out[f"elasticity_{key}"] = float(slope[i])
-            out[f"bend_{key}"] = float(off[i] / change[i])
-            out[f"span_{key}"] = float(change[i] / base[i])
+        beside = variation.base * np.array([1.0 - 1e-3, 1.0 + 1e-3])
+        low, high, *rows = (fs.phasor(variation.apply(circuit, v), frequencies).f_el_mean for v in (*beside, *x))
+        line, y = np.column_stack([np.ones_like(x), x]), np.array(rows)
+        off = np.abs(y - line @ np.linalg.lstsq(line, y, rcond=None)[0]).max(axis=0) / np.abs(y[-1] - y[0])
+        slope = (high - low) / (2e-3 * base)
+        out |= {(variation.name, f): (slope[i], off[i]) for i, f in enumerate(frequencies)}
     return out
 
 
@@ -136,6 +105,7 @@ def test_fig_3_has_the_papers_curves(folder: Path) -> None:
 def test_scaling_the_area_scales_what_the_paper_calls_the_area() -> None:
     variation = figures.variations()[1]
     values = variation.apply(table1_circuit(), 45.0)["Xgap"].values
+    assert variation.base == pytest.approx(37.94, rel=1e-4)
     assert values["alpha"] * 0.5 ** values["m_exp"] == pytest.approx(45.0, rel=1e-13)
     assert values["beta"] / values["alpha"] == pytest.approx(32.0 / 54.4, rel=1e-13)
     assert (values["m_exp"], values["n_exp"]) == (0.52, 1.41)
@@ -160,39 +130,38 @@ def test_figs_4_and_5_are_two_periods_of_the_periodic_state(folder: Path, number
         assert jumps == (3 if number == 5 else 0)
 
 
-def test_numbers_of_the_time_responses_are_those_of_a_long_run(numbers: dict[str, float]) -> None:
-    solution = simulate(table1(), t_stop=0.1, rtol=1e-8)
-    assert numbers["sine_100Hz_mean"] == pytest.approx(solution.summary()["f_el_mean_periodic"], rel=1e-5)
-
-
-def test_what_the_papers_text_claims(numbers: dict[str, float]) -> None:
-    """Claims that hold as they stand; where ours differ (66.5 % for 60 %, 72 % for 80 %) ours is held."""
-    n = numbers
-    assert n["area_unloaded"] == pytest.approx(37.94e-6, rel=1e-4)
-    assert n["gain_100Hz"] == pytest.approx(0.6653, abs=5e-5)
-    assert n["lead_100Hz"] == pytest.approx(7.94, abs=0.01)
-    assert n["gain_5000Hz"] == pytest.approx(0.8768, abs=5e-5)
-    assert n["lead_5000Hz"] == pytest.approx(1.37, abs=0.005)
-    assert n["rise"] == pytest.approx(1.724, abs=5e-4)
-    assert n["rise_above_2kHz"] == pytest.approx(1.03, abs=5e-3)
-    rises = [n[f"rise_r_a_{r:g}"] for r in (0.5, 1.0, 2.0, 7.0)]
-    np.testing.assert_allclose(rises, [3.06, 1.72, 1.21, 0.91], atol=5e-3)
+def test_numbers_of_the_time_responses_are_those_of_a_long_run_and_of_the_papers_figures() -> None:
+    long = simulate(table1(), t_stop=0.1, rtol=1e-8)
+    sine = figures.time_response(fs.Sine, 100.0)
+    assert sine.summary()["f_el_mean_periodic"] == pytest.approx(long.summary()["f_el_mean_periodic"], rel=1e-5)
     # The square wave's force is volatile at 100 Hz and nearly constant at 5 kHz.
-    found = [[numbers[f"square_{f}_{what}"] for what in ("min", "max", "mean")] for f in ("100Hz", "5000Hz")]
-    np.testing.assert_allclose(found, [[0.1845, 0.5826, 0.2278], [0.3326, 0.3829, 0.3550]], atol=5.1e-5)
+    for f, wanted in ((100.0, (0.1845, 0.5826, 0.2278)), (5000.0, (0.3326, 0.3829, 0.3550))):
+        s = figures.time_response(fs.Square, f)
+        found = s.f_el.min(), s.f_el.max(), s.summary()["f_el_mean_periodic"]
+        np.testing.assert_allclose(found, wanted, atol=5.1e-5)
+
+
+def test_how_the_force_rises_with_other_gap_resistances() -> None:
+    """Where our rise of 72 % differs from the paper's 80 %, ours is held; `test_paper` has the other claims."""
+    low, resistance = table1_circuit().replace({"Vdrive.amplitude": figures.U0_FORCE}), figures.variations()[2]
+    assert resistance.values == (0.5, 1.0, 2.0, 7.0)
+    forces = np.array([fs.phasor(resistance.apply(low, r), (100.0, 10000.0)).f_el_mean for r in resistance.values])
+    np.testing.assert_allclose(forces[:, 1] / forces[:, 0], [3.06, 1.72, 1.21, 0.91], atol=5e-3)
 
 
 @pytest.mark.parametrize(
     ("f", "ratio", "gap"),
-    [("10Hz", 3.04, -1.97), ("100Hz", 4.07, -1.95), ("1000Hz", 10.05, -1.79), ("10000Hz", 10.93, -1.71)],
+    [(10.0, 3.04, -1.97), (100.0, 4.07, -1.95), (1000.0, 10.05, -1.79), (10000.0, 10.93, -1.71)],
 )
-def test_how_the_force_goes_with_skin_area_and_gap(numbers: dict[str, float], f: str, ratio: float, gap: float) -> None:
+def test_how_the_force_goes_with_skin_area_and_gap(
+    trends: dict[tuple[str, float], tuple[float, float]], f: float, ratio: float, gap: float
+) -> None:
     """About linear in skin thickness and area, which matters more, and about as the inverse square of the gap."""
+    (area, bent_area), (skin, bent_skin), (thin, bent_gap) = (trends[name, f] for name in ("area", "d_sc", "d_a"))
     # Off the best straight line by 6 % of the change at most for the skin (at 10 Hz), 1.2 % for the area.
-    assert numbers[f"bend_d_sc_{f}"] < 0.06
-    assert numbers[f"bend_area_{f}"] < 0.012
-    assert numbers[f"bend_d_a_{f}"] > 0.19
-    area, skin = numbers[f"elasticity_area_{f}"], numbers[f"elasticity_d_sc_{f}"]
+    assert bent_skin < 0.06
+    assert bent_area < 0.012
+    assert bent_gap > 0.19
     assert skin < 0.0 < area
     assert area / -skin == pytest.approx(ratio, abs=0.01)
-    assert numbers[f"elasticity_d_a_{f}"] == pytest.approx(gap, rel=1e-7, abs=5e-3)
+    assert thin == pytest.approx(gap, rel=1e-7, abs=5e-3)

@@ -20,10 +20,11 @@ def fundamental(solution, x, f):
     return 2j * np.mean(x * np.exp(-2j * np.pi * f * t))
 
 
+@pytest.mark.filterwarnings("ignore:.*outside 10 Hz to 100 kHz")
 @pytest.mark.parametrize("f", [1.0, 10.0, 100.0, 1e3, 5e3, 1e4, 1e5])
 @pytest.mark.parametrize("law", ["local", "mobile"])
 def test_periodic_sine_equals_eq_11_in_amplitude_and_phase(f, law):
-    circuit = table1(f"SIN(0 200 {f!r})", f, skin={"f": f}) if 10.0 <= f <= 1e5 else outside_band(f)
+    circuit = table1(f"SIN(0 200 {f!r})", f)
     solution = steady_state(circuit, area=AREA, charge_law=law, rtol=1e-12, points=400).solution
     gains = ref.phasor_gains(f, AREA, ref.table1_layers(f))
     got = fundamental(solution, solution.u_gap, f) / 200.0
@@ -31,11 +32,6 @@ def test_periodic_sine_equals_eq_11_in_amplitude_and_phase(f, law):
     peak = 200.0 * abs(gains[ref.GAP])
     wave = peak * np.sin(2.0 * np.pi * f * solution.t + np.angle(gains[ref.GAP]))
     assert np.abs(solution.u_gap - wave).max() <= 1e-10 * peak
-
-
-def outside_band(f):
-    with pytest.warns(fs.FingerspiceWarning, match="outside 10 Hz to 100 kHz"):
-        return table1(f"SIN(0 200 {f!r})", f)
 
 
 @pytest.mark.parametrize(("f", "duty"), [(100.0, 0.5), (5000.0, 0.5), (500.0, 0.2)])
@@ -59,19 +55,13 @@ def test_mean_and_frozen_areas_are_what_their_names_say():
         fs.simulate(table1(), sources={"Vdrive": fs.DC(10.0)}, area="mean")
 
 
-def test_low_frequency_limit_is_resistive_eq_14():
-    with pytest.warns(fs.FingerspiceWarning, match="outside 10 Hz to 100 kHz"):
-        circuit = table1("SIN(0 200 0.01)", 1.0)
-    solution = steady_state(circuit, area=AREA, rtol=1e-10, points=200).solution
-    got = abs(fundamental(solution, solution.u_gap, 0.01)) / 200.0
-    assert got == pytest.approx(ref.gap_limit_eq14(1.0, AREA), rel=1e-6)
-
-
-def test_high_frequency_limit_is_capacitive_eq_15():
-    circuit = table1("SIN(0 200 1e8)", 1e5)
-    solution = steady_state(circuit, area=AREA, rtol=1e-10, points=200).solution
-    got = abs(fundamental(solution, solution.u_gap, 1e8)) / 200.0
-    assert got == pytest.approx(ref.gap_limit_eq15(1e5), rel=1e-6)
+@pytest.mark.filterwarnings("ignore:.*outside 10 Hz to 100 kHz")
+@pytest.mark.parametrize(
+    ("f", "skin", "limit"), [(0.01, 1.0, ref.gap_limit_eq14(1.0, AREA)), (1e8, 1e5, ref.gap_limit_eq15(1e5))]
+)
+def test_the_low_frequency_limit_is_resistive_and_the_high_one_capacitive_eqs_14_and_15(f, skin, limit):
+    solution = steady_state(table1(f"SIN(0 200 {f!r})", skin), area=AREA, rtol=1e-10, points=200).solution
+    assert abs(fundamental(solution, solution.u_gap, f)) / 200.0 == pytest.approx(limit, rel=1e-6)
 
 
 def test_a_pure_capacitor_stack_follows_the_source_without_delay():

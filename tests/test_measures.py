@@ -13,7 +13,7 @@ import fingerspice as fs
 from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import NODES, POINTS
 from fingerspice.results import measures, steps
-from scenes import deck, table1, table1_deck
+from scenes import cases, deck, table1
 
 LAWS = pytest.mark.parametrize("law", ["local", "mobile"])
 FIGURES = ("u_gap_peak", "u_gap_rms", "f_el_max", "f_el_mean", "f_el_mean_periodic", "area_min", "area_mean")
@@ -80,7 +80,7 @@ def test_figures_are_the_same_whatever_tstep(law, source, name):
     drive = circuit.by_device("V")[0].name
     waveform = fs.parse_netlist(f"t\nV1 a 0 {source}\nR1 a 0 1\n.tran 1u 3m\n")["V1"].waveform
     seen = []
-    for step in (3e-3, *rng.uniform(1e-6, 1e-3, 3)):
+    for step in (3e-3, *rng.uniform(1e-6, 1e-3, cases(3, 1))):
         outputs = np.append(np.arange(0.0, 3e-3, step), 3e-3)
         figures = fs.simulate(
             circuit, sources={drive: waveform}, t_stop=3e-3, t_eval=outputs, charge_law=law, rtol=1e-7, throw=False
@@ -89,10 +89,10 @@ def test_figures_are_the_same_whatever_tstep(law, source, name):
         seen.append({k: v for k, v in figures.items() if not k.startswith("fold_margin")})
     assert all(other == seen[0] for other in seen[1:])
     # And a much tighter run of many outputs, by parabolas through them, gives the same.
+    outputs = np.linspace(0.0, 3e-3, 60_001)
     fine = fs.simulate(
-        circuit, sources={drive: waveform}, t_stop=3e-3, t_eval=np.linspace(0.0, 3e-3, 60_001), charge_law=law,
-        rtol=1e-10, throw=False,
-    )  # fmt: skip
+        circuit, sources={drive: waveform}, t_stop=3e-3, t_eval=outputs, charge_law=law, rtol=1e-10, throw=False
+    )
     signals = {name: fine.record.one(name) for name in fine._figures.shown}
     for key in (k for k in signals if k.startswith(("u_gap", "f_el"))):
         x = signals[key]
@@ -102,7 +102,7 @@ def test_figures_are_the_same_whatever_tstep(law, source, name):
 
 
 @pytest.mark.filterwarnings("ignore:sources names")
-@pytest.mark.parametrize("law", ["local", "mobile"])
+@LAWS
 def test_a_run_of_many_periods_has_the_figures_of_its_stepped_twin(law):
     # A period that stands for many, where the skin remembers for dozens of them.
     circuit = fs.read_netlist("circuits/fingerpad_dispersive.cir")
@@ -122,38 +122,21 @@ def test_a_run_of_many_periods_has_the_figures_of_its_stepped_twin(law):
 
 
 def test_the_last_period_may_begin_in_the_middle_of_steps_and_of_repeated_periods():
-    whole = table1_run(fs.Sine(200.0, 100.0), 100.0, 40, rtol=1e-9)
-    odd = table1_run(fs.Sine(200.0, 100.0), 100.0, 40.37, rtol=1e-9)
+    whole, odd = (table1_run(fs.Sine(200.0, 100.0), 100.0, periods, rtol=1e-9) for periods in (40, 40.37))
     assert odd.stats["repeated"] > 20
     for key in ("f_el_mean_periodic", "u_gap_amplitude", "u_gap_phase_deg", "u_source_phase_deg", "f_el_ripple"):
         assert odd.summary()[key] == pytest.approx(whole.summary()[key], rel=1e-7, abs=1e-7)
 
 
 def test_no_figure_and_no_output_depends_on_how_many_steps_are_recorded_at_once(monkeypatch):
-    def run():
-        return table1_run(fs.AM(200.0, 5000.0, 50.0), 5000.0, 60, method="exponential", outputs=1001)
-
-    whole = run()
+    how = {"method": "exponential", "outputs": 1001}
+    whole = table1_run(fs.AM(200.0, 5000.0, 50.0), 5000.0, 60, **how)
     monkeypatch.setattr(steps, "_AT_ONCE", 6)
-    pieces = run()
+    pieces = table1_run(fs.AM(200.0, 5000.0, 50.0), 5000.0, 60, **how)
     assert pieces.summary() == whole.summary()
     assert pieces.u_gap.tobytes() == whole.u_gap.tobytes()
     assert pieces.q_source.tobytes() == whole.q_source.tobytes()
     assert pieces.nfev == whole.nfev
-
-
-def test_a_frozen_sine_has_the_phasors_amplitude_and_its_rms():
-    circuit = table1(f=100.0)
-    solution = fs.simulate(circuit, area="frozen", start="periodic", t_eval=[0.05], t_stop=0.05, rtol=1e-10)
-    figures = solution.summary()
-    assert figures["figures_from"] == "steps"
-    area = float(ref.area(0.0))
-    gain = ref.phasor_gains(100.0, area, ref.table1_layers(100.0))[1]
-    assert figures["u_gap_amplitude"] == pytest.approx(200.0 * abs(gain), rel=1e-10)
-    assert figures["u_gap_peak"] == pytest.approx(200.0 * abs(gain), rel=1e-10)
-    assert figures["u_gap_rms_periodic"] == pytest.approx(200.0 * abs(gain) / np.sqrt(2.0), rel=1e-10)
-    lead = figures["u_gap_phase_deg"] - figures["u_source_phase_deg"]
-    assert lead == pytest.approx(np.degrees(np.angle(gain)), abs=1e-8)
 
 
 def test_a_network_without_layers_has_figures_of_its_own():
@@ -169,9 +152,10 @@ def test_a_network_without_layers_has_figures_of_its_own():
 
 
 def test_tstart_is_where_figures_begin():
-    late = fs.parse_netlist(table1_deck(tran="1m 50m 30m uic"))
     expected = ref.transient(ref.sine_segments(200.0, 100.0, 0.05), [0.0], freq=100.0)
-    assert fs.simulate(late).f_el_mean == pytest.approx(expected.mean_force(0.03, 0.05), rel=1e-8)
+    assert fs.simulate(table1(tran="1m 50m 30m uic")).f_el_mean == pytest.approx(
+        expected.mean_force(0.03, 0.05), rel=1e-8
+    )
 
 
 def test_weights_of_outputs_integrate_cubics_between_jumps_and_lines_where_points_are_few():
@@ -194,9 +178,7 @@ def test_weights_of_four_hundred_thousand_outputs_with_a_jump_at_every_tenth():
 
 
 def test_a_pickled_solution_has_the_same_figures():
-    solution = table1_run(fs.Square(200.0, 100.0), 100.0, 20)
-    closed = fs.simulate(table1(), area="frozen")
-    for one in (solution, closed):
+    for one in (table1_run(fs.Square(200.0, 100.0), 100.0, 20), fs.simulate(table1(), area="frozen")):
         assert pickle.loads(pickle.dumps(one)).summary() == one.summary()
 
 

@@ -12,7 +12,6 @@ import pytest
 import fingerspice as fs
 from fingerspice.base.pages import SCREEN, Page, Table
 from fingerspice.circuit.describe import changes_text, drive_text, heading, waveform_text
-from fingerspice.results.report import summary_table
 from scenes import table1
 
 MAKERS: dict[str, Callable[[], Any]] = {
@@ -61,7 +60,7 @@ def test_a_result_is_at_most_a_screen_and_is_whole_html(name: str) -> None:
 
 def test_a_printed_solution_is_its_summary_and_a_long_page_is_cut_on_the_prompt_and_whole_in_print() -> None:
     solution = fs.simulate(table1(), t_stop=0.02)
-    assert repr(solution) == str(solution) == summary_table(solution)
+    assert repr(solution) == str(solution) == solution._page()
     nodes = "".join(f"R{i} n{i} n{i + 1} 1k\n" for i in range(60))
     solution = fs.simulate(fs.parse_netlist(f"t\nV1 n0 0 1\n{nodes}C1 n60 0 1n\n.tran 10u 1m uic\n"))
     assert "node n60" in str(solution)

@@ -101,8 +101,7 @@ def test_without_a_gap_the_layers_voltages_are_shown_alone() -> None:
 
 
 def test_a_run_that_stopped_shows_where_and_why() -> None:
-    source = fs.Function(lambda t: 1e4 * t if t < 0.0123 else math.nan)
-    solution = with_source(source, t_stop=0.02)
+    solution = with_source(fs.Function(lambda t: 1e4 * t if t < 0.0123 else math.nan), t_stop=0.02)
     assert not solution.success
     figure = traces.plot_solution(solution)
     assert [t.get_text().strip() for t in figure.axes[0].texts] == ["stopped"]
@@ -114,11 +113,12 @@ def test_a_run_that_stopped_shows_where_and_why() -> None:
 
 @pytest.mark.parametrize("rows", [0, 1, 2])
 def test_a_run_that_stopped_at_once_still_makes_a_picture(sine: fs.Solution, rows: int, tmp_path: Path) -> None:
-    whole = sine.record
-    record = dataclasses.replace(whole, t=whole.t[:rows], left=whole.left[:rows], rows=whole.rows[:rows])
-    state = dataclasses.replace(sine.state, t=float(sine.t[max(rows - 1, 0)]))
-    status = fs.Status.SOURCE_NOT_FINITE
-    solution = dataclasses.replace(sine, t=sine.t[:rows].copy(), record=record, state=state, status=status)
+    some = {name: getattr(sine.record, name)[:rows] for name in ("t", "left", "rows")}
+    changed = {
+        "record": dataclasses.replace(sine.record, **some), "status": fs.Status.SOURCE_NOT_FINITE,
+        "state": dataclasses.replace(sine.state, t=float(sine.t[max(rows - 1, 0)])),
+    }  # fmt: skip
+    solution = dataclasses.replace(sine, t=sine.t[:rows].copy(), **changed)
     assert solution.u_gap.size == rows
     figure = traces.plot_solution(solution)
     assert "stopped" in figure.axes[0].texts[0].get_text()
@@ -150,11 +150,8 @@ def test_a_sweep_shows_gain_phase_force_and_area() -> None:
     figure = traces.plot_phasor((result,), circuit)
     assert len(labels(figure)) == 4
     assert all(ax.get_xscale() == "log" for ax in figure.axes)
-    for ax, values in zip(
-        figure.axes,
-        (abs(result.gain), np.degrees(np.angle(result.gain)), result.f_el_mean, 1e6 * result.area),
-        strict=True,
-    ):
+    drawn = abs(result.gain), np.degrees(np.angle(result.gain)), result.f_el_mean, 1e6 * result.area
+    for ax, values in zip(figure.axes, drawn, strict=True):
         np.testing.assert_allclose(ax.lines[0].get_ydata(), values)
     assert "outside the skin data" in small_print(figure)
     # Within the skin data nothing is shaded.
@@ -181,15 +178,12 @@ def test_the_phasor_lies_on_the_transient_where_the_area_is_fixed(phase: float) 
         np.testing.assert_allclose(curve(ax, transient)[1], curve(ax, p)[1], atol=1e-6 * scale)
 
 
-def test_the_comparison_shows_its_table() -> None:
+def test_the_comparison_shows_its_table_which_has_room_for_the_names_of_several_fingers() -> None:
     comparison = compare(table1())
     table = comparison.plot().axes[2].tables[0].get_celld()
     assert table[1, 0].get_text().get_text() == "Gap voltage at the fundamental [V]"
     assert table[3, 3].get_text().get_text() == f"{comparison.coupled.f_el_mean:.5g}"
-
-
-def test_the_table_of_several_fingers_has_room_for_their_names() -> None:
-    figure = compare(fs.read_netlist(Path(__file__).parents[1] / "circuits" / "two_fingers.cir"), rtol=1e-5).plot()
+    figure = compare(fs.read_netlist("circuits/two_fingers.cir"), rtol=1e-5).plot()
     figure.canvas.draw()
     cells = figure.axes[2].tables[0].get_celld()
     for row in range(1, 9):
@@ -210,16 +204,15 @@ def test_a_picture_has_150_dots_an_inch_or_more_and_a_folder_that_can_be_written
 
 
 @pytest.mark.parametrize(
-    ("peak", "unit", "least", "expected"),
+    ("peak", "unit", "least", "factor", "shown"),
     [
-        (0.05, "s", 1.0, (1e3, "ms")), (2e-4, "s", 1.0, (1e6, "µs")), (1e-3, "s", 1.0, (1e3, "ms")),
-        (1.0, "s", 1.0, (1.0, "s")), (0.21, "N", 0.05, (1.0, "N")), (0.004, "N", 0.05, (1e3, "mN")),
-        (200.0, "V", 2.0, (1.0, "V")), (0.0, "V", 2.0, (1.0, "V")), (math.nan, "V", 2.0, (1.0, "V")),
+        (0.05, "s", 1.0, 1e3, "ms"), (2e-4, "s", 1.0, 1e6, "µs"), (1e-3, "s", 1.0, 1e3, "ms"),
+        (1.0, "s", 1.0, 1.0, "s"), (0.21, "N", 0.05, 1.0, "N"), (0.004, "N", 0.05, 1e3, "mN"),
+        (200.0, "V", 2.0, 1.0, "V"), (0.0, "V", 2.0, 1.0, "V"), (math.nan, "V", 2.0, 1.0, "V"),
     ],
 )  # fmt: skip
-def test_engineering_units(peak: float, unit: str, least: float, expected: tuple[float, str]) -> None:
-    factor, name = drawing.engineering(peak, unit, least)
-    assert (factor, name) == (pytest.approx(expected[0]), expected[1])
+def test_engineering_units(peak: float, unit: str, least: float, factor: float, shown: str) -> None:
+    assert drawing.engineering(peak, unit, least) == (pytest.approx(factor), shown)
 
 
 def test_thinning_keeps_every_extreme_and_both_ends() -> None:
@@ -357,13 +350,10 @@ def test_an_envelope_is_smooth_where_oscillations_are_longer_than_most_and_falls
 # Pictures show themselves
 
 
-def test_a_picture_shows_itself_where_a_notebook_asks_it(sine: fs.Solution) -> None:
+def test_a_picture_shows_itself_in_a_notebook_and_without_a_window_says_what_to_do(sine: fs.Solution) -> None:
     content, size = sine.plot()._repr_png_()
     with Image.open(io.BytesIO(content)) as image:
         assert image.width == 2 * size["width"] == 1400
-
-
-def test_where_there_is_no_window_show_says_what_to_do(sine: fs.Solution) -> None:
     with pytest.raises(fs.InputError, match=r"no window can be opened here .*; allowed: savefig"):
         sine.plot().show()
 

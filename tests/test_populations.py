@@ -160,12 +160,17 @@ indices = true
 """
 
 
-def test_the_command_writes_scenes_indices_and_a_picture(tmp_path: Path, command: Command) -> None:
-    file = tmp_path / "fingers.toml"
-    file.write_text(SMALL)
+def described(folder: Path, text: str) -> str:
+    """The file of a sweep beside its deck."""
     for name in ("fingerpad.cir", "fingerspice.lib"):
-        (tmp_path / name).write_bytes((CIRCUITS / name).read_bytes())
-    done = command("sweep", str(file), "--out", str(tmp_path / "o"), "--json")
+        (folder / name).write_bytes((CIRCUITS / name).read_bytes())
+    (folder / "fingers.toml").write_text(text)
+    return str(folder / "fingers.toml")
+
+
+def test_the_command_writes_scenes_indices_and_a_picture(tmp_path: Path, command: Command) -> None:
+    file = described(tmp_path, SMALL)
+    done = command("sweep", file, "--out", str(tmp_path / "o"), "--json")
     answer = json.loads(done.out)
     assert done.code == 0, done.err
     assert (answer["scenes"], answer["failed"], answer["n"]) == (32, 0, 32)
@@ -176,7 +181,7 @@ def test_the_command_writes_scenes_indices_and_a_picture(tmp_path: Path, command
         assert kept.f_el_mean_periodic_total.shape == (2,)
     assert (tmp_path / "o" / "fingers.png").stat().st_size > 10_000
     # Of the same deck: replaced without a question.
-    assert command("sweep", str(file), "--out", str(tmp_path / "o"), "--no-plot").code == 0
+    assert command("sweep", file, "--out", str(tmp_path / "o"), "--no-plot").code == 0
 
 
 @pytest.mark.parametrize(
@@ -195,11 +200,7 @@ def test_the_command_writes_scenes_indices_and_a_picture(tmp_path: Path, command
 def test_bad_files_are_refused_in_one_sentence(
     tmp_path: Path, command: Command, change: tuple[str, str], said: str
 ) -> None:
-    file = tmp_path / "bad.toml"
-    file.write_text(SMALL.replace(*change))
-    for name in ("fingerpad.cir", "fingerspice.lib"):
-        (tmp_path / name).write_bytes((CIRCUITS / name).read_bytes())
-    done = command("sweep", str(file), "--out", str(tmp_path / "o"))
+    done = command("sweep", described(tmp_path, SMALL.replace(*change)), "--out", str(tmp_path / "o"))
     assert done.code == 2
     assert said in done.err
     assert "Traceback" not in done.err

@@ -1,8 +1,9 @@
-"""The figures of a run (`Solution.summary`) against closed forms and the independent reference."""
+"""The figures of a run against closed forms and the independent reference: in its summary, printed, as attributes."""
 
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -11,66 +12,65 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 from fingerspice.results import steps
-from scenes import table1
+from fingerspice.results.summary import Figures
+from scenes import deck, table1
 
 AREA = 34.9715871843e-6
 F, U, OFFSET, PHASE = 100.0, 200.0, 60.0, 140.0
 STRESS = 8.854e-12 / (2.0 * 3.5e-6**2)
+NAMES = [
+    "f_el_mean", "f_el_mean_periodic", "f_el_peak", "f_t_mean", "f_t_mean_periodic", "friction_mean", "area_mean",
+    "u_gap_peak", "u_gap_rms", "u_gap_amplitude", "u_gap_phase_deg",
+]  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def settled() -> dict[str, Any]:
-    """Of two periods of the periodic state under a sine with offset and phase, the area fixed."""
+def test_figures_of_a_sine_with_offset_and_phase_are_the_closed_form() -> None:
+    # Of two periods of the periodic state, the area fixed.
     source = fs.Sine(U, F, offset=OFFSET, phase_deg=PHASE)
     run = fs.simulate(table1().replace({"Vdrive": source}), area=AREA, start="periodic", t_stop=2.0 / F, rtol=1e-10)
-    return run.summary()
+    got, layers = run.summary(), ref.table1_layers(F)
+    gain = ref.phasor_gains(F, AREA, layers)[ref.GAP]
+    m, a = float(ref.dc_operating_point(OFFSET, layers, frozen=AREA)[ref.GAP]), U * abs(gain)
+    # Means of (m + a sin)^2 and of its square: the force goes with the square of the gap voltage.
+    square, fourth, force = m**2 + 0.5 * a**2, m**4 + 3.0 * m**2 * a**2 + 0.375 * a**4, STRESS * AREA
+    for over in ("", "_periodic"):
+        for name, mean, amplitude in (("u_source", OFFSET, U), ("u_gap", m, a)):
+            assert got[f"{name}_mean{over}"] == pytest.approx(mean, abs=1e-6 * amplitude)
+            assert got[f"{name}_rms{over}"] == pytest.approx(math.sqrt(mean**2 + 0.5 * amplitude**2), rel=1e-10)
+    for key, value, rel in (
+        ("u_gap_max", m + a, 1e-9), ("u_gap_min", m - a, 1e-9), ("u_gap_amplitude", a, 1e-10),
+        ("u_source_amplitude", U, 1e-9), ("f_el_mean", force * square, 1e-7),
+        ("f_el_rms", force * math.sqrt(fourth), 1e-7), ("f_el_ripple", force * (m + a) ** 2, 1e-9),
+        ("f_t_mean", 0.3 * (0.5 + force * square), 1e-7),
+        ("friction_mean_periodic", 0.3 * (1.0 + force * square / 0.5), 1e-7), ("area_max", AREA, 1e-12),
+    ):  # fmt: skip
+        assert got[key] == pytest.approx(value, rel=rel, abs=0.0), key
+    assert got["u_source_phase_deg"] == pytest.approx(PHASE, abs=1e-7)
+    assert got["u_gap_phase_deg"] == pytest.approx(PHASE + math.degrees(np.angle(gain)), abs=1e-7)
+    assert (got["u_gap_peak"], got["area_min"], got["fundamental"]) == (got["u_gap_max"], got["area_max"], F)
 
 
-def gap() -> tuple[float, float]:
-    """The gap voltage's mean and amplitude, V."""
-    layers = ref.table1_layers(F)
-    return float(ref.dc_operating_point(OFFSET, layers, frozen=AREA)[ref.GAP]), U * abs(
-        ref.phasor_gains(F, AREA, layers)[ref.GAP]
-    )
+COLUMNS = {
+    "min": "min", "max": "max", "mean": "mean", "last period": "mean_periodic", "rms": "rms_periodic",
+    "ripple": "ripple",
+}  # fmt: skip
+ROWS = {
+    "source voltage": "u_source", "gap voltage": "u_gap", "electroadhesive force": "f_el", "friction force": "f_t",
+    "friction coefficient": "friction", "ridge contact area": "area",
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("over", ["", "_periodic"])
-def test_rms_and_mean_of_a_sine_with_offset_are_the_closed_form(settled: dict[str, Any], over: str) -> None:
-    mean, amplitude = gap()
-    for name, m, a in (("u_source", OFFSET, U), ("u_gap", mean, amplitude)):
-        assert settled[f"{name}_mean{over}"] == pytest.approx(m, abs=1e-6 * a)
-        assert settled[f"{name}_rms{over}"] == pytest.approx(math.sqrt(m**2 + 0.5 * a**2), rel=1e-7)
-
-
-def test_extremes_amplitude_and_phase_of_a_sine_with_offset_are_the_closed_form(settled: dict[str, Any]) -> None:
-    mean, amplitude = gap()
-    lead = math.degrees(np.angle(ref.phasor_gains(F, AREA, ref.table1_layers(F))[ref.GAP]))
-    # Of a thousand outputs a period the nearest to the crest misses it by 5e-6 of the amplitude at most.
-    assert settled["u_gap_max"] == pytest.approx(mean + amplitude, rel=1e-5)
-    assert settled["u_gap_min"] == pytest.approx(mean - amplitude, rel=1e-5)
-    assert settled["u_gap_peak"] == settled["u_gap_max"]
-    assert settled["u_gap_amplitude"] == pytest.approx(amplitude, rel=1e-9)
-    assert settled["u_source_amplitude"] == pytest.approx(U, rel=1e-9)
-    assert settled["u_source_phase_deg"] == pytest.approx(PHASE, abs=1e-7)
-    assert settled["u_gap_phase_deg"] == pytest.approx(PHASE + lead, abs=1e-7)
-    assert settled["fundamental"] == F
-
-
-def test_the_force_goes_with_the_mean_square_of_the_gap_voltage(settled: dict[str, Any]) -> None:
-    mean, a = gap()
-    # Of (m + a sin)^2 and of its square.
-    square, fourth = mean**2 + 0.5 * a**2, mean**4 + 3.0 * mean**2 * a**2 + 0.375 * a**4
-    force = STRESS * AREA
-    assert settled["f_el_mean"] == pytest.approx(force * square, rel=1e-7)
-    assert settled["f_el_rms"] == pytest.approx(force * math.sqrt(fourth), rel=1e-7)
-    assert settled["f_el_ripple"] == pytest.approx(force * (mean + a) ** 2, rel=1e-5)
-    assert settled["f_t_mean"] == pytest.approx(0.3 * (0.5 + force * square), rel=1e-7)
-    assert settled["friction_mean_periodic"] == pytest.approx(0.3 * (1.0 + force * square / 0.5), rel=1e-7)
-    assert settled["area_max"] == settled["area_min"] == pytest.approx(AREA, rel=1e-12, abs=0.0)
+def number(text: str) -> float:
+    """A printed value in the unit without its prefix, mm^2 as m^2."""
+    value, _, unit = text.strip().partition(" ")
+    if unit == "mm^2":
+        return 1e-6 * float(value)
+    assert re.fullmatch(r"([kmuµn]?)[VN]|", unit), text
+    return float(value) * {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "n": 1e-9}[unit[:-1]]
 
 
 @pytest.mark.parametrize("law", ["local", "mobile"])
-def test_figures_of_the_coupled_state_are_the_reference_s(law: str) -> None:
+def test_figures_of_the_coupled_state_are_the_reference_s_and_so_are_the_printed_ones(law: str) -> None:
     run = fs.simulate(table1(), start="periodic", t_stop=1.0 / F, rtol=1e-9, charge_law=law)
     got = run.summary()
     t = np.arange(4000) / 4000.0 / F
@@ -79,11 +79,41 @@ def test_figures_of_the_coupled_state_are_the_reference_s(law: str) -> None:
     assert got["u_gap_rms"] == pytest.approx(math.sqrt(np.mean(want.u_gap**2)), rel=1e-6)
     assert got["f_el_mean"] == pytest.approx(want.mean_force(0.0, 1.0 / F), rel=1e-6)
     assert got["f_el_max"] == pytest.approx(ends["force_max"], rel=1e-5)
-    assert got["area_mean"] == pytest.approx(np.mean(want.area), rel=1e-6, abs=0.0)
-    assert got["area_min"] == pytest.approx(want.area.min(), rel=1e-6, abs=0.0)
+    # Eq. 1: F_T = mu (F_N + F_el), of which the coefficient is F_T / F_N.
+    friction = 0.3 * (0.5 + want.force)
+    for name, x in (("u_gap", want.u_gap), ("area", want.area), ("f_t", friction), ("friction", friction / 0.5)):
+        assert got[f"{name}_max"] == pytest.approx(x.max(), rel=1e-5, abs=0.0)
+        assert got[f"{name}_min"] == pytest.approx(x.min(), rel=1e-5 if name == "u_gap" else 1e-6, abs=0.0)
+        if name != "u_gap":
+            assert got[f"{name}_mean"] == pytest.approx(np.mean(x), rel=1e-6, abs=0.0)
+            assert got[f"{name}_ripple"] == pytest.approx(np.ptp(x), rel=6e-4, abs=0.0)
     first = 2j * np.mean(want.u_gap * np.exp(-2j * np.pi * F * t))
     assert got["u_gap_amplitude"] == pytest.approx(abs(first), rel=1e-6)
     assert got["u_gap_phase_deg"] == pytest.approx(math.degrees(np.angle(first)), abs=1e-4)
+    # The table has four digits of these figures, and no others; the mean of a sine is nothing, not its rounding.
+    lines = [re.split(r"  +", line.strip()) for line in str(run).splitlines()]
+    table = {name: cells for name, *cells in lines if len(cells) == len(COLUMNS) and name in ROWS}
+    assert table.keys() == ROWS.keys()
+    assert number(table["source voltage"][2]) == 0.0
+    for text, name in ROWS.items():
+        for cell, kind in zip(table[text], COLUMNS.values(), strict=True):
+            value = got.get(f"{name}_{kind}")
+            shown = None if cell == "-" else number(cell)
+            assert shown == (value and pytest.approx(value, rel=6e-4, abs=1e-12 * got[f"{name}_peak"])), (text, kind)
+
+
+@pytest.mark.parametrize("phase", [0.0, 33.0, 175.0, -120.0])
+@pytest.mark.parametrize("f", [100.0, 5000.0])
+def test_the_printed_lead_is_that_of_the_gap_over_the_source(f: float, phase: float) -> None:
+    # A source that starts elsewhere in its period leads and lags by the same; past half a turn too.
+    circuit = table1(f=f).replace({"Vdrive": fs.Sine(200.0, f, phase_deg=phase)})
+    page = str(fs.simulate(circuit, area=35e-6, start="periodic", t_stop=1.0 / f))
+    gain = ref.phasor_gains(f, 35e-6, ref.table1_layers(f))[ref.GAP]
+    said = re.search(r"at (\S+ k?Hz): gap voltage (\S+ V), (\S+) % of the source, leading by (\S+) deg", page)
+    assert said[1] == {100.0: "100 Hz", 5000.0: "5 kHz"}[f]
+    assert number(said[2]) == pytest.approx(200.0 * abs(gain), rel=6e-4)
+    assert float(said[3]) == pytest.approx(100.0 * abs(gain), abs=5.1e-3)
+    assert float(said[4]) == pytest.approx(math.degrees(np.angle(gain)), abs=5.1e-3)
 
 
 @pytest.mark.parametrize("name", ["fingerpad_dispersive", "am_carrier", "amplifier", "two_fingers"])
@@ -104,15 +134,88 @@ def test_where_the_recorded_steps_fill_their_arrays_changes_nothing(name: str, m
 @pytest.mark.parametrize("t_eval", [[0.02], [0.003, 0.0071, 0.02], None], ids=["one", "three", "deck"])
 def test_figures_of_every_method_are_integrals_of_the_run(method: str, t_eval: list[float] | None) -> None:
     # Of the area held the last period is the closed form, of the coupled one the independent reference.
-    held = fs.simulate(
-        table1().replace({"Vdrive": fs.Sine(U, F)}), area=AREA, start="periodic", t_stop=0.02, t_eval=t_eval,
-        method=method, rtol=1e-6,
-    )  # fmt: skip
+    how: dict[str, Any] = {"t_stop": 0.02, "t_eval": t_eval, "method": method, "rtol": 1e-6}
+    held = fs.simulate(table1().replace({"Vdrive": fs.Sine(U, F)}), area=AREA, start="periodic", **how)
     amplitude = U * abs(ref.phasor_gains(F, AREA, ref.table1_layers(F))[ref.GAP])
     assert held.f_el_mean == pytest.approx(STRESS * AREA * amplitude**2 / 2.0, rel=3e-6)
     assert held.u_gap_peak == pytest.approx(amplitude, rel=2e-6)
     exact = ref.transient(ref.sine_segments(U, F, 0.02), [0.0, 0.02], freq=F)
-    run = fs.simulate(table1(), t_stop=0.02, t_eval=t_eval, method=method, rtol=1e-6)
+    run = fs.simulate(table1(), **how)
     assert run.summary()["figures_from"] == "steps"
     assert run.f_el_mean == pytest.approx(exact.mean_force(0.0, 0.02), rel=3e-6)
     assert run.summary()["f_el_max"] >= run.f_el.max()
+
+
+# As attributes, each an integral of its own, computed once
+
+
+@pytest.mark.parametrize("area", ["coupled", "frozen"])
+def test_every_attribute_is_the_summarys_entry_whichever_is_asked_for_first(
+    area: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    monkeypatch.setattr(Figures, "_made", lambda self, *key, make=Figures._made: made.append(key) or make(self, *key))
+    run, other = (fs.simulate(table1(), area=area, t_stop=0.02) for _ in range(2))
+    assert run.f_el_mean == run.f_el_mean
+    assert made == [("f_el", "mean")]
+    summary = other.summary()
+    for name in NAMES:
+        assert getattr(run, name) == getattr(other, name) == summary[name], name
+    assert run.summary() == summary
+
+
+def test_a_steady_state_has_the_figures_of_its_period() -> None:
+    state = fs.steady_state(table1("SIN(0 200 100)"), rtol=1e-10)
+    expected = ref.periodic_state(ref.sine_segments(200.0, 100.0, 0.01), freq=100.0)
+    assert state.f_el_mean == pytest.approx(expected.mean_force(0.0, 0.01), rel=1e-9)
+    assert state.f_el_mean_periodic == state.f_el_mean
+    assert state.u_gap_amplitude == state.solution.summary()["u_gap_amplitude"]
+    assert state.period == 0.01
+    # The mean of the outputs counts both ends of the period.
+    few = fs.steady_state(table1("SQUARE(200 100)"), points=50)
+    assert abs(few.solution.f_el.mean() / few.f_el_mean - 1.0) > 0.05  # type: ignore[union-attr, operator]
+    assert few.f_el_mean == pytest.approx(fs.steady_state(table1("SQUARE(200 100)")).f_el_mean, rel=1e-7)
+
+
+def test_several_fingers_have_a_figure_each() -> None:
+    run = fs.simulate(fs.read_netlist("circuits/two_fingers.cir"))
+    summary = run.summary()
+    for name in NAMES:
+        signal = next(k for k in ("f_el", "f_t", "friction", "area", "u_gap") if name.startswith(f"{k}_"))
+        kept = [summary.get(f"{signal}:{gap}{name.removeprefix(signal)}") for gap in run.gaps]
+        if None not in kept:
+            np.testing.assert_array_equal(getattr(run, name), kept)
+            assert not getattr(run, name).flags.writeable
+    assert run.f_el_mean.shape == (2,)  # type: ignore[union-attr]
+
+
+def test_there_is_none_without_a_gap_and_without_a_period() -> None:
+    flat = fs.simulate(deck("V1 a 0 SIN(0 5 100)", "R1 a b 1k", "C1 b 0 1u", ".tran 100u 20m uic"))
+    assert [getattr(flat, name) for name in NAMES] == [None] * len(NAMES)
+    short = fs.simulate(table1(), t_stop=5e-3)
+    assert short.f_el_mean is not None
+    assert short.f_el_mean_periodic is short.summary()["f_el_mean_periodic"] is short.u_gap_amplitude is None
+    assert "u_gap_amplitude" not in short.summary()
+
+
+@pytest.mark.parametrize(
+    "source", [fs.Square(200.0, 100.0), fs.Square(200.0, 100.0, delay=1e-3), fs.Sine(200.0, 100.0)]
+)
+def test_a_period_that_ends_with_a_jump_is_looked_at_a_few_times(
+    source: fs.Waveform, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # By rounding of the time the jump fell into the last panel, which was halved two thousand times.
+    looks = []
+    look = steps.Recorded.values_at
+    monkeypatch.setattr(steps.Recorded, "values_at", lambda *a: looks.append(a) or look(*a))
+    run = fs.simulate(table1(), sources={"Vdrive": source}, t_stop=0.05, rtol=1e-8)
+    assert run.summary()["figures_from"] == "steps"
+    assert len(looks) < 100
+
+
+def test_a_gap_alone_has_them_too() -> None:
+    """A stack of one layer has no state: its voltage is the source's."""
+    gap = "Xgap a 0 area GAP d=3.5u eps_r=1 r=1meg fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
+    run = fs.simulate(deck("V1 a 0 SIN(0 100 100)", gap, ".tran 10u 20m uic"))
+    assert run.f_el_mean == pytest.approx(np.trapezoid(run.f_el, run.t) / 0.02, rel=1e-6)
+    assert run.u_gap_amplitude == pytest.approx(100.0, rel=1e-9)

@@ -21,7 +21,6 @@ from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic, put_beside
 from scenes import table1
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
-DECKS = sorted(CIRCUITS.glob("*.cir"))
 BRIDGE = """A bridge of long names, a delay, a fixed area and a current
 Vdrive_of_the_whole_bridge drive 0 SIN(0 200 5k) AC 2
 Rupper drive left 1k
@@ -39,11 +38,10 @@ LADDER = "A ladder\nV1 n0 0 1\n" + "".join(
 OTHERS = {"bridge": BRIDGE, "ladder": LADDER}
 
 
-@pytest.fixture(params=[*(p.stem for p in DECKS), *OTHERS])
+@pytest.fixture(params=[*sorted(p.stem for p in CIRCUITS.glob("*.cir")), *OTHERS])
 def circuit(request: pytest.FixtureRequest) -> fs.Circuit:
-    if request.param in OTHERS:
-        return fs.parse_netlist(OTHERS[request.param])
-    return fs.read_netlist(CIRCUITS / f"{request.param}.cir")
+    name: str = request.param
+    return fs.parse_netlist(OTHERS[name]) if name in OTHERS else fs.read_netlist(CIRCUITS / f"{name}.cir")
 
 
 def texts(svg: str) -> list[str]:
@@ -119,14 +117,11 @@ def test_a_stack_is_one_ladder_beside_its_source() -> None:
     ]  # fmt: skip
 
 
-def test_areas_are_said_where_there_are_several_or_a_source_gives_one() -> None:
+def test_areas_are_said_where_a_source_gives_one_and_a_resistor_is_drawn_where_a_layer_leaks() -> None:
     said = [" ".join(texts(c.draw()._repr_svg_())) for c in (fs.parse_netlist(BRIDGE), table1())]
     assert "area = spot" in said[0]
     assert "DC 100 mm^2" in said[0]
     assert "area" not in said[1]
-
-
-def test_a_layer_that_does_not_leak_has_no_resistor() -> None:
     strokes = [len(table1().replace({"Xcoat.r": r}).draw().axes[0].lines) for r in (2e5, float("inf"))]
     assert strokes[0] > strokes[1]
 

@@ -81,19 +81,14 @@ def test_the_integral_of_a_tones_density_is_its_variance() -> None:
     assert found.frequency[found.density.argmax()] == pytest.approx(500.0)
 
 
-def test_the_interval_covers_the_density_of_white_noise(noise: fs.Solution) -> None:
+def test_the_interval_covers_the_density_of_white_noise_and_narrows_with_the_resolution(noise: fs.Solution) -> None:
     with pytest.warns(fs.FingerspiceWarning, match="folded"):
-        found = noise.spectrum("u_source")
+        found, coarse, fine = (noise.spectrum("u_source", resolution=f) for f in (None, 50.0, 2.0))
     inside = slice(2, -2)
     true = 2.0 / RATE
     covered = np.mean((found.lower[inside] <= true) & (true <= found.upper[inside]))
     assert abs(covered - 0.95) < 0.01
     assert found.shown_variance == pytest.approx(found.variance, rel=0.01)
-
-
-def test_the_interval_narrows_with_the_resolution(noise: fs.Solution) -> None:
-    with pytest.warns(fs.FingerspiceWarning, match="folded"):
-        coarse, fine = (noise.spectrum("u_source", resolution=f) for f in (50.0, 2.0))
     assert coarse.segments > 20 * fine.segments
     low, high = interval(1e6)
     assert (low, high) == pytest.approx((1.0, 1.0), abs=3e-3)
@@ -114,23 +109,19 @@ def test_the_rows_that_jumps_add_are_left_out() -> None:
     found = solution.spectrum("u_source")
     inside = (np.arange(8001) >= 800) & (np.arange(8001) <= 1600)
     assert found.variance == pytest.approx(np.var(inside), rel=1e-3)
-
-
-def test_outputs_from_a_time_on() -> None:
-    solution = resistor(fs.PWL((0.0, 0.4, 1.0), (50.0, 1.0, 1.0)), 1.0)
+    # From a time on, after which it is constant.
     assert solution.spectrum("u_source", since=0.5).variance == pytest.approx(0.0, abs=1e-20)
 
 
-@pytest.mark.parametrize("step", [100e-6, 60e-6])
-def test_outputs_too_rare_for_the_force_are_told(step: float) -> None:
+def test_outputs_too_rare_for_the_force_are_told() -> None:
     # The force of a sine of 3 kHz has 6 kHz, which half the rate of the outputs has to reach.
-    t = np.arange(0.0, 0.02, step)
-    solution = fs.simulate(table1(), sources={"Vdrive": fs.Chirp(100.0, 3e3, 3.001e3, 0.02)}, t_eval=t, rtol=1e-6)
-    if step > 1.0 / 12e3:
-        with pytest.warns(fs.FingerspiceWarning, match=r"half the rate of the outputs, 5000 Hz.*shorter step"):
-            solution.spectrum()
-    else:
-        solution.spectrum()
+    rare, often = (
+        fs.simulate(table1(), sources=fs.Chirp(100.0, 3e3, 3.001e3, 0.02), t_eval=np.arange(0.0, 0.02, h), rtol=1e-6)
+        for h in (100e-6, 60e-6)
+    )
+    with pytest.warns(fs.FingerspiceWarning, match=r"half the rate of the outputs, 5000 Hz.*shorter step"):
+        rare.spectrum()
+    often.spectrum()
 
 
 def test_a_period_that_is_not_yet_periodic_is_told() -> None:

@@ -106,7 +106,6 @@ def run(
       fingerspice run long.cir --stream --rtol 1e-5 --signals u_gap,f_t
     """
     from fingerspice.plots.schematic import put_beside
-    from fingerspice.results.report import summary_table
     from fingerspice.solve.simulation import check_arguments, simulate
     from fingerspice.studies.feel import feel as felt
 
@@ -158,7 +157,7 @@ def run(
             except InputError as error:
                 # The outputs are too few or uneven, which is told after the files of the run have been written.
                 unfelt = error
-        answer.give(lambda: "\n\n".join([summary_table(solution), *map(str, fingers)]), writes)
+        answer.give(lambda: "\n\n".join([solution._page(), *map(str, fingers)]), writes)
         if solution.failure is not None:
             raise SolveError(solution.failure, solution)
         if unfelt is not None:

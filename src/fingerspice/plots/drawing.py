@@ -28,10 +28,8 @@ if TYPE_CHECKING:
 BLACK, GREY, BLUE, VERMILION = "#000000", "#777777", "#0072B2", "#D55E00"
 GREEN, PURPLE, ORANGE, SKY = "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 
-FONT, SMALL = 8.5, 7.0
-WIDTH = 7.0
-"""Font sizes (points) and width (inches) of a figure across a page."""
-
+#: Font sizes (points) and width (inches) of a figure across a page.
+FONT, SMALL, WIDTH = 8.5, 7.0, 7.0
 #: Number of bins into which long curves are divided: larger than the number of dots across the page.
 MAX_BINS = 4000
 #: Largest number of characters of a name in a legend.
@@ -42,10 +40,7 @@ _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"
 
 
 def new_figure(rows: int, columns: int = 1, height: float = 3.0, **options: Any) -> tuple[Picture, list[Axes]]:
-    """A figure of `rows` by `columns` panels, 7 inches wide and `height` inches high, and the panels, row by row.
-
-    It can be saved without a display; `options` are those of ``Figure.subplots``.
-    """
+    """A figure across a page, `height` inches high, and its panels row by row; `options` are of ``Figure.subplots``."""
     from fingerspice.plots.picture import Picture
 
     figure = Picture(figsize=(WIDTH, height), layout="constrained", facecolor="white")
@@ -112,13 +107,7 @@ def caption(figure: Figure, text: str, color: str = GREY) -> None:
 
 
 def save(figure: Figure, path: str | Path, *, about: Mapping[str, str] | None = None, dpi: float = 160.0) -> Path:
-    """Write a figure as PNG, with the texts in `about`; the file is complete or absent.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be written.
-    """
+    """Write a figure as PNG, with the texts in `about`; the file is complete or absent."""
     options: dict[str, Any] = {"format": "png", "dpi": dpi, "pil_kwargs": {"compress_level": 3}}
     return write_aside(Path(path), lambda target: figure.savefig(target, metadata=dict(about or {}), **options))
 

@@ -12,7 +12,7 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.circuit.describe import drive_text, heading
 from fingerspice.plots import drawing
 from fingerspice.results.outcome import Status
-from fingerspice.results.signals import SIGNALS
+from fingerspice.results.signals import SIGNALS, Signal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,28 +29,12 @@ _WIDTHS = (2.0, 1.5, 1.2, 1.0)
 _PALE: dict[str, Any] = {"linewidth": 3.2, "alpha": 0.45, "linestyle": "-", "solid_capstyle": "butt"}
 
 
-class Quantity(NamedTuple):
-    """The physical quantity of a panel."""
-
-    label: str
-    unit: str
-    least: float  # The unit's prefix is chosen so that the peak is at least this number; 0 means no prefix
-    color: str
-    from_zero: bool  # Whether the scale starts at 0
-
-
-VOLTAGE = Quantity("Voltage", "V", 2.0, drawing.BLUE, False)
-QUANTITIES = {
-    **dict.fromkeys(("u_source", "u_gap", "u_layer", "v"), VOLTAGE),
-    "f_el": Quantity("Force", "N", 0.05, drawing.VERMILION, True),
-    "area": Quantity("Ridge area", "mm²", 0.0, drawing.GREEN, False),
-    "f_t": Quantity("Friction", "N", 0.05, drawing.PURPLE, True),
-    "friction": Quantity("Friction coefficient", "", 0.0, drawing.PURPLE, True),
-    "sigma_el": Quantity("Stress", "Pa", 2.0, drawing.VERMILION, True),
-    "q_source": Quantity("Charge", "C", 2.0, drawing.BLUE, False),
-    "i_source": Quantity("Current", "A", 2.0, drawing.BLUE, False),
-    "fold_margin": Quantity("Distance to the fold", "", 0.0, drawing.BLACK, True),
-}
+#: Colour of a panel's line where there is one, by its label.
+COLORS = {
+    "Voltage": drawing.BLUE, "Charge": drawing.BLUE, "Current": drawing.BLUE, "Ridge area": drawing.GREEN,
+    "Friction": drawing.PURPLE, "Friction coefficient": drawing.PURPLE, "Distance to the fold": drawing.BLACK,
+    "Force": drawing.VERMILION, "Stress": drawing.VERMILION,
+}  # fmt: skip
 
 
 class Drawn(NamedTuple):
@@ -71,10 +55,10 @@ class Trace(NamedTuple):
 
 def end_of(solution: Solution) -> float:
     """Time at which the run stopped, s."""
-    return float(max(solution.state.t, solution.t[-1])) if solution.t.size else float(solution.state.t)
+    return float(max([solution.state.t, *solution.t[-1:]]))
 
 
-def signal_of(solution: Solution, key: str) -> dict[str, FloatArray]:
+def columns_of(solution: Solution, key: str) -> dict[str, FloatArray]:
     """A signal by name; empty if this run lacks the element, which another run of the picture may have."""
     kind, colon, _ = key.partition(":")
     return solution.by_name(key) if not colon or key in solution.record.names(kind) else {}
@@ -89,7 +73,7 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
     shared = len({run.solution.u_source.tobytes() for run in runs}) == 1
     for number, run in enumerate(runs):
         for key in keys:
-            found = signal_of(run.solution, key)
+            found = columns_of(run.solution, key)
             for place, (name, x) in enumerate(found.items()):
                 kind, _, element = name.partition(":")
                 source = kind == "u_source"
@@ -103,39 +87,30 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
                 elif source:
                     color = (drawing.GREY, *drawing.CYCLE[::-1])[place % (len(drawing.CYCLE) + 1)]
                 elif len(found) == 1 and len(keys) <= 2:
-                    color = QUANTITIES[kind].color
+                    color = COLORS[SIGNALS[kind].axis]
                 else:
                     color = drawing.CYCLE[above % len(drawing.CYCLE)]
-                style: dict[str, Any] = {"color": color}
-                if source:
-                    style |= _PALE
-                else:
-                    style |= {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
-                    above += 1
+                style = _PALE if source else {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
+                above += not source
                 if run.label and not (source and shared):
                     label = f"{label}, {run.label}"
-                out.append(Trace(run.solution, label, x, style))
+                out.append(Trace(run.solution, label, x, {"color": color, **style}))
     return out
 
 
-def scale_of(quantity: Quantity, traces: list[Trace], start: float, stop: float) -> tuple[float, str]:
+def scale_of(signal: Signal, traces: list[Trace], start: float, stop: float) -> tuple[float, str]:
     """Factor and unit of a panel."""
-    if quantity.unit == "mm²":
-        return 1e6, "mm²"
-    if quantity.least == 0.0:
-        return 1.0, quantity.unit
+    if signal.least == 0.0:
+        return (1e6, "mm²") if signal.unit == "m^2" else (1.0, "")
     peaks = [drawing.peak_of(t.x[(t.solution.t >= start) & (t.solution.t <= stop)]) for t in traces]
-    return drawing.engineering(max(peaks, default=0.0), quantity.unit, quantity.least)
+    return drawing.engineering(max(peaks, default=0.0), signal.unit, signal.least)
 
 
 def draw_line(
     ax: Axes, trace: Trace, factor: float, start: float, stop: float, runs: Sequence[Drawn],
     envelope: FloatArray | None = None,
 ) -> None:  # fmt: skip
-    """Draw a line from `start` to `stop` (s) with a factor from its SI unit, beside the other `runs` of the picture.
-
-    With the times (s) of its turning points, two per oscillation, an envelope is drawn.
-    """
+    """Draw a line from `start` to `stop` (s), or with the times (s) of its turning points `envelope` its envelope."""
     t = trace.solution.t
     # One output beyond each end of the window is drawn too, so that the line reaches the edges of the picture.
     first, last = max(int(np.searchsorted(t, start)) - 1, 0), int(np.searchsorted(t, stop, side="right")) + 1
@@ -148,8 +123,7 @@ def draw_line(
     middle, spans = _envelope_spans(t, start, stop, envelope)
     low, high = np.minimum.reduceat(x, spans)[::2], np.maximum.reduceat(x, spans)[::2]
     pale = "alpha" in trace.style
-    color = trace.style["color"]
-    ax.fill_between(scale * middle, low, high, color=color, alpha=0.3 if pale else 0.2, linewidth=0.0)
+    ax.fill_between(scale * middle, low, high, color=trace.style["color"], alpha=0.3 if pale else 0.2, linewidth=0.0)
     edge = {**trace.style, "linewidth": 1.6 if pale else 0.7 * trace.style["linewidth"]}
     ax.plot(scale * middle, low, **edge)
     ax.plot(scale * middle, high, **edge, label=trace.label)
@@ -178,18 +152,16 @@ def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray)
 def draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:
     """Draw the mean force as a horizontal line; with `told` the legend names it."""
     summary = trace.solution.summary()
-    periodic = summary.get("f_el_mean_periodic")
-    mean = periodic if periodic is not None else summary.get("f_el_mean")
-    if mean is not None:
-        text = f"mean {'of the last period' if periodic is not None else 'of the run'}, {factor * mean:.4g} {unit}"
-        label = text if told else "_"
+    means = {"of the last period": summary.get("f_el_mean_periodic"), "of the run": summary.get("f_el_mean")}
+    for of, mean in [(of, mean) for of, mean in means.items() if mean is not None][:1]:
+        label = f"mean {of}, {factor * mean:.4g} {unit}" if told else "_"
         ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
 
 
-def finish_panel(ax: Axes, quantity: Quantity, unit: str, values: Sequence[FloatArray], room: int = PAGE) -> None:
+def finish_panel(ax: Axes, signal: Signal, unit: str, values: Sequence[FloatArray], room: int = PAGE) -> None:
     """Labels, limits and legend of a panel; `room` is the number of letters that the legend has room for."""
-    drawing.dress(ax, f"{quantity.label} [{unit}]" if unit else quantity.label)
-    if quantity.from_zero:
+    drawing.dress(ax, f"{signal.axis} [{unit}]" if unit else signal.axis)
+    if signal.from_zero:
         drawing.from_zero(ax)
     else:
         ax.ticklabel_format(axis="y", useOffset=False)
@@ -229,24 +201,23 @@ def time_axis(axes: Sequence[Axes], runs: Sequence[Drawn], start: float, stop: f
                 ax.axvspan(factor * end, factor * (start + wide * span), color="#EEEEEE", zorder=0.5)
             ax.axvline(factor * end, color=drawing.VERMILION, linewidth=1.2, linestyle=drawing.DASHES[3])
     if early:
-        place: dict[str, Any] = {"transform": axes[0].get_xaxis_transform(), "ha": "right", "va": "top"}
-        place |= {"fontsize": drawing.FONT - 0.5, "color": drawing.VERMILION}
-        axes[0].text(factor * end_of(early[0]), 0.98, "stopped ", **place)
+        axes[0].text(
+            factor * end_of(early[0]), 0.98, "stopped ", transform=axes[0].get_xaxis_transform(), ha="right", va="top",
+            fontsize=drawing.FONT - 0.5, color=drawing.VERMILION,
+        )  # fmt: skip
     axes[-1].set_xlabel(f"Time [{unit}]", fontsize=drawing.FONT)
 
 
 def _facts(solution: Solution) -> list[str]:
     """Facts of a run for its caption, each always at the same index; an empty text if a fact does not apply."""
-    error = f"error estimate {solution.error.u_gap:.2g} V"
-    if solution.gaps:
-        error += f", {solution.error.f_el:.2g} N"
+    area, force = (f"area: {solution.area_mode}", f", {solution.error.f_el:.2g} N") if solution.gaps else ("", "")
     return [
         heading(solution.circuit),
         drive_text(solution.circuit),
         f"{solution.charge_law} charge law",
-        f"area: {solution.area_mode}" if solution.gaps else "",
+        area,
         f"method {solution.method}, rtol {solution.rtol:.2g}",
-        error,
+        f"error estimate {solution.error.u_gap:.2g} V{force}",
     ]
 
 

@@ -117,7 +117,12 @@ def _columns(order: Sequence[tuple[Element, Element | None]], rows: Rows) -> Pla
             room = column == len(taken) or all(p.bottom <= top or p.top >= bottom for p in taken[column])
             so_far = {node: extents.get(node, (column, column)) for node in ends}
             wider = {node: (min(lo, column), max(hi, column)) for node, (lo, hi) in so_far.items()}
-            if room and not _meet(wider, extents, rows):
+            after = {**extents, **wider}
+            if room and not any(
+                rows[node] == rows[other] and node != other and lo <= after[other][1] and after[other][0] <= hi
+                for node, (lo, hi) in wider.items()
+                for other in after
+            ):
                 break
         else:
             return None
@@ -126,15 +131,5 @@ def _columns(order: Sequence[tuple[Element, Element | None]], rows: Rows) -> Pla
         upright = rows[ends[0]] < rows[ends[1]]
         places[element.name] = Place(element, column, top, bottom, upright)
         taken[column].append(places[element.name])
-        extents |= wider
+        extents = after
     return Placement(tuple(places.values()), rows, extents)
-
-
-def _meet(wider: Mapping[str, Extent], extents: Mapping[str, Extent], rows: Rows) -> bool:
-    """Whether a node that became wider meets another one of its row."""
-    after = {**extents, **wider}
-    return any(
-        rows[node] == rows[other] and node != other and lo <= after[other][1] and after[other][0] <= hi
-        for node, (lo, hi) in wider.items()
-        for other in after
-    )

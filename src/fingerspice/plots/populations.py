@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -23,9 +23,7 @@ _WIDE = 20.0
 def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> Picture:
     """An output of `sweep` along its grid of one dimension, with the band from 5 to 95 %, or its histogram.
 
-    With the indices of `sobol`, for the same parameters, each parameter has a panel with the band and three curves,
-    where it takes low, middle and high values and the others stay at their medians; the last panel has the total
-    indices.
+    With the indices of `sobol` a panel for each parameter shows it at three quantiles, and the last one the indices.
     """
     one = found[output]
     dims = [str(dim) for dim in one.dims if dim != "scene"]
@@ -156,37 +154,31 @@ def plot_panels(panels: Sequence[Panel]) -> Picture:
     """Data with error bars and the fit of several quantities side by side, each with its residuals below."""
     count = len(panels)
     figure, axes = drawing.new_figure(2, count, height=4.2, sharex="col", height_ratios=(2.4, 1.0))
-    for place, panel in enumerate(panels):
-        _draw(axes[place], axes[count + place], panel, _ROOM // count, first=place == 0)
+    for top, bottom, panel in zip(axes[:count], axes[count:], panels, strict=True):
+        largest = np.concatenate([curve.measured for curve in panel.curves])
+        # An area is shown in mm^2: a prefix would be squared with its unit.
+        factor, shown = (1e6, "mm²") if panel.unit == "m^2" else (1.0, "")
+        if panel.unit not in ("", "m^2"):
+            factor, shown = drawing.engineering(drawing.peak_of(largest), panel.unit, 0.05)
+        bottom.axhline(0.0, color=drawing.GREY, linewidth=0.8)
+        for number, curve in enumerate(panel.curves):
+            order, color = np.argsort(curve.x, kind="stable"), drawing.CYCLE[number % len(drawing.CYCLE)]
+            x, measured, fitted, sigma = (values[order] for values in curve[1:])
+            style: dict[str, Any] = {"fmt": "o", "markersize": 3.5, "color": color, "elinewidth": 0.8, "capsize": 2.0}
+            top.errorbar(x, factor * measured, factor * sigma, label=curve.name, **style)
+            top.plot(x, factor * fitted, color=color, linewidth=1.3)
+            bottom.plot(x, (measured - fitted) / sigma, "o", markersize=3.5, color=color)
+        x = np.concatenate([curve.x for curve in panel.curves])
+        if x.min() > 0.0 and x.max() > _WIDE * x.min():
+            from matplotlib.ticker import LogFormatter
+
+            bottom.set_xscale("log")
+            # Plain numbers: 20, 50, 100, and no powers of ten.
+            bottom.xaxis.set_major_formatter(LogFormatter())
+            bottom.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
+        drawing.dress(top, f"{panel.quantity} [{shown}]" if shown else panel.quantity)
+        if len(panel.curves) > 1 or count == 1:
+            drawing.legend_within(top, _ROOM // count)
+        drawing.dress(bottom, "residual / sigma" if top is axes[0] else "", panel.x_label)
     drawing.caption(figure, "dots: measured, with one standard deviation; lines: fitted")
     return figure
-
-
-def _draw(top: Axes, bottom: Axes, panel: Panel, room: int, *, first: bool) -> None:
-    largest = np.concatenate([curve.measured for curve in panel.curves])
-    # An area is shown in mm^2: a prefix would be squared with its unit.
-    factor, shown = (1e6, "mm²") if panel.unit == "m^2" else (1.0, "")
-    if panel.unit not in ("", "m^2"):
-        factor, shown = drawing.engineering(drawing.peak_of(largest), panel.unit, 0.05)
-    bottom.axhline(0.0, color=drawing.GREY, linewidth=0.8)
-    for number, curve in enumerate(panel.curves):
-        order, color = np.argsort(curve.x, kind="stable"), drawing.CYCLE[number % len(drawing.CYCLE)]
-        x, measured, fitted, sigma = (values[order] for values in curve[1:])
-        top.errorbar(
-            x, factor * measured, factor * sigma, fmt="o", markersize=3.5, color=color, elinewidth=0.8, capsize=2.0,
-            label=curve.name,
-        )  # fmt: skip
-        top.plot(x, factor * fitted, color=color, linewidth=1.3)
-        bottom.plot(x, (measured - fitted) / sigma, "o", markersize=3.5, color=color)
-    x = np.concatenate([curve.x for curve in panel.curves])
-    if x.min() > 0.0 and x.max() > _WIDE * x.min():
-        from matplotlib.ticker import LogFormatter
-
-        bottom.set_xscale("log")
-        # Plain numbers: 20, 50, 100, and no powers of ten.
-        bottom.xaxis.set_major_formatter(LogFormatter())
-        bottom.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
-    drawing.dress(top, f"{panel.quantity} [{shown}]" if shown else panel.quantity)
-    if len(panel.curves) > 1 or room == _ROOM:
-        drawing.legend_within(top, room)
-    drawing.dress(bottom, "residual / sigma" if first else "", panel.x_label)

@@ -6,11 +6,12 @@ Symbols are strokes: points in inches around the symbol's centre, the first node
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import image, rc_context
@@ -33,58 +34,52 @@ Stroke = Sequence[tuple[float, float]]
 #: Half the height of a part, and half the distance of a resistor from the capacitor beside it.
 HALF, APART = 0.24, 0.17
 _RADIUS = 0.17
+_ZIGZAG: Stroke = [(0.06 * (-1.0) ** k, 0.15 - 0.05 * (k + 0.5)) for k in range(6)]
+_RESISTOR: list[Stroke] = [[(0.0, HALF), (0.0, 0.15), *_ZIGZAG, (0.0, -0.15), (0.0, -HALF)]]
+_CAPACITOR: list[Stroke] = [
+    *([(-0.11, s * 0.035), (0.11, s * 0.035)] for s in (1.0, -1.0)),
+    *([(0.0, s * 0.035), (0.0, s * HALF)] for s in (1.0, -1.0)),
+]
+_CIRCLE: list[Stroke] = [
+    [(float(_RADIUS * np.cos(a)), float(_RADIUS * np.sin(a))) for a in np.linspace(0.0, 2.0 * np.pi, 61)],
+    *([(0.0, s * _RADIUS), (0.0, s * HALF)] for s in (1.0, -1.0)),
+]
+_PLUS_MINUS: list[Stroke] = [
+    [(-0.045, 0.085), (0.045, 0.085)], [(0.0, 0.04), (0.0, 0.13)], [(-0.045, -0.085), (0.045, -0.085)]
+]  # fmt: skip
+_ARROW: list[Stroke] = [[(0.0, 0.11), (0.0, -0.11)], [(-0.045, -0.05), (0.0, -0.11), (0.045, -0.05)]]
+#: Strokes of the parts, and half their width. The arrow of a current points from the first node to the second.
+_PARTS = {
+    "R": (_RESISTOR, 0.08), "C": (_CAPACITOR, 0.12),
+    "V": (_CIRCLE + _PLUS_MINUS, _RADIUS), "I": (_CIRCLE + _ARROW, _RADIUS),
+}  # fmt: skip
 
 
 def symbol(element: Element) -> tuple[list[Stroke], float, float]:
     """Strokes of an element's symbol, half its height, and half its width."""
-    if element.device == "R":
-        return [*_resistor(0.0, 0.0)], HALF, 0.08
-    if element.device == "C":
-        return [*_capacitor(0.0, 0.0)], HALF, 0.12
-    if element.device in "VI":
-        return [*_source(element.device)], HALF, _RADIUS
+    if element.device in _PARTS:
+        strokes, wide = _PARTS[element.device]
+        return strokes, HALF, wide
     if element.device == "SKIN_DISPERSIVE":
         # Two cells stand for the many of the ladder, with dots in between.
         away = HALF + 0.1
         dots: list[Stroke] = [[(0.0, y), (0.0, y + 0.02)] for y in (-0.06, -0.01, 0.04)]
         return [*_cell(away, leaks=True), *dots, *_cell(-away, leaks=True)], 2.0 * HALF + 0.1, APART + 0.12
     leak = element.values.get("r", element.values.get("rho", 0.0))
-    return [*_cell(0.0, leaks=bool(np.isfinite(leak)))], HALF, APART + 0.12
-
-
-def ground(x: float, y: float) -> list[Stroke]:
-    """Strokes of a ground whose wire begins at (x, y)."""
-    lines: list[Stroke] = [[(x, y), (x, y - 0.14)]]
-    return lines + [[(x - w, y - d), (x + w, y - d)] for w, d in ((0.13, 0.14), (0.08, 0.19), (0.03, 0.24))]
+    return _cell(0.0, leaks=bool(np.isfinite(leak))), HALF, APART + 0.12
 
 
 def _cell(y: float, *, leaks: bool) -> list[Stroke]:
     """A capacitor, and a resistor beside it where the layer leaks."""
     if not leaks:
-        return _capacitor(0.0, y)
+        return _moved(_CAPACITOR, 0.0, y)
     bars: list[Stroke] = [[(-APART, y + s * HALF), (APART, y + s * HALF)] for s in (1.0, -1.0)]
-    return [*_resistor(-APART, y), *_capacitor(APART, y), *bars]
+    return [*_moved(_RESISTOR, -APART, y), *_moved(_CAPACITOR, APART, y), *bars]
 
 
-def _resistor(x: float, y: float) -> list[Stroke]:
-    zigzag = [(x + 0.06 * (-1.0) ** k, y + 0.15 - 0.05 * (k + 0.5)) for k in range(6)]
-    return [[(x, y + HALF), (x, y + 0.15), *zigzag, (x, y - 0.15), (x, y - HALF)]]
-
-
-def _capacitor(x: float, y: float) -> list[Stroke]:
-    plates: list[Stroke] = [[(x - 0.11, y + s * 0.035), (x + 0.11, y + s * 0.035)] for s in (1.0, -1.0)]
-    return [*plates, *([(x, y + s * 0.035), (x, y + s * HALF)] for s in (1.0, -1.0))]
-
-
-def _source(device: str) -> list[Stroke]:
-    """A circle, with plus and minus for a voltage, and for a current its arrow from the first node to the second."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 61)
-    circle = [(float(_RADIUS * np.cos(a)), float(_RADIUS * np.sin(a))) for a in angle]
-    leads: list[Stroke] = [[(0.0, s * _RADIUS), (0.0, s * HALF)] for s in (1.0, -1.0)]
-    if device == "I":
-        return [circle, *leads, [(0.0, 0.11), (0.0, -0.11)], [(-0.045, -0.05), (0.0, -0.11), (0.045, -0.05)]]
-    plus: list[Stroke] = [[(-0.045, 0.085), (0.045, 0.085)], [(0.0, 0.04), (0.0, 0.13)]]
-    return [circle, *leads, *plus, [(-0.045, -0.085), (0.045, -0.085)]]
+def _moved(strokes: Sequence[Stroke], x: float, y: float, up: float = 1.0) -> list[Stroke]:
+    """Strokes around (x, y), upside down where `up` is -1."""
+    return [[(x + dx, y + up * dy) for dx, dy in stroke] for stroke in strokes]
 
 
 #: Largest number of elements that a picture can show.
@@ -137,19 +132,9 @@ class Schematic(Picture):
         return write_aside(path, lambda target: self._write_svg(target, about or {}))
 
 
-class _Sheet(NamedTuple):
-    """Where columns and rows lie, inches."""
-
-    x: list[float]
-    y: list[float]
-    width: float
-    height: float
-
-
 def put_beside(picture: Figure, circuit: Circuit) -> Figure:
     """The picture of a run with the circuit's schematic, small, on its right."""
-    schematic = draw_circuit(circuit)
-    content = io.BytesIO()
+    schematic, content = draw_circuit(circuit), io.BytesIO()
     schematic.savefig(content, format="png", dpi=_SMALL_DPI)
     content.seek(0)
     width, height = picture.get_size_inches()
@@ -161,10 +146,8 @@ def put_beside(picture: Figure, circuit: Circuit) -> Figure:
     engine: Any = picture.get_layout_engine()
     engine.set(rect=(0.0, 0.0, width / total, 1.0))
     # Axes without a grid take no part in the layout.
-    ax = picture.add_axes(
-        (width / total, 0.5 - 0.5 * shrunk * high / height, shrunk * wide / total, shrunk * high / height),
-        label="schematic",
-    )
+    share = shrunk * high / height
+    ax = picture.add_axes((width / total, 0.5 - 0.5 * share, shrunk * wide / total, share), label="schematic")
     ax.set_axis_off()
     ax.imshow(image.imread(content), aspect="auto", interpolation="antialiased")
     return picture
@@ -192,23 +175,22 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     title = textwrap.wrap(drawing.drawable(circuit.title), 60) or [""]
     widths = {node: size(name, False) for node, name in names.items()}
     wide = {name: max(size(line, k == 0) for k, line in enumerate(lines)) for name, lines in labels.items()}
-    sheet = _sheet(placed, labels, wide, widths, max(size(line, True) for line in title), len(title))
-    figure.set_size_inches(sheet.width, sheet.height)
+    x, y, width, height = _sheet(placed, labels, wide, widths, max(size(line, True) for line in title), len(title))
+    figure.set_size_inches(width, height)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    ax.set(xlim=(0.0, sheet.width), ylim=(0.0, sheet.height))
+    ax.set(xlim=(0.0, width), ylim=(0.0, height))
     ax.set_axis_off()
     for k, line in enumerate(title):
-        _write(ax, _MARGIN, sheet.height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, bold=True)
-    strokes, dots = _wires(placed, sheet)
+        _write(ax, _MARGIN, height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, bold=True)
+    strokes, dots = _wires(placed, x, y)
     for p in placed.places:
-        strokes += _draw_element(ax, sheet, p, labels[p.element.name])
+        strokes += _draw_element(ax, x, y, p, labels[p.element.name])
     for node, name in names.items():
-        x, y = sheet.x[placed.extents[node][0]] + 0.07, sheet.y[placed.rows[node]] + 0.08
-        _write(ax, x, y, name, color=drawing.BLUE)
+        _write(ax, x[placed.extents[node][0]] + 0.07, y[placed.rows[node]] + 0.08, name, color=drawing.BLUE)
     for stroke in strokes:
         ax.plot(*zip(*stroke, strict=True), color=drawing.BLACK, linewidth=1.0, solid_capstyle="round")
-    for x, y in dots:
-        ax.plot([x], [y], "o", color=drawing.BLACK, markersize=3.5)
+    for dot in dots:
+        ax.plot(*dot, "o", color=drawing.BLACK, markersize=3.5)
     if path is not None:
         figure.write(path)
     return figure
@@ -259,8 +241,8 @@ def _quantity(value: float, unit: str) -> str:
 def _sheet(
     placed: Placement, labels: Mapping[str, tuple[str, ...]], widths: Mapping[str, float], names: Mapping[str, float],
     title: float, lines: int,
-) -> _Sheet:  # fmt: skip
-    """Columns so wide and rows so high that nothing meets, from the widths (inches) of labels, nodes and title."""
+) -> tuple[list[float], list[float], float, float]:  # fmt: skip
+    """Places of columns and rows, between which nothing meets, width and height (inches), from the widths of texts."""
     columns = 1 + max(p.column for p in placed.places)
     gaps = max(p.bottom for p in placed.places)
     left, right, high = [0.2] * columns, [0.3] * columns, [0.0] * gaps
@@ -274,8 +256,8 @@ def _sheet(
         column = placed.extents[node][0]
         right[column] = max(right[column], 0.07 + width)
     x = [_MARGIN + left[0]]
-    for k in range(1, columns):
-        x.append(x[-1] + right[k - 1] + _MARGIN + left[k])
+    for before, own in itertools.pairwise(zip(left, right, strict=True)):
+        x.append(x[-1] + before[1] + _MARGIN + own[0])
     width = max(x[-1] + right[-1] + _MARGIN, title + 2.0 * _MARGIN)
     # Names of nodes stand above their rows, also above the first one; ground hangs below the last.
     above = [_MARGIN + 1.2 * _LINE * lines + _ROOM + _LINE, *(h + 2.0 * _ROOM + _LINE for h in high)]
@@ -283,38 +265,39 @@ def _sheet(
     y = [height - above[0]]
     for step in above[1:]:
         y.append(y[-1] - step)
-    return _Sheet(x, y, width, height)
+    return x, y, width, height
 
 
-def _draw_element(ax: Axes, sheet: _Sheet, p: Place, label: Sequence[str]) -> list[Stroke]:
+def _draw_element(
+    ax: Axes, columns: Sequence[float], rows: Sequence[float], p: Place, label: Sequence[str]
+) -> list[Stroke]:
     """Write an element's label; gives the strokes of its symbol and of its wires."""
     strokes, tall, wide = symbol(p.element)
-    x = sheet.x[p.column]
     # The name of the node below needs the lowest line.
-    y = 0.5 * (sheet.y[p.gap] + sheet.y[p.gap + 1] + _LINE)
-    tint = _TINTS.get(p.element.device)
-    if tint is not None:
+    x, y = columns[p.column], 0.5 * (rows[p.gap] + rows[p.gap + 1] + _LINE)
+    if tint := _TINTS.get(p.element.device):
         corner = (x - wide - 0.02, y - tall)
         ax.add_patch(Rectangle(corner, 2.0 * wide + 0.04, 2.0 * tall, color=tint, alpha=0.2, linewidth=0))
     for k, line in enumerate(label):
         _write(ax, x + wide + _BESIDE, y + 0.5 * _LINE * len(label) - (k + 0.5) * _LINE, line, bold=k == 0)
-    up = 1.0 if p.upright else -1.0
-    moved: list[Stroke] = [[(x + dx, y + up * dy) for dx, dy in stroke] for stroke in strokes]
-    return [*moved, [(x, sheet.y[p.top]), (x, y + tall)], [(x, y - tall), (x, sheet.y[p.bottom])]]
+    moved = _moved(strokes, x, y, 1.0 if p.upright else -1.0)
+    return [*moved, [(x, rows[p.top]), (x, y + tall)], [(x, y - tall), (x, rows[p.bottom])]]
 
 
-def _wires(placed: Placement, sheet: _Sheet) -> tuple[list[Stroke], Stroke]:
+def _wires(placed: Placement, x: Sequence[float], y: Sequence[float]) -> tuple[list[Stroke], Stroke]:
     """The rows of nodes with ground, and the points where three wires or more meet."""
     rows: list[Stroke] = []
     dots = []
     for node, (first, last) in placed.extents.items():
-        y = sheet.y[placed.rows[node]]
+        height = y[placed.rows[node]]
         if last > first:
-            rows.append([(sheet.x[first], y), (sheet.x[last], y)])
+            rows.append([(x[first], height), (x[last], height)])
         ends = [p.column for p in placed.places if node in p.element.nodes[:2]]
         for column in sorted(set(ends)):
             meeting = ends.count(column) + (column > first) + (column < last)
             if meeting + (node == GROUND and column == first) >= 3:
-                dots.append((sheet.x[column], y))
-    column = placed.extents[GROUND][0]
-    return [*rows, *ground(sheet.x[column], sheet.y[placed.rows[GROUND]])], dots
+                dots.append((x[column], height))
+    # Ground hangs from the first column of its row.
+    lines: list[Stroke] = [[(0.0, 0.0), (0.0, -0.14)]]
+    lines += [[(-w, -d), (w, -d)] for w, d in ((0.13, 0.14), (0.08, 0.19), (0.03, 0.24))]
+    return [*rows, *_moved(lines, x[placed.extents[GROUND][0]], y[placed.rows[GROUND]])], dots

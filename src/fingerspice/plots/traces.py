@@ -13,14 +13,13 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.describe import changes_text, heading
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.plots import drawing, lines
-from fingerspice.plots.lines import Drawn, Quantity
-from fingerspice.results.signals import SIGNALS
+from fingerspice.plots.lines import Drawn
+from fingerspice.results.signals import SIGNALS, Signal, signal_of
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from fingerspice.base.arrays import FloatArray
     from fingerspice.circuit.circuit import Circuit
     from fingerspice.plots.picture import Picture
     from fingerspice.results.phasor_solution import PhasorSolution
@@ -47,30 +46,29 @@ def plot_solution(
     marks, heights = _turns(runs, panels, start, stop)
     dense = marks.size > 2 * MOST_DRAWN
     zoomed = _zoom(marks, heights, start, stop)
-    beside = zoomed is not None
-    shares = [1.5 if quantity == lines.VOLTAGE else 1.1 for quantity, _ in panels]
-    options: dict[str, Any] = {"height_ratios": shares, "sharex": "col", "sharey": "row"}
-    if beside:
-        options["width_ratios"] = [1.5, 1.0]
-    tall = max(3.4, 0.7 + 1.15 * sum(shares))
-    figure, axes = drawing.new_figure(len(panels), 2 if beside else 1, height=tall, **options)
-    left, right = (axes[::2], axes[1::2]) if beside else (axes, [])
-    for row, (quantity, keys) in enumerate(panels):
+    shares = [1.5 if signal.axis == "Voltage" else 1.1 for signal, _ in panels]
+    widths = [1.0] if zoomed is None else [1.5, 1.0]
+    figure, axes = drawing.new_figure(
+        len(panels), len(widths), height=max(3.4, 0.7 + 1.15 * sum(shares)), height_ratios=shares, width_ratios=widths,
+        sharex="col", sharey="row",
+    )  # fmt: skip
+    left, right = axes[:: len(widths)], [] if zoomed is None else axes[1::2]
+    for row, (signal, keys) in enumerate(panels):
         traces = lines.traces_of(runs, keys)
-        factor, unit = lines.scale_of(quantity, traces, start, stop)
+        factor, unit = lines.scale_of(signal, traces, start, stop)
         for trace in traces:
             lines.draw_line(left[row], trace, factor, start, stop, runs, envelope=marks if dense else None)
             if zoomed is not None:
                 lines.draw_line(right[row], trace._replace(label="_"), factor, *zoomed, runs)
         if keys == ["f_el"] and len(traces) == 1:
-            lines.draw_mean(left[row], traces[0], factor, unit, told=not beside)
-            if beside:
+            lines.draw_mean(left[row], traces[0], factor, unit, told=not right)
+            if right:
                 lines.draw_mean(right[row], traces[0], factor, unit)
                 drawing.legend_above(right[row], 1)
-        room = lines.HALF if beside else lines.PAGE
-        lines.finish_panel(left[row], quantity, unit, [factor * t.x for t in traces], room)
+        room = lines.HALF if right else lines.PAGE
+        lines.finish_panel(left[row], signal, unit, [factor * t.x for t in traces], room)
         if keys == ["f_t"] and len(traces) == 1:
-            lines.coefficient_axis(right[row] if beside else left[row], traces[0].solution, factor)
+            lines.coefficient_axis((right or left)[row], traces[0].solution, factor)
     lines.time_axis(left, runs, start, stop)
     small = lines.about_all(runs)
     if zoomed is not None:
@@ -94,10 +92,8 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     """Every run with its name: the given name, or the facts in which the run differs from the other runs."""
     from fingerspice.results.solution import Solution
 
-    if isinstance(others, Solution):
-        others = (others,)
     named = isinstance(others, Mapping)
-    rest = list(others.values()) if named else list(others) if isinstance(others, Sequence) else [others]
+    rest = [*(others.values() if named else others if isinstance(others, Sequence) else [others])]
     for other in rest:
         require(isinstance(other, Solution), "others", repr(other), "Solutions, or a mapping of names to Solutions")
     every = [solution, *rest]
@@ -115,29 +111,27 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     return [Drawn(s, label) for s, label in zip(every, labels, strict=True)]
 
 
-def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[tuple[Quantity, list[str]]]:
-    """Panels from top to bottom, each with the names of its signals."""
+def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[tuple[Signal, list[str]]]:
+    """Panels from top to bottom, each with its first signal and the names of all."""
     every = [run.solution.record for run in runs]
     if signals is None:
+        inside = "u_layer" if any(s.layers for s in every) else "v"
         contact = any(s.gaps for s in every)
-        layers = any(s.layers for s in every)
-        signals = (
-            ["u_source", "u_gap", "f_el", "area", "f_t"] if contact else ["u_source", "u_layer" if layers else "v"]
-        )
+        signals = ["u_source", *(("u_gap", "f_el", "area", "f_t") if contact else (inside,))]
     asked = [signals] if isinstance(signals, str) else list(signals)
     known = {name: None for s in every for key in SIGNALS for name in (key, *s.names(key)) if s.names(key)}
-    panels: list[tuple[Quantity, list[str]]] = []
+    panels: list[tuple[Signal, list[str]]] = []
     for name in asked:
         if name not in known:
             near = get_close_matches(str(name), known, 1, 0.0)
             allowed = ", ".join([*(name for name in known if ":" not in name), "and name:element"])
             raise InputError(f"unknown signal {name!r}; nearest: {near[0]!r}; allowed: {allowed}")
-        quantity = lines.QUANTITIES[name.partition(":")[0]]
-        same = [keys for q, keys in panels if q == quantity]
+        signal = signal_of(name)
+        same = [keys for other, keys in panels if other.axis == signal.axis]
         if same:
             same[0].append(name)
         else:
-            panels.append((quantity, [name]))
+            panels.append((signal, [name]))
     require(bool(panels), "signals", "empty", "one name or more")
     return panels
 
@@ -158,7 +152,7 @@ def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[floa
 
 
 def _turns(
-    runs: list[Drawn], panels: list[tuple[Quantity, list[str]]], start: float, stop: float
+    runs: list[Drawn], panels: list[tuple[Signal, list[str]]], start: float, stop: float
 ) -> tuple[FloatArray, FloatArray]:
     """Times (s) and values of the turning points, two per oscillation, of the first panel's most oscillating signal."""
     best = np.zeros(0), np.zeros(0)
@@ -166,7 +160,7 @@ def _turns(
         t = run.solution.t
         kept = (t >= start) & (t <= stop)
         for key in panels[0][1]:
-            for x in lines.signal_of(run.solution, key).values():
+            for x in lines.columns_of(run.solution, key).values():
                 step = np.diff(x[kept])
                 # Turning points of round-off are not counted.
                 steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
@@ -202,23 +196,21 @@ _DRAWN = 1e-6
 def plot_spectrum(spectrum: Spectrum) -> Picture:
     """Amplitudes of the lines, or the density with its confidence interval, against frequency, on logarithmic axes."""
     figure, (ax,) = drawing.new_figure(1, height=3.4)
-    name = spectrum.signal.partition(":")[0]
-    color, unit = lines.QUANTITIES[name].color, spectrum.unit.replace("^2", "²")
-    label = f"{SIGNALS[name].text.capitalize()} {spectrum.signal.partition(':')[2]}".rstrip()
+    signal = signal_of(spectrum.signal)
+    color, unit = lines.COLORS[signal.axis], spectrum.unit.replace("^2", "²")
+    label = f"{signal.text.capitalize()} {spectrum.signal.partition(':')[2]}".rstrip()
     if spectrum.amplitude is not None:
         least = _DRAWN * drawing.peak_of(spectrum.amplitude)
         stems(ax, spectrum.frequency, spectrum.amplitude, least, color=color)
         drawing.dress(ax, f"{label}: amplitude [{unit}]", "Frequency [Hz]")
         small = f"Fourier integrals over a period; {spectrum.frequency.size} lines, {spectrum.resolution:.4g} Hz apart"
     else:
-        assert spectrum.density is not None
-        assert spectrum.lower is not None
-        assert spectrum.upper is not None
-        some = (spectrum.frequency > 0.0) & (spectrum.density > 0.0)
+        f = spectrum.frequency
+        density, lower, upper = map(np.asarray, (spectrum.density, spectrum.lower, spectrum.upper))
+        some = (f > 0.0) & (density > 0.0)
         if some.any():
-            f = spectrum.frequency[some]
-            ax.fill_between(f, spectrum.lower[some], spectrum.upper[some], color=color, alpha=0.25, linewidth=0.0)
-            ax.loglog(f, spectrum.density[some], color=color, linewidth=1.2)
+            ax.fill_between(f[some], lower[some], upper[some], color=color, alpha=0.25, linewidth=0.0)
+            ax.loglog(f[some], density[some], color=color, linewidth=1.2)
         drawing.dress(ax, f"{label}: density [{unit}²/Hz]", "Frequency [Hz]")
         small = (
             f"Welch's density, {spectrum.resolution:.4g} Hz wide, with the interval that holds the true one with a "
@@ -236,13 +228,11 @@ def stems(
 ) -> None:
     """Draw the lines of a spectrum that are larger than `least`, from the bottom of a logarithmic panel."""
     some = size > least
-    if not some.any():
-        return
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.plot(f[some], size[some], color=color, marker=marker, markersize=3.5, linestyle="none", label=label)
-    ax.vlines(f[some], least, size[some], color=color, linewidth=1.0)
-    ax.set_ylim(bottom=least)
+    if some.any():
+        ax.set(xscale="log", yscale="log")
+        ax.plot(f[some], size[some], color=color, marker=marker, markersize=3.5, linestyle="none", label=label)
+        ax.vlines(f[some], least, size[some], color=color, linewidth=1.0)
+        ax.set_ylim(bottom=least)
 
 
 def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
@@ -268,8 +258,8 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
         drawing.from_zero(ax)
     amplitude = results[0].amplitude
     if not np.isfinite(amplitude):
-        place: dict[str, Any] = {"transform": axes[2].transAxes, "ha": "center", "fontsize": drawing.FONT}
-        axes[2].text(0.5, 0.5, "the source has no fundamental", **place)
+        told = "the source has no fundamental"
+        axes[2].text(0.5, 0.5, told, transform=axes[2].transAxes, ha="center", fontsize=drawing.FONT)
     if len(results) > 1:
         axes[0].legend(fontsize=drawing.FONT, frameon=False, loc="lower right", handlelength=3.0)
     drawing.flat(axes[3], 1e6 * np.concatenate([r.area for r in results]))
@@ -280,8 +270,7 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
 
 def _plot_nodes(result: PhasorSolution, circuit: Circuit) -> Picture:
     """Amplitude and phase of every node's voltage against frequency."""
-    v = result.v_nodes
-    assert v is not None
+    v = np.asarray(result.v_nodes)
     figure, axes = drawing.new_figure(2, 1, height=4.6, sharex=True)
     _against_frequency(axes[0], result, np.abs(v), "Node voltage [V]", label=result.nodes)
     _against_frequency(axes[1], result, np.degrees(np.angle(v)), "Phase [°]")
@@ -305,13 +294,13 @@ def _finished(
     """The picture with its caption, the lowest row's label, and frequencies outside the data of SKIN shaded."""
     f = result.frequency
     low, high = f.min(), f.max()
-    spans = [(low, min(high, SKIN_BAND[0])), (max(low, SKIN_BAND[1]), high)]
-    spans = [s for s in spans if s[1] > s[0]] if circuit.by_device("SKIN") else []
+    outside = ((low, min(high, SKIN_BAND[0])), (max(low, SKIN_BAND[1]), high)) if circuit.by_device("SKIN") else ()
+    spans = [(a, b) for a, b in outside if b > a]
     for ax in axes:
         for a, b in spans:
             ax.axvspan(a, b, color="#EEEEEE", zorder=0.5)
     for ax in axes[-columns:]:
         ax.set_xlabel("Frequency [Hz]", fontsize=drawing.FONT)
-    outside = "shaded: outside the skin data of Eqs. 18 and 19" if spans else ""
-    drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, outside) if p))
+    shaded = "shaded: outside the skin data of Eqs. 18 and 19" if spans else ""
+    drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, shaded) if p))
     return figure

@@ -11,9 +11,9 @@ from numpy.polynomial import legendre
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.numerics.chebyshev import largest
-from fingerspice.numerics.lobatto import BETWEEN, NODES, POINTS
+from fingerspice.numerics.lobatto import NODES, POINTS
 from fingerspice.results.signals import Signals
-from fingerspice.results.steps import Panels, Recorded
+from fingerspice.results.steps import Panels, Recorded, missed
 
 _NODES = POINTS[:NODES]
 #: Smallest tolerance of the interpolation error of a panel, relative to the signal's peak.
@@ -47,13 +47,10 @@ class Weighed:
 
 
 class Stretch:
-    """A run between two times (s), with weights and extremes of every signal.
+    """A run between two times (s), with weights and extremes of every signal, more exact than its error `rtol`.
 
-    A panel is halved where the polynomial through its nodes differs from the signal between them: steps are chosen to
-    resolve the gap voltage, and the area may change within a small part of the voltage's range.
-
-    `rtol` is the error of the run relative to its peaks, than which means and extremes are more exact; no panel is
-    longer than `longest` (s).
+    A panel is halved where it is longer than `longest` (s), or the polynomial through its nodes differs from the signal
+    between them: steps resolve the gap voltage, and the area may change within a small part of the voltage's range.
     """
 
     def __init__(self, run: Recorded, since: float, until: float, rtol: float, longest: float = math.inf) -> None:
@@ -61,24 +58,23 @@ class Stretch:
         self.panels = run.panels(since, until)
         while (long := self.panels.duration > longest).any():
             self.panels = _joined([self.panels.take(~long), self.panels.take(long).halved()])
-        self._share, self._shares = _shares(self.panels)
 
     def weigh(self, name: str) -> Weighed:
         """A signal with weights for its means."""
         t, x = self.run.at_points(name, self.panels)
-        peak = float(np.abs(x).max(initial=0.0)) or 1.0
-        missed = _missed(x) / peak
+        error = missed(x) / (float(np.abs(x).max(initial=0.0)) or 1.0)
+        share = self.panels.duration / self.panels.duration.sum()
         # Gauss-Lobatto weights integrate polynomials up to twice the degree of the interpolant exactly. If the terms of
         # the series fall geometrically, the quadrature error is about the interpolation error to the power 1.85; 1.5 is
         # on the safe side.
-        if float((self._share * missed**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
-            return Weighed(t[:, :NODES], self._shares, x[:, :NODES])
-        return self._cut(name, t, x, _FINEST)[0]
+        if float((share * error**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
+            return Weighed(t[:, :NODES], share[:, None] * _WEIGHTS, x[:, :NODES])
+        return self._cut(name, _FINEST)[0]
 
     def extremes(self, name: str) -> tuple[float, float]:
         """Smallest and largest value of a signal, evaluated where its polynomials have their extremes."""
         # An interpolation error shifts the place of an extreme, which changes the signal there by its square only.
-        weighed, panels = self._cut(name, *self.run.at_points(name, self.panels), max(_FINEST, 1e-3 * self.rtol))
+        weighed, panels = self._cut(name, max(_FINEST, 1e-3 * self.rtol))
         found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
         panel, place = np.array([p for p, _, _ in found]), np.array([x for _, x, _ in found])
         panels = panels.take(panel)
@@ -87,26 +83,22 @@ class Stretch:
         return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
 
     def at_nodes(self, names: Sequence[str], tol: float) -> list[FloatArray]:
-        """Times (s) and these signals at the nodes of panels on which each misses its polynomial by `tol` of its peak.
-
-        All have the shape (p, NODES). Panels on which the rounding of the time alone is as much, as on an edge of 1 ns,
-        are not cut.
-        """
+        """Times (s) and signals at the nodes (p, NODES) of panels on which each misses its polynomial by `tol`."""
+        # Panels on which the rounding of the time alone is as much, as on an edge of 1 ns, are not cut.
         shortest = np.finfo(float).eps * abs(self.span[1]) / tol
         for name in names:
-            self.panels = self._cut(name, *self.run.at_points(name, self.panels), tol, shortest)[1]
+            self.panels = self._cut(name, tol, shortest)[1]
         found = [self.run.at_points(name, self.panels) for name in names]
         return [x[:, :NODES] for x in (found[0][0], *(x for _, x in found))]
 
-    def _cut(
-        self, name: str, t: FloatArray, x: FloatArray, tol: float, shortest: float = 0.0
-    ) -> tuple[Weighed, Panels]:
+    def _cut(self, name: str, tol: float, shortest: float = 0.0) -> tuple[Weighed, Panels]:
         """A signal, and panels on which its interpolation error is at most `tol` of its peak, or as short as told."""
-        smooth = tol * float(np.abs(x).max(initial=0.0))
         panels, parts = self.panels, []
+        t, x = self.run.at_points(name, panels)
+        smooth = tol * float(np.abs(x).max(initial=0.0))
         most = _MOST_CUT + 4 * panels.step.size
         for left in range(_MOST_ROUNDS, 0, -1):
-            wrong = (_missed(x) > smooth) & (panels.duration > shortest)
+            wrong = (missed(x) > smooth) & (panels.duration > shortest)
             if most <= 0 or left == 1:
                 # Panels that are still not smooth hold round-off, or a jump that round-off has shifted across an end.
                 wrong[:] = False
@@ -118,22 +110,12 @@ class Stretch:
             t, x = self.run.at_points(name, panels)
         every = _joined([part[0] for part in parts])
         t, x = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
-        return Weighed(t, _shares(every)[1], x), every
+        share = every.duration / every.duration.sum()
+        return Weighed(t, share[:, None] * _WEIGHTS, x), every
 
 
 def _joined(parts: Sequence[Panels]) -> Panels:
     return Panels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _missed(x: FloatArray) -> FloatArray:
-    """Largest interpolation error found between the nodes of each panel, from values (p, ROWS), shape (p,)."""
-    return np.asarray(np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1, initial=0.0))
-
-
-def _shares(panels: Panels) -> tuple[FloatArray, FloatArray]:
-    """Weight of each panel, shape (p,), and of the values at its nodes, shape (p, NODES), in a mean."""
-    share = panels.duration / panels.duration.sum()
-    return share, share[:, None] * _WEIGHTS
 
 
 class Outputs:

@@ -10,7 +10,7 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.circuit.network import Network
 from fingerspice.engine.network import Net
-from fingerspice.physics.contact import Contact, areas, forces, inverse_area_array
+from fingerspice.physics.contact import areas, forces, inverse_area_array
 from fingerspice.results.signals import Signals, sealed, side_by_side
 from fingerspice.waveforms.waveform import Waveform
 
@@ -43,21 +43,13 @@ class Record(Signals):
     rows: FloatArray
     has_charge: bool
 
-    @cached_property
-    def layers(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of the layers, in the order of `u_layer`."""
-        return tuple(e.name for e in self.network.layers)
-
-    @cached_property
-    def sources(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of the sources, in the order of the columns of their signals."""
-        return tuple(e.name for e in self.network.sources)
-
-    @cached_property
-    def fingers(self) -> tuple[tuple[str, Contact], ...]:  # type: ignore[override]
-        """Each GAP's name and contact."""
-        found = ((self.network.areas[i].gap, self.network.contacts[i]) for i in self.network.fingers)
-        return tuple((gap.name, contact) for gap, contact in found if gap is not None and contact is not None)
+    def __post_init__(self) -> None:
+        network = self.network
+        found = ((network.areas[i].gap, network.contacts[i]) for i in network.fingers)
+        fingers = tuple((gap.name, contact) for gap, contact in found if gap is not None and contact is not None)
+        layers, sources = (tuple(e.name for e in some) for some in (network.layers, network.sources))
+        vars(self).update(layers=layers, sources=sources, fingers=fingers)
+        super().__post_init__()
 
     @cached_property
     def _x(self) -> FloatArray:

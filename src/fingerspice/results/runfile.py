@@ -24,7 +24,7 @@ from fingerspice.physics.contact import Contact
 from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.signals import StoredRecord, kept_rows, variables
 from fingerspice.results.solution import Solution
-from fingerspice.results.steps import Block, Recorded
+from fingerspice.results.steps import Recorded, whole_steps
 from fingerspice.waveforms import combinations, periodic, ramps, samples
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
@@ -195,9 +195,8 @@ def _solution(file: Any) -> Solution:
         period = np.asarray(group.variables["between"][...], float)
         begin, end = period[::NODES, 0], period[NODES - 1 :: NODES, 0]
         values = period[:, 1:].reshape(begin.size, NODES, -1).transpose(0, 2, 1)
-        steps = Block(np.column_stack([begin, end - begin, end, np.ones(begin.size)]), values)
         make = partial(StoredRecord, tuple(map(str, run["between"])), sources, fingers)
-        continuous = Recorded((steps,), float(run["t_stop"]) - float(run["period"]), make)
+        continuous = Recorded(whole_steps(begin, end, values), float(run["t_stop"]) - float(run["period"]), make)
     return Solution(
         t=t,
         record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:].T),

@@ -20,32 +20,41 @@ class Signal(NamedTuple):
     unit: str
     text: str  # Its long name
     short: str  # Its name in a legend
+    axis: str  # Label of its panel in a picture, which signals of the same quantity share
+    least: float = 0.0  # A panel's unit has a prefix by which the peak is at least this number; 0 means no prefix
+    from_zero: bool = False  # Whether the scale of a panel starts at 0
     of: str = ""  # "source", "layer", "gap" or "node" where each of these has a column
+    ripple: bool = False  # Whether its summary has a ripple instead of an rms
     # Other signals follow from the record itself: this one from another signal, with the contact of the gap
     base: str = ""
     make: Callable[[Contact, FloatArray], FloatArray] | None = None
-    ripple: bool = False  # Whether its summary has a ripple instead of an rms
 
 
 #: Signals in the order of tables and files; those of layers and nodes are ``u_layer:NAME`` and ``v:NAME``.
 SIGNALS = {
-    "u_source": Signal("V", "source voltage", "source", "source"),
-    "u_layer": Signal("V", "layer voltage", "layer", "layer"),
-    "u_gap": Signal("V", "gap voltage", "gap", "gap"),
-    "area": Signal("m^2", "ridge contact area", "area", "gap", ripple=True),
-    "sigma_el": Signal("Pa", "electroadhesive stress", "electroadhesive stress", "gap", "u_gap", Contact.stress),
-    "f_el": Signal("N", "electroadhesive force", "electroadhesive force", "gap", ripple=True),
+    "u_source": Signal("V", "source voltage", "source", "Voltage", 2.0, of="source"),
+    "u_layer": Signal("V", "layer voltage", "layer", "Voltage", 2.0, of="layer"),
+    "u_gap": Signal("V", "gap voltage", "gap", "Voltage", 2.0, of="gap"),
+    "area": Signal("m^2", "ridge contact area", "area", "Ridge area", of="gap", ripple=True),
+    "sigma_el": Signal(
+        "Pa", "electroadhesive stress", "electroadhesive stress", "Stress", 2.0, True, "gap", False, "u_gap",
+        Contact.stress,
+    ),
+    "f_el": Signal("N", "electroadhesive force", "electroadhesive force", "Force", 0.05, True, "gap", True),
     "f_t": Signal(
-        "N", "friction force", "friction", "gap", "f_el", lambda contact, f: contact.mu * (contact.f_n + f), ripple=True
+        "N", "friction force", "friction", "Friction", 0.05, True, "gap", True, "f_el",
+        lambda contact, f: contact.mu * (contact.f_n + f),
     ),
     "friction": Signal(
-        "1", "friction coefficient f_t / f_n", "coefficient", "gap", "f_t", lambda contact, f: f / contact.f_n,
-        ripple=True,
+        "1", "friction coefficient f_t / f_n", "coefficient", "Friction coefficient", 0.0, True, "gap", True, "f_t",
+        lambda contact, f: f / contact.f_n,
     ),
-    "q_source": Signal("C", "charge delivered by the source", "charge", "source"),
-    "i_source": Signal("A", "source current, regular part", "current", "source"),
-    "fold_margin": Signal("1", "distance to the fold of the mobile law", "distance to the fold"),
-    "v": Signal("V", "node voltage", "node", "node"),
+    "q_source": Signal("C", "charge delivered by the source", "charge", "Charge", 2.0, of="source"),
+    "i_source": Signal("A", "source current, regular part", "current", "Current", 2.0, of="source"),
+    "fold_margin": Signal(
+        "1", "distance to the fold of the mobile law", "distance to the fold", "Distance to the fold", from_zero=True
+    ),
+    "v": Signal("V", "node voltage", "node", "Voltage", 2.0, of="node"),
 }  # fmt: skip
 
 
@@ -111,31 +120,23 @@ class Signals(Sealed):
     def columns(self, key: str) -> tuple[str, ...]:
         """Names of the layers, gaps, sources or nodes to which the columns of a signal belong."""
         of = SIGNALS[key].of
-        if of == "node":
-            return tuple(self.node_voltages)
-        return {"": (), "source": self.sources, "layer": self.layers, "gap": self.gaps}[of]
+        return () if not of else tuple(self.node_voltages if of == "node" else getattr(self, f"{of}s"))
 
     def names(self, key: str) -> tuple[str, ...]:
-        """``key`` itself, or ``key:element`` for each of several elements; empty where the run has no such signal.
-
-        Raises
-        ------
-        InputError
-            For a name that no signal has.
-        """
+        """``key`` itself, or ``key:element`` for each of several elements; empty where the run has no such signal."""
         base, colon, _ = key.partition(":")
         if base not in SIGNALS or (colon and key not in self.names(base)):
             raise InputError(f"unknown signal {key!r}; allowed: {', '.join(SIGNALS)}")
         if colon:
             return (key,)
-        several = self.columns(key)
+        several = tuple(f"{key}:{name}" for name in self.columns(key))
         if key in ("u_layer", "v"):
-            return tuple(f"{key}:{name}" for name in several)
+            return several
         # Decide without computing the signal, where possible.
         missing = SIGNALS[key].of == "gap" and not several
         if key in ("q_source", "i_source") or (key == "area" and missing):
             missing = self.value(key) is None
-        return () if missing else (key,) if len(several) < 2 else tuple(f"{key}:{name}" for name in several)
+        return () if missing else several if len(several) > 1 else (key,)
 
     def one(self, name: str) -> FloatArray:
         """The signal of one of the `names`, shape (n_t,)."""
@@ -170,9 +171,9 @@ def attribute(get: Callable[[Any], Any], doc: str) -> Any:
     return property(get, doc=doc)
 
 
-def _given(key: str, doc: str) -> FloatArray | None:
+def _given(key: str, doc: str) -> Any:
     """A property: a signal; None where the run has no such signal."""
-    return attribute(lambda result: result.record.value(key), doc)  # type: ignore[no-any-return]
+    return attribute(lambda result: result.record.value(key), doc)
 
 
 class Signalled:
@@ -187,42 +188,42 @@ class Signalled:
         lambda result: result.record.sources,
         "Names of the sources of a network; of a series stack there is one, its loop.",
     )
-    u_source: FloatArray = attribute(
-        lambda result: result.record.one("u_source"),
-        "Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,).",
-    )
-    u_layer: FloatArray = attribute(
-        lambda result: result.record.one("u_layer"),
-        "Voltage of each layer from its p to its n node, V, shape (n_t, n_layer).",
-    )
     node_voltages: dict[str, FloatArray] = attribute(
         lambda result: result.record.node_voltages, "Node name to its voltage, V, shape (n_t,)."
     )
-    fold_margin: FloatArray = attribute(
-        lambda result: result.record.one("fold_margin"),
+    u_source: FloatArray = _given(
+        "u_source", "Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,)."
+    )
+    u_layer: FloatArray = _given("u_layer", "Voltage of each layer from its p to its n node, V, shape (n_t, n_layer).")
+    fold_margin: FloatArray = _given(
+        "fold_margin",
         "Distance to the fold of the `mobile` law: 1 without stored charge, 0 at the fold; 1 under `local`.",
     )
-    area = _given("area", "Ridge contact area, m^2, shape (n_t,); None for a circuit without any.")
-    q_source = _given(
+    area: FloatArray | None = _given("area", "Ridge contact area, m^2, shape (n_t,); None for a circuit without any.")
+    q_source: FloatArray | None = _given(
         "q_source",
         "Charge delivered by the source since the start, C, shape (n_t,), with the impulses at jumps.\n\n"
         "None where the run was asked to leave it out.",
     )
-    i_source = _given(
+    i_source: FloatArray | None = _given(
         "i_source",
         "Current of the source, A, shape (n_t,), without the impulses at jumps, which only `q_source` shows.",
     )
-    u_gap = _given("u_gap", "Gap voltage, V, shape (n_t,); None for a circuit without GAP.")
-    sigma_el = _given("sigma_el", "Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP.")
-    f_el = _given(
+    u_gap: FloatArray | None = _given("u_gap", "Gap voltage, V, shape (n_t,); None for a circuit without GAP.")
+    sigma_el: FloatArray | None = _given(
+        "sigma_el", "Electroadhesive stress (Eq. 2), Pa, shape (n_t,); None for a circuit without GAP."
+    )
+    f_el: FloatArray | None = _given(
         "f_el",
         "Electroadhesive force, N, shape (n_t,); None for a circuit without GAP.\n\n"
         "Its mean is `f_el_mean`, and over the last period `f_el_mean_periodic`. ``f_el.mean()`` is another figure: it "
         "gives every output the same weight, including both ends of a period and both rows of a jump, which causes an "
         "error of some per cent at 50 to 200 outputs per period.",
     )
-    f_t = _given("f_t", "Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP.")
-    friction = _given("friction", "Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP.")
+    f_t: FloatArray | None = _given("f_t", "Friction force (Eq. 1), N, shape (n_t,); None for a circuit without GAP.")
+    friction: FloatArray | None = _given(
+        "friction", "Friction coefficient f_t / f_n, shape (n_t,); None for a circuit without GAP."
+    )
 
     def by_name(self, key: str) -> dict[str, FloatArray]:
         """A signal by its name, or the columns of several elements by ``name:element``.
@@ -253,10 +254,7 @@ Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]
 def kept_rows(solution: Signalled, jumps: str) -> BoolArray:
     """Mask of the rows that are written, shape (n_t,): all rows, or all but the left-hand rows of jumps."""
     require(jumps in ("right", "both"), "jumps", repr(jumps), "'right' or 'both'")
-    keep = np.ones(solution.t.size, bool)
-    if jumps == "right" and solution.t.size:
-        keep[:-1] = np.diff(solution.t) > 0.0
-    return keep
+    return np.append(np.diff(solution.t) > 0.0, True)[: solution.t.size] | (jumps == "both")
 
 
 def variables(

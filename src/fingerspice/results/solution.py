@@ -15,7 +15,6 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown
 from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status
-from fingerspice.results.report import summary_table
 from fingerspice.results.signals import Sealed, Signalled, Signals, kept_rows, variables
 from fingerspice.results.summary import Figured, Figures
 
@@ -106,7 +105,7 @@ class Solution(Sealed, Shown, Signalled, Figured):
     sensitivities: Mapping[str, Sensitivity] = field(default_factory=dict)
 
     def _page(self) -> Page:
-        return summary_table(self)
+        return self._figures.page()
 
     @property
     def message(self) -> str:

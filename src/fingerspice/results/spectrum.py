@@ -77,10 +77,9 @@ class Spectrum(Sealed, Shown):
     @property
     def shown_variance(self) -> float:
         """Variance in the spectrum: less than `variance` where the signal has frequencies beyond the highest one."""
-        if self.amplitude is not None:
-            return 0.5 * float((self.amplitude**2).sum())
-        assert self.density is not None
-        return float(self.density.sum()) * self.resolution
+        if self.density is not None:
+            return float(self.density.sum()) * self.resolution
+        return 0.5 * float((np.asarray(self.amplitude) ** 2).sum())
 
     def _page(self) -> Page:
         name = f"{signal_of(self.signal).text} ({self.signal})"
@@ -88,10 +87,8 @@ class Spectrum(Sealed, Shown):
         head = f"spectrum of the {name}: mean {format_si(self.mean, self.unit)}, rms about it {rms}"
         if self.amplitude is not None:
             strongest = np.sort(np.argsort(self.amplitude)[::-1][:_SHOWN])
-            rows = [
-                (format_si(float(self.frequency[i]), "Hz"), format_si(float(self.amplitude[i]), self.unit))
-                for i in strongest
-            ]
+            pairs = zip(self.frequency[strongest].tolist(), self.amplitude[strongest].tolist(), strict=True)
+            rows = [(format_si(f, "Hz"), format_si(amplitude, self.unit)) for f, amplitude in pairs]
             share = 100.0 * self.shown_variance / self.variance if self.variance > 0.0 else 100.0
             last = f"the strongest of {self.frequency.size} lines, which hold {share:.4g} % of the variance"
             return Page([head, "", Table(("line", "amplitude"), rows), "", last])
@@ -126,13 +123,10 @@ def spectrum_of(
     welch_only = resolution is not None or since is not None
     if method == "lines" and welch_only:
         raise InputError("resolution and since go with method 'welch'; the lines are those of the last period")
-    if method != "welch" and not welch_only:
-        found = _lines(solution, names[0], highest)
-        if found is not None:
-            return found
-        if method == "lines":
-            raise InputError("the run holds no whole period of its source; allowed: a longer run, or method 'welch'")
-    return _density(solution, names[0], highest, resolution, since)
+    found = None if method == "welch" or welch_only else _lines(solution, names[0], highest)
+    if method == "lines" and found is None:
+        raise InputError("the run holds no whole period of its source; allowed: a longer run, or method 'welch'")
+    return found or _density(solution, names[0], highest, resolution, since)
 
 
 def _lines(solution: Solution, name: str, highest: float | None) -> Spectrum | None:
@@ -143,8 +137,7 @@ def _lines(solution: Solution, name: str, highest: float | None) -> Spectrum | N
     count = _LINES if highest is None else int(highest * period * (1.0 + 1e-12))
     allowed = f"{1.0 / period:g} Hz, the lowest line, to {_MOST_LINES / period:g} Hz"
     require(1 <= count <= _MOST_LINES, "highest", f"{highest} Hz", allowed)
-    found = solution._figures.last_finely(name, period / count)
-    if found is None:
+    if (found := solution._figures.last_finely(name, period / count)) is None:
         return None
     weighed, exact = found
     if not exact:
@@ -251,6 +244,5 @@ def interval(segments: float) -> tuple[float, float]:
     """Factors from an estimated density to the ends of its interval: chi-square, two degrees of freedom per segment."""
     from scipy.stats import chi2
 
-    degrees = 2.0 * segments
-    tail = 0.5 * (1.0 - CONFIDENCE)
+    degrees, tail = 2.0 * segments, 0.5 * (1.0 - CONFIDENCE)
     return float(degrees / chi2.ppf(1.0 - tail, degrees)), float(degrees / chi2.ppf(tail, degrees))

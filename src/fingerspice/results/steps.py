@@ -58,53 +58,48 @@ class Panels(NamedTuple):
         return np.asarray(self.low[:, None] * (1.0 - points) + self.high[:, None] * points)
 
 
-@dataclass(frozen=True)
-class Block:
-    """Consecutive steps, and the periods that they represent."""
-
-    # (k, 4): Start and length of each step and the end reached, s, and the part of the length that was reached
-    times: FloatArray
-    # (k, n_column, NODES): Values at the nodes of the whole step, which may extend beyond the end reached
-    values: FloatArray
-    count: int = 1  # Number of equal periods
-    # shift, period: The first of these periods is `shift` (s) after the steps' own times, each further one `period` (s)
-    # later
-    shift: float = 0.0
-    period: float = 0.0
+#: Consecutive steps: times (6, k) and values (k, n_column, NODES). Rows of the times are the start of each step, its
+#: length, the end reached (s), the part of the length that was reached, the number of equal periods that the step
+#: stands for, and the time (s) from its own to the first of them and from each to the next. Values are those at the
+#: nodes of the whole step, which may extend beyond the end reached.
+Block = tuple[FloatArray, FloatArray]
 
 
-@dataclass
+def whole_steps(begin: FloatArray, end: FloatArray, values: FloatArray) -> tuple[Block, ...]:
+    """Steps that were reached whole and stand for themselves."""
+    one = np.ones(begin.size)
+    return ((np.array([begin, end - begin, end, one, one, 0.0 * one]), values),)
+
+
 class Recorder:
     """Collects the steps of one integration after each call of its compiled loop."""
 
-    columns: int
-    room: Steps = field(init=False)
-    parts: list[Block] = field(default_factory=list)
-    numbers: int = 0
-    full: bool = False
-
-    def __post_init__(self) -> None:
-        self.room = new_steps(min(CAPACITY, 1 + _AT_ONCE // max(self.columns, 1)), self.columns)
+    def __init__(self, columns: int) -> None:
+        self.columns, self.numbers = columns, 0
+        self.room: Steps = new_steps(min(CAPACITY, 1 + _AT_ONCE // max(columns, 1)), columns)
+        self.parts: list[Block] = []
 
     def drain(self, counters: IntArray) -> None:
         """Collect the steps that the loop has recorded, as a block; none of them where there are too many."""
         count = int(counters[RECORDED])
         counters[RECORDED] = 0
         self.numbers += count * self.columns * NODES
-        self.full = self.full or self.numbers > MOST_NUMBERS
-        if self.full:
+        if self.numbers > MOST_NUMBERS:
             self.parts.clear()
         elif count > 0:
-            self.parts.append(Block(self.room.times[:count].copy(), self.room.values[:count].copy()))
+            times = np.zeros((6, count))
+            times[:4], times[4] = self.room.times[:count].T, 1.0
+            self.parts.append((times, self.room.values[:count].copy()))
 
     def repeat(self, since: int, periods: int, period: float) -> None:
         """Let the blocks from number `since` on also represent the `periods` periods that follow them."""
-        if periods > 0:
-            self.parts += [Block(b.times, b.values, periods, period, period) for b in self.parts[since:]]
+        again = np.array([[periods], [period]])
+        for times, values in self.parts[since:] if periods > 0 else ():
+            self.parts.append((np.concatenate([times[:4], again.repeat(len(values), axis=1)]), values))
 
     def finish(self, first: float, make: Make) -> Recorded | None:
         """The run recorded since `first` (s); None where nothing, or too much, was recorded."""
-        return None if self.full or not self.parts else Recorded(tuple(self.parts), first, make)
+        return Recorded(tuple(self.parts), first, make) if self.parts else None
 
 
 @dataclass(frozen=True)
@@ -124,23 +119,15 @@ class Recorded:
         return self if since >= self.first - 1e-9 * (until - since) else None
 
     @cached_property
-    def times(self) -> FloatArray:
-        """As in `Block`, of all steps, shape (4, k)."""
-        return np.concatenate([b.times for b in self.parts]).T
-
-    @cached_property
-    def values(self) -> FloatArray:
-        """As in `Block`, of all steps, shape (k, n_column, NODES)."""
-        return np.concatenate([b.values for b in self.parts])
+    def steps(self) -> Block:
+        """All of them as one block."""
+        times, values = zip(*self.parts, strict=True)
+        return np.concatenate(times, axis=1), np.concatenate(values)
 
     def panels(self, since: float, until: float) -> Panels:
         """Parts of the steps between two times (s); equal periods are one panel with the duration of all of them."""
-        sizes = [len(b.times) for b in self.parts]
-        count, shift, period = (
-            np.repeat(x, sizes) for x in zip(*((b.count, b.shift, b.period) for b in self.parts), strict=True)
-        )
-        start, length, reached, reach = self.times
-        begin, end = start + shift, reached + shift
+        start, length, reached, reach, count, period = self.steps[0]
+        begin, end = start + period, reached + period
         slack = same_time(1.0) * np.abs(end)
         index = np.arange(start.size)
         if ((begin >= since - slack) & (end + (count - 1) * period <= until + slack)).all():
@@ -164,24 +151,24 @@ class Recorded:
     @cached_property
     def _whole(self) -> tuple[FloatArray, Signals]:
         """Times (k, ROWS) and the record at the points of every step, up to the end that it reached."""
-        columns = np.concatenate([self.values, self.values @ BETWEEN], axis=2)
-        reach = self.times[3]
-        fraction = reach[:, None] * POINTS
-        short = np.flatnonzero(reach != 1.0)
+        times, values = self.steps
+        columns = np.concatenate([values, values @ BETWEEN], axis=2)
+        fraction = times[3, :, None] * POINTS
+        short = np.flatnonzero(times[3] != 1.0)
         if short.size:
-            columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], _basis(fraction[short]))
+            columns[short] = np.einsum("pcn,pqn->pcq", values[short], _basis(fraction[short]))
         return self._record(slice(None), fraction, columns.transpose(1, 0, 2))
 
     def _record(self, index: IntArray | slice, fraction: FloatArray, columns: FloatArray) -> tuple[FloatArray, Signals]:
         """Times at fractions of steps, and the record there of states, shape (n_column, *fraction.shape)."""
-        start, length, reached, reach = self.times[:, index, None]
+        start, length, reached, reach = self.steps[0][:4, index, None]
         left = fraction >= reach
         t = np.where(left, reached, start + fraction * length)
         return t, self.make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size))
 
     def at_points(self, name: str, panels: Panels) -> tuple[FloatArray, FloatArray]:
         """Times (s) and a signal at the `POINTS` of panels, shape (p, ROWS) each."""
-        own = (panels.low == 0.0) & (panels.high == self.times[3, panels.step])
+        own = (panels.low == 0.0) & (panels.high == self.steps[0][3, panels.step])
         if not own.any():
             return self.values_at(name, panels.step, panels.fractions(POINTS))
         # Panels that are whole steps share one record for all signals.
@@ -196,7 +183,7 @@ class Recorded:
         key = index.tobytes(), fraction.tobytes()
         found = self._known.get(key)
         if found is None:
-            columns = np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction))
+            columns = np.einsum("pcn,pqn->cpq", self.steps[1][index], _basis(fraction))
             found = self._record(index, fraction, columns)
             if fraction.size <= _MOST_KNOWN:
                 while len(self._known) >= _KNOWN:
@@ -213,6 +200,11 @@ def _basis(fraction: FloatArray) -> FloatArray:
     weight = np.where(hit.any(axis=2, keepdims=True), hit, BARYCENTRIC / np.where(hit, 1.0, distance))
     weight /= weight.sum(axis=2, keepdims=True)
     return np.asarray(weight)
+
+
+def missed(x: FloatArray) -> FloatArray:
+    """Largest interpolation error found between the nodes of each panel, from values (p, ROWS), shape (p,)."""
+    return np.asarray(np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1, initial=0.0))
 
 
 #: Largest interpolation error of a panel between its nodes, relative to the signal's peak.
@@ -266,8 +258,7 @@ class ClosedForm:
         short = np.flatnonzero(end - begin <= _ROUNDINGS * np.spacing(np.abs(end)))
         first, last = values[short, :, :1], values[short, :, -1:]
         values[short] = first + POINTS[:NODES] * (last - first)
-        times = np.column_stack([begin, end - begin, end, np.ones(begin.size)])
-        return Recorded((Block(times, values),), since, partial(bare_record, record.network, record.net))
+        return Recorded(whole_steps(begin, end, values), since, partial(bare_record, record.network, record.net))
 
     def _marks(self, since: float, until: float) -> FloatArray | None:
         """Ends of the first panels, s; None if they are too many."""
@@ -304,8 +295,7 @@ class ClosedForm:
                 continue
             values = record.one(name)[place]
             peaks[name] = max(peaks.get(name, 0.0), float(np.abs(values).max(initial=0.0)))
-            missed = np.abs(values[:, :NODES] @ BETWEEN - values[:, NODES:]).max(axis=1)
-            wrong |= missed > max(max(_MISSED, self.error) * peaks[name], self.rounding)
+            wrong |= missed(values) > max(max(_MISSED, self.error) * peaks[name], self.rounding)
         return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
 
     def _zeros(self, names: Sequence[str], marks: FloatArray, record: Record, place: IntArray) -> Iterator[FloatArray]:

@@ -77,11 +77,7 @@ class Array:
         return _fault(self.file(place), math.prod(self.chunk) * np.dtype(self.kind).itemsize)
 
     def put(self, place: tuple[int, ...], values: NDArray[Any]) -> None:
-        """Write a chunk, at the edge of the array with fewer values than a whole one, durably but for its name.
-
-        It is written under a temporary name and renamed once it is on the disk; that name may be lost in a crash of
-        the machine.
-        """
+        """Write a chunk, which may be smaller at the array's edge, durably but for its name, which a crash may lose."""
         if values.shape != self.chunk:
             whole = np.full(self.chunk, self.fill, self.kind)
             whole[tuple(map(slice, values.shape))] = values
@@ -105,10 +101,7 @@ class Array:
 def create(
     path: Path, attributes: dict[str, Any], arrays: Mapping[str, Array], known: Mapping[str, NDArray[Any]], suffix: str
 ) -> None:
-    """Create a store under a temporary name with this suffix, then rename it.
-
-    Arrays have no values yet, but for those in `known`, which are one chunk each.
-    """
+    """Create a store without values, but for those `known` as one chunk each, under a temporary name, and rename it."""
     zarr = zarr_library()
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f"{UNFINISHED}{suffix}")

@@ -1,4 +1,4 @@
-"""Figures of a run: means, peaks and amplitudes of its signals, each computed on first use and cached."""
+"""Figures of a run: means, peaks and amplitudes of its signals, each computed on first use; and their table."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
+from fingerspice.base.pages import Page, Table
+from fingerspice.base.units import format_si
+from fingerspice.circuit.describe import head_lines
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.measures import Outputs, Stretch, Weighed
 from fingerspice.results.signals import attribute, sealed, signal_of
@@ -23,6 +26,12 @@ Value = float | FloatArray | None
 MOST_BETWEEN = 2_000_000
 # The signals in it, and how far they may be from their polynomials, relative to their peaks.
 _BETWEEN, _MISSED = ("u_source", "u_layer", "v", "u_gap", "area", "f_el", "fold_margin"), 1e-10
+#: Signals that have rows in the table, in their order, and its columns of figures: heading and key.
+_ROWS = ("u_source", "u_gap", "u_layer", "v", "f_el", "f_t", "friction", "area")
+_COLUMNS = {
+    "min": "min", "max": "max", "mean": "mean", "last period": "mean_periodic", "rms": "rms_periodic",
+    "ripple": "ripple",
+}  # fmt: skip
 
 
 class Figures:
@@ -31,24 +40,21 @@ class Figures:
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
         self.signals = solution.record
-        self._kept: dict[tuple[str, str], Any] = {}
+        self._kept: dict[str, Any] = dict(solution.stored or {})
+        self._extremes: dict[tuple[str, bool], tuple[float, float]] = {}
 
     def value(self, key: str, kind: str) -> Value:
-        """A figure of a signal: one number, an array where several gaps or sources have it, or None.
-
-        `kind` is mean, rms, min, max, peak, ripple, amplitude, phase_deg, or one of the first two with ``_periodic``.
-        """
+        """A figure of a kind that `_made` knows: a number, an array of several gaps or sources, or None."""
         values = [self._one(name, kind) for name in self.signals.names(key)]
         if len(values) < 2:
             return values[0] if values else None
         return None if None in values else sealed(np.array(values, float))
 
     def _one(self, name: str, kind: str) -> float | None:
-        if self.solution.stored is not None:
-            return self.solution.stored.get(f"{name}_{kind}")
-        if (name, kind) not in self._kept:
-            self._kept[name, kind] = self._made(name, kind)
-        return self._kept[name, kind]  # type: ignore[no-any-return]
+        key = f"{name}_{kind}"
+        if key not in self._kept and self.solution.stored is None:
+            self._kept[key] = self._made(name, kind)
+        return self._kept.get(key)
 
     def _made(self, name: str, kind: str) -> float | None:
         kind, periodic, _ = kind.partition("_periodic")
@@ -62,10 +68,10 @@ class Figures:
                 return None
             p = span.weigh(name).phasor(self.solution.fundamental.frequency)
             return abs(p) if kind == "amplitude" else math.degrees(cmath.phase(p))
-        key = name, f"extremes {span is self.whole}"
-        if key not in self._kept:
-            self._kept[key] = span.extremes(name)
-        low, high = self._kept[key]
+        key = name, span is self.whole
+        if key not in self._extremes:
+            self._extremes[key] = span.extremes(name)
+        low, high = self._extremes[key]
         figures: dict[str, float] = {"min": low, "max": high, "peak": max(high, -low), "ripple": high - low}
         return figures[kind]
 
@@ -87,15 +93,12 @@ class Figures:
         s = self.solution
         if s.period is None or not s.t.size:
             return None
-        tolerance = 1e-9 * s.period
-        since = s.t_stop - s.period
-        if s.continuous is not None and since >= s.first - tolerance:
-            if since <= s.first + tolerance:
+        since, found = s.t_stop - s.period, None
+        if s.continuous is not None and since >= s.first - 1e-9 * s.period:
+            if since <= s.first + 1e-9 * s.period:
                 return self.whole
             found = self._between(since, s.t_stop)
-            if found is not None:
-                return found
-        return self._last_outputs
+        return found or self._last_outputs
 
     @cached_property
     def _last_outputs(self) -> Outputs | None:
@@ -115,8 +118,7 @@ class Figures:
     def last_finely(self, name: str, longest: float) -> tuple[Weighed, bool] | None:
         """A signal with weights over the last period, and whether it is known between the outputs; None without one.
 
-        If it is known, its panels are no longer than `longest` (s), so that the weights also integrate the product of
-        the signal with an oscillation of that period.
+        Then the weights also integrate its product with an oscillation of the period `longest` (s).
         """
         # Charges and currents are those of the outputs alone.
         last = self._last_outputs if self.last is not None and name.startswith(("q_", "i_")) else self.last
@@ -125,10 +127,9 @@ class Figures:
         return None if last is None else (last.weigh(name), False)
 
     def between(self) -> tuple[list[str], FloatArray] | None:
-        """Names of the voltages, areas and forces, and a table of the last period: times (s), then these signals.
+        """Names of signals, and a table of times (s) and these signals at the nodes of the last period's panels.
 
-        Its rows are the nodes of panels on which all are polynomials. None where the run is not known between its
-        outputs, or the table is larger than `MOST_BETWEEN`.
+        None where the run is not known between its outputs, or the table is larger than `MOST_BETWEEN`.
         """
         if not isinstance(self.last, Stretch):
             return None
@@ -172,6 +173,65 @@ class Figures:
         if self.signals.gaps:
             out["fold_margin_min"] = min(s.fold_margin_min, float(s.fold_margin.min(initial=1.0)))
         return out
+
+    def page(self) -> Page:
+        """The figures as a table, and below it errors, the distance to the fold, and how the run ended."""
+        run, s, error = self.solution, self.summary(), self.solution.error
+        end = format_si(float(run.t[-1]), "s") if run.t.size else "nothing"
+        out: list[str | Table] = [
+            *head_lines(run.circuit),
+            f"{end} simulated; charge law {run.charge_law}, area {run.area_mode}, method {run.method}, "
+            f"rtol {run.rtol:g}",
+            "",
+        ]
+        if run.t.size >= 2:
+            names = [name for key in _ROWS for name in self.signals.names(key) if f"{name}_max" in s]
+            out.append(Table(("", *_COLUMNS), [_row(name, s) for name in names]))
+            if any(s.get(f"{name}_mean_periodic") is not None for name in ("u_source", "f_el")):
+                out.append(
+                    "last period: the mean over it; rms and ripple (max - min) are those of the last period, too"
+                )
+            if "u_gap_amplitude" in s:
+                lead = (s["u_gap_phase_deg"] - s["u_source_phase_deg"] + 180.0) % 360.0 - 180.0
+                share = s["u_gap_amplitude"] / s["u_source_amplitude"] if s["u_source_amplitude"] else math.nan
+                out += [
+                    "",
+                    f"at {format_si(s['fundamental'], 'Hz')}: gap voltage {format_si(s['u_gap_amplitude'], 'V')}, "
+                    f"{100.0 * share:.2f} % of the source, leading by {lead:.2f} deg",
+                ]
+        force, inside = f", force {error.f_el:.2g} N", "layer" if run.layers else "capacitor"
+        about, rest = (
+            ("estimated error: gap", force) if run.gaps else (f"no GAP, no forces; estimated error: {inside}", "")
+        )
+        nodes = "" if error.v_nodes is None else f", node voltages {error.v_nodes:.2g} V"
+        out += ["", f"{about} voltage {error.u_gap:.2g} V{rest}{nodes}"]
+        if s.get("figures_from") == "outputs":
+            out.append("figures are those of the outputs: what lies between them is not known")
+        if run.charge_law == "mobile" and "fold_margin_min" in s:
+            out.append(f"distance to the fold: {s['fold_margin_min']:.3g} at least (1 far, 0 at the fold)")
+        out.append(f"status: {run.message}")
+        if run.failure is not None and run.failure.tried:
+            out += ["", "last steps tried:", run.failure.history()]
+        return Page(out)
+
+
+def _row(name: str, s: dict[str, Any]) -> tuple[str, ...]:
+    """Name and figures of a signal, as the table has them."""
+    key, _, element = name.partition(":")
+    signal = signal_of(name)
+    label = {"u_layer": f"{element} voltage", "v": f"node {element}", "friction": f"friction coefficient {element}"}
+    cells = [label.get(key, f"{signal.text} {element}").rstrip()]
+    for kind in _COLUMNS.values():
+        value = s.get(f"{name}_{kind}")
+        if value is None:
+            cells.append("-")
+            continue
+        # A mean that is 0 to round-off is written as 0.
+        value = 0.0 if abs(value) <= 1e-12 * s[f"{name}_peak"] else value
+        # An area takes no prefix, which would be squared with its unit, and a coefficient has none.
+        plain = {"m^2": f"{1e6 * value:.4g} mm^2", "1": f"{value:.4g}"}
+        cells.append(plain.get(signal.unit) or format_si(value, signal.unit))
+    return tuple(cells)
 
 
 def figure(key: str, kind: str, doc: str) -> Value:

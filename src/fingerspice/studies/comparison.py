@@ -24,6 +24,7 @@ from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.plots import drawing, lines
 from fingerspice.results.measures import weigh_outputs
 from fingerspice.results.phasor_solution import PhasorSolution
+from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Value
 from fingerspice.solve.runs import Progress
@@ -123,15 +124,15 @@ class Comparison(Shown):
         voltages = [one["amplitude"] * wave for one, wave in zip(of_gaps, waves, strict=True)]
         forces = [2.0 * one["f_el_mean"] * wave**2 for one, wave in zip(of_gaps, waves, strict=True)]
         for ax, keys, curves in zip(axes, (["u_source", "u_gap"], ["f_el"]), (voltages, forces), strict=False):
-            quantity, traces = lines.QUANTITIES[keys[-1]], lines.traces_of(runs, keys)
-            factor, unit = lines.scale_of(quantity, traces, start, stop)
+            signal, traces = SIGNALS[keys[-1]], lines.traces_of(runs, keys)
+            factor, unit = lines.scale_of(signal, traces, start, stop)
             for trace in traces:
                 lines.draw_line(ax, trace, factor, start, stop, runs)
             t = lines.time_unit(runs)[0] * solution.t
             style: dict[str, Any] = {"color": drawing.BLACK, "linestyle": drawing.DASHES[3], "linewidth": 1.5}
             for trace, curve in zip(traces[-len(curves) :], curves, strict=True):
                 ax.plot(t, factor * curve, label=f"{trace.label}, phasor", **style)
-            lines.finish_panel(ax, quantity, unit, [factor * trace.x for trace in traces])
+            lines.finish_panel(ax, signal, unit, [factor * trace.x for trace in traces])
         lines.time_axis(axes[:2], runs, start, stop)
         self._draw_table(axes[2])
         drawing.caption(figure, f"{lines.about_all(runs)} · periodic state; the phasor is of the fundamental alone")

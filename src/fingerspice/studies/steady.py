@@ -18,7 +18,6 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.outcome import ErrorEstimate, SolveError
-from fingerspice.results.report import summary_table
 from fingerspice.results.sensitivity import Sensitivity
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Figured, Figures
@@ -75,7 +74,7 @@ class SteadyState(Shown, Figured):
             "of a small disturbance"
         )
         try:
-            period = summary_table(self.solution).blocks
+            period = self.solution._page().blocks
         except SolveError as error:
             period = (error.message,)
         return Page([found, left, "", *period])
