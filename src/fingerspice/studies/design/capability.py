@@ -22,7 +22,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import heading
 from fingerspice.plots.drawing import BLUE, caption, dress, engineering, new_figure
 from fingerspice.solve.runs import Progress
-from fingerspice.studies.design.finger import Finger, ForceCurve, Inverter, the_finger
+from fingerspice.studies.design.finger import Finger, Inverter, Voltages, force_curve, the_finger
 from fingerspice.studies.design.inverse import Task
 from fingerspice.waveforms.samples import Samples
 
@@ -186,8 +186,8 @@ def capability(
     # The charges in the layers can raise the gap voltage above the source voltage, but not to ten times the limit.
     area = float(contact.area(10.0 * limit)) if finger.area is None else finger.area
     most = 0.4 * float(contact.stress(10.0 * limit)) * area
-    curve = ForceCurve(finger, None if carrier is None else float(_PER_CARRIER), most)
-    search = _Search(finger, curve, finger.inverter(10.0 * limit), limit, carrier)
+    voltages = force_curve(finger, None if carrier is None else float(_PER_CARRIER), most)
+    search = _Search(finger, voltages, finger.inverter(10.0 * limit), limit, carrier)
     largest = search.largest(lambda x: search.wanted(x, 1.0 / _LASTS, 0.0), most)
     force = np.linspace(0.0, largest, means)
     amplitude = np.zeros((means, f.size))
@@ -211,7 +211,7 @@ class _Search:
     """
 
     finger: Finger
-    curve: ForceCurve
+    voltages: Voltages
     inverter: Inverter
     limit: float  # V
     carrier: float | None  # Hz
@@ -240,7 +240,7 @@ class _Search:
 
     def _peak(self, force: Samples) -> float:
         """Largest voltage (V) of the inverter's drive for a force."""
-        u = self.curve.voltages(force.values, force.rate, self.carrier, round(self.finger.lead * force.rate))
+        u = self.voltages(force.values, force.rate, self.carrier, round(self.finger.lead * force.rate))
         return float(np.abs(self.inverter(u, 1.0 / force.rate, math.inf, math.inf)[0]).max())
 
 

@@ -177,13 +177,12 @@ def fold_limits(
         skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
         varied.append(("frequency", "Hz", [f"{sources[0].name}.frequency", *skins]))
     factors = np.geomspace(1.0 / span, span, points)
-    around = fold_voltage(circuit, peak, t_stop)
+    around, told = fold_voltage(circuit, peak, t_stop), progress or (lambda _: None)
     sweeps: list[FoldSweep] = []
     for name, unit, paths in varied:
         own, voltages, guess = float(circuit.parameters[paths[0]].value), np.zeros(points), peak
         for i, x in enumerate(factors):
-            if progress is not None:
-                progress((1 + i + points * len(sweeps)) / (1 + points * len(varied)))
+            told((1 + i + points * len(sweeps)) / (1 + points * len(varied)))
             changed = circuit.varied(dict.fromkeys(paths, own * x))
             voltages[i] = fold_voltage(changed, peak, t_stop / x if name == "frequency" else t_stop, guess)
             # The next search starts at this voltage.
@@ -191,8 +190,7 @@ def fold_limits(
         # The fold at the deck's own value is known: the bisection of the sweep may end 1e-3 beside it.
         voltages[np.abs(factors - 1.0) <= 1e-12] = around
         sweeps.append(FoldSweep(name, unit, own, own * factors, voltages))
-    if progress is not None:
-        progress(1.0)
+    told(1.0)
     return FoldLimits(circuit, peak, around, tuple(sweeps))
 
 

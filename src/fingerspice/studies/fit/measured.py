@@ -22,6 +22,9 @@ Given = Mapping[str, ArrayLike] | str | Path
 #: What a name in a header means, with all names of the header beside it: the column's key, the key of the column whose
 #: unit it has (of a standard deviation that of the values, else its own), and this unit, or None where none is known.
 Meaning = Callable[[str, Sequence[str]], tuple[str, str, str | None]]
+#: Columns (n,) in SI units or, of a circuit's parameters, those of the netlist; where they come from, as subject of a
+#: message; and the groups.
+Measured = tuple[dict[str, FloatArray], str, "Groups | None"]
 
 
 class Groups(NamedTuple):
@@ -34,14 +37,6 @@ class Groups(NamedTuple):
     def labels(self) -> tuple[str, ...]:
         """Every group's name, in the order of the data."""
         return tuple(dict.fromkeys(self.of))
-
-
-class Measured(NamedTuple):
-    """Columns of measured numbers, (n,) each, in SI units or, of a circuit's parameters, those of the netlist."""
-
-    columns: dict[str, FloatArray]
-    place: str  # Where they come from, as subject of a message
-    groups: Groups | None = None
 
 
 def measured_of(
@@ -71,18 +66,17 @@ def measured_of(
     # A number stands for a column of it.
     columns = {name: np.broadcast_to(x, size).copy() for name, x in found.items()}
     if by is None:
-        return Measured(columns, place)
+        return columns, place, None
     cells = np.asarray(given[by])
     if cells.ndim != 1 or cells.dtype.kind not in "iufU":
         raise InputError(f"data column {by!r} tells the group; allowed: a text or a number for every measurement")
     if cells.size != size:
         raise InputError(f"data column {by!r} has {cells.size} rows, others have {size}; allowed: as many")
-    return Measured(columns, place, Groups(by, tuple(x if isinstance(x, str) else f"{x:g}" for x in cells.tolist())))
+    return columns, place, Groups(by, tuple(x if isinstance(x, str) else f"{x:g}" for x in cells.tolist()))
 
 
 def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> Measured:
-    file = checked_file(path, MAX_TEXT_BYTES)
-    table = read_text_columns(file, by)
+    table = read_text_columns(checked_file(path, MAX_TEXT_BYTES), by)
     if not table.names:
         raise InputError(f"'{path}' has no header; allowed: names with units, such as {example}")
     found: dict[str, FloatArray] = {}
@@ -104,19 +98,15 @@ def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> M
         # Beside values in % (a friction coefficient), a standard deviation in % is of their unit, and no share of them.
         if units.get(values, "%") != "%":
             found[key] = found[key] * np.abs(found[values])
-    return Measured(found, f"the data in '{path}'", groups)
+    return found, f"the data in '{path}'", groups
 
 
 def _unit_factor(unit: str, base: str, what: str) -> float:
-    """A header's unit over the unit `base`."""
-    if unit in ("", base):
-        return 1.0
-    if base == "" and unit == "%":
-        return 0.01
-    if base == "m^2" and unit in ("mm2", "mm²"):
-        return 1e-6
-    prefix = unit.removesuffix(base) if base and unit.endswith(base) else None
-    if prefix in _PREFIXES:
-        return _PREFIXES[prefix] ** (2 if base == "m^2" else 1)
+    """A header's unit over the unit `base`; the prefix of an area is squared with it."""
+    power = 2 if base == "m^2" else 1
+    known = {prefix + base: factor**power for prefix, factor in _PREFIXES.items()} if base else {"%": 0.01}
+    known |= {"": 1.0} | (dict.fromkeys(("mm2", "mm²"), 1e-6) if power == 2 else {})
+    if unit in known:
+        return known[unit]
     scaled = ", with k, m, u or n before it where need be" if base else ""
     raise InputError(f"{what} is {unit!r}; allowed: {base or 'none'}{scaled}")
