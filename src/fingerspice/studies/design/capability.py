@@ -224,9 +224,18 @@ class _Search:
         return Samples(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0), rate)
 
     def largest(self, wanted: Callable[[float], Samples], most: float) -> float:
-        """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit."""
+        """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit.
+
+        By bisection, to `_EXACT` times itself or 1e-3 `_EXACT` times `most`.
+        """
         for _ in range(_MOST):
-            found = _largest(lambda x: self.ratio * self._peak(wanted(x)) <= self.limit, most)
+            found, high = 0.0, most
+            if self.ratio * self._peak(wanted(most)) <= self.limit:
+                found = most
+            while high - found > _EXACT * max(found, 1e-3 * most):
+                middle = 0.5 * (found + high)
+                within = self.ratio * self._peak(wanted(middle)) <= self.limit
+                found, high = (middle, high) if within else (found, middle)
             if self.finger.network.stack is not None or found == 0.0:
                 break
             force = wanted(found)
@@ -242,14 +251,3 @@ class _Search:
         """Largest voltage (V) of the inverter's drive for a force."""
         u = self.voltages(force.values, force.rate, self.carrier, round(self.finger.lead * force.rate))
         return float(np.abs(self.inverter(u, 1.0 / force.rate, math.inf, math.inf)[0]).max())
-
-
-def _largest(holds: Callable[[float], bool], most: float) -> float:
-    """Largest number up to `most` that holds, by bisection, to `_EXACT` times itself or 1e-3 `_EXACT` times `most`."""
-    if holds(most):
-        return most
-    low, high = 0.0, most
-    while high - low > _EXACT * max(low, 1e-3 * most):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return low

@@ -67,7 +67,31 @@ def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, .
     for number, one in enumerate(several, 1):
         place = "the data" if len(several) == 1 else f"data {number}"
         columns, place, _ = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
-        for relation in _relations(columns, fn, place):
+        measured = [name for name in MEASURED if name in columns]
+        if not measured:
+            raise InputError(f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
+        alone = len(measured) == 1 and SIGMA in columns
+        sigmas = {name: SIGMA if alone else f"{name}_{SIGMA}" for name in measured}
+        unknown = [name for name in columns if name not in (*measured, *CONDITIONS, *sigmas.values())]
+        if unknown:
+            why = ": which of the measured columns it belongs to is not known" if unknown[0] == SIGMA else ""
+            allowed = ", ".join([*MEASURED, *CONDITIONS, SIGMA, *(f"{name}_{SIGMA}" for name in measured)])
+            raise InputError(f"{place} have a column {unknown[0]!r}{why}; allowed: {allowed}")
+        for name, x in columns.items():
+            if name != "u_gap" and not np.all(x > 0.0):
+                raise InputError(f"{place}: the smallest {name} is {x.min():g}; allowed: more than 0")
+        none = np.zeros(columns[measured[0]].size)
+        at, u, depth = columns.get("fn", none + fn), columns.get("u_gap", none), columns.get("indentation")
+        if depth is not None and np.any(u != 0.0):
+            raise InputError(f"{place} have the columns indentation and u_gap; allowed: indentations without voltage")
+        own = []
+        for name in measured:
+            values, sigma = columns[name], columns.get(sigmas[name])
+            if name == "area" and depth is not None:
+                own.append(Relation("indentation", values, sigma, at, none, depth))
+            if name != "area" or depth is None or "fn" in columns:
+                own.append(Relation(name, values, sigma, at, u, none))
+        for relation in own:
             key = relation.kind, relation.sigma is None
             if key in found:
                 known = {name: x for name, x in vars(found[key]).items() if isinstance(x, np.ndarray)}
@@ -82,37 +106,6 @@ def _meaning(name: str, names: Sequence[str]) -> tuple[str, str, str | None]:
     measured = [own for own in MEASURED if own in lower]
     values = measured[0] if key == SIGMA and len(measured) == 1 else key.removesuffix(f"_{SIGMA}")
     return key, values, (MEASURED | CONDITIONS).get(values)
-
-
-def _relations(columns: Mapping[str, FloatArray], fn: float, place: str) -> list[Relation]:
-    measured = [name for name in MEASURED if name in columns]
-    if not measured:
-        raise InputError(f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
-    sigmas = {name: f"{name}_{SIGMA}" for name in measured}
-    if len(measured) == 1 and SIGMA in columns:
-        sigmas[measured[0]] = SIGMA
-    unknown = [name for name in columns if name not in (*measured, *CONDITIONS, *sigmas.values())]
-    if unknown:
-        why = ": which of the measured columns it belongs to is not known" if unknown[0] == SIGMA else ""
-        each = ", ".join(f"{name}_{SIGMA}" for name in measured)
-        allowed = ", ".join([*MEASURED, *CONDITIONS, SIGMA, each])
-        raise InputError(f"{place} have a column {unknown[0]!r}{why}; allowed: {allowed}")
-    for name, x in columns.items():
-        if name != "u_gap" and not np.all(x > 0.0):
-            raise InputError(f"{place}: the smallest {name} is {x.min():g}; allowed: more than 0")
-    size = columns[measured[0]].size
-    at, none = columns.get("fn", np.full(size, fn)), np.zeros(size)
-    u, depth = columns.get("u_gap", none), columns.get("indentation")
-    if depth is not None and np.any(u != 0.0):
-        raise InputError(f"{place} have the columns indentation and u_gap; allowed: indentations without voltage")
-    found = []
-    for name in measured:
-        values, sigma = columns[name], columns.get(sigmas[name])
-        if name == "area" and depth is not None:
-            found.append(Relation("indentation", values, sigma, at, none, depth))
-        if name != "area" or depth is None or "fn" in columns:
-            found.append(Relation(name, values, sigma, at, u, none))
-    return found
 
 
 @dataclass(frozen=True)

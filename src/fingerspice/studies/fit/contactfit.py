@@ -30,7 +30,7 @@ _SHARE = 0.1
 # The share of an error's variance below which a relation has no part in it.
 _NO_PART = 1e-9
 # Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
-# this; they are no smaller than the last.
+# this; they are no smaller than the last, as are singular values that count, relative to the largest.
 _ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
 # Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
 _FEWEST = 0.5
@@ -272,39 +272,29 @@ class Pool(NamedTuple):
     freedom: float
 
 
-def _pools(task: ContactTask, best: Fitted) -> list[Pool]:
-    """The relations by what they have been measured with: ridge areas against the load come from one set of images.
+def _solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
+    """Least squares, with the standard deviation of every pool that has none from its own residuals.
 
-    What the parameters take up of values is the sum of their leverages.
+    Returns the task with the standard deviations found, the fit, and the pools: ridge areas against the load come from
+    one set of images. What the parameters take up of values is the sum of their leverages.
     """
     from scipy.linalg import orth
 
-    leverage = np.sum(orth(best.by_log, 1e-9) ** 2, axis=1)
     members: dict[tuple[str, bool], list[tuple[str, IntArray]]] = {}
     for relation, at in zip(task.relations, task.split(np.arange(task.scale.size)), strict=True):
         key = relation.kind.removesuffix("_sliding"), relation.sigma is None
         members.setdefault(key, []).append((relation.name, at))
-    found = []
-    for (_, unknown), own in members.items():
-        at = np.concatenate([at for _, at in own])
-        freedom = at.size - float(leverage[at].sum()) if unknown else math.inf
-        found.append(Pool(" and the ".join(name for name, _ in own), at, freedom))
-    return found
-
-
-def _solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
-    """Least squares, with the standard deviation of every pool that has none from its own residuals.
-
-    Returns the task with the standard deviations found, the fit, and the pools.
-    """
     begin = task.initial
     for _ in range(_ROUNDS):
-        best = followed(task.residuals, task.bounds, begin)
-        pools, scale = _pools(task, best), task.scale.copy()
-        for pool in pools:
-            if _FEWEST <= pool.freedom < math.inf:
-                spread = float(np.sqrt(np.sum(best.residual[pool.at] ** 2) / pool.freedom))
-                scale[pool.at] = np.maximum(scale[pool.at] * spread, _LEAST)
+        best, pools, scale = followed(task.residuals, task.bounds, begin), [], task.scale.copy()
+        leverage = np.sum(orth(best.by_log, _LEAST) ** 2, axis=1)
+        for (_, unknown), own in members.items():
+            at = np.concatenate([at for _, at in own])
+            freedom = at.size - float(leverage[at].sum()) if unknown else math.inf
+            pools.append(Pool(" and the ".join(name for name, _ in own), at, freedom))
+            if _FEWEST <= freedom < math.inf:
+                spread = float(np.sqrt(np.sum(best.residual[at] ** 2) / freedom))
+                scale[at] = np.maximum(scale[at] * spread, _LEAST)
         if np.abs(np.log(scale / task.scale)).max() < _SETTLED:
             break
         task, begin = replace(task, scale=scale), best.values

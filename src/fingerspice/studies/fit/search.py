@@ -14,13 +14,15 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.numerics.small import AT, STEP, derivative
+from fingerspice.numerics.small import AT, derivative
 from fingerspice.results.outcome import SolveError
 
 #: What data that cannot be predicted are off by, over their scale.
 REFUSED = 1e6
 # Error of the least squares' last step, relative; and the largest number of evaluations, and of refused ones.
 _CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
+# Step of the differences in a parameter's logarithm, at which those of fourth order are exact to rounding.
+_STEP = 1e-3
 #: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
 FARTHEST = 1e3
 # Singular values of the derivatives below this share of the largest are rounding.
@@ -91,8 +93,8 @@ class Problem:
 
     def compared(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals over their scale (n,), and their derivatives by the logarithms of the values (n, n_parameter)."""
-        ways = 1.0 + STEP * np.multiply.outer(AT, np.eye(values.size))
-        by = [derivative([self.misses(values * one) for one in way], STEP) for way in ways.swapaxes(0, 1)]
+        ways = np.exp(_STEP * np.multiply.outer(AT, np.eye(values.size)))
+        by = [derivative([self.misses(values * one) for one in way], _STEP) for way in ways.swapaxes(0, 1)]
         return self.misses(values), np.array(by).T
 
     def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
