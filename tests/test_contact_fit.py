@@ -122,7 +122,7 @@ def test_a_power_law_has_the_intervals_of_linear_regression(circuit: fs.Circuit)
 
 
 def test_intervals_cover_the_truth_though_every_relation_has_its_own_noise(circuit: fs.Circuit) -> None:
-    rng, hits, count = np.random.default_rng(4), 0, cases(40, 8)
+    rng, hits, count = np.random.default_rng(4), 0, cases(40, 5)
     for _ in range(count):
         parts = finger(rng, 0.03)
         parts[1]["area"] = parts[1]["area"] * np.exp(0.1 * rng.standard_normal(DEPTH.size))

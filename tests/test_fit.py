@@ -78,7 +78,7 @@ def test_intervals_cover_the_truth_and_an_unknown_sigma_is_of_the_likelier_kind(
     circuit: fs.Circuit, kind: str, said: str
 ) -> None:
     data = measured(circuit, [60.0, 120.0, 200.0], [30.0, 100.0, 500.0])
-    force, rng, count, hits = data["f_el_mean"], np.random.default_rng(0), cases(30, 6), 0
+    force, rng, count, hits = data["f_el_mean"], np.random.default_rng(0), cases(30, 4), 0
     sigma = 0.02 * (np.full(force.size, force.mean()) if kind == "equal" else force)
     finger = circuit.replace({"Xgap.alpha": TRUE["Xgap.alpha"]})
     for number in range(count):
@@ -129,89 +129,78 @@ def test_a_network_is_fitted_by_differences() -> None:
     assert found.estimates[path].value == pytest.approx(0.9 * gap, rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("data", "parameters", "text"),
-    [
-        ({"f_el_mean": [1e-2, 2e-2]}, ["Xgap.dd"], "nearest: 'Xgap.d'"),
-        ({"f_el_mean": [1e-2]}, ["Xgap.d", "Xgap.r"], "1 data cannot tell 2 parameters"),
-        ({"f_el_mean": [1e-2, np.nan]}, ["Xgap.d"], "is nan in row 1"),
-        ({"f_el_mean": [1e-2, 2e-2], "Vdrive.amplitude": [1.0, 2.0, 3.0]}, ["Xgap.d"], "allowed: as many"),
-        ({"Vdrive.amplitude": [1.0, 2.0]}, ["Xgap.d"], "no measured column"),
-        ({"f_el_mean": [1e-2], "Xgap.d": [3e-6]}, ["Xgap.d"], "is a condition of the data"),
-        ({"f_el_mean": [1e-2], "sigma": [0.0]}, ["Xgap.d"], "smallest sigma is 0"),
-        ({"f_el_mean": [1e-2, -2e-2]}, ["Xgap.d"], r"f_el_mean is -0\.02 N in row 1; allowed: 0 or more, as the el"),
-        ({"friction_mean": [-0.5, 0.5]}, ["Xgap.d"], r"friction_mean is -0\.5 in row 0; allowed: 0 or more"),
-        ({"t": [0.0, 0.5], "f_t": [1e-3, -2e-3]}, ["Xgap.d"], r"f_t is -0\.0005 N on average; allowed: 0 or more"),
-        ({"frequency": [1.0, 2.0], "impedance": [1e6, 0.0]}, ["Xgap.r"], "is 0 ohm in row 1; allowed: magnitudes ab"),
-        ({"t": [1.0, 0.5], "f_el": [0.0, 0.0]}, ["Xgap.d"], "rising times"),
-        ([1.0, 2.0], ["Xgap.d"], "data is a list"),
-        ({"f_el_mean": [1e-2]}, "Xgap.d", "a sequence of paths"),
-        ({"f_el_mean": [1e-2]}, ["Xgap.tau"], "fitted in its logarithm"),
-        ({"voltage": [100.0], "f_el_mean": [1e-2]}, ["Xgap.d"], "a column 'voltage', which is no param.*, such as X"),
-        ({"frequency": [1e3], "impedance": [-1e5]}, ["Xgap.d"], "magnitudes above 0"),
-        ({"frequency": [1e3], "f_el_mean": [0.1], "impedance_phase": [-30.0]}, ["Xgap.d"], "beside impedance"),
-        ({"frequency": [1e3], "impedance": [1j], "impedance_phase": [1.0]}, ["Xgap.d"],
-         "impedance is complex, and impedance_phase is given"),
-        ({"frequency": [1e3, 2e3], "impedance": np.ma.array([1j, 2j], mask=[True, False])}, ["Xgap.d"],
-         "'impedance' is .*MaskedArray with masked values; allowed: numbers"),
-        ({"impedance": [1.0], "sigma": [1j]}, ["Xgap.d"], "'sigma' is .*of complex numbers; allowed: numbers"),
-        ({"f_el_mean": [1e-2, 2e-2]}, ["Xgap.d", "xgap.D"], r"Xgap\.d is named twice; allowed: once"),
-        ({"f_el_mean": [1e-2], "Vdrive.amplitude": 1.0, "source.amplitude": 2.0}, ["Xgap.d"],
-         r"two columns of Vdrive\.amplitude; allowed: one"),
-        ({"f_el_mean": [1e-2, 2e-2], "Vdrive.amplitude": [100.0]}, ["Xgap.d"],
-         r"'Vdrive.amplitude' has the shape \(1,\), others have 2 rows; allowed: as ma"),
-    ],
-)  # fmt: skip
-def test_bad_requests(circuit: fs.Circuit, data: object, parameters: object, text: str) -> None:
-    with pytest.raises(InputError, match=text):
-        fs.fit(circuit, data, parameters)  # type: ignore[arg-type]
-
-
 NAMED = {"finger": ["a", "b"], "f_el_mean": [0.1, 0.2]}
+ONE = {"f_el_mean": [1e-2]}
+
+
+def by(**groups: object) -> dict[str, object]:
+    return {"groups": groups}
 
 
 @pytest.mark.parametrize(
     ("data", "options", "text"),
     [
-        (NAMED, {"groups": {"hand": ["Xgap.d"]}}, "no column 'hand', which groups names; they have"),
-        (NAMED, {"groups": {"finger": ["Xgap.r"]}}, r"groups names 'Xgap.r', which is not fitted; allowed: Xgap\.d"),
-        (NAMED, {"groups": {"finger": "Xgap.d"}}, "allowed: a mapping of a column"),
-        (NAMED, {"groups": {"finger": ["Xgap.d"], "hand": ["Xgap.d"]}}, "allowed: a mapping of a column"),
-        (NAMED, {"groups": {"Xgap.fn": ["Xgap.d"]}}, "the column 'Xgap.fn', which is a parameter"),
+        ({"f_el_mean": [1e-2, 2e-2]}, {"parameters": ["Xgap.dd"]}, "nearest: 'Xgap.d'"),
+        (ONE, {"parameters": ["Xgap.d", "Xgap.r"]}, "1 data cannot tell 2 parameters"),
+        ({"f_el_mean": [1e-2, np.nan]}, {}, "is nan in row 1"),
+        ({"f_el_mean": [1e-2, 2e-2], "Vdrive.amplitude": [1.0, 2.0, 3.0]}, {}, "allowed: as many"),
+        ({"Vdrive.amplitude": [1.0, 2.0]}, {}, "no measured column"),
+        (ONE | {"Xgap.d": [3e-6]}, {}, "is a condition of the data"),
+        (ONE | {"sigma": [0.0]}, {}, "smallest sigma is 0"),
+        ({"f_el_mean": [1e-2, -2e-2]}, {}, r"f_el_mean is -0\.02 N in row 1; allowed: 0 or more, as the el"),
+        ({"friction_mean": [-0.5, 0.5]}, {}, r"friction_mean is -0\.5 in row 0; allowed: 0 or more"),
+        ({"t": [0.0, 0.5], "f_t": [1e-3, -2e-3]}, {}, r"f_t is -0\.0005 N on average; allowed: 0 or more"),
+        ({"frequency": [1.0, 2.0], "impedance": [1e6, 0.0]}, {}, "is 0 ohm in row 1; allowed: magnitudes above 0"),
+        ({"t": [1.0, 0.5], "f_el": [0.0, 0.0]}, {}, "rising times"),
+        ([1.0, 2.0], {}, "data is a list"),
+        (ONE, {"parameters": "Xgap.d"}, "a sequence of paths"),
+        (ONE, {"parameters": ["Xgap.tau"]}, "fitted in its logarithm"),
+        (ONE | {"voltage": [100.0]}, {}, "a column 'voltage', which is no param.*, such as X"),
+        ({"frequency": [1e3], "impedance": [-1e5]}, {}, "magnitudes above 0"),
+        (ONE | {"frequency": [1e3], "impedance_phase": [-30.0]}, {}, "beside impedance"),
+        ({"frequency": [1e3], "impedance": [1j], "impedance_phase": [1.0]}, {},
+         "impedance is complex, and impedance_phase is given"),
+        ({"frequency": [1e3, 2e3], "impedance": np.ma.array([1j, 2j], mask=[True, False])}, {},
+         "'impedance' is .*MaskedArray with masked values; allowed: numbers"),
+        ({"impedance": [1.0], "sigma": [1j]}, {}, "'sigma' is .*of complex numbers; allowed: numbers"),
+        ({"f_el_mean": [1e-2, 2e-2]}, {"parameters": ["Xgap.d", "xgap.D"]}, r"Xgap\.d is named twice; allowed: once"),
+        (ONE | {"Vdrive.amplitude": 1.0, "source.amplitude": 2.0}, {},
+         r"two columns of Vdrive\.amplitude; allowed: one"),
+        ({"f_el_mean": [1e-2, 2e-2], "Vdrive.amplitude": [100.0]}, {},
+         r"'Vdrive.amplitude' has the shape \(1,\), others have 2 rows; allowed: as ma"),
+        (NAMED, by(hand=["Xgap.d"]), "no column 'hand', which groups names; they have"),
+        (NAMED, by(finger=["Xgap.r"]), r"groups names 'Xgap.r', which is not fitted; allowed: Xgap\.d"),
+        (NAMED, by(finger="Xgap.d"), "allowed: a mapping of a column"),
+        (NAMED, by(finger=["Xgap.d"], hand=["Xgap.d"]), "allowed: a mapping of a column"),
+        (NAMED, by(**{"Xgap.fn": ["Xgap.d"]}), "the column 'Xgap.fn', which is a parameter"),
         (NAMED, {"groups": ["Xgap.d"]}, "allowed: a mapping of a column"),
-        ({"t": [0.0, 1e-3], "f_el": [0.1, 0.2], "g": [1, 2]}, {"groups": {"g": ["Xgap.d"]}}, "have times and groups"),
-        ({"f_el_mean": [1e-2]}, {"bounds": {"Xgap.r": (1.0, 2.0)}}, r"bounds names Xgap\.r, which is not fitted"),
-        *(({"f_el_mean": [1e-2]}, {"bounds": {"Xgap.d": pair}}, "allowed: two values with 0 <= low < high")
+        ({"t": [0.0, 1e-3], "f_el": [0.1, 0.2], "g": [1, 2]}, by(g=["Xgap.d"]), "have times and groups"),
+        (ONE, {"bounds": {"Xgap.r": (1.0, 2.0)}}, r"bounds names Xgap\.r, which is not fitted"),
+        *((ONE, {"bounds": {"Xgap.d": pair}}, "allowed: two values with 0 <= low < high")
           for pair in ((3e-6, 3e-6), (4e-6, 3e-6), (-1.0, 1.0), (np.nan, 1.0), (1.0,))),
-        ({"f_el_mean": [1e-2]}, {"profiles": ["Xskin.d"]},
-         r"profiles names 'Xskin\.d', which is not fitted; allowed: True, or Xgap\.d"),
-    ],
-)  # fmt: skip
-def test_bad_options(circuit: fs.Circuit, data: object, options: dict[str, object], text: str) -> None:
-    with pytest.raises(InputError, match=text):
-        fs.fit(circuit, data, ["Xgap.d"], **options)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("rows", "by", "text"),
-    [
-        ("Vdrive.amplitude (A),f_el_mean (mN)\n100,1\n", None, "of column 'Vdrive.amplitude' is 'A'; allowed: V"),
-        ("Vdrive.amplitude (V),f_el_mean (mN)\n100,1\n200,-4\n", None,
+        (ONE, {"profiles": ["Xskin.d"]}, r"profiles names 'Xskin\.d', which is not fitted; allowed: True, or Xgap\.d"),
+        ("Vdrive.amplitude (A),f_el_mean (mN)\n100,1\n", {}, "of column 'Vdrive.amplitude' is 'A'; allowed: V"),
+        ("Vdrive.amplitude (V),f_el_mean (mN)\n100,1\n200,-4\n", {},
          r"data\.csv': f_el_mean is -0\.004 N in row 2; allowed: 0 or more"),
-        ("frequency (Hz),impedance (kohm)\n100,-1\n", None, "impedance is -1000 ohm in row 1; allowed: magnitudes abo"),
-        ("100,1\n200,4\n", None, "has no header"),
-        ("time (ms),friction (mN)\n0,150\n1,160\n", None, "the unit of column 'friction' is 'mN'; allowed: none"),
-        ("f_el_mean (N),Xgap.fn (N),Xgap.fn (N)\n0.01,0.5,0.6\n", None, r"two columns 'Xgap\.fn'; allowed: one"),
-        ("finger,f_el_mean (N)\na,0.1\nb,0.2\n", None,
+        ("frequency (Hz),impedance (kohm)\n100,-1\n", {}, "impedance is -1000 ohm in row 1; allowed: magnitudes abo"),
+        ("100,1\n200,4\n", {}, "has no header"),
+        ("time (ms),friction (mN)\n0,150\n1,160\n", {}, "the unit of column 'friction' is 'mN'; allowed: none"),
+        ("f_el_mean (N),Xgap.fn (N),Xgap.fn (N)\n0.01,0.5,0.6\n", {}, r"two columns 'Xgap\.fn'; allowed: one"),
+        ("finger,f_el_mean (N)\na,0.1\nb,0.2\n", {},
          "no rows of numbers; allowed: numbers, and names in the column that groups"),
-        ("finger,f_el_mean (N)\na,0.1\n", "hand", "has no column 'hand' in its header; it has finger, f_el_mean"),
-        ("finger,f_el_mean (N)\na,0.1\nb,0.2 oops\n", "finger", "line 3"),
+        ("finger,f_el_mean (N)\na,0.1\n", by(hand=["Xgap.d"]),
+         "has no column 'hand' in its header; it has finger, f_el_mean"),
+        ("finger,f_el_mean (N)\na,0.1\nb,0.2 oops\n", by(finger=["Xgap.d"]), "line 3"),
     ],
 )  # fmt: skip
-def test_bad_tables(circuit: fs.Circuit, tmp_path: Path, rows: str, by: str | None, text: str) -> None:
-    (tmp_path / "data.csv").write_text(rows)
+def test_bad_requests_are_refused_in_one_line(
+    circuit: fs.Circuit, tmp_path: Path, data: object, options: dict[str, object], text: str
+) -> None:
+    if isinstance(data, str):
+        (tmp_path / "data.csv").write_text(data)
+        data = tmp_path / "data.csv"
     with pytest.raises(InputError, match=text) as told:
-        fs.fit(circuit, tmp_path / "data.csv", ["Xgap.d"], groups=None if by is None else {by: ["Xgap.d"]})
+        fs.fit(circuit, data, **{"parameters": ["Xgap.d"], **options})  # type: ignore[arg-type]
     assert "\n" not in str(told.value)
 
 
@@ -258,7 +247,7 @@ def impedances(circuit: fs.Circuit, f: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("with_phase", [True, False])
 def test_an_impedance_against_frequency(quiet: fs.Circuit, tmp_path: Path, with_phase: bool) -> None:
-    f = np.geomspace(20.0, 2e4, 6)
+    f = np.geomspace(20.0, 2e4, 4)
     z = impedances(quiet.replace({"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6}), f)
     data = {"frequency": f, "impedance": np.abs(z), "impedance_phase": np.degrees(np.angle(z))}
     if not with_phase:
@@ -276,14 +265,14 @@ def test_an_impedance_against_frequency(quiet: fs.Circuit, tmp_path: Path, with_
         found = fs.fit(quiet, given, ["Xgap.d", "Xgap.r"], skin="follow")
         assert found.estimates["Xgap.d"].value == pytest.approx(3.1e-6, rel=1e-6)
         assert found.estimates["Xgap.r"].value == pytest.approx(1.4e6, rel=1e-6)
-        assert found.freedom == (12 if with_phase else 6) - 2
+        assert found.freedom == (8 if with_phase else 4) - 2
     np.testing.assert_allclose(found.predicted, np.abs(z), rtol=1e-6)
     assert "values of impedance" in str(found)
     found.plot()
 
 
 def test_intervals_from_noisy_impedances_cover_the_truth(quiet: fs.Circuit) -> None:
-    f, rng, count, hits = np.geomspace(20.0, 2e4, 6), np.random.default_rng(5), cases(25, 5), 0
+    f, rng, count, hits = np.geomspace(20.0, 2e4, 6), np.random.default_rng(5), cases(25, 4), 0
     z = impedances(quiet.replace({"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6}), f)
     for _ in range(count):
         noisy = z * (1.0 + 0.02 * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)))
@@ -381,10 +370,11 @@ def test_the_example_finds_its_finger_and_predicts_another_force(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     program = runpy.run_path(str(CIRCUITS / "fit_finger.py"))
+    found = program["fitted"]()
+    program["main"].__globals__["fitted"] = lambda: found
     program["main"](tmp_path)
     said = capsys.readouterr().out
     assert (tmp_path / "fit_finger.png").stat().st_size > 10_000
-    found = program["fitted"]()
     assert covered(found) == len(TRUE)
     middle, low, high = program["predicted"](found)
     assert low < force_of(fs.read_netlist(CIRCUITS / "fingerpad.cir").replace(dict(TRUE)), 180.0, 300.0) < high
@@ -460,20 +450,20 @@ def test_a_skin_that_suits_every_source_is_not_told(
 def test_data_in_another_unit_are_told_and_end_in_a_bounded_number_of_evaluations(
     circuit: fs.Circuit, data: Data, column: str, factor: float, said: str
 ) -> None:
-    some = {key: (factor if key == column else 1.0) * x[-2:] for key, x in data.items()}
+    # Of one value: many of these evaluations are far from any finger, and slow.
+    some = {key: (factor if key == column else 1.0) * x[-1:] for key, x in data.items()}
     with pytest.warns(fs.FingerspiceWarning, match=said):
         found = fs.fit(circuit, some, ["Xgap.d"], starts=1, rtol=1e-4, skin="follow")
     assert found.evaluations <= 40
     assert 1e-3 <= found.estimates["Xgap.d"].value / 3.5e-6 <= 1e3
 
 
-def test_the_axes_of_a_fits_picture_have_names_and_units(circuit: fs.Circuit, data: Data) -> None:
-    finger = circuit.replace(dict(TRUE))
-    top, bottom = fs.fit(finger, data, ["Xgap.d"], starts=1, rtol=1e-4, skin="follow").plot().axes
+def test_the_axes_of_a_fits_picture_have_names_and_units(circuit: fs.Circuit, example: fs.Fit) -> None:
+    top, bottom = example.plot().axes
     assert (top.get_ylabel(), bottom.get_xlabel()) == ("mean electroadhesive force [N]", "frequency of Vdrive [Hz]")
-    assert top.get_legend_handles_labels()[1] == ["amplitude of Vdrive = 100 V", "amplitude of Vdrive = 200 V"]
+    assert top.get_legend_handles_labels()[1] == [f"amplitude of Vdrive = {u} V" for u in (100, 150, 200)]
     loads = {"Xgap.fn": [0.3, 0.5], "f_t_mean": [0.1, 0.17]}
-    _, bottom = fs.fit(finger, loads, ["Xgap.d"], starts=1, rtol=1e-4).plot().axes
+    _, bottom = fs.fit(circuit, loads, ["Xgap.d"], starts=1, rtol=1e-4).plot().axes
     assert bottom.get_xlabel() == "load of Xgap [N]"
 
 

@@ -42,29 +42,24 @@ def fit(
     with Answering("fit", as_json, charge_law=charge_law) as answer:
         from fingerspice.studies.fit.circuitfit import fit as find
 
-        grouped = _groups(groups)
+        grouped = None
+        if groups is not None:
+            column, _, paths = groups.partition(":")
+            if not (column.strip() and paths.strip()):
+                allowed = "a column of the data and paths, such as finger:Xgap.d,Xgap.r"
+                raise InputError(f"--groups is {groups!r}; allowed: {allowed}")
+            grouped = {column.strip(): [path.strip() for path in paths.split(",")]}
         circuit = read_circuit(deck, changes, None)
         answer.update(**answers.of_circuit(circuit, charge_law))
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         results.will_write("_fit.csv", lambda file: found.to_csv(file))
         results.will_draw("_fit.png", lambda: found.plot(), unless=no_plot)
-        paths = [path.strip() for path in free.split(",")]
         found = find(
-            circuit, table, paths, groups=grouped, average=average, skin=skin, charge_law=charge_law,
-            profiles=profile,
+            circuit, table, [path.strip() for path in free.split(",")], groups=grouped, average=average, skin=skin,
+            charge_law=charge_law, profiles=profile,
         )  # fmt: skip
         answer.update(**found.to_dict())
         answer.give(lambda: str(found), results.ready())
-
-
-def _groups(text: str | None) -> dict[str, list[str]] | None:
-    """The argument of `--groups`."""
-    if text is None:
-        return None
-    column, _, paths = text.partition(":")
-    if not (column.strip() and paths.strip()):
-        raise InputError(f"--groups is {text!r}; allowed: a column of the data and paths, such as finger:Xgap.d,Xgap.r")
-    return {column.strip(): [path.strip() for path in paths.split(",")]}
 
 
 def fit_contact(

@@ -22,7 +22,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import heading
 from fingerspice.plots.drawing import BLUE, caption, dress, engineering, new_figure
 from fingerspice.solve.runs import Progress
-from fingerspice.studies.design.finger import Finger, ForceCurve, Inverter, the_finger
+from fingerspice.studies.design.finger import Finger, Inverter, Voltages, force_curve, the_finger
 from fingerspice.studies.design.inverse import Task
 from fingerspice.waveforms.samples import Samples
 
@@ -186,8 +186,8 @@ def capability(
     # The charges in the layers can raise the gap voltage above the source voltage, but not to ten times the limit.
     area = float(contact.area(10.0 * limit)) if finger.area is None else finger.area
     most = 0.4 * float(contact.stress(10.0 * limit)) * area
-    curve = ForceCurve(finger, None if carrier is None else float(_PER_CARRIER), most)
-    search = _Search(finger, curve, finger.inverter(10.0 * limit), limit, carrier)
+    voltages = force_curve(finger, None if carrier is None else float(_PER_CARRIER), most)
+    search = _Search(finger, voltages, finger.inverter(10.0 * limit), limit, carrier)
     largest = search.largest(lambda x: search.wanted(x, 1.0 / _LASTS, 0.0), most)
     force = np.linspace(0.0, largest, means)
     amplitude = np.zeros((means, f.size))
@@ -211,7 +211,7 @@ class _Search:
     """
 
     finger: Finger
-    curve: ForceCurve
+    voltages: Voltages
     inverter: Inverter
     limit: float  # V
     carrier: float | None  # Hz
@@ -224,9 +224,18 @@ class _Search:
         return Samples(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0), rate)
 
     def largest(self, wanted: Callable[[float], Samples], most: float) -> float:
-        """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit."""
+        """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit.
+
+        By bisection, to `_EXACT` times itself or 1e-3 `_EXACT` times `most`.
+        """
         for _ in range(_MOST):
-            found = _largest(lambda x: self.ratio * self._peak(wanted(x)) <= self.limit, most)
+            found, high = 0.0, most
+            if self.ratio * self._peak(wanted(most)) <= self.limit:
+                found = most
+            while high - found > _EXACT * max(found, 1e-3 * most):
+                middle = 0.5 * (found + high)
+                within = self.ratio * self._peak(wanted(middle)) <= self.limit
+                found, high = (middle, high) if within else (found, middle)
             if self.finger.network.stack is not None or found == 0.0:
                 break
             force = wanted(found)
@@ -240,16 +249,5 @@ class _Search:
 
     def _peak(self, force: Samples) -> float:
         """Largest voltage (V) of the inverter's drive for a force."""
-        u = self.curve.voltages(force.values, force.rate, self.carrier, round(self.finger.lead * force.rate))
+        u = self.voltages(force.values, force.rate, self.carrier, round(self.finger.lead * force.rate))
         return float(np.abs(self.inverter(u, 1.0 / force.rate, math.inf, math.inf)[0]).max())
-
-
-def _largest(holds: Callable[[float], bool], most: float) -> float:
-    """Largest number up to `most` that holds, by bisection, to `_EXACT` times itself or 1e-3 `_EXACT` times `most`."""
-    if holds(most):
-        return most
-    low, high = 0.0, most
-    while high - low > _EXACT * max(low, 1e-3 * most):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return low

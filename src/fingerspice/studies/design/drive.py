@@ -22,8 +22,6 @@ from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from fingerspice.plots.picture import Picture
 
 _FULL = 2.0**31
@@ -109,12 +107,11 @@ class InverseDrive(Sealed, Shown):
     def to_dict(self) -> dict[str, Any]:
         """The figures as plain data, in SI units."""
         wanted, reached, _ = self._asked
+        figures = ["carrier", "limit", "slew", "lead", "peak", "at_limit", "worst", "rms", "worst_share", "rms_share"]
         return {
-            "kind": self.kind, "rate": self.drive.rate, "samples": self.drive.values.size, "carrier": self.carrier,
-            "limit": self.limit, "slew": self.slew, "lead": self.lead, "peak": self.peak, "at_limit": self.at_limit,
-            "worst": self.worst, "rms": self.rms, "worst_share": self.worst_share, "rms_share": self.rms_share,
-            "largest_wanted": float(wanted.max()), "largest_reached": float(reached.max()),
-            "corrections": self.corrections,
+            "kind": self.kind, "rate": self.drive.rate, "samples": self.drive.values.size,
+            **{name: getattr(self, name) for name in figures}, "largest_wanted": float(wanted.max()),
+            "largest_reached": float(reached.max()), "corrections": self.corrections,
         }  # fmt: skip
 
     def _page(self) -> Page:
@@ -150,15 +147,11 @@ class InverseDrive(Sealed, Shown):
         scale, unit = drawing.engineering(float(at[-1]), "s")
         force, newton = drawing.engineering(float(wanted.max(initial=0.0)) or 1.0, "N")
         small, milli = drawing.engineering(max(self.worst, 1e-12), "N")
-        lines: list[tuple[Axes, FloatArray, FloatArray, dict[str, Any]]] = [
-            (top, self.times, force * wanted, {"color": drawing.BLACK, "linewidth": 2.2, "label": "wanted"}),
-            (top, self.times, force * reached,
-             {"color": drawing.ORANGE, "linewidth": 1.2, "linestyle": (0, (4, 1.5)), "label": "reached"}),
-            (middle, self.times, small * miss, {"color": drawing.VERMILION, "linewidth": 1.0}),
-            (bottom, at, volts, {"color": drawing.BLUE, "linewidth": 0.9}),
-        ]  # fmt: skip
-        for ax, t, x, style in lines:
-            ax.plot(*drawing.thin(scale * t, x), **style)
+        dashes, t = (0, (4, 1.5)), scale * self.times
+        top.plot(*drawing.thin(t, force * wanted), color=drawing.BLACK, linewidth=2.2, label="wanted")
+        top.plot(*drawing.thin(t, force * reached), color=drawing.ORANGE, linewidth=1.2, ls=dashes, label="reached")
+        middle.plot(*drawing.thin(t, small * miss), color=drawing.VERMILION, linewidth=1.0)
+        bottom.plot(*drawing.thin(scale * at, volts), color=drawing.BLUE, linewidth=0.9)
         drawing.dress(top, f"{self.kind.capitalize()} [{newton}]")
         drawing.legend_above(top, 2)
         drawing.dress(middle, f"Miss [{milli}]")

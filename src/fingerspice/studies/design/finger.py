@@ -15,7 +15,6 @@ from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, Element
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.network import Network
 from fingerspice.circuit.response import areas_at_rest
-from fingerspice.circuit.statespace import Stack
 from fingerspice.circuit.topology import find_branches
 from fingerspice.engine.inverse import drive_stack, hold
 from fingerspice.physics.contact import Contact, fixed_area_curve
@@ -24,6 +23,9 @@ from fingerspice.waveforms.waveform import require
 #: Source voltages for gap voltages u (V, shape (n,), positive in the direction of the source) at intervals h (s), and
 #: the samples at a limit: of `inverter(u, h, largest voltage (V), largest slew rate (V/s))`.
 Inverter = Callable[[FloatArray, float, float, float], tuple[FloatArray, BoolArray]]
+#: Gap voltages (V) at a rate (Hz) that rise in some steps, and then produce forces (N), on a carrier (Hz) if one is
+#: given: of `voltages(forces, rate, carrier, steps)`.
+Voltages = Callable[[FloatArray, float, float | None, int], FloatArray]
 
 # Default time in which the force rises to its first value, for networks other than a series stack, s.
 _LEAD = 2e-3
@@ -64,9 +66,29 @@ class Finger:
         return float(stack.sign[stack.gap]) * stack.sources[0][1]
 
     def inverter(self, u_max: float) -> Inverter:
-        """What computes the source voltage for gap voltages up to `u_max` (V)."""
+        """What computes the source voltage for gap voltages up to `u_max` (V).
+
+        A stack is inverted step by step; while a limit holds the source, its layers' state follows from the source.
+        """
         stack = self.network.stack
-        return _of_network(self.network) if stack is None else _of_stack(stack, u_max, self.law == "mobile")
+        if stack is None:
+            wish = _linear_inverse(self.network)
+        else:
+            assert stack.contact is not None
+            assert stack.gap is not None
+            gap, area = stack.gap, stack.area_given
+            curve = stack.contact.curve(1.2 * max(u_max, 1.0)) if area is None else fixed_area_curve(area)
+            cells = np.column_stack([stack.c, stack.g_total, stack.g_area])
+
+        def drive(u: FloatArray, h: float, limit: float, slew: float) -> tuple[FloatArray, BoolArray]:
+            out, held = np.empty(u.size), np.empty(u.size, np.bool_)
+            if stack is None:
+                hold(wish(u, h), limit, slew * h, out, held)
+            else:
+                drive_stack(u, h, curve, cells, gap, self.law == "mobile", limit, slew * h, out, held)
+            return out, held
+
+        return drive
 
 
 def the_finger(circuit: Circuit, charge_law: str | None) -> Finger:
@@ -91,24 +113,8 @@ def the_finger(circuit: Circuit, charge_law: str | None) -> Finger:
     return Finger(circuit, law, gaps[0], sources[0], contact, network.areas[place].given, network)
 
 
-def _of_stack(stack: Stack, u_max: float, mobile: bool) -> Inverter:
-    """Inverts a stack step by step; while a limit holds the source, it integrates the layers' state from the source."""
-    assert stack.contact is not None
-    assert stack.gap is not None
-    gap, area = stack.gap, stack.area_given
-    curve = stack.contact.curve(1.2 * max(u_max, 1.0)) if area is None else fixed_area_curve(area)
-    cells = np.column_stack([stack.c, stack.g_total, stack.g_area])
-
-    def drive(u: FloatArray, h: float, limit: float, slew: float) -> tuple[FloatArray, BoolArray]:
-        out, held = np.empty(u.size), np.empty(u.size, np.bool_)
-        drive_stack(u, h, curve, cells, gap, mobile, limit, slew * h, out, held)
-        return out, held
-
-    return drive
-
-
-def _of_network(net: Network) -> Inverter:
-    """Inverts the linear response of a network at its areas at rest.
+def _linear_inverse(net: Network) -> Callable[[FloatArray, float], FloatArray]:
+    """Inverts the linear response of a network at its areas at rest: source voltages from gap voltages and interval.
 
     The signals are damped by exp(-a t), which evaluates the response at s = a + i omega. There it has no zero (a
     floating body passes no direct voltage, a zero at s = 0), and the end of the signal does not wrap round.
@@ -135,75 +141,67 @@ def _of_network(net: Network) -> Inverter:
             )
         return np.asarray(gain)
 
-    def drive(u: FloatArray, h: float, limit: float, slew: float) -> tuple[FloatArray, BoolArray]:
-        n = u.size
-        m = next_fast_len(2 * n, real=True)
+    def wish(u: FloatArray, h: float) -> FloatArray:
+        n, m = u.size, next_fast_len(2 * u.size, real=True)
         damp = np.exp(-_DAMPING / (m * h) * h * np.arange(m))
         spectrum = rfft(np.append(u, np.full(m - n, u[-1])) * damp)
-        wish = irfft(spectrum / response(m, h), m)[:n] / damp[:n]
-        out, held = np.empty(n), np.empty(n, np.bool_)
-        hold(wish, limit, slew * h, out, held)
-        return out, held
+        return np.asarray(irfft(spectrum / response(m, h), m)[:n] / damp[:n])
 
-    return drive
+    return wish
 
 
-class ForceCurve:
-    """Mean force over a period of the carrier against the carrier's amplitude; without a carrier, the force itself.
+def force_curve(finger: Finger, points: float | None, most: float) -> Voltages:
+    """What computes gap voltages for forces up to `most` (N), which are means over each period of a carrier.
 
     `points` is the number of samples in a period of the carrier, between which the voltage is linear, or None without a
-    carrier; `most` (N) the largest force that is needed.
+    carrier.
     """
+    from scipy.interpolate import CubicSpline
 
-    def __init__(self, finger: Finger, points: float | None, most: float) -> None:
-        from scipy.interpolate import CubicSpline
+    shape, weight = np.ones(1), np.ones(1)
+    if points is not None:
+        count = round(points) if abs(points - round(points)) < 1e-9 else round(8 * points)
+        at = np.sin(2.0 * np.pi * np.arange(count + 1) / points)
+        shape = np.abs(np.concatenate([at[:-1], 0.5 * (at[1:] + at[:-1])]))
+        # Simpson's rule between samples: the voltage is linear there, so the force is a parabola but for the change of
+        # the area.
+        weight = np.repeat([1.0 / 3.0, 2.0 / 3.0], count) / count
 
-        self._contact, self._area = finger.contact, finger.area
-        self._shape, self._weight = np.ones(1), np.ones(1)
-        if points is not None:
-            count = round(points) if abs(points - round(points)) < 1e-9 else round(8 * points)
-            at = np.sin(2.0 * np.pi * np.arange(count + 1) / points)
-            self._shape = np.abs(np.concatenate([at[:-1], 0.5 * (at[1:] + at[:-1])]))
-            # Simpson's rule between samples: the voltage is linear there, so the force is a parabola but for the change
-            # of the area.
-            self._weight = np.repeat([1.0 / 3.0, 2.0 / 3.0], count) / count
-        top = 1.0
-        while self.mean(np.array([top]))[0] < 1.01 * most:
-            if top > 1e6:
-                raise InputError(
-                    f"the force wanted, {most:g} N, is reached by no voltage: at 1 MV the gap has "
-                    f"{float(self.mean(np.array([1e6]))[0]):.3g} N; allowed: less"
-                )
-            top *= 1.4
-        amplitude = top * np.arange(1, _GRID + 1) / _GRID
-        force = self.mean(amplitude)
-        rising = np.concatenate([[True], np.diff(force) > 0.0])
-        last = _GRID if rising.all() else int(np.argmin(rising))
-        root = np.sqrt(force[:last])
-        if root[-1] ** 2 < most:
-            raise InputError(f"the force wanted, {most:g} N, is reached by no voltage; allowed: at most "
-                             f"{root[-1] ** 2:.3g} N")  # fmt: skip
-        # The voltage over the root of the force, which at 0 V is that of a small voltage.
-        scale = float(self.force(np.array([1e-3]))[0]) / 1e-3**2
-        at_zero = math.sqrt(1.0 / float(self._weight @ self._shape**2) / scale)
-        self._spline = CubicSpline(np.append(0.0, root), np.append(at_zero, amplitude[:last] / root))
+    def force_at(u: FloatArray) -> FloatArray:
+        area = finger.contact.area(u) if finger.area is None else finger.area
+        return np.asarray(finger.contact.stress(u) * area)
 
-    def force(self, u: FloatArray) -> FloatArray:
-        """Force at gap voltages, N."""
-        area = self._contact.area(u) if self._area is None else self._area
-        return np.asarray(self._contact.stress(u) * area)
+    def mean(amplitude: FloatArray) -> FloatArray:
+        return np.asarray(force_at(amplitude[:, None] * shape) @ weight)
 
-    def mean(self, amplitude: FloatArray) -> FloatArray:
-        """Mean force at amplitudes of the gap voltage (V, shape (n,)), N."""
-        return np.asarray(self.force(amplitude[:, None] * self._shape) @ self._weight)
+    top = 1.0
+    while mean(np.array([top]))[0] < 1.01 * most:
+        if top > 1e6:
+            raise InputError(
+                f"the force wanted, {most:g} N, is reached by no voltage: at 1 MV the gap has "
+                f"{float(mean(np.array([1e6]))[0]):.3g} N; allowed: less"
+            )
+        top *= 1.4
+    amplitude = top * np.arange(1, _GRID + 1) / _GRID
+    force = mean(amplitude)
+    rising = np.concatenate([[True], np.diff(force) > 0.0])
+    last = _GRID if rising.all() else int(np.argmin(rising))
+    root = np.sqrt(force[:last])
+    if root[-1] ** 2 < most:
+        raise InputError(f"the force wanted, {most:g} N, is reached by no voltage; allowed: at most "
+                         f"{root[-1] ** 2:.3g} N")  # fmt: skip
+    # The voltage over the root of the force, which at 0 V is that of a small voltage.
+    scale = float(force_at(np.array([1e-3]))[0]) / 1e-3**2
+    at_zero = math.sqrt(1.0 / float(weight @ shape**2) / scale)
+    spline = CubicSpline(np.append(0.0, root), np.append(at_zero, amplitude[:last] / root))
 
-    def voltages(self, force: FloatArray, rate: float, carrier: float | None, lead: int) -> FloatArray:
-        """Gap voltages (V) at a rate (Hz) that rise in `lead` steps, and then produce forces (N) on a carrier (Hz)."""
-        root = np.sqrt(force)
-        u = root * self._spline(root)
+    def voltages(force: FloatArray, rate: float, carrier: float | None, lead: int) -> FloatArray:
+        u = np.sqrt(force) * spline(np.sqrt(force))
         # The rise has zero first and second derivative at both ends.
         x = np.arange(lead) / max(lead, 1)
         u = np.append(u[0] * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x)), u)
         if carrier is not None:
             u *= np.sin(2.0 * np.pi * carrier / rate * (np.arange(u.size) - lead))
         return u
+
+    return voltages

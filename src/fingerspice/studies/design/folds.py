@@ -124,13 +124,6 @@ class FoldLimits(Shown):
         return write_csv(path, ("parameter", "value [SI]", "unit", "fold [V]"), rows)
 
 
-def grid_of(points: int, span: float) -> tuple[int, float]:
-    """Values of each parameter, and the factor to either side; those that `fold_limits` takes."""
-    points, span = whole_number("points", points, 3, 1000), real_number("span", span, "more than 1, at most 1e6")
-    require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
-    return points, span
-
-
 def fold_limits(
     circuit: Circuit, *, points: int = 9, span: float = 10.0, progress: Progress | None = None
 ) -> FoldLimits:
@@ -159,7 +152,8 @@ def fold_limits(
         If a run fails for another reason than a fold.
     """
     require_circuit(circuit)
-    points, span = grid_of(points, span)
+    points, span = whole_number("points", points, 3, 1000), real_number("span", span, "more than 1, at most 1e6")
+    require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
     gaps = circuit.by_device("GAP")
     if len(gaps) != 1:
         found = ", ".join(g.name for g in gaps) or "none"
@@ -177,13 +171,12 @@ def fold_limits(
         skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
         varied.append(("frequency", "Hz", [f"{sources[0].name}.frequency", *skins]))
     factors = np.geomspace(1.0 / span, span, points)
-    around = fold_voltage(circuit, peak, t_stop)
+    around, told = fold_voltage(circuit, peak, t_stop), progress or (lambda _: None)
     sweeps: list[FoldSweep] = []
     for name, unit, paths in varied:
         own, voltages, guess = float(circuit.parameters[paths[0]].value), np.zeros(points), peak
         for i, x in enumerate(factors):
-            if progress is not None:
-                progress((1 + i + points * len(sweeps)) / (1 + points * len(varied)))
+            told((1 + i + points * len(sweeps)) / (1 + points * len(varied)))
             changed = circuit.varied(dict.fromkeys(paths, own * x))
             voltages[i] = fold_voltage(changed, peak, t_stop / x if name == "frequency" else t_stop, guess)
             # The next search starts at this voltage.
@@ -191,8 +184,7 @@ def fold_limits(
         # The fold at the deck's own value is known: the bisection of the sweep may end 1e-3 beside it.
         voltages[np.abs(factors - 1.0) <= 1e-12] = around
         sweeps.append(FoldSweep(name, unit, own, own * factors, voltages))
-    if progress is not None:
-        progress(1.0)
+    told(1.0)
     return FoldLimits(circuit, peak, around, tuple(sweeps))
 
 
@@ -202,47 +194,45 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
     It is found by bisection to a relative 1e-3. The run starts as the deck's run does. `peak` is the present peak
     voltage of the circuit's sources (V), and `guess` the voltage where the search starts (V).
     """
+
+    def folds(voltage: float) -> bool:
+        by = as_waveform(voltage / peak)
+        raised = circuit.varied(
+            {e.name: Product((by, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
+        )
+        try:
+            problem = prepare(
+                raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck", charge=False,
+                rtol=RTOL,
+            )  # fmt: skip
+            if problem.scene.stack is not None:
+                return meets_fold(problem, RTOL)
+            # Not by `simulate`, which would warn about voltages that the user did not ask for.
+            run = run_problem(problem, np.array([0.0, problem.t_stop]), RTOL)
+        except InputError as error:
+            # An operating point depends on the raised source, and may itself be past the fold, which counts as a fold.
+            # A start given by .ic does not depend on the source: report the error.
+            if circuit.initial or "past the fold" not in str(error):
+                raise
+            return True
+        if run.failure is not None and run.status is not Status.FOLD:
+            raise SolveError(run.failure, run)
+        return run.status is Status.FOLD
+
     low = high = min(max(guess or peak, LOWEST), HIGHEST)
-    if _folds(circuit, high / peak, t_stop):
-        low = STEP * high
-        while _folds(circuit, low / peak, t_stop):
+    if folds(high):
+        while folds(low := STEP * high):
             if low < LOWEST:
                 return low
-            low, high = STEP * low, low
+            high = low
     else:
         while high < HIGHEST:
             low, high = high, min(high / STEP, HIGHEST)
-            if _folds(circuit, high / peak, t_stop):
+            if folds(high):
                 break
         else:
             return math.nan
     while high > low * (1.0 + EXACT):
         middle = math.sqrt(low * high)
-        low, high = (low, middle) if _folds(circuit, middle / peak, t_stop) else (middle, high)
+        low, high = (low, middle) if folds(middle) else (middle, high)
     return math.sqrt(low * high)
-
-
-def _folds(circuit: Circuit, factor: float, t_stop: float) -> bool:
-    """Whether a run up to `t_stop` (s) reaches the fold, with every voltage source `factor` times its own."""
-    by = as_waveform(factor)
-    raised = circuit.varied(
-        {e.name: Product((by, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
-    )
-    try:
-        problem = prepare(
-            raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck", charge=False,
-            rtol=RTOL,
-        )  # fmt: skip
-        if problem.scene.stack is not None:
-            return meets_fold(problem, RTOL)
-        # Not by `simulate`, which would warn about voltages that the user did not ask for.
-        run = run_problem(problem, np.array([0.0, problem.t_stop]), RTOL)
-    except InputError as error:
-        # An operating point depends on the raised source, and may itself be past the fold, which counts as a fold.
-        # A start given by .ic does not depend on the source: report the error.
-        if circuit.initial or "past the fold" not in str(error):
-            raise
-        return True
-    if run.failure is not None and run.status is not Status.FOLD:
-        raise SolveError(run.failure, run)
-    return run.status is Status.FOLD

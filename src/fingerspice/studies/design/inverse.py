@@ -16,7 +16,7 @@ from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.design.drive import InverseDrive
-from fingerspice.studies.design.finger import Finger, ForceCurve, the_finger
+from fingerspice.studies.design.finger import Finger, force_curve, the_finger
 from fingerspice.waveforms.columns import read_text_columns
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file
 from fingerspice.waveforms.ramps import PWL
@@ -177,7 +177,18 @@ def inverse_drive(
     )  # fmt: skip
     finger = the_finger(circuit, charge_law)
     wave, end = _wave_of(wanted, kind, rate, duration)
-    rate = _rate(rate, carrier, wave, end)
+    if carrier is not None:
+        if rate is not None and rate < FEWEST * carrier:
+            raise InputError(
+                f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: at most a {FEWEST}th of "
+                f"it, {rate / FEWEST:g} Hz, or a higher rate"
+            )
+        rate = rate or PER_PERIOD * carrier
+        if end * carrier < 1.0:
+            raise InputError(f"{end:g} s hold no period of the carrier; allowed: 1 or more")
+    rate = rate or (wave.rate if isinstance(wave, Samples) else RATE)
+    count, allowed = end * rate, f"2 to {MOST_SAMPLES:,} samples"
+    require(1.0 <= count <= MOST_SAMPLES - 1, "the drive", f"{count:,.0f} samples long", allowed)
     begin = finger.lead if lead is None else real_number("lead", lead, "a number in s")
     require(0.0 <= begin < 1e3, "lead", f"{begin:g} s", "0 or more, less than 1000")
     found = Task(finger, kind, wave, end, rate, carrier, begin).solve(limit or math.inf, slew or math.inf)
@@ -188,25 +199,6 @@ def inverse_drive(
         )
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return found
-
-
-def _rate(rate: float | None, carrier: float | None, wave: Waveform, end: float) -> float:
-    """The drive's rate, Hz."""
-    if carrier is not None:
-        if rate is not None and rate < FEWEST * carrier:
-            raise InputError(
-                f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: at most a {FEWEST}th of "
-                f"it, {rate / FEWEST:g} Hz, or a higher rate"
-            )
-        rate = PER_PERIOD * carrier if rate is None else rate
-        if end * carrier < 1.0:
-            raise InputError(f"{end:g} s hold no period of the carrier; allowed: 1 or more")
-    if rate is None:
-        rate = wave.rate if isinstance(wave, Samples) else RATE
-    count = end * rate
-    allowed = f"2 to {MOST_SAMPLES:,} samples"
-    require(2.0 <= count + 1.0 <= MOST_SAMPLES, "the drive", f"{count:,.0f} samples long", allowed)
-    return rate
 
 
 class Task:
@@ -223,79 +215,81 @@ class Task:
         self.fine = 1 if carrier is None else 2
         count = math.floor(end * rate * (1.0 + 1e-12)) + 1
         t = np.arange(self.fine * (count - 1) + 1) / (self.fine * rate)
-        self.wanted = self._forces(wave.value(t), t)
-        points = None if carrier is None else rate / carrier
-        self.curve = ForceCurve(finger, points, float(self.wanted.max()))
-        self.target = self.curve.voltages(self.wanted[:: self.fine], rate, carrier, self.lead)
-
-    def _forces(self, values: FloatArray, t: FloatArray) -> FloatArray:
-        """The forces (N) that are wanted at times (s), all of them attractive; negative round-off becomes 0."""
-        contact, friction = self.finger.contact, self.kind == "friction"
-        if friction and contact.mu == 0.0:
-            raise InputError("the GAP has mu=0, so that no voltage makes friction; allowed: mu > 0, or a wanted force")
-        # F_el = F_T / mu - F_N (Eq. 1 with full slip).
-        force = values / contact.mu - contact.f_n if friction else values
+        contact, friction, force = finger.contact, kind == "friction", wave.value(t)
+        if friction:
+            if contact.mu == 0.0:
+                raise InputError(
+                    "the GAP has mu=0, so that no voltage makes friction; allowed: mu > 0, or a wanted force"
+                )
+            # F_el = F_T / mu - F_N (Eq. 1 with full slip).
+            force = force / contact.mu - contact.f_n
         bad = np.flatnonzero(~(force >= -1e-12 * max(1.0, float(np.abs(force).max()))))
         if bad.size:
-            i = int(bad[0])
-            least = f"{contact.mu * contact.f_n:g} N, the friction without a voltage" if friction else "0 N"
-            value = contact.mu * (force[i] + contact.f_n) if friction else force[i]
+            value, least = float(force[bad[0]]), "0 N"
+            if friction:
+                value = contact.mu * (value + contact.f_n)
+                least = f"{contact.mu * contact.f_n:g} N, the friction without a voltage"
             raise InputError(
-                f"{self.kind}: {value:g} N at {t[i]:g} s is reached by no voltage, which only attracts; allowed: from "
-                f"{least}"
+                f"{kind}: {value:g} N at {t[bad[0]]:g} s is reached by no voltage, which only attracts; allowed: "
+                f"from {least}"
             )
-        return np.asarray(np.maximum(force, 0.0))
+        # Negative round-off becomes 0.
+        self.wanted = np.maximum(force, 0.0)
+        voltages = force_curve(finger, None if carrier is None else rate / carrier, float(self.wanted.max()))
+        self.target = voltages(self.wanted[:: self.fine], rate, carrier, self.lead)
 
     def solve(self, limit: float = math.inf, slew: float = math.inf, close: float = CLOSE) -> InverseDrive:
         """The drive within limits (V, V/s), corrected by the errors of the gap voltage until they are `close`."""
-        peak = float(np.abs(self.target).max())
-        inverter = self.finger.inverter(peak)
-        target, best, least, done = self.target, None, math.inf, -1
+        finger, target, contact = self.finger, self.target, self.finger.contact
+        peak = float(np.abs(target).max())
+        inverter = finger.inverter(peak)
+        best, least, done = None, math.inf, -1
         wish, levelled = target.copy(), self.carrier is None
         while best is None or done < CORRECTIONS:
-            drive, held = inverter(wish, 1.0 / self.rate, limit, slew)
-            u, force = self._forward(drive, close * RTOL / CLOSE)
-            miss = np.where(held, 0.0, target - self.finger.sign * u)
+            values, held = inverter(wish, 1.0 / self.rate, limit, slew)
+            drive = Samples(values, self.rate)
+            circuit = finger.circuit.varied({finger.source.name: drive})
+            u, force = self._forward(circuit, close * RTOL / CLOSE)
+            miss = np.where(held, 0.0, target - finger.sign * u)
             size = float(np.abs(miss[self.lead :]).max()) / max(peak, 1e-300)
             done += 1
             stalled = size > STALLED * least
             if size < least:
-                best, least = (drive, held, force, done), size
+                best, least = (circuit, drive, held, force, done), size
             if (size <= close or stalled) and levelled:
                 break
             wish = wish + miss
             if size <= close or stalled:
                 # The gap voltage is linear between samples, not a sine, which changes the mean force: now that the
-                # force is known, scale the envelope once.
-                factor, levelled, least = np.where(held, 1.0, self._level(force)), True, math.inf
+                # force is known, scale the envelope once, so that the mean of each period becomes the wanted one.
+                times, wanted, reached = self._compared(force)
+                some = (reached > 0.5 * wanted) & (wanted > 1e-3 * wanted.max())
+                factor = np.sqrt(np.divide(wanted, reached, out=np.ones_like(wanted), where=some))
+                at = (np.arange(target.size) - self.lead) / self.rate
+                factor, levelled, least = np.where(held, 1.0, np.interp(at, times, factor)), True, math.inf
                 target, wish = target * factor, wish * factor
         assert best is not None
-        drive, held, force, done = best
-        lead, contact = self.lead / self.rate, self.finger.contact
-        times, wanted, reached = self._compared(force)
+        circuit, drive, held, force, done = best
+        lead, (times, wanted, reached) = self.lead / self.rate, self._compared(force)
         return InverseDrive(
-            self._driven(drive), Samples(drive, self.rate), lead + times, wanted, reached,
-            contact.mu * (contact.f_n + wanted), contact.mu * (contact.f_n + reached), self.kind, self.carrier,
-            limit, slew, lead, float(held.mean()), done,
+            circuit, drive, lead + times, wanted, reached, contact.mu * (contact.f_n + wanted),
+            contact.mu * (contact.f_n + reached), self.kind, self.carrier, limit, slew, lead, float(held.mean()), done,
         )  # fmt: skip
 
-    def _forward(self, drive: FloatArray, rtol: float) -> tuple[FloatArray, FloatArray]:
-        """Gap voltage at the samples (V), and force at the fine times (N), that a drive gives."""
-        t = np.arange(self.fine * (drive.size - 1) + 1) / (self.fine * self.rate)
+    def _forward(self, circuit: Circuit, rtol: float) -> tuple[FloatArray, FloatArray]:
+        """Gap voltage at the samples (V), and force at the fine times (N), that the circuit with a drive has."""
+        t = np.arange(self.fine * (self.target.size - 1) + 1) / (self.fine * self.rate)
         with warnings.catch_warnings():
             # The reader has given the deck's warnings, and warnings about an uncorrected drive do not concern the user.
             warnings.simplefilter("ignore", FingerspiceWarning)
             run = simulate(
-                self._driven(drive), t_stop=float(t[-1]), t_eval=t, charge_law=self.finger.law,
-                rtol=rtol, start="uncharged", charge=False,
+                circuit, t_stop=float(t[-1]), t_eval=t, charge_law=self.finger.law, rtol=rtol, start="uncharged",
+                charge=False,
             )  # fmt: skip
         u, force = run.u_gap, run.f_el
         assert u is not None
         assert force is not None
         return u[:: self.fine], force
-
-    def _driven(self, drive: FloatArray) -> Circuit:
-        return self.finger.circuit.varied({self.finger.source.name: Samples(drive, self.rate)})
 
     def _compared(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Times after the lead (s), and the wanted and the reached force there (N), from the force at the fine times.
@@ -315,10 +309,3 @@ class Task:
             return np.asarray(np.diff(at_edges) / np.diff(edges))
 
         return 0.5 * (edges[1:] + edges[:-1]), means(self.wanted), means(reached)
-
-    def _level(self, force: FloatArray) -> FloatArray:
-        """Factors for the gap voltage at the samples, by which the mean force of each period becomes the wanted one."""
-        times, wanted, reached = self._compared(force)
-        some = (reached > 0.5 * wanted) & (wanted > 1e-3 * wanted.max())
-        factor = np.sqrt(np.divide(wanted, reached, out=np.ones_like(wanted), where=some))
-        return np.interp((np.arange(self.target.size) - self.lead) / self.rate, times, factor)

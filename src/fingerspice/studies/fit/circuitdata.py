@@ -17,7 +17,6 @@ from fingerspice.circuit.statespace import build_stack, is_stack
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.circuit.usual import MEASURED as USUAL
 from fingerspice.circuit.usual import MEASURING
-from fingerspice.numerics.small import AT, STEP, derivative
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.batch.batch import batch
 from fingerspice.studies.batch.form import in_lockstep_by
@@ -35,7 +34,7 @@ MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V"
 #: The one measured quantity that is no mean, and the column that may stand beside it.
 IMPEDANCE, PHASE = "impedance", "impedance_phase"
 _MEANS = ("f_el", "f_t", "friction", "area")
-_TIME, _SOURCE = "t", "source"
+_TIME = "t"
 _UNITS = MEASURED | {f"{signal}_mean": unit for signal, unit in MEASURED.items()} | {_TIME: "s", PHASE: "deg"}
 # Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's.
 _SLOPES = 1e-6
@@ -127,22 +126,23 @@ def data_of(circuit: Circuit, given: Given, by: str | None = None) -> Data:
         raise InputError(
             f"{place} have {what}, and the columns {', '.join(columns)}; allowed: one of {', '.join(names)}"
         )
-    values = columns.pop(measured[0])
-    sigma, t, phase = (columns.pop(name, None) for name in (SIGMA, _TIME, PHASE))
-    if phase is not None and measured[0] != IMPEDANCE:
-        raise InputError(f"{place} have the column {PHASE} beside {measured[0]}; allowed: beside {IMPEDANCE}")
-    _refuse_signs(measured[0], values, place, first=0 if isinstance(given, Mapping) else 1)
+    (name,) = measured
+    values = columns.pop(name)
+    sigma, t, phase = (columns.pop(key, None) for key in (SIGMA, _TIME, PHASE))
+    if phase is not None and name != IMPEDANCE:
+        raise InputError(f"{place} have the column {PHASE} beside {name}; allowed: beside {IMPEDANCE}")
+    _refuse_signs(name, values, place, first=0 if isinstance(given, Mapping) else 1)
     if sigma is not None and not np.all(sigma > 0.0):
         raise InputError(f"{place}: the smallest sigma is {sigma.min():g}; allowed: more than 0")
-    if t is not None and (measured[0].endswith("_mean") or np.any(np.diff(t) <= 0.0)):
+    if t is not None and (name.endswith("_mean") or np.any(np.diff(t) <= 0.0)):
         raise InputError(f"{place} have the column t; allowed: rising times, with a signal that is no mean")
     conditions: dict[str, FloatArray] = {}
-    for name, x in columns.items():
-        path = _path(circuit, name)
+    for column, x in columns.items():
+        path = _path(circuit, column)
         if path in conditions:
             raise InputError(f"{place} have two columns of {path}; allowed: one")
         conditions[path] = x
-    data = Data(names[measured[0]], values, sigma, conditions, t, phase, groups)
+    data = Data(names[name], values, sigma, conditions, t, phase, groups)
     if t is not None and data.varying:
         raise InputError(f"{place} have times and changing conditions; allowed: one run over time, or means")
     if t is not None and groups is not None:
@@ -155,25 +155,25 @@ def _refuse_signs(name: str, values: FloatArray, place: str, first: int) -> None
 
     A signal over time may be below 0 now and then, by noise. Rows count from `first`.
     """
-    if name == IMPEDANCE or name.endswith("_mean"):
-        bad = np.flatnonzero(values <= 0.0 if name == IMPEDANCE else values < 0.0)
-        told = [(f"in row {i + first}", values[i]) for i in bad[:1]]
-    else:
-        told = [("on average", values.mean())] if name in _MEANS and values.mean() < 0.0 else []
-    allowed = "magnitudes above 0" if name == IMPEDANCE else "0 or more"
-    if name.startswith("f_el"):
+    low, allowed = values < 0.0, "0 or more"
+    if name == IMPEDANCE:
+        low, allowed = values <= 0.0, "magnitudes above 0"
+    elif name.startswith("f_el"):
         allowed += ", as the electroadhesive force counts as positive where it pulls towards the screen"
-    for where, value in told:
-        size = f"{value:g} {_UNITS[name]}".rstrip()
-        raise InputError(f"{place}: {name} is {size} {where}; allowed: {allowed}")
+    if name == IMPEDANCE or name.endswith("_mean"):
+        told = [(values[i], f"in row {i + first}") for i in np.flatnonzero(low)[:1]]
+    else:
+        told = [(values.mean(), "on average")] if name in _MEANS and values.mean() < 0.0 else []
+    for value, where in told:
+        raise InputError(f"{place}: {name} is {f'{value:g} {_UNITS[name]}'.rstrip()} {where}; allowed: {allowed}")
 
 
 def _path(circuit: Circuit, name: str) -> str:
     """A condition's path; ``source.`` stands for the only source, and ``frequency`` for its frequency."""
     if name.lower() == "frequency":
-        name = f"{_SOURCE}.frequency"
+        name = "source.frequency"
     element, _, parameter = name.partition(".")
-    if element.lower() == _SOURCE:
+    if element.lower() == "source":
         driving = driving_sources(circuit)
         if len(driving) != 1:
             raise InputError(f"{name} is the only source's, and the circuit has {len(driving)}; allowed: its name")
@@ -216,41 +216,40 @@ class Task(Problem):
 
     def compared(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         self.watch()
-        found, by = self._predicted(values)
-        off = found - self.data.target
-        if self.data.phase is not None:
-            n = self.data.values.size
-            off[n:] = np.remainder(off[n:] + 180.0, 360.0) - 180.0
-        return off / self.scale, by / self.scale[:, None]
+        if self.data.signal == IMPEDANCE:
+            return super().compared(values)
+        found, by = self._in_batches(values) if self._in_lockstep else self._in_single_runs(values)
+        return (found - self.data.values) / self.scale, by * values / self.scale[:, None]
 
-    def _predicted(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Predicted data (n,), and their derivatives by the logarithms of the parameters (n, n_parameter)."""
-        data, how = self.data, {"rtol": self.rtol, "charge_law": self.charge_law, "charge": False}
-        if data.t is not None:
-            paths = tuple(self.places)
-            run = simulate(self._scene(values, 0), t_eval=data.t, sensitivities=paths, **how)  # type: ignore[arg-type]
-            slopes = [getattr(run.sensitivities[path], data.signal) for path in paths]
-            return np.asarray(getattr(run, data.signal)), np.array(slopes).T * values
-        if data.signal == IMPEDANCE:
-            moved = values * (1.0 + np.multiply.outer(STEP * np.array(AT), np.eye(values.size)))
-            by = derivative([np.array([self._impedance(one) for one in each]) for each in moved], STEP)
-            return self._impedance(values), by.T
-        if self._in_lockstep:
-            return self._in_batches(values)
-        if self.average == "run" and self.circuit.tran is None:
+    def misses(self, values: FloatArray) -> FloatArray:
+        """Of impedances, at the area that the deck's amplitude causes."""
+        data, how = self.data, "swept" if self.skin == "follow" else "own"
+        runs = [phasor(self._scene(values, row), skin=how).impedance for row in range(data.values.size)]
+        z = np.array([one[0] for one in runs if one is not None])
+        off = np.abs(z) - data.values
+        if data.phase is not None:
+            off = np.append(off, np.remainder(np.angle(z, deg=True) - data.phase + 180.0, 360.0) - 180.0)
+        return np.asarray(off / self.scale)
+
+    def _in_single_runs(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Predicted means or a signal (n,), and their derivatives by the parameters (n, n_parameter)."""
+        data, over_time = self.data, self.data.t is not None
+        if not over_time and self.average == "run" and self.circuit.tran is None:
             raise InputError("the deck has no .tran, and average is 'run'; allowed: a deck with .tran, or 'periodic'")
-        name, found, by = data.name, np.empty(data.values.size), np.zeros((data.values.size, values.size))
-        for row in range(data.values.size):
-            circuit = self._scene(values, row)
-            felt = np.flatnonzero(self.members[:, row])
+        found, by = np.empty(data.values.size), np.zeros((data.values.size, values.size))
+        # A signal over time has all its values from one run.
+        for row in range(1 if over_time else data.values.size):
+            circuit, felt = self._scene(values, row), np.flatnonzero(self.members[:, row])
             paths = tuple(self.unknowns[k].path for k in felt)
-            if self.average == "periodic":
-                one = steady_state(circuit, sensitivities=paths, points=4, **how)  # type: ignore[arg-type]
+            how = {"sensitivities": paths, "rtol": self.rtol, "charge_law": self.charge_law, "charge": False}
+            if over_time or self.average == "run":
+                one = simulate(circuit, t_eval=data.t if over_time else [0.0], **how)  # type: ignore[arg-type]
             else:
-                one = simulate(circuit, sensitivities=paths, t_eval=[0.0], **how)  # type: ignore[arg-type,assignment]
-            found[row] = getattr(one, name)
+                one = steady_state(circuit, points=4, **how)  # type: ignore[arg-type,assignment]
+            at = slice(None) if over_time else row
+            found[at] = getattr(one, data.name)
             for k, path in zip(felt, paths, strict=True):
-                by[row, k] = getattr(one.sensitivities[path], name) * values[k]
+                by[at, k] = getattr(one.sensitivities[path], data.name)
         return found, by
 
     def _scene(self, values: FloatArray, row: int) -> Circuit:
@@ -264,25 +263,18 @@ class Task(Problem):
             changed = changed.varied(skins)
         return changed
 
-    def _impedance(self, values: FloatArray) -> FloatArray:
-        """Magnitudes (ohm), and phases (deg) where they are given, at the area that the deck's amplitude causes."""
-        how = "swept" if self.skin == "follow" else "own"
-        runs = [phasor(self._scene(values, row), skin=how).impedance for row in range(self.data.values.size)]
-        z = np.array([one[0] for one in runs if one is not None])
-        return np.abs(z) if self.data.phase is None else np.concatenate([np.abs(z), np.degrees(np.angle(z))])
-
     @cached_property
     def _in_lockstep(self) -> bool:
         """Whether a batch predicts all measurements, and has their derivatives, in lockstep."""
         paths = {*self.data.conditions, *self.places}
         skins = {f"{e.name}.f" for e in self.circuit.by_device("SKIN")}
-        if self.charge_law is not None or (self.skin == "follow" and paths & skins):
+        if self.data.t is not None or self.charge_law is not None or (self.skin == "follow" and paths & skins):
             return False
         alone = self.skin == "own" or len(driving_sources(self.circuit)) == 1
         return alone and in_lockstep_by(self.circuit, paths, (self.data.name,), max(self.rtol, _SLOPES))
 
     def _in_batches(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As `_predicted`, all measurements at once, and their derivatives with an error that suits least squares."""
+        """As `_in_single_runs`, all measurements at once, and derivatives with an error that suits least squares."""
         name, by, runs = self.data.name, np.zeros((self.data.values.size, values.size)), []
         slopes = max(self.rtol, _SLOPES), tuple(self.places)
         for status, (rtol, gradients) in (("gradient_status", slopes), ("status", (self.rtol, ()))):
@@ -290,7 +282,7 @@ class Task(Problem):
             if np.any(runs[-1][status].to_numpy() >= REFUSED):
                 raise InputError(runs[-1].attrs["failures"][0])
         for i, own in enumerate(self.places.values()):
-            by[:, own] = self.members[own].T * runs[0][f"d_{name}"].to_numpy()[:, i, None] * values[own]
+            by[:, own] = self.members[own].T * runs[0][f"d_{name}"].to_numpy()[:, i, None]
         return runs[1][name].to_numpy(), by
 
     def scenes(self, values: FloatArray, rtol: float, gradients: tuple[str, ...] = ()) -> Dataset:

@@ -25,8 +25,8 @@ from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.results.signals import SIGNALS
 from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.fit.circuitdata import IMPEDANCE, MEASURED, Data, Task, data_of
-from fingerspice.studies.fit.result import Drawn, FitResult, covariance_of, estimated, misfit_note, profile_of
-from fingerspice.studies.fit.search import FARTHEST, Fitted, Unknown, bounds_of, followed, refuse_few
+from fingerspice.studies.fit.result import Drawn, FitResult, estimated, misfit_note, profile_of
+from fingerspice.studies.fit.search import FARTHEST, Fitted, Unknown, bounded, followed
 from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
@@ -98,7 +98,7 @@ class Fit(FitResult):
         equal = float(np.ptp(self.sigma)) <= 1e-9 * float(self.sigma.max())
         noise = f"estimated from the residuals, {'equal for all' if equal else 'as equal shares of the values'}"
         lines: list[str | Table] = [
-            f"{len(self.estimates)} parameters fitted to {data.values.size} values of {data.name}, {self._effort}",
+            self._head(f"{data.values.size} values of {data.name}"),
             f"residual {self._rms:.3g} {MEASURED[data.signal]} rms, {share:.2g} % of the largest value; "
             f"sigma {'as given' if data.sigma is not None else noise}",
         ]
@@ -209,7 +209,7 @@ def fit(
     measured, unknowns = _request(circuit, data, parameters, groups)
     require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
-    start, box = bounds_of(circuit, tuple(one.path for one in unknowns), bounds or {})
+    start, box = bounded(circuit, unknowns, measured.target.size, bounds or {})
     bar, begun, count = Bar("fitting", endless=True), time.perf_counter(), itertools.count(1)
 
     def watch() -> None:
@@ -255,36 +255,33 @@ def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
         variance, reach = 1.0, float(norm.ppf(0.975))
     elif freedom > 0:
         variance, reach = best.objective / freedom, float(t.ppf(0.975, freedom))
-    covariance, remedy = covariance_of(best.by_log), data.remedy(task.circuit)
-    values = best.values.tolist()
-    each = list(zip(task.unknowns, values, strict=True))
+    error, remedy = np.sqrt(np.diag(best.covariance) * variance), data.remedy(task.circuit)
+
+    def of_group(label: str) -> Circuit:
+        own = zip(task.unknowns, best.values.tolist(), strict=True)
+        return task.circuit.varied({one.path: value for one, value in own if one.label in (None, label)})
+
     found = Fit(
         **estimated(
-            task, best, covariance, np.sqrt(np.diag(covariance) * variance), [reach] * len(task.unknowns),
-            lambda _: remedy, misfit_note(best.objective, freedom) if data.sigma is not None else [],
+            task, best, error, [reach] * error.size, lambda _: remedy,
+            misfit_note(best.objective, freedom) if data.sigma is not None else [],
         ),
         data=data,
         predicted=data.values + (best.residual * task.scale)[:n],
         sigma=data.sigma if data.sigma is not None else math.sqrt(variance) * task.scale[:n],
         objectives=tuple(end.objective for end in ends),
         freedom=freedom,
-        circuit=task.circuit.varied({path: _geometric_mean(values, own) for path, own in task.places.items()}),
-        circuits={
-            label: task.circuit.varied({one.path: x for one, x in each if one.label in (None, label)})
-            for label in (data.groups.labels if data.groups is not None else ())
-        },
+        # The geometric mean of one value is that value to the last digit.
+        circuit=task.circuit.varied(
+            {path: float(np.prod(best.values[own] ** (1.0 / len(own)))) for path, own in task.places.items()}
+        ),
+        circuits={label: of_group(label) for label in (data.groups.labels if data.groups is not None else ())},
     )  # fmt: skip
     # Of chi squared and F with one degree of freedom, quantiles are the squares of those of the normal distribution
     # and of Student's (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
-    found.profiles.update(
-        (name, profile_of(replace(task, bounds=free.bounds), best, found.estimates[name], variance * reach**2))
-        for name in wanted
-    )
+    task, room = replace(task, bounds=free.bounds), variance * reach**2
+    found.profiles.update((name, profile_of(task, best, found.estimates[name], room)) for name in wanted)
     return found
-
-
-def _geometric_mean(values: list[float], own: list[int]) -> float:
-    return values[own[0]] if len(own) == 1 else math.exp(sum(math.log(values[k]) for k in own) / len(own))
 
 
 def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[Task, list[Fitted]]:
@@ -315,37 +312,29 @@ def _request(
         if path.lower() not in known:
             circuit.varied({path: 1.0})
     paths = tuple(known[path.lower()] for path in parameters)
-    for path in paths:
-        require(paths.count(path) == 1, path, "named twice", "once")
-    by, separate = (None, []) if groups is None else _grouped(circuit, groups)
-    data = data_of(circuit, given, by)
-    both = sorted(set(paths) & set(data.conditions))
-    if both:
-        raise InputError(f"{both[0]} is to be fitted, and is a condition of the data; allowed: one of both")
-    for path in paths:
-        value = circuit.parameters[path].value
-        if not (math.isfinite(value) and value > 0.0):
-            raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
+    by: str | None = None
+    separate: Sequence[str] = ()
+    if groups is not None:
+        wanted = "a mapping of a column of the data to the parameters of each group, such as {'finger': ['Xgap.d']}"
+        ((by, separate),) = groups.items() if isinstance(groups, Mapping) and len(groups) == 1 else (("", ""),)
+        if not isinstance(by, str) or isinstance(separate, str) or not separate:
+            raise InputError(f"groups is {groups!r}; allowed: {wanted}")
+        if by.lower() in known:
+            raise InputError(f"groups names the column {by!r}, which is a parameter; allowed: {wanted}")
     for path in separate:
         if known.get(path.lower()) not in paths:
             raise InputError(f"groups names {path!r}, which is not fitted; allowed: {', '.join(paths)}")
+    data = data_of(circuit, given, by)
+    for path in paths:
+        value = circuit.parameters[path].value
+        require(paths.count(path) == 1, path, "named twice", "once")
+        if path in data.conditions:
+            raise InputError(f"{path} is to be fitted, and is a condition of the data; allowed: one of both")
+        if not (math.isfinite(value) and value > 0.0):
+            raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
     own = {known[path.lower()] for path in separate}
     labels = data.groups.labels if data.groups is not None else ()
-    unknowns = tuple(Unknown(path, label) for path in paths for label in (labels if path in own else (None,)))
-    refuse_few(data.target.size, unknowns)
-    return data, unknowns
-
-
-def _grouped(circuit: Circuit, groups: Mapping[str, Sequence[str]]) -> tuple[str, Sequence[str]]:
-    """The column that tells the group, and what every group has of its own: ``{"finger": ["Xgap.d"]}``."""
-    wanted = "a mapping of a column of the data to the parameters of each group, such as {'finger': ['Xgap.d']}"
-    if isinstance(groups, Mapping) and len(groups) == 1:
-        ((column, paths),) = groups.items()
-        if isinstance(column, str) and not isinstance(paths, str) and paths:
-            if column.lower() in map(str.lower, circuit.parameters):
-                raise InputError(f"groups names the column {column!r}, which is a parameter; allowed: {wanted}")
-            return column, paths
-    raise InputError(f"groups is {groups!r}; allowed: {wanted}")
+    return data, tuple(Unknown(path, label) for path in paths for label in (labels if path in own else (None,)))
 
 
 def _starts(task: Task, count: int) -> list[FloatArray]:

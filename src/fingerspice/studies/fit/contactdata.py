@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
-from fingerspice.numerics.small import AT, derivative
 from fingerspice.physics.contact import Contact, ridge_area
 from fingerspice.studies.fit.measured import SIGMA, Given, measured_of
-from fingerspice.studies.fit.search import Fitted, Problem, followed
+from fingerspice.studies.fit.search import Problem
 
 #: Measured columns and conditions, with their units.
 MEASURED = {"area": "m^2", "area_sliding": "m^2", "f_t": "N"}
@@ -26,14 +25,6 @@ NAMES = {
     "area": "ridge area at rest", "indentation": "ridge area by indentation",
     "area_sliding": "ridge area while sliding", "f_t": "friction force",
 }  # fmt: skip
-_ALLOWED = ", ".join([*MEASURED, *CONDITIONS, "sigma"])
-# Step of the differences in a parameter's logarithm, at which those of fourth order are exact to rounding.
-_STEP = 1e-3
-# Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
-# this; they are no smaller than the last.
-_ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
-#: Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
-FEWEST = 0.5
 
 
 @dataclass(frozen=True)
@@ -47,11 +38,6 @@ class Relation:
     fn: FloatArray
     u_gap: FloatArray
     indentation: FloatArray
-
-    @property
-    def unit(self) -> str:
-        """Unit of the values."""
-        return MEASURED.get(self.kind, "m^2")
 
     @property
     def name(self) -> str:
@@ -81,7 +67,31 @@ def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, .
     for number, one in enumerate(several, 1):
         place = "the data" if len(several) == 1 else f"data {number}"
         columns, place, _ = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
-        for relation in _relations(columns, fn, place):
+        measured = [name for name in MEASURED if name in columns]
+        if not measured:
+            raise InputError(f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
+        alone = len(measured) == 1 and SIGMA in columns
+        sigmas = {name: SIGMA if alone else f"{name}_{SIGMA}" for name in measured}
+        unknown = [name for name in columns if name not in (*measured, *CONDITIONS, *sigmas.values())]
+        if unknown:
+            why = ": which of the measured columns it belongs to is not known" if unknown[0] == SIGMA else ""
+            allowed = ", ".join([*MEASURED, *CONDITIONS, SIGMA, *(f"{name}_{SIGMA}" for name in measured)])
+            raise InputError(f"{place} have a column {unknown[0]!r}{why}; allowed: {allowed}")
+        for name, x in columns.items():
+            if name != "u_gap" and not np.all(x > 0.0):
+                raise InputError(f"{place}: the smallest {name} is {x.min():g}; allowed: more than 0")
+        none = np.zeros(columns[measured[0]].size)
+        at, u, depth = columns.get("fn", none + fn), columns.get("u_gap", none), columns.get("indentation")
+        if depth is not None and np.any(u != 0.0):
+            raise InputError(f"{place} have the columns indentation and u_gap; allowed: indentations without voltage")
+        own = []
+        for name in measured:
+            values, sigma = columns[name], columns.get(sigmas[name])
+            if name == "area" and depth is not None:
+                own.append(Relation("indentation", values, sigma, at, none, depth))
+            if name != "area" or depth is None or "fn" in columns:
+                own.append(Relation(name, values, sigma, at, u, none))
+        for relation in own:
             key = relation.kind, relation.sigma is None
             if key in found:
                 known = {name: x for name, x in vars(found[key]).items() if isinstance(x, np.ndarray)}
@@ -98,36 +108,6 @@ def _meaning(name: str, names: Sequence[str]) -> tuple[str, str, str | None]:
     return key, values, (MEASURED | CONDITIONS).get(values)
 
 
-def _relations(columns: Mapping[str, FloatArray], fn: float, place: str) -> list[Relation]:
-    measured = [name for name in MEASURED if name in columns]
-    if not measured:
-        raise InputError(f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
-    sigmas = {name: f"{name}_{SIGMA}" for name in measured}
-    if len(measured) == 1 and SIGMA in columns:
-        sigmas[measured[0]] = SIGMA
-    unknown = [name for name in columns if name not in (*measured, *CONDITIONS, *sigmas.values())]
-    if unknown:
-        why = ": which of the measured columns it belongs to is not known" if unknown[0] == SIGMA else ""
-        each = ", ".join(f"{name}_{SIGMA}" for name in measured)
-        raise InputError(f"{place} have a column {unknown[0]!r}{why}; allowed: {_ALLOWED}, {each}")
-    for name, x in columns.items():
-        if name != "u_gap" and not np.all(x > 0.0):
-            raise InputError(f"{place}: the smallest {name} is {x.min():g}; allowed: more than 0")
-    size = columns[measured[0]].size
-    at, none = columns.get("fn", np.full(size, fn)), np.zeros(size)
-    u, depth = columns.get("u_gap", none), columns.get("indentation")
-    if depth is not None and np.any(u != 0.0):
-        raise InputError(f"{place} have the columns indentation and u_gap; allowed: indentations without voltage")
-    found = []
-    for name in measured:
-        values, sigma = columns[name], columns.get(sigmas[name])
-        if name == "area" and depth is not None:
-            found.append(Relation("indentation", values, sigma, at, none, depth))
-        if name != "area" or depth is None or "fn" in columns:
-            found.append(Relation(name, values, sigma, at, u, none))
-    return found
-
-
 @dataclass(frozen=True)
 class ContactTask(Problem):
     """The fit of a contact; the scale of a relation without sigma is the standard deviation of the logarithms."""
@@ -141,72 +121,15 @@ class ContactTask(Problem):
 
     def predict(self, values: FloatArray) -> list[FloatArray]:
         """Each relation's values as the contact has them."""
-        paths = [one.path for one in self.unknowns]
-        changed = self.circuit.varied(dict(zip(paths, values.tolist(), strict=True)))
-        own: Contact | None = build_stack(changed).contact if is_stack(changed) else None
+        changed = self.circuit.varied(dict(zip(self.names, values.tolist(), strict=True)))
+        own = build_stack(changed).contact if is_stack(changed) else None
         contact = contact_of(changed[self.gap]) if own is None else own
         return [relation.predicted(contact) for relation in self.relations]
 
-    def compared(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        middle, by = self._misses(values), np.zeros((self.scale.size, values.size))
-        for k, one in enumerate(np.eye(values.size)):
-            moved = [values * np.exp(at * _STEP * one) for at in AT]
-            by[:, k] = derivative([self._misses(each) for each in moved], _STEP)
-        return middle, by
-
-    def _misses(self, values: FloatArray) -> FloatArray:
+    def misses(self, values: FloatArray) -> FloatArray:
         parts = []
         for relation, found in zip(self.relations, self.predict(values), strict=True):
             if relation.sigma is None and not np.all(found > 0.0):
                 raise InputError("friction leaves no area; allowed: a smaller c2")
             parts.append(found - relation.values if relation.sigma is not None else np.log(found / relation.values))
         return np.concatenate(parts) / self.scale
-
-
-class Pool(NamedTuple):
-    """Relations whose values have one standard deviation, as they come from the same instrument."""
-
-    name: str  # What was measured, in words
-    at: IntArray  # Places of their values among the residuals
-    # Number of values less what the parameters take up of them; infinity where the standard deviation is given, and
-    # does not follow from the residuals
-    freedom: float
-
-
-def _pools(task: ContactTask, best: Fitted) -> list[Pool]:
-    """The relations by what they have been measured with: ridge areas against the load come from one set of images.
-
-    What the parameters take up of values is the sum of their leverages.
-    """
-    left, singular, _ = np.linalg.svd(best.by_log, full_matrices=False)
-    left = left[:, singular > 1e-9 * max(float(singular.max()), 1e-300)]
-    leverage = np.sum(left**2, axis=1)
-    members: dict[tuple[str, bool], list[tuple[str, IntArray]]] = {}
-    for relation, at in zip(task.relations, task.split(np.arange(task.scale.size)), strict=True):
-        key = relation.kind.removesuffix("_sliding"), relation.sigma is None
-        members.setdefault(key, []).append((relation.name, at))
-    found = []
-    for (_, estimated), own in members.items():
-        at = np.concatenate([at for _, at in own])
-        freedom = at.size - float(leverage[at].sum()) if estimated else float("inf")
-        found.append(Pool(" and the ".join(name for name, _ in own), at, freedom))
-    return found
-
-
-def solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
-    """Least squares, with the standard deviation of every pool that has none from its own residuals.
-
-    Returns the task with the standard deviations found, the fit, and the pools.
-    """
-    begin = task.initial
-    for _ in range(_ROUNDS):
-        best = followed(task.residuals, task.bounds, begin)
-        pools, scale = _pools(task, best), task.scale.copy()
-        for pool in pools:
-            if FEWEST <= pool.freedom < np.inf:
-                spread = float(np.sqrt(np.sum(best.residual[pool.at] ** 2) / pool.freedom))
-                scale[pool.at] = np.maximum(scale[pool.at] * spread, _LEAST)
-        if np.abs(np.log(scale / task.scale)).max() < _SETTLED:
-            break
-        task, begin = replace(task, scale=scale), best.values
-    return task, best, pools

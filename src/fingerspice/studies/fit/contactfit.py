@@ -5,21 +5,21 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page
 from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.studies.fit.contactdata import FEWEST, ContactTask, Pool, Relation, relations_of, solved
+from fingerspice.studies.fit.contactdata import MEASURED, ContactTask, Relation, relations_of
 from fingerspice.studies.fit.measured import Given
-from fingerspice.studies.fit.result import Drawn, FitResult, covariance_of, estimated, misfit_note, profile_of
-from fingerspice.studies.fit.search import Fitted, Unknown, bounds_of, refuse_few
+from fingerspice.studies.fit.result import Drawn, FitResult, estimated, misfit_note, profile_of
+from fingerspice.studies.fit.search import Fitted, Unknown, bounded, followed
 from fingerspice.waveforms.waveform import require
 
 PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
@@ -29,6 +29,11 @@ _TOO_MUCH = 0.2
 _SHARE = 0.1
 # The share of an error's variance below which a relation has no part in it.
 _NO_PART = 1e-9
+# Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
+# this; they are no smaller than the last, as are singular values that count, relative to the largest.
+_ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
+# Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
+_FEWEST = 0.5
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -45,8 +50,6 @@ class ContactFit(FitResult):
         The data, by kind.
     predicted, sigma : tuple of ndarray
         Values and standard deviations of every relation, as the fit has them.
-    misfits : tuple of float
-        Root mean square of the logarithm of prediction over data, of every relation.
     objective : float
         Sum of the squared residuals over sigma.
     freedom : int
@@ -60,8 +63,13 @@ class ContactFit(FitResult):
     relations: tuple[Relation, ...]
     predicted: tuple[FloatArray, ...]
     sigma: tuple[FloatArray, ...]
-    misfits: tuple[float, ...]
     reach: dict[str, float]
+
+    @property
+    def misfits(self) -> tuple[float, ...]:
+        """Root mean square of the logarithm of prediction over data, of every relation."""
+        pairs = zip(self.predicted, self.relations, strict=True)
+        return tuple(float(np.sqrt(np.mean(np.log(np.maximum(x, 1e-300) / one.values) ** 2))) for x, one in pairs)
 
     @property
     def values(self) -> dict[str, float]:
@@ -74,8 +82,7 @@ class ContactFit(FitResult):
         return " ".join(f"{path.rpartition('.')[2]}={one.value:.6g}" for path, one in self.estimates.items())
 
     def _page(self) -> Page:
-        fitted = f"{len(self.estimates)} parameters fitted to {self._count} values"
-        lines = [f"contact of {self.gap}: {fitted}, {self._effort}"]
+        lines = [f"contact of {self.gap}: {self._head(f'{self._count} values')}"]
         for one, misfit in zip(self.relations, self.misfits, strict=True):
             known = "sigma as given" if one.sigma is not None else "sigma estimated from the residuals"
             lines.append(f"{one.name}: {one.values.size} values, residual {100.0 * misfit:.3g} % rms; {known}")
@@ -93,7 +100,7 @@ class ContactFit(FitResult):
             order = np.argsort(others, kind="stable")
             names = [name.format(other) if np.ptp(others) > 0.0 else one.name for other in others[order]]
             columns = [column[order] for column in (x, one.values, fitted, sigma)]
-            panels.append((names, columns, label, one.name, one.unit))
+            panels.append((names, columns, label, one.name, MEASURED.get(one.kind, "m^2")))
         return panels
 
     def to_dict(self) -> dict[str, Any]:
@@ -109,11 +116,13 @@ class ContactFit(FitResult):
 
     def _columns(self) -> dict[str, Any]:
         every = self.relations
-        columns: dict[str, Any] = {"relation": [one.kind for one in every for _ in one.values]}
-        for name in ("fn", "u_gap", "indentation", "values"):
-            columns[name] = np.concatenate([getattr(one, name) for one in every])
-        columns["measured"] = columns.pop("values")
-        return columns | {"fitted": np.concatenate(self.predicted), "sigma": np.concatenate(self.sigma)}
+        columns = {"fn": "fn", "u_gap": "u_gap", "indentation": "indentation", "measured": "values"}
+        return {
+            "relation": [one.kind for one in every for _ in one.values],
+            **{name: np.concatenate([getattr(one, own) for one in every]) for name, own in columns.items()},
+            "fitted": np.concatenate(self.predicted),
+            "sigma": np.concatenate(self.sigma),
+        }
 
 
 def fit_contact(
@@ -175,19 +184,18 @@ def fit_contact(
     if heavy is not None:
         warnings.warn(heavy, FingerspiceWarning, stacklevel=2)
     names = _wanted(parameters, relations)
-    # What is fitted in its logarithm cannot start at 0.
-    zero = {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default for name in names if own[name] == 0.0}
     # The smallest load lets any contact be that is one under some load; at rest friction takes nothing off it.
-    least = {f"{gap}.fn": min(float(relation.fn.min()) for relation in relations)}
-    least |= {f"{gap}.c2": 0.0} if {one.kind for one in relations} <= {"area", "indentation"} else {}
-    start = circuit.varied(least | {path: value for path, value in zero.items() if value is not None})
-    paths = tuple(f"{gap}.{name}" for name in names)
+    begin = {f"{gap}.fn": min(float(relation.fn.min()) for relation in relations)}
+    begin |= {f"{gap}.c2": 0.0} if {one.kind for one in relations} <= {"area", "indentation"} else {}
+    # What is fitted in its logarithm cannot start at 0.
+    begin |= {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default or 0.0 for name in names if own[name] == 0.0}
     scale = np.concatenate([np.full(one.values.size, _SHARE) if one.sigma is None else one.sigma for one in relations])
-    refuse_few(scale.size, paths)
-    start, box = bounds_of(start, paths, {named(path): pair for path, pair in (bounds or {}).items()})
-    task = ContactTask(start, tuple(map(Unknown, paths)), box, scale, gap, relations)
+    unknowns = tuple(Unknown(f"{gap}.{name}") for name in names)
+    limits = {named(path): pair for path, pair in (bounds or {}).items()}
+    start, box = bounded(circuit.varied(begin), unknowns, scale.size, limits)
+    task = ContactTask(start, unknowns, box, scale, gap, relations)
     wanted = task.profiled(profiles if isinstance(profiles, bool) else [named(path) for path in profiles])
-    task, best, pools = solved(task)
+    task, best, pools = _solved(task)
     if not best.found:
         raise InputError(
             f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data; "
@@ -195,16 +203,26 @@ def fit_contact(
         )
     # With the warnings that a user who writes these values would get.
     try:
-        fitted = circuit.replace({path: float(value) for path, value in zip(paths, best.values, strict=True)})
+        fitted = circuit.replace(dict(zip(task.names, best.values.tolist(), strict=True)))
     except InputError as refused:
         raise InputError(f"the fitted values do not go with the circuit's others: {refused.message}") from None
-    found = _result(fitted, task, best, pools)
+    (error, reach), predicted = _errors(best, pools), task.predict(best.values)
+    sized = zip(relations, predicted, task.split(task.scale), strict=True)
+    notes = _further_notes(task, best, pools)
+    found = ContactFit(
+        **estimated(task, best, error, reach, lambda names: _remedy(task, names), notes),
+        circuit=fitted,
+        gap=gap,
+        relations=relations,
+        predicted=tuple(predicted),
+        sigma=tuple(one.sigma if one.sigma is not None else share * values for one, values, share in sized),
+        freedom=scale.size - len(unknowns),
+        reach=dict(zip(task.names, reach, strict=True)),
+    )
     for relation, misfit in zip(relations, found.misfits, strict=True):
         if misfit > _TOO_MUCH:
-            said = (
-                f"the {relation.name} misses the data by {100.0 * misfit:.2g} % rms; its relation may not hold for them"
-            )
-            warnings.warn(f"{said}, or a column is in another unit", FingerspiceWarning, stacklevel=2)
+            said = f"the {relation.name} misses the data by {100.0 * misfit:.2g} % rms; its relation may not hold for"
+            warnings.warn(f"{said} them, or a column is in another unit", FingerspiceWarning, stacklevel=2)
     for path in wanted:
         found.profiles[path] = profile_of(task, best, found.estimates[path], found.reach[path] ** 2)
     return found
@@ -244,29 +262,46 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
     return tuple(name for name in PARAMETERS if name in bare)
 
 
-def _result(circuit: Circuit, task: ContactTask, best: Fitted, pools: Sequence[Pool]) -> ContactFit:
-    """The result of the best fit; `circuit` is the fitted one."""
-    covariance, predicted = covariance_of(best.by_log), task.predict(best.values)
-    error, reach = _errors(best, covariance, pools)
-    sized = [*zip(task.relations, predicted, task.split(task.scale), strict=True)]
-    return ContactFit(
-        **estimated(
-            task, best, covariance, error, reach, lambda names: _remedy(task, names), _further_notes(task, best, pools),
-        ),
-        circuit=circuit,
-        gap=task.gap,
-        relations=task.relations,
-        predicted=tuple(predicted),
-        sigma=tuple(one.sigma if one.sigma is not None else share * found for one, found, share in sized),
-        misfits=tuple(
-            float(np.sqrt(np.mean(np.log(np.maximum(found, 1e-300) / one.values) ** 2))) for one, found, _ in sized
-        ),
-        freedom=best.residual.size - len(task.unknowns),
-        reach=dict(zip(task.names, reach, strict=True)),
-    )  # fmt: skip
+class Pool(NamedTuple):
+    """Relations whose values have one standard deviation, as they come from the same instrument."""
+
+    name: str  # What was measured, in words
+    at: IntArray  # Places of their values among the residuals
+    # Number of values less what the parameters take up of them; infinity where the standard deviation is given, and
+    # does not follow from the residuals
+    freedom: float
 
 
-def _errors(best: Fitted, covariance: FloatArray, pools: Sequence[Pool]) -> tuple[FloatArray, list[float]]:
+def _solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
+    """Least squares, with the standard deviation of every pool that has none from its own residuals.
+
+    Returns the task with the standard deviations found, the fit, and the pools: ridge areas against the load come from
+    one set of images. What the parameters take up of values is the sum of their leverages.
+    """
+    from scipy.linalg import orth
+
+    members: dict[tuple[str, bool], list[tuple[str, IntArray]]] = {}
+    for relation, at in zip(task.relations, task.split(np.arange(task.scale.size)), strict=True):
+        key = relation.kind.removesuffix("_sliding"), relation.sigma is None
+        members.setdefault(key, []).append((relation.name, at))
+    begin = task.initial
+    for _ in range(_ROUNDS):
+        best, pools, scale = followed(task.residuals, task.bounds, begin), [], task.scale.copy()
+        leverage = np.sum(orth(best.by_log, _LEAST) ** 2, axis=1)
+        for (_, unknown), own in members.items():
+            at = np.concatenate([at for _, at in own])
+            freedom = at.size - float(leverage[at].sum()) if unknown else math.inf
+            pools.append(Pool(" and the ".join(name for name, _ in own), at, freedom))
+            if _FEWEST <= freedom < math.inf:
+                spread = float(np.sqrt(np.sum(best.residual[at] ** 2) / freedom))
+                scale[at] = np.maximum(scale[at] * spread, _LEAST)
+        if np.abs(np.log(scale / task.scale)).max() < _SETTLED:
+            break
+        task, begin = replace(task, scale=scale), best.values
+    return task, best, pools
+
+
+def _errors(best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, list[float]]:
     """Standard errors of the logarithms, and Student's t with the degrees of freedom of Satterthwaite.
 
     (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946.) Each pool has its own variance, known from its own
@@ -274,12 +309,13 @@ def _errors(best: Fitted, covariance: FloatArray, pools: Sequence[Pool]) -> tupl
     """
     from scipy.stats import norm, t
 
+    covariance = best.covariance
     parts = np.array([np.sum((covariance @ best.by_log[pool.at].T) ** 2, axis=1) for pool in pools])
     error, reach = np.sqrt(np.diag(covariance)), []
     for k, own in enumerate(parts.T):
-        shares = own / max(float(own.sum()), 1e-300)
-        felt = [(share, pool.freedom) for share, pool in zip(shares.tolist(), pools, strict=True) if share > _NO_PART]
-        inverse = sum(share**2 / left if left >= FEWEST else math.inf for share, left in felt)
+        shares = zip((own / max(float(own.sum()), 1e-300)).tolist(), (pool.freedom for pool in pools), strict=True)
+        felt = [(share, left) for share, left in shares if share > _NO_PART]
+        inverse = sum(share**2 / left if left >= _FEWEST else math.inf for share, left in felt)
         if math.isinf(inverse):
             error[k] = math.inf
             reach.append(math.inf)
@@ -291,7 +327,7 @@ def _errors(best: Fitted, covariance: FloatArray, pools: Sequence[Pool]) -> tupl
 def _further_notes(task: ContactTask, best: Fitted, pools: Sequence[Pool]) -> list[str]:
     found = []
     for pool in pools:
-        if pool.freedom < FEWEST:
+        if pool.freedom < _FEWEST:
             found.append(
                 f"Of the {pool.name} there are hardly more values ({pool.at.size}) than parameters, which leaves no "
                 "measure of their errors: measure more of them, or give sigma."

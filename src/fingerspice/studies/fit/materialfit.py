@@ -17,7 +17,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.physics.ladder import Ladder
 from fingerspice.physics.materials import EPS0
-from fingerspice.studies.fit.materialdata import ALLOWED, COLUMNS, likely_slips, read_table
+from fingerspice.studies.fit.measured import ALLOWED, COLUMNS, likely_slips, read_table
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -241,7 +241,19 @@ def fit_material(
         y = data.admittivity(f)
         consistency, doubt = _consistency(f, y), ""
     else:
-        table = _checked(read_table(Path(data)) if isinstance(data, (str, Path)) else data)
+        # Rows of frequency (Hz, ascending), resistivity (ohm m) and relative permittivity.
+        data = read_table(Path(data)) if isinstance(data, (str, Path)) else data
+        table = real_numbers("material data", data, f"rows of {ALLOWED}, or a file")
+        allowed = "rows of f, rho, eps_r"
+        require(table.ndim == 2 and table.shape[1] == 3, "material data", f"of shape {table.shape}", allowed)
+        require(table.shape[0] >= 3, "material data", f"{table.shape[0]} rows", "three frequencies or more")
+        for column, name in zip(table.T, COLUMNS, strict=True):
+            bad = np.flatnonzero(~((column >= _LEAST) & (column <= _MOST)))
+            if bad.size:
+                allowed = f"more than 0, from {_LEAST:g} to {_MOST:g}"
+                raise InputError(f"{name} in row {bad[0] + 1} is {column[bad[0]]:g}; allowed: {allowed}")
+        table = table[np.argsort(table[:, 0])]
+        require(bool(np.all(np.diff(table[:, 0]) > 0.0)), "frequencies", "repeated", "each once")
         f, y = _admittivity(table)
         consistency = _consistency(f, y)
         doubt = _doubt(table, consistency)
@@ -264,25 +276,6 @@ def fit_material(
     if rms > max(NOTABLE, 1.05 * consistency.rms):
         warnings.warn(f"{said}; more poles would come nearer", FingerspiceWarning, stacklevel=2)
     return MaterialFit(ladder, rms, float(misfit.max()), f, misfit, consistency, y)
-
-
-def _checked(data: ArrayLike) -> FloatArray:
-    """Rows of frequency (Hz, ascending), resistivity (ohm m) and relative permittivity."""
-    table = real_numbers("material data", data, f"rows of {ALLOWED}, or a file")
-    require(
-        table.ndim == 2 and table.shape[1] == 3, "material data", f"of shape {table.shape}", "rows of f, rho, eps_r"
-    )
-    require(table.shape[0] >= 3, "material data", f"{table.shape[0]} rows", "three frequencies or more")
-    for column, name in enumerate(COLUMNS):
-        bad = np.flatnonzero(~((table[:, column] >= _LEAST) & (table[:, column] <= _MOST)))
-        if bad.size:
-            raise InputError(
-                f"{name} in row {bad[0] + 1} is {table[bad[0], column]:g}; allowed: more than 0, from {_LEAST:g} to "
-                f"{_MOST:g}"
-            )
-    table = table[np.argsort(table[:, 0])]
-    require(bool(np.all(np.diff(table[:, 0]) > 0.0)), "frequencies", "repeated", "each once")
-    return table
 
 
 def _admittivity(table: FloatArray) -> tuple[FloatArray, ComplexArray]:

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 # Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
 # the error of a parameter, in its logarithm, from which on nothing is known of it.
 _TOGETHER, _NOTABLE, _UNKNOWN = 0.98, 0.05, 0.7
-# Singular values of the derivatives below this share of the largest are rounding.
-_LEAST = 1e-9
 # A value this close to a bound, relative, is at it.
 _AT_BOUND = 1e-6
 # An interval that reaches farther than this, in the logarithm, has no ends.
@@ -138,9 +136,9 @@ class FitResult(Shown):
         named = itertools.combinations(enumerate(self.estimates), 2)
         return [(a, b, float(self.correlation[i, j])) for (i, a), (j, b) in named]
 
-    @property
-    def _effort(self) -> str:
-        return f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
+    def _head(self, values: str) -> str:
+        effort = f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
+        return f"{len(self.estimates)} parameters fitted to {values}, {effort}"
 
     def _lines(self) -> list[str | Table]:
         """Table of the parameters, correlations, profiles and notes, as a report has them."""
@@ -168,8 +166,7 @@ class FitResult(Shown):
         As there, the criteria of Akaike and Bayes are n log(chi-square / n) + 2 k, and + k log(n), of n data and k
         parameters.
         """
-        estimates, square, count = self.estimates, self.objective, self._count
-        k, freedom = len(estimates), count - len(estimates)
+        estimates, square, count, k = self.estimates, self.objective, self._count, len(self.estimates)
         level = count * math.log(max(square, 1e-300) / count)
         wide = max(map(len, estimates)) + 1
         lines = [
@@ -179,7 +176,7 @@ class FitResult(Shown):
             f"    # data points      = {count}",
             f"    # variables        = {k}",
             f"    chi-square         = {square:.8g}",
-            f"    reduced chi-square = {square / freedom if freedom > 0 else math.inf:.8g}",
+            f"    reduced chi-square = {square / (count - k) if count > k else math.inf:.8g}",
             f"    Akaike info crit   = {level + 2.0 * k:.8g}",
             f"    Bayesian info crit = {level + k * math.log(count):.8g}",
             "[[Variables]]",
@@ -202,25 +199,13 @@ class FitResult(Shown):
             "objective": self.objective,
             "notes": list(self.notes),
             "profiles": [
-                {**vars(one), "values": one.values.tolist(), "objective": one.objective.tolist()}
-                for one in self.profiles.values()
+                {name: np.asarray(x).tolist() for name, x in vars(one).items()} for one in self.profiles.values()
             ],
         }
 
 
-def covariance_of(by_log: FloatArray) -> FloatArray:
-    """Covariance of the logarithms of the parameters, for residuals of variance 1.
-
-    Combinations of parameters that no datum feels have a large variance, and not an infinite one, of which no
-    correlation would be known.
-    """
-    _, singular, right = np.linalg.svd(by_log, full_matrices=False)
-    spread = 1.0 / np.maximum(singular, _LEAST * max(float(singular.max()), 1e-300))
-    return np.asarray((right.T * spread**2) @ right)
-
-
 def estimated(
-    task: Problem, best: Fitted, covariance: FloatArray, error: FloatArray, reach: Sequence[float],
+    task: Problem, best: Fitted, error: FloatArray, reach: Sequence[float],
     remedy: Callable[[tuple[str, ...]], str], more: Sequence[str],
 ) -> dict[str, Any]:  # fmt: skip
     """Fields of a `FitResult` from the best fit.
@@ -234,13 +219,12 @@ def estimated(
     ):
         at_bound = bool(np.any(np.abs(value / box[np.isfinite(box) & (box > 0.0)] - 1.0) < _AT_BOUND))
         ratio = math.exp(far * off) if far * off < _NO_END else math.inf
-        unit = task.circuit.parameters[one.path].unit
-        estimates[one.name] = Estimate(
-            one.name, unit, value, start, value * off, value / ratio, value * ratio, at_bound
-        )  # fmt: skip
+        name, unit = one.name, task.circuit.parameters[one.path].unit
+        estimates[name] = Estimate(name, unit, value, start, value * off, value / ratio, value * ratio, at_bound)
         if at_bound:
             own = f"{value:g} {unit}".rstrip()
-            notes.append(f"{one.name} is at its bound, {own}: its interval is not that of a free parameter.")
+            notes.append(f"{name} is at its bound, {own}: its interval is not that of a free parameter.")
+    covariance = best.covariance
     spread = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(spread, spread)
     for (i, a), (j, b) in itertools.combinations(enumerate(estimates), 2):
@@ -309,12 +293,11 @@ def profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profi
         with np.errstate(divide="ignore"):
             farthest = min(math.log(FARTHEST), abs(float(np.log(bound)) - here))
         near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
-        while look(here + sign * far) <= limit:
-            if far >= farthest:
-                opened.append(word)
-                ends.append(bound)
-                break
+        while look(here + sign * far) <= limit and far < farthest:
             near, far = far, min(_GROWTH * far, farthest)
+        if look(here + sign * far) <= limit:
+            opened.append(word)
+            ends.append(bound)
         else:
             away = brentq(beyond, near, far, args=(sign,), xtol=_END * far, rtol=1e-6)
             ends.append(math.exp(here + sign * away))
