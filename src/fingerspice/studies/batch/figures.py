@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.circuit.circuit import Circuit
-from fingerspice.engine.lockstep.march import put_traces, trace_changes
 from fingerspice.engine.lockstep.step import ALL_MOMENTS
-from fingerspice.results.outcome import ErrorEstimate
-from fingerspice.results.solution import Solution
-from fingerspice.solve.simulation import simulate
-from fingerspice.studies.batch.form import FIGURES, LockstepForm
+from fingerspice.studies.batch.form import FIGURES
 from fingerspice.studies.batch.ladder import Ladder, Level, Run
-from fingerspice.studies.batch.task import SIGNALS_OF_BATCH, Answers, Task
-from fingerspice.studies.steady import SteadyState, steady_state
 
 # The relative round-off added to every stated error.
 _ROUNDING = 1e-11
@@ -45,15 +35,11 @@ class Figures(Ladder):
     named = ""
     unmet = "what does not end after half periods or at a sample, or does not meet its error in lockstep"
 
-    def __init__(
-        self, task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], members: IntArray, found: Answers
-    ) -> None:
-        self.traced = task.traced
-        self.names = [name for name in task.outputs if name != "u_gap"]
-        # Rows of the moments that the figures need
+    def prepare(self) -> None:
+        """Find the rows of the moments that the figures need."""
+        self.names = [name for name in self.task.outputs if name != "u_gap"]
         self.needed = sorted({i for name in self.names for i in FIGURES[name.removesuffix("_periodic")][0]} or {0})
         self.n_moment = ALL_MOMENTS if self.needed[-1] else 1
-        super().__init__(task, form, scenes, members, found)
 
     def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
         """Of the moments, those of the last period are the second ones."""
@@ -62,9 +48,10 @@ class Figures(Ladder):
             first = self.n_moment if name.endswith("_periodic") or self.task.periodic else 0
             moments = run.fine[first : first + self.n_moment, good]
             self.found.values[name][self.members[at]] = self.figure(name, moments, at)
-        if self.traced:
-            every, places = level.steps // self.task.points, self.members[at]
-            put_traces(run.trace, np.flatnonzero(good), every, places, self.found.values["u_gap"])
+        if self.task.traced:
+            u, some = self.found.values["u_gap"], run.trace[good, :: level.steps // self.task.points]
+            u[self.members[at], : some.shape[1]] = some
+            u[self.members[at], some.shape[1] :] = np.nan
 
     def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
         """The largest of all outputs, relative to themselves."""
@@ -82,13 +69,12 @@ class Figures(Ladder):
                 last = np.abs(run.fine[later])
                 changes.append(np.abs(run.fine[later] - run.coarse[later]) / np.where(last > 0.0, last, 1.0))
             changes.append(change / np.where(size > 0.0, size, 1.0))
-        if self.traced:
-            off = np.empty(peak.size)
-            trace_changes(run.trace, run.trace_coarse, off)
+        if self.task.traced:
+            off = np.abs(run.trace[:, : 2 * run.trace_coarse.shape[1] : 2] - run.trace_coarse).max(axis=1)
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
         change = np.max(changes, axis=0) + run.coarse[-1]
-        share = self._share(level, self.mesh.decays[pending], self.mesh.least[pending])
+        share = self._share(level, self.decays[pending], self.least[pending])
         return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING)
 
     def _share(self, level: Level, decays: FloatArray, least: FloatArray) -> FloatArray | float:
@@ -99,39 +85,7 @@ class Figures(Ladder):
         if self.form.jumping:
             return _STATED_JUMPING
         own, stiff = (next(s for rtol, s in shares if self.task.rtol >= rtol) for shares in (_STATED, _STATED_STIFF))
-        own = _STATED_TRACED if self.traced else own
+        own = _STATED_TRACED if self.task.traced else own
         share = np.where(2.0 * decays > _STIFF * level.steps, max(own, stiff), own)
         # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
         return np.where(least > decays, _STATED_STARTED, share)
-
-    @staticmethod
-    def alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
-        """The outputs from one run, and their stated error."""
-        ran: Solution | SteadyState
-        if task.periodic:
-            ran = steady_state(circuit, rtol=rtol, points=task.points, charge=False)
-            trace = ran.solution if task.traced else None
-        else:
-            stop, t = task.stop(frequency), None
-            if task.traced:
-                t = np.arange(math.ceil(stop * frequency * task.points - 1e-9)) / (frequency * task.points)
-            ran = trace = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False)
-        values = {}
-        for name in task.outputs:
-            if name == "u_gap":
-                assert trace is not None
-                u = np.asarray(trace.u_gap)
-                values[name] = u[:-1] if task.periodic else u
-                continue
-            signal = next(s for s in SIGNALS_OF_BATCH if name.startswith(f"{s}_"))
-            value = ran._figures.value(signal, name[len(signal) + 1 :])
-            values[name] = np.asarray(math.nan if value is None else value, float)
-        return values, error_of(ran)
-
-
-def error_of(ran: Solution | SteadyState) -> float:
-    """Stated error of the gap voltage relative to its peak, or of the force relative to its mean, if that is larger."""
-    error: ErrorEstimate = ran.error
-    pairs = (error.u_gap, ran.u_gap_peak), (error.f_el, ran.f_el_mean)
-    sizes = [float(np.min(size)) if size is not None else 0.0 for _, size in pairs]
-    return max((off / size for (off, _), size in zip(pairs, sizes, strict=True) if size > 0.0), default=0.0)

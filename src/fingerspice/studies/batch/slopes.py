@@ -7,20 +7,12 @@ derivative.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.circuit.circuit import Circuit
 from fingerspice.numerics.small import STEP
-from fingerspice.results.solution import Solution
-from fingerspice.solve.simulation import simulate
-from fingerspice.studies.batch.figures import error_of
-from fingerspice.studies.batch.form import LockstepForm, table_of
+from fingerspice.studies.batch.form import table_of
 from fingerspice.studies.batch.ladder import Ladder, Level, Run
-from fingerspice.studies.batch.task import Answers, Task
-from fingerspice.studies.steady import SteadyState, steady_state
 
 # A run of degree d has this rounding error, relative, besides 2^d times 1e-16: the area's polynomial's coefficients
 # lose a digit in two to the rounding with every power.
@@ -44,30 +36,26 @@ class Slopes(Ladder):
     named = "gradients: "
     unmet = "what does not end after half periods, or does not meet its error in lockstep"
 
-    def __init__(
-        self, task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], members: IntArray, found: Answers
-    ) -> None:
-        assert task.gradients is not None
-        super().__init__(task, form, scenes, members, found)
-        self.wanted = task.gradients
-        self.given = np.array([scenes[path.lower()] for path in self.wanted.paths])  # (n_parameter, n)
-        self.mesh = self.mesh._replace(
-            possible=self.mesh.possible & (np.isfinite(self.given) & (self.given != 0.0)).all(axis=0)
-        )
+    def prepare(self) -> None:
+        """Make the copies of the scenes."""
+        assert self.task.gradients is not None
+        self.wanted = self.task.gradients
+        self.given = np.array([self.scenes[path.lower()] for path in self.wanted.paths])  # (n_parameter, n)
+        self.possible &= (np.isfinite(self.given) & (self.given != 0.0)).all(axis=0)
         self.copies = 2 * len(self.wanted.paths)
-        moved = {path: np.tile(array, (2, len(self.wanted.paths), 1)) for path, array in scenes.items()}
+        moved = {path: np.tile(array, (2, len(self.wanted.paths), 1)) for path, array in self.scenes.items()}
         for k, path in enumerate(self.wanted.paths):
             for other in self.wanted.together[path]:
                 for side, sign in enumerate((-1.0, 1.0)):
                     moved[other.lower()][side, k] *= 1.0 + sign * STEP
         self.scenes = {path: array.ravel() for path, array in moved.items()}
-        self.table = table_of(form, self.scenes)
+        self.table = table_of(self.form, self.scenes)
 
     def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
         """Per unit of the parameter."""
         at = pending[good]
         _, change = self._changes(run.fine[0], pending)
-        for j, name in enumerate(self.wanted.outputs):
+        for j, name in enumerate(self.task.outputs):
             self.found.values[name][self.members[at]] = (change[j][:, good] / self.given[:, at]).T
 
     def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
@@ -90,33 +78,7 @@ class Slopes(Ladder):
 
         `mean` is the mean of u^2 A in all copies of the scenes.
         """
-        columns, outputs = self.columns(pending), self.wanted.outputs
+        columns, outputs = self.columns(pending), self.task.outputs
         values = np.array([self.figure(name, mean[None], columns) for name in outputs])
         low, high = np.moveaxis(values.reshape(len(outputs), 2, len(self.wanted.paths), -1), 1, 0)
         return np.abs(0.5 * (low + high)), (high - low) / (2.0 * STEP)
-
-    @staticmethod
-    def alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
-        """The derivatives from one run, and their stated error."""
-        wanted = task.gradients
-        assert wanted is not None
-        paths = tuple(dict.fromkeys(other for path in wanted.paths for other in wanted.together[path]))
-        ran: Solution | SteadyState
-        stop = task.stop(frequency)
-        if task.periodic:
-            ran = steady_state(circuit, rtol=rtol, points=4, charge=False, sensitivities=paths)
-        else:
-            ran = simulate(circuit, t_stop=stop, t_eval=[stop], rtol=rtol, charge=False, sensitivities=paths)
-        values = {}
-        for name in wanted.outputs:
-            # For a change of each parameter by all of itself.
-            each = {p: getattr(ran.sensitivities[p], name) * circuit.parameters[p].value for p in paths}
-            by = [sum(each[other] for other in wanted.together[path]) for path in wanted.paths]
-            if wanted.clock is not None and task.periods is not None and isinstance(ran, Solution):
-                # The run ends after a number of periods: its end moves with the frequency, and the mean with its end.
-                start = circuit.tran.start if circuit.tran is not None else 0.0
-                gained = float(getattr(ran, name.removesuffix("_mean"))[-1]) - float(getattr(ran, name))
-                by[wanted.paths.index(wanted.clock)] -= gained * stop / (stop - start)
-            values[name] = np.array([x / circuit.parameters[p].value for x, p in zip(by, wanted.paths, strict=True)])
-        # Their error, as that of a change by all of the parameter, is about ten times that of the run.
-        return values, Slopes.limit * error_of(ran)
