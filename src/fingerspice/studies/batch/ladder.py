@@ -10,7 +10,7 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.lockstep.card import march_on_card
-from fingerspice.engine.lockstep.march import march, new_stepping
+from fingerspice.engine.lockstep.march import march
 from fingerspice.engine.lockstep.samples import N_PORTION, march_samples
 from fingerspice.engine.lockstep.scenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
 from fingerspice.engine.lockstep.step import START_TIMES, marks_of
@@ -211,25 +211,21 @@ class Ladder(ABC):
         widths = [halves * n // 2 if self.task.traced else 0 for n in sizes]
         traces = np.empty((columns.size, widths[0])), np.empty((columns.size, widths[1]))
         lengths = form.cells - 1, waves[1].shape[1], form.places[1].size, level.degree + 1, self.n_moment
-        marks, rows = marks_of(*lengths), self.table.shape[0]
+        marks, scenes = marks_of(*lengths), (self.table, columns, form.places, curves)
+        block = new_block(self.table.shape[0], level.pieces, marks)
         if form.recording is not None:
             out = np.empty((2, (1 + N_PORTION) * self.n_moment + 3, columns.size))
             values = form.recording.between(0, halves + 1) / peak_of(form.recording)
-            how_sampled = sizes, level.covered
-            march_samples(
-                self.table, columns, form.places, curves, values, how_sampled, new_block(rows, marks), out, marks
-            )
+            march_samples(scenes, values, (sizes, level.covered), block, out, marks)
         else:
             source = np.array(form.multiples, float), waves
             tol = (_CLOSING if task.periodic else _SETTLED) * (task.rtol * self.closer)
             how = halves, steps // 2, level.pieces, task.periodic, tol, level.covered
             if task.device == "cuda":
-                most = _MOST_PIECES if form.jumping else 0
-                out = march_on_card(self.table, columns, form.places, curves, source, how, most, lengths)
+                out = march_on_card(scenes, source, how, _MOST_PIECES if form.jumping else 0, lengths)
             else:
                 out = np.empty((2, 2 * self.n_moment + 3, columns.size))
-                block, stepping = new_block(rows, marks), new_stepping(level.pieces, marks)
-                march(self.table, columns, form.places, curves, source, how, block, stepping, out, traces, marks)
+                march(scenes, source, how, block, out, traces, marks)
         if before is None:
             return Run(out[0], out[1], traces[0], traces[1])
         return Run(before.fine, out[1], before.trace, traces[1])
