@@ -20,12 +20,11 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
-from fingerspice.solve.simulation import RTOL_RANGE
-from fingerspice.studies.batch.alone import run_alone
-from fingerspice.studies.batch.figures import Figures
+from fingerspice.results.solution import Solution
+from fingerspice.solve.simulation import RTOL_RANGE, simulate
+from fingerspice.studies.batch.figures import Figures, Slopes
 from fingerspice.studies.batch.form import LockstepForm, lockstep_form, why_alone
 from fingerspice.studies.batch.ladder import Ladder
-from fingerspice.studies.batch.slopes import Slopes
 from fingerspice.studies.batch.task import (
     FAILED,
     ONE_BY_ONE,
@@ -33,12 +32,14 @@ from fingerspice.studies.batch.task import (
     SIGNALS_OF_BATCH,
     STATUS_NAMES,
     Answers,
+    Gradients,
     Task,
     checked_scenes,
     frequencies,
     gradients_of,
     task_of,
 )
+from fingerspice.studies.steady import SteadyState, steady_state
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -226,11 +227,11 @@ def _find_alone(
         rtol, found.done[i] = max(_OVER_PEAK * task.rtol, finest), True
         try:
             circuit = task.circuit.varied({path: float(array[i]) for path, array in scenes.items()})
-            values, error = run_alone(task, circuit, float(frequency[i]), rtol)
+            values, error = _run_alone(task, circuit, float(frequency[i]), rtol)
             if error > allowed and rtol > finest:
                 # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
                 closer = max(0.5 * rtol * allowed / error, finest)
-                values, error = run_alone(task, circuit, float(frequency[i]), closer)
+                values, error = _run_alone(task, circuit, float(frequency[i]), closer)
         except (InputError, SolveError) as failure:
             found.status[i] = REFUSED if isinstance(failure, InputError) else FAILED
             found.messages[i] = f"{ladder.named}{failure}"
@@ -248,6 +249,57 @@ def _find_alone(
                 # Several gaps have one column each.
                 found.values[name] = np.full((found.error.size, value.size), np.nan)
             found.values[name][(i, slice(value.size)) if value.ndim == 1 else i] = value
+
+
+def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
+    """What is wanted of a scene from one run, and its stated error; `frequency` (Hz) is that of its periods."""
+    wanted, stop, t = task.gradients, task.stop(frequency), None
+    paths = () if wanted is None else tuple(dict.fromkeys(p for path in wanted.paths for p in wanted.together[path]))
+    ran: Solution | SteadyState
+    if task.periodic:
+        points = task.points if wanted is None else 4
+        ran = steady_state(circuit, rtol=rtol, points=points, charge=False, sensitivities=paths)
+        trace = ran.solution if task.traced else None
+    else:
+        if wanted is not None:
+            t = np.array([stop])
+        elif task.traced:
+            t = np.arange(math.ceil(stop * frequency * task.points - 1e-9)) / (frequency * task.points)
+        ran = trace = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False, sensitivities=paths)
+    # Largest of the errors of the gap voltage relative to its peak, and of the force relative to its mean.
+    pairs = (ran.error.u_gap, ran.u_gap_peak), (ran.error.f_el, ran.f_el_mean)
+    sizes = [(off, 0.0 if size is None else float(np.min(size))) for off, size in pairs]
+    error = max((off / size for off, size in sizes if size > 0.0), default=0.0)
+    if wanted is not None:
+        # The error of a change by all of the parameter is about ten times that of the run.
+        return {name: _slopes_of(task, wanted, circuit, ran, name, stop) for name in task.outputs}, Slopes.limit * error
+    values = {}
+    for name in task.outputs:
+        if name == "u_gap":
+            assert trace is not None
+            u = np.asarray(trace.u_gap)
+            values[name] = u[:-1] if task.periodic else u
+            continue
+        signal = next(s for s in SIGNALS_OF_BATCH if name.startswith(f"{s}_"))
+        value = ran._figures.value(signal, name[len(signal) + 1 :])
+        values[name] = np.asarray(math.nan if value is None else value, float)
+    return values, error
+
+
+def _slopes_of(
+    task: Task, wanted: Gradients, circuit: Circuit, ran: Solution | SteadyState, name: str, stop: float
+) -> FloatArray:
+    """Derivatives of a mean by the parameters `wanted`."""
+    known = circuit.parameters
+    # For a change of each parameter by all of itself.
+    each = {path: getattr(one, name) * known[path].value for path, one in ran.sensitivities.items()}
+    by = [sum(each[other] for other in wanted.together[path]) for path in wanted.paths]
+    if wanted.clock is not None and task.periods is not None and isinstance(ran, Solution):
+        # The run ends after a number of periods: its end moves with the frequency, and the mean with its end.
+        start = circuit.tran.start if circuit.tran is not None else 0.0
+        gained = float(getattr(ran, name.removesuffix("_mean"))[-1]) - float(getattr(ran, name))
+        by[wanted.paths.index(wanted.clock)] -= gained * stop / (stop - start)
+    return np.array([x / known[path].value for x, path in zip(by, wanted.paths, strict=True)])
 
 
 def _jobs(task: Task, count: FloatArray, chosen: BoolArray, recorded: bool) -> list[tuple[int, IntArray]]:

@@ -19,8 +19,9 @@ from fingerspice.studies.batch.task import LOCKSTEP, Answers, Task
 
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
 # and (of the highest) under several; and initial degree of the area's polynomial, of which each takes the compiler 8 s.
-_RUNGS = ((5e-4, 40, 32, 8), (5e-5, 64, 48, 8), (5e-6, 96, 96, 12), (5e-7, 144, 144, 12), (0.0, 144, 144, 24))
-HIGHEST_DEGREE, _MOST_STEPS = 24, 8192
+_RUNGS = ((5e-4, 40, 32, 8), (5e-5, 64, 48, 8), (5e-6, 96, 96, 16), (5e-7, 144, 144, 16), (0.0, 144, 144, 24))
+# By how much that grows with every doubling of the steps, its highest, and the largest number of steps.
+_MORE_DEGREE, HIGHEST_DEGREE, _MOST_STEPS = 8, 24, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
 # Largest gap voltage that the area's polynomial covers, as a ratio to its estimate: the second one for scenes that the
@@ -76,8 +77,7 @@ class Ladder(ABC):
     closer = 1.0  # Factor on the tolerance that ends the search for a periodic state
     # As an estimate may be small by chance, doubling the steps may not reduce it by more than this factor.
     most_gain: float
-    # By how much the degree of the area's polynomial grows from level to level, and the highest one.
-    more_degree, highest_degree = HIGHEST_DEGREE, HIGHEST_DEGREE
+    highest_degree = HIGHEST_DEGREE  # Of the area's polynomial
     gives_up = True  # Whether scenes are given up for which more steps are no help
     named: str  # What comes before the message of a scene that cannot be run
     unmet: str  # Why scenes of a form that lockstep takes may have no result from it
@@ -156,7 +156,7 @@ class Ladder(ABC):
             kept = np.tile(left, self.copies)
             before = Run(run.fine[:, kept], run.fine[:, kept], run.trace[kept], run.trace[kept])
             last, pending = error[left], pending[left]
-            degree = max(level.degree, min(level.degree + self.more_degree, self.highest_degree))
+            degree = max(level.degree, min(level.degree + _MORE_DEGREE, self.highest_degree))
             level = level._replace(steps=2 * level.steps, degree=degree)
         return np.concatenate(outside)
 
@@ -170,7 +170,9 @@ class Ladder(ABC):
         if self.form.recording is not None:
             steps = _PARTS[0]
         if self.task.traced:
-            steps = self.task.points * -(-steps // self.task.points)
+            # Half of the steps, too, are an even number.
+            points = self.task.points * (1 if self.task.points % 4 == 0 else 2)
+            steps = points * -(-steps // points)
         return Level(halves, pieces, covered, steps, degree)
 
     def _look(self) -> None:
