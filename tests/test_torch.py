@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-import importlib.util
-import re
+import runpy
 import subprocess
 import sys
 import warnings
@@ -313,26 +312,10 @@ except fs.InputError as error:
     assert done.stdout == "fingerspice.torch needs torch, which is not installed; pip install 'fingerspice[torch]'\n"
 
 
-def test_the_code_of_the_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (ROOT / "docs" / "torch.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    assert page.count("```") == 2 * len(blocks)
-    monkeypatch.chdir(ROOT)
-    names: dict[str, Any] = {}
-    for block in blocks:
-        exec(block, names)
-    d, r = (names["model"].value(path).item() for path in ("Xgap.d", "Xgap.r"))
-    assert (d, r) == (pytest.approx(3.1e-6, rel=1e-4), pytest.approx(0.7e6, rel=1e-4))
-
-
 def test_the_example_learns_a_drive() -> None:
-    spec = importlib.util.spec_from_file_location("learned_drive", CIRCUITS / "learned_drive.py")
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    module = script.simulator()
-    deviations = script.learn(module, 20)
+    script = runpy.run_path(str(CIRCUITS / "learned_drive.py"))
+    module = script["simulator"]()
+    deviations = script["learn"](module, 20)
     assert deviations[-1] < 0.66 * deviations[0]
     # Where 150 steps lead.
     found = [getattr(module, f"V{k}_amplitude").item() for k in (1, 3, 5, 7)]

@@ -179,7 +179,7 @@ def _slopes(task: Task, scenes: Mapping[str, FloatArray], figures: Answers, pool
     assert wanted is not None
     found = Answers.empty({name: np.full((n, len(wanted.paths)), np.nan) for name in task.outputs}, n)
     failed = figures.status >= REFUSED
-    found.status[failed], found.done[failed] = figures.status[failed], True
+    found.status[failed] = figures.status[failed]
     every = {**scenes, **{path: np.full(n, known[path].value) for path in wanted.paths if path not in scenes}}
     form = lockstep_form(task.circuit, every)
     why = why_alone(form, task.outputs, task.rtol)
@@ -205,8 +205,8 @@ def _find(
             ladder(task, form, some, members, found).climb(halves)
 
         # Jobs have no scene in common, so that threads write to different places.
-        list(pool.map(climb, _jobs(task, task.count(clock), ~found.done, recorded)))
-    rest = np.flatnonzero(~found.done)
+        list(pool.map(climb, _jobs(task, task.count(clock), found.status < 0, recorded)))
+    rest = np.flatnonzero(found.status < 0)
     if task.traced:
         found.values["u_gap"][rest] = np.nan
     if rest.size:
@@ -224,7 +224,7 @@ def _find_alone(
     allowed, finest = ladder.limit * task.rtol, RTOL_RANGE[0]
 
     def alone(i: int) -> tuple[int, dict[str, FloatArray]]:
-        rtol, found.done[i] = max(_OVER_PEAK * task.rtol, finest), True
+        rtol = max(_OVER_PEAK * task.rtol, finest)
         try:
             circuit = task.circuit.varied({path: float(array[i]) for path, array in scenes.items()})
             values, error = _run_alone(task, circuit, float(frequency[i]), rtol)

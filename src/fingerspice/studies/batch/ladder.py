@@ -142,7 +142,7 @@ class Ladder(ABC):
             good = (error <= ENOUGH * self.limit * rtol) & resolved & (before is not None or not doubtful)
             self.enter(level, run, pending, good)
             at = self.members[pending[good]]
-            found.error[at], found.status[at], found.done[at] = error[good] / self.stated, LOCKSTEP, True
+            found.error[at], found.status[at] = error[good] / self.stated, LOCKSTEP
             tail = run.fine[-1].reshape(self.copies, -1)
             beyond, left = np.isinf(tail).any(axis=0), ~good
             if self.gives_up:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import BoolArray, FloatArray, positive_number, real_numbers, whole_number
+from fingerspice.base.arrays import FloatArray, positive_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
@@ -79,8 +79,7 @@ class Answers:
     # (n,) each, (n, n_parameter) for derivatives, or (n, width) for gap voltages, which become NaN last
     values: dict[str, FloatArray]
     error: FloatArray  # (n,): Stated error, of outputs relative to themselves
-    status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`
-    done: BoolArray  # (n,): Whether results have been entered
+    status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`, and -1 before results have been entered
     messages: dict[int, str] = field(default_factory=dict)  # Of the scenes without a result
     ordinary: str = ""  # Why some scenes were not in lockstep
 
@@ -92,7 +91,7 @@ class Answers:
     @classmethod
     def empty(cls, values: dict[str, FloatArray], n: int) -> Answers:
         """Answers of n scenes, none of them done."""
-        return cls(values, np.full(n, np.nan), np.full(n, ONE_BY_ONE, np.int8), np.zeros(n, bool))
+        return cls(values, np.full(n, np.nan), np.full(n, -1, np.int8))
 
 
 def task_of(
