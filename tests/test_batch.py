@@ -10,6 +10,7 @@ from scipy.integrate import quad
 
 import analytic as ref
 import fingerspice as fs
+from batches import check, population, singles, singly
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.engine.lockstep.step import marks_of
 from fingerspice.engine.lockstep.weights import moment_integrals, weigh
@@ -18,92 +19,59 @@ from scenes import cases, table1
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 OUTPUTS = ("f_el_mean", "f_el_mean_periodic", "f_t_rms", "u_gap_rms")
 # A loop is compiled, in ten seconds, for every number of modes, tones, moments and powers of the area's polynomial, of
-# which there are 24 at 4e-7, 8 or 24 at 1e-4, and 12 or 24 at 1e-6.
-ONE_DEGREE = (4e-7, 1e-4, 1e-6)[: cases(3, 1)]
+# which there are 8 at first, below an rtol of 5e-5 16, and below 5e-7 24. So squares go without root mean squares, for
+# which three moments are followed instead of one.
+FEW = OUTPUTS[: cases(4, 2)]
 
 
 def square() -> Circuit:
     return table1().replace({"Vdrive": fs.Square(200.0, 100.0)})
 
 
-def population(n: int, seed: int) -> dict[str, np.ndarray]:
-    """Fingers and drives that differ widely."""
-    rng = np.random.default_rng(seed)
-    return {
-        "Vdrive.frequency": 10.0 ** rng.uniform(np.log10(20.0), 4.0, n),
-        "Vdrive.amplitude": rng.uniform(50.0, 300.0, n),
-        "Xgap.r": 1e6 * 10.0 ** rng.uniform(-1.0, 1.0, n),
-        "Xcoat.r": 2e5 * 10.0 ** rng.uniform(-1.0, 1.0, n),
-        "Xgap.fn": rng.uniform(0.1, 2.0, n),
-        "Xgap.d": rng.uniform(2e-6, 6e-6, n),
-    }
+BOTH = pytest.mark.parametrize(("circuit", "outputs"), [(table1(), OUTPUTS), (square(), FEW)], ids=["sine", "square"])
 
 
-def scene(circuit: Circuit, parameters: dict[str, Any], i: int) -> Circuit:
-    changes = {path: float(values[i]) for path, values in parameters.items()}
-    followed = {"Xskin.f": changes["Vdrive.frequency"]} if "Vdrive.frequency" in changes else {}
-    return circuit.varied({**followed, **changes})
-
-
-def singly(
-    circuit: Circuit, parameters: dict[str, Any], outputs: tuple[str, ...], periods: float | None = None
-) -> np.ndarray:
-    """The outputs of single runs at a tolerance far below any here, shape (n_output, n_scene)."""
-    rows = []
-    for i in range(next(iter(parameters.values())).size):
-        stop = None if periods is None else periods / parameters["Vdrive.frequency"][i]
-        summary = fs.simulate(scene(circuit, parameters, i), t_stop=stop, rtol=1e-11, charge=False).summary()
-        rows.append([summary[name] for name in outputs])
-    return np.array(rows).T
-
-
-@pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
-def test_a_wide_population_meets_what_was_asked_and_states_its_error(circuit: Circuit) -> None:
-    # Root mean squares under squares are below, too, with a dispersive skin.
+@BOTH
+def test_a_wide_population_meets_what_was_asked_and_states_its_error(circuit: Circuit, outputs: Any) -> None:
     parameters = population(60, seed=11)
-    outputs = OUTPUTS if circuit["Vdrive"] == table1()["Vdrive"] else OUTPUTS[: cases(4, 2)]
-    expected = singly(circuit, parameters, outputs, 5)
+    expected = singly(circuit, parameters, outputs, periods=5)
     for rtol in (1e-3, 1e-4, 4e-7, 1e-6)[: cases(4, 3)]:
-        found = fs.batch(circuit, parameters, outputs=outputs, periods=5, skin="follow", rtol=rtol)
-        off = np.abs(np.array([found[name].values for name in outputs]) / expected - 1.0)
-        assert off.max() <= rtol
+        found = check(circuit, parameters, outputs, expected, rtol, periods=5, skin="follow")
         assert found.error.max() <= rtol
-        assert np.mean(np.all(off <= found.error.values, axis=0)) >= 0.95
-        assert np.all(np.isin(found.status, (0, 1)))
-        assert found.attrs["n_ordinary"] == np.count_nonzero(found.status == 1) == 0
+        assert np.all(found.status == 0)
+        assert found.attrs["n_ordinary"] == 0
 
 
-@pytest.mark.parametrize(("periods", "rtol"), [(0.5, 1e-4), (5, 1e-4), (0.5, 1e-6), (1, 1e-6)])
+@pytest.mark.parametrize(("periods", "rtols"), [(0.5, (1e-4, 1e-6)), (5, (1e-4,)), (1, (1e-6,))])
 @pytest.mark.parametrize("phase", [21.0, 90.0, 250.0])
-def test_what_a_start_away_from_0_v_excites_is_in_the_error(phase: float, periods: float, rtol: float) -> None:
+def test_what_a_start_away_from_0_v_excites_is_in_the_error(phase: float, periods: float, rtols: Any) -> None:
     rng = np.random.default_rng(5)
-    circuit = table1().replace({"Vdrive.phase_deg": phase})
+    circuit, outputs = table1().replace({"Vdrive.phase_deg": phase}), OUTPUTS[2:]
     parameters = {
         "Xgap.r": 10.0 ** rng.uniform(4.0, 8.0, 30), "Xcoat.r": 10.0 ** rng.uniform(3.0, 7.0, 30),
         "Xgap.fn": rng.uniform(0.1, 2.0, 30), "Vdrive.frequency": np.full(30, 100.0),
     }  # fmt: skip
-    expected = singly(circuit, parameters, OUTPUTS[2:], periods)
-    found = fs.batch(circuit, parameters, outputs=OUTPUTS[2:], periods=periods, rtol=rtol)
-    off = np.max(np.abs(np.array([found[name].values for name in OUTPUTS[2:]]) / expected - 1.0), axis=0)
-    assert off.max() <= rtol
-    assert np.mean(off <= found.error.values + 0.01 * rtol) >= 0.95
-    assert np.count_nonzero(found.status == 0) >= 12
+    expected = singly(circuit, parameters, outputs, periods=periods)
+    for rtol in rtols:
+        found = check(circuit, parameters, outputs, expected, rtol, slack=0.01 * rtol, periods=periods)
+        assert np.count_nonzero(found.status == 0) >= 12
 
 
 def test_a_leaking_gap_that_leads_a_sine_from_0_v_has_its_error_met() -> None:
     changes = {"Xgap.r": 26850.0, "Xcoat.r": 420900.0, "Xgap.fn": 0.1793, "Xgap.d": 3.59e-6, "Vdrive.amplitude": 184.5}
-    found = fs.batch(table1(), changes, periods=0.5, rtol=1e-6)
+    found = fs.batch(table1(), changes, periods=0.5, rtol=1e-6, outputs=("f_el_mean", "u_gap_rms"))
     run = fs.simulate(table1().varied(changes), t_stop=0.005, rtol=1e-11, charge=False)
     assert found.f_el_mean[0] == pytest.approx(run.f_el_mean, rel=1e-6)
 
 
-@pytest.mark.parametrize("jumping", [False, True], ids=["sine", "square"])
-def test_the_mean_force_is_that_of_the_independent_reference(jumping: bool) -> None:
+@BOTH
+def test_the_mean_force_is_that_of_the_independent_reference(circuit: Circuit, outputs: Any) -> None:
     volts, f = np.array([80.0, 200.0, 290.0]), 400.0
-    circuit = table1().replace({"Vdrive": fs.Square(200.0, f) if jumping else fs.Sine(200.0, f), "Xskin.f": f})
-    found = fs.batch(circuit, {"Vdrive.amplitude": volts}, periods=3, rtol=1e-7)
+    circuit = circuit.replace({"Vdrive.frequency": f, "Xskin.f": f})
+    found = fs.batch(circuit, {"Vdrive.amplitude": volts}, periods=3, rtol=1e-7, outputs=outputs)
     expected = []
     for u in volts:
+        jumping = isinstance(circuit["Vdrive"].waveform, fs.Square)
         segments = ref.square_segments(u, f, 3) if jumping else ref.sine_segments(u, f, 3 / f)
         run = ref.transient(segments, [3 / f], freq=f)
         expected.append(run.force_integral(3 / f) * f / 3)
@@ -111,67 +79,60 @@ def test_the_mean_force_is_that_of_the_independent_reference(jumping: bool) -> N
     np.testing.assert_allclose(found.f_el_mean, expected, rtol=1e-7)
 
 
-def test_gap_voltages_are_those_of_single_runs() -> None:
-    for circuit in (table1(), square()):
-        parameters = population(6, seed=2)
-        found = fs.batch(circuit, parameters, outputs=("u_gap",), periods=2, points=50, skin="follow", rtol=1e-4)
-        assert found.u_gap.dims == ("scene", "turn")
-        for i in range(6):
-            f = float(parameters["Vdrive.frequency"][i])
-            run = fs.simulate(scene(circuit, parameters, i), t_eval=found.turn.values / f, t_stop=2 / f, rtol=1e-10)
-            peak = np.abs(run.u_gap).max()
-            np.testing.assert_allclose(found.u_gap[i], run.u_gap, rtol=0.0, atol=1e-4 * peak)
+@BOTH
+def test_gap_voltages_are_those_of_single_runs(circuit: Circuit, outputs: Any) -> None:
+    parameters = population(6, seed=2)
+    found = fs.batch(
+        circuit, parameters, outputs=("u_gap", outputs[-1]), periods=2, points=50, skin="follow", rtol=1e-4
+    )
+    assert found.u_gap.dims == ("scene", "turn")
+    for u, run in zip(found.u_gap, singles(circuit, parameters, periods=2, points=50), strict=True):
+        np.testing.assert_allclose(u, run.u_gap, rtol=0.0, atol=1e-4 * np.abs(run.u_gap).max())
 
 
-def test_the_periodic_state_is_that_of_steady_state() -> None:
-    for circuit in (table1(), square()):
-        parameters = population(8, seed=3)
-        found = fs.batch(circuit, parameters, outputs=("f_el_mean",), periodic=True, skin="follow", rtol=1e-5)
-        assert np.count_nonzero(found.status == 0) >= 5
-        for i in range(8):
-            state = fs.steady_state(scene(circuit, parameters, i), rtol=1e-10, charge=False)
-            assert found.f_el_mean[i] == pytest.approx(state.f_el_mean, rel=1e-5)
+def test_half_the_steps_are_an_even_number_for_any_number_of_gap_voltages() -> None:
+    # Otherwise the error that they show is hundreds of times too large.
+    for points in (44, 50):
+        found = fs.batch(table1(), {"Xgap.d": [3e-6]}, outputs=("u_gap",), periods=1, points=points, rtol=1e-3)
+        assert found.error[0] < 6e-4
 
 
-FINE = (1e-6, 4e-7)[cases(0, 1)]
+@BOTH
+def test_the_periodic_state_is_that_of_steady_state(circuit: Circuit, outputs: Any) -> None:
+    parameters = population(8, seed=3)
+    found = fs.batch(circuit, parameters, outputs=outputs, periodic=True, skin="follow", rtol=1e-5)
+    assert np.count_nonzero(found.status == 0) >= 5
+    for i in range(8):
+        changes = {path: float(values[i]) for path, values in parameters.items()}
+        one = circuit.varied({"Xskin.f": changes["Vdrive.frequency"], **changes})
+        state = fs.steady_state(one, rtol=1e-10, charge=False)
+        assert found.f_el_mean[i] == pytest.approx(state.f_el_mean, rel=1e-5)
+
+
+COAT, FINE = "a area LAYER d=1u eps_r=3.9 r=0.2meg", (1e-6, 4e-7)[cases(0, 1)]
+SKIN = "0 area SKIN d=350u f=100"
+LAYERS = {
+    "gap turned": (f"Xcoat drive {COAT}\nXgap b a area GAP r=1meg\nXskin b {SKIN}", 1e-6),
+    "two, gap turned": (f"Xcoat drive {COAT}\nXgap 0 a area GAP r=1meg", FINE),
+    "four": (
+        f"X1 drive {COAT}\nX2 a b area SLAB d=5u eps_r=3 rho=1e8\nXgap b c area GAP r=1meg\nXskin c {SKIN}", FINE,
+    ),
+    "equal rates": (
+        "X1 drive a area LAYER d=1u eps_r=3.9 r=inf\nXgap a c area GAP r=1meg\n"
+        "X2 c 0 area LAYER d=1u eps_r=3.9 r=inf", FINE,
+    ),
+}  # fmt: skip
 
 
 # Voltages at times are hardly to be had in lockstep at 4e-7; they show which way round the gap is.
-@pytest.mark.parametrize(
-    ("layers", "rtol"),
-    [
-        (
-            "Xcoat drive a area LAYER d=1u eps_r=3.9 r=0.2meg\nXgap b a area GAP r=1meg\n"
-            "Xskin b 0 area SKIN d=350u f=100\n",
-            1e-6,
-        ),
-        (
-            "Xcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg\nXgap 0 top area GAP r=1meg\n",
-            FINE,
-        ),
-        (
-            "X1 drive a area LAYER d=1u eps_r=3.9 r=0.2meg\nX2 a b area SLAB d=5u eps_r=3 rho=1e8\n"
-            "Xgap b c area GAP r=1meg\nXskin c 0 area SKIN d=350u f=100\n",
-            FINE,
-        ),
-        (
-            "X1 drive a area LAYER d=1u eps_r=3.9 r=inf\nXgap a c area GAP r=1meg\n"
-            "X2 c 0 area LAYER d=1u eps_r=3.9 r=inf\n",
-            FINE,
-        ),
-    ],
-    ids=["gap turned", "two, gap turned", "four", "equal rates"],
-)
+@pytest.mark.parametrize(("layers", "rtol"), LAYERS.values(), ids=LAYERS)
 def test_stacks_of_other_layers(layers: str, rtol: float) -> None:
-    text = (
-        "stack\n.include fingerspice.lib\nVdrive drive 0 SIN(0 150 100 0 0 40)\n" + layers + ".tran 10u 25m uic\n.end\n"
-    )
-    circuit, outputs = fs.parse_netlist(text), ("f_el_mean", "u_gap_rms", "u_gap")[: 3 if rtol == 1e-6 else 2]
+    start = "stack\n.include fingerspice.lib\nVdrive drive 0 SIN(0 150 100 0 0 40)"
+    circuit = fs.parse_netlist(f"{start}\n{layers}\n.tran 10u 25m uic\n.end\n")
+    outputs = ("f_el_mean", "u_gap_rms", "u_gap")[: 3 if rtol == 1e-6 else 2]
     found = fs.batch(circuit, {"Xgap.d": [3e-6, 4e-6]}, outputs=outputs, rtol=rtol)
     assert found.attrs["n_ordinary"] == 0
-    for i, d in enumerate((3e-6, 4e-6)):
-        t = found.turn.values / 100.0 if rtol == 1e-6 else None
-        run = fs.simulate(circuit.replace({"Xgap.d": d}), t_eval=t, t_stop=0.025, rtol=1e-10)
+    for i, run in enumerate(singles(circuit, {"Xgap.d": [3e-6, 4e-6]}, periods=2.5, points=200)):
         np.testing.assert_allclose(found.f_el_mean[i], run.f_el_mean, rtol=rtol)
         np.testing.assert_allclose(found.u_gap_rms[i], run.u_gap_rms, rtol=rtol)
         if rtol == 1e-6:
@@ -194,25 +155,19 @@ SOURCES = {
 }
 
 
-def test_gap_voltages_of_a_settled_run_are_those_of_its_last_period() -> None:
+@pytest.mark.parametrize("periods", [9.0, 12.5])
+def test_gap_voltages_of_a_settled_run_are_those_of_its_last_period(periods: float) -> None:
     # A slow skin, of which some scenes settle within few periods and others within many, in one block.
     rng = np.random.default_rng(2)
     parameters = {"Xgap.d": 3.5e-6 * rng.lognormal(0.0, 0.1, 24), "Xgap.r": rng.uniform(2e5, 5e6, 24)}
-    for periods in (9.0, 12.5):
-        found = fs.batch(table1(), parameters, outputs=("u_gap", "f_el_mean"), periods=periods, points=64, rtol=1e-4)
-        alone = fs.batch(table1(), {path: x[5:6] for path, x in parameters.items()}, outputs=("u_gap", "f_el_mean"),
-                         periods=periods, points=64, rtol=1e-4)  # fmt: skip
-        np.testing.assert_array_equal(found.u_gap[5], alone.u_gap[0])
-        covered = []
-        for i in range(24):
-            changed = table1().varied({path: float(x[i]) for path, x in parameters.items()})
-            frequency = changed["Vdrive"].waveform.frequency  # type: ignore[union-attr]
-            t = np.arange(int(64 * periods)) / (64 * frequency)
-            run = fs.simulate(changed, t_stop=periods / frequency, t_eval=t, rtol=1e-10, charge=False)
-            off = float(np.abs(found.u_gap.values[i, : t.size] - run.u_gap).max() / np.abs(run.u_gap).max())
-            assert off <= 1e-4
-            covered.append(off <= float(found.error[i]))
-        assert np.mean(covered) >= 0.95
+    how: dict[str, Any] = {"outputs": ("u_gap", "u_gap_rms"), "periods": periods, "points": 64, "rtol": 1e-4}
+    found = fs.batch(table1(), parameters, **how)
+    alone = fs.batch(table1(), {path: x[5:6] for path, x in parameters.items()}, **how)
+    np.testing.assert_array_equal(found.u_gap[5], alone.u_gap[0])
+    runs = singles(table1(), parameters, periods=periods, points=64)
+    off = [abs(u - run.u_gap).max() / abs(run.u_gap).max() for u, run in zip(found.u_gap.values, runs, strict=True)]
+    assert max(off) <= 1e-4
+    assert np.mean(off <= found.error.values) >= 0.95
 
 
 @pytest.mark.parametrize(
@@ -235,12 +190,9 @@ def test_tones_and_the_dispersive_skin(source: str, skin: str) -> None:
     if source == "three sines":
         parameters |= {"V2.amplitude": rng.uniform(0.0, 80.0, 20), "V3.phase_deg": rng.uniform(-180.0, 180.0, 20)}
     expected = singly(circuit, parameters, OUTPUTS)
-    for rtol in ONE_DEGREE if skin else (1e-4, 4e-7, 1e-6)[: cases(3, 2)]:
-        found = fs.batch(circuit, parameters, outputs=OUTPUTS, rtol=rtol)
-        off = np.abs(np.array([found[name].values for name in OUTPUTS]) / expected - 1.0)
+    for rtol in (4e-7, 1e-4, 1e-6)[: cases(3, 1)] if skin else (1e-4, 4e-7, 1e-6)[: cases(3, 2)]:
+        found = check(circuit, parameters, OUTPUTS, expected, rtol)
         assert np.all(found.status == 0)
-        assert off.max() <= rtol
-        assert np.mean(off <= found.error.values) >= 0.95
 
 
 def test_neither_threads_nor_the_order_of_scenes_change_a_byte() -> None:
@@ -265,9 +217,8 @@ def test_neither_threads_nor_the_order_of_scenes_change_a_byte() -> None:
 SETTLING: dict[str, list[float]] = {"Xgap.r": [3e5, 1e9], "Xcoat.r": [2e5, 1e9]}
 
 
-@pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
-def test_a_run_that_has_settled_ends_and_one_that_has_not_goes_on(circuit: Circuit) -> None:
-    outputs = OUTPUTS[: 3 if circuit["Vdrive"] == table1()["Vdrive"] else cases(3, 2)]
+@BOTH
+def test_a_run_that_has_settled_ends_and_one_that_has_not_goes_on(circuit: Circuit, outputs: Any) -> None:
     found = {n: fs.batch(circuit, SETTLING, outputs=outputs, periods=n, rtol=4e-7) for n in (20, 60, 60.5)}
     # The last period is the very same one in a run of 20 and of 60 periods. An odd number of half periods begins with
     # one of them.
@@ -276,19 +227,18 @@ def test_a_run_that_has_settled_ends_and_one_that_has_not_goes_on(circuit: Circu
     assert quick[2] == pytest.approx(quick[1], rel=1e-6)
     assert abs(slow[1] / slow[0] - 1.0) > 1e-6
     for n, batch in found.items():
-        for i in range(2):
-            one = circuit.varied({path: values[i] for path, values in SETTLING.items()})
-            expected = fs.simulate(one, t_stop=n / 100.0, rtol=1e-11, charge=False).summary()
-            for name in outputs:
-                assert abs(batch[name][i] / expected[name] - 1.0) <= batch.error[i] <= 4e-7
+        for name, expected in zip(outputs, singly(circuit, SETTLING, outputs, periods=n), strict=True):
+            assert np.all(np.abs(batch[name] / expected - 1.0) <= batch.error)
+        assert batch.error.max() <= 4e-7
 
 
-@pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
-def test_no_scene_s_bytes_depend_on_when_those_beside_it_settle(circuit: Circuit) -> None:
+@BOTH
+def test_no_scene_s_bytes_depend_on_when_those_beside_it_settle(circuit: Circuit, outputs: Any) -> None:
     mixed = {path: np.array(values * 20) for path, values in SETTLING.items()}
-    together = fs.batch(circuit, mixed, periods=12, rtol=1e-5).f_el_mean.values
+    how: dict[str, Any] = {"outputs": outputs, "periods": 12, "rtol": 1e-5}
+    together = fs.batch(circuit, mixed, **how).f_el_mean.values
     for i in range(2):
-        alone = fs.batch(circuit, {path: [values[i]] for path, values in SETTLING.items()}, periods=12, rtol=1e-5)
+        alone = fs.batch(circuit, {path: [values[i]] for path, values in SETTLING.items()}, **how)
         assert np.all(together[i::2] == alone.f_el_mean.values[0])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
+from batches import population
 from fingerspice.circuit.circuit import Circuit
 from scenes import cases, table1
 
@@ -21,110 +21,94 @@ WEIGHTS = {-2: 1.0, -1: -8.0, 1: 8.0, 2: -1.0}
 ALLOWED = 10.0
 """Error allowed to a derivative, for a change by all of the parameter and relative to the output, in `rtol`."""
 MEANS = ("f_el_mean", "f_t_mean", "friction_mean")
+EVERY = (*MEANS, "area_mean")
 THREE = {"Xgap.d": [2.5e-6, 3.5e-6, 5e-6], "Xgap.r": [3e5, 1e6, 4e6], "Vdrive.amplitude": [240.0, 150.0, 80.0]}
 PATHS = ("Xgap.d", "Xgap.fn", "Xskin.d", "Xcoat.r", "Vdrive.amplitude")
 
 
-def square(f: float = 100.0) -> Circuit:
-    return table1().replace({"Vdrive": fs.Square(200.0, f)})
+def square(volts: float = 200.0, **how: Any) -> Circuit:
+    return table1(**how).replace({"Vdrive": fs.Square(volts, 100.0)})
 
 
-def over_periods(periods: float) -> Callable[[Circuit], Any]:
-    """A run over a number of periods of its own source."""
-    return lambda c: fs.simulate(c, t_stop=periods / c.parameters["Vdrive.frequency"].value, rtol=1e-12, charge=False)
-
-
-def of_deck(circuit: Circuit) -> Any:
-    return fs.simulate(circuit, rtol=1e-12, charge=False)
-
-
-def periodic(circuit: Circuit) -> Any:
-    return fs.steady_state(circuit, rtol=1e-12, charge=False)
-
-
-def expected(scene: Circuit, path: str, run: Callable[[Circuit], Any], follow: bool = False) -> dict[str, float]:
+def expected(scene: Circuit, path: str, how: dict[str, Any]) -> dict[str, float]:
     """Change of the means for a change of a parameter by all of itself, from four runs."""
-    total: dict[str, float] = {}
+    total = dict.fromkeys(EVERY, 0.0)
     for k, weight in WEIGHTS.items():
-        value = scene.parameters[path].value * (1.0 + k * STEP)
-        found = run(scene.varied({path: value, **({"Xskin.f": value} if follow else {})}))
-        for name in (*MEANS, "area_mean"):
-            total[name] = total.get(name, 0.0) + weight * float(getattr(found, name)) / (12.0 * STEP)
+        moved = {path: scene.parameters[path].value * (1.0 + k * STEP)}
+        if how.get("skin") == "follow" and path == "Vdrive.frequency":
+            moved["Xskin.f"] = moved[path]
+        circuit = scene.varied(moved)
+        if how.get("periodic"):
+            found: Any = fs.steady_state(circuit, rtol=1e-12, charge=False)
+        else:
+            stop = how["periods"] / circuit.parameters["Vdrive.frequency"].value if "periods" in how else None
+            found = fs.simulate(circuit, t_stop=stop, rtol=1e-12, charge=False)
+        for name in EVERY:
+            total[name] += weight * float(getattr(found, name)) / (12.0 * STEP)
     return total
 
 
-def check(
-    circuit: Circuit, parameters: dict[str, Any], paths: tuple[str, ...], rtol: float, run: Callable[[Circuit], Any],
-    outputs: tuple[str, ...] = MEANS, status: int = 0, **how: Any,
-) -> None:  # fmt: skip
-    """Every derivative is within the error allowed, and within the error stated."""
-    found = fs.batch(circuit, parameters, outputs=outputs, gradients=paths, rtol=rtol, **how)
-    assert found.gradient_status.values.tolist() == [status] * found.sizes["scene"]
-    for i in range(found.sizes["scene"]):
-        scene = circuit.varied({path: float(found[path][i]) for path in parameters})
-        if how.get("skin") == "follow":
-            scene = scene.varied({"Xskin.f": scene.parameters["Vdrive.frequency"].value})
-        for path in paths:
-            right = expected(scene, path, run, follow=how.get("skin") == "follow" and path == "Vdrive.frequency")
-            for name in outputs:
-                one = float(found[f"d_{name}"].sel(parameter=path)[i]) * scene.parameters[path].value
-                off = abs(one - right[name]) / float(found[name][i])
-                assert off <= min(ALLOWED * rtol, max(float(found.gradient_error[i]), 1e-9)), (i, path, name, off)
+def uneven() -> Circuit:
+    """A source of points at uneven times."""
+    t = np.linspace(0.0, 0.05, 701)
+    times = np.sort(np.append(t, t[:-1] + 0.3 * np.diff(t)))
+    return table1().replace({"Vdrive": fs.PWL(times, 150.0 * np.sin(2.0 * np.pi * 150.0 * times))})
 
 
-@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
-@pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
-def test_derivatives_in_lockstep_are_those_of_single_runs(circuit: Circuit, rtol: float) -> None:
-    check(circuit, THREE, PATHS, rtol, over_periods(3), periods=3)
-
-
-@pytest.mark.parametrize("circuit", [table1(), square()], ids=["sine", "square"])
-def test_derivatives_of_the_periodic_state(circuit: Circuit) -> None:
+TWO, CLOCK = {"Xgap.d": [3e-6, 4e-6]}, ("Vdrive.frequency", "Xgap.d")
+OWN, FOLLOWED = ("Xgap.d", "Xcoat.r"), {"Vdrive.frequency": [80.0, 400.0]}
+BY_TURNS, FOLLOW, PERIODIC = {"periods": 3}, {"periods": 3, "skin": "follow"}, {"periodic": True}
+MOBILE = {"library": "fingerspice_mobile.lib"}
+DISPERSIVE = fs.read_netlist(CIRCUITS / "fingerpad_dispersive.cir")
+# Status, circuit, parameters of its scenes, paths, `rtol`, and how they run.
+CASES: dict[str, tuple[Any, ...]] = {
+    "sine": (0, table1(), THREE, PATHS, (1e-4, 1e-6), BY_TURNS),
+    "square": (0, square(), THREE, PATHS, (1e-4, 1e-6), BY_TURNS),
     # The frequency of a square moves its jumps, and those of a period in proportion to it.
-    check(circuit, THREE, ("Xgap.d", "Xcoat.r", "Vdrive.frequency"), 1e-5, periodic, periodic=True)
+    "square's frequency": (0, square(), THREE, CLOCK[:1], (1e-5,), BY_TURNS),
+    "periodic": (0, table1(), THREE, (*OWN, "Vdrive.frequency"), (1e-5,), PERIODIC),
+    "periodic square": (0, square(), THREE, (*OWN, "Vdrive.frequency"), (1e-5,), PERIODIC),
+    "dispersive skin": (0, DISPERSIVE, TWO, ("Xgap.d", "Xgap.r", "Xskin.d"), (1e-5,), {}),
+    # The frequency moves the end of a run whose length is in periods, and a skin that follows it.
+    "frequency": (0, table1(), THREE, CLOCK, (1e-5,), {"periods": 2.5}),
+    "frequency, alone": (1, table1(), THREE, CLOCK, (1e-9,), {"periods": 2.5}),
+    "frequency, of the deck": (1, table1(), THREE, CLOCK, (1e-5,), {}),
+    "followed": (0, table1(), FOLLOWED, CLOCK, (1e-5,), FOLLOW),
+    "followed, alone": (1, table1(), FOLLOWED, CLOCK, (1e-9,), FOLLOW),
+    "uneven points": (1, uneven(), {"Xgap.d": [3e-6]}, ("Xgap.d", "Xgap.r"), (1e-5,), {}),
+}  # fmt: skip
+for kind in ("sine", "square"):
+    for law in ({}, MOBILE):
+        one = table1(**law) if kind == "sine" else square(150.0, **law)
+        for how in ({}, PERIODIC):
+            CASES[f"fine {kind} {law} {how}"] = (1, one, TWO, OWN, (1e-10,), {"outputs": EVERY, **how})
 
 
-def test_a_dispersive_skin() -> None:
-    circuit = fs.read_netlist(CIRCUITS / "fingerpad_dispersive.cir")
-    check(circuit, {"Xgap.d": [3e-6, 4e-6]}, ("Xgap.d", "Xgap.r", "Xskin.d"), 1e-5, of_deck)
-
-
-@pytest.mark.parametrize("how", [{"periods": 2.5}, {"periods": 2.5, "rtol": 1e-9}, {}], ids=["lockstep", "one", "deck"])
-def test_the_frequency_moves_the_end_of_a_run_whose_length_is_in_periods(how: dict[str, Any]) -> None:
-    run = over_periods(2.5) if "periods" in how else of_deck
-    rtol, status = how.get("rtol", 1e-5), 0 if how == {"periods": 2.5} else 1
-    more = {key: value for key, value in how.items() if key != "rtol"}
-    check(table1(), THREE, ("Vdrive.frequency", "Xgap.d"), rtol, run, status=status, **more)
-
-
-@pytest.mark.parametrize("rtol", [1e-5, 1e-9])
-def test_a_skin_that_follows_the_frequency_is_moved_with_it(rtol: float) -> None:
-    parameters = {"Vdrive.frequency": [80.0, 400.0]}
-    status = 0 if rtol == 1e-5 else 1
-    check(table1(), parameters, ("Vdrive.frequency", "Xgap.d"), rtol, over_periods(3),
-          status=status, periods=3, skin="follow")  # fmt: skip
-
-
-@pytest.mark.parametrize("deck", ["fingerspice.lib", "fingerspice_mobile.lib"])
-@pytest.mark.parametrize("shape", ["sine", "square"])
-def test_derivatives_of_scenes_one_by_one_at_a_fine_error(deck: str, shape: str) -> None:
-    circuit = table1(library=deck)
-    if shape == "square":
-        circuit = circuit.replace({"Vdrive": fs.Square(150.0, 100.0)})
-    outputs = (*MEANS, "area_mean")
-    for run, how in ((of_deck, {}), (periodic, {"periodic": True})):
-        check(circuit, {"Xgap.d": [3e-6, 4e-6]}, ("Xgap.d", "Xcoat.r"), 1e-10, run, outputs, status=1, **how)
+@pytest.mark.parametrize(("status", "circuit", "parameters", "paths", "rtols", "how"), CASES.values(), ids=CASES)
+def test_derivatives_have_the_errors_allowed_and_stated(
+    status: int, circuit: Circuit, parameters: dict[str, Any], paths: tuple[str, ...], rtols: tuple[float, ...],
+    how: dict[str, Any],
+) -> None:  # fmt: skip
+    how = {"outputs": MEANS, **how}
+    n = len(next(iter(parameters.values())))
+    scenes = [circuit.varied({path: values[i] for path, values in parameters.items()}) for i in range(n)]
+    if how.get("skin") == "follow":
+        scenes = [scene.varied({"Xskin.f": scene.parameters["Vdrive.frequency"].value}) for scene in scenes]
+    right = [[expected(scene, path, how) for path in paths] for scene in scenes]
+    for rtol in rtols:
+        found = fs.batch(circuit, parameters, gradients=paths, rtol=rtol, **how)
+        assert found.gradient_status.values.tolist() == [status] * n
+        for i, scene in enumerate(scenes):
+            for path, changes in zip(paths, right[i], strict=True):
+                for name in how["outputs"]:
+                    one = float(found[f"d_{name}"].sel(parameter=path)[i]) * scene.parameters[path].value
+                    off = abs(one - changes[name]) / float(found[name][i])
+                    assert off <= min(ALLOWED * rtol, max(float(found.gradient_error[i]), 1e-9)), (i, path, name, off)
 
 
 def test_the_stated_error_of_a_wide_population_holds() -> None:
-    rng, n = np.random.default_rng(7), cases(40, 20)
-    parameters = {
-        "Vdrive.frequency": 10.0 ** rng.uniform(np.log10(20.0), 4.0, n),
-        "Vdrive.amplitude": rng.uniform(50.0, 300.0, n),
-        "Xgap.r": 1e6 * 10.0 ** rng.uniform(-1.0, 1.0, n),
-        "Xgap.fn": rng.uniform(0.1, 2.0, n),
-        "Xgap.d": rng.uniform(2e-6, 6e-6, n),
-    }
+    parameters = population(cases(40, 20), seed=7)
+    del parameters["Xcoat.r"]
     paths = tuple(parameters)
     size = np.stack(list(parameters.values()), axis=1)
     right = fs.batch(table1(), parameters, gradients=paths, periods=3, skin="follow", rtol=1e-10)
@@ -180,7 +164,6 @@ def test_the_frequency_of_a_square_is_refused_where_it_moves_the_edges_of_a_run_
     assert found.gradient_status.values.tolist() == [2]
     assert "moves the edges of its source" in found.attrs["failures"][0]
     assert "changes the number of periods" in found.attrs["ordinary_gradients"]
-    check(square(), THREE, ("Vdrive.frequency",), 1e-5, over_periods(3), periods=3)
 
 
 def test_the_dataset_says_what_it_holds(tmp_path: Path) -> None:
@@ -211,14 +194,6 @@ def test_the_dataset_says_what_it_holds(tmp_path: Path) -> None:
 def test_bad_input_is_refused_in_one_sentence(gradients: Any, options: dict[str, Any], message: str) -> None:
     with pytest.raises(fs.InputError, match=message):
         fs.batch(table1(), {"Xgap.r": [1e6]}, gradients=gradients, periods=1, **options)
-
-
-def test_points_at_uneven_times_have_them() -> None:
-    t = np.linspace(0.0, 0.05, 701)
-    times = np.sort(np.append(t, t[:-1] + 0.3 * np.diff(t)))
-    v = 150.0 * np.sin(2.0 * np.pi * 150.0 * times)
-    circuit = table1().replace({"Vdrive": fs.PWL(times, v)})
-    check(circuit, {"Xgap.d": [3e-6]}, ("Xgap.d", "Xgap.r"), 1e-5, of_deck, status=1)
 
 
 def test_two_fingers_are_refused() -> None:

@@ -1,4 +1,4 @@
-"""Recordings in lockstep: against single runs at 1e-9, in wide populations, for any threads, order and bad scenes."""
+"""Recordings in lockstep: against single runs, in wide populations, for any threads, order and bad scenes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import butter, sosfilt
 
 import fingerspice as fs
+from batches import check, singly
 from fingerspice.base.errors import InputError
 from scenes import cases, table1, table1_deck
 
@@ -39,29 +40,21 @@ def people(n: int, seed: int = 2) -> dict[str, np.ndarray]:
     }
 
 
-def check(
+def check_all(
     circuit: fs.Circuit, scenes: dict[str, np.ndarray], rtols: tuple[float, ...], outputs: tuple[str, ...] = OUTPUTS,
     in_lockstep: float = 0.0, rounding: float = 1e-9,
 ) -> None:  # fmt: skip
     """Scenes go in lockstep, with the errors asked for and, 19 of 20, within those stated."""
-    true = []
-    for i in range(scenes["Xgap.d"].size):
-        changes = {path: float(values[i]) for path, values in scenes.items()}
-        run = fs.simulate(circuit.replace(changes), t_stop=T_STOP, t_eval=[T_STOP], rtol=1e-10, charge=False)
-        figures = run.summary()
-        true.append([figures[name] for name in outputs])
+    true = singly(circuit, scenes, outputs, t_stop=T_STOP, t_eval=[T_STOP])
     for rtol in rtols:
-        found = fs.batch(circuit, scenes, outputs=outputs, t_stop=T_STOP, rtol=rtol)
-        assert (found["status"] == 0).mean() > in_lockstep
-        off = np.abs(np.array([found[name].values for name in outputs]).T / true - 1.0).max(axis=1)
-        assert off.max() <= rtol
-        assert (off <= found["error"].to_numpy() + rounding).mean() >= 0.95
+        found = check(circuit, scenes, outputs, true, rtol, slack=rounding, t_stop=T_STOP)
+        assert (found.status == 0).mean() > in_lockstep
 
 
 @pytest.mark.parametrize(("highest", "rtols"), [(1000.0, (1e-4, 1e-6)), (8000.0, (1e-3, 1e-5))])
 def test_stated_errors_cover_wide_populations(highest: float, rtols: tuple[float, ...]) -> None:
     # Root mean squares, for which another loop is compiled, are below, with a dispersive skin.
-    check(recorded(highest), people(cases(40, 20)), rtols, OUTPUTS[: cases(3, 1)], in_lockstep=0.9)
+    check_all(recorded(highest), people(cases(40, 20)), rtols, OUTPUTS[: cases(3, 1)], in_lockstep=0.9)
 
 
 @pytest.mark.parametrize("seed", [2, 4, 5][: cases(3, 1)])
@@ -69,12 +62,14 @@ def test_stated_errors_cover_fingers_that_differ_little(seed: int) -> None:
     # Their errors go up and down together, so that an estimate that is small by chance is so for all of them.
     r = np.random.default_rng(1)
     scenes = {"Xgap.d": r.uniform(3e-6, 4e-6, 24), "Xgap.r": 1e6 * 10.0 ** r.uniform(-0.5, 0.5, 24)}
-    check(recorded(8000.0, seed=seed), scenes, (1e-6,), ("f_el_mean",))
+    check_all(recorded(8000.0, seed=seed), scenes, (1e-6,), ("f_el_mean",))
 
 
 def test_a_dispersive_skin_states_its_error() -> None:
     text = table1_deck().replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
-    check(recorded(8000.0, fs.parse_netlist(text)), people(cases(16, 6)), (1e-3,), in_lockstep=1.0 - 1e-9, rounding=0.0)
+    check_all(
+        recorded(8000.0, fs.parse_netlist(text)), people(cases(16, 6)), (1e-3,), in_lockstep=1.0 - 1e-9, rounding=0.0
+    )
 
 
 def test_threads_and_order_change_no_byte() -> None:

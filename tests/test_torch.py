@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-import importlib.util
-import re
+import runpy
 import subprocess
 import sys
 import warnings
@@ -47,36 +46,33 @@ def shares() -> Any:
 
 @pytest.fixture
 def means() -> Any:
-    return by_shares(
-        fs.torch.Simulator(table1(), (), ("f_el_mean", "area_mean"), t_stop=T_STOP, rtol=1e-9), "f_el_mean"
-    )
+    outputs = ("f_el_mean", "area_mean")
+    return by_shares(fs.torch.Simulator(table1(), (), outputs, t_stop=T_STOP, rtol=1e-9), "f_el_mean")
 
 
-def mixed(**how: Any) -> Any:
-    return fs.torch.Simulator(table1(), (), ("u_gap", "f_el_mean", "f_t"), t=TIMES, t_stop=T_STOP, rtol=1e-9, **how)
-
-
-@pytest.mark.parametrize("output", ["f_el_mean", "u_gap"])
+# Of a periodic state, which takes long, one scene.
+@pytest.mark.parametrize(
+    ("output", "outputs", "how"),
+    [
+        ("f_el_mean", ("u_gap", "f_el_mean", "f_t"), {"t": TIMES, "t_stop": T_STOP}),
+        ("u_gap", ("u_gap", "f_el_mean", "f_t"), {"t": TIMES, "t_stop": T_STOP}),
+        # Values come from lockstep, and slopes from runs.
+        ("f_el_mean", ("area_mean", "f_el_mean"), {"t_stop": 0.02}),
+    ],
+    ids=["mean", "signal", "batch"],
+)
 @pytest.mark.parametrize("periodic", [False, True])
-def test_gradcheck_backward_and_forward(shares: Any, output: str, periodic: bool) -> None:
-    # One scene of a periodic state, which takes long.
-    shares = shares[:1] if periodic else shares
-    function = by_shares(mixed(periodic=periodic), output)
+def test_gradcheck_backward_and_forward(
+    shares: Any, periodic: bool, output: str, outputs: tuple[str, ...], how: dict[str, Any]
+) -> None:
+    simulator = fs.torch.Simulator(table1(), (), outputs, periodic=periodic, rtol=1e-9, **how)
+    function, batched = by_shares(simulator, output), "t" in how
+    shares = shares[:1] if periodic and batched else shares
     size = float(function(shares).abs().max())
     torch.autograd.gradcheck(
         lambda s: function(s) / size, (shares.requires_grad_(),), eps=1e-4, atol=1e-6, rtol=1e-6,
-        check_forward_ad=True, check_batched_grad=True, check_batched_forward_grad=True,
+        check_forward_ad=True, check_batched_grad=batched, check_batched_forward_grad=batched,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize("periodic", [False, True])
-def test_gradcheck_where_values_come_from_lockstep_and_slopes_from_runs(shares: Any, periodic: bool) -> None:
-    how = {"periodic": True} if periodic else {"t_stop": 0.02}
-    function = by_shares(fs.torch.Simulator(table1(), (), ("area_mean", "f_el_mean"), rtol=1e-9, **how), "f_el_mean")
-    size = float(function(shares).max())
-    torch.autograd.gradcheck(
-        lambda s: function(s) / size, (shares.requires_grad_(),), eps=1e-4, atol=1e-6, rtol=1e-6, check_forward_ad=True
-    )
 
 
 def test_every_transform_of_torch_gives_the_same(means: Any, shares: Any) -> None:
@@ -123,9 +119,7 @@ def test_values_and_derivatives_are_those_of_differences_of_runs(law: str) -> No
 def test_points_at_uneven_times_have_derivatives() -> None:
     # Two steps of time in turn: with every other point alone, on the same lines, the times are even.
     t = np.linspace(0.0, T_STOP, 601)
-    v = 150.0 * np.sin(2.0 * np.pi * 150.0 * t)
-    between = t[:-1] + 0.3 * np.diff(t)
-    times = np.sort(np.append(t, between))
+    v, times = 150.0 * np.sin(2.0 * np.pi * 150.0 * t), np.sort(np.append(t, t[:-1] + 0.3 * np.diff(t)))
     found = []
     for source in (fs.PWL(times, np.interp(times, t, v)), fs.PWL(t, v)):
         simulator = fs.torch.Simulator(
@@ -318,26 +312,10 @@ except fs.InputError as error:
     assert done.stdout == "fingerspice.torch needs torch, which is not installed; pip install 'fingerspice[torch]'\n"
 
 
-def test_the_code_of_the_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (ROOT / "docs" / "torch.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    assert page.count("```") == 2 * len(blocks)
-    monkeypatch.chdir(ROOT)
-    names: dict[str, Any] = {}
-    for block in blocks:
-        exec(block, names)
-    d, r = (names["model"].value(path).item() for path in ("Xgap.d", "Xgap.r"))
-    assert (d, r) == (pytest.approx(3.1e-6, rel=1e-4), pytest.approx(0.7e6, rel=1e-4))
-
-
 def test_the_example_learns_a_drive() -> None:
-    spec = importlib.util.spec_from_file_location("learned_drive", CIRCUITS / "learned_drive.py")
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    module = script.simulator()
-    deviations = script.learn(module, 20)
+    script = runpy.run_path(str(CIRCUITS / "learned_drive.py"))
+    module = script["simulator"]()
+    deviations = script["learn"](module, 20)
     assert deviations[-1] < 0.66 * deviations[0]
     # Where 150 steps lead.
     found = [getattr(module, f"V{k}_amplitude").item() for k in (1, 3, 5, 7)]

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,9 +28,6 @@ from fingerspice.studies.steady import SteadyState, steady_state
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
-if TYPE_CHECKING:
-    from xarray import Dataset
-
 
 @dataclass(frozen=True)
 class Scenes:
@@ -42,70 +39,59 @@ class Scenes:
     t_stop: float | None  # End of every run, s; None where only the periodic state is asked for
     periodic: bool  # Whether the periodic state is asked for, and not the run
     rtol: float
+    alone: bool  # Whether one output was asked for by its name, not in a sequence
 
     @property
     def sizes(self) -> list[int]:
         """How many numbers each output has."""
         return [1 if name in MEANS else self.t.size for name in self.outputs]
 
-    def values(self, paths: Sequence[str], given: FloatArray) -> FloatArray:
-        """The outputs one after the other, shape (n_scene, sum of `sizes`), at values `given` (n_scene, n_path)."""
-        if not self.t.size:
-            found = self._batch(paths, given, ())
-            return np.stack([found[name].to_numpy().reshape(len(given)) for name in self.outputs], axis=1)
-        out = np.empty((len(given), sum(self.sizes)))
-        for i, row in enumerate(given):
-            with named("scene", i):
-                out[i] = np.concatenate([np.ravel(getattr(run, name)) for name, run in self._runs(paths, row, ())])
-        return out
+    def values(self, paths: Sequence[str], given: FloatArray, wanted: Sequence[str] = ()) -> FloatArray:
+        """The outputs one after the other, shape (n_scene, sum of `sizes`), at values `given` (n_scene, n_path).
 
-    def slopes(self, paths: Sequence[str], wanted: Sequence[str], given: FloatArray) -> FloatArray:
-        """Derivatives of `values` by the parameters `wanted`, shape (n_scene, sum of `sizes`, n_wanted)."""
-        if not self.t.size and in_lockstep_by(self.circuit, paths, self.outputs, self.rtol):
-            found = self._batch(paths, given, wanted)
-            return np.stack([found[f"d_{name}"].to_numpy() for name in self.outputs], axis=1)
-        out = np.empty((len(given), sum(self.sizes), len(wanted)))
+        With `wanted`, their derivatives by these parameters, shape (n_scene, sum of `sizes`, n_wanted).
+        """
+        if not self.t.size and (not wanted or in_lockstep_by(self.circuit, paths, self.outputs, self.rtol)):
+            # The means, or their derivatives, of all scenes at once.
+            found = batch(
+                self.circuit, dict(zip(paths, given.T, strict=True)), outputs=self.outputs, rtol=self.rtol,
+                periodic=self.periodic, t_stop=None if self.periodic else self.t_stop, gradients=wanted,
+            )  # fmt: skip
+            bad = np.flatnonzero(found["gradient_status" if wanted else "status"].to_numpy() >= REFUSED)
+            if bad.size:
+                raise InputError(f"{bad.size} of {len(given)} scenes cannot be run; {found.attrs['failures'][0]}")
+            return np.stack([found[f"d_{name}" if wanted else name].to_numpy() for name in self.outputs], axis=1)
+        rows = []
         for i, row in enumerate(given):
             with named("scene", i):
                 runs = self._runs(paths, row, wanted)
-                for k, path in enumerate(wanted):
-                    out[i, :, k] = np.concatenate(
-                        [np.ravel(getattr(run.sensitivities[path], name)) for name, run in runs]
-                    )
-        return out
+                if wanted:
+                    by = [[getattr(run.sensitivities[path], name) for name, run in runs.items()] for path in wanted]
+                    rows.append(np.stack([np.hstack(column) for column in by], axis=-1))
+                else:
+                    rows.append(np.hstack([getattr(run, name) for name, run in runs.items()]))
+        return np.array(rows)
 
-    def given_back(self, found: Tensor, alone: bool) -> Tensor | dict[str, Tensor]:
-        """The outputs in a tensor (..., sum of `sizes`) by their names; itself for one that was asked for `alone`."""
+    def given_back(self, found: Tensor) -> Tensor | dict[str, Tensor]:
+        """The outputs in a tensor (..., sum of `sizes`) by their names, or the one that was asked for alone."""
         parts = dict(zip(self.outputs, found.split(self.sizes, dim=-1), strict=True))
         parts = {name: part.squeeze(-1) if name in MEANS else part for name, part in parts.items()}
-        return parts[self.outputs[0]] if alone else parts
-
-    def _batch(self, paths: Sequence[str], given: FloatArray, wanted: Sequence[str]) -> Dataset:
-        """The means, and their derivatives, of all scenes at once."""
-        found = batch(
-            self.circuit, dict(zip(paths, given.T, strict=True)), outputs=self.outputs, rtol=self.rtol,
-            periodic=self.periodic, t_stop=None if self.periodic else self.t_stop, gradients=wanted,
-        )  # fmt: skip
-        bad = np.flatnonzero(found["gradient_status" if wanted else "status"].to_numpy() >= REFUSED)
-        if bad.size:
-            raise InputError(f"{bad.size} of {len(given)} scenes cannot be run; {found.attrs['failures'][0]}")
-        return found
+        return parts[self.outputs[0]] if self.alone else parts
 
     def _runs(
         self, paths: Sequence[str], row: FloatArray, wanted: Sequence[str]
-    ) -> list[tuple[str, Solution | SteadyState]]:
-        """Every output of a scene with the run that has it."""
+    ) -> dict[str, Solution | SteadyState]:  # fmt: skip
+        """The run of a scene that has each output."""
         circuit = self.circuit.varied(dict(zip(paths, row.tolist(), strict=True)))
         of_period = [name for name in self.outputs if self.periodic and name in MEANS]
         found: dict[str, Solution | SteadyState] = {}
+        if len(of_period) < len(self.outputs):
+            run = self.run(circuit, start="periodic" if self.periodic else "deck", sensitivities=wanted)
+            found = dict.fromkeys(self.outputs, run)
         if of_period:
             state = steady_state(circuit, rtol=self.rtol, points=4, charge=False, sensitivities=wanted)
             found |= dict.fromkeys(of_period, state)
-        if len(of_period) < len(self.outputs):
-            start = "periodic" if self.periodic else "deck"
-            run: Solution | SteadyState = self.run(circuit, start=start, sensitivities=wanted)
-            found = dict.fromkeys(self.outputs, run) | found
-        return list(found.items())
+        return found
 
     def run(self, circuit: Circuit, **how: Any) -> Solution:
         """A run of a circuit, with outputs at the times `t`, or at its end where there are only means."""
@@ -125,9 +111,12 @@ def named(what: str, number: int) -> Iterator[None]:
 
 
 def request(
-    circuit: Circuit, names: tuple[str, ...], t: ArrayLike | None, t_stop: float | None, periodic: bool, rtol: float
-) -> Scenes:
+    circuit: Circuit, outputs: str | Sequence[str], t: ArrayLike | None, t_stop: float | None, periodic: bool,
+    rtol: float,
+) -> Scenes:  # fmt: skip
     """The checked request."""
+    alone = isinstance(outputs, str)
+    names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     for name in names:
         if name not in (*MEANS, *SIGNALS):
             raise InputError(f"unknown output {name!r}; allowed: {', '.join((*MEANS, *SIGNALS))}")
@@ -145,9 +134,8 @@ def request(
         t_stop = circuit.tran.stop
     elif signals or not periodic:
         raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
-    return Scenes(
-        circuit, names, np.zeros(0) if times is None else times, t_stop, bool(periodic), rtol_given(rtol, LEAST_RTOL)
-    )
+    times = np.zeros(0) if times is None else times
+    return Scenes(circuit, names, times, t_stop, bool(periodic), rtol_given(rtol, LEAST_RTOL), alone)
 
 
 def tensor_of(path: str, one: Tensor | ArrayLike) -> Tensor:
@@ -209,9 +197,7 @@ class Drive(torch.nn.Module):
             require(len(names) == 1, "source", "missing", f"one of {', '.join(names)}")
             source = names[0]
         require(source.lower() in known, "source", repr(source), f"one of {', '.join(names)}")
-        self._alone = isinstance(outputs, str)
-        wanted = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-        self._scenes = request(circuit, wanted, t, t_stop, False, rtol)
+        self._scenes = request(circuit, outputs, t, t_stop, False, rtol)
         self._source, self._rate = known[source.lower()], positive_number("rate", rate, "Hz")
         self.samples = torch.nn.Parameter(tensor_of("samples", samples).detach().clone())
 
@@ -237,16 +223,7 @@ class Drive(torch.nn.Module):
         given = self.samples if samples is None else tensor_of("samples", samples)
         require(given.ndim > 0, "samples", "one number", "a row of two or more")
         found: Tensor = _Run.apply(self, given)
-        return self._scenes.given_back(found, self._alone)
-
-    def _runs(self, given: FloatArray) -> list[Solution]:
-        """A run for each row of samples, shape (n_scene, n)."""
-        found = []
-        for i, row in enumerate(given):
-            with named("drive", i):
-                sources = {self._source: Samples(row, self._rate)}
-                found.append(self._scenes.run(self._scenes.circuit, sources=sources))
-        return found
+        return self._scenes.given_back(found)
 
 
 def _backward(ctx: Any, by_output: Tensor) -> tuple[None, Tensor]:
@@ -266,9 +243,12 @@ class _Run(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, drive: Drive, samples: Tensor) -> Tensor:
-        runs = drive._runs(samples.detach().numpy().reshape(-1, samples.shape[-1]))
-        ctx.scenes, ctx.runs, ctx.shape = drive._scenes, runs, samples.shape
-        rows = [np.concatenate([np.ravel(getattr(run, name)) for name in drive._scenes.outputs]) for run in runs]
+        scenes = drive._scenes
+        ctx.scenes, ctx.runs, ctx.shape = scenes, [], samples.shape
+        for i, row in enumerate(samples.detach().numpy().reshape(-1, samples.shape[-1])):
+            with named("drive", i):
+                ctx.runs.append(scenes.run(scenes.circuit, sources={drive._source: Samples(row, drive._rate)}))
+        rows = [np.hstack([getattr(run, name) for name in scenes.outputs]) for run in ctx.runs]
         return torch.from_numpy(np.stack(rows)).reshape(*samples.shape[:-1], -1)
 
     # Not a decorator: without torch, types are not known.

@@ -67,9 +67,7 @@ class Simulator(torch.nn.Module):
         if len(gaps) != 1:
             raise InputError(f"the circuit has {len(gaps)} GAPs; allowed: one")
         self.circuit, self.logarithms = circuit, logarithms
-        self._alone = isinstance(outputs, str)
-        names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-        self._scenes = request(circuit, names, t, t_stop, periodic, rtol)
+        self._scenes = request(circuit, outputs, t, t_stop, periodic, rtol)
         self.paths: dict[str, str] = {}
         for path, value in _initial(circuit, parameters).items():
             if logarithms and not bool((value > 0.0).all()):
@@ -126,8 +124,8 @@ class Simulator(torch.nn.Module):
         except RuntimeError:
             shapes = ", ".join(f"{tuple(one.shape)} ({path})" for path, one in every.items())
             raise InputError(f"the values have shapes {shapes}; allowed: shapes that broadcast") from None
-        found: Tensor = _Run.apply(self._scenes, tuple(every), *shaped)
-        return self._scenes.given_back(found, self._alone)
+        found: Tensor = _Run.apply(self._scenes, tuple(every), (), *shaped)
+        return self._scenes.given_back(found)
 
 
 def _initial(circuit: Circuit, parameters: Sequence[str] | Mapping[str, ArrayLike]) -> dict[str, Tensor]:
@@ -144,78 +142,58 @@ def _initial(circuit: Circuit, parameters: Sequence[str] | Mapping[str, ArrayLik
     return found
 
 
-def _in_front(size: int, dims: Sequence[int | None], tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Tensors of one shape, with the mapped dimension first in all of them."""
-    return [
-        one.movedim(dim, 0) if dim is not None else one.expand(size, *one.shape)
-        for one, dim in zip(tensors, dims, strict=True)
-    ]
-
-
-# The methods of both functions have the names and signatures that torch calls.
+# The methods have the names and signatures that torch calls.
 class _Run(torch.autograd.Function):
-    """The outputs of scenes at values of one shape (...): a tensor of shape (..., number of outputs)."""
+    """The outputs of scenes at values of one shape (...): a tensor of shape (..., number of outputs).
 
-    generate_vmap_rule = False
-
-    @staticmethod
-    def forward(scenes: Scenes, paths: tuple[str, ...], *values: Tensor) -> Tensor:
-        found = scenes.values(paths, torch.stack([one.flatten() for one in values], dim=1).numpy(force=True))
-        return torch.from_numpy(found).reshape(*values[0].shape, -1)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.scenes, ctx.paths = inputs[:2]
-        ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*inputs[2:])
-        ctx.save_for_forward(*inputs[2:])
-
-    @staticmethod
-    def backward(ctx: Any, by_output: Tensor | None) -> tuple[Tensor | None, ...]:
-        needed = ctx.needs_input_grad[2:]
-        wanted = tuple(path for path, need in zip(ctx.paths, needed, strict=True) if need)
-        if by_output is None or not wanted:
-            return (None,) * (2 + len(needed))
-        slopes = _Slopes.apply(ctx.scenes, ctx.paths, wanted, *ctx.saved_tensors)
-        each = iter((by_output.unsqueeze(-1) * slopes).sum(-2).unbind(-1))
-        return (None, None, *(next(each) if need else None for need in needed))
-
-    @staticmethod
-    def jvp(ctx: Any, *moves: Tensor | None) -> Tensor | None:
-        moved = [(path, one) for path, one in zip(ctx.paths, moves[2:], strict=True) if one is not None]
-        if not moved:
-            return None
-        slopes = _Slopes.apply(ctx.scenes, ctx.paths, tuple(path for path, _ in moved), *ctx.saved_tensors)
-        return (slopes * torch.stack([one for _, one in moved], dim=-1).unsqueeze(-2)).sum(-1)
-
-    @staticmethod
-    def vmap(info: Any, dims: tuple[Any, ...], scenes: Scenes, paths: tuple[str, ...], *values: Tensor) -> Any:
-        return _Run.apply(scenes, paths, *_in_front(info.batch_size, dims[2:], values)), 0
-
-
-class _Slopes(torch.autograd.Function):
-    """Derivatives of `_Run` by some of the values: a tensor of shape (..., number of outputs, number of values)."""
+    With `wanted`, their derivatives by these parameters: of shape (..., number of outputs, number of parameters).
+    """
 
     generate_vmap_rule = False
 
     @staticmethod
     def forward(scenes: Scenes, paths: tuple[str, ...], wanted: tuple[str, ...], *values: Tensor) -> Tensor:
         rows = torch.stack([one.flatten() for one in values], dim=1).numpy(force=True)
-        return torch.from_numpy(scenes.slopes(paths, wanted, rows)).reshape(*values[0].shape, -1, len(wanted))
+        found = scenes.values(paths, rows, wanted)
+        return torch.from_numpy(found).reshape(*values[0].shape, *found.shape[1:])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        """Nothing is kept: there are no further derivatives."""
+        ctx.scenes, ctx.paths, ctx.wanted, *values = inputs
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*values)
+        ctx.save_for_forward(*values)
 
     @staticmethod
-    def backward(ctx: Any, *by_output: Tensor) -> Any:
+    def backward(ctx: Any, by_output: Tensor | None) -> tuple[Tensor | None, ...]:
+        needed = ctx.needs_input_grad[3:]
+        wanted = tuple(path for path, need in zip(ctx.paths, needed, strict=True) if need)
+        if by_output is None or not wanted:
+            return (None,) * (3 + len(needed))
+        each = iter((by_output.unsqueeze(-1) * _slopes(ctx, wanted)).sum(-2).unbind(-1))
+        return (None, None, None, *(next(each) if need else None for need in needed))
+
+    @staticmethod
+    def jvp(ctx: Any, *moves: Tensor | None) -> Tensor | None:
+        moved = [(path, one) for path, one in zip(ctx.paths, moves[3:], strict=True) if one is not None]
+        if not moved:
+            return None
+        slopes = _slopes(ctx, tuple(path for path, _ in moved))
+        return (slopes * torch.stack([one for _, one in moved], dim=-1).unsqueeze(-2)).sum(-1)
+
+    @staticmethod
+    def vmap(info: Any, dims: tuple[Any, ...], scenes: Scenes, paths: Any, wanted: Any, *values: Tensor) -> Any:
+        # Tensors of one shape, with the mapped dimension first in all of them.
+        each = [
+            one.movedim(dim, 0) if dim is not None else one.expand(info.batch_size, *one.shape)
+            for one, dim in zip(values, dims[3:], strict=True)
+        ]
+        return _Run.apply(scenes, paths, wanted, *each), 0
+
+
+def _slopes(ctx: Any, wanted: tuple[str, ...]) -> Tensor:
+    """Derivatives of a run's outputs by the parameters `wanted`."""
+    if ctx.wanted:
         raise InputError("second derivatives of a run are asked for; allowed: first derivatives")
-
-    jvp = backward
-
-    @staticmethod
-    def vmap(
-        info: Any, dims: tuple[Any, ...], scenes: Scenes, paths: tuple[str, ...], wanted: tuple[str, ...],
-        *values: Tensor,
-    ) -> Any:  # fmt: skip
-        return _Slopes.apply(scenes, paths, wanted, *_in_front(info.batch_size, dims[3:], values)), 0
+    found: Tensor = _Run.apply(ctx.scenes, ctx.paths, wanted, *ctx.saved_tensors)
+    return found

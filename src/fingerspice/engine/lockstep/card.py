@@ -14,12 +14,11 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.card import card_compiler, for_card
-from fingerspice.engine.lockstep.march import How, Source, march_block, stepping_shapes
-from fingerspice.engine.lockstep.scenes import Places, block_shapes, scratch_shapes
+from fingerspice.engine.lockstep.march import How, Source, march_block
+from fingerspice.engine.lockstep.scenes import Scenes, block_shapes
 from fingerspice.engine.lockstep.step import Marks, marks_of
 
 Lengths = tuple[int, int, int, int, int]
@@ -36,22 +35,15 @@ _CARD = Lock()
 def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., None]:
     """The function of a thread, for the compiler: it integrates one scene, as `march` does.
 
-    Parameters
-    ----------
-    lengths : tuple of int
-        `Lengths`.
-    rows : int
-        Rows of the table.
-    pieces : int
-        Largest number of pieces of a half period, 0 for a source without jumps.
+    It is for tables of so many rows, and at most so many pieces of a half period, 0 for a source without jumps.
     """
     global cuda
     cuda, integrate = card_compiler(), for_card(march_block)
     marks: Marks = marks_of(*lengths, lanes=1)
     modes = lengths[0]
-    (constants,), *_ = block_shapes(rows, marks)
-    (cells,), _, _, _, _, (both,), _, (points,), *_ = scratch_shapes(marks)
-    (row,), (most, _, _), (states,), (sums,), *_ = stepping_shapes(pieces or 4, marks)
+    found, scratches, steppings = block_shapes(rows, pieces or 4, marks)
+    (constants,), (cells,), (both,), (points,) = found[0], scratches[0], scratches[5], scratches[7]
+    (row,), (most, _, _), (states,), (sums,), *_ = steppings
     jumping = pieces > 0
 
     def kernel(
@@ -69,11 +61,11 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
             cuda.local.array((2, modes), np.float64), cuda.local.array((2, cells, modes), np.float64),
             cuda.local.array((2, cells), np.float64), cuda.local.array((2, cells), np.int64),
         )  # fmt: skip
-        block = (
+        columns = (
             cuda.local.array(constants, np.float64), cuda.local.array(modes, np.float64),
             cuda.local.array((modes, 1), np.float64), cuda.local.array((modes, 1), np.float64),
             cuda.local.array(rows, np.float64), cuda.local.array(1, np.float64),
-            cuda.local.array(1, np.float64), scratch,
+            cuda.local.array(1, np.float64),
         )  # fmt: skip
         stepping = (
             cuda.local.array(row, np.float64), cuda.local.array((most, 3, row), np.float64),
@@ -82,10 +74,9 @@ def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., Non
             cuda.local.array(1, np.float64), cuda.local.array((11, 1), np.float64),
         )  # fmt: skip
         how = (halves, half, count if jumping else 0, periodic, tol, covered)
-        integrate(
-            table, pending, first, (gap, leaks), (series, nodes, matrix), (tones, (coarse, fine)), how, block,
-            stepping, out, (block[5][:0], block[5][:0]), marks,
-        )  # fmt: skip
+        scenes, none = (table, pending, (gap, leaks), (series, nodes, matrix)), columns[5][:0]
+        block = (columns, scratch, stepping)
+        integrate(scenes, first, (tones, (coarse, fine)), how, block, out, (none, none), marks)
 
     return kernel
 
@@ -96,29 +87,17 @@ def _compiled(lengths: Lengths, rows: int, pieces: int) -> Any:
     return card_compiler().jit(thread_kernel(lengths, rows, pieces))
 
 
-def march_on_card(
-    table: FloatArray, pending: NDArray[np.int64], places: Places,
-    curves: tuple[FloatArray, FloatArray, FloatArray], source: Source, how: How, most_pieces: int,
-    lengths: Lengths,
-) -> FloatArray:  # fmt: skip
+def march_on_card(scenes: Scenes, source: Source, how: How, most_pieces: int, lengths: Lengths) -> FloatArray:
     """Integrate scenes of a table as `march.march` does, and return its `out`.
 
-    Parameters
-    ----------
-    table, pending, places, curves, source, how
-        As `march.march` takes them.
-    most_pieces : int
-        Number of pieces for which the kernel is compiled; 0 for a source without jumps.
-    lengths : tuple of int
-        `Lengths`.
+    The kernel is compiled for `most_pieces`, 0 for a source without jumps.
     """
+    table, pending, (gap, leaks), curves = scenes
     kernel = _compiled(lengths, table.shape[0], most_pieces)
     chosen = np.ascontiguousarray(table[:, pending])  # Not always in the order of the table
     with _CARD:
-        given = (chosen, np.arange(pending.size), places[1], *curves, source[0], *source[1])
-        columns, order, leaks, series, nodes, matrix, tones, coarse, fine = (cuda.to_device(x) for x in given)
+        given = (chosen, np.arange(pending.size), leaks, *curves, source[0], *source[1])
+        columns, order, *arrays = (cuda.to_device(x) for x in given)
         out = cuda.device_array((2, 2 * lengths[4] + 3, pending.size))
-        kernel[-(-pending.size // THREADS), THREADS](
-            columns, order, places[0], leaks, series, nodes, matrix, tones, coarse, fine, *how, out
-        )
+        kernel[-(-pending.size // THREADS), THREADS](columns, order, gap, *arrays, *how, out)
         return np.asarray(out.copy_to_host())

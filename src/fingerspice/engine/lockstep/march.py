@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray, aligned
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit
 from fingerspice.engine.lockstep import step as lockstep
-from fingerspice.engine.lockstep.scenes import CELL_ROWS, OMEGA, Block, Places, fill_block, put_result
-from fingerspice.engine.lockstep.step import Marks, Weights, area_row, n_state, run
+from fingerspice.engine.lockstep.scenes import CELL_ROWS, OMEGA, Scenes, fill_block, put_result
+from fingerspice.engine.lockstep.step import Marks, area_row, run
 from fingerspice.engine.lockstep.weights import weigh
 
 # Most periods in the search for the periodic state.
@@ -20,51 +19,15 @@ MOST_PERIODS = 16
 # Whether a run has settled is judged as if its modes decayed slower than with the area held, by this factor.
 SLOWER = 0.5
 Source = tuple[FloatArray, tuple[FloatArray, FloatArray]]
-How = tuple[int, int, int, bool, float, float]
-
-
-class Stepping(NamedTuple):
-    """Arrays for the steps of a block of scenes; all are overwritten."""
-
-    # still, moving: Weights, as `lockstep.run` takes them
-    still: FloatArray
-    moving: NDArray[np.float64]
-    s: FloatArray  # (n_state * lanes,): State
-    last: FloatArray  # (n_moment * lanes,): Sums over the last period
-    before: FloatArray  # (n_mode * lanes,): Modes at the start of the last period
-    # (n_mode * lanes,): In the search for the periodic state, the derivative of the start by what a period leaves open,
-    # with the area held. In a run from rest, an upper bound of the modes' time constants, in periods.
-    back: FloatArray
-    # (lanes,): What the periodic state is off, relative to the peak gap voltage; or half of what the mean force is off
-    # because the last period stands for those after it, relative to that force, and infinite while it does not
-    closing: FloatArray
-    # (lanes,): Length of the shortest step, s; in a run from rest, then the number of half periods after which it has
-    # settled
-    length: FloatArray
-    moments: FloatArray  # (11, lanes): Scratch of `weights.weigh`
-
-
-def stepping_shapes(pieces: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
-    """Shapes of the arrays of a `Stepping`, for weights of so many pieces (4 without jumps)."""
-    m_all, _, l_all, _, count, lanes = (len(mark) for mark in marks)
-    row, modes = lockstep.N_WEIGHTS * m_all * lanes, (m_all * lanes,)
-    sums = (count * lanes,)
-    return (
-        (row,),
-        (pieces, 3, row),
-        (n_state(m_all, l_all, count) * lanes,),
-        sums,
-        modes,
-        modes,
-        (lanes,),
-        (lanes,),
-        (11, lanes),
-    )
-
-
-def new_stepping(pieces: int, marks: Marks) -> Stepping:
-    """Arrays for the steps of blocks of scenes, whose half periods have so many pieces (0 without jumps)."""
-    return Stepping._make(aligned(stepping_shapes(pieces or 4, marks)))
+"""Frequencies of the tones, in that of the source; and the waves of both numbers of steps, as `step.run` takes them."""
+How = tuple[
+    int,  # Number of half periods
+    int,  # Steps in each, in the second run; the first has half as many, or is left out if its waves are empty
+    int,  # Pieces of each if the source jumps to its negative after each, else 0
+    bool,  # Whether the periodic state is wanted
+    float,  # Its tolerance, relative to the peak gap voltage
+    float,  # Largest gap voltage that the area's polynomial covers, as a ratio to its estimate
+]
 
 
 @jit
@@ -92,7 +55,7 @@ def _closed(
 
 
 @jit
-def _settled(i: int, c: FloatArray, stepping: Stepping, steps: int, traced: bool, marks: Marks) -> float:
+def _settled(i: int, c: FloatArray, stepping: Any, steps: int, traced: bool, marks: Marks) -> float:
     """Half of what lane i's mean force is off, relative to it, if the last period stands for all that follow.
 
     What a mode was off the periodic state, on average over the period, is at most its change over the period times its
@@ -100,7 +63,7 @@ def _settled(i: int, c: FloatArray, stepping: Stepping, steps: int, traced: bool
     peak voltage times this, and the area; `steps` is the number of steps of a period. If gap voltages are wanted, then
     at least what these change, relative to their peak.
     """
-    s, last, before, back = stepping[2], stepping[3], stepping[4], stepping[5]
+    _, _, s, last, before, back, _, _, _ = stepping
     m_all, lanes = len(marks[0]), len(marks[5])
     off, held = 0.0, area_row(m_all, len(marks[1]), len(marks[2])) + len(marks[3]) - 1
     for m in range(m_all):
@@ -113,16 +76,16 @@ def _settled(i: int, c: FloatArray, stepping: Stepping, steps: int, traced: bool
 
 @jit
 def _from_rest(
-    c: FloatArray, g: Weights, wave: FloatArray, how: tuple[int, int, bool], tol: float, stepping: Stepping,
-    trace: FloatArray, out: FloatArray, first: int, marks: Marks,
+    found: Any, stepping: Any, wave: FloatArray, how: tuple[int, int, int], tol: float, trace: FloatArray,
+    out: FloatArray, first: int, marks: Marks,
 ) -> None:  # fmt: skip
-    """Run a block's scenes period by period, until the run ends or all have settled; see `march` for the arguments.
+    """Run a block's scenes period by period, until the run ends or all have settled.
 
     A scene that has settled takes part in further periods only if others of its block do, and its results stay those
     at which it settled: no result depends on the scenes beside it. A first range of half a period makes the rest whole.
     """
-    halves, steps, jumping = how
-    s, last, before, closing, settled = stepping[2], stepping[3], stepping[4], stepping[6], stepping[7]
+    halves, steps, pieces = how
+    still, moving, s, last, before, _, closing, settled, _ = stepping
     m_all, count, lanes = len(marks[0]), len(marks[4]), len(marks[5])
     sums = (lockstep.N_STATE * m_all + lockstep.VALUE + count) * lanes
     for i in range(lanes):
@@ -134,7 +97,7 @@ def _from_rest(
             before[i] = s[lockstep.Z * m_all * lanes + i]
         for i in range(last.size):
             last[i] = -s[sums + i] if done > 0 else 0.0
-        run(c, g, s, wave, (done, upto, steps, jumping), trace, marks)
+        run(found[0], (still, moving[: pieces or 4]), s, wave, (done, upto, steps, pieces > 0), trace, marks)
         for i in range(last.size):
             last[i] = last[i] + s[sums + i] if upto - done == 2 else math.nan
         done = upto
@@ -144,11 +107,11 @@ def _from_rest(
                 continue
             off = 0.0
             if ahead > 0:
-                off = _settled(i, c, stepping, 2 * steps, trace.size > 0, marks)
+                off = _settled(i, found[0], stepping, 2 * steps, trace.size > 0, marks)
             if ahead == 0 or off <= tol:
                 closing[i], settled[i] = off, done
                 left -= 1
-                put_result(i, s, last, off, (ahead, halves, steps), first, out, marks)
+                put_result(i, s, last, off, (ahead, halves * steps, 2 * steps), found, first, out, marks)
     width = trace.size // lanes
     for i in range(lanes if width > 0 else 0):
         # The last period, again and again.
@@ -158,21 +121,21 @@ def _from_rest(
 
 @jit
 def march_block(
-    table: FloatArray, pending: NDArray[np.int64], first: int, places: Places,
-    curves: tuple[FloatArray, FloatArray, FloatArray], source: Source, how: How, block: Block, stepping: Stepping,
-    out: FloatArray, voltages: tuple[FloatArray, FloatArray], marks: Marks,
+    scenes: Scenes, first: int, source: Source, how: How, block: tuple[Any, Any, Any], out: FloatArray,
+    voltages: tuple[FloatArray, FloatArray], marks: Marks,
 ) -> None:  # fmt: skip
-    """Integrate the scenes from number `first` of `pending` on, as many as there are lanes; see `march`.
+    """Integrate as many scenes as there are lanes, from number `first` on; see `march`.
 
     `voltages` take the gap voltages before the steps of both runs, each of shape (lanes * steps,) or (0,).
     """
     halves, half, pieces, periodic, tol, covered = how
     m_all, count, lanes, jumping = len(marks[0]), len(marks[4]), len(marks[5]), pieces > 0
     # Unpacked by position, as a compiler for graphics cards may know plain tuples only.
-    c, start, rates, drive, t, top, tails, _ = block
+    found, scratch, stepping = block
+    c, start, rates, drive, t, _, _ = found
     still, moving, s, _, _, back, closing, length, moments = stepping
     sums, omega = (lockstep.N_STATE * m_all + lockstep.VALUE + count) * lanes, (CELL_ROWS * (m_all + 1) + OMEGA) * lanes
-    fill_block(table, pending, first, places, curves, (source[0], jumping, covered), block, marks)
+    fill_block(scenes, first, (source[0], jumping, covered), found, scratch, marks)
     for i in range(lanes):
         period = 2.0 * math.pi / t[omega + i]
         for m in range(m_all):
@@ -180,7 +143,7 @@ def march_block(
                 back[m * lanes + i] = -1.0 / math.expm1(-rates[m, i] * period)
             else:
                 back[m * lanes + i] = 1.0 / (SLOWER * rates[m, i] * period + 1e-300)
-    g = (still, moving[: pieces if jumping else 4])
+    g = (still, moving[: pieces or 4])
     for w in range(2):
         if source[1][w].size == 0:
             continue
@@ -194,49 +157,29 @@ def march_block(
             for i in range(s.size):
                 s[i] = start[i] if i < start.size else 0.0
             if not periodic:
-                way = (halves, steps, jumping)
-                _from_rest(c, g, source[1][w], way, tol, stepping, voltages[w], out[w], first, marks)
+                way = (halves, steps, pieces)
+                _from_rest(found, stepping, source[1][w], way, tol, voltages[w], out[w], first, marks)
                 break
             run(c, g, s, source[1][w], (0, halves, steps, jumping), voltages[w], marks)
             done = _closed(s, start, back, c, closing, tol, marks)
+            way = (0, halves * steps, 2 * steps)
             for i in range(lanes):
-                put_result(i, s, s[sums:], closing[i], (0, halves, steps), first, out[w], marks)
+                put_result(i, s, s[sums:], closing[i], way, found, first, out[w], marks)
             if done:
                 break
-        for i in range(min(lanes, pending.size - first)):
-            within = out[w, 2 * count, first + i] <= top[i]
-            out[w, 2 * count + 2, first + i] = tails[i] if within else math.inf
 
 
 @jit
 def march(
-    table: FloatArray, pending: NDArray[np.int64], places: Places,
-    curves: tuple[FloatArray, FloatArray, FloatArray], source: Source, how: How, block: Block, stepping: Stepping,
-    out: FloatArray, traces: tuple[FloatArray, FloatArray], marks: Marks,
+    scenes: Scenes, source: Source, how: How, block: tuple[Any, Any, Any], out: FloatArray,
+    traces: tuple[FloatArray, FloatArray], marks: Marks,
 ) -> None:  # fmt: skip
     """Integrate scenes of a table, block by block, with each of two numbers of steps; the first may be none.
 
     Parameters
     ----------
-    table : ndarray, shape (n_row, n_scene)
-        `CELL_ROWS` for all cells, `N_OTHERS` rows, and two for every tone.
-    pending : ndarray, shape (n,)
-        Indices of the scenes to integrate.
-    places : tuple
-        Index of the gap among the cells, and of those with a total leakage, one for every leak of the marks.
-    curves : tuple of ndarray
-        Polynomial coefficients of the universal curve over X, highest power first; Chebyshev points; and the matrix
-        from values at these points to polynomial coefficients (d + 1, d + 1), highest power first.
-    source : tuple of ndarray
-        Frequencies of the tones, in that of the source; and the waves as `lockstep.run` takes them, for both numbers of
-        steps.
-    how : tuple
-        Number of half periods; of steps in each, in the second run (the first run has half as many, or none if its
-        waves are empty); of pieces of each if the source jumps to its negative after each, else 0; whether the periodic
-        state is wanted; its tolerance, relative to the peak gap voltage; and the largest gap voltage that the area's
-        polynomial covers, as a ratio to its estimate.
-    block, stepping
-        From `scenes.new_block` and `new_stepping`.
+    block
+        From `scenes.new_block`.
     out : ndarray, shape (2, 2 n_moment + 3, n)
         For each run the means over it and over its last period, the peak (V), the relative error of the periodic
         state, and the relative size of the last coefficient of the area's series. The latter is infinite where the
@@ -244,35 +187,11 @@ def march(
     traces : tuple of ndarray, each of shape (n, steps)
         Gap voltage before every step of each run, V; (n, 0) for none.
     """
-    lanes = len(marks[5])
+    lanes, n = len(marks[5]), scenes[1].size
     voltages = np.empty(lanes * traces[0].shape[1]), np.empty(lanes * traces[1].shape[1])
-    for first in range(0, pending.size, lanes):
-        march_block(table, pending, first, places, curves, source, how, block, stepping, out, voltages, marks)
+    for first in range(0, n, lanes):
+        march_block(scenes, first, source, how, block, out, voltages, marks)
         for w in range(2):
             width = traces[w].shape[1]
-            for i in range(min(lanes, pending.size - first) if width > 0 else 0):
+            for i in range(min(lanes, n - first) if width > 0 else 0):
                 traces[w][first + i] = voltages[w][i * width : (i + 1) * width]
-
-
-@jit
-def trace_changes(fine: FloatArray, coarse: FloatArray, out: FloatArray) -> None:
-    """Largest difference of gap voltages (n, 2 steps) and (n, steps) at the same times, for each scene, into `out`."""
-    for i in range(fine.shape[0]):
-        largest = 0.0
-        for j in range(coarse.shape[1]):
-            off = abs(fine[i, 2 * j] - coarse[i, j])
-            largest = off if off > largest else largest
-        out[i] = largest
-
-
-@jit
-def put_traces(
-    traces: FloatArray, chosen: NDArray[np.int64], stride: int, at: NDArray[np.int64], out: FloatArray
-) -> None:
-    """Every `stride`-th gap voltage of the `chosen` scenes, into the rows `at` of `out`, which are NaN beyond them."""
-    for k in range(chosen.size):
-        count, trace, row = traces.shape[1] // stride, traces[chosen[k]], out[at[k]]
-        for j in range(count):
-            row[j] = trace[j * stride]
-        for j in range(count, row.size):
-            row[j] = math.nan

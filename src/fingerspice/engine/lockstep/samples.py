@@ -10,24 +10,14 @@ the kink of 1/A is added in closed form, for a voltage that is a straight line i
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lockstep.scenes import CELL_ROWS, OMEGA, Block, Places, fill_block
-from fingerspice.engine.lockstep.step import (
-    GAP,
-    N_STATE,
-    PEAK,
-    SCALE,
-    SHAPE,
-    VALUE,
-    Marks,
-    area_row,
-    n_state,
-)
+from fingerspice.engine.lockstep.scenes import CELL_ROWS, OMEGA, Scenes, fill_block, put_result
+from fingerspice.engine.lockstep.step import GAP, N_STATE, PEAK, SCALE, SHAPE, VALUE, Marks, area_row, n_state
 from fingerspice.engine.lockstep.weights import moment_integrals
 
 # Rows of the weights, each for every mode. To the middle: decay, source at both ends, nonlinear term at the start and
@@ -177,24 +167,20 @@ def _run(
 
     `portions` takes the sums over each portion of the run, as the state holds those over the whole run.
     """
-    own, count, lanes = N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
+    size = len(marks[4]) * len(marks[5])
     # A step of length 0 evaluates the nonlinear term and the integrands.
     _step(c, still, s, slope, (values[0], values[0]), 0.0, marks)
-    for i in range(lanes):
-        s[(own + PEAK) * lanes + i] = abs(s[(own + GAP) * lanes + i])
-        for k in range(count):
-            s[(own + VALUE + count + k) * lanes + i] = 0.0
-    sums, intervals = (own + VALUE + count) * lanes, values.size - 1
+    sums, intervals = (N_STATE * len(marks[0]) + VALUE) * len(marks[5]) + size, values.size - 1
     for p in range(N_PORTION):
-        for i in range(count * lanes):
-            portions[p, i] = -s[sums + i]
+        for i in range(size):
+            portions[p * size + i] = -s[sums + i]
         for j in range(p * intervals // N_PORTION, (p + 1) * intervals // N_PORTION):
             here, change = values[j], (values[j + 1] - values[j]) / parts
             for k in range(parts):
                 ends = (here + k * change, here + (k + 1) * change)
                 _step(c, g, s, slope, ends, 1.0 / 6.0, marks)
-        for i in range(count * lanes):
-            portions[p, i] += s[sums + i]
+        for i in range(size):
+            portions[p * size + i] += s[sums + i]
 
 
 @jit
@@ -210,61 +196,45 @@ def _slopes(c: FloatArray, area: int, degree: int, slope: FloatArray, marks: Mar
 
 
 @jit
-def _put_results(
-    s: FloatArray, portions: FloatArray, steps: float, block: Block, first: int, out: FloatArray, marks: Marks
-) -> None:
-    """Write a block's columns of `out`, which `march_samples` describes."""
-    own, count, lanes = N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
-    for i in range(min(lanes, out.shape[1] - first)):
-        for j in range(count):
-            out[j, first + i] = s[(own + VALUE + count + j) * lanes + i] / steps
-            for p in range(N_PORTION):
-                out[(1 + p) * count + j, first + i] = portions[p, j * lanes + i] / steps
-        peak = s[(own + PEAK) * lanes + i]
-        out[-3, first + i], out[-2, first + i] = peak, 0.0
-        out[-1, first + i] = block.tail[i] if peak <= block.top[i] else math.inf
-
-
-@jit
 def march_samples(
-    table: FloatArray, pending: NDArray[np.int64], places: Places,
-    curves: tuple[FloatArray, FloatArray, FloatArray], values: FloatArray, how: tuple[tuple[int, int], float],
-    block: Block, out: FloatArray, marks: Marks,
+    scenes: Scenes, values: FloatArray, how: tuple[tuple[int, int], float], block: tuple[Any, Any, Any],
+    out: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
     """Integrate scenes of a table under one recording, block by block, with each of two numbers of steps a sample.
 
+    Its peak is the amplitude of the one wave; the table's frequency is half that of the samples.
+
     Parameters
     ----------
-    table, pending, places, curves, block, marks
-        As for `march.march`, with one wave, whose amplitude is the recording's peak; the table's frequency is half
-        that of the samples.
     values : ndarray, shape (n,)
         Samples relative to their peak.
     how : tuple
         Steps a sample in both runs, 0 for none in the first; and the largest gap voltage that the area's
         polynomial covers, as a ratio to its estimate.
-    out : ndarray, shape (2, (1 + N_PORTION) * n_moment + 3, n)
-        As for `march.march`, with the shares of the run's portions in place of the last period.
+    block, out
+        As for `march.march`, with the shares of `N_PORTION` portions of the run in place of the last period.
     """
     m_all, l_all, d_all, count, lanes = len(marks[0]), len(marks[2]), len(marks[3]) - 1, len(marks[4]), len(marks[5])
-    area, row = area_row(m_all, 1, l_all), N_WEIGHTS * m_all * lanes
-    omega = (CELL_ROWS * (m_all + 1) + OMEGA) * lanes
-    c, still, g = block.c, np.zeros(row), np.empty(row)
-    # The last rows hold the voltages of the leaks.
-    s, slope = np.empty((n_state(m_all, l_all, count) + l_all) * lanes), np.empty(lanes)
-    portions, h = np.empty((N_PORTION, count * lanes)), np.empty(lanes)
+    omega, row = (CELL_ROWS * (m_all + 1) + OMEGA) * lanes, N_WEIGHTS * m_all * lanes
+    found, scratch, _ = block
+    c, _, rates, drive, t, _, _ = found
+    # The last rows of the state hold the voltages of the leaks.
+    s, still, g = np.empty((n_state(m_all, l_all, count) + l_all) * lanes), np.zeros(row), np.empty(row)
+    portions, slope, h = np.empty(N_PORTION * count * lanes), np.empty(lanes), np.empty(lanes)
     for kind in (HALF, DECAY):
         still[kind * m_all * lanes : (kind + 1) * m_all * lanes] = 1.0
-    for first in range(0, pending.size, lanes):
-        fill_block(table, pending, first, places, curves, (np.ones(1), True, how[1]), block, marks)
-        _slopes(c, area, d_all, slope, marks)
+    for first in range(0, scenes[1].size, lanes):
+        fill_block(scenes, first, (np.ones(1), True, how[1]), found, scratch, marks)
+        _slopes(c, area_row(m_all, 1, l_all), d_all, slope, marks)
         for w in range(2):
             parts = how[0][w]
             if parts == 0:
                 continue
             for i in range(lanes):
-                h[i] = math.pi / block.t[omega + i] / parts
-            _weigh(h, block.rates, block.drive, g, marks)
+                h[i] = math.pi / t[omega + i] / parts
+            _weigh(h, rates, drive, g, marks)
             s[:] = 0.0
             _run(c, still, g, s, slope, values, parts, portions, marks)
-            _put_results(s, portions, float((values.size - 1) * parts), block, first, out[w], marks)
+            steps = (values.size - 1) * parts
+            for i in range(lanes):
+                put_result(i, s, portions, 0.0, (0, steps, steps), found, first, out[w], marks)

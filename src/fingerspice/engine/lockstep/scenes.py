@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray, aligned
 from fingerspice.base.compiled import jit, jit_rows
 from fingerspice.engine.lockstep import step as lockstep
-from fingerspice.engine.lockstep.step import Marks, area_row, n_constants
+from fingerspice.engine.lockstep.step import Marks, area_row, n_state
 from fingerspice.numerics.modes import write_modes
 
 # A mode's rate nearer than this (relative) to the rate of a cell, a pole of the characteristic equation, has too few
@@ -73,37 +74,8 @@ def _shapes(
                 feed[(j * m_all + m) * lanes + i] *= -1.0 / norm
 
 
-class Scratch(NamedTuple):
-    """Arrays for the cells and modes of a block (`find_rates` and the like); and for `write_modes` those of one lane.
-
-    The latter are rates and shares of the cells, rates and gains of the modes, their feeds and shapes, and its scratch.
-    """
-
-    k: FloatArray
-    moved: FloatArray
-    r: FloatArray
-    near: FloatArray
-    gain: FloatArray
-    feed: FloatArray
-    shape: FloatArray
-    values: FloatArray
-    own: FloatArray
-    found: FloatArray
-    forms: NDArray[np.float64]
-    floats: FloatArray
-    whole: NDArray[np.int64]
-
-
-def scratch_shapes(marks: Marks) -> tuple[tuple[int, ...], ...]:
-    """Shapes of the arrays of a `Scratch`."""
-    m, lanes = len(marks[0]), len(marks[5])
-    row, both = ((m + 1) * lanes,), ((m + 1) * m * lanes,)
-    block = (row, row, row, (lanes,), (m * lanes,), both, both, (len(marks[3]) * lanes,))
-    return *block, (2, m + 1), (2, m), (2, m + 1, m), (2, m + 1), (2, m + 1)
-
-
 @jit
-def find_modes(rates: FloatArray, scratch: Scratch, marks: Marks) -> None:
+def find_modes(rates: FloatArray, scratch: Any, marks: Marks) -> None:
     """Modes of all lanes: in closed form, and by iteration where this would lose digits or there is none."""
     k, _, r, near, gain, feed, shape, _, own, found, forms, floats, whole = scratch
     m_all, lanes = len(marks[0]), len(marks[5])
@@ -149,8 +121,15 @@ After them come the amplitudes (V) of the sine and of the cosine in each of its 
 first of both."""
 LARGEST_X = 1.3
 """Largest X that the series of the universal curve covers."""
-Places = tuple[int, NDArray[np.int64]]
-"""Index of the gap among the cells, and of the cells whose leak has a total resistance."""
+Scenes = tuple[
+    FloatArray,  # (n_row, n_scene): Table, `CELL_ROWS` for all cells, `N_OTHERS` rows, and two for every tone
+    NDArray[np.int64],  # (n,): Which of them are integrated
+    tuple[int, NDArray[np.int64]],  # The gap among the cells, and those whose leak has a total resistance
+    # Polynomial coefficients of the universal curve over X, highest power first; Chebyshev points; and the matrix from
+    # values at these points to polynomial coefficients (d + 1, d + 1), highest power first
+    tuple[FloatArray, FloatArray, FloatArray],
+]
+"""Scenes of a table, and what they have in common."""
 
 
 @jit_rows
@@ -285,78 +264,93 @@ def _drive(
 
 @jit
 def put_result(
-    i: int, s: FloatArray, last: FloatArray, closing: float, lengths: tuple[int, int, int], first: int,
+    i: int, s: FloatArray, parts: FloatArray, closing: float, lengths: tuple[int, int, int], found: Any, first: int,
     out: FloatArray, marks: Marks,
 ) -> None:  # fmt: skip
-    """Lane i's means over the run and its last period, its peak (V), and the relative error of the periodic state.
+    """Write lane i's column of `out`, which `march.march` describes; `parts` are the sums over parts of the run.
 
-    `lengths` are the number of periods that the last period stands for beside itself; that of half periods of the run;
-    and of the steps in each.
+    `lengths` are how often the last part stands for others beside itself; steps of the run; and steps of a part, or of
+    the run, of which each part then has its share.
     """
     own, count, lanes = lockstep.N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
-    ahead, halves, steps = lengths
-    if first + i >= out.shape[1]:
+    ahead, steps, of_part = lengths
+    at, peak = first + i, s[(own + lockstep.PEAK) * lanes + i]
+    if at >= out.shape[1]:
         return
     for j in range(count):
         total = s[(own + lockstep.VALUE + count + j) * lanes + i]
         if ahead > 0:
-            total += ahead * last[j * lanes + i]
-        out[j, first + i] = total / (halves * steps)
-        out[count + j, first + i] = last[j * lanes + i] / (2 * steps)
-    out[2 * count, first + i] = s[(own + lockstep.PEAK) * lanes + i]
-    out[2 * count + 1, first + i] = closing
+            total += ahead * parts[j * lanes + i]
+        out[j, at] = total / steps
+        for k in range(j, out.shape[0] - 3 - count, count):
+            out[count + k, at] = parts[k * lanes + i] / of_part
+    out[-3, at], out[-2, at] = peak, closing
+    out[-1, at] = found[6][i] if peak <= found[5][i] else math.inf
 
 
-class Block(NamedTuple):
-    """What `fill_block` finds of a block's scenes, and its scratch."""
+def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int, ...], ...], ...]:
+    """Shapes of a block's arrays, for a table with so many rows and half periods of so many pieces (4 without jumps).
 
-    c: FloatArray  # (n_constants * lanes,): Constants, as `engine.lockstep.step` takes them
-    start: FloatArray  # (n_mode * lanes,): Modes at the start, V
-    # rates, drive (n_mode, lanes): Rates (1/s), and drive of a source of constant pieces
-    rates: FloatArray
-    drive: FloatArray
-    t: FloatArray  # (n_row * lanes,): The scenes' columns of the table
-    # top, tail (lanes,): Largest gap voltage that the area's polynomial covers (V), and the relative size of its last
-    # coefficient; infinite where the universal curve does not reach so far
-    top: FloatArray
-    tail: FloatArray
-    scratch: Scratch
+    They are in three groups: what `fill_block` finds, its scratch, and what `march.march_block` steps with.
+    """
+    m, w, k, d, count, lanes = (len(mark) for mark in marks)
+    lane, modes, cells, both = (lanes,), (m * lanes,), ((m + 1) * lanes,), ((m + 1) * m * lanes,)
+    weights = lockstep.N_WEIGHTS * m * lanes
+    found = (
+        ((area_row(m, w, k) + d) * lanes,),  # Constants, as `step` takes them
+        modes,  # Modes at the start, V
+        (m, lanes), (m, lanes),  # Rates (1/s), and drive of a source of constant pieces
+        (rows * lanes,),  # Columns of the table
+        # Largest gap voltage that the area's polynomial covers (V), and the relative size of its last coefficient;
+        # infinite where the universal curve does not reach so far
+        lane, lane,
+    )  # fmt: skip
+    # Of the cells, their share, rate by total resistance and rate; of a lane, whether a rate is near, and others; the
+    # modes' gain, feed and shape; values of the area; and for `write_modes` of one lane, rates and shares of the cells,
+    # rates and gains of the modes, their feeds and shapes, and its scratch.
+    scratch = (
+        cells, cells, cells, lane, modes, both, both, (d * lanes,), (2, m + 1), (2, m), (2, m + 1, m), (2, m + 1),
+    )  # fmt: skip
+    stepping = (
+        (weights,), (pieces, 3, weights),  # Weights, as `step.run` takes them
+        (n_state(m, k, count) * lanes,),  # State
+        (count * lanes,),  # Sums over the last period
+        modes,  # Modes at the start of the last period
+        # In the search for the periodic state, the derivative of the start by what a period leaves open, with the area
+        # held. In a run from rest, an upper bound of the modes' time constants, in periods.
+        modes,
+        # What the periodic state is off, relative to the peak gap voltage; or half of what the mean force is off
+        # because the last period stands for those after it, relative to that force, and infinite while it does not
+        lane,
+        # Length of the shortest step, s; in a run from rest, then the number of half periods after which it has settled
+        lane,
+        (11, lanes),  # Scratch of `weights.weigh`
+    )  # fmt: skip
+    return found, scratch, stepping
 
 
-def block_shapes(rows: int, marks: Marks) -> tuple[tuple[int, ...], ...]:
-    """Shapes of the arrays of a `Block` before its scratch, for a table with so many rows."""
-    m_all, w_all, l_all, d_all, _, lanes = (len(mark) for mark in marks)
-    size = n_constants(m_all, w_all, l_all, d_all - 1) * lanes
-    modes = (m_all, lanes)
-    return (size,), (m_all * lanes,), modes, modes, (rows * lanes,), (lanes,), (lanes,)
-
-
-def new_block(rows: int, marks: Marks) -> Block:
-    """Arrays for blocks of scenes of a table with so many rows."""
-    *floats, whole = scratch_shapes(marks)
-    shapes = block_shapes(rows, marks)
-    arrays = aligned([*shapes, *floats])
-    scratch = Scratch._make([*arrays[len(shapes) :], np.empty(whole, np.int64)])
-    return Block._make([*arrays[: len(shapes)], scratch])
+def new_block(rows: int, pieces: int, marks: Marks) -> tuple[Any, Any, Any]:
+    """Arrays for blocks of scenes; `pieces` is 0 without jumps."""
+    shapes = block_shapes(rows, pieces or 4, marks)
+    arrays = iter(aligned(shape for group in shapes for shape in group))
+    found, scratch, stepping = (tuple(islice(arrays, len(group))) for group in shapes)
+    return found, (*scratch, np.empty((2, len(marks[0]) + 1), np.int64)), stepping
 
 
 @jit
 def fill_block(
-    table: FloatArray, pending: NDArray[np.int64], first: int, places: Places,
-    curves: tuple[FloatArray, FloatArray, FloatArray], source: tuple[FloatArray, bool, float], block: Block,
-    marks: Marks,
-) -> None:  # fmt: skip
-    """Constants of the scenes from number `first` of `pending` on, into `block`.
+    scenes: Scenes, first: int, source: tuple[FloatArray, bool, float], found: Any, scratch: Any, marks: Marks
+) -> None:
+    """Find the constants of the scenes from number `first` on.
 
     `source` has the frequencies of the tones, in that of the source; whether it is of constant pieces, or of straight
-    lines; and the largest gap voltage that the area's polynomial covers, as a ratio to its estimate. The other
-    arguments are those of `march`.
+    lines; and the largest gap voltage that the area's polynomial covers, as a ratio to its estimate.
     """
     m_all, w_all, l_all, d_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[5])
     area = area_row(m_all, w_all, l_all)
-    c, start, rates, drive, t, top, tails, scratch = block
+    table, pending, (gap, leaks), curves = scenes
+    c, start, rates, drive, t, top, tails = found
     k, moved, r, near, gain, feed, shape, values, _, _, _, _, _ = scratch
-    gap, leaks = places
     for i in range(lanes):
         scene = pending[min(first + i, pending.size - 1)]
         for row in range(table.shape[0]):

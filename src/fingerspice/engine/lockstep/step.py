@@ -64,12 +64,6 @@ def area_row(m: int, w: int, k: int) -> int:
 
 
 @jit
-def n_constants(m: int, w: int, k: int, d: int) -> int:
-    """Rows of the constants of m modes, w waves, k leaks and a polynomial of degree d."""
-    return area_row(m, w, k) + d + 1
-
-
-@jit
 def n_state(m: int, k: int, moments: int) -> int:
     """Rows of the state, with m modes and k leaks."""
     return N_STATE * m + VALUE + 2 * moments + k
@@ -185,18 +179,10 @@ def _window(
 ) -> None:  # fmt: skip
     """Take steps of one length, a range of Gregory's rule.
 
-    Parameters
-    ----------
-    g : ndarray, shape (3, n)
-        Weights of the first, second and all further steps.
-    places : tuple of int
-        Row of the waves at the start, its change from step to step, and the row after which the first one follows.
-    steps : tuple of int
-        Number of steps, and how many of this length precede them.
-    unit : float
-        Length of a step, in that of the sums.
-    trace : ndarray, shape (lanes * n,) or (0,)
-        Takes the gap voltages before the steps, from `at` on unless that is negative.
+    `g` (3, n) are weights of the first, second and further steps; `places` the row of the waves at the start, its
+    change from step to step, and the row after which the first one follows; `steps` their number, and how many of this
+    length precede them; `unit` their length in that of the sums. The `trace` takes the gap voltages before the steps,
+    from column `at` on unless that is negative.
     """
     count, own = len(marks[4]), N_STATE * len(marks[0])
     place, stride, period = places
@@ -228,30 +214,18 @@ def run(
     c: FloatArray, g: Weights, s: FloatArray, wave: FloatArray, how: tuple[int, int, int, bool], trace: FloatArray,
     marks: Marks,
 ) -> None:  # fmt: skip
-    """Integrate a block's scenes over some half periods, from the state `s` on.
+    """Integrate a block's scenes over some half periods, from the state `s` on: at the start modes, and 0 for the rest.
 
-    Parameters
-    ----------
-    c, g, s : ndarray
-        Constants, weights and state, each flat. At the start of a run the state needs the modes only.
-    wave : ndarray, shape (n + START + 1, len(waves)) or (2, 1)
-        Waves at the n steps of a period, and at the times of the shorter steps at the start (`START_TIMES`); for a
-        turned source its values in both halves of a period.
-    how : tuple
-        Number of half periods that lie behind, 0 at the start of a run; and of those when this ends; number of steps in
-        each; and whether the source is turned: it is constant for a half period, then jumps to its negative, and the
-        method restarts. Such a half period has the pieces that `g` has: of equally many steps, which are twice as long
-        in every piece as in the one before. Without jumps, all of these half periods are a range of Gregory's rule.
-    trace : ndarray, shape (lanes * steps,) or (0,)
-        The gap voltage before each step of the run, V.
+    `wave` (n + START + 1, len(waves)) has the waves at the n steps of a period, and at `START_TIMES`; of a turned
+    source (2, 1) its values in both halves of a period. `how` is the number of half periods that lie behind, 0 at the
+    start of a run; and of those when this ends; number of steps in each; and whether the source is turned: it is
+    constant for a half period, then jumps to its negative, and the method restarts. Such a half period has the pieces
+    that `g` has: of equally many steps, which are twice as long in every piece as in the one before. Without jumps, all
+    of these half periods are a range of Gregory's rule. The `trace` (lanes * steps,) or (0,) takes the gap voltage
+    before each step of the run, V.
     """
     done, halves, half, turned = how
-    count, own, pieces, lanes = len(marks[4]), N_STATE * len(marks[0]), g[1].shape[0], len(marks[5])
-    if done == 0:
-        for i in range(count * lanes):
-            s[(own + VALUE + count) * lanes + i] = 0.0
-        for i in range(lanes):
-            s[(own + PEAK) * lanes + i] = 0.0
+    pieces = g[1].shape[0]
     if not turned:
         begun = 0
         if done == 0:

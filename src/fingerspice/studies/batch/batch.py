@@ -7,7 +7,6 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,14 +20,13 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.notices import scenes_warnings
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
-from fingerspice.solve.simulation import RTOL_RANGE
-from fingerspice.studies.batch.figures import Figures
+from fingerspice.results.solution import Solution
+from fingerspice.solve.simulation import RTOL_RANGE, simulate
+from fingerspice.studies.batch.figures import Figures, Slopes
 from fingerspice.studies.batch.form import LockstepForm, lockstep_form, why_alone
 from fingerspice.studies.batch.ladder import Ladder
-from fingerspice.studies.batch.slopes import Slopes
 from fingerspice.studies.batch.task import (
     FAILED,
-    LOCKSTEP,
     ONE_BY_ONE,
     REFUSED,
     SIGNALS_OF_BATCH,
@@ -41,6 +39,7 @@ from fingerspice.studies.batch.task import (
     gradients_of,
     task_of,
 )
+from fingerspice.studies.steady import SteadyState, steady_state
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -141,11 +140,19 @@ def batch(
             changed[f"{element.name}.f"] = frequency
     for text in scenes_warnings(circuit, task.t_stop, scenes, skin):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    task = replace(task, gradients=gradients_of(task, gradients, scenes, skin))
+    asked = gradients_of(task, gradients, scenes, skin)
+    form = lockstep_form(circuit, changed)
+    recorded = isinstance(form, LockstepForm) and form.recording is not None
+    why = why_alone(form, task.outputs)
     with ThreadPoolExecutor(threads or _processors()) as pool:
-        found, attrs = _figures(task, changed, pool)
-        slopes = None if task.gradients is None else _slopes(task, task.gradients, changed, found, pool, attrs)
-    return _dataset(task, scenes, found, slopes, {"skin": _skin(task, scenes, skin), **attrs})
+        found = _unfilled(task, changed, recorded)
+        _find(task, changed, why or form, found, pool)
+        slopes = None if asked is None else _slopes(asked, changed, found, pool)
+    about = {
+        "skin": _skin(circuit, scenes, skin), "n_ordinary": found.n_ordinary, "ordinary": found.ordinary,
+        "device": "cpu" if why or recorded else task.device,
+    }  # fmt: skip
+    return _dataset(task if asked is None else asked, scenes, found, slopes, about)
 
 
 def _processors() -> int:
@@ -153,58 +160,44 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _figures(
-    task: Task, scenes: Mapping[str, FloatArray], pool: ThreadPoolExecutor
-) -> tuple[Answers, dict[str, Any]]:  # fmt: skip
-    """The outputs of all scenes, and attributes that say how they were found."""
-    n = next(iter(scenes.values())).size
-    form = lockstep_form(task.circuit, scenes)
-    recorded = isinstance(form, LockstepForm) and form.recording is not None
-    width = 0
+def _unfilled(task: Task, scenes: Mapping[str, FloatArray], recorded: bool) -> Answers:
+    """Answers for the outputs, of which none are found."""
+    n, width = next(iter(scenes.values())).size, 0
     if task.traced or (recorded and task.t_stop is None):
         # Refused for what has no period, such as a recording.
         count = task.count(frequencies(task.circuit, scenes))
         width = math.ceil(float(count.max()) * task.points - 1e-9) if task.traced else 0
     require(n * width <= _MOST_VOLTAGES, "outputs", f"of {n * width:.3g} gap voltages", f"at most {_MOST_VOLTAGES:g}")
+    # The memory of gap voltages, which is much, is taken by the threads that write them.
     values = {name: np.empty((n, width)) if name == "u_gap" else np.full(n, np.nan) for name in task.outputs}
-    why, found = why_alone(form, task.outputs), Answers.empty(values, n)
-    reason = _find(Figures, task, scenes, why or form, found, pool)
-    where = task.device if not why and task.on_card(recorded) else "cpu"
-    alone = int(np.count_nonzero(found.status != LOCKSTEP))
-    return found, {"n_ordinary": alone, "ordinary": reason, "device": where}
+    return Answers.empty(values, n)
 
 
-def _slopes(
-    task: Task, wanted: Gradients, scenes: Mapping[str, FloatArray], found: Answers, pool: ThreadPoolExecutor,
-    attrs: dict[str, Any],
-) -> Answers:  # fmt: skip
-    """Derivatives in all scenes that have outputs; attributes that say how they were found go to `attrs`."""
-    n, known = found.error.size, task.circuit.parameters
-    slopes = Answers.empty({name: np.full((n, len(wanted.paths)), np.nan) for name in wanted.outputs}, n)
-    failed = found.status >= REFUSED
-    slopes.status[failed], slopes.done[failed] = found.status[failed], True
+def _slopes(task: Task, scenes: Mapping[str, FloatArray], figures: Answers, pool: ThreadPoolExecutor) -> Answers:
+    """The derivatives that `task` asks for, in all scenes that have `figures`."""
+    wanted, known, n = task.gradients, task.circuit.parameters, figures.error.size
+    assert wanted is not None
+    found = Answers.empty({name: np.full((n, len(wanted.paths)), np.nan) for name in task.outputs}, n)
+    failed = figures.status >= REFUSED
+    found.status[failed] = figures.status[failed]
     every = {**scenes, **{path: np.full(n, known[path].value) for path in wanted.paths if path not in scenes}}
     form = lockstep_form(task.circuit, every)
-    why = why_alone(form, wanted.outputs, task.rtol)
+    why = why_alone(form, task.outputs, task.rtol)
     if not why and wanted.clock is not None and task.t_stop is not None:
         why = f"{wanted.clock} changes the number of periods in t_stop"
-    attrs["ordinary_gradients"] = _find(Slopes, task, every, why or form, slopes, pool)
-    attrs["n_ordinary_gradients"] = int(np.count_nonzero(slopes.status != LOCKSTEP))
-    found.messages |= slopes.messages
-    return slopes
+    _find(task, every, why or form, found, pool)
+    return found
 
 
 def _find(
-    ladder: type[Ladder], task: Task, scenes: Mapping[str, FloatArray], form: LockstepForm | str, found: Answers,
-    pool: ThreadPoolExecutor,
-) -> str:  # fmt: skip
-    """Find what a ladder is for in all scenes that are not done; why some were not in lockstep ('' where all were)."""
-    n, reason = found.error.size, form if isinstance(form, str) else ladder.unmet
+    task: Task, scenes: Mapping[str, FloatArray], form: LockstepForm | str, found: Answers, pool: ThreadPoolExecutor
+) -> None:
+    """Find what `task` asks for in all scenes that are not done; `form` may be why none of them goes in lockstep."""
+    ladder = Figures if task.gradients is None else Slopes
     if isinstance(form, LockstepForm):
         lower = {path.lower(): array for path, array in scenes.items()}
-        clock = (
-            np.full(n, form.frequency or math.nan) if form.recording is not None else frequencies(task.circuit, scenes)
-        )
+        recorded = form.recording is not None
+        clock = np.full(found.error.size, form.frequency) if recorded else frequencies(task.circuit, scenes)
 
         def climb(job: tuple[int, IntArray]) -> None:
             halves, members = job
@@ -212,50 +205,101 @@ def _find(
             ladder(task, form, some, members, found).climb(halves)
 
         # Jobs have no scene in common, so that threads write to different places.
-        list(pool.map(climb, _jobs(task, task.count(clock), ~found.done, form.recording is not None)))
-    rest = np.flatnonzero(~found.done)
-    if "u_gap" in found.values:
+        list(pool.map(climb, _jobs(task, task.count(clock), found.status < 0, recorded)))
+    rest = np.flatnonzero(found.status < 0)
+    if task.traced:
         found.values["u_gap"][rest] = np.nan
     if rest.size:
+        found.ordinary = form if isinstance(form, str) else ladder.unmet
         _find_alone(ladder, task, scenes, rest, found, pool)
-    return reason if rest.size else ""
 
 
 def _find_alone(
     ladder: type[Ladder], task: Task, scenes: Mapping[str, FloatArray], rest: IntArray, found: Answers,
     pool: ThreadPoolExecutor,
 ) -> None:  # fmt: skip
-    """Find what a ladder is for in the scenes `rest`, each by itself."""
+    """Find what `task` asks for in the scenes `rest`, each by itself."""
     by_period = (task.periods is not None and not task.periodic) or task.traced
     frequency = frequencies(task.circuit, scenes) if by_period else np.ones(found.error.size)
     allowed, finest = ladder.limit * task.rtol, RTOL_RANGE[0]
 
-    def alone(i: int) -> tuple[dict[str, FloatArray], float, int, str]:
+    def alone(i: int) -> tuple[int, dict[str, FloatArray]]:
+        rtol = max(_OVER_PEAK * task.rtol, finest)
         try:
             circuit = task.circuit.varied({path: float(array[i]) for path, array in scenes.items()})
-            rtol = max(_OVER_PEAK * task.rtol, finest)
-            values, error = ladder.alone(task, circuit, float(frequency[i]), rtol)
+            values, error = _run_alone(task, circuit, float(frequency[i]), rtol)
             if error > allowed and rtol > finest:
                 # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
                 closer = max(0.5 * rtol * allowed / error, finest)
-                values, error = ladder.alone(task, circuit, float(frequency[i]), closer)
+                values, error = _run_alone(task, circuit, float(frequency[i]), closer)
         except (InputError, SolveError) as failure:
-            return {}, math.nan, REFUSED if isinstance(failure, InputError) else FAILED, f"{ladder.named}{failure}"
-        return values, error, ONE_BY_ONE, ""
+            found.status[i] = REFUSED if isinstance(failure, InputError) else FAILED
+            found.messages[i] = f"{ladder.named}{failure}"
+            return i, {}
+        found.error[i], found.status[i] = error, ONE_BY_ONE
+        return i, values
 
     # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         ran = list(pool.map(alone, rest.tolist()))
-    for i, (values, error, status, message) in zip(rest.tolist(), ran, strict=True):
-        found.error[i], found.status[i], found.done[i] = error, status, True
-        if message:
-            found.messages[i] = message
+    for i, values in ran:
         for name, value in values.items():
             if value.ndim == 1 and found.values[name].ndim == 1:
                 # Several gaps have one column each.
                 found.values[name] = np.full((found.error.size, value.size), np.nan)
             found.values[name][(i, slice(value.size)) if value.ndim == 1 else i] = value
+
+
+def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
+    """What is wanted of a scene from one run, and its stated error; `frequency` (Hz) is that of its periods."""
+    wanted, stop, t = task.gradients, task.stop(frequency), None
+    paths = () if wanted is None else tuple(dict.fromkeys(p for path in wanted.paths for p in wanted.together[path]))
+    ran: Solution | SteadyState
+    if task.periodic:
+        points = task.points if wanted is None else 4
+        ran = steady_state(circuit, rtol=rtol, points=points, charge=False, sensitivities=paths)
+        trace = ran.solution if task.traced else None
+    else:
+        if wanted is not None:
+            t = np.array([stop])
+        elif task.traced:
+            t = np.arange(math.ceil(stop * frequency * task.points - 1e-9)) / (frequency * task.points)
+        ran = trace = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False, sensitivities=paths)
+    # Largest of the errors of the gap voltage relative to its peak, and of the force relative to its mean.
+    pairs = (ran.error.u_gap, ran.u_gap_peak), (ran.error.f_el, ran.f_el_mean)
+    sizes = [(off, 0.0 if size is None else float(np.min(size))) for off, size in pairs]
+    error = max((off / size for off, size in sizes if size > 0.0), default=0.0)
+    if wanted is not None:
+        # The error of a change by all of the parameter is about ten times that of the run.
+        return {name: _slopes_of(task, wanted, circuit, ran, name, stop) for name in task.outputs}, Slopes.limit * error
+    values = {}
+    for name in task.outputs:
+        if name == "u_gap":
+            assert trace is not None
+            u = np.asarray(trace.u_gap)
+            values[name] = u[:-1] if task.periodic else u
+            continue
+        signal = next(s for s in SIGNALS_OF_BATCH if name.startswith(f"{s}_"))
+        value = ran._figures.value(signal, name[len(signal) + 1 :])
+        values[name] = np.asarray(math.nan if value is None else value, float)
+    return values, error
+
+
+def _slopes_of(
+    task: Task, wanted: Gradients, circuit: Circuit, ran: Solution | SteadyState, name: str, stop: float
+) -> FloatArray:
+    """Derivatives of a mean by the parameters `wanted`."""
+    known = circuit.parameters
+    # For a change of each parameter by all of itself.
+    each = {path: getattr(one, name) * known[path].value for path, one in ran.sensitivities.items()}
+    by = [sum(each[other] for other in wanted.together[path]) for path in wanted.paths]
+    if wanted.clock is not None and task.periods is not None and isinstance(ran, Solution):
+        # The run ends after a number of periods: its end moves with the frequency, and the mean with its end.
+        start = circuit.tran.start if circuit.tran is not None else 0.0
+        gained = float(getattr(ran, name.removesuffix("_mean"))[-1]) - float(getattr(ran, name))
+        by[wanted.paths.index(wanted.clock)] -= gained * stop / (stop - start)
+    return np.array([x / known[path].value for x, path in zip(by, wanted.paths, strict=True)])
 
 
 def _jobs(task: Task, count: FloatArray, chosen: BoolArray, recorded: bool) -> list[tuple[int, IntArray]]:
@@ -271,7 +315,8 @@ def _jobs(task: Task, count: FloatArray, chosen: BoolArray, recorded: bool) -> l
     for size in np.unique(halves[good]).astype(int).tolist():
         members = np.flatnonzero(good & (halves == size))
         chunk = int(np.clip(members.size // _JOBS, *(_RECORDED if recorded else _CHUNKS)))
-        chunk = _TRACED if task.traced and not recorded else _ON_CARD if task.on_card(recorded) else chunk
+        if not recorded:
+            chunk = _TRACED if task.traced else _ON_CARD if task.device == "cuda" else chunk
         jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
     return jobs
 
@@ -304,6 +349,8 @@ def _dataset(
         told = "stated error of a derivative times its parameter, relative to the output"
         data["gradient_error"] = ("scene", slopes.error, {"units": "1", "long_name": told})
         data["gradient_status"] = ("scene", slopes.status, meanings)
+        attrs |= {"ordinary_gradients": slopes.ordinary, "n_ordinary_gradients": slopes.n_ordinary}
+        found.messages |= slopes.messages
         paths = list(task.gradients.paths)
         coords |= {"parameter": paths, "parameter_unit": ("parameter", [known[path].unit for path in paths])}
     length = {"t_stop": task.t_stop} if task.t_stop is not None else {"periods": task.periods}
@@ -312,9 +359,9 @@ def _dataset(
     return Dataset(data, coords, attrs)
 
 
-def _skin(task: Task, scenes: Mapping[str, FloatArray], skin: str) -> str:
+def _skin(circuit: Circuit, scenes: Mapping[str, FloatArray], skin: str) -> str:
     """Text about the frequency at which the skin's data are taken."""
-    skins = task.circuit.by_device("SKIN")
+    skins = circuit.by_device("SKIN")
     if skin == "follow" or not skins:
         return "the skin's data follow the source's frequency" if skins else "there is no SKIN"
     held = ", ".join(f"{e.name}.f" for e in skins)

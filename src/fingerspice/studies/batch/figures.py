@@ -1,23 +1,14 @@
-"""Figures and gap voltages of scenes in lockstep, with their errors."""
+"""What is wanted of scenes in lockstep, with its error: figures and gap voltages, or derivatives of means."""
 
 from __future__ import annotations
-
-import math
-from collections.abc import Mapping
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.circuit.circuit import Circuit
-from fingerspice.engine.lockstep.march import put_traces, trace_changes
 from fingerspice.engine.lockstep.step import ALL_MOMENTS
-from fingerspice.results.outcome import ErrorEstimate
-from fingerspice.results.solution import Solution
-from fingerspice.solve.simulation import simulate
-from fingerspice.studies.batch.form import FIGURES, LockstepForm
+from fingerspice.numerics.small import STEP
+from fingerspice.studies.batch.form import FIGURES, table_of
 from fingerspice.studies.batch.ladder import Ladder, Level, Run
-from fingerspice.studies.batch.task import SIGNALS_OF_BATCH, Answers, Task
-from fingerspice.studies.steady import SteadyState, steady_state
 
 # The relative round-off added to every stated error.
 _ROUNDING = 1e-11
@@ -36,6 +27,12 @@ _STATED_TRACED = 0.8
 _STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
 # What decays after a start away from 0 V meets steps of several lengths, whose errors may cancel with half the steps.
 _STATED_STARTED = 2.0
+# A run of degree d has this rounding error, relative, besides 2^d times 1e-16: the area's polynomial's coefficients
+# lose a digit in two to the rounding with every power.
+_ROUNDING_OF_SLOPES, _EPS = 1e-13, 1.1e-16
+# The stated error of a derivative has this many changes from half the steps to all steps, under tones and under
+# squares. Under tones a kink's error is about as large as the change, or larger where that is small by chance.
+_STATED_SLOPES, _STATED_SLOPES_JUMPING = 3.0, 2.0
 
 
 class Figures(Ladder):
@@ -45,15 +42,11 @@ class Figures(Ladder):
     named = ""
     unmet = "what does not end after half periods or at a sample, or does not meet its error in lockstep"
 
-    def __init__(
-        self, task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], members: IntArray, found: Answers
-    ) -> None:
-        self.traced = task.traced
-        self.names = [name for name in task.outputs if name != "u_gap"]
-        # Rows of the moments that the figures need
+    def prepare(self) -> None:
+        """Find the rows of the moments that the figures need."""
+        self.names = [name for name in self.task.outputs if name != "u_gap"]
         self.needed = sorted({i for name in self.names for i in FIGURES[name.removesuffix("_periodic")][0]} or {0})
         self.n_moment = ALL_MOMENTS if self.needed[-1] else 1
-        super().__init__(task, form, scenes, members, found)
 
     def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
         """Of the moments, those of the last period are the second ones."""
@@ -62,9 +55,10 @@ class Figures(Ladder):
             first = self.n_moment if name.endswith("_periodic") or self.task.periodic else 0
             moments = run.fine[first : first + self.n_moment, good]
             self.found.values[name][self.members[at]] = self.figure(name, moments, at)
-        if self.traced:
-            every, places = level.steps // self.task.points, self.members[at]
-            put_traces(run.trace, np.flatnonzero(good), every, places, self.found.values["u_gap"])
+        if self.task.traced:
+            u, some = self.found.values["u_gap"], run.trace[good, :: level.steps // self.task.points]
+            u[self.members[at], : some.shape[1]] = some
+            u[self.members[at], some.shape[1] :] = np.nan
 
     def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
         """The largest of all outputs, relative to themselves."""
@@ -82,13 +76,12 @@ class Figures(Ladder):
                 last = np.abs(run.fine[later])
                 changes.append(np.abs(run.fine[later] - run.coarse[later]) / np.where(last > 0.0, last, 1.0))
             changes.append(change / np.where(size > 0.0, size, 1.0))
-        if self.traced:
-            off = np.empty(peak.size)
-            trace_changes(run.trace, run.trace_coarse, off)
+        if self.task.traced:
+            off = np.abs(run.trace[:, : 2 * run.trace_coarse.shape[1] : 2] - run.trace_coarse).max(axis=1)
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
         change = np.max(changes, axis=0) + run.coarse[-1]
-        share = self._share(level, self.mesh.decays[pending], self.mesh.least[pending])
+        share = self._share(level, self.decays[pending], self.least[pending])
         return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING)
 
     def _share(self, level: Level, decays: FloatArray, least: FloatArray) -> FloatArray | float:
@@ -99,39 +92,74 @@ class Figures(Ladder):
         if self.form.jumping:
             return _STATED_JUMPING
         own, stiff = (next(s for rtol, s in shares if self.task.rtol >= rtol) for shares in (_STATED, _STATED_STIFF))
-        own = _STATED_TRACED if self.traced else own
+        own = _STATED_TRACED if self.task.traced else own
         share = np.where(2.0 * decays > _STIFF * level.steps, max(own, stiff), own)
         # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
         return np.where(least > decays, _STATED_STARTED, share)
 
-    @staticmethod
-    def alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
-        """The outputs from one run, and their stated error."""
-        ran: Solution | SteadyState
-        if task.periodic:
-            ran = steady_state(circuit, rtol=rtol, points=task.points, charge=False)
-            trace = ran.solution if task.traced else None
-        else:
-            stop, t = task.stop(frequency), None
-            if task.traced:
-                t = np.arange(math.ceil(stop * frequency * task.points - 1e-9)) / (frequency * task.points)
-            ran = trace = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False)
-        values = {}
-        for name in task.outputs:
-            if name == "u_gap":
-                assert trace is not None
-                u = np.asarray(trace.u_gap)
-                values[name] = u[:-1] if task.periodic else u
-                continue
-            signal = next(s for s in SIGNALS_OF_BATCH if name.startswith(f"{s}_"))
-            value = ran._figures.value(signal, name[len(signal) + 1 :])
-            values[name] = np.asarray(math.nan if value is None else value, float)
-        return values, error_of(ran)
 
+class Slopes(Ladder):
+    """Derivatives by the parameters asked for: central differences of runs with the very same steps.
 
-def error_of(ran: Solution | SteadyState) -> float:
-    """Stated error of the gap voltage relative to its peak, or of the force relative to its mean, if that is larger."""
-    error: ErrorEstimate = ran.error
-    pairs = (error.u_gap, ran.u_gap_peak), (error.f_el, ran.f_el_mean)
-    sizes = [float(np.min(size)) if size is not None else 0.0 for _, size in pairs]
-    return max((off / size for (off, _), size in zip(pairs, sizes, strict=True) if size > 0.0), default=0.0)
+    Copies of a scene have one of the parameters smaller, then larger, by a step. The steps do not depend on a
+    parameter: a difference has the error of the method and hardly any noise. The tangents of the same steps would have
+    this error, too: it comes from the kink of 1/A where the gap voltage is 0, which has order 1 in a derivative.
+    """
+
+    limit = 10.0  # For a change of the parameter by all of itself
+    stated = 1.0
+    # What ends the search for a periodic state moves a difference by 1 / STEP of itself.
+    closer = STEP
+    # Kinks have order 1, with a factor that depends on where between two steps they fall.
+    most_gain = 8.0
+    highest_degree = 16
+    gives_up = False
+    named = "gradients: "
+    unmet = "what does not end after half periods, or does not meet its error in lockstep"
+
+    def prepare(self) -> None:
+        """Make the copies of the scenes."""
+        assert self.task.gradients is not None
+        self.wanted = self.task.gradients
+        self.given = np.array([self.scenes[path.lower()] for path in self.wanted.paths])  # (n_parameter, n)
+        self.possible &= (np.isfinite(self.given) & (self.given != 0.0)).all(axis=0)
+        self.copies = 2 * len(self.wanted.paths)
+        moved = {path: np.tile(array, (2, len(self.wanted.paths), 1)) for path, array in self.scenes.items()}
+        for k, path in enumerate(self.wanted.paths):
+            for other in self.wanted.together[path]:
+                for side, sign in enumerate((-1.0, 1.0)):
+                    moved[other.lower()][side, k] *= 1.0 + sign * STEP
+        self.scenes = {path: array.ravel() for path, array in moved.items()}
+        self.table = table_of(self.form, self.scenes)
+
+    def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
+        """Per unit of the parameter."""
+        at = pending[good]
+        change, _ = self._changes(run.fine[0], pending)
+        for j, name in enumerate(self.task.outputs):
+            self.found.values[name][self.members[at]] = (change[j][:, good] / self.given[:, at]).T
+
+    def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
+        """For a change of a parameter by all of itself, relative to the output; the largest of all."""
+        (_, own), (_, coarse) = (self._changes(each[0], pending) for each in (run.fine, run.coarse))
+        largest = np.abs(own).max(axis=(0, 1))
+        change = np.abs(own - coarse).max(axis=(0, 1))
+        # The third derivative of a power that has this slope, at most.
+        cut = STEP**2 / 6.0 * largest * (largest + 1.0) * (largest + 2.0)
+        closing, tail = run.fine[-2:].reshape(2, self.copies, -1).max(axis=1)
+        # The polynomial's error is one of Chebyshev's, whose slope is larger by its degree.
+        tail = level.degree * (tail + run.coarse[-1].reshape(self.copies, -1).max(axis=0))
+        noise = 2.0 * closing + _ROUNDING_OF_SLOPES + 2.0**level.degree * _EPS
+        share = _STATED_SLOPES_JUMPING if self.form.jumping else _STATED_SLOPES
+        return np.asarray(share * change + cut + tail + noise / STEP)
+
+    def _changes(self, mean: FloatArray, pending: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Changes of outputs by each parameter, for all of it, shape (n_output, n_parameter, n), and relative to them.
+
+        `mean` is the mean of u^2 A in all copies of the scenes.
+        """
+        columns, outputs = self.columns(pending), self.task.outputs
+        values = np.array([self.figure(name, mean[None], columns) for name in outputs])
+        low, high = np.moveaxis(values.reshape(len(outputs), 2, len(self.wanted.paths), -1), 1, 0)
+        size, change = np.abs(0.5 * (low + high)), (high - low) / (2.0 * STEP)
+        return change, change / np.where(size > 0.0, size, 1.0)

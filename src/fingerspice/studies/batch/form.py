@@ -107,7 +107,8 @@ def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str
     varied = [path.lower() for path in varied]
     if not _starts_uncharged(circuit, charged, varied):
         return "the run does not start uncharged, or its figures start late"
-    may_vary = {e.name.lower(): _varies(e.waveform, found.frequency) for e, _ in found.sources}
+    fixed = () if found.frequency is None else ("frequency",)
+    may_vary = {e.name.lower(): set(_source_of(e.waveform)[1]).difference(fixed) for e, _ in found.sources}
     layers = {e.name.lower() for e in stack.layers}
     for path in varied:
         name, _, parameter = path.rpartition(".")
@@ -126,9 +127,9 @@ def _form_of_sources(stack: Stack) -> LockstepForm | str:
         if recording.start != 0.0:
             return "the recording does not start at 0 s"
         return LockstepForm(stack, sources, (1,), 0.5 * recording.rate, False, recording)
-    jumping = len(waves) == 1 and isinstance(waves[0], Square | Pulse)
-    tones = [hz for wave in waves for hz in _tones(wave)]
-    if not (_plain_square(waves[0]) if jumping else tones and all(tones) and len(tones) <= _MOST_TONES):
+    jumping = any(isinstance(wave, Square | Pulse) for wave in waves)
+    tones = [hz for wave in waves for hz in _source_of(wave)[0]]
+    if not (tones and all(tones) and len(tones) <= (1 if jumping else _MOST_TONES)):
         return (
             f"the sources are not 1 to {_MOST_TONES} plain sines, not a square that starts with its period, and not a "
             "recording"
@@ -165,30 +166,22 @@ def in_lockstep_by(circuit: Circuit, paths: Iterable[str], outputs: Iterable[str
     return not why_alone(lockstep_form(circuit, paths), outputs, rtol)
 
 
-def _tones(wave: object) -> tuple[float, ...]:
-    """Frequencies of a source without offset that consists of sines from t = 0 on; a zero for any other."""
-    if isinstance(wave, AM):
-        return (wave.carrier, wave.carrier - wave.modulation, wave.carrier + wave.modulation)
-    if isinstance(wave, Sine) and wave.offset == 0.0 and wave.delay == 0.0 and wave.damping == 0.0:
-        return (wave.frequency,)
-    return (0.0,)
+def _source_of(wave: object) -> tuple[tuple[float, ...], tuple[str, ...]]:
+    """Frequencies of a source's tones from t = 0 on, and its parameters that may vary; 0 Hz of one without such tones.
 
-
-def _plain_square(wave: object) -> bool:
-    """Whether a square has no offset and its period begins at t = 0."""
-    if isinstance(wave, Pulse):
-        return wave.half_wave and wave.rise == 0.0 and wave.delay == 0.0
-    return isinstance(wave, Square) and wave.half_wave and wave.phase_deg == 0.0 and wave.delay == 0.0
-
-
-def _varies(wave: object, frequency: float | None) -> tuple[str, ...]:
-    """Parameters of a source that may vary from scene to scene."""
-    if isinstance(wave, AM):
-        return ("amplitude", "depth", "phase_deg")
-    if not isinstance(wave, Sine | Square):
-        return ()
-    may_vary = {"amplitude": True, "frequency": frequency is None, "phase_deg": isinstance(wave, Sine)}
-    return tuple(name for name, allowed in may_vary.items() if allowed)
+    A square that starts with its period counts as one tone.
+    """
+    match wave:
+        case AM():
+            sides = wave.carrier - wave.modulation, wave.carrier + wave.modulation
+            return (wave.carrier, *sides), ("amplitude", "depth", "phase_deg")
+        case Sine(offset=0.0, delay=0.0, damping=0.0):
+            return (wave.frequency,), ("amplitude", "frequency", "phase_deg")
+        case Square(half_wave=True, phase_deg=0.0, delay=0.0):
+            return (wave.frequency,), ("amplitude", "frequency")
+        case Pulse(half_wave=True, rise=0.0, delay=0.0):
+            return (wave.tone() or 0.0,), ()
+    return (0.0,), ()
 
 
 def _starts_uncharged(circuit: Circuit, charged: bool, varied: Iterable[str]) -> bool:
@@ -204,7 +197,7 @@ def _starts_uncharged(circuit: Circuit, charged: bool, varied: Iterable[str]) ->
 
 
 def _tones_of(wave: object, given: Mapping[str, Value]) -> list[tuple[Value, Value]]:
-    """Amplitude (V) and phase (rad) of the tones of a source, in the order of `_tones`; `given` has what varies."""
+    """Amplitude (V) and phase (rad) of the tones of a source, in the order of `_source_of`; `given` has what varies."""
 
     def value(name: str) -> Value:
         return given.get(name, getattr(wave, name, 0.0))

@@ -9,9 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.circuit.circuit import Circuit
 from fingerspice.engine.lockstep.card import march_on_card
-from fingerspice.engine.lockstep.march import march, new_stepping
+from fingerspice.engine.lockstep.march import march
 from fingerspice.engine.lockstep.samples import N_PORTION, march_samples
 from fingerspice.engine.lockstep.scenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
 from fingerspice.engine.lockstep.step import START_TIMES, marks_of
@@ -20,8 +19,9 @@ from fingerspice.studies.batch.task import LOCKSTEP, Answers, Task
 
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
 # and (of the highest) under several; and initial degree of the area's polynomial, of which each takes the compiler 8 s.
-_RUNGS = ((5e-4, 40, 32, 8), (5e-5, 64, 48, 8), (5e-6, 96, 96, 12), (5e-7, 144, 144, 12), (0.0, 144, 144, 24))
-HIGHEST_DEGREE, _MOST_STEPS = 24, 8192
+_RUNGS = ((5e-4, 40, 32, 8), (5e-5, 64, 48, 8), (5e-6, 96, 96, 16), (5e-7, 144, 144, 16), (0.0, 144, 144, 24))
+# By how much that grows with every doubling of the steps, its highest, and the largest number of steps.
+_MORE_DEGREE, HIGHEST_DEGREE, _MOST_STEPS = 8, 24, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
 # Largest gap voltage that the area's polynomial covers, as a ratio to its estimate: the second one for scenes that the
@@ -64,17 +64,6 @@ class Run(NamedTuple):
     trace: FloatArray
 
 
-class Mesh(NamedTuple):
-    """What scenes need of their steps, each of shape (n,)."""
-
-    possible: BoolArray  # Whether there is contact, and lockstep has what is wanted
-    pieces: IntArray  # As in `Level`
-    slowest: FloatArray  # Smallest leakage rate of a cell, in periods over 2 pi
-    decays: FloatArray  # Half a period in time constants of the fastest cell
-    # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
-    least: FloatArray
-
-
 class Ladder(ABC):
     """Scenes in lockstep: the steps are doubled until what is wanted of a scene has an error that is small enough.
 
@@ -83,14 +72,12 @@ class Ladder(ABC):
 
     copies = 1
     n_moment = 1
-    traced = False  # Whether gap voltages are wanted
     limit = 1.0  # Error allowed to what is wanted, over rtol
     stated = ENOUGH  # Estimate over the error that is stated
     closer = 1.0  # Factor on the tolerance that ends the search for a periodic state
     # As an estimate may be small by chance, doubling the steps may not reduce it by more than this factor.
     most_gain: float
-    # By how much the degree of the area's polynomial grows from level to level, and the highest one.
-    more_degree, highest_degree = HIGHEST_DEGREE, HIGHEST_DEGREE
+    highest_degree = HIGHEST_DEGREE  # Of the area's polynomial
     gives_up = True  # Whether scenes are given up for which more steps are no help
     named: str  # What comes before the message of a scene that cannot be run
     unmet: str  # Why scenes of a form that lockstep takes may have no result from it
@@ -102,7 +89,12 @@ class Ladder(ABC):
         self.scenes = scenes  # Values by path in lower case, (copies n,)
         self.members, self.found = members, found  # (n,): Places of the scenes among the answers
         self.table = table_of(form, scenes)  # (n_row, copies n)
-        self.mesh = self._mesh()
+        self._look()
+        self.prepare()
+
+    @abstractmethod
+    def prepare(self) -> None:
+        """Do what comes before the first steps."""
 
     @abstractmethod
     def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
@@ -111,11 +103,6 @@ class Ladder(ABC):
     @abstractmethod
     def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
         """Put what is wanted of the scenes that are `good` among `pending` into the answers."""
-
-    @staticmethod
-    @abstractmethod
-    def alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
-        """What is wanted of one scene from a run of its own, and its stated error; `frequency` (Hz) is of periods."""
 
     def figure(self, name: str, moments: FloatArray, columns: IntArray) -> FloatArray:
         """An output of some columns of the table, from their moments."""
@@ -131,11 +118,10 @@ class Ladder(ABC):
 
     def climb(self, halves: int) -> None:
         """Find what is wanted in runs of so many half periods; scenes whose error stays too large stay not done."""
-        mesh = self.mesh
         # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
-        order = np.argsort(mesh.slowest) if halves > 4 else np.arange(self.members.size)
-        for pieces in np.unique(mesh.pieces[mesh.possible]).tolist():
-            pending = order[(mesh.possible & (mesh.pieces == pieces))[order]]
+        order = np.argsort(self.slowest) if halves > 4 else np.arange(self.members.size)
+        for pieces in np.unique(self.pieces[self.possible]).tolist():
+            pending = order[(self.possible & (self.pieces == pieces))[order]]
             for covered in _COVERED:
                 pending = self._climb(self._first(halves, pieces, covered), pending)
 
@@ -151,12 +137,12 @@ class Ladder(ABC):
             run = self._run(level, self.columns(pending), before)
             if run is None:
                 break
-            error, resolved = self.error(level, run, pending), self.mesh.least[pending] <= level.steps
+            error, resolved = self.error(level, run, pending), self.least[pending] <= level.steps
             error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
             good = (error <= ENOUGH * self.limit * rtol) & resolved & (before is not None or not doubtful)
             self.enter(level, run, pending, good)
             at = self.members[pending[good]]
-            found.error[at], found.status[at], found.done[at] = error[good] / self.stated, LOCKSTEP, True
+            found.error[at], found.status[at] = error[good] / self.stated, LOCKSTEP
             tail = run.fine[-1].reshape(self.copies, -1)
             beyond, left = np.isinf(tail).any(axis=0), ~good
             if self.gives_up:
@@ -170,7 +156,7 @@ class Ladder(ABC):
             kept = np.tile(left, self.copies)
             before = Run(run.fine[:, kept], run.fine[:, kept], run.trace[kept], run.trace[kept])
             last, pending = error[left], pending[left]
-            degree = max(level.degree, min(level.degree + self.more_degree, self.highest_degree))
+            degree = max(level.degree, min(level.degree + _MORE_DEGREE, self.highest_degree))
             level = level._replace(steps=2 * level.steps, degree=degree)
         return np.concatenate(outside)
 
@@ -183,33 +169,38 @@ class Ladder(ABC):
             steps = 2 * pieces * next(s for least, s in _PIECES if rtol >= least)
         if self.form.recording is not None:
             steps = _PARTS[0]
-        if self.traced:
-            steps = self.task.points * -(-steps // self.task.points)
+        if self.task.traced:
+            # Half of the steps, too, are an even number.
+            points = self.task.points * (1 if self.task.points % 4 == 0 else 2)
+            steps = points * -(-steps // points)
         return Level(halves, pieces, covered, steps, degree)
 
-    def _mesh(self) -> Mesh:
-        """What the scenes of the table need of their steps."""
-        form, table = self.form, self.table
+    def _look(self) -> None:
+        """Find what the scenes need of their steps, each of shape (n,)."""
+        form, table, periodic = self.form, self.table, self.task.periodic
         cells, others = form.cells, CELL_ROWS * form.cells
-        possible = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
-        pieces = np.zeros(table.shape[1], int)
+        # Whether there is contact
+        self.possible = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
         # Leakage rate of every cell with its area at rest; the largest is an upper bound of the rates of the modes.
         leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
         rates = leaks / (table[:cells] * table[others + OMEGA])
-        decays = np.max(rates, axis=0) * np.pi
+        # Smallest leakage rate, in periods over 2 pi; and half a period in time constants of the fastest cell
+        self.slowest, self.decays = rates.min(axis=0), np.max(rates, axis=0) * np.pi
+        self.pieces = np.zeros(table.shape[1], int)  # As in `Level`
         first: FloatArray | float = 0.0
         if form.jumping:
             # Gap voltages at equal distances need a single piece.
-            pieces = np.ceil(np.log2(1.0 + _PIECE_START * decays)).clip(1, 1 if self.traced else _MOST_PIECES)
-            pieces = pieces.astype(int)
-            first = pieces / (2.0**pieces - 1.0)
-        elif form.recording is not None and not self.task.periodic:
+            most = 1 if self.task.traced else _MOST_PIECES
+            self.pieces = np.ceil(np.log2(1.0 + _PIECE_START * self.decays)).clip(1, most).astype(int)
+            first = self.pieces / (2.0**self.pieces - 1.0)
+        elif form.recording is not None and not periodic:
             first = 0.5 * (form.recording.between(0, 1)[0] != 0.0)
-        elif not self.task.periodic:
+        elif not periodic:
             sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
             from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
             first = np.where(from_zero, START_TIMES[1] if self.task.rtol < _LEADING else 0.0, 1.0)
-        return Mesh(possible, pieces, rates.min(axis=0), decays, 2.0 * first * decays / _LONGEST_STEP)
+        # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
+        self.least = 2.0 * first * self.decays / _LONGEST_STEP
 
     def _run(self, level: Level, columns: IntArray, before: Run | None) -> Run | None:
         """Integrate columns of the table, for half the steps, too, where `before` has no results; None: no curve."""
@@ -219,28 +210,24 @@ class Ladder(ABC):
             return None
         sizes = steps // 2 if before is None else 0, steps
         waves = _waves(sizes[0], form), _waves(sizes[1], form)
-        widths = [halves * n // 2 if self.traced else 0 for n in sizes]
+        widths = [halves * n // 2 if self.task.traced else 0 for n in sizes]
         traces = np.empty((columns.size, widths[0])), np.empty((columns.size, widths[1]))
         lengths = form.cells - 1, waves[1].shape[1], form.places[1].size, level.degree + 1, self.n_moment
-        marks, rows = marks_of(*lengths), self.table.shape[0]
+        marks, scenes = marks_of(*lengths), (self.table, columns, form.places, curves)
+        block = new_block(self.table.shape[0], level.pieces, marks)
         if form.recording is not None:
             out = np.empty((2, (1 + N_PORTION) * self.n_moment + 3, columns.size))
             values = form.recording.between(0, halves + 1) / peak_of(form.recording)
-            how_sampled = sizes, level.covered
-            march_samples(
-                self.table, columns, form.places, curves, values, how_sampled, new_block(rows, marks), out, marks
-            )
+            march_samples(scenes, values, (sizes, level.covered), block, out, marks)
         else:
             source = np.array(form.multiples, float), waves
             tol = (_CLOSING if task.periodic else _SETTLED) * (task.rtol * self.closer)
             how = halves, steps // 2, level.pieces, task.periodic, tol, level.covered
-            if task.on_card(recorded=False):
-                most = _MOST_PIECES if form.jumping else 0
-                out = march_on_card(self.table, columns, form.places, curves, source, how, most, lengths)
+            if task.device == "cuda":
+                out = march_on_card(scenes, source, how, _MOST_PIECES if form.jumping else 0, lengths)
             else:
                 out = np.empty((2, 2 * self.n_moment + 3, columns.size))
-                block, stepping = new_block(rows, marks), new_stepping(level.pieces, marks)
-                march(self.table, columns, form.places, curves, source, how, block, stepping, out, traces, marks)
+                march(scenes, source, how, block, out, traces, marks)
         if before is None:
             return Run(out[0], out[1], traces[0], traces[1])
         return Run(before.fine, out[1], before.trace, traces[1])

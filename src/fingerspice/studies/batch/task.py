@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import BoolArray, FloatArray, positive_number, real_numbers, whole_number
+from fingerspice.base.arrays import FloatArray, positive_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.topology import driving_sources
@@ -34,7 +34,6 @@ class Gradients:
     """The parameters by which the means are to be differentiated."""
 
     paths: tuple[str, ...]  # In the circuit's own spelling
-    outputs: tuple[str, ...]  # Outputs that have derivatives
     # Each parameter with those that grow in proportion to it: the frequency of a source with that of a skin
     together: Mapping[str, tuple[str, ...]]
     clock: str | None  # The frequency of the only source, if it is one of the parameters
@@ -42,7 +41,10 @@ class Gradients:
 
 @dataclass(frozen=True)
 class Task:
-    """A checked request; its attributes are arguments of `batch`, with exactly one of `t_stop` and `periods` given."""
+    """A checked request; its attributes are arguments of `batch`, with exactly one of `t_stop` and `periods` given.
+
+    It asks for derivatives of its outputs, which are means, if it has `gradients`. Gap voltages stay on the processor.
+    """
 
     circuit: Circuit
     outputs: tuple[str, ...]
@@ -58,10 +60,6 @@ class Task:
     def traced(self) -> bool:
         """Whether gap voltages are wanted."""
         return "u_gap" in self.outputs
-
-    def on_card(self, recorded: bool) -> bool:
-        """Whether lockstep is done on a graphics card; recordings, and gap voltages, stay on the processor."""
-        return self.device == "cuda" and not recorded and not self.traced
 
     def stop(self, frequency: float) -> float:
         """End of a run with a source of this frequency (Hz), s."""
@@ -81,14 +79,19 @@ class Answers:
     # (n,) each, (n, n_parameter) for derivatives, or (n, width) for gap voltages, which become NaN last
     values: dict[str, FloatArray]
     error: FloatArray  # (n,): Stated error, of outputs relative to themselves
-    status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`
-    done: BoolArray  # (n,): Whether results have been entered
+    status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`, and -1 before results have been entered
     messages: dict[int, str] = field(default_factory=dict)  # Of the scenes without a result
+    ordinary: str = ""  # Why some scenes were not in lockstep
+
+    @property
+    def n_ordinary(self) -> int:
+        """Number of scenes not in lockstep."""
+        return int(np.count_nonzero(self.status != LOCKSTEP))
 
     @classmethod
     def empty(cls, values: dict[str, FloatArray], n: int) -> Answers:
         """Answers of n scenes, none of them done."""
-        return cls(values, np.full(n, np.nan), np.full(n, ONE_BY_ONE, np.int8), np.zeros(n, bool))
+        return cls(values, np.full(n, np.nan), np.full(n, -1, np.int8))
 
 
 def task_of(
@@ -117,7 +120,8 @@ def task_of(
         if circuit.tran is None:
             raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s, or periods")
         t_stop = circuit.tran.stop
-    return Task(circuit, tuple(outputs), rtol, t_stop, 1.0 if periodic else periods, periodic, points, device)
+    periods, device = 1.0 if periodic else periods, "cpu" if "u_gap" in outputs else device
+    return Task(circuit, tuple(outputs), rtol, t_stop, periods, periodic, points, device)
 
 
 def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
@@ -203,7 +207,7 @@ def frequencies(circuit: Circuit, scenes: Mapping[str, FloatArray], of_skin: boo
     return np.full(n, 1.0 / period)
 
 
-def gradients_of(task: Task, gradients: Sequence[str], scenes: Mapping[str, FloatArray], skin: str) -> Gradients | None:
+def gradients_of(task: Task, gradients: Sequence[str], scenes: Mapping[str, FloatArray], skin: str) -> Task | None:
     """The checked request of derivatives in scenes with these values by path; None for none."""
     circuit = task.circuit
     if isinstance(gradients, str):
@@ -233,7 +237,7 @@ def gradients_of(task: Task, gradients: Sequence[str], scenes: Mapping[str, Floa
             raise InputError(f"skin='follow', and gradients names {path}, with which the skin's frequency changes; "
                              "allowed: the frequency of the only source, or skin='own'")  # fmt: skip
     together = {path: (path, *(skins if path == clock else ())) for path in paths}
-    return Gradients(paths, outputs, together, clock if clock in paths else None)
+    return replace(task, outputs=outputs, gradients=Gradients(paths, together, clock if clock in paths else None))
 
 
 def _turns(circuit: Circuit, path: str) -> bool:
