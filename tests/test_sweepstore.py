@@ -25,7 +25,6 @@ import fingerspice as fs
 from commands import Command, tree
 from fingerspice.studies.sweep import chunks, workers
 from fingerspice.studies.sweep.plan import make_plan
-from fingerspice.studies.sweep.store import SweepStore
 from processes import ended, no_room, start
 from scenes import cases
 
@@ -321,7 +320,7 @@ def test_dask_workers_that_are_killed_again_and_again_cost_nothing(
 def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, computed, write = tmp_path / "s.zarr", chunks._computed, SweepStore.write
+    path, computed, write = tmp_path / "s.zarr", chunks.Work._computed, chunks.Work._write
     begun, written, at_once = 0, 0, 0
 
     def computing(*given: Any) -> Any:
@@ -340,8 +339,8 @@ def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
         written += 1
         write(*given)
 
-    monkeypatch.setattr(chunks, "_computed", computing)
-    monkeypatch.setattr(SweepStore, "write", writing)
+    monkeypatch.setattr(chunks.Work, "_computed", computing)
+    monkeypatch.setattr(chunks.Work, "_write", writing)
     with cluster_of(1, processes=False) as cluster:
         fs.sweep(circuit, PARAMETERS, store=path, scheduler=cluster.scheduler_address, **HOW)
     assert (begun, written) == (192, 192)

@@ -97,14 +97,9 @@ def sweep(
         raise InputError(
             "workers, scheduler or shard is given without store; allowed: a folder such as 'out/sweep.zarr'"
         )
-    plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
-    return _in_memory(circuit, plan, options)
-
-
-def _in_memory(circuit: Circuit, plan: Plan, options: Mapping[str, Any]) -> Dataset:
-    """The batch of all scenes, in the shape of the grid."""
     from xarray import Dataset
 
+    plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
     total = math.prod(plan.sizes)
     require(total <= MOST_SCENES, "the sweep", f"{total:,} scenes", f"at most {MOST_SCENES:,}, or a store")
     draws = plan.draws()
@@ -162,13 +157,25 @@ def sobol(
     outputs = options.get("outputs", ("f_el_mean",))
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     require("u_gap" not in outputs, "outputs", "u_gap", "figures, which are one number for each scene")
-    places = [dict(zip(plan.grid, values, strict=True)) for values in product(*plan.grid.values())]
+    from xarray import Dataset
+
+    # Every place of the grid: each of its parameters with one value, shape (1,).
+    places = [dict(zip(plan.grid, np.reshape(values, (-1, 1)), strict=True)) for values in product(*plan.grid.values())]
     rows = [_indices(circuit, plan, place, outputs, confidence, options) for place in places]
-    return _as_dataset(plan, outputs, rows)
+    data: dict[str, Any] = {}
+    for i, output in enumerate(outputs):
+        for kind in rows[0]:
+            each = np.array([row[kind][i] for row in rows])
+            own = ("parameter", "quantile")[: each.ndim - 1]
+            data[f"{output}_{kind}"] = ((*plan.grid, *own), each.reshape((*plan.sizes[:-1], *each.shape[1:])))
+    coords = plan.coordinates | {"parameter": list(plan.drawn), "quantile": list(QUANTILES)}
+    coords["unit"] = ("parameter", [plan.units[name] for name in plan.drawn])
+    data["at"] = (("parameter", "quantile"), [law.ppf(QUANTILES) for law in plan.drawn.values()])
+    return Dataset(data, coords, {"n": plan.n, "seed": plan.seed, "outputs": list(outputs)})
 
 
 def _indices(
-    circuit: Circuit, plan: Plan, place: dict[str, float], outputs: tuple[str, ...], confidence: float,
+    circuit: Circuit, plan: Plan, place: dict[str, FloatArray], outputs: tuple[str, ...], confidence: float,
     options: Mapping[str, Any],
 ) -> dict[str, FloatArray]:  # fmt: skip
     """Indices (n_output, d), their intervals, and mean and standard deviation of the outputs, at one place."""
@@ -177,7 +184,7 @@ def _indices(
     told: list[FloatArray] = []
 
     def figures(x: FloatArray) -> FloatArray:
-        found = batch(circuit, plan.scenes(dict(zip(plan.drawn, np.asarray(x, float), strict=True)) | place), **options)
+        found = batch(circuit, plan.spread(place, dict(zip(plan.drawn, np.asarray(x, float), strict=True))), **options)
         if lost := int(np.count_nonzero(found.status >= REFUSED)):
             why = f" ({found.attrs['failures'][0]})" if len(found.attrs["failures"]) else ""
             raise InputError(
@@ -221,23 +228,6 @@ def _saltelli(a: FloatArray, b: FloatArray, mixed: FloatArray) -> FloatArray:
         total = 0.5 * np.mean((a - mixed) ** 2, axis=-1) / variance
     # A figure that does not change has indices of 0.
     return np.asarray(np.nan_to_num(np.array([first.T, total.T]), nan=0.0, posinf=0.0, neginf=0.0), float)
-
-
-def _as_dataset(plan: Plan, outputs: tuple[str, ...], rows: list[dict[str, FloatArray]]) -> Dataset:
-    from xarray import Dataset
-
-    dims = tuple(plan.grid)
-    data: dict[str, Any] = {}
-    for i, output in enumerate(outputs):
-        for kind in rows[0]:
-            values = np.array([row[kind][i] for row in rows])
-            own = ("parameter", "quantile")[: values.ndim - 1]
-            data[f"{output}_{kind}"] = ((*dims, *own), values.reshape((*plan.shape, *values.shape[1:])))
-    coords: dict[str, Any] = plan.coordinates
-    coords |= {"parameter": list(plan.drawn), "quantile": list(QUANTILES)}
-    coords["unit"] = ("parameter", [plan.units[name] for name in plan.drawn])
-    data["at"] = (("parameter", "quantile"), [law.ppf(QUANTILES) for law in plan.drawn.values()])
-    return Dataset(data, coords, {"n": plan.n, "seed": plan.seed, "outputs": list(outputs)})
 
 
 def ranking(found: Dataset, output: str) -> list[dict[str, Any]]:
