@@ -229,12 +229,12 @@ def compare(
     mean = steady_state(circuit, charge_law=charge_law, area="mean", rtol=rtol, points=2000).solution
     found = [phasors[name] for name in coupled.gaps]
     figures = [(abs(p.u_gap[0]), np.degrees(np.angle(p.gain[0])), p.f_el_mean[0], p.area[0]) for p in found]
-    every = [_together(*np.array(figures).T)]
+    every = []
     for one in (mean, coupled):
         lead = np.asarray(one.u_gap_phase_deg, float) - np.degrees(fundamental.phase)
         lead, area = (lead + 180.0) % 360.0 - 180.0, one._figures.value("area", "mean_periodic")
         every.append(_together(one.u_gap_amplitude, lead, one.f_el_mean_periodic, area))
-    return Comparison(*every, fundamental.frequency, coupled)
+    return Comparison(_together(*np.array(figures).T), every[0], every[1], fundamental.frequency, coupled)
 
 
 def _together(*values: Value | FloatArray) -> Figures:
@@ -305,7 +305,9 @@ def large_signal(
     skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     found = []
     for place, (size, phase, drive) in enumerate(drives):
-        gains, areas, forces = [], [], []
+        gains: list[list[complex]] = []
+        areas: list[float] = []
+        forces: list[float] = []
         for number, x in enumerate(f.tolist(), place * f.size + 1):
             changed = circuit.varied({**dict.fromkeys(skins, x), source.name: Sine(size, x)})
             s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution

@@ -126,10 +126,10 @@ def phasor(
     network = build_network(held) if scene is None else scene.network
     alone = len(network.sources) == 1
     fundamental = network.waveforms[0].fundamental if alone else None
-    if frequency is None and fundamental is None:
+    asked = frequency if frequency is not None or fundamental is None else fundamental.frequency
+    if asked is None:
         raise InputError("the source has no fundamental: give the frequencies in Hz")
-    own = [] if fundamental is None else fundamental.frequency
-    f = positive_row("frequency", own if frequency is None else frequency, "Hz")
+    f = positive_row("frequency", asked, "Hz")
     driving = tuple((e, 1.0) for e in network.sources) if scene is None else scene.sources
     amplitude, phase, drive = sweep_drive(driving, fundamental, frequency is not None)
     if isinstance(area, str):
