@@ -200,7 +200,7 @@ def ac(
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
     from fingerspice.plots.traces import plot_phasor
-    from fingerspice.results.phasor_solution import phasor_csv, phasor_tables
+    from fingerspice.results.phasor_solution import PhasorSolution, phasor_csv, phasor_tables
     from fingerspice.sets.parameters import parameters
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.comparison import large_signal
@@ -217,23 +217,24 @@ def ac(
             )
         check_arguments(rtol)
         frequencies = sweep_frequencies(options.sweep(sweep, circuit))
-        if area == "coupled" and skin != "swept":
-            raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-        if amplitude and area == "coupled":
-            positive_row("amplitude", amplitude, "V")
-        if area != "coupled":
+        found: tuple[PhasorSolution, ...] = ()
+        if area == "coupled":
+            if skin != "swept":
+                raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
             if amplitude:
-                raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
-            found = [phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger)]
+                positive_row("amplitude", amplitude, "V")
+        elif amplitude:
+            raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
+        else:
+            found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger),)
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         results.will_write("_ac.csv", lambda file: phasor_csv(found, file))
         results.will_draw("_ac.png", lambda: plot_phasor(found, circuit), unless=no_plot)
         if area == "coupled":
             with progress("sweeping") as update:
-                every = large_signal(
+                found = large_signal(
                     circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger, progress=update
                 )
-            found = [*every]
         answer.update(sweeps=[r.to_dict() for r in found] if as_json else None)
         answer.give(lambda: phasor_tables(found, circuit), results.ready())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -69,10 +70,10 @@ def sweep(
         if store is not None:
             if asked.get("indices"):
                 raise InputError(f"{file}: indices = true and --store are both given; allowed: one of them")
-            found = populations.sweep(
-                circuit, parameters, store=store, workers=workers, scheduler=scheduler, shard=_shard(shard), **options
-            )
-            _give_stored(answer, found, store)
+            if (part := re.fullmatch("([0-9]+)/([0-9]+)", "1/1" if shard is None else shard)) is None:
+                raise InputError(f"--shard is {shard!r}; allowed: two whole numbers such as 1/8")
+            options |= {"workers": workers, "scheduler": scheduler, "shard": (int(part[1]), int(part[2]))}
+            _give_stored(answer, populations.sweep(circuit, parameters, store=store, **options), store)
             return
         for option, given in (("workers", workers), ("scheduler", scheduler), ("shard", shard)):
             if given is not None:
@@ -125,16 +126,6 @@ def _give_stored(answer: Answering, found: Any, store: Path) -> None:
         said.append(f"{about['chunks_missing']:,} pieces of other parts are missing")
     said += about["failures"][:_MOST_TOLD]
     answer.give(lambda: "\n".join(said))
-
-
-def _shard(text: str | None) -> tuple[int, int]:
-    """The numbers of ``I/M``."""
-    if text is None:
-        return 1, 1
-    first, _, last = text.partition("/")
-    if not (first.isascii() and first.isdigit() and last.isascii() and last.isdigit()):
-        raise InputError(f"--shard is {text!r}; allowed: two whole numbers such as 1/8")
-    return int(first), int(last)
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Path]:
