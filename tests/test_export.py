@@ -14,13 +14,13 @@ from fingerspice.netlist.files import LIBRARIES, library_text
 from ngspice_tools import CIRCUITS, call_ngspice, run_ngspice
 from random_decks import NETWORKS, SOURCES
 from random_decks import deck as random_deck
-from scenes import deck, table1
+from scenes import cases, deck, table1
 
 LAWS = ["local", "mobile"]
 SEEDS = range(50)
 DECKS = sorted(Path(CIRCUITS).glob("*.cir"))
 # Exported as a hundred thousand points and more, among which ngspice searches at every step: their beginnings, s.
-BEGINNINGS = {"burst": 2.5e-3, "chirp": 4e-3}
+BEGINNINGS = {"burst": 2.5e-3, "chirp": 4e-3, **({"texture_recording": 0.05} if cases(0, 1) else {})}
 JUMPS = ("jump", "pwl", "repeat", "square", "pulse")
 
 NESTED = """\

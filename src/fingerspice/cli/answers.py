@@ -11,7 +11,6 @@ from fingerspice import __version__
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.outcome import Plan
     from fingerspice.results.solution import Solution
 
 Answer = dict[str, Any]
@@ -79,12 +78,6 @@ def of_run(solution: Solution) -> Answer:
         "tier": solution.plan.tier, "error": vars(solution.error), "signals": rows, "t_stop": s["t_stop"],
         **{key: s.get(key) for key in ("figures_from", "fundamental", "fold_margin_min")},
     }  # fmt: skip
-
-
-def of_plan(plan: Plan) -> Answer:
-    """The part of an answer that describes a plan; `plan_area` is the area of a model with one area."""
-    found = plan.to_dict()
-    return {**{key: found[key] for key in OWN["plan"] if key in found and key != "area"}, "plan_area": plan.area}
 
 
 Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir), - for standard input.")]

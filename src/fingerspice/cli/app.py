@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 from typing import Annotated, Any
 
 import typer
@@ -141,7 +142,10 @@ def run(
             ".png", lambda: put_beside(solution.plot(), circuit) if schematic else solution.plot(), unless=no_plot
         )
         if schematic:
-            results.will_write_schematic()
+            # An SVG file knows no names of our own, and keeps all of them as one text.
+            results.will_write(
+                "_schematic.svg", lambda file: circuit.draw().write(file, {"Description": json.dumps(results.about)})
+            )
         if feel and not circuit.by_device("GAP"):
             raise InputError("--feel: the circuit has no GAP, so there is no friction to feel")
         image = results.file("_feel.png") if feel and not no_plot else None
@@ -199,6 +203,8 @@ def ac(
 
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
+    from fingerspice.circuit.circuit import AcSweep
+    from fingerspice.netlist.netlist import sweep_from_text
     from fingerspice.plots.traces import plot_phasor
     from fingerspice.results.phasor_solution import PhasorSolution, phasor_csv, phasor_tables
     from fingerspice.sets.parameters import parameters
@@ -216,7 +222,11 @@ def ac(
                 f"--finger {finger!r} is a set of parameters, and here a GAP is meant; allowed: --set {finger}"
             )
         check_arguments(rtol)
-        frequencies = sweep_frequencies(options.sweep(sweep, circuit))
+        try:
+            line = sweep_from_text(sweep) if sweep is not None else circuit.ac or AcSweep("dec", 20, 10.0, 1e5)
+        except InputError as error:
+            raise InputError(f"--sweep {error.message}") from None
+        frequencies = sweep_frequencies(line)
         found: tuple[PhasorSolution, ...] = ()
         if area == "coupled":
             if skin != "swept":
@@ -267,7 +277,9 @@ def plan(
         answer.update(**answers.of_circuit(circuit, charge_law))
         circuit, _ = options.with_times(circuit, stop)
         result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
-        answer.update(**answers.of_plan(result))
+        found = result.to_dict()
+        answer.update(**{key: found[key] for key in answers.OWN["plan"] if key in found and key != "area"})
+        answer.update(plan_area=result.area)
         answer.give(lambda: "\n".join([*head_lines(circuit), "", str(result)]))
 
 
