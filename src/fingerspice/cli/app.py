@@ -134,10 +134,9 @@ def run(
                 )
             run_streamed(answer, results, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
             return
-        if csv:
-            results.will_write(".csv", lambda file: solution.to_csv(file))
-        else:
-            results.will_write(".nc", lambda file: solution.to_netcdf(file))
+        results.will_write(
+            ".csv" if csv else ".nc", lambda file: solution.to_csv(file) if csv else solution.to_netcdf(file)
+        )
         results.will_draw(
             ".png", lambda: put_beside(solution.plot(), circuit) if schematic else solution.plot(), unless=no_plot
         )
