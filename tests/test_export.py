@@ -75,6 +75,7 @@ def deviation(circuit: fs.Circuit, law: str | None = None) -> tuple[float, float
     return float(np.abs(own - (there[p] - there[n])).max() / np.abs(own).max()), worst
 
 
+@pytest.mark.filterwarnings("ignore:Vdrive. the recording ends")
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("path", DECKS, ids=lambda path: path.stem)
 def test_every_shipped_deck_agrees_as_exported(path: Path, law: str) -> None:
