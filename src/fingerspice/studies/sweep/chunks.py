@@ -120,7 +120,7 @@ class Work:
         if not os.path.lexists(self.path):
             plan, arrays = self.plan, self.outputs | self._drawn()
             for name, values in plan.grid.items():
-                of = {NAMES: list(plan.tables[name].names)} if name in plan.tables else {"units": plan.units[name]}
+                of = {NAMES: list(plan.names[name])} if name in plan.names else {"units": plan.units[name]}
                 arrays[name] = Array(self.path / name, (name,), values.shape, values.shape, of, fill=0.0)
             try:
                 create(self.path, {**about, RUN: json.dumps(own)}, arrays, plan.grid, os.urandom(6).hex())
@@ -141,9 +141,8 @@ class Work:
         values: dict[str, Any] = {}
         for name, one in (plan.grid | plan.fixed).items():
             values[name] = hashlib.sha256(one.tobytes()).hexdigest() if one.size > 8 else one.tolist()
-            if name in plan.tables:
-                sets = plan.tables[name]
-                values[name] = [sets.names, {path: each.tolist() for path, each in sets.columns.items()}]
+            if name in plan.names:
+                values[name] = [plan.names[name], {path: np.ravel(x).tolist() for path, x in plan.own[name].items()}]
         for name, law in plan.drawn.items():
             # Nine digits are the same on every machine.
             values[name] = [f"{x:.9g}" for x in law.ppf(_PROBES)]

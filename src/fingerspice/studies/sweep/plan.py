@@ -93,18 +93,18 @@ class Plan:
     """Parameters that make a grid, those that are drawn (`n` draws by `seed`), and those that are one number.
 
     Names are paths, or several paths with commas, whose numbers are factors; `own` has the paths of each and the values
-    that the factors are of. A kind of named sets, such as ``finger``, is a name as well: its numbers count the sets of
-    its table.
+    that the factors are of. A kind of named sets, such as ``finger``, is a name as well, whose numbers count the sets:
+    `own` has the values of each path in all sets, and `names` those of the sets.
     """
 
     grid: dict[str, FloatArray]
     drawn: dict[str, Any]
     fixed: dict[str, FloatArray]
-    own: dict[str, dict[str, float]]
+    own: dict[str, Mapping[str, float | FloatArray]]
     units: dict[str, str]
     n: int
     seed: int
-    tables: dict[str, SetTable]
+    names: dict[str, tuple[str, ...]]
 
     @property
     def dims(self) -> tuple[str, ...]:
@@ -118,12 +118,11 @@ class Plan:
 
     def paths(self, values: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         """Values of each path of these names."""
-        found = {
-            path: factor * np.asarray(every, float)
-            for name, every in values.items() for path, factor in self.own.get(name, {}).items()
-        }  # fmt: skip
-        for name in values.keys() & self.tables.keys():
-            found |= {path: each[np.asarray(values[name], int)] for path, each in self.tables[name].columns.items()}
+        found = {}
+        for name, numbers in values.items():
+            for path, of in self.own[name].items():
+                x = np.asarray(numbers, float)
+                found[path] = np.take(of, x.astype(int)) if name in self.names else np.asarray(of * x)
         return found
 
     def about(self, circuit: Circuit) -> dict[str, Any]:
@@ -135,7 +134,7 @@ class Plan:
     def coordinates(self) -> dict[str, Any]:
         """Of each dimension of the grid its numbers, or the names of its sets, for a Dataset."""
         return {
-            name: (name, list(self.tables[name].names)) if name in self.tables
+            name: (name, list(self.names[name])) if name in self.names
             else (name, values, {"units": self.units[name]})
             for name, values in self.grid.items()
         }  # fmt: skip
@@ -222,7 +221,8 @@ def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int
         if twice := [path for path, count in taken.items() if count > 1]:
             raise InputError(f"{twice[0]} is given twice, where sets that differ in it count; allowed: once")
         if held:
-            plan.tables[given], plan.grid[given] = value, np.arange(len(value.names), dtype=float)
+            plan.names[given], plan.own[given] = value.names, value.columns
+            plan.grid[given] = np.arange(len(value.names), dtype=float)
             continue
         path, alone = ",".join(paths), len(paths) == 1
         plan.own[path] = {one: 1.0 if alone else circuit.parameters[one].value for one in paths}
