@@ -126,7 +126,7 @@ def sobol(
     """Shares of a figure's variance that come from each random parameter: Sobol indices at every place of a grid.
 
     The index of first order is the share that the parameter causes alone, the total one that with all its interactions
-    (Saltelli et al. 2010, by `scipy.stats.sobol_indices`). n (d + 2) scenes at each place of the grid, where d
+    (Saltelli et al. 2010, as `scipy.stats.sobol_indices`). n (d + 2) scenes at each place of the grid, where d
     parameters are drawn.
 
     Parameters
@@ -179,12 +179,10 @@ def _indices(
     options: Mapping[str, Any],
 ) -> dict[str, FloatArray]:  # fmt: skip
     """Indices (n_output, d), their intervals, and mean and standard deviation of the outputs, at one place."""
-    from scipy.stats import sobol_indices
-
-    told: list[FloatArray] = []
+    from scipy.stats import qmc
 
     def figures(x: FloatArray) -> FloatArray:
-        found = batch(circuit, plan.spread(place, dict(zip(plan.drawn, np.asarray(x, float), strict=True))), **options)
+        found = batch(circuit, plan.spread(place, dict(zip(plan.drawn, x, strict=True))), **options)
         if lost := int(np.count_nonzero(found.status >= REFUSED)):
             why = f" ({found.attrs['failures'][0]})" if len(found.attrs["failures"]) else ""
             raise InputError(
@@ -193,26 +191,27 @@ def _indices(
             )
         values = np.array([found[name].values for name in outputs])
         require(values.ndim == 2, "outputs", "one for each of several gaps", "figures of a circuit with one GAP")
-        # A copy: scipy takes the mean off what it is given.
-        told.append(values.copy())
         return values
 
-    found = sobol_indices(func=figures, n=plan.n, dists=list(plan.drawn.values()), rng=plan.seed)
-    d = len(plan.drawn)
-    a, b = told[0], told[1]
-    # The third call has the scenes in which parameter j is taken from the other population, at every d-th place.
-    mixed = np.moveaxis(told[2].reshape(len(outputs), plan.n, d), -1, 0)
+    # Two populations, and for each parameter the first one with that parameter of the second.
+    d, laws = len(plan.drawn), list(plan.drawn.values())
+    points = qmc.Sobol(2 * d, bits=64, rng=plan.seed).random(plan.n).T
+    pair = np.array([law.ppf(x) for law, x in zip(laws * 2, points, strict=True)], float).reshape(2, d, plan.n)
+    other = np.repeat(pair[:1], d, axis=0)
+    other[np.arange(d), np.arange(d)] = pair[1]
+    a, b = map(figures, pair)
+    mixed = np.moveaxis(figures(np.moveaxis(other, 0, -1).reshape(d, -1)).reshape(len(outputs), plan.n, d), -1, 0)
     # Then each parameter by itself.
     alone = np.full((d, len(QUANTILES), d), 0.5)
     alone[np.arange(d), :, np.arange(d)] = QUANTILES
-    x = np.array([law.ppf(alone[..., j].ravel()) for j, law in enumerate(plan.drawn.values())])
+    x = np.array([law.ppf(alone[..., j].ravel()) for j, law in enumerate(laws)])
     picks = np.random.default_rng(plan.seed).integers(0, plan.n, (RESAMPLES, plan.n))
     drawn = np.array([_saltelli(a[:, pick], b[:, pick], mixed[..., pick]) for pick in picks])
     low, high = np.quantile(drawn, [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence], axis=0)
-    both = np.concatenate([a, b], axis=1)
+    both, (first, total) = np.concatenate([a, b], axis=1), _saltelli(a, b, mixed)
     return {
-        "first": np.reshape(found.first_order, (len(outputs), d)), "first_low": low[0], "first_high": high[0],
-        "total": np.reshape(found.total_order, (len(outputs), d)), "total_low": low[1], "total_high": high[1],
+        "first": first, "first_low": low[0], "first_high": high[0],
+        "total": total, "total_low": low[1], "total_high": high[1],
         "mean": both.mean(axis=1), "std": both.std(axis=1),
         "alone": figures(x).reshape(len(outputs), d, len(QUANTILES)),
     }  # fmt: skip
