@@ -94,9 +94,10 @@ def moved(browser: Any, count: int) -> dict[str, list[float]]:
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.goto(url)
         page.wait_for_selector("body[data-figures]", timeout=120_000)
-        # The sweep over frequencies is done by then.
-        page.wait_for_timeout(5000)
-        page.evaluate(MOVES, 30)
+        if count > 10:
+            # The sweep over frequencies is done by then.
+            page.wait_for_timeout(5000)
+            page.evaluate(MOVES, 30)
         times = page.evaluate(MOVES, count)
         page.close()
     return dict(zip(("traces drawn", "next frame begun", "figures shown"), times, strict=True))
@@ -146,7 +147,8 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         version = f"Chromium {browser.version}"
-        first_pictures(browser, 1)
+        if not quick:
+            first_pictures(browser, 1)
         cold = first_pictures(browser, 1 if quick else COLD)
         times = moved(browser, 10 if quick else 300)
         browser.close()

@@ -53,21 +53,36 @@ def test_what_is_no_circuit_is_refused_with_how_one_is_made(call: Any, given: An
         call(given)
 
 
+# What every call refuses, and what a run does.
+NO_SOURCES: list[tuple[Any, str]] = [
+    ({"sources": np.zeros(5)}, rf"a source is array\(.*, a ndarray; .* {AT_A_RATE}"),
+    ({"sources": (0.0, 1.0)}, r"a source is \(0\.0, 1\.0\), a tuple; .* values at a rate are fs\.Samples"),
+    ({"sources": {"Vdrive": Path("x.csv")}}, rf"a source is .*x\.csv.*; allowed: {A_WAVEFORM}"),
+    ({"sources": {"Vdrive2": SQUARE}}, "unknown element 'Vdrive2'; nearest: 'Vdrive'"),
+    ({"sources": {"Xgap": SQUARE}}, "sources names 'Xgap', which is a GAP; allowed: a V or I element"),
+    ({"sources": {3: SQUARE}}, "sources names 3, a int; allowed: names of V or I elements"),
+    ({"parameters": ("Xgap.d", 3e-6)}, r"parameters is a tuple; allowed: a mapping such as \{'Xgap.d': 3e-6\}"),
+    ({"parameters": "Xgap.d=3u"}, "parameters is a str; allowed: a mapping"),
+]
+NO_ARGUMENTS: list[tuple[Any, str]] = [
+    ({"t_stop": "50m"}, "t_stop is '50m'; allowed: a number in s"),
+    ({"t_stop": (0.0, 1.0)}, "t_stop is .*, a tuple; allowed: a number in s"),
+    ({"t_eval": "50m"}, "t_eval is '50m'; allowed: numbers in s"),
+    ({"t_eval": {"a": 1}}, "t_eval is .*; allowed: numbers in s"),
+    ({"area": (1e-6, 2e-6)}, "area is .*, a tuple; allowed: 'coupled', 'mean', 'frozen' or a number in m"),
+    ({"area": np.zeros(2)}, "area is .*, a ndarray; allowed"),
+    ({"rtol": "1e-6"}, "rtol is '1e-6'; allowed: 1e-13 to 0.1"),
+    ({"method": 3}, "method is 3; allowed: a name"),
+    ({"charge_law": 3}, "charge_law is 3; allowed: 'local' or 'mobile'"),
+    ({"start": 0.5}, "start is 0.5; allowed: 'deck'"),
+]
+
+
 @pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"sources": np.zeros(5)}, rf"a source is array\(.*, a ndarray; .* {AT_A_RATE}"),
-        ({"sources": (0.0, 1.0)}, r"a source is \(0\.0, 1\.0\), a tuple; .* values at a rate are fs\.Samples"),
-        ({"sources": {"Vdrive": Path("x.csv")}}, rf"a source is .*x\.csv.*; allowed: {A_WAVEFORM}"),
-        ({"sources": {"Vdrive2": SQUARE}}, "unknown element 'Vdrive2'; nearest: 'Vdrive'"),
-        ({"sources": {"Xgap": SQUARE}}, "sources names 'Xgap', which is a GAP; allowed: a V or I element"),
-        ({"sources": {3: SQUARE}}, "sources names 3, a int; allowed: names of V or I elements"),
-        ({"parameters": ("Xgap.d", 3e-6)}, r"parameters is a tuple; allowed: a mapping such as \{'Xgap.d': 3e-6\}"),
-        ({"parameters": "Xgap.d=3u"}, "parameters is a str; allowed: a mapping"),
-    ],
+    ("call", "given", "said"),
+    [*((c, *one) for c in CALLS for one in NO_SOURCES), *((fs.simulate, *one) for one in NO_ARGUMENTS)],
 )
-@pytest.mark.parametrize("call", CALLS)
-def test_what_is_no_source_or_parameter_is_refused_with_one_sentence(call: Any, given: Any, said: str) -> None:
+def test_an_argument_of_another_kind_is_refused_with_one_sentence(call: Any, given: Any, said: str) -> None:
     with pytest.raises(fs.InputError, match=said):
         call(table1(), **given)
 
@@ -79,26 +94,6 @@ def test_one_source_for_a_circuit_of_none_or_several_is_refused() -> None:
     two = table1(extra="Vbias top b 0\nRb b 0 1meg")
     with pytest.raises(fs.InputError, match=r"the circuit has Vdrive, Vbias; allowed: a mapping such as \{'Vdrive': "):
         fs.simulate(two, sources=SQUARE)
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"t_stop": "50m"}, "t_stop is '50m'; allowed: a number in s"),
-        ({"t_stop": (0.0, 1.0)}, "t_stop is .*, a tuple; allowed: a number in s"),
-        ({"t_eval": "50m"}, "t_eval is '50m'; allowed: numbers in s"),
-        ({"t_eval": {"a": 1}}, "t_eval is .*; allowed: numbers in s"),
-        ({"area": (1e-6, 2e-6)}, "area is .*, a tuple; allowed: 'coupled', 'mean', 'frozen' or a number in m"),
-        ({"area": np.zeros(2)}, "area is .*, a ndarray; allowed"),
-        ({"rtol": "1e-6"}, "rtol is '1e-6'; allowed: 1e-13 to 0.1"),
-        ({"method": 3}, "method is 3; allowed: a name"),
-        ({"charge_law": 3}, "charge_law is 3; allowed: 'local' or 'mobile'"),
-        ({"start": 0.5}, "start is 0.5; allowed: 'deck'"),
-    ],
-)
-def test_arguments_of_another_kind_are_refused_with_one_sentence(given: Any, said: str) -> None:
-    with pytest.raises(fs.InputError, match=said):
-        fs.simulate(table1(), **given)
 
 
 # Of every kind that a user may have -----------------------------------------------------------------------------------

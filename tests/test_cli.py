@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import json
 import math
 import os
 import re
+import shutil
 import sys
 import threading
 from pathlib import Path
@@ -20,6 +22,7 @@ import xarray
 import fingerspice as fs
 from commands import QUICK, Command, Result, tree
 from deck_edits import edited
+from fingerspice.results.store import create
 
 OUT = {"out", "out/.gitignore"}
 """What stands where nobody named a folder, besides the results."""
@@ -280,6 +283,36 @@ def test_each_of_several_sources_is_replaced_by_its_name(command: Command) -> No
     none = command(*words, "--source", "SQUARE(100 100)", "--name", "none")
     assert none.code == 2
     assert "the circuit has Vbias, Vdrive; allowed: NAME=SPEC with one of these names" in none.err
+
+
+def test_a_store_that_another_process_writes_is_refused(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("zarr")
+    words, busy = (
+        ("run", "pad.cir", "--stream", "--chunk", "10m"),
+        "another process writes out/pad.zarr; allowed: to wait",
+    )
+    assert command(*words).code == 0
+    before = tree(Path("out"))
+    number = os.open("out/pad.zarr", os.O_RDONLY)
+    fcntl.flock(number, fcntl.LOCK_EX)
+    for more in ((), ("--overwrite",)):
+        done = command(*words, *more)
+        assert (done.code, done.out) == (2, "")
+        assert busy in done.lines[-1]
+    os.close(number)
+    assert command(*words).code == 0
+    shutil.move("out/pad.zarr", "pad.zarr")
+
+    def late(*given: object) -> None:
+        # Another process is faster: it has created its store since this one began.
+        shutil.copytree("pad.zarr", "out/pad.zarr")
+        create(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("fingerspice.cli.store.create", late)
+    done = command(*words)
+    assert (done.code, done.out) == (2, "")
+    assert busy in done.lines[-1]
+    assert tree(Path("out")) == before
 
 
 # decks from elsewhere

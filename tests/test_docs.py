@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import shlex
-import subprocess
 import warnings
 import wave
 from pathlib import Path
@@ -14,7 +12,6 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from commands import Command
 from fingerspice.base.units import SCALES, parse_number, spice_text
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
 from fingerspice.circuit.usual import SOURCES as USUAL_OF_SOURCES
@@ -110,18 +107,6 @@ def test_the_other_decks_run_unchanged_in_ngspice(text: str) -> None:
     assert {round(theirs[f"v({node})"][-1], 1) for node in areas} == set(np.round(1e6 * np.ravel(ours.area[-1]), 1))
 
 
-def test_the_commands_run(command: Command, tmp_path: Path) -> None:
-    (tmp_path / "finger.cir").write_text(FINGER, encoding="utf-8")
-    for line in "".join(blocks("sh")).splitlines():
-        program, *words = shlex.split(line)
-        assert program == "fingerspice"
-        result = command(*words, *([] if words[0] == "export" else ["--no-plot"]))
-        assert (result.code, result.err) == (0, ""), line
-    # The exported deck is alone in its folder: the library is inside.
-    subprocess.run(["ngspice", "-b", "-r", "out.raw", "finger_ngspice.cir"], check=True, capture_output=True)
-    assert (tmp_path / "out.raw").stat().st_size > 1000
-
-
 def test_the_table_of_parameters_is_that_of_the_devices() -> None:
     plain = ("m", "V/m", "ohm", "F", "Hz", "s")
 
@@ -167,30 +152,6 @@ def test_the_sources_are_read(row: list[str], tmp_path: Path) -> None:
         warnings.simplefilter("error")
         circuit = fs.parse_netlist(FINGER.replace("SIN(0 200 100)", row[0].strip("`")), tmp_path / "finger.cir")
     assert fs.simulate(circuit, t_stop=2e-3).success
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("d=3.5u", "d=3,5u", "if it is a decimal comma write 3.5u"),
-        ("0.2meg", "2k7", "write 2.7k"),
-        ("0.2meg", "1x", "write 1meg"),
-        ("0.2meg", "1a", "write 1"),
-        ("fn=0.5", "fn=1N", "write the number alone, in newton"),
-        ("uic\n", "uic\nC1 drive 0 1F\n", "write the number alone, in farad"),
-        ("mu=0.3", "mu=5", "no contact"),
-        ("mu=0.3", "m_exp=2", "0 < m_exp < n_exp"),
-        ("uic\n", "startup\n", "startup"),
-        ("SIN(0 200 100)", "AM(1 1 1 1)", "AM"),
-        ("SIN(0 200 100)", "SIN(0 200 100 0 0 0 5)", "Ncycles"),
-        ("uic\n", "uic\n.include fingerspice_mobile.lib\n", "both"),
-    ],
-)
-def test_what_the_page_calls_refused_is_refused(old: str, new: str, said: str) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with pytest.raises(fs.InputError, match=re.escape(said)):
-            fs.parse_netlist(FINGER.replace(old, new))
 
 
 def test_numbers_mean_what_the_page_says() -> None:

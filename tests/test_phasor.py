@@ -140,22 +140,6 @@ def test_the_coupled_area_is_the_contacts_at_the_rms_gap_voltage_to_40_digits() 
     assert abs(solution.area[0] / a - 1) < 1e-14
 
 
-def test_table_1_at_200_volts_has_the_golden_gains() -> None:
-    low, high = (fs.phasor(table1(f"SIN(0 200 {f})", f=f)) for f in (100.0, 5000.0))
-    assert abs(low.gain[0]) == pytest.approx(0.6653, abs=5e-5)
-    assert math.degrees(cmath.phase(low.gain[0])) == pytest.approx(7.9, abs=0.05)
-    assert abs(high.gain[0]) == pytest.approx(0.8768, abs=5e-5)
-    assert math.degrees(cmath.phase(high.gain[0])) == pytest.approx(1.37, abs=5e-3)
-    assert low.f_el_mean[0] == pytest.approx(0.1113, abs=5e-5)
-    assert high.f_el_mean[0] == pytest.approx(0.1893, abs=5e-5)
-
-
-def test_at_140_volts_the_mean_force_rises_1_724_times_from_100_hz_to_10_khz() -> None:
-    force = fs.phasor(table1("SIN(0 140 100)"), [100.0, 2000.0, 10000.0]).f_el_mean
-    assert force[2] / force[0] == pytest.approx(1.724, abs=5e-4)
-    assert force[2] / force[1] == pytest.approx(1.03, abs=5e-3)
-
-
 def test_the_reading_of_equation_7_reaches_the_coupled_area() -> None:
     held = fs.phasor(table1(extra=".options work=total"))
     assert held.area[0] == pytest.approx(coupled_phasor(100.0, 200.0, k=work_factor(100.0)).area, rel=1e-13)
@@ -282,7 +266,16 @@ def test_sources_without_ac_are_silent_in_a_circuit_without_a_gap_as_in_ngspice(
         np.testing.assert_allclose(found.v_nodes[:, found.nodes.index(node)], theirs, rtol=1e-9)
 
 
-def test_a_circuit_without_a_gap_and_without_an_amplitude_is_refused() -> None:
+def test_a_circuit_without_a_gap_says_where_its_skins_data_are_held_and_takes_no_other_area() -> None:
+    skin = deck("V1 a 0 SIN(0 10 100)", "Xskin a 0 area SKIN d=350u f=100", "Varea area 0 35")
+    held, alone = fs.phasor(skin, [50.0, 1e3], skin="own"), fs.phasor(skin, 100.0)
+    assert held.notes == (
+        "the skin's data are held at the deck's own frequency (Xskin f = 100 Hz) over the whole sweep",
+    )
+    assert held.circuit is skin
+    np.testing.assert_allclose((1.0 / held.impedance).real, (1.0 / alone.impedance).real[0], rtol=1e-12)
+    with pytest.raises(fs.InputError, match="area is 'frozn'; allowed: 'mean', 'frozen' or a number"):
+        fs.phasor(skin, 100.0, area="frozn")
     with pytest.raises(fs.InputError, match="no source has an amplitude; allowed: AC on a source"):
         fs.phasor(deck("V1 in 0 5", "R1 in out 1k", "C1 out 0 1u"), 100.0)
 

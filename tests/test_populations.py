@@ -50,10 +50,12 @@ def test_a_population_is_the_same_at_every_place_and_for_every_seed(circuit: fs.
 
 
 def test_indices_are_those_of_the_ishigami_function(circuit: fs.Circuit, monkeypatch: pytest.MonkeyPatch) -> None:
+    def function(x: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sin(x[0]) + 7.0 * np.sin(x[1]) ** 2 + 0.1 * x[2] ** 4 * np.sin(x[0]))
+
     def ishigami(_circuit: fs.Circuit, scenes: Any, **_options: Any) -> xr.Dataset:
-        x, y, z = (np.asarray(scenes[path]) for path in ("Xgap.d", "Xgap.r", "Xskin.d"))
-        value = np.sin(x) + 7.0 * np.sin(y) ** 2 + 0.1 * z**4 * np.sin(x)
-        status = np.zeros(x.size, np.int8)
+        value = function(np.array([scenes[path] for path in ("Xgap.d", "Xgap.r", "Xskin.d")]))
+        status = np.zeros(value.size, np.int8)
         return xr.Dataset({"f_el_mean": ("scene", value), "status": ("scene", status)}, attrs={"failures": []})
 
     monkeypatch.setattr(populations, "batch", ishigami)
@@ -66,13 +68,21 @@ def test_indices_are_those_of_the_ishigami_function(circuit: fs.Circuit, monkeyp
     for kind, exact in (("first", first), ("total", total)):
         assert np.all(found[f"f_el_mean_{kind}_low"] <= np.array(exact) + 0.01)
         assert np.all(found[f"f_el_mean_{kind}_high"] >= np.array(exact) - 0.01)
-    # The intervals belong to scipy's own indices: their formulas are the same.
+    theirs = stats.sobol_indices(func=function, n=4096, dists=[law] * 3, rng=0)
+    np.testing.assert_allclose(found.f_el_mean_first, theirs.first_order, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.f_el_mean_total, theirs.total_order, rtol=0, atol=1e-12)
     assert np.all(found.f_el_mean_first_low <= found.f_el_mean_first)
     assert np.all(found.f_el_mean_first_high >= found.f_el_mean_first)
     assert float(found.f_el_mean_mean) == pytest.approx(3.5, abs=0.05)
     rows = populations.ranking(found, "f_el_mean")
     assert [row["parameter"] for row in rows] == ["Xgap.d", "Xgap.r", "Xskin.d"]
     assert all(row["low"] <= row["total"] <= row["high"] for row in rows)
+
+
+def test_one_parameter_alone_has_the_whole_variance(circuit: fs.Circuit) -> None:
+    found = fs.sobol(circuit, {"Xgap.d": stats.lognorm(0.1, scale=3.5e-6)}, n=64, skin="follow", **HOW)
+    for kind in ("first", "total"):
+        np.testing.assert_allclose(found[f"f_el_mean_periodic_{kind}"], [1.0], atol=0.05)
 
 
 def test_what_matters_to_the_force_is_named_at_every_place(circuit: fs.Circuit) -> None:

@@ -25,21 +25,22 @@ def bare(folder: Path, *commands: str, **scripts: str) -> dict[str, str]:
     return {**{k: v for k, v in os.environ.items() if k != "CI"}, "PATH": str(folder)}
 
 
-def suite(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    words = ("-m", "pytest", "-p", "no:cacheprovider", "-x", "tests/test_export.py", "-k", "needs_no_other_file")
-    command = [sys.executable, *words]
-    return subprocess.run(command, cwd=TESTS.parent, env=environment, capture_output=True, text=True, timeout=120)
+def suite(folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """A test that takes ngspice, run as those of this folder."""
+    (folder / "test_one.py").write_text("import ngspice_tools\n\ndef test_one(): ngspice_tools.call_ngspice('.')\n")
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "conftest", str(folder / "test_one.py")]
+    path = {"PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path])}
+    return subprocess.run(command, cwd=folder, env=environment | path, capture_output=True, text=True, timeout=120)
 
 
 def test_without_ngspice_the_last_line_says_what_was_not_run(tmp_path: Path) -> None:
     environment = bare(tmp_path)
-    done = suite(environment)
+    done = suite(tmp_path, environment)
     assert done.returncode == 0, done.stdout
     last = done.stdout.splitlines()[-1]
-    assert (
-        " comparisons with ngspice were not run, as it is not installed; to run them: apt-get install ngspice" in last
-    )
-    failed = suite({**environment, "CI": "true"})
+    said = " comparisons with ngspice were not run, as it is not installed; to run them: apt-get install ngspice"
+    assert said in last
+    failed = suite(tmp_path, {**environment, "CI": "true"})
     assert failed.returncode == 1
     assert "ngspice is not installed, which CI asks for" in failed.stdout
 

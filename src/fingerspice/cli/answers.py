@@ -11,7 +11,6 @@ from fingerspice import __version__
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.outcome import Plan
     from fingerspice.results.solution import Solution
 
 Answer = dict[str, Any]
@@ -65,36 +64,20 @@ def of_circuit(circuit: Circuit, charge_law: str | None) -> Answer:
 
 def of_run(solution: Solution) -> Answer:
     """The part of an answer that describes a run: its method and error, and figures of every signal in SI units."""
-    s = solution.summary()
-    names = [key.removesuffix("_peak") for key in s if key.endswith("_peak")]
-    return {
-        "charge_law": solution.charge_law,
-        "method": solution.method,
-        "area": solution.area_mode,
-        "tier": solution.plan.tier,
-        "t_stop": s["t_stop"],
-        "figures_from": s.get("figures_from"),
-        "error": vars(solution.error),
-        "fundamental": s.get("fundamental"),
-        "fold_margin_min": s.get("fold_margin_min"),
-        "signals": [_row(solution, name, s) for name in names],
-    }
-
-
-def of_plan(plan: Plan) -> Answer:
-    """The part of an answer that describes a plan; `plan_area` is the area of a model with one area."""
-    found = plan.to_dict()
-    return {**{key: found[key] for key in OWN["plan"] if key in found and key != "area"}, "plan_area": plan.area}
-
-
-def _row(solution: Solution, name: str, summary: dict[str, Any]) -> Answer:
     from fingerspice.results.signals import SIGNALS
 
-    signal, _, element = name.partition(":")
-    if not element and signal in ("u_gap", "area", "f_el", "f_t", "friction") and len(solution.gaps) == 1:
-        element = solution.gaps[0]
-    figures = {figure: summary.get(f"{name}_{figure}") for figure in FIGURES}
-    return {"signal": signal, "element": element or None, "unit": SIGNALS[signal][0], **figures}
+    s, rows = solution.summary(), []
+    for name in [key.removesuffix("_peak") for key in s if key.endswith("_peak")]:
+        signal, _, element = name.partition(":")
+        if not element and signal in ("u_gap", "area", "f_el", "f_t", "friction") and len(solution.gaps) == 1:
+            element = solution.gaps[0]
+        figures = {figure: s.get(f"{name}_{figure}") for figure in FIGURES}
+        rows.append({"signal": signal, "element": element or None, "unit": SIGNALS[signal][0], **figures})
+    return {
+        "charge_law": solution.charge_law, "method": solution.method, "area": solution.area_mode,
+        "tier": solution.plan.tier, "error": vars(solution.error), "signals": rows, "t_stop": s["t_stop"],
+        **{key: s.get(key) for key in ("figures_from", "fundamental", "fold_margin_min")},
+    }  # fmt: skip
 
 
 Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir), - for standard input.")]

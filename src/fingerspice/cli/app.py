@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 from typing import Annotated, Any
 
 import typer
@@ -132,15 +133,17 @@ def run(
                 )
             run_streamed(answer, results, circuit, how, chunk=chunk, signals=signals, netcdf=netcdf)
             return
-        if csv:
-            results.will_write(".csv", lambda file: solution.to_csv(file))
-        else:
-            results.will_write(".nc", lambda file: solution.to_netcdf(file))
+        results.will_write(
+            ".csv" if csv else ".nc", lambda file: solution.to_csv(file) if csv else solution.to_netcdf(file)
+        )
         results.will_draw(
             ".png", lambda: put_beside(solution.plot(), circuit) if schematic else solution.plot(), unless=no_plot
         )
         if schematic:
-            results.will_write_schematic()
+            # An SVG file knows no names of our own, and keeps all of them as one text.
+            results.will_write(
+                "_schematic.svg", lambda file: circuit.draw().write(file, {"Description": json.dumps(results.about)})
+            )
         if feel and not circuit.by_device("GAP"):
             raise InputError("--feel: the circuit has no GAP, so there is no friction to feel")
         image = results.file("_feel.png") if feel and not no_plot else None
@@ -198,8 +201,10 @@ def ac(
 
       fingerspice ac circuits/fingerpad.cir --area coupled --amplitude 50 --amplitude 200
     """
+    from fingerspice.circuit.circuit import AcSweep
+    from fingerspice.netlist.netlist import sweep_from_text
     from fingerspice.plots.traces import plot_phasor
-    from fingerspice.results.phasor_solution import phasor_csv, phasor_tables
+    from fingerspice.results.phasor_solution import PhasorSolution, phasor_csv, phasor_tables
     from fingerspice.sets.parameters import parameters
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.comparison import large_signal
@@ -215,24 +220,29 @@ def ac(
                 f"--finger {finger!r} is a set of parameters, and here a GAP is meant; allowed: --set {finger}"
             )
         check_arguments(rtol)
-        frequencies = sweep_frequencies(options.sweep(sweep, circuit))
-        if area == "coupled" and skin != "swept":
-            raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
-        if amplitude and area == "coupled":
-            positive_row("amplitude", amplitude, "V")
-        if area != "coupled":
+        try:
+            line = sweep_from_text(sweep) if sweep is not None else circuit.ac or AcSweep("dec", 20, 10.0, 1e5)
+        except InputError as error:
+            raise InputError(f"--sweep {error.message}") from None
+        frequencies = sweep_frequencies(line)
+        found: tuple[PhasorSolution, ...] = ()
+        if area == "coupled":
+            if skin != "swept":
+                raise InputError(f"--skin {skin} does not go with --area coupled; allowed: --skin swept")
             if amplitude:
-                raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
-            found = [phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger)]
+                positive_row("amplitude", amplitude, "V")
+        elif amplitude:
+            raise InputError(f"--amplitude goes with --area coupled, not with --area {area}")
+        else:
+            found = (phasor(circuit, frequencies, area=area_from_text(area), skin=skin, finger=finger),)
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         results.will_write("_ac.csv", lambda file: phasor_csv(found, file))
         results.will_draw("_ac.png", lambda: plot_phasor(found, circuit), unless=no_plot)
         if area == "coupled":
             with progress("sweeping") as update:
-                every = large_signal(
+                found = large_signal(
                     circuit, frequencies, amplitude, charge_law=charge_law, rtol=rtol, finger=finger, progress=update
                 )
-            found = [*every]
         answer.update(sweeps=[r.to_dict() for r in found] if as_json else None)
         answer.give(lambda: phasor_tables(found, circuit), results.ready())
 
@@ -265,7 +275,9 @@ def plan(
         answer.update(**answers.of_circuit(circuit, charge_law))
         circuit, _ = options.with_times(circuit, stop)
         result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
-        answer.update(**answers.of_plan(result))
+        found = result.to_dict()
+        answer.update(**{key: found[key] for key in answers.OWN["plan"] if key in found and key != "area"})
+        answer.update(plan_area=result.area)
         answer.give(lambda: "\n".join([*head_lines(circuit), "", str(result)]))
 
 

@@ -6,7 +6,6 @@ import dataclasses
 import os
 import tempfile
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ from fingerspice.base.units import parse_number
 from fingerspice.cli.terminal import complain
 
 if TYPE_CHECKING:
-    from fingerspice.circuit.circuit import AcSweep, Circuit
+    from fingerspice.circuit.circuit import Circuit
     from fingerspice.waveforms.waveform import Waveform
 
 #: Largest area that causes no warning, m^2; a larger one was probably given in mm^2.
@@ -40,8 +39,11 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
     # A path has a dot, and the name of a set none.
     named = [change for change in changes or () if change and not set("=.") & set(change)]
     try:
-        circuit = _with_sets(circuit, {"set": named, **sets})
-        circuit = _with_changes(circuit, changes or [], named)
+        for option, text in [
+            (option, text) for option, texts in {"set": named, **sets}.items() for text in texts or ()
+        ]:
+            circuit = _with_set(circuit, option, text)
+        circuit = _with_values(circuit, changes or [], named)
         circuit = _with_sources(circuit, sources or [])
         given = circuit.warnings
     finally:
@@ -58,21 +60,18 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
     return circuit
 
 
-def _with_sets(circuit: Circuit, asked: Mapping[str, list[str] | None]) -> Circuit:
-    """The circuit with the sets that each option names, in this order."""
+def _with_set(circuit: Circuit, option: str, text: str) -> Circuit:
     from fingerspice.sets.parameters import parameters
 
-    for option, text in [(option, text) for option, texts in asked.items() for text in texts or ()]:
-        element, equals, name = (part.strip() for part in text.rpartition("="))
-        try:
-            circuit = parameters(name, None if option == "set" else option).apply(circuit, element if equals else None)
-        except InputError as error:
-            other = "; or PATH=VALUE, such as Xgap.d=3u" if option == "set" and "unknown set" in error.message else ""
-            raise InputError(f"--{option} {text!r}: {error.message}{other}") from None
-    return circuit
+    element, equals, name = (part.strip() for part in text.rpartition("="))
+    try:
+        return parameters(name, None if option == "set" else option).apply(circuit, element if equals else None)
+    except InputError as error:
+        other = "; or PATH=VALUE, such as Xgap.d=3u" if option == "set" and "unknown set" in error.message else ""
+        raise InputError(f"--{option} {text!r}: {error.message}{other}") from None
 
 
-def _with_changes(circuit: Circuit, changes: list[str], named: list[str]) -> Circuit:
+def _with_values(circuit: Circuit, changes: list[str], named: list[str]) -> Circuit:
     """The circuit with all ``--set`` values applied together, as two exponents may only be legal together."""
     values: dict[str, str] = {}
     for change in (change for change in changes if change not in named):
@@ -200,16 +199,3 @@ def check_output(file: Path, deck: Path | None = None) -> None:
             raise InputError(f"cannot write {file}: it is the deck itself; allowed: another name or folder")
     except OSError as error:
         raise InputError(f"cannot write {file}: {error.strerror}; {allowed}") from None
-
-
-def sweep(text: str | None, circuit: Circuit) -> AcSweep:
-    """The sweep given by ``--sweep``, else the deck's, and else a sweep over the band of the skin's data."""
-    from fingerspice.circuit.circuit import AcSweep
-    from fingerspice.netlist.netlist import sweep_from_text
-
-    if text is None:
-        return circuit.ac or AcSweep("dec", 20, 10.0, 1e5)
-    try:
-        return sweep_from_text(text)
-    except InputError as error:
-        raise InputError(f"--sweep {error.message}") from None

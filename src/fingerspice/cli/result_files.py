@@ -79,14 +79,6 @@ class Results:
         """As `will_write`, of the picture that a function draws, unless none is wanted."""
         self._writes += self.pictures(None if unless else self.file(end), draw)
 
-    def will_write_schematic(self) -> None:
-        """As `will_write`, of the circuit's schematic."""
-        # An SVG file knows no names of our own, and keeps all of them as one text.
-        self.will_write(
-            "_schematic.svg",
-            lambda file: self.circuit.draw().write(file, {"Description": json.dumps(self.about)}),
-        )
-
     def ready(self) -> list[Callable[[], Path]]:
         """The functions that write the files, for which there is a folder now."""
         if self._writes:
@@ -95,13 +87,15 @@ class Results:
 
     def pictures(self, path: Path | None, draw: Callable[[], Any]) -> list[Callable[[], Path]]:
         """The function that draws and writes a picture; none without a path."""
+        if path is None:
+            return []
 
-        def write(file: Path) -> Path:
+        def write() -> Path:
             from fingerspice.plots.drawing import save
 
-            return save(draw(), file, about=self.about)
+            return save(draw(), path, about=self.about)
 
-        return [] if path is None else [lambda: write(path)]
+        return [write]
 
     def open(self) -> None:
         """When the default folder is created, put a .gitignore into it, to keep results out of version control."""

@@ -6,6 +6,7 @@ whose file is replaced atomically after the chunk's data have reached the disk.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -13,6 +14,7 @@ import time
 import warnings
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +23,7 @@ import numpy as np
 from fingerspice import __version__
 from fingerspice.base.announcing import paced
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.files import settle_on_disk, write_aside, write_durably
+from fingerspice.base.files import UNFINISHED, settle_on_disk, write_aside, write_durably
 from fingerspice.cli.options import check_output, time_from_text
 from fingerspice.cli.result_files import Results
 from fingerspice.cli.terminal import Answering
@@ -44,25 +46,40 @@ class Store:
     """A store of one run in a folder.
 
     `run` is its identity, all inputs that determine its results, as plain data; the run has `total` outputs, and a
-    chunk `count`.
+    chunk `count`. Within `lock`, no other process writes the store.
     """
 
     def __init__(self, path: Path, run: dict[str, Any], total: int, count: int) -> None:
         self.zarr = zarr_library()
         self.run = json.loads(json.dumps({**run, "kind of checksum": CHECKSUM}))
         self.path, self.total, self.count = path, total, count
-        self.chunks = -(-total // count)  # Of the whole run
-        self.done = 0
+        self.chunks, self.done, self.there = -(-total // count), 0, False  # Chunks of the whole run
         self.mark: dict[str, Any] = {}
         self.so_far: dict[str, Any] = {}
+        self.lock = ExitStack()
+
+    def _hold(self, folder: Path) -> None:
+        """Keep other processes from the store in a folder, also after it is renamed."""
+        # Without locks, as on some file systems, nothing is refused.
+        with suppress(OSError):
+            number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+            self.lock.callback(os.close, number)
+            try:
+                fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise self._busy() from None
+
+    def _busy(self) -> InputError:
+        return InputError(f"another process writes {self.path}; allowed: to wait for it, --name NAME, or another --out")
 
     def open(self, overwrite: bool) -> None:
         """Open an existing store of the same run, to continue it; with `overwrite` remove any store.
 
-        A folder that is no store is refused, as is a store that is damaged or of another run.
+        A folder that is no store is refused, as is a store that is damaged, of another run, or being written.
         """
         if not os.path.lexists(self.path):
             return
+        self._hold(self.path)
         try:
             attributes = attributes_of(self.path)
             whole = all(isinstance(attributes[key], dict) for key in (RUN, MARK, SO_FAR, COLUMNS))
@@ -75,6 +92,7 @@ class Store:
         if overwrite:
             shutil.rmtree(self.path)
             return
+        self.there = True
         for key, own in self.run.items():
             held = attributes[RUN].get(key)
             if held != own:
@@ -84,11 +102,10 @@ class Store:
                 raise InputError(f"{self.path} holds a run of {what}; {ways}")
         self.done, self.mark, self.so_far = attributes[DONE], attributes[MARK], attributes[SO_FAR]
         written: set[Path] = set()
-        for array in (self._array(name, columns) for name, columns in attributes[COLUMNS].items()):
-            for chunk in range(self.done):
-                place = _place(array, chunk)
-                fault = array.fault(place)
-                if fault is not None:
+        for name, columns in attributes[COLUMNS].items():
+            array = self._array(name, columns)
+            for place in ((chunk, *(0,) * bool(columns)) for chunk in range(self.done)):
+                if fault := array.fault(place):
                     raise InputError(f"{self.path} is damaged: {array.file(place)} {fault}; allowed: --overwrite")
                 written.add(array.file(place))
         # What a call that was killed has left.
@@ -118,11 +135,10 @@ class Store:
             "t_stop": solution.t_stop, "error": vars(solution.error), "fold_margin_min": solution.fold_margin_min,
         }  # fmt: skip
         try:
-            if not self.path.exists():
-                attributes = {**about, RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, COLUMNS: columns}
-                create(self.path, attributes, arrays, {}, self.path.name)
+            if not self.there:
+                self._create({**about, RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, COLUMNS: columns}, arrays)
             for name, one in arrays.items():
-                place = _place(one, chunk)
+                place = (chunk, *(0,) * bool(columns[name]))
                 one.put(place, data[name][1])
                 settle_on_disk(one.file(place).parent)
             head = json.loads((self.path / "zarr.json").read_text())
@@ -135,6 +151,21 @@ class Store:
                 "written, and the same command goes on from there"
             ) from None
         self.done = chunk + 1
+
+    def _create(self, attributes: dict[str, Any], arrays: Mapping[str, Array]) -> None:
+        """Create the store, which is locked before it has its name; refused if another process was faster."""
+        aside = self.path.with_name(f"{UNFINISHED}{os.urandom(6).hex()}")
+        try:
+            create(aside, attributes, arrays, {}, os.urandom(6).hex())
+            self._hold(aside)
+            if self.path.exists():
+                raise self._busy()
+            # It fails where another process has just done the same.
+            aside.rename(self.path)
+            settle_on_disk(self.path.parent)
+            self.there = True
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
 
     def to_netcdf(self, path: Path) -> Path:
         """Write the whole run as NetCDF, piece by piece."""
@@ -155,27 +186,19 @@ class Store:
             with h5netcdf.File(target, "w") as file:
                 file.dimensions["time"] = self.total
                 for name, array in arrays.items():
-                    self._copy(name, array, file)
+                    names = array.metadata.dimension_names
+                    for dimension, length in zip(names[1:], array.shape[1:], strict=True):
+                        if dimension not in file.dimensions:
+                            file.dimensions[dimension] = length
+                    variable = file.create_variable(name, names, dtype="f8")
+                    for key, value in array.attrs.asdict().items():
+                        variable.attrs[key] = value if isinstance(value, str) else json.dumps(value)
+                    rows = max(1, _PIECE // (8 * max(1, int(np.prod(array.shape[1:])))))
+                    for at in range(0, self.total, rows):
+                        variable[at : at + rows] = array[at : at + rows]
                 file.attrs.update({k: value for k, value in group.attrs.asdict().items() if isinstance(value, str)})
 
         return write_aside(path, write)
-
-    def _copy(self, name: str, array: Any, file: Any) -> None:
-        """Copy an array into a NetCDF file."""
-        names = array.metadata.dimension_names
-        for dimension, length in zip(names[1:], array.shape[1:], strict=True):
-            if dimension not in file.dimensions:
-                file.dimensions[dimension] = length
-        variable = file.create_variable(name, names, dtype="f8")
-        for key, value in array.attrs.asdict().items():
-            variable.attrs[key] = value if isinstance(value, str) else json.dumps(value)
-        rows = max(1, _PIECE // (8 * max(1, int(np.prod(array.shape[1:])))))
-        for at in range(0, self.total, rows):
-            variable[at : at + rows] = array[at : at + rows]
-
-
-def _place(array: Array, chunk: int) -> tuple[int, ...]:
-    return chunk, *(0 for _ in array.shape[1:])
 
 
 def run_streamed(
@@ -194,25 +217,26 @@ def run_streamed(
     if netcdf:
         results.will_write(".nc", lambda file: store.to_netcdf(file))
     store = Store(path, _identity(run, circuit, how, names), run.outputs.total, run.count)
-    store.open(results.overwrite)
-    if store.done and store.done < store.chunks:
-        run.go_to(store.mark, store.done * store.count)
-    results.open()
-    begun, first, total = time.perf_counter(), store.done, run.outputs.total
-    answer.data["files"].append(str(path))
-    if first < store.chunks:
-        _fill(run, store, names, results)
-    took, span = time.perf_counter() - begun, run.problem.t_stop - run.problem.t_start
-    said = [f"{total:,} outputs of {span:g} s in {store.chunks:,} piece{'s' if store.chunks > 1 else ''}: {path}"]
-    if first < store.chunks:
-        said.append(f"{(store.chunks - first) / store.chunks * span / took:,.3g} times real time")
-    error = store.so_far["error"]
-    said.append(f"stated error {error['u_gap']:.2g} V of the gap voltage, {error['f_el']:.2g} N of the force")
-    if first:
-        said.append(f"the first {first:,} were there already")
-    found = {"chunks": store.chunks, "found": first, "outputs": total, "seconds": took}
-    answer.update(**store.so_far, stream=found)
-    answer.give(lambda: "; ".join(said), results.ready())
+    with store.lock:
+        store.open(results.overwrite)
+        if store.done and store.done < store.chunks:
+            run.go_to(store.mark, store.done * store.count)
+        results.open()
+        begun, first, total = time.perf_counter(), store.done, run.outputs.total
+        answer.data["files"].append(str(path))
+        if first < store.chunks:
+            _fill(run, store, names, results)
+        took, span = time.perf_counter() - begun, run.problem.t_stop - run.problem.t_start
+        said = [f"{total:,} outputs of {span:g} s in {store.chunks:,} piece{'s' if store.chunks > 1 else ''}: {path}"]
+        if first < store.chunks:
+            said.append(f"{(store.chunks - first) / store.chunks * span / took:,.3g} times real time")
+        error = store.so_far["error"]
+        said.append(f"stated error {error['u_gap']:.2g} V of the gap voltage, {error['f_el']:.2g} N of the force")
+        if first:
+            said.append(f"the first {first:,} were there already")
+        found = {"chunks": store.chunks, "found": first, "outputs": total, "seconds": took}
+        answer.update(**store.so_far, stream=found)
+        answer.give(lambda: "; ".join(said), results.ready())
 
 
 def _names(signals: str | None, circuit: Circuit) -> list[str]:
@@ -235,12 +259,11 @@ def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[st
     from fingerspice.circuit.describe import digests
 
     elements, sources = digests(circuit)
-    o = run.outputs
+    o, scene = run.outputs, run.problem.scene
     return {
-        "circuit": elements, "source": sources, "rtol": how["rtol"],
-        "charge_law": run.problem.scene.charge_law, "area": run.problem.scene.area_mode, "method": how["method"],
-        "start": str(how["start"]), "chunk": run.count, "signals": names, "end": run.problem.t_stop,
-        "output_times": [o.start, o.over, o.low, o.total],
+        "circuit": elements, "source": sources, "rtol": how["rtol"], "charge_law": scene.charge_law,
+        "area": scene.area_mode, "method": how["method"], "start": str(how["start"]), "chunk": run.count,
+        "signals": names, "end": run.problem.t_stop, "output_times": [o.start, o.over, o.low, o.total],
         "program": f"fingerspice {__version__} ({STAMP[:12]}), NumPy {np.__version__}",
     }  # fmt: skip
 
@@ -250,9 +273,9 @@ def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None
     about = {key: text for key, text in results.about.items() if key != "files"}
     known: set[str] = set()
     writing: Future[None] | None = None
-    start, stop = run.problem.t_start, run.problem.t_stop
+    start, span = run.problem.t_start, run.problem.t_stop - run.problem.t_start
     first = float(run.outputs.times(run.done, run.done + 1)[0])
-    with ThreadPoolExecutor(1) as writer, paced("simulating", (first - start) / (stop - start)) as show:
+    with ThreadPoolExecutor(1) as writer, paced("simulating", (first - start) / span) as show:
         for number, solution in enumerate(run, store.done):
             for text in solution.warnings:
                 if text not in known:
@@ -262,6 +285,6 @@ def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None
                 writing.result()
             writing = writer.submit(store.write, number, solution, names, about, run.mark())
             reached = solution.t_stop
-            show((reached - start) / (stop - start), lambda s, t=reached: f"{(t - first) / s:,.3g} times real time,")
+            show((reached - start) / span, lambda s, t=reached: f"{(t - first) / s:,.3g} times real time,")
         if writing is not None:
             writing.result()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -69,18 +70,25 @@ def sweep(
         if store is not None:
             if asked.get("indices"):
                 raise InputError(f"{file}: indices = true and --store are both given; allowed: one of them")
-            found = populations.sweep(
-                circuit, parameters, store=store, workers=workers, scheduler=scheduler, shard=_shard(shard), **options
-            )
+            if (part := re.fullmatch("([0-9]+)/([0-9]+)", "1/1" if shard is None else shard)) is None:
+                raise InputError(f"--shard is {shard!r}; allowed: two whole numbers such as 1/8")
+            part_of = int(part[1]), int(part[2])
+            options |= {"store": store, "workers": workers, "scheduler": scheduler, "shard": part_of}
+        else:
+            for option, given in (("workers", workers), ("scheduler", scheduler), ("shard", shard)):
+                if given is not None:
+                    raise InputError(f"--{option} is given without --store; allowed: --store OUT.zarr, too")
+            results = Results(deck, circuit, out, name or file.stem, overwrite, None)
+            own = {"deck": circuit.text}
+            results.will_write(".nc", lambda path: _written(found, indices, own | results.about, path))
+            results.will_draw(".png", lambda: plot_sweep(found, output, indices), unless=no_plot)
+        found = populations.sweep(circuit, parameters, **options)
+        about = found.attrs
+        known = {"sets": about.get("sets", []), "n": about.get("n"), "seed": about.get("seed")}
+        answer.update(scenes=int(found.status.size), **known)
+        if store is not None:
             _give_stored(answer, found, store)
             return
-        for option, given in (("workers", workers), ("scheduler", scheduler), ("shard", shard)):
-            if given is not None:
-                raise InputError(f"--{option} is given without --store; allowed: --store OUT.zarr, too")
-        results = Results(deck, circuit, out, name or file.stem, overwrite, None)
-        results.will_write(".nc", lambda path: _written(found, indices, {"deck": circuit.text, **results.about}, path))
-        results.will_draw(".png", lambda: plot_sweep(found, output, indices), unless=no_plot)
-        found = populations.sweep(circuit, parameters, **options)
         output = str(next(iter(found.data_vars)))
         indices = populations.sobol(circuit, parameters, **options) if asked.get("indices") else None
         said = [_told(answer, found)]
@@ -91,15 +99,10 @@ def sweep(
         answer.give(lambda: "\n\n".join(said), results.ready())
 
 
-def _told(answer: Answering, found: Any, *, whole: bool = True) -> str:
-    """Fill the answer with what a sweep has run, and, if it is whole, with the percentiles that this text has."""
+def _told(answer: Answering, found: Any) -> str:
+    """Fill the answer with the percentiles of a whole sweep, which this text has."""
     from fingerspice.studies.sweep import populations
 
-    about = found.attrs
-    known = {"sets": about.get("sets", []), "n": about.get("n"), "seed": about.get("seed")}
-    answer.update(scenes=int(found.status.size), **known)
-    if not whole:
-        return ""
     rows = populations.summary(found)
     answer.update(figures=rows, failed=int((found.status >= 2).sum()))
     head = f"{'output':<24}{'unit':<8}{'5 %':>12}{'median':>12}{'95 %':>12}{'mean':>12}"
@@ -118,23 +121,11 @@ def _give_stored(answer: Answering, found: Any, store: Path) -> None:
     about = found.attrs
     answer.data["files"].append(str(store))
     answer.update(store={key: about[key] for key in ("chunks", "chunks_found", "chunks_missing", "seconds")})
-    told = _told(answer, found, whole=not about["chunks_missing"] and found.status.size <= MOST_SCENES)
-    said = [told] if told else []
+    said = [_told(answer, found)] if not about["chunks_missing"] and found.status.size <= MOST_SCENES else []
     said.append(f"{about['chunks']:,} pieces ({about['chunks_found']:,} were there already) in {store}")
     if about["chunks_missing"]:
         said.append(f"{about['chunks_missing']:,} pieces of other parts are missing")
-    said += about["failures"][:_MOST_TOLD]
-    answer.give(lambda: "\n".join(said))
-
-
-def _shard(text: str | None) -> tuple[int, int]:
-    """The numbers of ``I/M``."""
-    if text is None:
-        return 1, 1
-    first, _, last = text.partition("/")
-    if not (first.isascii() and first.isdigit() and last.isascii() and last.isdigit()):
-        raise InputError(f"--shard is {text!r}; allowed: two whole numbers such as 1/8")
-    return int(first), int(last)
+    answer.give(lambda: "\n".join([*said, *about["failures"][:_MOST_TOLD]]))
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Path]:

@@ -163,7 +163,6 @@ def figures(
     with Answering("figures", as_json) as answer:
         if gallery and only:
             raise InputError("--only and --gallery are both given; allowed: one of them")
-        files: list[Path] = []
         if gallery:
             from fingerspice.explorer.gallery import decks, draw, scenes
 
@@ -172,8 +171,8 @@ def figures(
             files = [folder / f"{one.name}.png" for one in entries]
             for file in files:
                 check_output(file)
+            folder.mkdir(parents=True, exist_ok=True)
             with progress("drawing") as update:
-                folder.mkdir(parents=True, exist_ok=True)
                 for i, (one, file) in enumerate(zip(entries, files, strict=True), 1):
                     draw(one, file)
                     if update is not None:
@@ -185,5 +184,5 @@ def figures(
                 for kind in ("png", "csv"):
                     check_output(folder / f"fig{number}.{kind}")
             with progress("drawing") as update:
-                files += make_figures(folder, only=only, progress=update)
+                files = make_figures(folder, only=only, progress=update)
         answer.give(str, [partial(Path, file) for file in files])

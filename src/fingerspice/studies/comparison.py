@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import head_lines
-from fingerspice.circuit.response import LinearScene, linear_scene
+from fingerspice.circuit.response import linear_scene
 from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.plots import drawing, lines
 from fingerspice.results.measures import weigh_outputs
@@ -28,7 +27,7 @@ from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.results.summary import Value
 from fingerspice.solve.runs import Progress
-from fingerspice.studies.phasors import Drive, phasor, sweep_drive, sweep_notes
+from fingerspice.studies.phasors import phasor, sweep_drive, sweep_notes
 from fingerspice.studies.steady import steady_state
 from fingerspice.waveforms.waveform import Sine
 
@@ -50,9 +49,9 @@ class Figures:
     f_el_mean: float | NDArray[np.float64]  # N
     area_mean: float | NDArray[np.float64]  # m^2
 
-    def of_gap(self, i: int) -> dict[str, float]:
-        """The figures of one GAP by their names."""
-        return {name: float(np.atleast_1d(value)[i]) for name, value in vars(self).items()}
+    def of_gap(self, name: str, i: int) -> float:
+        """A figure of one GAP."""
+        return float(np.atleast_1d(getattr(self, name))[i])
 
 
 # Of every figure: its unit in tables, the factor from SI to that unit, and its name on the page and in the picture.
@@ -89,15 +88,11 @@ class Comparison(Shown):
     solution: Solution
 
     def _page(self) -> Page:
-        rows = []
-        for what, unit, *numbers in self.rows():
-            name, _, gap = what.partition(":")
-            rows.append((f"{_FIGURES[name][2]} {gap}".rstrip() + f" [{unit}]", *(f"{x:.6g}" for x in numbers)))
+        rows = [(f"{label} [{unit}]", *(f"{x:.6g}" for x in numbers)) for label, unit, numbers in self._labelled(2)]
         head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
         said = []
         for i, gap in enumerate(self.gaps):
-            figures = self.phasor, self.mean, self.coupled
-            reference, mean, coupled = (f.of_gap(i)["f_el_mean"] for f in figures)
+            reference, mean, coupled = (f.of_gap("f_el_mean", i) for f in (self.phasor, self.mean, self.coupled))
             # Round before formatting, and add 0.0, so that -0.00 is not printed.
             total = round(100.0 * (coupled / reference - 1.0), 2) + 0.0
             waveform = round(100.0 * (mean / reference - 1.0), 2) + 0.0
@@ -119,10 +114,9 @@ class Comparison(Shown):
         start, stop = float(solution.t[0]), float(solution.t[-1])
         source_phase = solution.fundamental.phase if solution.fundamental else 0.0
         turns = 2.0 * np.pi * self.frequency * solution.t + source_phase
-        of_gaps = [p.of_gap(i) for i in range(len(self.gaps))]
-        waves = [np.sin(turns + np.radians(one["phase_deg"])) for one in of_gaps]
-        voltages = [one["amplitude"] * wave for one, wave in zip(of_gaps, waves, strict=True)]
-        forces = [2.0 * one["f_el_mean"] * wave**2 for one, wave in zip(of_gaps, waves, strict=True)]
+        waves = [np.sin(turns + np.radians(p.of_gap("phase_deg", i))) for i in range(len(self.gaps))]
+        voltages = [p.of_gap("amplitude", i) * wave for i, wave in enumerate(waves)]
+        forces = [2.0 * p.of_gap("f_el_mean", i) * wave**2 for i, wave in enumerate(waves)]
         for ax, keys, curves in zip(axes, (["u_source", "u_gap"], ["f_el"]), (voltages, forces), strict=False):
             signal, traces = SIGNALS[keys[-1]], lines.traces_of(runs, keys)
             factor, unit = lines.scale_of(signal, traces, start, stop)
@@ -143,9 +137,7 @@ class Comparison(Shown):
         split = "transient,\nmean area", "transient,\ncoupled", "coupled −\nphasor", "of it, ripple\nof the area"
         head = ["", "phasor", *split]
         cells = []
-        for what, unit, *numbers in self.rows():
-            name, _, gap = what.partition(":")
-            label = f"{_FIGURES[name][3]} {gap}".rstrip()
+        for label, unit, numbers in self._labelled(3):
             texts = [*(f"{x:.5g}" for x in numbers[:3]), *(f"{x:+.2g}" for x in numbers[3:])]
             marks = unit.replace("deg", "°").replace("^2", "²")
             cells.append([f"{label} [{marks}]", *(text.replace("-", "−") for text in texts)])
@@ -173,9 +165,15 @@ class Comparison(Shown):
         out = []
         for i, gap in enumerate(self.gaps):
             for name, (unit, factor, *_) in _FIGURES.items():
-                p, m, c = (factor * f.of_gap(i)[name] for f in (self.phasor, self.mean, self.coupled))
+                p, m, c = (factor * f.of_gap(name, i) for f in (self.phasor, self.mean, self.coupled))
                 out.append((name if len(self.gaps) == 1 else f"{name}:{gap}", unit, p, m, c, c - p, c - m))
         return out
+
+    def _labelled(self, place: int) -> Iterator[tuple[str, str, list[float]]]:
+        """Rows with the names at this place of `_FIGURES`."""
+        for what, unit, *numbers in self.rows():
+            name, _, gap = what.partition(":")
+            yield f"{_FIGURES[name][place]} {gap}".rstrip(), unit, numbers
 
     @property
     def gaps(self) -> tuple[str, ...]:
@@ -232,24 +230,12 @@ def compare(
     mean = steady_state(circuit, charge_law=charge_law, area="mean", rtol=rtol, points=2000).solution
     found = [phasors[name] for name in coupled.gaps]
     figures = [(abs(p.u_gap[0]), np.degrees(np.angle(p.gain[0])), p.f_el_mean[0], p.area[0]) for p in found]
-    return Comparison(
-        _together(*np.array(figures).T),
-        _figures(mean, fundamental.phase),
-        _figures(coupled, fundamental.phase),
-        fundamental.frequency,
-        coupled,
-    )
-
-
-def _figures(solution: Solution, phase: float) -> Figures:
-    """Figures of a period of the transient; `phase` (rad) is that of the source's fundamental."""
-    lead = np.asarray(solution.u_gap_phase_deg, float) - np.degrees(phase)
-    return _together(
-        solution.u_gap_amplitude,
-        (lead + 180.0) % 360.0 - 180.0,
-        solution.f_el_mean_periodic,
-        solution._figures.value("area", "mean_periodic"),
-    )
+    every = []
+    for one in (mean, coupled):
+        lead = np.asarray(one.u_gap_phase_deg, float) - np.degrees(fundamental.phase)
+        lead, area = (lead + 180.0) % 360.0 - 180.0, one._figures.value("area", "mean_periodic")
+        every.append(_together(one.u_gap_amplitude, lead, one.f_el_mean_periodic, area))
+    return Comparison(_together(*np.array(figures).T), every[0], every[1], fundamental.frequency, coupled)
 
 
 def _together(*values: Value | FloatArray) -> Figures:
@@ -307,47 +293,40 @@ def large_signal(
         names = ", ".join(e.name for e, _ in scene.sources)
         raise InputError(f"a large-signal sweep drives one source, and this circuit has {names}")
     own = sweep_drive(scene.sources, scene.fundamental, swept=True)
-    if amplitude is None and math.isnan(own.amplitude):
+    if amplitude is None and math.isnan(own[0]):
         raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
-    given = positive_row("amplitude", own.amplitude if amplitude is None else amplitude, "V")
+    given = positive_row("amplitude", own[0] if amplitude is None else amplitude, "V")
     f = positive_row("frequency", frequency, "Hz")
-    for text in sweep_notes(circuit, f)[1]:
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    drives = [own] if amplitude is None else [Drive(float(a), 0.0, "the amplitude given") for a in given]
-    found = itertools.count(1)
-
-    def one() -> None:
-        if progress is not None:
-            progress(next(found) / (f.size * len(drives)))
-
-    return tuple(_sweep(circuit, scene, f, drive, charge_law, rtol, one) for drive in drives)
-
-
-def _sweep(
-    circuit: Circuit, scene: LinearScene, frequency: FloatArray, drive: Drive, charge_law: str | None, rtol: float,
-    one: Callable[[], None],
-) -> PhasorSolution:  # fmt: skip
-    (source, sign), *_ = scene.sources
-    name = scene.layers[scene.gap]
-    skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
-    gains, areas, forces, amplitude = [], [], [], drive.amplitude
-    for f in frequency.tolist():
-        changed = circuit.varied({**dict.fromkeys(skins, f), source.name: Sine(amplitude, f)})
-        s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution
-        # The output starts at a multiple of the period, so that phases from its start are phases relative to the
-        # source.
-        period = s.t - s.t[0]
-        area, force = (s.by_name(key)[key if len(s.gaps) == 1 else f"{key}:{name}"] for key in ("area", "f_el"))
-        gains.append([weigh_outputs(period, u).phasor(f) * sign / amplitude for u in s.u_layer.T])
-        areas.append(weigh_outputs(period, area).mean())
-        forces.append(weigh_outputs(period, force).mean())
-        one()
-    gain = np.array(gains, np.complex128)
-    u_gap = gain[:, scene.gap] * amplitude * np.exp(1j * drive.phase)
-    notes, warned = sweep_notes(circuit, frequency)
+    notes, warned = sweep_notes(circuit, f)
     notes = (*notes, scene.note) if scene.note else notes
-    largest = max(forces), float(scene.contact.stress(np.abs(u_gap)).max()), max(areas)
-    return PhasorSolution(
-        frequency, gain[:, scene.gap], gain, u_gap, np.array(areas), np.array(forces), amplitude, s.layers, drive.phase,
-        drive.text, notes, (*warned, *beyond_fingers("", *largest)), circuit,
-    )  # fmt: skip
+    for text in warned:
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    drives = [own] if amplitude is None else [(float(a), 0.0, "the amplitude given") for a in given]
+    (source, sign), *_ = scene.sources
+    skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
+    found = []
+    for place, (size, phase, drive) in enumerate(drives):
+        gains: list[list[complex]] = []
+        areas: list[float] = []
+        forces: list[float] = []
+        for number, x in enumerate(f.tolist(), place * f.size + 1):
+            changed = circuit.varied({**dict.fromkeys(skins, x), source.name: Sine(size, x)})
+            s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution
+            # The output starts at a multiple of the period, so that phases from its start are phases relative to the
+            # source.
+            period, end = s.t - s.t[0], "" if len(s.gaps) == 1 else f":{scene.layers[scene.gap]}"
+            gains.append([weigh_outputs(period, u).phasor(x) * sign / size for u in s.u_layer.T])
+            for means, key in ((areas, "area"), (forces, "f_el")):
+                means.append(weigh_outputs(period, s.by_name(key)[key + end]).mean())
+            if progress is not None:
+                progress(number / (f.size * len(drives)))
+        gain = np.array(gains, np.complex128)
+        u_gap = gain[:, scene.gap] * size * np.exp(1j * phase)
+        largest = max(forces), float(scene.contact.stress(np.abs(u_gap)).max()), max(areas)
+        found.append(
+            PhasorSolution(
+                f, gain[:, scene.gap], gain, u_gap, np.array(areas), np.array(forces), size, s.layers, phase, drive,
+                notes, (*warned, *beyond_fingers("", *largest)), circuit,
+            )
+        )  # fmt: skip
+    return tuple(found)

@@ -68,8 +68,18 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     law = charge_law or circuit.charge_law or "local"
     if law not in LIBRARIES:
         raise InputError(f"charge_law is {law!r}; allowed: {' or '.join(map(repr, LIBRARIES))}")
-    _refuse_merged_names(circuit)
-    ratio = max((contact.work_ratio for contact in _contacts(circuit).values()), default=1.0)
+    nodes = {n: _name(n) for e in circuit.elements for n in e.node_names}
+    for names in (nodes, {e.name: _element_name(e) for e in circuit.elements}):
+        seen: dict[str, str] = {}
+        for name in sorted(names):
+            other = seen.setdefault(names[name].lower(), name)
+            if other.lower() != name.lower():
+                raise InputError(f"{other} and {name} would be one name in the export; allowed: rename one of them")
+    network = network_of(circuit)
+    pairs = zip(network.areas, network.contacts, strict=True)
+    contacts = {area.node: contact for area, contact in pairs if contact is not None}
+    areas = _start_areas(circuit, law, contacts)
+    ratio = max((contact.work_ratio for contact in contacts.values()), default=1.0)
     lines = [
         circuit.title or "fingerspice export",
         f"* Written by fingerspice; charge law {law}. Run: ngspice -b -r out.raw FILE",
@@ -77,11 +87,16 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     if circuit.overrides:
         changed = ", ".join(f"{k} = {v}" for k, v in circuit.overrides.items())
         lines.append(f"* Changed from the deck: {' '.join(changed.split())}"[:1000])
-    areas = _start_areas(circuit, law)
     for element in circuit.elements:
-        lines += _element_lines(element, circuit, ratio, areas)
-    lines += _analysis_lines(circuit)
-    lines += _start_lines(circuit, areas)
+        text = _element_line(element, circuit, ratio, areas)
+        lines += textwrap.wrap(text, 100, subsequent_indent="+ ", break_long_words=False, break_on_hyphens=False)
+    if (tran := circuit.tran) is not None:
+        numbers = [tran.step, tran.stop, *([tran.start] if tran.start or tran.max_step else [])]
+        numbers += [tran.max_step] if tran.max_step else []
+        lines.append(f".tran {' '.join(map(repr, numbers))}{' uic' if tran.uic else ''}")
+    if (ac := circuit.ac) is not None:
+        lines.append(f".ac {ac.scale} {ac.points} {ac.start!r} {ac.stop!r}")
+    lines += _start_lines(circuit, areas, contacts)
     lines += ["", library_text(law).rstrip(), "", _OPTIONS, ".end", ""]
     return "\n".join(lines)
 
@@ -100,30 +115,12 @@ def _element_name(element: Element) -> str:
     return name if name[0].upper() == letter else f"{letter}{name}"
 
 
-def _refuse_merged_names(circuit: Circuit) -> None:
-    nodes = {n: _name(n) for e in circuit.elements for n in e.node_names}
-    for names in (nodes, {e.name: _element_name(e) for e in circuit.elements}):
-        seen: dict[str, str] = {}
-        for name in sorted(names):
-            other = seen.setdefault(names[name].lower(), name)
-            if other.lower() != name.lower():
-                raise InputError(f"{other} and {name} would be one name in the export; allowed: rename one of them")
-
-
-def _contacts(circuit: Circuit) -> dict[str, Contact]:
-    """The contact of each GAP, by area node."""
-    network = network_of(circuit)
-    pairs = zip(network.areas, network.contacts, strict=True)
-    return {area.node: contact for area, contact in pairs if contact is not None}
-
-
-def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
+def _start_areas(circuit: Circuit, law: str, contacts: Mapping[str, Contact]) -> dict[str, float]:
     """Area (mm^2) of each area node at the start of a run with ``uic``; empty for a run that starts otherwise."""
     if circuit.tran is None or not starts_uncharged(circuit):
         return {}
-    contacts, out = _contacts(circuit), {}
-    areas, _ = find_branches(circuit)
-    for area in areas:
+    out = {}
+    for area in find_branches(circuit)[0]:
         value = area.given
         if value is None and area.gap is not None:
             value = float(contacts[area.node].area(abs(start_voltage(area.gap, circuit.initial))))
@@ -140,16 +137,16 @@ def _start_areas(circuit: Circuit, law: str) -> dict[str, float]:
     return out
 
 
-def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
+def _start_lines(circuit: Circuit, areas: Mapping[str, float], contacts: Mapping[str, Contact]) -> Iterator[str]:
     """Start values (.ic) and guesses (.nodeset) of nodes; with ``uic`` the layers' own lines hold start voltages."""
     written = {node: name for e in circuit.elements for node, name in zip(e.nodes, e.node_names, strict=True)}
     gaps = {gap.nodes[2]: gap for gap in circuit.by_device("GAP")}
-    contacts = _contacts(circuit)
     for node, value in circuit.initial.items():
         if node != "0" and node not in gaps:
             yield f".ic v({_name(written[node])})={value!r}"
     for node, gap in gaps.items():
-        guess = gap.values["a_fix"] or 1e6 * float(contacts[node].area(0.0))
+        contact = contacts[node]
+        guess = gap.values["a_fix"] or 1e6 * float(contact.area(0.0))
         held = circuit.initial.get(node)
         if areas:
             # An area with a delay is a state and needs a start value; for an area without delay a guess is enough.
@@ -158,32 +155,22 @@ def _start_lines(circuit: Circuit, areas: Mapping[str, float]) -> Iterator[str]:
         word, value = (".nodeset", guess) if held is None else (".ic", held)
         yield f"{word} v({_name(written[node])})={value!r}"
         if areas and circuit.initial and not gap.values["a_fix"]:
-            yield from _guesses_inside(gap, contacts[node], start_voltage(gap, circuit.initial))
+            # Without guesses for the nodes inside a GAP, ngspice's first Newton iteration fails at u != 0.
+            u, name = start_voltage(gap, circuit.initial), _element_name(gap)
+            y = float(contact.area_adhesive(u)) / (at_rest := float(contact.area_adhesive(0.0)))
+            pull, area = float(contact.stress(u)) * at_rest / contact.f_n, 1e6 * float(contact.area(u))
+            guesses = ("x", math.log(y)), ("y", y), ("v", pull), ("follow", area)
+            yield ".nodeset " + " ".join(f"v({name}.{inner})={one!r}" for inner, one in guesses)
 
 
-def _guesses_inside(gap: Element, contact: Contact, u: float) -> Iterator[str]:
-    """Guesses for the nodes inside a GAP at `u` V, without which ngspice's first Newton iteration fails at u != 0."""
-    at_rest, adhesive = (float(contact.area_adhesive(v)) for v in (0.0, u))
-    y = adhesive / at_rest
-    pull, area = float(contact.stress(u)) * at_rest / contact.f_n, 1e6 * float(contact.area(u))
-    guesses = ("x", math.log(y)), ("y", y), ("v", pull), ("follow", area)
-    name = _element_name(gap)
-    yield ".nodeset " + " ".join(f"v({name}.{node})={value!r}" for node, value in guesses)
-
-
-def _element_lines(
-    element: Element, circuit: Circuit, work_ratio: float, start_areas: Mapping[str, float]
-) -> Iterator[str]:
-    nodes = " ".join(_name(n) for n in element.node_names)
-    name = _element_name(element)
+def _element_line(element: Element, circuit: Circuit, work_ratio: float, start_areas: Mapping[str, float]) -> str:
+    head = f"{_element_name(element)} {' '.join(_name(n) for n in element.node_names)}"
     if element.waveform is not None:
         ac = "" if element.ac is None else f" AC {float(element.ac.magnitude)!r} {float(element.ac.phase_deg)!r}"
-        yield from _wrapped(f"{name} {nodes} {_source_text(element.waveform, element, circuit)}{ac}")
-        return
+        return f"{head} {_source_text(element.waveform, element.name, circuit)}{ac}"
     if not element.spec.is_layer:
         initial = f" IC={element.initial!r}" if element.initial is not None else ""
-        yield f"{name} {nodes} {element.values['value']!r}{initial}"
-        return
+        return f"{head} {element.values['value']!r}{initial}"
     # e_max is left out: it only serves a warning of this package.
     numbers = {k: "1e30" if math.isinf(v) else repr(float(v)) for k, v in element.values.items() if k != "e_max"}
     values = " ".join(f"{k}={number}" for k, number in numbers.items())
@@ -191,39 +178,53 @@ def _element_lines(
     area = start_areas.get(element.nodes[2])
     held = 0.0 if area is None else start_voltage(element, circuit.initial)
     extra += f" ic={held!r} a_ic={area!r}" if held else ""
-    yield from _wrapped(f"{name} {nodes} {element.device} {values}{extra}")
-
-
-def _wrapped(line: str) -> list[str]:
-    return textwrap.wrap(line, 100, subsequent_indent="+ ", break_long_words=False, break_on_hyphens=False)
+    return f"{head} {element.device} {values}{extra}"
 
 
 def _call(name: str, numbers: Iterable[float]) -> str:
     return f"{name}({' '.join(repr(float(x)) for x in numbers)})"
 
 
-def _source_text(w: Waveform, element: Element, circuit: Circuit) -> str:
+def _source_text(w: Waveform, name: str, circuit: Circuit) -> str:
+    """A waveform as ngspice has it, or as points."""
     if isinstance(w, DC):
         return f"DC {w.level!r}"
     if isinstance(w, Sine):
         return _call("SIN", (w.offset, w.amplitude, w.frequency, w.delay, w.damping, w.phase_deg))
     if isinstance(w, Exp):
         return _call("EXP", (w.v1, w.v2, w.td1 or NOW, w.tau1, w.td2 or NOW, w.tau2))
-    pulse = _pulse_numbers(w, circuit) if isinstance(w, Pulse) else None
-    if pulse is not None:
-        return _call("PULSE", pulse)
+    tran = circuit.tran
+    edge = EDGE if tran is None else min(EDGE, 1e-3 * tran.step)
+    given = circuit.initial or any(e.initial is not None for e in circuit.elements)
+    empty = tran is not None and starts_uncharged(circuit) and not given
+    if isinstance(w, Pulse):
+        stop = tran.stop if tran else 1.0
+        jumps = empty and w.value(0.0) != 0.0 and w.breakpoint_rate() * stop < _FEW_POINTS
+        if not jumps and (numbers := _pulse_numbers(w, stop + abs(w.delay), edge)):
+            return _call("PULSE", numbers)
     if isinstance(w, PWL | Samples) and w.period is None:
-        t, v = _own_points(w, element, circuit)
+        t, v = _own_points(w, name, circuit)
     else:
-        t, v = _sampled(w, element, circuit)
-    if _starts_empty(circuit):
+        t, v = _sampled(w, name, circuit)
+    if empty:
         # All voltages start at 0, so let the source start at 0 V and jump: otherwise ngspice often fails at its first
         # step.
         t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, w.value(0.0)], v[t > 0.0])
-    return _pwl_text(t, v, _edge(circuit))
+    return _pwl_text(t, v, edge)
 
 
-def _own_points(waveform: PWL | Samples, element: Element, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
+def _pulse_numbers(p: Pulse, span: float, edge: float) -> tuple[float, ...] | None:
+    """A pulse's numbers in ngspice, over a span (s); None if the edges of its jumps have no room."""
+    # The rise time of a jump is subtracted from the width, so that the pulse still ends at its time.
+    width = p.width - (0.0 if p.rise else edge) if math.isfinite(p.width) else 10.0 * span
+    rise, fall = p.rise or edge, p.fall or edge
+    period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * span + rise + width + fall
+    if width <= 0.0 or rise + width + fall > period:
+        return None
+    return p.v1, p.v2, p.delay, rise, fall, width, period
+
+
+def _own_points(waveform: PWL | Samples, name: str, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
     """The waveform's own points from 0 s to the first one after the end of the run; all if the end is not known."""
     v = np.asarray(waveform.values)
     at = waveform.times if isinstance(waveform, PWL) else waveform.start + np.arange(v.size) / waveform.rate
@@ -234,47 +235,22 @@ def _own_points(waveform: PWL | Samples, element: Element, circuit: Circuit) -> 
     if t[0] < 0.0:
         at_0 = [waveform.value(0.0, "left").item(), waveform.value(0.0).item()]
         t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append(at_0, v[t > 0.0])
-    _refuse_many(t.size, element)
+    _refuse_many(t.size, name)
     return t, v
 
 
-def _refuse_many(points: float, element: Element) -> None:
+def _refuse_many(points: float, name: str) -> None:
     if points > _MAX_POINTS:
         raise InputError(
-            f"{element.name}: the source would take {points:.0f} PWL points; allowed: at most {_MAX_POINTS}; shorten "
-            "the run (--stop, or .tran)"
+            f"{name}: the source would take {points:.0f} PWL points; allowed: at most {_MAX_POINTS}; shorten the run "
+            "(--stop, or .tran)"
         )
 
 
-def _starts_empty(circuit: Circuit) -> bool:
-    given = circuit.initial or any(e.initial is not None for e in circuit.elements)
-    return circuit.tran is not None and starts_uncharged(circuit) and not given
-
-
-def _edge(circuit: Circuit) -> float:
-    """Rise time of an ideal jump, s."""
-    return min(EDGE, 1e-3 * circuit.tran.step) if circuit.tran else EDGE
-
-
-def _pulse_numbers(p: Pulse, circuit: Circuit) -> tuple[float, ...] | None:
-    """A pulse's numbers in ngspice; None if its edges have no room, or if it should start at 0 V and does not."""
-    stop = circuit.tran.stop if circuit.tran else 1.0
-    if _starts_empty(circuit) and p.value(0.0) != 0.0 and p.breakpoint_rate() * stop < _FEW_POINTS:
-        return None
-    edge, span = _edge(circuit), stop + abs(p.delay)
-    # The rise time of a jump is subtracted from the width, so that the pulse still ends at its time.
-    width = p.width - (0.0 if p.rise else edge) if math.isfinite(p.width) else 10.0 * span
-    rise, fall = p.rise or edge, p.fall or edge
-    period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * span + rise + width + fall
-    if width <= 0.0 or rise + width + fall > period:
-        return None
-    return p.v1, p.v2, p.delay, rise, fall, width, period
-
-
-def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
+def _sampled(waveform: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
     """Points (s, V) of a waveform over the run: left and right values at breakpoints, and dense points between them."""
     if circuit.tran is None:
-        raise InputError(f"{element.name}: exporting this source as PWL needs a .tran line to know how far")
+        raise InputError(f"{name}: exporting this source as PWL needs a .tran line to know how far")
     stop = circuit.tran.stop
     spacing = waveform.shortest_time() / _POINTS_PER_TIME_SCALE
     terms = waveform.terms(np.array([0.0]), np.array([stop]))
@@ -287,7 +263,7 @@ def _sampled(waveform: Waveform, element: Element, circuit: Circuit) -> tuple[np
     if points <= 10 * _MAX_POINTS:
         breaks = waveform.breakpoints(0.0, stop)
         points = count + 2 * breaks.size
-    _refuse_many(points, element)
+    _refuse_many(points, name)
     if circuit.tran.uic:
         # The left value at t = 0 only matters for an operating point, which a run with uic does not have.
         breaks = breaks[breaks > 0.0]
@@ -312,15 +288,3 @@ def _pwl_text(t: np.ndarray, v: np.ndarray, edge: float) -> str:
         times.append(time)
         values.append(value)
     return _call("PWL", itertools.chain.from_iterable(zip(times, values, strict=True)))
-
-
-def _analysis_lines(circuit: Circuit) -> Iterator[str]:
-    if circuit.tran is not None:
-        tran = circuit.tran
-        numbers = [tran.step, tran.stop, *([tran.start] if tran.start or tran.max_step else [])]
-        if tran.max_step:
-            numbers.append(tran.max_step)
-        yield f".tran {' '.join(map(repr, numbers))}{' uic' if tran.uic else ''}"
-    if circuit.ac is not None:
-        ac = circuit.ac
-        yield f".ac {ac.scale} {ac.points} {ac.start!r} {ac.stop!r}"

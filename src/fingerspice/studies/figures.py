@@ -7,7 +7,7 @@ as periodic states of the transient. The measured points that the paper shows in
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,6 @@ from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import Sine, Waveform, require
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 TABLE1_DECK = """\
@@ -203,49 +202,40 @@ def _time_figure(shape: type[Sine] | type[Square]) -> Drawn:
 
     A square wave has many harmonics, so a dispersive skin is shown as well.
     """
-    dispersive = shape is Square
+    header = ["frequency [Hz]", "t [s]", "u_source [V]", "u_gap [V]", "f_el [N]", "area [m^2]"]
     figure, axes = drawing.new_figure(2, 2, height=4.3, sharex="col", sharey="row")
-    parts = []
-    for column, frequency in enumerate(FREQUENCIES):
+    parts, dash = [], drawing.DASHES[1]
+    for frequency, upper, lower in zip(FREQUENCIES, axes[:2], axes[2:], strict=True):
         data = two_periods(time_response(shape, frequency))
-        if dispersive:
+        factor, unit = drawing.engineering(2.0 / frequency, "s")
+        # The last value of the period is put in front, so that an edge at t = 0 is drawn as a vertical line.
+        t = factor * np.append(0.0, data["t"])
+        y = {name: np.append(x[-1], x) for name, x in data.items()}
+        upper.plot(t, y["u_source"], color=drawing.GREY, linewidth=1.2, linestyle=dash, label="source $U$")
+        upper.plot(t, y["u_gap"], color=drawing.BLUE, linewidth=1.6, label=r"gap $U_\mathrm{a}$")
+        lower.plot(t, y["f_el"], color=drawing.VERMILION, linewidth=1.6, label=r"force $F_\mathrm{el}$")
+        if shape is Square:
             broad = two_periods(time_response(shape, frequency, dispersive=True))
-            data |= {f"{name}_dispersive": broad[name] for name in ("u_gap", "f_el")}
+            # The name appears only in the legend of the force, which has room for it.
+            for ax, name, label in ((upper, "u_gap", "_"), (lower, "f_el", "dispersive")):
+                data[f"{name}_dispersive"] = x = broad[name]
+                style: dict[str, Any] = {"color": drawing.BLACK, "linewidth": 0.9, "linestyle": drawing.DASHES[3]}
+                ax.plot(t, np.append(x[-1], x), label=label, **style)
+        mean = float(np.trapezoid(data["f_el"], data["t"]) / data["t"][-1])
+        lower.axhline(mean, color=drawing.BLACK, linewidth=1.0, linestyle=dash, label=f"mean {mean:.3f} N")
+        for ax in (upper, lower):
+            drawing.legend_above(ax, right=True, math=True)
+        upper.set_title(f"{frequency:g} Hz", fontsize=drawing.FONT + 0.5, loc="left", weight="bold")
+        upper.set_xlim(-0.02 * t[-1], 1.02 * t[-1])
+        upper.set_xticks(np.linspace(0.0, t[-1], 5))
+        drawing.dress(lower, "", f"Time [{unit}]")
         parts.append((np.full(data["t"].size, frequency), *data.values()))
-        _time_column((axes[column], axes[column + 2]), data, frequency)
     drawing.dress(axes[0], "Voltage [V]")
     drawing.dress(axes[2], r"Force $F_\mathrm{el}$ [N]")
     for ax in axes[2:]:
         ax.set_ylim(0.0, None)
-    header = ["frequency [Hz]", "t [s]", "u_source [V]", "u_gap [V]", "f_el [N]", "area [m^2]"]
-    if dispersive:
-        header += ["u_gap_dispersive [V]", "f_el_dispersive [N]"]
+    header += ["u_gap_dispersive [V]", "f_el_dispersive [N]"] if shape is Square else []
     return figure, {name: np.concatenate(c) for name, c in zip(header, zip(*parts, strict=True), strict=True)}
-
-
-def _time_column(axes: Sequence[Axes], data: dict[str, FloatArray], frequency: float) -> None:
-    upper, lower = axes
-    factor, unit = drawing.engineering(2.0 / frequency, "s")
-    mean = float(np.trapezoid(data["f_el"], data["t"]) / data["t"][-1])
-    dash = drawing.DASHES[1]
-    # The last value of the period is put in front, so that an edge at t = 0 is drawn as a vertical line.
-    t = factor * np.append(0.0, data["t"])
-    y = {name: np.append(x[-1], x) for name, x in data.items()}
-    upper.plot(t, y["u_source"], color=drawing.GREY, linewidth=1.2, linestyle=dash, label="source $U$")
-    upper.plot(t, y["u_gap"], color=drawing.BLUE, linewidth=1.6, label=r"gap $U_\mathrm{a}$")
-    lower.plot(t, y["f_el"], color=drawing.VERMILION, linewidth=1.6, label=r"force $F_\mathrm{el}$")
-    for ax, name in ((upper, "u_gap_dispersive"), (lower, "f_el_dispersive")):
-        if name in y:
-            # The name appears only in the legend of the force, which has room for it.
-            label = "dispersive" if ax is lower else "_"
-            ax.plot(t, y[name], color=drawing.BLACK, linewidth=0.9, linestyle=drawing.DASHES[3], label=label)
-    lower.axhline(mean, color=drawing.BLACK, linewidth=1.0, linestyle=dash, label=f"mean {mean:.3f} N")
-    for ax in axes:
-        drawing.legend_above(ax, right=True, math=True)
-    upper.set_title(f"{frequency:g} Hz", fontsize=drawing.FONT + 0.5, loc="left", weight="bold")
-    upper.set_xlim(-0.02 * t[-1], 1.02 * t[-1])
-    upper.set_xticks(np.linspace(0.0, t[-1], 5))
-    drawing.dress(lower, "", f"Time [{unit}]")
 
 
 FIGURES: dict[int, Callable[[], Drawn]] = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,27 +22,23 @@ from fingerspice.waveforms.waveform import Fundamental, require
 MAX_FREQUENCIES = 1_000_000
 
 
-@dataclass(frozen=True)
-class Drive:
-    """The drive of a sweep."""
+def sweep_drive(
+    sources: tuple[tuple[Element, float], ...], fundamental: Fundamental | None, swept: bool
+) -> tuple[float, float, str]:
+    """The drive of a circuit: in a sweep the ``AC`` of its sources, if the deck has it, and else the fundamental.
 
-    amplitude: float  # V (A for a current source); NaN if there is neither AC nor a fundamental
-    phase: float  # rad
-    text: str  # Origin of amplitude and phase, in words
-
-
-def sweep_drive(sources: tuple[tuple[Element, float], ...], fundamental: Fundamental | None, swept: bool) -> Drive:
-    """The drive of a circuit: in a sweep the ``AC`` of its sources, if the deck has it, and else the fundamental."""
-    given = [(e, sign) for e, sign in sources if e.ac is not None]
+    Gives its amplitude (V, or A for a current source; NaN if there is neither), phase (rad), and their origin in words.
+    """
+    given = [(e, sign, e.ac) for e, sign in sources if e.ac is not None]
     if swept and given:
         # As in ngspice, a source without AC has an AC amplitude of 0.
-        total = sum(sign * e.ac.phasor for e, sign in given if e.ac is not None)
-        words = [f"AC {e.ac.magnitude:g} {e.ac.phase_deg:g} of {e.name}" for e, _ in given if e.ac is not None]
-        return Drive(abs(total), math.atan2(total.imag, total.real), " and ".join(words))
+        total = sum(sign * ac.phasor for _, sign, ac in given)
+        words = [f"AC {ac.magnitude:g} {ac.phase_deg:g} of {e.name}" for e, _, ac in given]
+        return abs(total), math.atan2(total.imag, total.real), " and ".join(words)
     names = " and ".join(e.name for e, _ in sources)
     if fundamental is None:
-        return Drive(math.nan, 0.0, f"no fundamental of {names}")
-    return Drive(fundamental.amplitude, fundamental.phase, f"the fundamental of {names}")
+        return math.nan, 0.0, f"no fundamental of {names}"
+    return fundamental.amplitude, fundamental.phase, f"the fundamental of {names}"
 
 
 def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -82,24 +77,6 @@ def sweep_frequencies(sweep: AcSweep) -> FloatArray:
     n = math.floor(count + 1e-9)
     out = sweep.start * base ** (np.arange(n + 1) / sweep.points)
     return np.asarray(np.append(out, sweep.stop) if count - n > 1e-9 else out)
-
-
-def _frequencies(frequency: ArrayLike | None, fundamental: Fundamental | None) -> FloatArray:
-    if frequency is None:
-        if fundamental is None:
-            raise InputError("the source has no fundamental: give the frequencies in Hz")
-        frequency = fundamental.frequency
-    return positive_row("frequency", frequency, "Hz")
-
-
-def _refuse_no_number(f: FloatArray, *results: NDArray[np.inexact]) -> None:
-    """Refuse a sweep with results that are not finite."""
-    bad = ~np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
-    if np.any(bad):
-        raise InputError(
-            f"the phasor at {f[np.argmax(bad)]:g} Hz is beyond the range of numbers; allowed: frequencies nearer to "
-            "the 10 Hz to 100 kHz of the skin's data, and values nearer to Table 1's"
-        )
 
 
 def phasor(
@@ -144,61 +121,60 @@ def phasor(
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
     area = area if isinstance(area, str) else area_given(area)
     circuit = overridden(circuit, sources, parameters)
-    if finger is None and not circuit.by_device("GAP"):
-        return _of_nodes(circuit if skin == "swept" else with_skin_held(circuit), frequency, area, skin)
-    scene = linear_scene(circuit if skin == "swept" else with_skin_held(circuit), finger)
-    f = _frequencies(frequency, scene.fundamental)
-    drive = sweep_drive(scene.sources, scene.fundamental, frequency is not None)
+    held = circuit if skin == "swept" else with_skin_held(circuit)
+    scene = None if finger is None and not circuit.by_device("GAP") else linear_scene(held, finger)
+    network = build_network(held) if scene is None else scene.network
+    alone = len(network.sources) == 1
+    fundamental = network.waveforms[0].fundamental if alone else None
+    asked = frequency if frequency is not None or fundamental is None else fundamental.frequency
+    if asked is None:
+        raise InputError("the source has no fundamental: give the frequencies in Hz")
+    f = positive_row("frequency", asked, "Hz")
+    driving = tuple((e, 1.0) for e in network.sources) if scene is None else scene.sources
+    amplitude, phase, drive = sweep_drive(driving, fundamental, frequency is not None)
     if isinstance(area, str):
         require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
-    if area == "mean" and math.isnan(drive.amplitude) and not scene.fixed:
+    if scene is None and math.isnan(amplitude):
+        raise InputError("no source has an amplitude; allowed: AC on a source, such as V1 in 0 AC 1, or one sine")
+    if scene is not None and area == "mean" and math.isnan(amplitude) and not scene.fixed:
         raise InputError(
             "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
             "'frozen' or an area in m^2"
         )
-    with np.errstate(all="ignore"):
-        areas = np.array([scene.areas(float(x), area, drive.amplitude) for x in f])
-        layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
-        impedance = np.array([scene.network.impedance(float(x), a) for x, a in zip(f, areas, strict=True)])
-        gain, own = layers[:, scene.gap], areas[:, scene.finger].copy()
-        u_gap = gain * drive.amplitude * np.exp(1j * drive.phase)
-        # At a constant area the mean force over a period of a sine is half its peak.
-        force = 0.5 * scene.contact.stress(np.abs(u_gap)) * own
-    _refuse_no_number(f, layers, own, *((u_gap, force) if math.isfinite(drive.amplitude) else ()))
     notes, warned = sweep_notes(circuit, f, skin)
-    notes = (*notes, scene.note) if scene.note else notes
-    largest = (float(np.max(x)) for x in (force, scene.contact.stress(np.abs(u_gap)), own))
-    warned = (*warned, *beyond_fingers("", *largest))
+    with np.errstate(all="ignore"):
+        u = amplitude * np.exp(1j * phase)
+        if scene is None:
+            # Node voltages at the areas that the circuit gives; as in ngspice, the AC of every source counts.
+            s = [u] if alone else [0.0 if e.ac is None else e.ac.phasor for e in network.sources]
+            at = areas_at_rest(network) if isinstance(area, str) else np.full(len(network.areas), area)
+            areas = np.tile(at, (f.size, 1))
+            v = np.array([network.node_phasors(float(x), at, np.array(s, complex)) for x in f])
+            gain = u_gap = np.full(f.size, math.nan + 0j)
+            layers, size, force = np.zeros((f.size, 0), complex), gain.real, gain.real
+            results: tuple[NDArray[np.inexact], ...] = (v,)
+        else:
+            areas, v = np.array([scene.areas(float(x), area, amplitude) for x in f]), None
+            layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
+            gain, size = layers[:, scene.gap], areas[:, scene.finger].copy()
+            u_gap = gain * amplitude * np.exp(1j * phase)
+            stress = scene.contact.stress(np.abs(u_gap))
+            # At a constant area the mean force over a period of a sine is half its peak.
+            force = 0.5 * stress * size
+            results = (layers, size, *((u_gap, force) if math.isfinite(amplitude) else ()))
+            notes = (*notes, scene.note) if scene.note else notes
+        impedance = np.array([network.impedance(float(x), a) for x, a in zip(f, areas, strict=True)]) if alone else None
+    finite = np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
+    if not finite.all():
+        raise InputError(
+            f"the phasor at {f[np.argmin(finite)]:g} Hz is beyond the range of numbers; allowed: frequencies nearer to "
+            "the 10 Hz to 100 kHz of the skin's data, and values nearer to Table 1's"
+        )
+    if scene is not None:
+        warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
     for text in warned:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return PhasorSolution(
-        f, gain, layers, u_gap, own, force, drive.amplitude, scene.layers, drive.phase, drive.text, notes, warned,
-        circuit, impedance,
-    )  # fmt: skip
-
-
-def _of_nodes(circuit: Circuit, frequency: ArrayLike | None, area: str | float, skin: str) -> PhasorSolution:
-    """Node voltages of a circuit without GAP, at the areas that it gives, under the AC of its sources as in ngspice."""
-    network = build_network(circuit)
-    alone = network.sources[0] if len(network.sources) == 1 else None
-    fundamental = None if alone is None or alone.waveform is None else alone.waveform.fundamental
-    f = _frequencies(frequency, fundamental)
-    drive = sweep_drive(tuple((e, 1.0) for e in network.sources), fundamental, frequency is not None)
-    if math.isnan(drive.amplitude):
-        raise InputError("no source has an amplitude; allowed: AC on a source, such as V1 in 0 AC 1, or one sine")
-    s = np.array([drive.amplitude * np.exp(1j * drive.phase)])
-    if alone is None:
-        s = np.array([0.0 if e.ac is None else e.ac.phasor for e in network.sources], complex)
-    areas = areas_at_rest(network) if isinstance(area, str) else np.full(len(network.areas), area)
-    with np.errstate(all="ignore"):
-        v = np.array([network.node_phasors(float(x), areas, s) for x in f])
-        impedance = None if alone is None else np.array([network.impedance(float(x), areas) for x in f])
-    _refuse_no_number(f, v)
-    notes, warned = sweep_notes(circuit, f, skin)
-    for text in warned:
-        warnings.warn(text, FingerspiceWarning, stacklevel=3)
-    none = np.full(f.size, math.nan)
-    return PhasorSolution(
-        f, none + 0j, np.zeros((f.size, 0), complex), none + 0j, none, none, drive.amplitude, (), drive.phase,
-        drive.text, notes, warned, circuit, impedance, network.node_names, v,
+        f, gain, layers, u_gap, size, force, amplitude, () if scene is None else scene.layers, phase, drive, notes,
+        warned, circuit, impedance, network.node_names if scene is None else (), v,
     )  # fmt: skip

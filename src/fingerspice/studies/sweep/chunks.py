@@ -1,11 +1,17 @@
-"""A sweep divided into chunks by itself alone, what determines their bytes, and running one of them."""
+"""A sweep divided into chunks by itself alone, the Zarr store that any number of processes fill, and running a chunk.
+
+A chunk is a block of scenes, one file of every array. The file of ``status`` is written last, when the others have
+reached the disk, and so marks the chunk as done.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
+import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from inspect import signature
@@ -13,18 +19,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fingerspice import __version__
-from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import digests
 from fingerspice.circuit.notices import scenes_warnings
-from fingerspice.results.store import Array
+from fingerspice.results.store import CHECKSUM, Array, attributes_of, create
 from fingerspice.studies.batch.batch import batch
 from fingerspice.studies.batch.task import LOCKSTEP, REFUSED, STATUS_NAMES, checked_scenes
-from fingerspice.studies.sweep import plan as plans
-from fingerspice.studies.sweep.store import STATUS, SweepStore
+from fingerspice.studies.sweep.plan import Plan, Sequence
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -32,31 +37,13 @@ if TYPE_CHECKING:
 
 # Scenes of a chunk, if the first scene goes in lockstep, and if it does not; largest number of chunks.
 CHUNK, SLOW_CHUNK, MOST_CHUNKS = 1 << 17, 1 << 8, 1 << 20
-# The status of a scene that has not been run.
-MISSING = len(STATUS_NAMES)
+# The array that marks chunks as done, and the status of a scene that has not been run.
+STATUS, MISSING = "status", len(STATUS_NAMES)
+# Attribute of the group with the identity of the sweep, as JSON; of a coordinate that counts named sets, their names.
+RUN, NAMES = "sweep", "names"
 # Quantiles by which a distribution is recognised.
 _PROBES = np.linspace(0.015625, 0.984375, 63)
 _FREE = nullcontext()
-
-
-@dataclass(frozen=True)
-class Work:
-    """A sweep with all that it takes to run any chunk of it; `draws` are None where nothing is drawn."""
-
-    circuit: Circuit
-    plan: plans.Plan
-    draws: plans.Sequence | None
-    options: Mapping[str, Any]
-    store: SweepStore
-    programs: str
-
-
-@dataclass(frozen=True)
-class Done:
-    """A chunk that is in the store: how many scenes it has, and why some of them have no result."""
-
-    count: int
-    failures: list[str]
 
 
 def programs() -> str:
@@ -66,9 +53,176 @@ def programs() -> str:
     return f"fingerspice {__version__}, NumPy {np.__version__}, SciPy {scipy.__version__}"
 
 
-def make_work(
-    circuit: Circuit, plan: plans.Plan, options: Mapping[str, Any], path: Path
-) -> tuple[Work, dict[str, Any]]:
+def identity_at(path: Path) -> dict[str, Any]:
+    """What the store that is at a path holds about its sweep; refuses what is no store of a sweep."""
+    try:
+        return dict(json.loads(attributes_of(path)[RUN]))
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path} is there already and is no store of a sweep; allowed: another path") from None
+
+
+@dataclass(frozen=True)
+class Work:
+    """A sweep with its store, and all that it takes to run any chunk of it."""
+
+    circuit: Circuit
+    plan: Plan
+    options: Mapping[str, Any]  # Of `batch`
+    path: Path
+    block: tuple[int, ...]  # Scenes of a chunk along each dimension
+    outputs: dict[str, Array]  # With ``error`` and ``status``
+    draws: Sequence | None
+    programs: str
+
+    @property
+    def _grid(self) -> tuple[int, ...]:
+        return tuple(-(-size // own) for size, own in zip(self.plan.sizes, self.block, strict=True))
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks."""
+        return math.prod(self._grid)
+
+    def _place(self, index: int) -> tuple[int, ...]:
+        """Number of a chunk along each dimension: chunks one after another have the same draws at other places."""
+        return tuple(int(i) for i in np.unravel_index(index, self._grid, "F" if self.plan.drawn else "C"))
+
+    def _drawn(self) -> dict[str, Array]:
+        """The arrays of drawn parameters, along ``scene``."""
+        sizes, block, units = self.plan.sizes[-1:], self.block[-1:], self.plan.units
+        return {
+            name: Array(self.path / name, ("scene",), sizes, block, {"units": units[name]}) for name in self.plan.drawn
+        }
+
+    def _pieces(self, index: int) -> Iterator[tuple[str, Array, tuple[int, ...]]]:
+        """Arrays of a chunk, and its place in each, ``status`` last; the first place of a grid has the draws."""
+        place = self._place(index)
+        if not any(place[:-1]):
+            yield from ((name, one, place[-1:]) for name, one in self._drawn().items())
+        for name in sorted(self.outputs, key=STATUS.__eq__):
+            one = self.outputs[name]
+            yield name, one, place + (0,) * (len(one.shape) - len(place))
+
+    def is_done(self, index: int) -> bool:
+        """Whether a chunk has been written as a whole, and has not changed since."""
+        return all(one.fault(place) is None for _, one, place in self._pieces(index))
+
+    def marked(self) -> int:
+        """Number of chunks that are marked as done."""
+        return sum(len(files) for _, _, files in os.walk(self.path / STATUS / "c"))
+
+    def open(self, about: Mapping[str, Any]) -> None:
+        """Create the store with these attributes, or make sure that the one there is of this sweep.
+
+        Anything else there, or the store of another sweep, is refused and stays.
+        """
+        own = json.loads(json.dumps({**self._identity(), "kind of checksum": CHECKSUM}, default=float))
+        if not os.path.lexists(self.path):
+            plan, arrays = self.plan, self.outputs | self._drawn()
+            for name, values in plan.grid.items():
+                of = {NAMES: list(plan.names[name])} if name in plan.names else {"units": plan.units[name]}
+                arrays[name] = Array(self.path / name, (name,), values.shape, values.shape, of, fill=0.0)
+            try:
+                create(self.path, {**about, RUN: json.dumps(own)}, arrays, plan.grid, os.urandom(6).hex())
+            except OSError as error:
+                raise InputError(f"cannot write {self.path}: {error.strerror or error}") from None
+        held = identity_at(self.path)
+        if differ := [key for key in {**own, **held} if held.get(key) != own.get(key)]:
+            key, told = differ[0], [str(one.get(differ[0])) for one in (held, own)]
+            said = "" if max(map(len, told)) > 40 else f" ({told[0]}, and this one {told[1]})"
+            raise InputError(
+                f"{self.path} holds a sweep of another {key.replace('_', ' ')}{said}; allowed: another path, or to "
+                "remove that folder"
+            )
+
+    def _identity(self) -> dict[str, Any]:
+        """All inputs that determine the bytes of the store, by which a later call recognises it."""
+        circuit, plan = self.circuit, self.plan
+        values: dict[str, Any] = {}
+        for name, one in (plan.grid | plan.fixed).items():
+            values[name] = hashlib.sha256(one.tobytes()).hexdigest() if one.size > 8 else one.tolist()
+            if name in plan.names:
+                values[name] = [plan.names[name], {path: np.ravel(x).tolist() for path, x in plan.own[name].items()}]
+        for name, law in plan.drawn.items():
+            # Nine digits are the same on every machine.
+            values[name] = [f"{x:.9g}" for x in law.ppf(_PROBES)]
+        # Options count alike, given or not.
+        own = {name: one.default for name, one in signature(batch).parameters.items() if one.default is not one.empty}
+        options = {**own, **self.options}
+        del options["threads"]
+        outputs = options["outputs"]
+        options["outputs"] = [outputs] if isinstance(outputs, str) else list(outputs)
+        return {
+            "programs": self.programs, "circuit": digests(circuit), "law of the deck": circuit.charge_law,
+            "times": repr(circuit.tran), "list of parameters": list(values),
+            **{f"range of {name}": value for name, value in values.items()},
+            **({"n": plan.n, "seed": plan.seed} if plan.drawn else {}),
+            **options, "block": self.block,
+        }  # fmt: skip
+
+    def dataset(self) -> Dataset:
+        """The sweep, whose values are read when they are used."""
+        import xarray
+
+        found: Dataset = xarray.open_zarr(self.path, chunks=None, consolidated=False, zarr_format=3)
+        del found.attrs[RUN]
+        found = found.set_coords(list(self.plan.drawn))
+        named = {str(name): one.attrs[NAMES] for name, one in found.coords.items() if NAMES in one.attrs}
+        return found.assign_coords(named)[list(self.outputs)]
+
+    def run_chunk(
+        self, index: int, computing: AbstractContextManager[Any] = _FREE, writing: AbstractContextManager[Any] = _FREE
+    ) -> tuple[int, list[str]]:
+        """Run the scenes of a chunk and write them, which marks the chunk as done.
+
+        Scenes are run within `computing`: a lock, where several chunks of a process are to be computed one after
+        another; and written within `writing`. Gives their number, and why some of them have no result.
+        """
+        if not (self.path / "zarr.json").is_file():
+            raise InputError(f"{self.path} is not there on a worker; allowed: a folder that all machines share")
+        if programs() != self.programs:
+            raise InputError(f"a worker has {programs()}, and the sweep is of {self.programs}; allowed: the same")
+        ranges = zip(self._place(index), self.block, self.plan.sizes, strict=True)
+        part = tuple(slice(i * own, min((i + 1) * own, size)) for i, own, size in ranges)
+        sizes = tuple(one.stop - one.start for one in part)
+        with computing:
+            found, values = self._computed(index, part)
+        for name, one in self.outputs.items():
+            own, more = found[name].values, one.shape[len(part) :]
+            if own.ndim == 1 and more:
+                # No scene of the chunk has a result.
+                own = np.full((own.size, *more), np.nan)
+            values[name] = own.reshape((*sizes, *more))
+        with writing:
+            self._write(index, values)
+        failures = []
+        for told in found.attrs["failures"]:
+            # Scenes are told by their numbers in the whole sweep.
+            scene, _, message = told.partition(": ")
+            place = np.unravel_index(int(scene.removeprefix("scene ")), sizes)
+            whole = [one.start + int(i) for one, i in zip(part, place, strict=True)]
+            number = np.ravel_multi_index(whole, self.plan.sizes) if whole else 0
+            failures.append(f"scene {number}: {message}")
+        return found.sizes["scene"], failures
+
+    def _computed(self, index: int, part: tuple[slice, ...]) -> tuple[Dataset, dict[str, NDArray[Any]]]:
+        """The batch of a chunk's scenes, and the values that are drawn."""
+        draws = {} if self.draws is None else self.draws.part(self._place(index)[-1])
+        grid = {name: values[one] for (name, values), one in zip(self.plan.grid.items(), part, strict=False)}
+        return batch(self.circuit, self.plan.spread(grid, draws), **self.options), {**draws}
+
+    def _write(self, index: int, values: Mapping[str, NDArray[Any]]) -> None:
+        try:
+            for name, one, place in self._pieces(index):
+                one.put(place, np.asarray(values[name]))
+        except OSError as error:
+            raise InputError(
+                f"cannot write {self.path}: {error.strerror or error}; what is written stays, and the same command "
+                "goes on from there"
+            ) from None
+
+
+def make_work(circuit: Circuit, plan: Plan, options: Mapping[str, Any], path: Path) -> tuple[Work, dict[str, Any]]:
     """The sweep as chunks, and the attributes of its store; its first scene is run to see what outputs there are."""
     _check_values(circuit, plan)
     middle = plan.quantiles(np.full((1, len(plan.drawn)), 0.5))
@@ -84,19 +238,10 @@ def make_work(
         raise InputError("outputs are u_gap, and a store has figures, which are one number for each scene")
     if int(first.status[0]) >= REFUSED and len(circuit.by_device("GAP")) > 1:
         raise InputError(f"the middle of the sweep has no result ({first.attrs['failures'][0]}); allowed: one that has")
-    store = _divided(plan, first, path.absolute())
-    require(store.chunks <= MOST_CHUNKS, "the sweep", f"{math.prod(plan.sizes):,} scenes", f"at most {MOST_CHUNKS:,} "
-            f"chunks of {math.prod(store.block):,}")  # fmt: skip
-    about = {key: value for key, value in first.attrs.items() if key not in ("n_ordinary", "ordinary", "failures")}
-    draws = plan.sequence(store.block[-1]) if plan.drawn else None
-    return Work(circuit, plan, draws, options, store, programs()), about | plan.about(circuit)
-
-
-def _divided(plan: plans.Plan, first: Dataset, path: Path) -> SweepStore:
-    """The store of a sweep, whose first scene has outputs of this kind."""
-    size = CHUNK if int(first.status[0]) == LOCKSTEP else SLOW_CHUNK
+    path = path.absolute()
     block: tuple[int, ...] = ()
     for length in reversed(plan.sizes):
+        size = CHUNK if int(first.status[0]) == LOCKSTEP else SLOW_CHUNK
         block = min(length, max(1, size // math.prod(block))), *block
     outputs = {
         str(name): Array(
@@ -108,18 +253,15 @@ def _divided(plan: plans.Plan, first: Dataset, path: Path) -> SweepStore:
     flags = dict(outputs[STATUS].attributes)
     flags |= {"flag_values": [*flags["flag_values"], MISSING], "flag_meanings": f"{flags['flag_meanings']} missing"}
     outputs[STATUS] = replace(outputs[STATUS], kind="i1", fill=MISSING, attributes=flags)
-    drawn = {
-        name: Array(path / name, ("scene",), plan.sizes[-1:], block[-1:], {"units": plan.units[name]})
-        for name in plan.drawn
-    }
-    grid = {
-        name: Array(path / name, (name,), values.shape, values.shape, plan.told(name), fill=0.0)
-        for name, values in plan.grid.items()
-    }
-    return SweepStore(path, plan.dims, plan.sizes, block, outputs, drawn, grid)
+    draws = plan.sequence(block[-1]) if plan.drawn else None
+    work = Work(circuit, plan, options, path, block, outputs, draws, programs())
+    require(work.chunks <= MOST_CHUNKS, "the sweep", f"{math.prod(plan.sizes):,} scenes", f"at most {MOST_CHUNKS:,} "
+            f"chunks of {math.prod(block):,}")  # fmt: skip
+    about = {key: value for key, value in first.attrs.items() if key not in ("n_ordinary", "ordinary", "failures")}
+    return work, about | plan.about(circuit)
 
 
-def _check_values(circuit: Circuit, plan: plans.Plan) -> None:
+def _check_values(circuit: Circuit, plan: Plan) -> None:
     """Refuse what a parameter does not accept: values of the grid, and quantiles beyond which there are draws."""
     ends = plan.quantiles(np.repeat([[1.0 / plan.n], [1.0 - 1.0 / plan.n]], len(plan.drawn), axis=1))
     for name, values in (plan.grid | plan.fixed | ends).items():
@@ -131,75 +273,3 @@ def _check_values(circuit: Circuit, plan: plans.Plan) -> None:
         except InputError as error:
             kind = "the distribution of" if name in plan.drawn else "the values of"
             raise InputError(f"{kind} {name}: {error}") from None
-
-
-def identity_of(work: Work) -> dict[str, Any]:
-    """All inputs that determine the bytes of a store, by which a later call recognises its own store."""
-    circuit, plan = work.circuit, work.plan
-    values: dict[str, Any] = {}
-    for name, one in (plan.grid | plan.fixed).items():
-        values[name] = hashlib.sha256(one.tobytes()).hexdigest() if one.size > 8 else one.tolist()
-        if name in plan.tables:
-            sets = plan.tables[name]
-            values[name] = [sets.names, {path: each.tolist() for path, each in sets.columns.items()}]
-    for name, law in plan.drawn.items():
-        # Nine digits are the same on every machine.
-        values[name] = [f"{x:.9g}" for x in law.ppf(_PROBES)]
-    return {
-        "programs": work.programs, "circuit": digests(circuit), "law of the deck": circuit.charge_law,
-        "times": repr(circuit.tran), "list of parameters": list(values),
-        **{f"range of {name}": value for name, value in values.items()},
-        **({"n": plan.n, "seed": plan.seed} if plan.drawn else {}),
-        **_effective(work.options), "block": work.store.block,
-    }  # fmt: skip
-
-
-def _effective(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that determine results, given or not."""
-    own = {name: one.default for name, one in signature(batch).parameters.items() if one.default is not one.empty}
-    every = {**own, **options}
-    del every["threads"]
-    return {**every, "outputs": [every["outputs"]] if isinstance(every["outputs"], str) else list(every["outputs"])}
-
-
-def run_chunk(
-    work: Work, index: int, computing: AbstractContextManager[Any] = _FREE, writing: AbstractContextManager[Any] = _FREE
-) -> Done:
-    """Run the scenes of a chunk, write them to the store, and mark the chunk as done.
-
-    Scenes are run within `computing`: a lock, where several chunks of a process are to be computed one after another;
-    and written within `writing`.
-    """
-    store = work.store
-    if not (store.path / "zarr.json").is_file():
-        raise InputError(f"{store.path} is not there on a worker; allowed: a folder that all machines share")
-    if programs() != work.programs:
-        raise InputError(f"a worker has {programs()}, and the sweep is of {work.programs}; allowed: the same")
-    part = store.part(index)
-    with computing:
-        found, draws = _computed(work, index, part)
-    values = {}
-    for name, one in store.outputs.items():
-        own, more = found[name].values, one.shape[len(part) :]
-        if own.ndim == 1 and more:
-            # No scene of the chunk has a result.
-            own = np.full((own.size, *more), np.nan)
-        values[name] = own.reshape((*(each.stop - each.start for each in part), *more))
-    with writing:
-        store.write(index, values | draws)
-    return Done(found.sizes["scene"], [_by_its_number(told, work, part) for told in found.attrs["failures"]])
-
-
-def _computed(work: Work, index: int, part: tuple[slice, ...]) -> tuple[Dataset, dict[str, FloatArray]]:
-    """The batch of a chunk's scenes, and the values that are drawn."""
-    draws = {} if work.draws is None else work.draws.part(work.store.place(index)[-1])
-    grid = {name: values[one] for (name, values), one in zip(work.plan.grid.items(), part, strict=False)}
-    return batch(work.circuit, work.plan.spread(grid, draws), **work.options), draws
-
-
-def _by_its_number(told: str, work: Work, part: tuple[slice, ...]) -> str:
-    """The message about a scene of a chunk, with the scene's number in the whole sweep."""
-    scene, _, message = told.partition(": ")
-    place = np.unravel_index(int(scene.removeprefix("scene ")), [one.stop - one.start for one in part])
-    whole = [one.start + int(i) for one, i in zip(part, place, strict=True)]
-    return f"scene {np.ravel_multi_index(whole, work.plan.sizes) if whole else 0}: {message}"

@@ -82,8 +82,6 @@ def _applied(circuit: Circuit, kind: str, entry: str) -> tuple[Circuit, str, Map
     return changed, f"{to}={one.name}" if to else one.name, changed.sets[one.name]
 
 
-#: Attribute of a coordinate that counts named sets of parameters: their names.
-NAMES = "names"
 # Bits of a Sobol point, and so the largest number of draws of all.
 BITS = 30
 # Quantiles are taken no nearer to 0 and 1 than this, so that a distribution without bounds gives finite values.
@@ -95,23 +93,18 @@ class Plan:
     """Parameters that make a grid, those that are drawn (`n` draws by `seed`), and those that are one number.
 
     Names are paths, or several paths with commas, whose numbers are factors; `own` has the paths of each and the values
-    that the factors are of. A kind of named sets, such as ``finger``, is a name as well: its numbers count the sets of
-    its table.
+    that the factors are of. A kind of named sets, such as ``finger``, is a name as well, whose numbers count the sets:
+    `own` has the values of each path in all sets, and `names` those of the sets.
     """
 
     grid: dict[str, FloatArray]
     drawn: dict[str, Any]
     fixed: dict[str, FloatArray]
-    own: dict[str, dict[str, float]]
+    own: dict[str, Mapping[str, float | FloatArray]]
     units: dict[str, str]
     n: int
     seed: int
-    tables: dict[str, SetTable]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of values of each parameter of the grid."""
-        return tuple(values.size for values in self.grid.values())
+    names: dict[str, tuple[str, ...]]
 
     @property
     def dims(self) -> tuple[str, ...]:
@@ -121,20 +114,15 @@ class Plan:
     @property
     def sizes(self) -> tuple[int, ...]:
         """Number of scenes along each dimension."""
-        return (*self.shape, *((self.n,) if self.drawn else ()))
-
-    def scenes(self, values: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
-        """Values of each path from those of each name that is no fixed one."""
-        return self.paths({**self.fixed, **values})
+        return (*(values.size for values in self.grid.values()), *((self.n,) if self.drawn else ()))
 
     def paths(self, values: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         """Values of each path of these names."""
-        found = {
-            path: factor * np.asarray(every, float)
-            for name, every in values.items() for path, factor in self.own.get(name, {}).items()
-        }  # fmt: skip
-        for name in values.keys() & self.tables.keys():
-            found |= {path: each[np.asarray(values[name], int)] for path, each in self.tables[name].columns.items()}
+        found = {}
+        for name, numbers in values.items():
+            for path, of in self.own[name].items():
+                x = np.asarray(numbers, float)
+                found[path] = np.take(of, x.astype(int)) if name in self.names else np.asarray(of * x)
         return found
 
     def about(self, circuit: Circuit) -> dict[str, Any]:
@@ -142,15 +130,11 @@ class Plan:
         drawn = {"n": self.n, "seed": self.seed} if self.drawn else {}
         return drawn | ({"sets": list(circuit.sets)} if circuit.sets else {})
 
-    def told(self, name: str) -> dict[str, Any]:
-        """Attributes of a parameter of the grid in a store: its unit, or the names of its sets."""
-        return {NAMES: list(self.tables[name].names)} if name in self.tables else {"units": self.units[name]}
-
     @property
     def coordinates(self) -> dict[str, Any]:
         """Of each dimension of the grid its numbers, or the names of its sets, for a Dataset."""
         return {
-            name: (name, list(self.tables[name].names)) if name in self.tables
+            name: (name, list(self.names[name])) if name in self.names
             else (name, values, {"units": self.units[name]})
             for name, values in self.grid.items()
         }  # fmt: skip
@@ -161,7 +145,7 @@ class Plan:
         mesh = np.meshgrid(*grid.values(), indexing="ij")
         places = mesh[0].size if mesh else 1
         flat = {path: np.repeat(values.ravel(), count) for path, values in zip(grid, mesh, strict=True)}
-        return self.scenes(flat | {path: np.tile(values, places) for path, values in draws.items()})
+        return self.paths(self.fixed | flat | {path: np.tile(values, places) for path, values in draws.items()})
 
     def quantiles(self, points: FloatArray) -> dict[str, FloatArray]:
         """Values of the drawn parameters at points of the unit cube, shape (n_point, n_drawn)."""
@@ -229,19 +213,18 @@ def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int
     n, seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
     power = most.bit_length() - 1
     require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
-    tables = {kind: value for kind, value in parameters.items() if isinstance(value, SetTable)}
-    plan = Plan({}, {}, {}, {}, {}, n, seed, tables)
-    taken = Counter(path for value in tables.values() for path in value.columns)
-    _refuse_twice(taken)
+    plan, taken = Plan({}, {}, {}, {}, {}, n, seed, {}), Counter[str]()
     for given, value in parameters.items():
-        if given in tables:
-            plan.grid[given] = np.arange(len(tables[given].names), dtype=float)
-            continue
-        paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
+        held = isinstance(value, SetTable)
+        paths = list(value.columns) if held else [own_path(circuit, one.strip()) for one in str(given).split(",")]
         taken.update(paths)
-        _refuse_twice(taken)
-        path = ",".join(paths)
-        alone = len(paths) == 1
+        if twice := [path for path, count in taken.items() if count > 1]:
+            raise InputError(f"{twice[0]} is given twice, where sets that differ in it count; allowed: once")
+        if held:
+            plan.names[given], plan.own[given] = value.names, value.columns
+            plan.grid[given] = np.arange(len(value.names), dtype=float)
+            continue
+        path, alone = ",".join(paths), len(paths) == 1
         plan.own[path] = {one: 1.0 if alone else circuit.parameters[one].value for one in paths}
         plan.units[path] = circuit.parameters[path].unit if alone else "1"
         if hasattr(value, "ppf"):
@@ -252,8 +235,3 @@ def make_plan(circuit: Circuit, parameters: Mapping[str, Any], n: int, seed: int
         require(array.ndim < 2 and array.size > 0, path, f"of shape {array.shape}", "numbers in one row")
         (plan.grid if array.ndim else plan.fixed)[path] = array
     return plan
-
-
-def _refuse_twice(paths: Counter[str]) -> None:
-    if twice := [path for path, count in paths.items() if count > 1]:
-        raise InputError(f"{twice[0]} is given twice, where sets that differ in it count; allowed: once")

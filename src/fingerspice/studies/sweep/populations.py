@@ -97,14 +97,9 @@ def sweep(
         raise InputError(
             "workers, scheduler or shard is given without store; allowed: a folder such as 'out/sweep.zarr'"
         )
-    plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
-    return _in_memory(circuit, plan, options)
-
-
-def _in_memory(circuit: Circuit, plan: Plan, options: Mapping[str, Any]) -> Dataset:
-    """The batch of all scenes, in the shape of the grid."""
     from xarray import Dataset
 
+    plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
     total = math.prod(plan.sizes)
     require(total <= MOST_SCENES, "the sweep", f"{total:,} scenes", f"at most {MOST_SCENES:,}, or a store")
     draws = plan.draws()
@@ -131,7 +126,7 @@ def sobol(
     """Shares of a figure's variance that come from each random parameter: Sobol indices at every place of a grid.
 
     The index of first order is the share that the parameter causes alone, the total one that with all its interactions
-    (Saltelli et al. 2010, by `scipy.stats.sobol_indices`). n (d + 2) scenes at each place of the grid, where d
+    (Saltelli et al. 2010, as `scipy.stats.sobol_indices`). n (d + 2) scenes at each place of the grid, where d
     parameters are drawn.
 
     Parameters
@@ -162,22 +157,32 @@ def sobol(
     outputs = options.get("outputs", ("f_el_mean",))
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     require("u_gap" not in outputs, "outputs", "u_gap", "figures, which are one number for each scene")
-    places = [dict(zip(plan.grid, values, strict=True)) for values in product(*plan.grid.values())]
+    from xarray import Dataset
+
+    # Every place of the grid: each of its parameters with one value, shape (1,).
+    places = [dict(zip(plan.grid, np.reshape(values, (-1, 1)), strict=True)) for values in product(*plan.grid.values())]
     rows = [_indices(circuit, plan, place, outputs, confidence, options) for place in places]
-    return _as_dataset(plan, outputs, rows)
+    data: dict[str, Any] = {}
+    for i, output in enumerate(outputs):
+        for kind in rows[0]:
+            each = np.array([row[kind][i] for row in rows])
+            own = ("parameter", "quantile")[: each.ndim - 1]
+            data[f"{output}_{kind}"] = ((*plan.grid, *own), each.reshape((*plan.sizes[:-1], *each.shape[1:])))
+    coords = plan.coordinates | {"parameter": list(plan.drawn), "quantile": list(QUANTILES)}
+    coords["unit"] = ("parameter", [plan.units[name] for name in plan.drawn])
+    data["at"] = (("parameter", "quantile"), [law.ppf(QUANTILES) for law in plan.drawn.values()])
+    return Dataset(data, coords, {"n": plan.n, "seed": plan.seed, "outputs": list(outputs)})
 
 
 def _indices(
-    circuit: Circuit, plan: Plan, place: dict[str, float], outputs: tuple[str, ...], confidence: float,
+    circuit: Circuit, plan: Plan, place: dict[str, FloatArray], outputs: tuple[str, ...], confidence: float,
     options: Mapping[str, Any],
 ) -> dict[str, FloatArray]:  # fmt: skip
     """Indices (n_output, d), their intervals, and mean and standard deviation of the outputs, at one place."""
-    from scipy.stats import sobol_indices
-
-    told: list[FloatArray] = []
+    from scipy.stats import qmc
 
     def figures(x: FloatArray) -> FloatArray:
-        found = batch(circuit, plan.scenes(dict(zip(plan.drawn, np.asarray(x, float), strict=True)) | place), **options)
+        found = batch(circuit, plan.spread(place, dict(zip(plan.drawn, x, strict=True))), **options)
         if lost := int(np.count_nonzero(found.status >= REFUSED)):
             why = f" ({found.attrs['failures'][0]})" if len(found.attrs["failures"]) else ""
             raise InputError(
@@ -186,26 +191,27 @@ def _indices(
             )
         values = np.array([found[name].values for name in outputs])
         require(values.ndim == 2, "outputs", "one for each of several gaps", "figures of a circuit with one GAP")
-        # A copy: scipy takes the mean off what it is given.
-        told.append(values.copy())
         return values
 
-    found = sobol_indices(func=figures, n=plan.n, dists=list(plan.drawn.values()), rng=plan.seed)
-    d = len(plan.drawn)
-    a, b = told[0], told[1]
-    # The third call has the scenes in which parameter j is taken from the other population, at every d-th place.
-    mixed = np.moveaxis(told[2].reshape(len(outputs), plan.n, d), -1, 0)
+    # Two populations, and for each parameter the first one with that parameter of the second.
+    d, laws = len(plan.drawn), list(plan.drawn.values())
+    points = qmc.Sobol(2 * d, bits=64, rng=plan.seed).random(plan.n).T
+    pair = np.array([law.ppf(x) for law, x in zip(laws * 2, points, strict=True)], float).reshape(2, d, plan.n)
+    other = np.repeat(pair[:1], d, axis=0)
+    other[np.arange(d), np.arange(d)] = pair[1]
+    a, b = map(figures, pair)
+    mixed = np.moveaxis(figures(np.moveaxis(other, 0, -1).reshape(d, -1)).reshape(len(outputs), plan.n, d), -1, 0)
     # Then each parameter by itself.
     alone = np.full((d, len(QUANTILES), d), 0.5)
     alone[np.arange(d), :, np.arange(d)] = QUANTILES
-    x = np.array([law.ppf(alone[..., j].ravel()) for j, law in enumerate(plan.drawn.values())])
+    x = np.array([law.ppf(alone[..., j].ravel()) for j, law in enumerate(laws)])
     picks = np.random.default_rng(plan.seed).integers(0, plan.n, (RESAMPLES, plan.n))
     drawn = np.array([_saltelli(a[:, pick], b[:, pick], mixed[..., pick]) for pick in picks])
     low, high = np.quantile(drawn, [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence], axis=0)
-    both = np.concatenate([a, b], axis=1)
+    both, (first, total) = np.concatenate([a, b], axis=1), _saltelli(a, b, mixed)
     return {
-        "first": np.reshape(found.first_order, (len(outputs), d)), "first_low": low[0], "first_high": high[0],
-        "total": np.reshape(found.total_order, (len(outputs), d)), "total_low": low[1], "total_high": high[1],
+        "first": first, "first_low": low[0], "first_high": high[0],
+        "total": total, "total_low": low[1], "total_high": high[1],
         "mean": both.mean(axis=1), "std": both.std(axis=1),
         "alone": figures(x).reshape(len(outputs), d, len(QUANTILES)),
     }  # fmt: skip
@@ -221,23 +227,6 @@ def _saltelli(a: FloatArray, b: FloatArray, mixed: FloatArray) -> FloatArray:
         total = 0.5 * np.mean((a - mixed) ** 2, axis=-1) / variance
     # A figure that does not change has indices of 0.
     return np.asarray(np.nan_to_num(np.array([first.T, total.T]), nan=0.0, posinf=0.0, neginf=0.0), float)
-
-
-def _as_dataset(plan: Plan, outputs: tuple[str, ...], rows: list[dict[str, FloatArray]]) -> Dataset:
-    from xarray import Dataset
-
-    dims = tuple(plan.grid)
-    data: dict[str, Any] = {}
-    for i, output in enumerate(outputs):
-        for kind in rows[0]:
-            values = np.array([row[kind][i] for row in rows])
-            own = ("parameter", "quantile")[: values.ndim - 1]
-            data[f"{output}_{kind}"] = ((*dims, *own), values.reshape((*plan.shape, *values.shape[1:])))
-    coords: dict[str, Any] = plan.coordinates
-    coords |= {"parameter": list(plan.drawn), "quantile": list(QUANTILES)}
-    coords["unit"] = ("parameter", [plan.units[name] for name in plan.drawn])
-    data["at"] = (("parameter", "quantile"), [law.ppf(QUANTILES) for law in plan.drawn.values()])
-    return Dataset(data, coords, {"n": plan.n, "seed": plan.seed, "outputs": list(outputs)})
 
 
 def ranking(found: Dataset, output: str) -> list[dict[str, Any]]:

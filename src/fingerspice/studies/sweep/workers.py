@@ -23,14 +23,15 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.results.store import tidy
 from fingerspice.studies.batch.batch import MESSAGES
-from fingerspice.studies.sweep.chunks import Done, Work, identity_of, make_work, run_chunk
+from fingerspice.studies.sweep.chunks import Work, identity_at, make_work
 from fingerspice.studies.sweep.plan import Plan
-from fingerspice.studies.sweep.store import identity
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
+# What is known of a chunk that has been run: the number of its scenes, and why some of them have no result.
+Ran = tuple[int, list[str]]
 # Chunks that a process has at once: it computes one while another one is waiting for the disk.
 AT_ONCE = 2
 _WRITING = Lock()
@@ -52,45 +53,37 @@ def stored(
     good = len(shard) == 2 and all(isinstance(x, int) for x in shard) and 1 <= shard[0] <= shard[1]
     require(good, "shard", shard, "two whole numbers (i, m), with i from 1 to m")
     if os.path.lexists(path):
-        identity(path)
+        identity_at(path)
     work, about = make_work(circuit, plan, options, path)
     if workers is not None or scheduler is not None:
         work = replace(work, options={"threads": 1, **options})
-    with at_work(None if workers is None else min(workers, work.store.chunks), scheduler) as client:
-        work.store.open(identity_of(work), about, plan.grid)
-        told = _run_chunks(work, shard, client)
-    found = work.store.dataset()
-    found.attrs |= told
+    with at_work(None if workers is None else min(workers, work.chunks), scheduler) as client:
+        work.open(about)
+        begun, mine = time.perf_counter(), range(shard[0] - 1, work.chunks, shard[1])
+        missing = [index for index in mine if not work.is_done(index)]
+        answers = _here(work, missing) if client is None or not missing else _by_scheduler(work, missing, client)
+        failures: list[str] = []
+        scenes, there, whole = 0, len(mine) - len(missing), max(len(mine), 1)
+        with paced("sweeping", there / whole) as show:
+            for number, (count, told) in enumerate(answers, there + 1):
+                failures, scenes = failures + told, scenes + count
+                show(number / whole, lambda s, count=scenes: f"{count / s:,.3g} scenes/s,")
+        lacking = work.chunks - work.marked()
+        if not lacking:
+            tidy(work.path)
+        took = time.perf_counter() - begun
+    found = work.dataset()
+    found.attrs |= {"chunks": len(mine), "chunks_found": there, "chunks_missing": lacking, "seconds": took}
+    found.attrs["failures"] = failures[:MESSAGES]
     return found
 
 
-def _run_chunks(work: Work, shard: tuple[int, int], client: Any) -> dict[str, Any]:
-    """Run the chunks of a shard that are not yet done, and return what is told of it, as `sweep` does in attributes."""
-    begun, store = time.perf_counter(), work.store
-    mine = range(shard[0] - 1, store.chunks, shard[1])
-    missing = [index for index in mine if not store.is_done(index)]
-    answers = _here(work, missing) if client is None or not missing else _by_scheduler(work, missing, client)
-    failures: list[str] = []
-    scenes, found, whole = 0, len(mine) - len(missing), max(len(mine), 1)
-    with paced("sweeping", found / whole) as show:
-        for number, done in enumerate(answers, found + 1):
-            failures, scenes = failures + done.failures, scenes + done.count
-            show(number / whole, lambda s, count=scenes: f"{count / s:,.3g} scenes/s,")
-    lacking = store.chunks - store.marked()
-    if not lacking:
-        tidy(store.path)
-    return {
-        "chunks": len(mine), "chunks_found": found, "chunks_missing": lacking,
-        "seconds": time.perf_counter() - begun, "failures": failures[:MESSAGES],
-    }  # fmt: skip
-
-
-def _here(work: Work, missing: Sequence[int]) -> Iterator[Done]:
+def _here(work: Work, missing: Sequence[int]) -> Iterator[Ran]:
     """Chunks by this process."""
     # A batch changes the filters for a while, and two of them at once for good.
     with warnings.catch_warnings(), ThreadPoolExecutor(AT_ONCE) as pool:
         warnings.simplefilter("ignore", FingerspiceWarning)
-        yield from pool.map(partial(run_chunk, work, computing=Lock()), missing)
+        yield from pool.map(partial(work.run_chunk, computing=Lock()), missing)
 
 
 @contextmanager
@@ -127,12 +120,12 @@ def at_work(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         yield client
 
 
-def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[Done]:
+def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[Ran]:
     """Chunks by the workers of a Dask scheduler, which gives the chunks of a lost worker to others."""
     from distributed import KilledWorker, TimeoutError, as_completed
 
     # Held by the scheduler, not by a worker, with which it could be lost.
-    held = client.submit(_same, work, pure=False)
+    held = client.submit(lambda: work, pure=False)
     todo, lost = deque(missing), Counter[int | None]()
     running: dict[Any, int] = {}
     given_up: dict[int, Exception] = {}
@@ -178,17 +171,13 @@ def _lost(chunk: str, count: int, reason: Exception) -> InputError:
     )
 
 
-def _same(work: Work) -> Work:
-    return work
-
-
-def _run_and_write_aside(work: Work, index: int) -> Done:
+def _run_and_write_aside(work: Work, index: int) -> Ran:
     """A task of Dask: its worker computes the next chunk while this one is written."""
     keep_freed_memory()
     if parent_process() is not None:
         # A process of Dask's own, whose terminal may be the user's, who has been warned before the first chunk.
         warnings.simplefilter("ignore", FingerspiceWarning)
-    return run_chunk(work, index, writing=_aside())
+    return work.run_chunk(index, writing=_aside())
 
 
 @contextmanager
