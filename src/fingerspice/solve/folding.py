@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import OdeSolution, solve_ivp
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.network import Segment, source
 from fingerspice.engine.one_area.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.results.outcome import Failure, SolveError, Status, last_tried
@@ -46,22 +46,22 @@ class _LostError(Exception):
     """A path took too many evaluations, found no step small enough, or no longer fulfils the area equation."""
 
 
-def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
+def run_to_fold(problem: Problem) -> Run | None:
     """A run under the `mobile` law up to the fold that it reaches or jumps past; None where it reaches no fold."""
-    run = solve_marching(problem, FINEST_RTOL, t_out, left, repeat=False)
+    run = solve_marching(problem, FINEST_RTOL, repeat=False)
     run.gaps[:, 2:] *= SAFETY
     jumped = run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size > 0
     if not jumped and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
         # Where the gap voltage is as small as rounding, steps may cross a fold unseen: their end is not the fold.
         return None
     if run.status is Status.FOLD:
-        return lead_to_fold(problem, run, t_out, left)
+        return lead_to_fold(problem, run)
     return run if run.status is Status.SUCCESS else None
 
 
-def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray) -> Run | None:
+def lead_to_fold(problem: Problem, run: Run) -> Run | None:
     """Continue a run that stopped near a fold until it reaches the fold; None where it does not reach it."""
-    state = to_stack(problem.scene, run.state)
+    state, t_out = to_stack(problem.scene, run.state), problem.t_out
     reached, path = _ahead(problem, run, state, FINEST_RTOL)
     if path is None:
         return run if reached else None
@@ -72,7 +72,7 @@ def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray)
     t = np.append(later[later < path.t], path.t)
     written = path.rows(problem, t)
     rows = from_written(problem.scene, written, state.offset, run.by_layer)[:, : run.rows.shape[1]]
-    run.t, run.left = np.append(run.t[:done], t), np.append(left[: done + t.size - 1], True)
+    run.t, run.left = np.append(run.t[:done], t), np.append(problem.left[: done + t.size - 1], True)
     run.rows = np.vstack([run.rows[:done], rows])
     run.t_failed, run.margin = path.t, 0.0
     for _, contact in run.record(problem).fingers:
@@ -95,8 +95,7 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
     SolveError
         Where the run fails for another reason than a fold.
     """
-    nothing = np.empty(0)
-    run = solve_marching(problem, rtol, nothing, nothing.astype(bool))
+    run = solve_marching(problem, rtol)
     if run.status is Status.SUCCESS:
         return False
     if run.status is not Status.FOLD:

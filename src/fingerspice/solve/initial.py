@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,8 +37,7 @@ from fingerspice.solve.starting import (
 from fingerspice.waveforms.waveform import require
 
 
-@dataclass(frozen=True)
-class StackState:
+class StackState(NamedTuple):
     """A state in the engine's form."""
 
     t: float  # s

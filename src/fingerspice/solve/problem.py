@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import cast
 
@@ -57,6 +57,13 @@ class Problem:
     # (n_gap, 2): Error of a periodic start, as its effect on every gap's voltage and force, V and N. The start was
     # computed with half of the error asked for; the other half is left to the run.
     begun: FloatArray | None = None
+    # t_out, left (n_out,): Output times, s, ascending, and whether the left-hand limit is meant
+    t_out: FloatArray = field(default_factory=lambda: np.empty(0))
+    left: BoolArray = field(default_factory=lambda: np.empty(0, bool))
+
+    def at(self, t: FloatArray, left: BoolArray) -> Problem:
+        """The problem with other outputs."""
+        return replace(self, t_out=t, left=left)
 
     @property
     def network(self) -> Network:
@@ -88,6 +95,10 @@ class Problem:
         if state is not self.initial:
             _, inner = self.scene.prepared["inner"] = self.initial, to_stack(self.scene, self.initial)
         return cast("StackState", inner)
+
+    def done(self, t: float) -> float:
+        """Fraction of the run that is done at time t, s."""
+        return (t - self.t_start) / (self.t_stop - self.t_start)
 
     def breakpoints(self) -> FloatArray:
         """The sources' breakpoints in the run, s; the waveform caches them if they are few."""

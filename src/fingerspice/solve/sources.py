@@ -31,10 +31,8 @@ class Tables:
     are cached with the waveform if the run has few windows; in a longer run they are computed anew, in constant memory.
     """
 
-    def __init__(
-        self, problem: Problem, tol: float, *, no_chirps: bool = False, t_out: FloatArray | None = None
-    ) -> None:
-        self.problem, self.no_chirps, self.t_out = problem, no_chirps, t_out
+    def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
+        self.problem, self.no_chirps = problem, no_chirps
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
         self.edges = _windows(problem)
         # An iteration skips windows that end by this time (s), except the last window.
@@ -79,8 +77,8 @@ class Tables:
             wave, w0, w1, self.tol, problem.step, no_chirps=self.no_chirps, scale=self.scales[place],
             shortest=shortest_event(problem),
         )  # fmt: skip
-        if self.t_out is not None and problem.scene.is_sampled and is_sampled(wave):
-            off = table.unseen(wave, self.t_out, self.tol)
+        if problem.scene.is_sampled and is_sampled(wave):
+            off = table.unseen(wave, problem.t_out, self.tol)
             self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
         return table
 

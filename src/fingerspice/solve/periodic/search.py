@@ -159,10 +159,9 @@ class Search:
 
     def _stepped(self, problem: Problem, tol: float) -> _Pass | None:
         """One pass by exponential steps; None where they fail before the end."""
-        none, scene, n = np.zeros(0), problem.scene, self.period.n
-        outputs = none, none.astype(bool)
+        scene, n = problem.scene, self.period.n
         while True:
-            one = stepping(problem, self.rtol, max(tol, FINEST), self.scale, self.top, *outputs, False)
+            one = stepping(problem, self.rtol, max(tol, FINEST), self.scale, self.top, False)
             try:
                 if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
                     return None
@@ -173,7 +172,7 @@ class Search:
         if isinstance(one, March):
             error = np.append(one.form.shape @ one.error[:n], one.error[n:])
             return _Pass(one.y, one.s_before, error, one.peaks.copy(), magnified, one.references.magnified)
-        end, system = one.state(), one.prepared.system
+        end, system = one.state(), one.system
         model, error = system.model, system.live[int(one.error[n])] @ one.error[:n]
         if model.mobile:
             error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
