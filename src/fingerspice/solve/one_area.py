@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.collocation import loopstate, readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
 from fingerspice.engine.collocation.exponential import forget, new_tables
@@ -25,16 +22,7 @@ from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import sided
-from fingerspice.results.signals import Signals
-from fingerspice.results.steps import Recorded
-from fingerspice.solve.initial import (
-    StackState,
-    as_marched,
-    from_stack,
-    from_written,
-    model_of,
-    row_width,
-)
+from fingerspice.solve.initial import StackState, as_marched, from_stack, from_written, model_of, row_width
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene, kept_with
 from fingerspice.solve.sources import segment_index
@@ -184,12 +172,6 @@ class Track(Stepping):
         write_row_at(model, u, du, self.y, c["sign"], found if found == found else c["u_gap"], row)
         return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
 
-    def recorded(self) -> Recorded | None:
-        recorded, shown = super().recorded(), self.problem.scene.shown
-        if recorded is None or not shown.is_turned:
-            return recorded
-        return replace(recorded, make=partial(_turned, recorded.make, shown.turn))
-
 
 def on_branch(model: Model, state: StackState, sign: float) -> StackState:
     """The state with its gap voltage computed anew from the area equation, on the branch with this sign."""
@@ -212,13 +194,6 @@ def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray)
         u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
         rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - problem.inner.offset
     return rows
-
-
-def _turned(
-    make: Callable[..., Signals], turn: FloatArray, t: FloatArray, left: BoolArray, columns: FloatArray
-) -> Signals:  # fmt: skip
-    """A record from live voltages counted along the loop."""
-    return make(t, left, turn[:, None] * columns)
 
 
 def _segment(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:

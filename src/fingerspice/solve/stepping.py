@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.engine.collocation import loop, loopstate, readout
 from fingerspice.engine.collocation.loop import Circuit, Looks
 from fingerspice.engine.collocation.loopstate import LoopState
@@ -17,10 +17,11 @@ from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Sources
 from fingerspice.numerics.lobatto import ROWS
 from fingerspice.results.outcome import Status
-from fingerspice.results.record import bare_record
+from fingerspice.results.record import Record
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
+from fingerspice.solve.scenes import Scene
 from fingerspice.waveforms.sampling import same_time
 
 # Runs of fewer periods are integrated throughout, because nothing would be saved.
@@ -265,5 +266,10 @@ class Stepping(Integration):
     def recorded(self) -> Recorded | None:
         """The recorded steps of the run so far."""
         self.recorder.drain(self.counters)
-        shown = self.problem.scene.shown
-        return self.recorder.finish(self.problem.first, partial(bare_record, shown.network, shown.net))
+        return self.recorder.finish(self.problem.first, partial(_record, self.problem.scene.shown))
+
+
+def _record(shown: Scene, t: FloatArray, left: BoolArray, columns: FloatArray) -> Record:
+    """A record without charge from recorded states, shape (size, n_t), which of a stack are counted along the loop."""
+    turned = shown.turn[:, None] * columns if shown.stack is not None and shown.is_turned else columns
+    return Record(shown.network, shown.net, t, left, turned.T, False)
