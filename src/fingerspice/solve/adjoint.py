@@ -235,10 +235,8 @@ class _Intervals:
 def _problem(run: Solution, sources: dict[str, Waveform]) -> Problem:
     """The problem of a run, with these sources in place of its own."""
     circuit = run.circuit.varied(sources) if sources else run.circuit
-    return asked(
-        circuit, t_stop=run.t_stop, t_eval=None, charge_law=run.charge_law, area=run.area_mode, start=run.start,
-        charge=False, rtol=run.rtol,
-    )  # fmt: skip
+    how: dict[str, Any] = {"t_stop": run.t_stop, "charge_law": run.charge_law, "area": run.area_mode}
+    return asked(circuit, start=run.start, charge=False, rtol=run.rtol, **how)
 
 
 def _parts_of(numbers: IntArray) -> list[IntArray]:

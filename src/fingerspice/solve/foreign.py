@@ -157,13 +157,7 @@ class Foreign(Collocation):
 
 
 def solve_foreign(problem: Problem, method: str, rtol: float, progress: Progress | None = None) -> Run:
-    """Integrate with a library's method until the error against our own Radau is within `rtol` of the peaks.
-
-    Raises
-    ------
-    InputError
-        For an unknown method, or for torchdiffeq if it is not installed.
-    """
+    """Integrate with a library's method until the error against our own Radau is within `rtol` of the peaks."""
     library, _, name = method.partition(":")
     known = SCIPY_METHODS if library == "scipy" else TORCH_METHODS
     if name not in known:

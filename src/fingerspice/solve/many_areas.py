@@ -24,7 +24,7 @@ from fingerspice.numerics.lobatto import integral_table
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene, kept_with
-from fingerspice.solve.sources import held as held_at
+from fingerspice.solve.sources import ramp
 from fingerspice.solve.stepping import Stepping
 
 # Number of sets of references cached with a scene: one for each thread and decade of tolerances.
@@ -57,11 +57,6 @@ class Known:
     @property
     def count(self) -> int:
         return int(self.arrays.used[0])
-
-    @property
-    def is_full(self) -> bool:
-        most: int = MOST_NUMBERS // self.arrays.numbers.shape[1]
-        return self.count >= max(2, min(MOST_REFERENCES, most))
 
     def add(self, scene: Scene, levels: tuple[int, ...]) -> None:
         """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
@@ -244,19 +239,22 @@ class March(Stepping):
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
         more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
         self.step[0]["most"] = taken + int(more)
-        return super().march(sources, t_end, looks)
+        while (code := super().march(sources, t_end, looks)) == loopstate.REFERENCE:
+            self._add_reference()
+        return code
 
     def _failed(self, code: int, sources: Sources) -> Status:
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
-        return self.march(held_at(self.t, after), self.t, no_looks()) == loopstate.DONE
+        # With sources that stay at these values.
+        return self.march(ramp(after, after, self.t), self.t, no_looks()) == loopstate.DONE
 
     def _add_reference(self) -> None:
         """Add the reference areas that the compiled loop needs next, and that it has written to `wanted`."""
         known, at = self.references, self.work.at
         wanted = tuple(map(int, known.arrays.wanted))
-        if known.is_full:
+        if known.count >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
             # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
             levels = tuple(map(int, known.arrays.levels[at[0]]))
             self.references = known = known_references(self.problem.scene, self.decade, anew=True)

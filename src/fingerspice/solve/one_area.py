@@ -13,7 +13,7 @@ from fingerspice.engine.collocation import loopstate, readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
 from fingerspice.engine.collocation.exponential import forget, new_tables
 from fingerspice.engine.collocation.step_control import end_row
-from fingerspice.engine.network import Segment, Sources, source
+from fingerspice.engine.network import Sources, source
 from fingerspice.engine.one_area.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.one_area.rows import Work, new_work
 from fingerspice.engine.one_area.step import OneArea
@@ -25,7 +25,7 @@ from fingerspice.results.record import sided
 from fingerspice.solve.initial import StackState, as_marched, from_stack, from_written, model_of, row_width
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene, kept_with
-from fingerspice.solve.sources import segment_index
+from fingerspice.solve.sources import segment_of
 from fingerspice.solve.stepping import OutOfRangeError, Stepping
 
 # Number of modal systems cached with a scene, one for each decade of tolerances, of up to 1 MB each.
@@ -124,10 +124,6 @@ class Track(Stepping):
         peak, size = float(self.peaks[0, readout.PEAK_U]), self.problem.scene.u_size
         return [4e-16 * (peak + self.system.model.k_gap * size), 4e-16 * (peak + size)]
 
-    @property
-    def margin(self) -> float:
-        return float(self.control["margin"])
-
     def circuit(self, sources: Sources) -> OneArea:
         return OneArea(self.system, *SCRATCH.of(self.system), integral_table(), sources)
 
@@ -136,7 +132,7 @@ class Track(Stepping):
             raise OutOfRangeError(self.system.u_top)
         if self.t > sources.edges[0]:
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
-            self.control["u_before"], _ = source(*_segment(sources, self.t, "left"))
+            self.control["u_before"], _ = source(*segment_of(sources, self.t, "left"))
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
 
     def state(self) -> State:
@@ -154,7 +150,7 @@ class Track(Stepping):
     def finish(self, sources: Sources, after: Sources | None) -> None:
         first = int(self.counters[readout.OUTPUT])
         row = np.empty(row_width(self.problem.scene))
-        segment, tau = _segment(after or sources, self.problem.t_stop, "right")
+        segment, tau = segment_of(after or sources, self.problem.t_stop, "right")
         model = self.system.model
         # `end_row` applies a jump at the end to these copies, so that the final state remains the left-hand one.
         end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.controls.copy(), row)
@@ -164,7 +160,7 @@ class Track(Stepping):
     def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
         # This model's area curve may reach higher voltages than the curve of the scene's model.
         model, c = self.system.model, self.control
-        segment, tau = _segment(sources, self.t, side)
+        segment, tau = segment_of(sources, self.t, side)
         row = np.empty(row_width(self.problem.scene))
         u, du = source(segment, tau)
         found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c["sign"], c["u_gap"])
@@ -187,20 +183,12 @@ def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray)
     """Convert rows of the compiled loops to rows of `Record`, in place; `mobile` needs the source u (V) for charge."""
     shown = problem.scene.shown
     n = int(shown.turn.size)
-    if shown.is_turned:
-        rows[:, :n] *= shown.turn
+    rows[:, :n] *= shown.turn
     if problem.charge and model.mobile:
         (cell,), network = shown.measured, shown.network
         u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
         rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - problem.inner.offset
     return rows
-
-
-def _segment(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:
-    """The segment of a single source that contains time t (s), and the time since the segment's start, s."""
-    (i,) = segment_index(sources, t, side).tolist()
-    start = float(sources.edges[i])
-    return Segment(start, float(sources.edges[i + 1]) - start, sources.terms[i], sources.series[i]), t - start
 
 
 def scale_of(problem: Problem, peak: float) -> float:

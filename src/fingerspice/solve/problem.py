@@ -118,11 +118,11 @@ class Problem:
 def prepare(
     circuit: Circuit,
     *,
-    t_stop: float | None,
-    t_eval: FloatArray | None,
-    charge_law: str | None,
-    area: str | float,
-    start: str | Solution,
+    t_stop: float | None = None,
+    t_eval: FloatArray | None = None,
+    charge_law: str | None = None,
+    area: str | float = "coupled",
+    start: str | Solution = "deck",
     charge: bool = True,
     rtol: float = 0.0,
 ) -> Problem:
@@ -130,11 +130,6 @@ def prepare(
 
     `rtol` decides whether a dispersive skin's data may be taken at one frequency. A run from the periodic state is
     prepared from the uncharged start.
-
-    Raises
-    ------
-    InputError
-        For anything in the request that cannot be run.
     """
     t_stop = None if t_stop is None else real_number("t_stop", t_stop, "a number in s")
     if isinstance(start, Solution) and start.stored is not None:
@@ -231,13 +226,7 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
 
 
 def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[FloatArray, BoolArray]:
-    """Output times (s) and whether each is left-hand: the given times, all right-hand, or the deck's.
-
-    Raises
-    ------
-    InputError
-        For a run that is too long or has too many outputs.
-    """
+    """Output times (s) and whether each is left-hand: the given times, all right-hand, or the deck's."""
     check_length(problem.waveform, problem.t_start, problem.t_stop)
     if t_eval is not None:
         return t_eval, np.zeros(t_eval.size, bool)

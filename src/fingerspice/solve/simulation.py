@@ -139,14 +139,8 @@ def simulate(
     return solution
 
 
-def asked(circuit: Circuit, *, t_eval: FloatArray | None, rtol: float, **how: Any) -> Problem:
-    """The problem that a call of `simulate` asks for, with arguments as `check_arguments` leaves them.
-
-    Raises
-    ------
-    InputError
-        For a request that cannot be run.
-    """
+def asked(circuit: Circuit, *, rtol: float, t_eval: FloatArray | None = None, **how: Any) -> Problem:
+    """The problem that a call of `simulate` asks for, with arguments as `check_arguments` leaves them."""
     problem = prepare(circuit, t_eval=t_eval, rtol=rtol, **how)
     if problem.start == "periodic":
         problem, _ = close_period(problem, 0.5 * rtol)
@@ -172,13 +166,7 @@ def check_arguments(
     start: str | Solution = "deck",
     jumps: str = "both",
 ) -> float:
-    """`rtol` as a number; arguments of `simulate` that no circuit can run with are refused.
-
-    Raises
-    ------
-    InputError
-        For the first of them.
-    """
+    """`rtol` as a number; arguments of `simulate` that no circuit can run with are refused."""
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
     require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
     library, _, name = method.partition(":")
@@ -215,9 +203,7 @@ def plan(
     t_stop = real_number("t_stop", t_stop, "a number in s") if t_stop is not None else None if circuit.tran else 1.0
     for text in circuit_warnings(circuit, t_stop):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    problem = prepare(
-        circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start="deck", charge=charge, rtol=rtol
-    )  # fmt: skip
+    problem = prepare(circuit, t_stop=t_stop, charge_law=charge_law, area=area, charge=charge, rtol=rtol)
     return make_plan(problem, rtol, tier)
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.engine.network import Sources, at_sources
+from fingerspice.engine.network import Segment, Sources, at_sources
 from fingerspice.solve.problem import Problem, check_length
 from fingerspice.solve.scenes import kept_with
 from fingerspice.waveforms.refining import WIDEST
@@ -133,11 +133,6 @@ def ramp(before: FloatArray, after: FloatArray, t: float = 0.0) -> Sources:
     return Sources(2 * np.arange(before.size + 1, dtype=np.int64), edges, terms, np.zeros((before.size, 0)))
 
 
-def held(t: float, values: FloatArray) -> Sources:
-    """Sources that are constant at these values (V or A) from time t (s) on."""
-    return ramp(values, values, t)
-
-
 def values_at(sources: Sources, t: float) -> FloatArray:
     """Right-hand values of the sources at t (s)."""
     out, slope = np.empty((2, sources.first.size - 1))
@@ -164,3 +159,10 @@ def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) ->
         min(max(int(np.searchsorted(sources.edges[a:b], t, side=side)) - 1, 0), b - a - 2)
         for a, b in itertools.pairwise(sources.first)
     ])  # fmt: skip
+
+
+def segment_of(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:
+    """The segment of a single source that contains time t (s), and the time since the segment's start, s."""
+    (i,) = segment_index(sources, t, side).tolist()
+    start = float(sources.edges[i])
+    return Segment(start, float(sources.edges[i + 1]) - start, sources.terms[i], sources.series[i]), t - start

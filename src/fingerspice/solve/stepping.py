@@ -137,17 +137,13 @@ class Stepping(Integration):
         """Round-off of the voltage of every area's gap and, last, of the nodes, V."""
 
     @property
-    @abstractmethod
     def margin(self) -> float:
         """Smallest distance to a fold so far."""
+        return float(self.control["margin"])
 
     @abstractmethod
     def _failed(self, code: int, sources: Sources) -> Status:
         """Status of a run whose loop ended with a code other than DONE."""
-
-    def _add_reference(self) -> None:
-        """Make the reference areas that the loop has asked for."""
-        raise NotImplementedError
 
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `loopstate`."""
@@ -155,9 +151,7 @@ class Stepping(Integration):
             code = int(loop.march_on(self.circuit(sources), self.pace, self.loop_state(), looks, t_end))
             if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
                 self.recorder.drain(self.counters)
-            if code == loopstate.REFERENCE:
-                self._add_reference()
-            elif code != loopstate.PAUSED:
+            if code != loopstate.PAUSED:
                 return code
 
     def stated_peaks(self) -> FloatArray:
@@ -271,5 +265,5 @@ class Stepping(Integration):
 
 def _record(shown: Scene, t: FloatArray, left: BoolArray, columns: FloatArray) -> Record:
     """A record without charge from recorded states, shape (size, n_t), which of a stack are counted along the loop."""
-    turned = shown.turn[:, None] * columns if shown.stack is not None and shown.is_turned else columns
+    turned = columns if shown.stack is None else shown.turn[:, None] * columns
     return Record(shown.network, shown.net, t, left, turned.T, False)
