@@ -75,3 +75,12 @@ def table1(source: str = "SIN(0 200 100)", f: float = 100.0, **changes: Any) -> 
 def deck(*lines: str) -> fs.Circuit:
     """A circuit from element lines."""
     return fs.parse_netlist("\n".join(("a deck", *lines, "")))
+
+
+def finger(p: str, n: str, area: str = "area", name: str = "", f: float = 5000.0, **gap: object) -> list[str]:
+    """Table 1's three layers between two nodes."""
+    return [
+        f"Xcoat{name} {p} top{name} {area} LAYER {assignments(COAT)}",
+        f"Xgap{name} top{name} skin{name} {area} GAP {assignments(GAP | gap)}",
+        f"Xskin{name} skin{name} {n} {area} SKIN d=350u f={f!r}",
+    ]

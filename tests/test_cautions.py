@@ -17,8 +17,7 @@ import fingerspice as fs
 from fingerspice.circuit.notices import course_warnings
 from fingerspice.circuit.spectrum import energy_outside, skin_error
 from fingerspice.waveforms.waveform import as_waveform
-from scenes import deck, table1, table1_deck
-from test_networks import finger
+from scenes import deck, finger, table1, table1_deck
 from waveform_cases import CASES
 
 every_kind = pytest.mark.parametrize("beside", ["", "Rbeside drive 0 1meg"], ids=["stack", "network"])

@@ -263,17 +263,18 @@ def test_scipys_methods_in_threads_leave_the_warning_filters_as_they_were(monkey
 def test_nothing_is_left_in_shared_arrays_from_one_call_to_the_next(
     right: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from fingerspice.solve.one_area import Track
+    from fingerspice.solve.one_area import SCRATCH, Track
 
     march, calls = Track.march, []
 
     def spoilt(self: Track, *arguments: Any) -> int:
         calls.append(1)
-        for array in self.prepared.work:
+        tables, work = SCRATCH.of(self.system)
+        for array in work:
             array[:] = np.nan
         # Tables of steps may be thrown out at any time.
-        self.prepared.tables.h[:] = 0.0
-        self.prepared.tables.level[:] = -1
+        tables.h[:] = 0.0
+        tables.level[:] = -1
         return march(self, *arguments)
 
     monkeypatch.setattr(Track, "march", spoilt)

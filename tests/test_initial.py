@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 import analytic
 import fingerspice as fs
 from ngspice_tools import CIRCUITS, run_ngspice
-from scenes import cases, deck, table1
+from scenes import cases, deck, finger, table1
 from start_reference import deck_of, random_network
-from test_networks import finger
 
 pytestmark = pytest.mark.filterwarnings("ignore:.* has no effect here")
 

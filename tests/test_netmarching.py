@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from scenes import deck
-from test_networks import LAWS, finger, floating
+from scenes import deck, finger
+from test_networks import LAWS, floating
 
 SQUARE = "PULSE(120 -120 1m 0 0 1m 2m)"
 CIRCUITS = {

@@ -14,21 +14,12 @@ import fingerspice as fs
 from commands import run_here
 from fingerspice.studies.design.folds import fold_voltage
 from network_reference import Floating
-from scenes import COAT, GAP, assignments, deck, table1
+from scenes import deck, finger, table1
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 WAVES = (fs.Sine(200.0, 5000.0), fs.Square(200.0, 5000.0), fs.Square(150.0, 5000.0, duty=0.3))
 SHIPPED = ("amplifier", "ungrounded_user", "two_fingers")
 every_law = pytest.mark.parametrize("law", ["local", "mobile"])
-
-
-def finger(p: str, n: str, name: str = "", f: float = 5000.0, **gap: object) -> list[str]:
-    """Table 1's three layers between two nodes."""
-    return [
-        f"Xcoat{name} {p} top{name} area{name} LAYER {assignments(COAT)}",
-        f"Xgap{name} top{name} skin{name} area{name} GAP {assignments(GAP | gap)}",
-        f"Xskin{name} skin{name} {n} area{name} SKIN d=350u f={f!r}",
-    ]
 
 
 def floating(source: str, tau: float = 0.0) -> fs.Circuit:
@@ -343,8 +334,11 @@ def test_a_source_that_is_no_number_within_its_period_is_named(guilty: str) -> N
     assert caught.value.failure.element == guilty
 
 
-@pytest.mark.parametrize("area", ["coupled", "frozen"])
-def test_a_rough_function_counts_in_both_errors_and_in_what_is_asked(area: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "area", "off"),
+    [("amplifier", "coupled", 1e-10), ("amplifier", "frozen", 1e-10), ("two_fingers", "coupled", 2e-10)],
+)
+def test_a_rough_function_counts_in_both_errors_and_in_what_is_asked(name: str, area: str, off: float) -> None:
     rng, table = np.random.default_rng(3), {}
 
     def rough(t: float) -> float:
@@ -352,14 +346,15 @@ def test_a_rough_function_counts_in_both_errors_and_in_what_is_asked(area: str) 
         return 200.0 * math.sin(3e3 * t) * (1.0 + 1e-11 * table.setdefault(t, rng.uniform(-1.0, 1.0)))
 
     given = {"sources": rough, "t_stop": 4e-4, "area": area}
-    met = fs.simulate(shipped("amplifier"), rtol=1e-8, **given)
-    tight = fs.simulate(shipped("amplifier"), rtol=1e-13, throw=False, **given)
+    met = fs.simulate(shipped(name), rtol=1e-8, **given)
+    tight = fs.simulate(shipped(name), rtol=1e-13, throw=False, **given)
     assert met.success
     assert tight.status is fs.Status.ERROR_NOT_MET
     assert "the source function itself is rough by" in tight.message
-    assert tight.error.u_gap >= 1e-10
-    # What moves the voltage by a part moves the force by twice that.
-    assert tight.error.f_el >= 2.0 * 1e-10 / np.abs(tight.u_gap).max() * tight.f_el.max()
+    assert tight.error.u_gap >= off
+    # What moves the voltage by a part moves the force of every finger by twice that.
+    peak, force = np.abs(tight.u_gap).max(axis=0), tight.f_el.max(axis=0)
+    assert tight.error.f_el >= np.max(2.0 * off / peak * force)
 
 
 # The command line, and folds --------------------------------------------------------------------------------

@@ -13,19 +13,10 @@ from hypothesis import strategies as st
 import analytic
 import fingerspice as fs
 from network_reference import Floating, Nodal, Tone
-from scenes import COAT, GAP, assignments, deck
+from scenes import COAT, GAP, assignments, deck, finger
 
 CIRCUITS = Path(__file__).resolve().parent.parent / "circuits"
 LAWS = ("local", "mobile")
-
-
-def finger(p: str, n: str, area: str = "area", name: str = "", f: float = 5000.0, **gap: object) -> list[str]:
-    """Table 1's three layers between two nodes."""
-    return [
-        f"Xcoat{name} {p} top{name} {area} LAYER {assignments(COAT)}",
-        f"Xgap{name} top{name} skin{name} {area} GAP {assignments(GAP | gap)}",
-        f"Xskin{name} skin{name} {n} {area} SKIN d=350u f={f!r}",
-    ]
 
 
 def floating(

@@ -267,6 +267,7 @@ def test_a_heavier_model_may_always_be_asked_for(tier: str) -> None:
         (table1(), "linear", {}, r"the charge \(charge=False leaves it out\) needs the one that follows"),
         (table1(), "linear", {"charge": False, "charge_law": "mobile"}, "the mobile law needs the one that follows"),
         (dry(), "linear", {"charge_law": "mobile"}, "the mobile law"),
+        (table1(extra="Rbeside drive 0 1meg"), "linear", {}, "not for this network; allowed: auto or coupled"),
     ],
 )
 def test_a_lighter_model_that_cannot_describe_the_circuit_is_refused(circuit, tier, options, message) -> None:

@@ -75,22 +75,3 @@ def test_a_finger_beyond_rounding_is_named_as_what_cannot_be_met():
     assert solution.status is fs.Status.ERROR_NOT_MET
     assert solution.failure.element == "Xlight.Xgap"
     assert "takes almost nothing of the" in solution.message
-
-
-def test_a_rough_function_counts_in_the_force_and_in_what_is_asked():
-    circuit = fs.read_netlist("circuits/two_fingers.cir")
-    rng = np.random.default_rng(3)
-    table = {}
-
-    def rough(t):
-        # Its own rounding: a part in 1e11, anew at every time.
-        return 200.0 * np.sin(3e3 * t) * (1.0 + 1e-11 * table.setdefault(float(t), rng.uniform(-1.0, 1.0)))
-
-    met = fs.simulate(circuit, sources={"Vdrive": rough}, t_stop=1e-3, rtol=1e-8)
-    tight = fs.simulate(circuit, sources={"Vdrive": rough}, t_stop=1e-3, rtol=1e-13, throw=False)
-    assert met.success
-    assert tight.status is fs.Status.ERROR_NOT_MET
-    # What is rough in the source stays, and moves the force twice as much.
-    peak, force = np.abs(tight.u_gap).max(axis=0), tight.f_el.max(axis=0)
-    assert tight.error.u_gap > 1e-11 * 200.0 * 0.1
-    assert tight.error.f_el >= np.max(2.0 * 0.1 * 1e-11 * 200.0 / peak * force)

@@ -154,7 +154,7 @@ def one_step(stages: int, law: str, h: float) -> np.ndarray:
     circuit = table1(f=F).replace({"Vdrive": fs.Sine(U0, F, phase_deg=PHASE)})
     problem = prepare(circuit, t_stop=0.25 / F, t_eval=None, charge_law=law, area="coupled", start="uncharged")
     scheme = radau_scheme(stages)
-    one = Collocation(problem, scheme, 1e-14, U0, np.empty(0), np.empty(0, bool))
+    one = Collocation(problem, scheme, 1e-14, U0)
     (tables,) = Tables(problem, 1e-14)
     sources = joined(tables)
     assert one.jump(values_at(sources, 0.0))

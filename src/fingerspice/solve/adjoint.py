@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,14 +25,14 @@ from fingerspice.results.sensitivity import MEANS, SIGNALS, SampleGradient
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block
-from fingerspice.solve.recordings.form import PIECES, LaneForm
+from fingerspice.solve.recordings.form import PIECES
 from fingerspice.solve.recordings.march import LEAST_MARGIN
 from fingerspice.solve.recordings.pieces import driving
 from fingerspice.solve.recordings.run import ready
 from fingerspice.solve.simulation import asked
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.samples import Samples, as_samples
-from fingerspice.waveforms.waveform import DC
+from fingerspice.waveforms.waveform import DC, Waveform
 
 # Steps of an interval: of the first two numbers, or below this `rtol` of the second and third, and twice as many while
 # these differ; and the error wanted, relative to the largest derivative, over `rtol`.
@@ -46,17 +45,8 @@ _AT_ONCE = 1 << 13
 _CLOSED, _SHARE = 1e-14, 1e-2
 
 
-class _Weights(NamedTuple):
-    """The scalar's derivatives by u_gap, force and area at the outputs, shape (n_t,), and by the latter's means."""
-
-    u_gap: FloatArray
-    f_el: FloatArray
-    area: FloatArray
-    f_el_mean: float
-    area_mean: float
-
-
-def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> _Weights:
+def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
+    """The number's derivatives by u_gap, force and area at the outputs, shape (n_t,), and by the latter's means."""
     allowed = ", ".join((*SIGNALS, *MEANS))
     if not of:
         raise InputError(f"no signal is given; allowed: {allowed}")
@@ -75,32 +65,9 @@ def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> _Weights:
         by[name] = value
     ((_, contact),) = run.record.fingers
     # F_t = mu (F_N + F_el), and the friction coefficient is F_t / F_N.
-    force, mean = (
-        by[f"f_el{kind}"] + contact.mu * (by[f"f_t{kind}"] + by[f"friction{kind}"] / contact.f_n)
-        for kind in ("", "_mean")
-    )
-    return _Weights(by["u_gap"], force, by["area"], float(mean), float(by["area_mean"]))
-
-
-@dataclass(frozen=True)
-class _Run:
-    """A run between the samples of its source."""
-
-    problem: Problem
-    form: LaneForm
-    name: str  # Of the source
-    sign: float  # Of the source along the loop
-    wave: Samples  # Its own
-    t: FloatArray  # (n + 1,): Start and end of the run, samples between, and the start of the means, s
-    start: FloatArray  # (m,): Modes at the start
-    # (m,): Their derivatives by the source there
-    moved: FloatArray
-
-    @property
-    def turn(self) -> float:
-        """Sign of the gap voltage along the loop."""
-        stack = self.problem.scene.stack
-        return 1.0 if stack is None or stack.gap is None else float(stack.sign[stack.gap])
+    for kind in ("", "_mean"):
+        by[f"f_el{kind}"] = by[f"f_el{kind}"] + contact.mu * (by[f"f_t{kind}"] + by[f"friction{kind}"] / contact.f_n)
+    return by
 
 
 def _source_of(problem: Problem) -> tuple[str, float, Samples]:
@@ -123,64 +90,48 @@ def _source_of(problem: Problem) -> tuple[str, float, Samples]:
     return known[0]
 
 
-def _run_of(run: Solution) -> _Run:
-    def problem_of(by: float) -> Problem:
-        circuit = run.circuit if by == 0.0 else run.circuit.varied({name: Sum((wave, DC(sign * by)))})
-        return asked(
-            circuit, t_stop=run.t_stop, t_eval=None, charge_law=run.charge_law, area=run.area_mode, start=run.start,
-            charge=False, rtol=run.rtol,
-        )  # fmt: skip
-
-    problem = problem_of(0.0)
-    name, sign, wave = _source_of(problem)
-    form = ready(problem, max(_SHARE * run.rtol, 1e-13)) or ready(problem, run.rtol)
-    if form is None:
-        raise InputError(
-            "derivatives by samples are asked for, and this circuit is not followed sample by sample "
-            "(docs/recordings.md); allowed: a circuit that is"
-        )
-    t0, t1 = problem.t_start, problem.t_stop
-    first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
-    t, slack = wave.start + np.arange(first, last + 1) / wave.rate, 1e-6 / wave.rate
-    t = np.concatenate([[t0], t[(t > t0 + slack) & (t < t1 - slack)], [t1]])
-    if np.abs(t - run.first).min() > slack:
-        t = np.insert(t, np.searchsorted(t, run.first), run.first)
-    start, moved = form.start(problem)[0][: form.lanes.rates.size], np.zeros(form.lanes.rates.size)
-    if problem.initial.s_before.any():
-        step = STEP * problem.scene.u_peak
-        moved = derivative([form.start(problem_of(at * step))[0][: moved.size] for at in AT], step)
-    return _Run(problem, form, name, sign, wave, t, start, moved)
-
-
-def _by_gap(weights: _Weights, run: Solution, one: _Run) -> FloatArray:
-    """Derivatives of the number by the gap voltage at the outputs, along the loop."""
-    ((_, contact),) = run.record.fingers
-    assert run.u_gap is not None
-    u = one.turn * run.u_gap
-    q, dq = inverse_areas_with_slopes(u, contact.curve(one.problem.scene.u_top))
-    dq = dq * np.sign(u)
-    by_u = one.turn * weights.u_gap - weights.area * dq / q**2
-    return np.asarray(by_u + weights.f_el * contact.stress(1.0) * u * (2.0 - u * dq / q) / q)
-
-
 class _Intervals:
-    """The intervals of a run between its times, with the modes at all of these."""
+    """The intervals of a run between the samples of its source."""
 
-    def __init__(self, one: _Run, rtol: float) -> None:
-        self.form, self.rtol, self.first, h = one.form, rtol, 0 if rtol >= _COARSE else 1, np.diff(one.t)
+    def __init__(self, run: Solution) -> None:
+        self.run, self.problem = run, _problem(run, {})
+        problem, rtol = self.problem, run.rtol
+        # Of the source: its name, its sign along the loop, and its samples.
+        self.name, self.sign, wave = _source_of(problem)
+        form = ready(problem, max(_SHARE * rtol, 1e-13)) or ready(problem, rtol)
+        if form is None:
+            raise InputError(
+                "derivatives by samples are asked for, and this circuit is not followed sample by sample "
+                "(docs/recordings.md); allowed: a circuit that is"
+            )
+        self.wave, self.form, self.first, self.m = wave, form, 0 if rtol >= _COARSE else 1, form.lanes.rates.size
+        t0, t1 = problem.t_start, problem.t_stop
+        first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
+        t, slack = wave.start + np.arange(first, last + 1) / wave.rate, 1e-6 / wave.rate
+        t = np.concatenate([[t0], t[(t > t0 + slack) & (t < t1 - slack)], [t1]])
+        # (n + 1,): Start and end of the run, samples between, and the start of the means, s
+        self.t = t if np.abs(t - run.first).min() <= slack else np.insert(t, np.searchsorted(t, run.first), run.first)
+        # (n + 1,): The source at these times
+        self.x, h = np.ascontiguousarray(problem.waveform.value(self.t)), np.diff(self.t)
         # Lengths of the intervals (n,), or their common one (1,), s
         self.h = h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
-        self.x, self.m = np.ascontiguousarray(one.problem.waveform.value(one.t)), one.form.lanes.rates.size
-        block, form, n = Block(one.form, self.x, self.h, True), one.form, one.t.size - 1
+        # Sign of the gap voltage along the loop.
+        stack = problem.scene.stack
+        self.turn = 1.0 if stack is None or stack.gap is None else float(stack.sign[stack.gap])
+
+    def follow(self) -> None:
+        """Find the modes at the starts of all intervals (m, n), and the distances of their differences (m + 1,)."""
+        form, n = self.form, self.t.size - 1
+        block, start = Block(form, self.x, self.h, True), form.start(self.problem)[0][: self.m]
         peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
         solved = (
-            block.solve(one.start, _STEPS[self.first + 2], _CLOSED * peak)
+            block.solve(start, _STEPS[self.first + 2], _CLOSED * peak)
             and block.on_one_branch
             and block.margin > LEAST_MARGIN
         )
         if not solved or float(np.abs(form.gap(block.xi)).max()) > form.u_top:
             cause = "the run is not followed sample by sample, for its derivatives by samples"
-            at = float(one.t[0])
+            at = float(self.t[0])
             raise SolveError(Failure(Status.STEP_UNDERFLOW, cause, "a higher sample rate takes shorter steps", at))
         self.z = block.kept[: self.m, :, :-1].reshape(self.m, -1)[:, :n]
         sizes = np.append(np.abs(self.z).max(axis=1), np.abs(self.x).max())
@@ -203,69 +154,89 @@ class _Intervals:
         """
         if not length.any():
             return 2 * [self._slopes(at, to, length, 1)]
-        m, many, first = self.m, length.size > 1, self.first
-        coarse, fine = (self._slopes(at, to, length, parts) for parts in _STEPS[first : first + 2])
+        m, many, allowed = self.m, length.size > 1, _ALLOWED * self.run.rtol
+        two, *finer = _STEPS[self.first : self.first + 2], *_STEPS[self.first + 2 :]
+        coarse, fine = (self._slopes(at, to, length, parts) for parts in two)
         # By the modes for what moves them, and by the source relative to the largest one.
         moved = self.delta[:m, None] * np.abs(fine[:, :m])
         scale = np.abs(fine[:, m:]).max(axis=(1, 2))[:, None] + np.zeros(m + 2)
         scale[:, :m] = moved.max(axis=(1, 2))[:, None] / self.delta[:m]
-        wanted = rows[:, None, None] & (np.abs(fine - coarse) > _ALLOWED * self.rtol * scale[..., None])
-        for parts in _STEPS[first + 2 :]:
+        wanted = rows[:, None, None] & (np.abs(fine - coarse) > allowed * scale[..., None])
+        for parts in finer:
             (still,) = np.nonzero(wanted.any(axis=(0, 1)))
             if not still.size:
                 break
             coarse[..., still] = fine[..., still]
             fine[..., still] = self._slopes(at[still], to[still], length[still] if many else length, parts)
-            off = np.abs(fine[..., still] - coarse[..., still]) > _ALLOWED * self.rtol * scale[..., None]
+            off = np.abs(fine[..., still] - coarse[..., still]) > allowed * scale[..., None]
             wanted[..., still] = rows[:, None, None] & off
         # Steps are of third order where the source is a line and the gap voltage has no zero.
         return [fine, fine + (fine - coarse) / 7.0]
 
+    def outputs(self, by: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of a number by modes (2, m, n) and source (2, n + 1) at all times, by the outputs after each."""
+        n, m, t, x, run = self.x.size - 1, self.m, self.t, self.x, self.run
+        ((_, contact),) = run.record.fingers
+        assert run.u_gap is not None
+        # By the gap voltage along the loop.
+        u = self.turn * run.u_gap
+        q, dq = inverse_areas_with_slopes(u, contact.curve(self.problem.scene.u_top))
+        dq = dq * np.sign(u)
+        by_u = self.turn * by["u_gap"] - by["area"] * dq / q**2
+        by_u = by_u + by["f_el"] * contact.stress(1.0) * u * (2.0 - u * dq / q) / q
+        of_modes, of_source = np.zeros((2, m, n)), np.zeros((2, n + 1))
+        place = np.clip(np.searchsorted(t, run.t, "right") - 1, 0, n - 1)
+        share = (run.t - t[place]) / (t[place + 1] - t[place])
+        on = share < 1e-9
+        for which, between in ((on, False), (~on, True)):
+            for some in _parts_of(np.flatnonzero(which & (by_u != 0.0))):
+                at, part = place[some], share[some] if between else np.zeros(some.size)
+                to = x[at] + part * (x[at + 1] - x[at])
+                length = part * np.diff(t)[at] if between else np.zeros(1)
+                for row, found in enumerate(self.slopes(at, to, length, np.arange(m + MORE) == m + GAP)):
+                    of_gap = by_u[some] * found[m + GAP]
+                    for k in range(m):
+                        np.add.at(of_modes[row, k], at, of_gap[k])
+                    np.add.at(of_source[row], at, of_gap[m] + (1.0 - part) * of_gap[m + 1])
+                    np.add.at(of_source[row], at + 1, part * of_gap[m + 1])
+        return of_modes, of_source
 
-def _outputs(by: _Intervals, one: _Run, run: Solution, weights: _Weights) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of the number by modes (2, m, n) and source (2, n + 1) at all times, by the outputs after each."""
-    n, m, t, x, by_u = by.x.size - 1, by.m, one.t, by.x, _by_gap(weights, run, one)
-    of_modes, of_source = np.zeros((2, m, n)), np.zeros((2, n + 1))
-    place = np.clip(np.searchsorted(t, run.t, "right") - 1, 0, n - 1)
-    share = (run.t - t[place]) / (t[place + 1] - t[place])
-    on = share < 1e-9
-    for which, between in ((on, False), (~on, True)):
-        for some in _parts_of(np.flatnonzero(which & (by_u != 0.0))):
-            at, part = place[some], share[some] if between else np.zeros(some.size)
-            to = x[at] + part * (x[at + 1] - x[at])
-            length = part * np.diff(t)[at] if between else np.zeros(1)
-            for row, found in enumerate(by.slopes(at, to, length, np.arange(m + MORE) == m + GAP)):
-                of_gap = by_u[some] * found[m + GAP]
-                for k in range(m):
-                    np.add.at(of_modes[row, k], at, of_gap[k])
-                np.add.at(of_source[row], at, of_gap[m] + (1.0 - part) * of_gap[m + 1])
-                np.add.at(of_source[row], at + 1, part * of_gap[m + 1])
-    return of_modes, of_source
+    def swept(self, by: Mapping[str, Any]) -> FloatArray:
+        """Derivatives of a number by the samples, with half the steps and with all, shape (2, n_sample)."""
+        self.follow()
+        t, m, wave, ((_, contact),) = self.t, self.m, self.wave, self.run.record.fingers
+        of_modes, of_source = self.outputs(by)
+        n, after, means = t.size - 1, np.zeros((2, m)), np.zeros((MORE, t.size - 1))
+        means[SQUARES], means[AREAS] = by["f_el_mean"] * contact.stress(1.0), by["area_mean"]
+        means *= (t[:-1] >= self.run.first - 1e-9 * (t[-1] - t[0])) / (t[-1] - self.run.first)
+        rows = np.append(np.ones(m, bool), means.any(axis=1))
+        for at in reversed(_parts_of(np.arange(n))):
+            a, b = at[0], at[-1] + 1
+            length = self.h[a:b] if self.h.size > 1 else self.h
+            for row, found in enumerate(self.slopes(at, self.x[at + 1], length, rows)):
+                own = np.ascontiguousarray(means[:, a:b]), np.ascontiguousarray(of_modes[row, :, a:b])
+                sum_back(found, *own, of_source[row, a : b + 1], after[row])
+        if self.problem.initial.s_before.any():
+            # The modes at the start follow the source there.
+            step = STEP * self.problem.scene.u_peak
+            moved = [Sum((wave, DC(self.sign * at * step))) for at in AT]
+            starts = [self.form.start(_problem(self.run, {self.name: one})) for one in moved]
+            of_source[:, 0] += after @ derivative([start[:m] for start, _ in starts], step)
+        # Samples before the times, and how far these are beyond, in samples.
+        out, place = np.zeros((2, wave.count)), np.clip((t - wave.start) * wave.rate, 0.0, wave.count - 1.0)
+        first = np.minimum(np.floor(place + 1e-6), wave.count - 2.0).astype(np.int64)
+        beyond = np.maximum(place - first, 0.0)
+        for row in range(2):
+            np.add.at(out[row], first, (1.0 - beyond) * of_source[row])
+            np.add.at(out[row], np.minimum(first + 1, wave.count - 1), beyond * of_source[row])
+        return out
 
 
-def _swept(one: _Run, run: Solution, weights: _Weights) -> FloatArray:
-    """Derivatives by the samples, with half the steps and with all, shape (2, n_sample)."""
-    by, t, ((_, contact),) = _Intervals(one, run.rtol), one.t, run.record.fingers
-    of_modes, of_source = _outputs(by, one, run, weights)
-    n, after, means = t.size - 1, np.zeros((2, by.m)), np.zeros((MORE, t.size - 1))
-    means[SQUARES], means[AREAS] = weights.f_el_mean * contact.stress(1.0), weights.area_mean
-    means *= (t[:-1] >= run.first - 1e-9 * (t[-1] - t[0])) / (t[-1] - run.first)
-    rows = np.append(np.ones(by.m, bool), means.any(axis=1))
-    for at in reversed(_parts_of(np.arange(n))):
-        a, b = at[0], at[-1] + 1
-        length = by.h[a:b] if by.h.size > 1 else by.h
-        for row, found in enumerate(by.slopes(at, by.x[at + 1], length, rows)):
-            own = np.ascontiguousarray(means[:, a:b]), np.ascontiguousarray(of_modes[row, :, a:b])
-            sum_back(found, *own, of_source[row, a : b + 1], after[row])
-    of_source[:, 0] += after @ one.moved
-    # Samples before the times, and how far these are beyond, in samples.
-    out, place = np.zeros((2, one.wave.count)), np.clip((t - one.wave.start) * one.wave.rate, 0.0, one.wave.count - 1.0)
-    first = np.minimum(np.floor(place + 1e-6), one.wave.count - 2.0).astype(np.int64)
-    beyond = np.maximum(place - first, 0.0)
-    for row in range(2):
-        np.add.at(out[row], first, (1.0 - beyond) * of_source[row])
-        np.add.at(out[row], np.minimum(first + 1, one.wave.count - 1), beyond * of_source[row])
-    return out
+def _problem(run: Solution, sources: dict[str, Waveform]) -> Problem:
+    """The problem of a run, with these sources in place of its own."""
+    circuit = run.circuit.varied(sources) if sources else run.circuit
+    how: dict[str, Any] = {"t_stop": run.t_stop, "charge_law": run.charge_law, "area": run.area_mode}
+    return asked(circuit, start=run.start, charge=False, rtol=run.rtol, **how)
 
 
 def _parts_of(numbers: IntArray) -> list[IntArray]:
@@ -282,8 +253,8 @@ def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradien
         )
     if run.failure is not None:
         raise InputError("derivatives by samples are asked for, and the run failed; allowed: a run to its end")
-    one, weights = _run_of(run), _weights(run, of)
-    coarse, fine = _swept(one, run, weights)
+    one = _Intervals(run)
+    coarse, fine = one.swept(_weights(run, of))
     largest = float(np.abs(fine).max())
     error = float(np.abs(fine - coarse).max()) + run.rtol * largest
     if error > _ALLOWED * run.rtol * largest:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.network import Modes
 from fingerspice.engine.network import at_sources
 from fingerspice.engine.one_area.model import follow, source_at
@@ -31,9 +31,7 @@ ROUNDING, ROUNDING_OF_MATRICES = 1e-13, 1e-12
 MOST_MODES = 8
 
 
-def solve_linear(
-    problem: Problem, t_out: FloatArray, left: BoolArray, area: FloatArray | None = None, bound: float = 0.0
-) -> Run:
+def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float = 0.0) -> Run:
     """Outputs of a circuit with its areas fixed: the modes' responses to the single sources, superposed.
 
     Areas (n_area,) in m^2 are the scene's by default, and a problem may ask for charge only if the circuit fixes them.
@@ -45,21 +43,21 @@ def solve_linear(
     modes: Modes = kept_with(scene.prepared, key, MOST_MODES, lambda: scene.modes_at(area))
     n = modes.rates.size
     v0 = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before)
-    tables = Tables(problem, 1e-13, no_chirps=True, t_out=t_out)
+    tables = Tables(problem, 1e-13, no_chirps=True)
     z_end = start.y[n:]
-    if _is_sample_by_sample(problem, t_out):
+    if _is_sample_by_sample(problem):
         rows, last = _at_samples(problem, modes, v0)
-        t, side, end = t_out, left, problem.t_stop
+        end = problem.t_stop
     else:
-        answer, last, end = _answer(problem, tables, modes, v0, t_out, left)
-        t, side, rows = t_out[: len(answer.v)], left[: len(answer.v)], answer.x(modes)
+        answer, last, end = _answer(problem, tables, modes, v0)
+        rows = answer.x(modes)
         if problem.charge:
             flow = partial(_charge, problem, area, modes, v0)
-            rows = np.hstack([rows, *flow(t, answer)])
+            rows = np.hstack([rows, *flow(problem.t_out[: len(rows)], answer)])
             z_end = flow(np.array([end]), last)[0][0]
     y = np.concatenate([last.x(modes)[0], z_end])
     state = State(end, y, last.s[0], np.zeros(area.size), scene.charge_law)
-    return _finished(problem, tables, t, side, rows, state, bound, partial(solve_linear, area=area))
+    return _finished(problem, tables, rows, state, bound, partial(solve_linear, area=area))
 
 
 class _Answer(NamedTuple):
@@ -79,12 +77,13 @@ class _Answer(NamedTuple):
 
 
 def _answer(
-    problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray, t_out: FloatArray, left: BoolArray
-) -> tuple[_Answer, _Answer, float]:
+    problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray
+) -> tuple[_Answer, _Answer, float]:  # fmt: skip
     """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s.
 
     Without modes it is that of the sources alone, and not their integrals.
     """
+    t_out, left = problem.t_out, problem.left
     n, n_s, size = v0.size, len(problem.waveforms), t_out.size
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
     v, s, integral, slope = (np.zeros((size + 1, k)) for k in (n, n_s, n_s, n_s))
@@ -95,7 +94,8 @@ def _answer(
             break
         sources, end = joined(window), min(float(table.edges[-1]) for table in window)
         # Evaluate at the window's end too: where one source's table ends there, the other tables continue past it.
-        at = np.append(np.arange(first, _upto(t_out, left, end)), size)
+        before, beyond = t_out.searchsorted(end), t_out.searchsorted(end, "right")
+        at = np.append(np.arange(first, before + np.count_nonzero(left[before:beyond])), size)
         t, side = np.append(t_out[at[:-1]], end), np.append(left[at[:-1]], True)
         v[size] = 0.0
         for j, table in enumerate(window):
@@ -118,17 +118,9 @@ def _answer(
     return out, last, end
 
 
-def _upto(t_out: FloatArray, left: BoolArray, end: float) -> int:
-    """Number of outputs up to the end of a window, including left-hand outputs at the end itself."""
-    last = int(np.searchsorted(t_out, end, side="left"))
-    while last < t_out.size and t_out[last] == end and left[last]:
-        last += 1
-    return last
-
-
-def _is_sample_by_sample(problem: Problem, t_out: FloatArray) -> bool:
+def _is_sample_by_sample(problem: Problem) -> bool:
     """Whether the outputs are a recorded source's own sample times from the first one on: then a recursion serves."""
-    wave = problem.waveform
+    wave, t_out = problem.waveform, problem.t_out
     if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.count:
         return False
     if wave.start != problem.t_start or t_out[-1] < problem.t_stop * (1.0 - 1e-12):
@@ -176,11 +168,11 @@ def _charge(
 
 
 def _finished(
-    problem: Problem, tables: Tables, t: FloatArray, left: BoolArray, rows: FloatArray, state: State, bound: float,
-    solve: Callable[..., Run],
-) -> Run:  # fmt: skip
+    problem: Problem, tables: Tables, rows: FloatArray, state: State, bound: float, again: Callable[[Problem], Run]
+) -> Run:
     """A run with its peaks and its stated errors: round-off, and `bound` relative to the peaks."""
     status = Status.SUCCESS if tables.not_finite is None else Status.SOURCE_NOT_FINITE
+    t, left = problem.t_out[: len(rows)], problem.left[: len(rows)]
     run = Run(t, left, rows, status, 0, {}, state, t_failed=tables.not_finite)
     run.unseen, run.rough = tables.unseen, tables.rough
     largest = max(problem.largest, problem.scene.u_size)
@@ -195,12 +187,8 @@ def _finished(
     run.node_error = rounding + bound * largest
     if not problem.scene.is_sampled:
         # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
-        run.continuous = closed_form(problem, partial(_look, dataclasses.replace(problem, charge=False), solve))
+        run.continuous = closed_form(replace(problem, charge=False), again)
     return run
-
-
-def _look(problem: Problem, solve: Callable[..., Run], t: FloatArray, left: BoolArray) -> Record:
-    return solve(problem, t, left).record(problem)
 
 
 def _peaks(record: Record) -> Iterator[tuple[float, float]]:
@@ -217,20 +205,20 @@ def _peaks(record: Record) -> Iterator[tuple[float, float]]:
         yield from ((float(np.abs(u).max(initial=0.0)), 0.0) for u, _ in gap_signals(record))
 
 
-def solve_algebraic(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run:
+def solve_algebraic(problem: Problem) -> Run:
     """Outputs of a stack without leakage: the layers share each change of the source's voltage in fixed ratios."""
     scene = problem.scene
-    model, start = model_of(scene), problem.inner
-    tables = Tables(problem, 1e-12, t_out=t_out)
-    answer, last, end = _answer(problem, tables, None, np.zeros(0), t_out, left)
-    done, rows, ended = len(answer.s), np.empty((len(answer.s), row_width(scene))), np.empty((1, row_width(scene)))
+    model, start, width = model_of(scene), problem.inner, row_width(scene)
+    tables = Tables(problem, 1e-12)
+    answer, last, end = _answer(problem, tables, None, np.zeros(0))
+    rows, ended = np.empty((len(answer.s), width)), np.empty((1, width))
     charge_error = follow(model, answer.s[:, 0], answer.slope[:, 0], start.y, start.u_before, rows)
     # The final state is the left-hand one: it does not include a jump at the end.
     follow(model, last.s[:, 0], np.zeros(1), start.y, start.u_before, ended)
     y = np.append(start.y[:-1], ended[0, -1])
     state = from_stack(scene, StackState(end, y, float(last.s[0, 0]), float(ended[0, 1]), start.offset))
     shown = from_written(scene, rows, start.offset, by_layer=False)
-    run = _finished(problem, tables, t_out[:done], left[:done], shown, state, 0.0, solve_algebraic)
+    run = _finished(problem, tables, shown, state, 0.0, solve_algebraic)
     if problem.charge:
         moved, held = rows[:, -1], rows[:, 0] / rows[:, 2] / model.s
         most = float(np.abs(moved).max(initial=0.0) + np.abs(held).max(initial=0.0))

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import OdeSolution, solve_ivp
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.network import Segment, source
 from fingerspice.engine.one_area.model import branch_area, dot, ramp, voltage_by_time, write_row_at
 from fingerspice.results.outcome import Failure, SolveError, Status, last_tried
@@ -24,7 +24,7 @@ from fingerspice.solve.initial import StackState, from_stack, from_written, mode
 from fingerspice.solve.marching import solve as solve_marching
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import PAST_FOLD, Run
-from fingerspice.solve.sources import Tables
+from fingerspice.solve.sources import Tables, joined, segment_of
 from fingerspice.waveforms.sampling import breakpoints_at
 
 FINEST_RTOL = 1e-12
@@ -46,22 +46,22 @@ class _LostError(Exception):
     """A path took too many evaluations, found no step small enough, or no longer fulfils the area equation."""
 
 
-def run_to_fold(problem: Problem, t_out: FloatArray, left: BoolArray) -> Run | None:
+def run_to_fold(problem: Problem) -> Run | None:
     """A run under the `mobile` law up to the fold that it reaches or jumps past; None where it reaches no fold."""
-    run = solve_marching(problem, FINEST_RTOL, t_out, left, repeat=False)
+    run = solve_marching(problem, FINEST_RTOL, repeat=False)
     run.gaps[:, 2:] *= SAFETY
     jumped = run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size > 0
     if not jumped and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
         # Where the gap voltage is as small as rounding, steps may cross a fold unseen: their end is not the fold.
         return None
     if run.status is Status.FOLD:
-        return lead_to_fold(problem, run, t_out, left)
+        return lead_to_fold(problem, run)
     return run if run.status is Status.SUCCESS else None
 
 
-def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray) -> Run | None:
+def lead_to_fold(problem: Problem, run: Run) -> Run | None:
     """Continue a run that stopped near a fold until it reaches the fold; None where it does not reach it."""
-    state = to_stack(problem.scene, run.state)
+    state, t_out = to_stack(problem.scene, run.state), problem.t_out
     reached, path = _ahead(problem, run, state, FINEST_RTOL)
     if path is None:
         return run if reached else None
@@ -72,7 +72,7 @@ def lead_to_fold(problem: Problem, run: Run, t_out: FloatArray, left: BoolArray)
     t = np.append(later[later < path.t], path.t)
     written = path.rows(problem, t)
     rows = from_written(problem.scene, written, state.offset, run.by_layer)[:, : run.rows.shape[1]]
-    run.t, run.left = np.append(run.t[:done], t), np.append(left[: done + t.size - 1], True)
+    run.t, run.left = np.append(run.t[:done], t), np.append(problem.left[: done + t.size - 1], True)
     run.rows = np.vstack([run.rows[:done], rows])
     run.t_failed, run.margin = path.t, 0.0
     for _, contact in run.record(problem).fingers:
@@ -90,13 +90,9 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
 
     A run that stops near a fold and does not reach it counts as a run without a fold: its later course is not examined.
 
-    Raises
-    ------
-    SolveError
-        Where the run fails for another reason than a fold.
+    A run that fails for another reason than a fold is a `SolveError`.
     """
-    nothing = np.empty(0)
-    run = solve_marching(problem, rtol, nothing, nothing.astype(bool))
+    run = solve_marching(problem, rtol)
     if run.status is Status.SUCCESS:
         return False
     if run.status is not Status.FOLD:
@@ -134,27 +130,24 @@ class _Path(NamedTuple):
         return rows
 
 
-def _start(problem: Problem, state: StackState) -> tuple[Segment, float, float, float]:
-    """Start of a path: segment of the source and its end (s), sign of the area's branch, and gap voltage (V).
+def _start(problem: Problem, state: StackState) -> tuple[Segment, float, float]:
+    """Start of a path: segment of the source, sign of the area's branch, and gap voltage (V).
 
     The voltage is NaN where the start is at the fold or past it, as after a jump of the source.
     """
-    t, model = state.t, model_of(problem.scene)
-    tables = [table for (table,) in Tables(problem, FINEST_RTOL)]
-    table = next((table for table in tables if table.edges[-1] > t), tables[-1])
-    i = min(max(int(np.searchsorted(table.edges, t, side="right")) - 1, 0), table.edges.size - 2)
-    start, end = float(table.edges[i]), float(table.edges[i + 1])
-    segment = Segment(start, end - start, table.terms[i], table.series[i])
-    u = state.u_gap
-    if t == start:
+    model, u = model_of(problem.scene), state.u_gap
+    windows = list(Tables(problem, FINEST_RTOL))
+    window = next((one for one in windows if one[0].edges[-1] > state.t), windows[-1])
+    segment, since = segment_of(joined(window), state.t, "right")
+    if since == 0.0:
         u_source, _ = source(segment, 0.0)
         u = float(ramp(model, model.k_gap * u_source, dot(model.gap, state.y), u))
     sign = math.copysign(1.0, u)
     if u != 0.0 and not math.isnan(u):
-        u_source, slope = source(segment, t - start)
+        u_source, slope = source(segment, since)
         margin, _ = voltage_by_time(model, u_source, slope, state.y, sign, u, np.empty(state.y.size))
         u = u if margin > 0.0 else math.nan
-    return segment, end, sign, u
+    return segment, sign, u
 
 
 def _ahead(problem: Problem, run: Run, state: StackState, rtol: float) -> tuple[bool, _Path | None]:
@@ -182,9 +175,9 @@ def _jacobian(slope: Callable[[float, FloatArray], FloatArray], s: float, z: Flo
     return np.array(columns).T
 
 
-def _path(problem: Problem, state: StackState, begun: tuple[Segment, float, float, float], rtol: float) -> _Path | None:
+def _path(problem: Problem, state: StackState, begun: tuple[Segment, float, float], rtol: float) -> _Path | None:
     t, y, model, n = state.t, state.y, model_of(problem.scene), state.y.size
-    segment, end, sign, u = begun
+    segment, sign, u = begun
     if u == 0.0:
         return None
     pace = model.tau if math.isfinite(model.tau) else segment.length
@@ -213,8 +206,9 @@ def _path(problem: Problem, state: StackState, begun: tuple[Segment, float, floa
     begin = np.concatenate([y, [0.0, u]]) / scale
     far = 3.0 * at(begin)[0]
     # At the fold, at the end of the segment, and too far from the fold again.
+    left_over = segment.start + segment.length - t
     events: list[Any] = [
-        lambda _, z: at(z)[0] - NOTHING_LEFT, lambda _, z: end - t - float(z[n]) * pace, lambda _, z: far - at(z)[0]
+        lambda _, z: at(z)[0] - NOTHING_LEFT, lambda _, z: left_over - float(z[n]) * pace, lambda _, z: far - at(z)[0]
     ]  # fmt: skip
     for event in events:
         event.terminal = True

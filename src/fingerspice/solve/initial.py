@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,8 +37,7 @@ from fingerspice.solve.starting import (
 from fingerspice.waveforms.waveform import require
 
 
-@dataclass(frozen=True)
-class StackState:
+class StackState(NamedTuple):
     """A state in the engine's form."""
 
     t: float  # s
@@ -59,7 +59,9 @@ def to_stack(scene: Scene, state: State) -> StackState:
     if not state.y.any() and not state.s_before.any():
         return StackState(state.t, state.y.copy(), 0.0, 0.0, 0.0)
     before, along = float(state.s_before[0]), scene.turn * state.y[:-1]
-    u_gap = float(along_gap(model, along[None], state.s_before)[0])
+    u_gap = float(np.einsum("k,k->", along[: model.gap.size], model.gap))
+    # If the gap's voltage is no state, it is the source's voltage less the states, whose weights are -1.
+    u_gap += 0.0 if model.gap.size and model.gap.max() > 0.0 else before
     inverse = inverse_area(abs(u_gap), model.curve)[0] if model.mobile else 0.0
     scale = model.area0 * inverse if model.mobile else 1.0
     offset = before / inverse / model.s if model.mobile else 0.0
@@ -68,13 +70,6 @@ def to_stack(scene: Scene, state: State) -> StackState:
     # A remainder within the rounding of the capacitive share is no stored charge: an uncharged start gives exactly 0.
     x[np.abs(x) <= 4e-16 * np.abs(share)] = 0.0
     return StackState(state.t, np.append(x / scale, state.y[-1]), before, u_gap, offset)
-
-
-def along_gap(model: Model, along: FloatArray, u_source: FloatArray) -> FloatArray:
-    """Gap voltages (n_t,) from rows of live voltages along the loop (n_t, n) and the source's, V."""
-    x = np.einsum("tk,k->t", along[:, : model.gap.size], model.gap)
-    # If the gap's voltage is no state, it is the source's voltage less the states, whose weights are -1.
-    return np.asarray(x if model.gap.size and model.gap.max() > 0.0 else u_source + x)
 
 
 def from_stack(scene: Scene, state: StackState) -> State:
@@ -92,12 +87,9 @@ def from_stack(scene: Scene, state: StackState) -> State:
     return State(state.t, y, np.array([state.u_before]), np.array([sign]), scene.charge_law)
 
 
-def unreachable(scene: Scene, state: StackState, largest: float) -> bool:
+def _unreachable(scene: Scene, state: StackState, largest: float) -> bool:
     """Whether the source, raised from 0 V, cannot reach a state's gap voltage; `largest`: largest cell voltage, V."""
-    model = model_of(scene)
-    if scene.network.gaps[0] is None:
-        return False
-    k_u = model.k_gap * state.u_before
+    model, k_u = model_of(scene), model_of(scene).k_gap * state.u_before
     sign = choose_branch(model, state.u_before, state.y)
     found = float(gap_voltage(model, k_u, float(model.gap @ state.y[:-1]), sign, k_u))
     # Behind an insulating coating, a gap voltage of 0 V is a difference of other voltages: allow for their round-off.
@@ -134,13 +126,7 @@ def row_width(scene: Scene) -> int:
 
 
 def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> State:
-    """State just before the start.
-
-    Raises
-    ------
-    InputError
-        For an unknown start, a solution of another circuit, or a start that no charge of the circuit allows.
-    """
+    """State just before the start."""
     network = scene.network
     size = sum(network.b.shape) + int(np.count_nonzero(scene.net.slow >= 0))
     if isinstance(start, Solution):
@@ -232,7 +218,8 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
         _, slow, _ = settle(net, u, slow, after)
     sign = np.zeros(len(network.areas))
     state = State(0.0, np.concatenate([x, slow, charge]), before, sign, scene.charge_law)
-    if scene.model is not None and np.any(u) and unreachable(scene, to_stack(scene, state), float(np.abs(u).max())):
+    has_gap = scene.model is not None and network.gaps[0] is not None
+    if has_gap and np.any(u) and _unreachable(scene, to_stack(scene, state), float(np.abs(u).max())):
         raise InputError(f"the start has {u[scene.measured[0]]:.4g} V across the gap, {PAST_FOLD}")
     return state
 
@@ -240,10 +227,7 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
 def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
     """Cell voltages (V) along the loop (n_cell,) at the DC operating point, with the area coupled.
 
-    Raises
-    ------
-    InputError
-        Where two or more layers do not leak: the node between them has no DC voltage.
+    Where two or more layers do not leak, the node between them has no DC voltage: such a start is refused.
     """
     insulating = stack.layers_of(stack.g_total + stack.g_area == 0.0)
     if len(insulating) > 1:

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, views_of
-from fingerspice.circuit.network import Modes, network_modes
+from fingerspice.base.arrays import FloatArray, IntArray, views_of
+from fingerspice.circuit.network import network_modes
 from fingerspice.engine.collocation import loopstate, readout
-from fingerspice.engine.collocation.exponential import Tables, new_tables
+from fingerspice.engine.collocation.exponential import new_tables
 from fingerspice.engine.collocation.loop import Looks, no_looks
 from fingerspice.engine.many_areas.begin import LEVEL_RATIO, ManyAreas, References
 from fingerspice.engine.many_areas.form import REFERRED, Form, new_work
@@ -25,8 +24,8 @@ from fingerspice.numerics.lobatto import integral_table
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene, kept_with
-from fingerspice.solve.sources import held as held_at
-from fingerspice.solve.stepping import Stepping, looks_of
+from fingerspice.solve.sources import ramp
+from fingerspice.solve.stepping import Stepping
 
 # Number of sets of references cached with a scene: one for each thread and decade of tolerances.
 MOST_SETS = 16
@@ -36,29 +35,29 @@ MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
 MOST_KEPT = 16
 
 
-@dataclass
 class Known:
-    """The references of a scene that one thread has needed so far, and the step tables for them."""
+    """The references of a scene that one thread has needed so far, and the step tables for them.
 
-    arrays: References
-    tables: Tables
-    # (n_area + 1,): Round-off of each gap's voltage, and last of the nodes' voltages, relative to the rounding of the
-    # largest voltage; the maximum over all references
-    magnified: FloatArray
-    shapes: list[tuple[int, ...]]  # Shapes of the arrays in `REFERRED`
-    fixed: dict[str, Any]  # The fields of a `Form` that are the same for all references
+    The first has the areas at 0 V. The scene, with which this is cached, is not an attribute: two objects that hold
+    each other are freed by garbage collection only.
+    """
+
+    def __init__(self, scene: Scene, decade: int) -> None:
+        numbers, magnified, self.shapes = _referred(scene, scene.area0)
+        n_area = scene.area0.size
+        counts = np.zeros(1, np.int64), np.zeros(n_area, np.int64)
+        self.arrays = References(np.zeros((2, n_area), np.int64), np.zeros((2, numbers.size)), *counts)
+        self.tables = new_tables(self.shapes[0][0])
+        # (n_area + 1,): Round-off of each gap's voltage, and last of the nodes' voltages, relative to the rounding of
+        # the largest voltage; the maximum over all references
+        self.magnified = np.zeros(magnified.size)
+        self.fixed = _fixed(scene, decade)  # The fields of a `Form` that are the same for all references
+        self.add(scene, (0,) * n_area)
 
     @property
     def count(self) -> int:
         return int(self.arrays.used[0])
 
-    @property
-    def is_full(self) -> bool:
-        most: int = MOST_NUMBERS // self.arrays.numbers.shape[1]
-        return self.count >= max(2, min(MOST_REFERENCES, most))
-
-    # The scene, with which this is cached, is not an attribute: two objects that hold each other are freed by garbage
-    # collection only.
     def add(self, scene: Scene, levels: tuple[int, ...]) -> None:
         """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
         arrays, one = self.arrays, self.count
@@ -68,9 +67,7 @@ class Known:
                 levels=np.vstack([arrays.levels, more[0]]), numbers=np.vstack([arrays.numbers, more[1]])
             )
         area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
-        key = ("referred", scene.fixed, area.tobytes())
-        found = kept_with(scene.network.kept, key, MOST_KEPT, lambda: _referred(scene, area))
-        arrays.numbers[one], magnified = found
+        arrays.numbers[one], magnified, _ = _referred(scene, area)
         arrays.levels[one] = levels
         arrays.used[0] += 1
         np.maximum(self.magnified, magnified, out=self.magnified)
@@ -84,43 +81,13 @@ class Known:
 
 
 def known_references(scene: Scene, decade: int, *, anew: bool = False) -> Known:
-    """The references of a scene for tolerances of a decade, the first of which has the areas at 0 V."""
+    """The references of a scene for tolerances of a decade."""
     # Each thread has its own set, because compiled code writes into the tables.
     key = ("references", decade, threading.get_ident())
     if anew:
         scene.prepared.pop(key, None)
-    found: Known = kept_with(scene.prepared, key, MOST_SETS, lambda: _make(scene, decade))
+    found: Known = kept_with(scene.prepared, key, MOST_SETS, lambda: Known(scene, decade))
     return found
-
-
-def _make(scene: Scene, decade: int) -> Known:
-    n_area = scene.area0.size
-    shapes = _shapes(scene)
-    room = References(
-        np.zeros((2, n_area), np.int64),
-        np.zeros((2, sum(math.prod(shape) for shape in shapes))),
-        np.zeros(1, np.int64),
-        np.zeros(n_area, np.int64),
-    )
-    n_modes = shapes[0][0]
-    known = Known(room, new_tables(n_modes), np.zeros(n_area + 1), shapes, _fixed(scene, decade))
-    known.add(scene, (0,) * n_area)
-    return known
-
-
-def _shapes(scene: Scene) -> list[tuple[int, ...]]:
-    """Shapes of the arrays in `REFERRED`."""
-    net = scene.net
-    n, n_s = net.b.shape
-    m = n + int(np.count_nonzero(net.slow >= 0))
-    n_f, n_area = _fed(scene).size, net.gap.size
-    shapes = {
-        "rates": (m,), "gain": (m, n_s), "shape": (n, n), "inverse": (n, n), "follow": (n, n_s), "feed": (m, n_f),
-        "tap": (n_f, n), "tap_s": (n_f, n_s), "area0": (n_area,), "gap": (n_area, n), "gap_s": (n_area, n_s),
-        "node": (len(scene.network.nodes), n), "node_s": (len(scene.network.nodes), n_s),
-        "size": (n,), "stored": (n_s, n), "stored_s": (n_s, n_s), "lost": (n_s, n), "lost_s": (n_s, n_s),
-    }  # fmt: skip
-    return [shapes[name] for name in REFERRED]
 
 
 def _fed(scene: Scene) -> IntArray:
@@ -161,8 +128,15 @@ def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
     }
 
 
-def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The arrays in `REFERRED` for reference areas (m^2), in one row, and the round-off as in `Known.magnified`."""
+def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
+    """The arrays in `REFERRED` for reference areas (m^2) in one row, the round-off as in `Known`, and their shapes."""
+    key = ("referred", scene.fixed, area.tobytes())
+    found: tuple[FloatArray, FloatArray, list[tuple[int, ...]]]
+    found = kept_with(scene.network.kept, key, MOST_KEPT, lambda: _refer(scene, area))
+    return found
+
+
+def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
     network, net = scene.network, scene.net
     modes = network_modes(network, area)
     n, n_s = modes.gains.shape
@@ -198,27 +172,20 @@ def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray]:
         "lost": network.through @ (leak * tap) + at_x @ modes.shape,
         "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
     }
-    return np.concatenate([parts[name].ravel() for name in REFERRED]), _magnified(modes, gap, gap_s, node, node_s)
-
-
-def _magnified(
-    modes: Modes, gap: FloatArray, gap_s: FloatArray, node: FloatArray, node_s: FloatArray
-) -> FloatArray:  # fmt: skip
-    """Round-off of each gap's voltage, and last of the nodes', relative to the rounding of the largest voltage.
-
-    A voltage is a sum over modes and sources: the sum of the moduli of its terms measures the cancellation.
-    """
     live = modes.rates[modes.rates > 0.0]
     # The eigenvectors of the slowest mode contain the round-off of the fastest one.
     spread = math.sqrt(float(live.max() / live.min())) if live.size else 0.0
     inverse = np.abs(modes.inverse)
     every = (np.abs(modes.shape) @ inverse).sum(axis=1).max(initial=1.0)
+    # A voltage is a sum over modes and sources: the sum of the moduli of its terms measures the cancellation.
     of_gaps, of_nodes = (
         (np.abs(by_mode) @ inverse).sum(axis=1) + np.abs(by_source).sum(axis=1)
         for by_mode, by_source in ((gap, gap_s), (node, node_s))
     )
     own = np.append(of_gaps, of_nodes.max(initial=0.0))
-    return np.asarray((every + spread) * np.minimum(own / every, 1.0))
+    magnified = np.asarray((every + spread) * np.minimum(own / every, 1.0))
+    numbers = np.concatenate([parts[name].ravel() for name in REFERRED])
+    return numbers, magnified, [parts[name].shape for name in REFERRED]
 
 
 # Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method. Where
@@ -230,29 +197,25 @@ MOST_STEPS = 100
 class March(Stepping):
     """One integration in progress, with an error of at most `tol` times `u_scale` (V) in every step."""
 
-    def __init__(
-        self, problem: Problem, tol: float, rtol: float, u_scale: float, t_out: FloatArray, left: BoolArray,
-        repeat: bool,
-    ) -> None:  # fmt: skip
+    def __init__(self, problem: Problem, rtol: float, tol: float, u_scale: float, repeat: bool) -> None:
         scene, size = problem.scene, problem.initial.y.size
         n_s, n_area = len(scene.waveforms), scene.net.gap.size
         self.u_scale, self.decade = u_scale, int(np.floor(np.log10(rtol)))
         self.gaps, self.largest = list(scene.network.fingers), u_scale
         self.area_error = max((area_missed(curve, self.decade) for curve in scene.net.curves), default=0.0)
-        width = size + n_s if problem.charge else size
-        super().__init__(problem, tol * u_scale, t_out, left, size - n_s, width)
+        self.capacitance = float(problem.network.capacitance(scene.area0).sum())
+        super().__init__(problem, tol * u_scale, size - n_s, size + n_s if problem.charge else size)
         self.control["magnified"] = 1.0
         self.rows = self.out.T
         self.error = np.zeros(self.n + self.n_slow)
         self.branch = np.tile([problem.t_start, math.inf], (n_area, 1))
         self.shortest = problem.waveform.shortest_time()
-        self.integral = integral_table()
         self.references = known_references(scene, self.decade)
         self.form = self.references.form()
         cells = self.form.c.size
         self.work = new_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
         scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
-        self.looks = looks_of(problem, self.form.rates.copy(), self.pace.tol, scale, repeat)
+        self.look_for_period(self.form.rates, scale, repeat)
 
     @property
     def rounding(self) -> list[float]:
@@ -262,17 +225,13 @@ class March(Stepping):
         return list(map(float, floor))
 
     @property
-    def capacitance(self) -> float:
-        return float(self.problem.network.capacitance(self.problem.scene.area0).sum())
-
-    @property
     def margin(self) -> float:
         return 1.0 / float(self.control["magnified"])
 
     def circuit(self, sources: Sources) -> ManyAreas:
         known = self.references
         return ManyAreas(
-            self.form, known.arrays, known.tables, self.work, self.integral, sources, self.u_scale, self.sign,
+            self.form, known.arrays, known.tables, self.work, integral_table(), sources, self.u_scale, self.sign,
             self.s_before, self.branch,
         )  # fmt: skip
 
@@ -280,19 +239,22 @@ class March(Stepping):
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
         more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
         self.step[0]["most"] = taken + int(more)
-        return super().march(sources, t_end, looks)
+        while (code := super().march(sources, t_end, looks)) == loopstate.REFERENCE:
+            self._add_reference()
+        return code
 
     def _failed(self, code: int, sources: Sources) -> Status:
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
-        return self.march(held_at(self.t, after), self.t, no_looks()) == loopstate.DONE
+        # With sources that stay at these values.
+        return self.march(ramp(after, after, self.t), self.t, no_looks()) == loopstate.DONE
 
     def _add_reference(self) -> None:
         """Add the reference areas that the compiled loop needs next, and that it has written to `wanted`."""
         known, at = self.references, self.work.at
         wanted = tuple(map(int, known.arrays.wanted))
-        if known.is_full:
+        if known.count >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
             # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
             levels = tuple(map(int, known.arrays.levels[at[0]]))
             self.references = known = known_references(self.problem.scene, self.decade, anew=True)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.results.outcome import Status
 from fingerspice.solve.many_areas import March
-from fingerspice.solve.one_area import Track, prepare_system, scale_of
+from fingerspice.solve.one_area import Track, scale_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Progress, Run, integrate
 from fingerspice.solve.sources import Tables
@@ -16,34 +15,23 @@ ATTEMPTS = 6
 GUESS = 1.0
 
 
-def stepping(
-    problem: Problem, rtol: float, tol: float, u_scale: float, top: float, t_out: FloatArray, left: BoolArray,
-    repeat: bool,
-) -> Track | March:  # fmt: skip
+def stepping(problem: Problem, rtol: float, tol: float, u_scale: float, top: float, repeat: bool) -> Track | March:
     """An integration with an error of `tol` times `u_scale` (V) in every step, in a run that is asked for `rtol`.
 
     A stack's area curve reaches `top` (V) if that is above 0.
     """
     if problem.scene.stack is None:
-        return March(problem, tol, rtol, u_scale, t_out, left, repeat)
-    return Track(problem, prepare_system(problem.scene, rtol, top), tol * u_scale, t_out, left, repeat)
+        return March(problem, rtol, tol, u_scale, repeat)
+    return Track(problem, rtol, tol * u_scale, top, repeat)
 
 
-def solve(
-    problem: Problem,
-    rtol: float,
-    t_out: FloatArray,
-    left: BoolArray,
-    progress: Progress | None = None,
-    *,
-    repeat: bool = True,
-) -> Run:
+def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, repeat: bool = True) -> Run:
     """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
 
     The tolerance of the first attempt is a guess; each further one follows from the previous attempt's stated error.
     With `repeat`, later periods may repeat one period, once the state no longer changes from one to the next.
     """
-    tables = Tables(problem, LOCAL_SHARE * rtol, t_out=t_out)
+    tables = Tables(problem, LOCAL_SHARE * rtol)
     is_stack = problem.scene.stack is not None
     met = tables.peak() if is_stack or problem.scene.is_sampled else 0.0
     u_scale = scale_of(problem, met) if is_stack else max(problem.largest, met) or GUESS
@@ -51,7 +39,7 @@ def solve(
     # The voltages of sources that cancel are rounding errors of those of their parts.
     finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
     while True:
-        one = stepping(problem, rtol, max(tol, finest), u_scale, top, t_out, left, repeat)
+        one = stepping(problem, rtol, max(tol, finest), u_scale, top, repeat)
         if tries_out:
             one.try_out(rtol)
         try:

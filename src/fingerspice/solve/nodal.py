@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -19,13 +19,13 @@ from fingerspice.engine.network import Sources, new_room
 from fingerspice.numerics.lobatto import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
-from fingerspice.results.record import Record
 from fingerspice.solve.problem import ROUNDING, Problem
 from fingerspice.solve.runs import (
     PAST_FOLD,
     Integration,
     Progress,
     Run,
+    apart,
     closed_form,
     gap_signals,
     integrate,
@@ -82,12 +82,11 @@ class Collocation(Integration):
     """One integration in progress; see `engine.implicit.run.advance`."""
 
     def __init__(
-        self, problem: Problem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray
+        self, problem: Problem, scheme: Scheme, tol: float, u_scale: float, progress: Progress | None = None
     ) -> None:
-        super().__init__(problem, t_out, left)
-        self.scheme, self.tol = scheme, tol
-        self.progress: Progress | None = None
-        self.rows = np.full((t_out.size, self.width), np.nan)
+        super().__init__(problem)
+        self.scheme, self.tol, self.progress = scheme, tol, progress
+        self.rows = np.full((self.t_out.size, self.width), np.nan)
         n_s = self.s_before.size
         least = problem.scene.area0.copy()
         for i, contact in enumerate(problem.network.contacts):
@@ -109,32 +108,29 @@ class Collocation(Integration):
     def t(self) -> float:
         return float(self.control[implicit.BASE] + self.control[implicit.T])
 
-    @property
-    def done(self) -> float:
-        """Fraction of the run that is done."""
-        return (self.t - self.problem.t_start) / (self.problem.t_stop - self.problem.t_start)
-
     def nodal(self, sources: Sources) -> Nodal:
         """The network with these sources, as the compiled steps take it."""
         return Nodal(self.net, self.room, self.scheme, self.work, sources, False, self.sign, self.scale, self.tol)
 
     def through(self, sources: Sources, t_end: float) -> Status:
+        run = Passage(
+            self.y, self.s_before, self.control, self.counters, self.peaks, self.problem.charge, self.t_out, self.left,
+            self.rows, self.tried,
+        )  # fmt: skip
         while True:
-            run = Passage(
-                self.y, self.s_before, self.control, self.counters, self.peaks, self.problem.charge, self.t_out,
-                self.left, self.rows, self.tried,
-            )  # fmt: skip
             code = advance(self.nodal(sources), run, t_end)
             if code == implicit.DONE:
                 return Status.SUCCESS
             if code == implicit.PAUSED:
-                steps = int(self.counters[implicit.ACCEPTED] + self.counters[implicit.REJECTED])
-                if steps > FIRST_STEPS + self.done * MOST_STEPS:
+                done = self.problem.done(self.t)
+                if (
+                    self.counters[implicit.ACCEPTED] + self.counters[implicit.REJECTED]
+                    > FIRST_STEPS + done * MOST_STEPS
+                ):
                     return Status.TOO_MANY_STEPS
                 if self.progress is not None:
-                    self.progress(self.done)
-                continue
-            if code == implicit.STEP_UNDERFLOW or (code == implicit.JUMP and not self.jump(values_at(sources, self.t))):
+                    self.progress(done)
+            elif code == implicit.STEP_UNDERFLOW or not self.jump(values_at(sources, self.t)):
                 return self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
@@ -155,9 +151,9 @@ def pass_through(
     problem: Problem, sources: Sources, tol: float, u_scale: float
 ) -> tuple[Status, Collocation, FloatArray]:
     """Integrate a problem without outputs: its status, the run, and its final error, estimated by a coarser run."""
-    none, ends = np.zeros(0), []
+    ends = []
     for scheme, share in zip(_schemes(problem), (BESIDE, 1.0), strict=True):
-        one = Collocation(problem, scheme, max(share * tol, FINEST), u_scale, none, none.astype(bool))
+        one = Collocation(problem, scheme, max(share * tol, FINEST), u_scale)
         status = one.through(sources, problem.t_stop)
         ends.append(one.y)
         if status is not Status.SUCCESS:
@@ -171,33 +167,27 @@ def _schemes(problem: Problem) -> tuple[Scheme, Scheme]:
     return radau_scheme(STAGES_BESIDE)._replace(h_max=longest), radau_scheme(STAGES)._replace(h_max=longest)
 
 
-def _integrate(
-    problem: Problem, scheme: Scheme, tol: float, u_scale: float, t_out: FloatArray, left: BoolArray,
-    progress: Progress | None,
-) -> Run:  # fmt: skip
-    one, scene = Collocation(problem, scheme, tol, u_scale, t_out, left), problem.scene
-    one.progress = progress
-    run = integrate(one, Tables(problem, tol, t_out=t_out), progress)
+def _integrate(problem: Problem, scheme: Scheme, tol: float, u_scale: float, progress: Progress | None = None) -> Run:
+    one, net = Collocation(problem, scheme, tol, u_scale, progress), problem.scene.net
+    run = integrate(one, Tables(problem, tol), progress)
     run.gaps = np.zeros((len(problem.network.fingers), 4))
     for row, i in zip(run.gaps, problem.network.fingers, strict=True):
         row[0], contact = one.peaks[i], problem.network.contacts[i]
-        if contact is not None and scene.net.gap[i] >= 0 and scene.net.slow[i] < 0:
-            row[1] = float(contact.stress(row[0])) / inverse_area(row[0], scene.net.curves[i])[0]
+        if contact is not None and net.gap[i] >= 0 and net.slow[i] < 0:
+            row[1] = float(contact.stress(row[0])) / inverse_area(row[0], net.curves[i])[0]
     return run
 
 
-def solve_coupled(
-    problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None = None,
-    reason: str = "",
-) -> Run:  # fmt: skip
+def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = None, reason: str = "") -> Run:
     """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
 
     The stated error is the difference from a second run of lower order with a larger tolerance. `reason` says why this
     method took over from another; a run that takes long is announced with it, and with its expected time.
     """
     progress = _announced(progress, f"{reason}: " if reason else "")
-    coarse, fine = _schemes(problem)
-    at, side, probed = _with_probes(problem, t_out, left)
+    (coarse, fine), mobile = _schemes(problem), problem.scene.net.mobile
+    probing, probed = _with_probes(problem)
+    compared = probing.at(probing.t_out[probed], probing.left[probed])
     u_scale = problem.largest
     if problem.network.n_voltage < len(problem.network.sources) or u_scale == 0.0:
         u_scale = _voltage_scale(problem, coarse, max(u_scale, 1.0))
@@ -206,13 +196,13 @@ def solve_coupled(
     nearest: tuple[float, Run] | None = None
     for attempt in range(ATTEMPTS):
         taken = tol
-        beside = _integrate(problem, coarse, BESIDE * tol, u_scale, at[probed], side[probed], progress)
-        run = _integrate(problem, fine, tol, u_scale, at, side, progress)
+        beside = _integrate(compared, coarse, BESIDE * tol, u_scale, progress)
+        run = _integrate(probing, fine, tol, u_scale, progress)
         nfev += beside.nfev + run.nfev
         run.nfev = nfev
         worst = _stated(problem, run, run.only(probed), beside, u_scale, ALIKE * tol) / rtol
         last = tol <= finest or attempt == ATTEMPTS - 1
-        if problem.scene.net.mobile and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
+        if mobile and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
             # A step has crossed a fold onto a branch of the area equation that no continuous path reaches.
             tol, run.status = max(0.03 * tol, finest), Status.ERROR_NOT_MET
         elif run.status is Status.FOLD and run.t_failed is not None:
@@ -237,17 +227,11 @@ def solve_coupled(
         # Round-off may dominate at the finest tolerances: take the run whose fold differs least from its predecessor's.
         run = nearest[1]
         run.status, run.nfev = Status.FOLD if believed else Status.ERROR_NOT_MET, nfev
-    if problem.scene.net.mobile:
-        run.margin = float(run.record(problem).fold_margin.min(initial=1.0))
+    margin = float(run.record(problem).fold_margin.min(initial=1.0)) if mobile else run.margin
     run = run.only(~probed)
     run.end_where_it_stopped()
-    if problem.scene.net.mobile and run.t.size:
-        run.margin = min(run.margin, float(run.record(problem).fold_margin[-1]))
-
-    def look(t: FloatArray, left: BoolArray) -> Record:
-        return _integrate(problem, fine, taken, u_scale, t, left, None).record(problem)
-
-    run.continuous = closed_form(problem, look, rtol)
+    run.margin = min(margin, float(run.record(problem).fold_margin[-1])) if mobile and run.t.size else margin
+    run.continuous = closed_form(problem, partial(_integrate, scheme=fine, tol=taken, u_scale=u_scale), rtol)
     run.note = f"{reason}; implicit steps took over, {run.stats['steps']} of them" if reason else ""
     return run
 
@@ -277,21 +261,20 @@ def _voltage_scale(problem: Problem, scheme: Scheme, guess: float) -> float:
     A high guess is better than a low one: a coarse run whose voltages are much smaller than the guess is cheap, whereas
     much larger voltages would be integrated far too accurately.
     """
-    at = np.linspace(problem.t_start, problem.t_stop, PROBES)
+    probing = problem.at(np.linspace(problem.t_start, problem.t_stop, PROBES), np.ones(PROBES, bool))
     for _ in range(20):
-        rough = _integrate(problem, scheme, 1e-2, guess, at, np.ones(at.size, bool), None)
-        n = problem.network.k.shape[0]
-        largest = float(np.abs(rough.rows[:, :n]).max(initial=0.0))
+        rough = _integrate(probing, scheme, 1e-2, guess)
+        largest = float(np.abs(rough.rows[:, : problem.network.k.shape[0]]).max(initial=0.0))
         if not 0.0 < largest < math.inf or 0.05 * guess <= largest <= guess:
             break
         guess = 1.5 * largest
     return guess
 
 
-def _with_probes(problem: Problem, t: FloatArray, left: BoolArray) -> tuple[FloatArray, BoolArray, BoolArray]:
-    """Output times merged with the times at which the error is estimated, their sides, and a mask of the latter.
+def _with_probes(problem: Problem) -> tuple[Problem, BoolArray]:
+    """The problem with more outputs, at which the error is estimated, and a mask of these.
 
-    The added times do not depend on the output times, so that neither the error nor the tolerance depends on them.
+    They do not depend on the output times, so that neither the error nor the tolerance depends on them.
     """
     span = problem.t_stop - problem.t_start
     count = int(min(max(PROBES, PROBES_PER_PERIOD * span / problem.waveform.shortest_time()), MOST_PROBES))
@@ -301,10 +284,10 @@ def _with_probes(problem: Problem, t: FloatArray, left: BoolArray) -> tuple[Floa
     some = np.arange(0, edges.size - 1, math.ceil(edges.size / MOST_EDGES))
     after = (edges[some, None] + np.diff(edges)[some, None] * AFTER_EDGE).ravel()
     probes = np.concatenate([probes, after[after < problem.t_stop]])
-    every = np.concatenate([t, probes])
-    side = np.concatenate([left, ~np.isin(probes, edges)])
+    every = np.concatenate([problem.t_out, probes])
+    side = np.concatenate([problem.left, ~np.isin(probes, edges)])
     order = np.lexsort((~side, every))
-    return every[order], side[order], (np.arange(every.size) >= t.size)[order]
+    return problem.at(every[order], side[order]), (np.arange(every.size) >= problem.t_out.size)[order]
 
 
 def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float, alike: float) -> float:
@@ -312,23 +295,18 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
 
     Returns the largest stated error relative to the peak of its gap, of voltages and forces.
     """
-    count = min(probed.t.size, beside.t.size)
-    both = (alike + 4e-15) * u_scale
-    gaps = []
+    both, gaps = (alike + 4e-15) * u_scale, []
+    fine, coarse = probed.record(problem), beside.record(problem)
     # Between the times compared, the steps may have seen larger voltages, and forces if the area has no time constant.
     met = itertools.chain(run.gaps[:, :2].tolist(), itertools.repeat((0.0, 0.0)))
-    for (u, f), (v, g), (u_met, f_met) in zip(
-        gap_signals(probed.record(problem)), gap_signals(beside.record(problem)), met, strict=False
-    ):
+    for (u, f), (v, g), (u_met, f_met) in zip(gap_signals(fine), gap_signals(coarse), met, strict=False):
         peak, force = max(float(np.abs(u).max(initial=0.0)), u_met), max(float(f.max(initial=0.0)), f_met)
-        u_error = float(np.abs(u[:count] - v[:count]).max(initial=0.0)) + both
         # F ~ u^2: an error du of u is an error 2 F du / u of F.
         moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
-        gaps.append((peak, force, u_error, float(np.abs(f[:count] - g[:count]).max(initial=0.0)) + moved))
+        gaps.append((peak, force, apart(u, v) + both, apart(f, g) + moved))
     run.gaps = np.array(gaps).reshape(-1, 4)
-    run.node_error = nodes_apart(probed.record(problem), beside.record(problem)) + both
+    run.node_error = nodes_apart(fine, coarse) + both
     if problem.charge:
-        n_s = problem.initial.s_before.size
-        at = slice(problem.initial.y.size - n_s, problem.initial.y.size)
-        run.charge_error = float(np.abs(probed.rows[:count, at] - beside.rows[:count, at]).max(initial=0.0))
+        at = slice(problem.initial.y.size - problem.initial.s_before.size, problem.initial.y.size)
+        run.charge_error = apart(probed.rows[:, at], beside.rows[:, at])
     return run.excess(max(ROUNDING * u_scale, problem.rounding))

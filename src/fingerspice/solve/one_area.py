@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import threading
-from collections.abc import Callable
-from functools import partial
 from typing import Literal
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.engine.collocation import loopstate, readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
 from fingerspice.engine.collocation.exponential import forget, new_tables
 from fingerspice.engine.collocation.step_control import end_row
-from fingerspice.engine.network import Segment, Sources, source
+from fingerspice.engine.network import Sources, source
 from fingerspice.engine.one_area.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.one_area.rows import Work, new_work
 from fingerspice.engine.one_area.step import OneArea
@@ -25,95 +22,55 @@ from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import sided
-from fingerspice.results.signals import Signals
-from fingerspice.results.steps import Recorded
-from fingerspice.solve.initial import (
-    StackState,
-    as_marched,
-    from_stack,
-    from_written,
-    model_of,
-    row_width,
-)
+from fingerspice.solve.initial import StackState, as_marched, from_stack, from_written, model_of, row_width
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import Scene, kept_with
-from fingerspice.solve.sources import segment_index
-from fingerspice.solve.stepping import OutOfRangeError, Stepping, looks_of
+from fingerspice.solve.sources import segment_of
+from fingerspice.solve.stepping import OutOfRangeError, Stepping
 
-# Number of modal systems cached with a scene: one for each thread and decade of tolerances, of up to 1 MB each.
-MOST_SYSTEMS = 64
+# Number of modal systems cached with a scene, one for each decade of tolerances, of up to 1 MB each.
+MOST_SYSTEMS = 16
 # Stated error of the charge over the estimate. It comes from a stack whose layers all leak fast: compared with a
 # reference, the errors of gap voltage and charge were 1.5 times the estimates, because they peak between the points of
 # the estimate; and from scene 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
 CHARGE_SAFETY = 1.75
 
 
-@dataclasses.dataclass
-class _Scratch:
-    """A thread's step tables and scratch arrays for a number of modes, and the system whose tables they are.
+class _Scratch(threading.local):
+    """The present thread's step tables and scratch arrays by number of modes, and the systems that the tables are of.
 
     Fresh arrays would cost a changed circuit some 50 us of its set-up, as the memory has to be mapped anew.
     """
 
-    tables: StepTables
-    work: Work
-    of: System | None = None
-
-
-class _OfThread(threading.local):
-    """The present thread's scratch by its number of modes."""
-
     def __init__(self) -> None:
-        self.by_size: dict[int, _Scratch] = {}
+        self.by_size: dict[int, tuple[StepTables, Work]] = {}
+        self.system: dict[int, System] = {}
 
-    def __getitem__(self, n: int) -> _Scratch:
+    def of(self, system: System) -> tuple[StepTables, Work]:
+        """Tables and arrays for the next call of a compiled loop: another system's run may use them after that."""
+        n = system.model.gap.size
         if n not in self.by_size:
-            self.by_size[n] = _Scratch(new_tables(n), new_work(n))
+            self.by_size[n] = new_tables(n), new_work(n)
+        if self.system.get(n) is not system:
+            self.system[n] = system
+            forget(self.by_size[n][0])
         return self.by_size[n]
 
 
-_SCRATCH = _OfThread()
+SCRATCH = _Scratch()
 
 
-@dataclasses.dataclass(frozen=True)
-class Prepared:
-    """A scene's modal system with scratch arrays, for one thread."""
-
-    system: System
-    integral: FloatArray
-    # Relative truncation error of the area's polynomial.
-    area_error: float
-    scratch: _Scratch
-
-    @property
-    def tables(self) -> StepTables:
-        """Step tables, for the next call of a compiled loop: another system's run may use them after that."""
-        if self.scratch.of is not self.system:
-            self.scratch.of = self.system
-            forget(self.scratch.tables)
-        return self.scratch.tables
-
-    @property
-    def work(self) -> Work:
-        """Scratch arrays, for the next call of a compiled loop."""
-        return self.scratch.work
-
-
-def prepare_system(scene: Scene, rtol: float, u_top: float = 0.0) -> Prepared:
-    """The modal system of a scene, made on first use; its area curve reaches `u_top` (V) if that is above 0."""
+def _prepared(scene: Scene, rtol: float, u_top: float) -> tuple[System, float]:
+    """The modal system of a scene, made on first use, and the relative error of its area's polynomial."""
     # The cache distinguishes tolerances by their decade, so that similar runs share a system.
     decade = int(np.floor(np.log10(rtol)))
-    # It also distinguishes threads, because compiled code writes into the tables and scratch arrays.
-    key = ("system", decade, u_top, threading.get_ident())
-    found: Prepared = kept_with(scene.prepared, key, MOST_SYSTEMS, lambda: _prepare(scene, decade, u_top))
+
+    def make() -> tuple[System, float]:
+        system = system_of(scene, decade, u_top)
+        return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
+
+    found: tuple[System, float] = kept_with(scene.prepared, ("system", decade, u_top), MOST_SYSTEMS, make)
     return found
-
-
-def _prepare(scene: Scene, decade: int, u_top: float) -> Prepared:
-    system = system_of(scene, decade, u_top)
-    return Prepared(
-        system, integral_table(), area_missed(system.model.curve, decade), _SCRATCH[system.model.gap.size]
-    )  # fmt: skip
 
 
 def system_of(
@@ -138,69 +95,54 @@ def system_of(
 class Track(Stepping):
     """One integration in progress, with an error of the gap voltage of at most `tol` (V) in every step.
 
-    The loop's state is that of `engine.one_area.model`; `state` and the outputs have the form used for all circuits.
+    The area's curve reaches `top` (V) if that is above 0. The loop's state is that of `engine.one_area.model`; `state`
+    and the outputs have the form used for all circuits.
     """
 
     def __init__(
-        self, problem: Problem, prepared: Prepared, tol: float, t_out: FloatArray, left: BoolArray,
-        repeat: bool = True, h_fixed: float = 0.0,
-    ) -> None:  # fmt: skip
+        self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True, h_fixed: float = 0.0
+    ) -> None:
         scene, start = problem.scene, problem.inner
-        self.prepared, self.start, n = prepared, start, start.y.size - 1
+        self.system, self.area_error = _prepared(scene, rtol, top)
+        self.start, model, n, shown = start, self.system.model, start.y.size - 1, scene.shown.turn.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
-        self.area_error = prepared.area_error if prepared.system.model.coupled else 0.0
-        shown = scene.shown.turn.size
-        super().__init__(problem, tol, t_out, left, shown, shown + 2 if problem.charge else shown, h_fixed)
+        # Of the layer through which the charge is computed.
+        self.capacitance = float(model.slow[-3]) * model.area0
+        super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown, h_fixed)
         self.y = start.y.copy()
         self.error = np.zeros(n + 1)
         self.control["u_before"] = start.u_before
         self.control["branch_length"] = np.inf
         self.control["margin"] = 1.0
-        if model_of(scene).mobile and problem.initial.sign[0] != 0.0:
+        if model.mobile and problem.initial.sign[0] != 0.0:
             self.control["u_gap"], self.control["sign"] = start.u_gap, math.copysign(1.0, start.u_gap)
-        self.looks = looks_of(problem, prepared.system.rates, tol, np.ones(n), repeat and h_fixed == 0.0)
-
-    @property
-    def capacitance(self) -> float:
-        """Capacitance of the layer through which the charge is computed, at the area at 0 V, F."""
-        model = self.prepared.system.model
-        return float(model.slow[-3]) * model.area0
+        self.look_for_period(self.system.rates, np.ones(n), repeat and h_fixed == 0.0)
 
     @property
     def rounding(self) -> list[float]:
         # Of the nodes, the peak is that of the gap.
         peak, size = float(self.peaks[0, readout.PEAK_U]), self.problem.scene.u_size
-        return [4e-16 * (peak + self.prepared.system.model.k_gap * size), 4e-16 * (peak + size)]
-
-    @property
-    def margin(self) -> float:
-        return float(self.control["margin"])
+        return [4e-16 * (peak + self.system.model.k_gap * size), 4e-16 * (peak + size)]
 
     def circuit(self, sources: Sources) -> OneArea:
-        p = self.prepared
-        return OneArea(p.system, p.tables, p.work, p.integral, sources)
+        return OneArea(self.system, *SCRATCH.of(self.system), integral_table(), sources)
 
     def _failed(self, code: int, sources: Sources) -> Status:
         if code == loopstate.OUT_OF_RANGE:
-            raise OutOfRangeError(self.prepared.system.u_top)
+            raise OutOfRangeError(self.system.u_top)
         if self.t > sources.edges[0]:
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
-            self.control["u_before"], _ = source(*_segment(sources, self.t, "left"))
+            self.control["u_before"], _ = source(*segment_of(sources, self.t, "left"))
         return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
 
     def state(self) -> State:
-        return from_stack(self.problem.scene, self.inner_state())
-
-    def inner_state(self) -> StackState:
-        """The state reached in the engine's form."""
         c = self.control
-        sign, u_gap = float(c["sign"]), float(c["u_gap"])
-        state = StackState(self.t, self.y.copy(), float(c["u_before"]), u_gap, self.start.offset)
-        return on_branch(self.prepared.system.model, state, sign)
+        found = StackState(self.t, self.y.copy(), float(c["u_before"]), float(c["u_gap"]), self.start.offset)
+        return from_stack(self.problem.scene, on_branch(self.system.model, found, float(c["sign"])))
 
     def written(self) -> FloatArray:
         n_out = int(self.counters[readout.OUTPUT])
-        model = self.prepared.system.model
+        model = self.system.model
         wanted = self.pace.charge and model.mobile
         u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out]) if wanted else np.empty(0)
         return as_recorded(self.problem, model, self.out[:, :n_out].T, u)
@@ -208,8 +150,8 @@ class Track(Stepping):
     def finish(self, sources: Sources, after: Sources | None) -> None:
         first = int(self.counters[readout.OUTPUT])
         row = np.empty(row_width(self.problem.scene))
-        segment, tau = _segment(after or sources, self.problem.t_stop, "right")
-        model = self.prepared.system.model
+        segment, tau = segment_of(after or sources, self.problem.t_stop, "right")
+        model = self.system.model
         # `end_row` applies a jump at the end to these copies, so that the final state remains the left-hand one.
         end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.controls.copy(), row)
         self.out[:, first:] = as_marched(self.problem.scene, row[None, :])[0, : len(self.out), None]
@@ -217,20 +159,14 @@ class Track(Stepping):
 
     def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
         # This model's area curve may reach higher voltages than the curve of the scene's model.
-        model, c = self.prepared.system.model, self.control
-        segment, tau = _segment(sources, self.t, side)
+        model, c = self.system.model, self.control
+        segment, tau = segment_of(sources, self.t, side)
         row = np.empty(row_width(self.problem.scene))
         u, du = source(segment, tau)
         found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c["sign"], c["u_gap"])
         # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
         write_row_at(model, u, du, self.y, c["sign"], found if found == found else c["u_gap"], row)
         return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
-
-    def recorded(self) -> Recorded | None:
-        recorded, shown = super().recorded(), self.problem.scene.shown
-        if recorded is None or not shown.is_turned:
-            return recorded
-        return dataclasses.replace(recorded, make=partial(_turned, recorded.make, shown.turn))
 
 
 def on_branch(model: Model, state: StackState, sign: float) -> StackState:
@@ -240,34 +176,19 @@ def on_branch(model: Model, state: StackState, sign: float) -> StackState:
     x_gap = dot(model.gap, state.y)
     found = float(gap_voltage(model, model.k_gap * state.u_before, x_gap, sign or 1.0, state.u_gap))
     # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
-    return state if found != found else dataclasses.replace(state, u_gap=found)
+    return state if found != found else state._replace(u_gap=found)
 
 
 def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray) -> FloatArray:
     """Convert rows of the compiled loops to rows of `Record`, in place; `mobile` needs the source u (V) for charge."""
     shown = problem.scene.shown
     n = int(shown.turn.size)
-    if shown.is_turned:
-        rows[:, :n] *= shown.turn
+    rows[:, :n] *= shown.turn
     if problem.charge and model.mobile:
         (cell,), network = shown.measured, shown.network
         u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
         rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - problem.inner.offset
     return rows
-
-
-def _turned(
-    make: Callable[..., Signals], turn: FloatArray, t: FloatArray, left: BoolArray, columns: FloatArray
-) -> Signals:  # fmt: skip
-    """A record from live voltages counted along the loop."""
-    return make(t, left, turn[:, None] * columns)
-
-
-def _segment(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:
-    """The segment of a single source that contains time t (s), and the time since the segment's start, s."""
-    (i,) = segment_index(sources, t, side).tolist()
-    start = float(sources.edges[i])
-    return Segment(start, float(sources.edges[i + 1]) - start, sources.terms[i], sources.series[i]), t - start
 
 
 def scale_of(problem: Problem, peak: float) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -45,13 +44,7 @@ _EVENT = 0.5 / 10e3
 
 
 def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "auto") -> Plan:
-    """The model for a problem with this error and tier asked for; a method that is named steps the coupled one.
-
-    Raises
-    ------
-    InputError
-        For an unknown tier, or a tier that cannot describe the circuit.
-    """
+    """The model for a problem with this error and tier asked for; a method that is named steps the coupled one."""
     if tier not in ("auto", *TIERS):
         raise InputError(f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
     asked = "coupled" if tier == "auto" and method != "auto" else tier
@@ -60,22 +53,18 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "
     return plan
 
 
-class _Choice(NamedTuple):
-    """The lightest valid tier and its reason; the largest relative change of 1/A, and the area it refers to (m^2)."""
-
-    tier: str
-    reason: str
-    sensitivity: float
-    area: float
+# The lightest valid tier and its reason; the largest relative change of 1/A, and the area it refers to (m^2).
+_Choice = tuple[str, str, float, float]
 
 
 def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     scene, span = problem.scene, problem.t_stop - problem.t_start
-    best = _of_network(problem) if scene.model is None else _of_stack(problem, scene.model, rtol)
-    chosen, reason = (best.tier, best.reason) if tier == "auto" else (tier, best.reason)
-    if chosen != best.tier:
-        _refuse(problem, chosen, best.tier)
-        reason = f"asked for; the lightest that is right would be {best.tier}: {reason}"
+    lightest = _of_network(problem) if scene.model is None else _of_stack(problem, scene.model, rtol)
+    best, reason, changed, area = lightest
+    chosen = best if tier == "auto" else tier
+    if chosen != best:
+        _refuse(problem, chosen, best)
+        reason = f"asked for; the lightest that is right would be {best}: {reason}"
     rates, shortest = scene.rates, min(problem.waveform.shortest_time(), span)
     fastest = float(rates.max(initial=0.0))
     reasons, stiff, needed = [reason], fastest * shortest > STIFF, 0.0
@@ -84,7 +73,7 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
     if chosen == "coupled" and scene.coupled and problem.waveform.period:
         reasons += [REPEATS] if span / problem.waveform.period >= FEWEST_PERIODS else []
     if chosen == "linear" and scene.model is not None and scene.coupled and np.any(scene.model.rate0 > 0.0):
-        needed = best.sensitivity
+        needed = changed
     if scene.skin is not None:
         f, error = scene.skin
         reasons.append(f"skin at {f:g} Hz: its dispersion moves the gap voltage by {error:.1g}")
@@ -95,14 +84,15 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
         event = format_si(shortest_event(problem), "s")
         reasons.append(f"a source is a function: an event in it shorter than {event} may be missed without breaks=")
     found = tuple(sorted(map(float, rates)))
-    return Plan(chosen, tuple(reasons), problem.start, found, stiff, best.sensitivity, needed, best.area)
+    return Plan(chosen, tuple(reasons), problem.start, found, stiff, changed, needed, area)
 
 
 def _refuse(problem: Problem, tier: str, best: str) -> None:
     """Refuse a tier that cannot describe the circuit."""
     stack, mobile = problem.scene.stack, problem.scene.charge_law == "mobile"
     if stack is None and tier != "coupled":
-        raise InputError(f"the {tier} tier is not for this network; allowed: auto, {best} or coupled")
+        others = "auto" if best == "coupled" else f"auto, {best}"
+        raise InputError(f"the {tier} tier is not for this network; allowed: {others} or coupled")
     if stack is not None and tier == "algebraic":
         leaking = stack.layers_of(stack.g_total + stack.g_area > 0.0)
         what = f"a stack without leaks; here {', '.join(leaking)} leak"
@@ -127,15 +117,15 @@ def _of_network(problem: Problem) -> _Choice:
     area = float(scene.area0[0]) if network.areas else math.nan
     if not scene.coupled:
         which = f"the areas are {scene.area_mode}" if network.areas else "no element has an area"
-        return _Choice("linear", f"{which}, so the circuit is linear", 0.0, area)
+        return ("linear", f"{which}, so the circuit is linear", 0.0, area)
     several = len(network.fingers) > 1
     follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
     if len(network.sources) > network.n_voltage:
         reason = f"{follows}; by how much is not known beforehand: a current source sets no bound"
-        return _Choice("coupled", reason, math.nan, area)
+        return ("coupled", reason, math.nan, area)
     largest = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
     reason = f"{follows}, {'each ' if several else ''}by up to {_percent(largest)} of its middle"
-    return _Choice("coupled", reason, largest, area)
+    return ("coupled", reason, largest, area)
 
 
 def _of_stack(problem: Problem, model: Model, rtol: float) -> _Choice:
@@ -145,9 +135,9 @@ def _of_stack(problem: Problem, model: Model, rtol: float) -> _Choice:
     if not np.any((model.rate > 0.0) | (model.rate0 > 0.0)) and not (
         model.mobile and model.coupled and _stores(problem)
     ):
-        return _Choice("algebraic", "no layer leaks, so the voltages follow the source at once", changed, area)
+        return ("algebraic", "no layer leaks, so the voltages follow the source at once", changed, area)
     if not model.coupled:
-        return _Choice("linear", f"the area is {scene.area_mode}, so the circuit is linear", changed, area)
+        return ("linear", f"the area is {scene.area_mode}, so the circuit is linear", changed, area)
     free, little = not np.any(model.rate0 > 0.0), changed <= 0.2 * rtol
     reason = f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
     if not model.mobile and (free or little):
@@ -157,7 +147,7 @@ def _of_stack(problem: Problem, model: Model, rtol: float) -> _Choice:
         elif not problem.charge:
             reason = f"the area changes the leaks by {changed:.2g} at most, against rtol = {rtol:g}"
     tier = "linear" if not (model.mobile or problem.charge) and (free or little) else "coupled"
-    return _Choice(tier, reason, changed, area)
+    return (tier, reason, changed, area)
 
 
 def _percent(share: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import cast
 
@@ -57,6 +57,13 @@ class Problem:
     # (n_gap, 2): Error of a periodic start, as its effect on every gap's voltage and force, V and N. The start was
     # computed with half of the error asked for; the other half is left to the run.
     begun: FloatArray | None = None
+    # t_out, left (n_out,): Output times, s, ascending, and whether the left-hand limit is meant
+    t_out: FloatArray = field(default_factory=lambda: np.empty(0))
+    left: BoolArray = field(default_factory=lambda: np.empty(0, bool))
+
+    def at(self, t: FloatArray, left: BoolArray) -> Problem:
+        """The problem with other outputs."""
+        return replace(self, t_out=t, left=left)
 
     @property
     def network(self) -> Network:
@@ -89,6 +96,10 @@ class Problem:
             _, inner = self.scene.prepared["inner"] = self.initial, to_stack(self.scene, self.initial)
         return cast("StackState", inner)
 
+    def done(self, t: float) -> float:
+        """Fraction of the run that is done at time t, s."""
+        return (t - self.t_start) / (self.t_stop - self.t_start)
+
     def breakpoints(self) -> FloatArray:
         """The sources' breakpoints in the run, s; the waveform caches them if they are few."""
         kept, key = self.waveform.kept, ("breakpoints", self.t_start, self.t_stop)
@@ -107,11 +118,11 @@ class Problem:
 def prepare(
     circuit: Circuit,
     *,
-    t_stop: float | None,
-    t_eval: FloatArray | None,
-    charge_law: str | None,
-    area: str | float,
-    start: str | Solution,
+    t_stop: float | None = None,
+    t_eval: FloatArray | None = None,
+    charge_law: str | None = None,
+    area: str | float = "coupled",
+    start: str | Solution = "deck",
     charge: bool = True,
     rtol: float = 0.0,
 ) -> Problem:
@@ -119,11 +130,6 @@ def prepare(
 
     `rtol` decides whether a dispersive skin's data may be taken at one frequency. A run from the periodic state is
     prepared from the uncharged start.
-
-    Raises
-    ------
-    InputError
-        For anything in the request that cannot be run.
     """
     t_stop = None if t_stop is None else real_number("t_stop", t_stop, "a number in s")
     if isinstance(start, Solution) and start.stored is not None:
@@ -220,13 +226,7 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
 
 
 def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[FloatArray, BoolArray]:
-    """Output times (s) and whether each is left-hand: the given times, all right-hand, or the deck's.
-
-    Raises
-    ------
-    InputError
-        For a run that is too long or has too many outputs.
-    """
+    """Output times (s) and whether each is left-hand: the given times, all right-hand, or the deck's."""
     check_length(problem.waveform, problem.t_start, problem.t_stop)
     if t_eval is not None:
         return t_eval, np.zeros(t_eval.size, bool)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -108,21 +109,25 @@ def excess_of(gaps: FloatArray, rounding: float) -> float:
     return worst
 
 
-def closed_form(problem: Problem, look: Callable[[FloatArray, BoolArray], Record], error: float = 0.0) -> ClosedForm:
-    """The run between its outputs, by a method that computes it at any times; see `ClosedForm`."""
+def closed_form(problem: Problem, again: Callable[[Problem], Run], error: float = 0.0) -> ClosedForm:
+    """The run between its outputs, by a method that computes it `again` with any outputs; see `ClosedForm`."""
+    look = partial(_look, problem, again)
     return ClosedForm(look, problem.waveform, problem.t_start, error, problem.rounding)
 
 
+def _look(problem: Problem, again: Callable[[Problem], Run], t: FloatArray, left: BoolArray) -> Record:
+    return again(problem.at(t, left)).record(problem)
+
+
 class Integration(ABC):
-    """One integration in progress, with outputs at `t_out` (s), as left-hand limits where `left` is true."""
+    """One integration of a problem in progress."""
 
     counters: IntArray  # With the indices of `engine.collocation.readout`
-    rows: (
-        FloatArray  # (n_out, width): Rows of the outputs, as in `Record`; of networks, whose steps have the same state
-    )
+    rows: FloatArray  # (n_out, width): Outputs as in `Record`, of networks, whose steps have the same state
 
-    def __init__(self, problem: Problem, t_out: FloatArray, left: BoolArray) -> None:
-        self.problem, self.net, self.t_out, self.left = problem, problem.scene.net, read_only(t_out), read_only(left)
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self.net = problem, problem.scene.net
+        self.t_out, self.left = read_only(problem.t_out), read_only(problem.left)
         self.n, n_s = map(int, self.net.b.shape)
         # The state reached, as in `State`.
         self.y, self.sign = problem.initial.y.copy(), problem.initial.sign.copy()
@@ -194,7 +199,7 @@ def integrate(one: Integration, tables: Tables, progress: Progress | None = None
                 break
         tables.done = one.t
         if progress is not None:
-            progress((one.t - problem.t_start) / (problem.t_stop - problem.t_start))
+            progress(problem.done(one.t))
         if tables.not_finite is not None:
             status, t_failed = Status.SOURCE_NOT_FINITE, tables.not_finite
             break
@@ -222,11 +227,15 @@ def gap_signals(record: Record) -> Iterator[tuple[FloatArray, FloatArray]]:
         yield u, np.zeros(u.size)
 
 
+def apart(one: FloatArray, other: FloatArray) -> float:
+    """Largest difference of a signal between two runs of the same outputs, over their common times."""
+    count = min(len(one), len(other))
+    return float(np.abs(one[:count] - other[:count]).max(initial=0.0))
+
+
 def nodes_apart(one: Record, other: Record) -> float:
-    """Largest difference (V) of a node's voltage between two records of the same outputs, over their common times."""
-    count = min(one.t.size, other.t.size)
-    pairs = zip(one.node_voltages.values(), other.node_voltages.values(), strict=True)
-    return max((float(np.abs(a[:count] - b[:count]).max(initial=0.0)) for a, b in pairs), default=0.0)
+    """As `apart`, of all nodes' voltages, V."""
+    return max(map(apart, one.node_voltages.values(), other.node_voltages.values()), default=0.0)
 
 
 ROUGH = "the source function itself is rough by {:.2g} V"

@@ -77,12 +77,12 @@ class Scene:
     # Cache of the tables and systems that integrators have made for this scene
     prepared: dict[Any, Any] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def stack(self) -> Stack | None:
         """The series stack, if the circuit is one."""
         return self.network.stack
 
-    @property
+    @cached_property
     def waveforms(self) -> tuple[Waveform, ...]:
         """Waveform of each source, V or A."""
         return self.network.waveforms
@@ -102,7 +102,7 @@ class Scene:
         """Whether some source is a user's function, which has to be sampled, not a waveform with a formula."""
         return any(is_sampled(w) for w in self.waveforms)
 
-    @property
+    @cached_property
     def coupled(self) -> bool:
         """Whether some area follows its gap's voltage."""
         return any(area is None for area in self.fixed)
@@ -190,11 +190,6 @@ class Scene:
         return self.stack.sign[list(self.stack.state_order[:-1])]
 
     @cached_property
-    def is_turned(self) -> bool:
-        """Whether some live voltage of a stack counts against the direction of the loop."""
-        return bool(np.any(self.turn < 0.0))
-
-    @cached_property
     def measured(self) -> tuple[int, ...]:
         """Cells for whose voltages errors are stated: the gaps, or without gaps the cell of smallest capacitance."""
         gaps = tuple(gap for gap in self.network.gaps if gap is not None)
@@ -209,11 +204,6 @@ def scene_of(
     """The circuit's scene under a charge law and area mode, made on first use.
 
     `rtol` decides whether a dispersive skin's data may be taken at one frequency.
-
-    Raises
-    ------
-    InputError
-        For anything in the request that cannot be run.
     """
     law = charge_law or circuit.charge_law or "local"
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import BoolArray, FloatArray, real_number, real_numbers
+from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import Parameters, Sources, area_given, overridden
 from fingerspice.circuit.circuit import Circuit
@@ -139,14 +139,8 @@ def simulate(
     return solution
 
 
-def asked(circuit: Circuit, *, t_eval: FloatArray | None, rtol: float, **how: Any) -> Problem:
-    """The problem that a call of `simulate` asks for, with arguments as `check_arguments` leaves them.
-
-    Raises
-    ------
-    InputError
-        For a request that cannot be run.
-    """
+def asked(circuit: Circuit, *, rtol: float, t_eval: FloatArray | None = None, **how: Any) -> Problem:
+    """The problem that a call of `simulate` asks for, with arguments as `check_arguments` leaves them."""
     problem = prepare(circuit, t_eval=t_eval, rtol=rtol, **how)
     if problem.start == "periodic":
         problem, _ = close_period(problem, 0.5 * rtol)
@@ -172,13 +166,7 @@ def check_arguments(
     start: str | Solution = "deck",
     jumps: str = "both",
 ) -> float:
-    """`rtol` as a number; arguments of `simulate` that no circuit can run with are refused.
-
-    Raises
-    ------
-    InputError
-        For the first of them.
-    """
+    """`rtol` as a number; arguments of `simulate` that no circuit can run with are refused."""
     require(jumps in ("both", "none"), "jumps", repr(jumps), "'both' or 'none'")
     require(isinstance(method, str), "method", repr(method), "a name, such as 'auto'")
     library, _, name = method.partition(":")
@@ -215,9 +203,7 @@ def plan(
     t_stop = real_number("t_stop", t_stop, "a number in s") if t_stop is not None else None if circuit.tran else 1.0
     for text in circuit_warnings(circuit, t_stop):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    problem = prepare(
-        circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start="deck", charge=charge, rtol=rtol
-    )  # fmt: skip
+    problem = prepare(circuit, t_stop=t_stop, charge_law=charge_law, area=area, charge=charge, rtol=rtol)
     return make_plan(problem, rtol, tier)
 
 
@@ -233,9 +219,9 @@ def run_problem(
     """Integrate a prepared problem; arguments as in `simulate`. A failed run raises no error."""
     plan = make_plan(problem, rtol, tier, method)
     t_out, left = asked_for(problem, t_eval, jumps)
-    run_at = t_out if t_eval is None else at_breakpoints(problem, t_eval)
+    problem = problem.at(t_out if t_eval is None else at_breakpoints(problem, t_eval), left)
     begin = time.perf_counter()
-    run, name = integrated(problem, plan, run_at, left, rtol, method, progress)
+    run, name = integrated(problem, plan, rtol, method, progress)
     run.stats["wall_s"] = time.perf_counter() - begin  # type: ignore[assignment]
     # Report the times asked for, not the breakpoints to which `at_breakpoints` has moved some of them.
     if run.status is not Status.SUCCESS:
@@ -246,17 +232,16 @@ def run_problem(
 
 
 def integrated(
-    problem: Problem, plan: Plan, t_out: FloatArray, left: BoolArray, rtol: float, method: str,
-    progress: Progress | None = None,
-) -> tuple[Run, str]:  # fmt: skip
+    problem: Problem, plan: Plan, rtol: float, method: str, progress: Progress | None = None
+) -> tuple[Run, str]:
     """A run as planned, with its stated error compared with `rtol`, and the name of its method."""
     if plan.tier == "algebraic":
-        run, name = solve_algebraic(problem, t_out, left), plan.tier
+        run, name = solve_algebraic(problem), plan.tier
     elif plan.tier == "linear":
         area = np.array([plan.area]) if problem.scene.stack is not None else None
-        run, name = solve_linear(problem, t_out, left, area, plan.error_bound), plan.tier
+        run, name = solve_linear(problem, area, plan.error_bound), plan.tier
     else:
-        run, name = _stepped(problem, method, own_rtol(problem, plan, rtol), t_out, left, progress)
+        run, name = _stepped(problem, method, own_rtol(problem, plan, rtol), progress)
         if plan.error_bound > 0.0:
             run.add_error(plan.error_bound * run.gaps[:, 0])
     state_error(problem, run, plan, rtol)
@@ -299,39 +284,37 @@ def solution_of(
     )
 
 
-def _stepped(
-    problem: Problem, method: str, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None
-) -> tuple[Run, str]:
+def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | None) -> tuple[Run, str]:
     """A run of the coupled tier, and the name of its method."""
     if ":" in method:
         from fingerspice.solve.foreign import solve_foreign
 
-        return solve_foreign(problem, method, rtol, t_out, left, progress), method
+        return solve_foreign(problem, method, rtol, progress), method
     if method == "auto":
         from fingerspice.solve.recordings.run import solve as solve_recording
 
-        recorded = solve_recording(problem, rtol, t_out, left, progress)
+        recorded = solve_recording(problem, rtol, progress)
         if recorded is not None:
             return recorded, "relaxation"
     is_stack, reason = problem.scene.stack is not None, ""
     if method != "radau" and (is_stack or problem.scene.coupled):
-        run = solve_exponential(problem, rtol, t_out, left, progress, repeat=method == "auto")
+        run = solve_exponential(problem, rtol, progress, repeat=method == "auto")
         if run.status not in (BEYOND_STACKS if is_stack else BEYOND_NETWORKS) or (is_stack and method == "exponential"):
             return run, "exponential"
         if is_stack and run.status is Status.FOLD:
             from fingerspice.solve.folding import run_to_fold
 
-            folded = run_to_fold(problem, t_out, left)
+            folded = run_to_fold(problem)
             if folded is not None:
                 return folded, "exponential"
         cause = "a fold is near" if run.status is Status.FOLD else run.status.cause
         reason = f"exponential steps gave up at t = {run.state.t:.4g} s, because {cause}"
     # The implicit method is the last resort: its step length does not depend on fast modes.
-    run = solve_coupled(problem, rtol, t_out, left, progress, reason)
+    run = solve_coupled(problem, rtol, progress, reason)
     if is_stack and run.status is Status.FOLD:
         from fingerspice.solve.folding import lead_to_fold
 
-        run = lead_to_fold(problem, run, t_out, left) or run
+        run = lead_to_fold(problem, run) or run
     return run, "radau"
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.engine.network import Sources, at_sources
+from fingerspice.engine.network import Segment, Sources, at_sources
 from fingerspice.solve.problem import Problem, check_length
 from fingerspice.solve.scenes import kept_with
 from fingerspice.waveforms.refining import WIDEST
@@ -31,10 +31,8 @@ class Tables:
     are cached with the waveform if the run has few windows; in a longer run they are computed anew, in constant memory.
     """
 
-    def __init__(
-        self, problem: Problem, tol: float, *, no_chirps: bool = False, t_out: FloatArray | None = None
-    ) -> None:
-        self.problem, self.no_chirps, self.t_out = problem, no_chirps, t_out
+    def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
+        self.problem, self.no_chirps = problem, no_chirps
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
         self.edges = _windows(problem)
         # An iteration skips windows that end by this time (s), except the last window.
@@ -79,8 +77,8 @@ class Tables:
             wave, w0, w1, self.tol, problem.step, no_chirps=self.no_chirps, scale=self.scales[place],
             shortest=shortest_event(problem),
         )  # fmt: skip
-        if self.t_out is not None and problem.scene.is_sampled and is_sampled(wave):
-            off = table.unseen(wave, self.t_out, self.tol)
+        if problem.scene.is_sampled and is_sampled(wave):
+            off = table.unseen(wave, problem.t_out, self.tol)
             self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
         return table
 
@@ -135,11 +133,6 @@ def ramp(before: FloatArray, after: FloatArray, t: float = 0.0) -> Sources:
     return Sources(2 * np.arange(before.size + 1, dtype=np.int64), edges, terms, np.zeros((before.size, 0)))
 
 
-def held(t: float, values: FloatArray) -> Sources:
-    """Sources that are constant at these values (V or A) from time t (s) on."""
-    return ramp(values, values, t)
-
-
 def values_at(sources: Sources, t: float) -> FloatArray:
     """Right-hand values of the sources at t (s)."""
     out, slope = np.empty((2, sources.first.size - 1))
@@ -166,3 +159,10 @@ def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) ->
         min(max(int(np.searchsorted(sources.edges[a:b], t, side=side)) - 1, 0), b - a - 2)
         for a, b in itertools.pairwise(sources.first)
     ])  # fmt: skip
+
+
+def segment_of(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:
+    """The segment of a single source that contains time t (s), and the time since the segment's start, s."""
+    (i,) = segment_index(sources, t, side).tolist()
+    start = float(sources.edges[i])
+    return Segment(start, float(sources.edges[i + 1]) - start, sources.terms[i], sources.series[i]), t - start

@@ -97,10 +97,7 @@ def operating_point(
     The sources have their values at 0-, and the nodes in `initial` are held. Areas follow their gaps by `contacts`; an
     area without contact is fixed at `area0` (m^2).
 
-    Raises
-    ------
-    InputError
-        Where a node has no path for direct current, or the iteration for the areas does not converge.
+    A node without a path for direct current is refused, and areas that find no operating point.
     """
     conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in network.areas}
     held = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
@@ -154,10 +151,7 @@ def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
 def at_own_area(u: float, area: float, curve: FloatArray) -> float:
     """The gap voltage (V) on its own area that has the same charge as `u` (V) on `area` (m^2), under ``mobile``.
 
-    Raises
-    ------
-    InputError
-        Where no voltage has that charge, which is then past the fold.
+    Where no voltage has that charge, the start is past the fold and refused.
     """
 
     def charge(v: float) -> float:
@@ -182,10 +176,7 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> tuple[Fl
     These are what the cells' start voltages u (n_cell,) V come to by Kirchhoff's law, with the sources at `s` (n_s,).
     Areas that are NaN in `slow` are set to their equilibrium at the consistent voltages.
 
-    Raises
-    ------
-    InputError
-        Where this leads past a fold.
+    A start from which this leads past a fold is refused.
     """
     n, free = net.k.shape[0], np.isnan(slow)
     area = np.where(free, 1.0, slow)

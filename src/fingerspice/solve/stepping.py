@@ -15,11 +15,13 @@ from fingerspice.engine.collocation.loopstate import LoopState
 from fingerspice.engine.collocation.readout import Outputs
 from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Sources
+from fingerspice.numerics.lobatto import ROWS
 from fingerspice.results.outcome import Status
-from fingerspice.results.record import bare_record
+from fingerspice.results.record import Record
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.runs import Integration, Run, excess_of
+from fingerspice.solve.scenes import Scene
 from fingerspice.waveforms.sampling import same_time
 
 # Runs of fewer periods are integrated throughout, because nothing would be saved.
@@ -29,45 +31,6 @@ FEWEST_PERIODS = 6.0
 TRIAL_PERIODS = 2.0
 # Remaining change allowed over all later periods, as a fraction of the error allowed in a step.
 _SHARE = 1.0 / 3.0
-
-
-def looks_of(problem: Problem, rates: FloatArray, tol: float, scale: FloatArray, repeat: bool) -> Looks:
-    """The looks of a run, none where it is not to `repeat` a period.
-
-    Parameters
-    ----------
-    problem : Problem
-    rates : ndarray
-        Rates of the modes with the area frozen, 1/s.
-    tol : float
-        Error of the gap voltage allowed in a step, V.
-    scale : ndarray, shape (n,)
-        Converts the first n entries of the integration's state to volts.
-    repeat : bool
-    """
-    period, start = problem.waveform.period or math.inf, max(problem.t_start, problem.waveform.settled)
-    live, values = rates[rates > 0.0], np.zeros(loop.N_VALUES)
-    values[loop.START], values[loop.STOP], values[loop.PERIOD] = start, problem.t_stop, period
-    values[loop.ALLOWED], values[loop.HAS_CHARGE], values[loop.LOOKED] = _SHARE * tol, problem.charge, -1.0
-    # A mode with rate 0 keeps its charge for ever, so that it does not limit the time to the periodic state.
-    values[loop.RATE] = loop.RATE_SHARE * float(live.min()) if live.size else math.inf
-    values[loop.DISTANCE] = values[loop.REMAINING] = values[loop.TRIAL] = math.inf
-    values[loop.NEXT] = start if repeat and periods_of(values) >= FEWEST_PERIODS else math.inf
-    return Looks(values, np.zeros(scale.size), scale)
-
-
-def periods_of(values: FloatArray) -> float:
-    """Number of periods of a run, from the values of its looks."""
-    return float((values[loop.STOP] - values[loop.START]) / values[loop.PERIOD] * (1.0 + 1e-12))
-
-
-def try_out(values: FloatArray, acceptable: float) -> None:
-    """Compare the ratio of estimated error to peak with the `acceptable` one after a few periods."""
-    if periods_of(values) >= 1.0 + 10.0 * TRIAL_PERIODS:
-        values[loop.TRIAL] = values[loop.START] + TRIAL_PERIODS * values[loop.PERIOD]
-        values[loop.ACCEPTABLE] = acceptable
-
-
 # Ratio of stated to estimated error: the largest error of a step may lie beside the points at which it is estimated,
 # and contributions of opposite sign may cancel at these points.
 SAFETY = 2.5
@@ -93,59 +56,58 @@ class OutOfRangeError(Exception):
 
 
 class Stepping(Integration):
-    """One integration by exponential steps; `tol` is the error allowed in each step, V.
+    """One integration by exponential steps, with an error of at most `tol` (V) in each step.
 
-    Attributes
-    ----------
-    pace : Pace
-    looks : Looks
-    control : record
-        Bookkeeping of the compiled loop, of type `engine.collocation.readout.CONTROL`.
-    out : ndarray, shape (width, n_out)
-        Output rows as columns.
-    peaks, collected : ndarray
-        As in `LoopState`; those of the gaps whose errors are stated are in the rows `gaps`.
-    branch : ndarray, shape (n, 2)
-        As in `ManyAreas`.
-    largest : float
-        Voltage (V) beside the peaks that the round-off of the charge goes with.
-    area_error, charge_safety : float
-        Relative error of the areas' polynomials; stated error of the charge over the estimate.
-    repeated : int
-        Number of periods that were not integrated but repeat another.
-    asked : float
-        With this the stated error is compared after a few periods, where `try_out` was called. The tolerance was chosen
-        before the peaks of the gaps were known; if it proves too large, the run ends there and not at its end before it
-        is repeated.
+    Steps are as long as that allows, or all of the length `h_fixed` (s).
     """
 
-    looks: Looks
-    error: FloatArray
-    gaps: list[int]
-    largest: float
-    area_error: float
-    charge_safety = 1.0
+    error: FloatArray  # As in `LoopState`, as `peaks` and `collected`
+    gaps: list[int]  # Rows of `peaks` of the gaps whose errors are stated
+    largest: float  # Voltage (V) beside the peaks that the round-off of the charge goes with
+    area_error: float  # Relative error of the areas' polynomials
+    capacitance: float  # Capacitance of what holds the charge, at the areas at 0 V, F
+    charge_safety = 1.0  # Stated error of the charge over the estimate
+    # The stated error is compared with this after a few periods, where `try_out` was called. The tolerance was chosen
+    # before the peaks of the gaps were known; if it proves too large, the run ends there and not at its end before it
+    # is repeated.
     asked = math.inf
 
-    def __init__(
-        self, problem: Problem, tol: float, t_out: FloatArray, left: BoolArray, shown: int, width: int,
-        h_fixed: float = 0.0,
-    ) -> None:  # fmt: skip
+    def __init__(self, problem: Problem, tol: float, shown: int, width: int, h_fixed: float = 0.0) -> None:
         self.controls = np.zeros(1, readout.CONTROL)
         self.control = self.controls[0]
         self.control["t"] = problem.t_start
-        super().__init__(problem, t_out, left)
-        span = problem.t_stop - problem.t_start
+        super().__init__(problem)
+        span, self.period = problem.t_stop - problem.t_start, problem.waveform.period or math.inf
         longest = h_fixed or min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
         self.pace = Pace(tol, longest, h_fixed == 0.0, problem.charge)
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.step = np.zeros(1, loopstate.STEP)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
-        self.branch = np.zeros((0, 2))
-        self.out = np.empty((width, t_out.size))
-        self.period, self.repeated = problem.waveform.period or math.inf, 0
+        self.branch = np.zeros((0, 2))  # (n, 2): As in `ManyAreas`
+        self.out = np.empty((width, self.t_out.size))  # Output rows as columns
+        self.outputs = Outputs(self.t_out, self.left, self.out)
+        self.repeated = 0  # Number of periods that were not integrated but repeat another
         self.recorder = Recorder(shown)
         self.keep(0)
+
+    def look_for_period(self, rates: FloatArray, scale: FloatArray, repeat: bool) -> None:
+        """Prepare the looks of the run, none where it is not to `repeat` a period.
+
+        `rates` (1/s) are those of the modes with the area frozen, and `scale` (n,) converts the first n entries of the
+        integration's state to volts.
+        """
+        problem, values = self.problem, np.zeros(loop.N_VALUES)
+        start, live = max(problem.t_start, problem.waveform.settled), rates[rates > 0.0]
+        values[loop.START], values[loop.STOP], values[loop.PERIOD] = start, problem.t_stop, self.period
+        values[loop.ALLOWED], values[loop.HAS_CHARGE], values[loop.LOOKED] = (
+            _SHARE * self.pace.tol, problem.charge, -1.0,
+        )  # fmt: skip
+        # A mode with rate 0 keeps its charge for ever, so that it does not limit the time to the periodic state.
+        values[loop.RATE] = loop.RATE_SHARE * float(live.min()) if live.size else math.inf
+        values[loop.DISTANCE] = values[loop.REMAINING] = values[loop.TRIAL] = math.inf
+        self.periods = (problem.t_stop - start) / self.period * (1.0 + 1e-12)
+        values[loop.NEXT] = start if repeat and self.periods >= FEWEST_PERIODS else math.inf
+        self.looks = Looks(values, np.zeros(scale.size), scale)
 
     @property
     def t(self) -> float:
@@ -158,15 +120,12 @@ class Stepping(Integration):
             self.kept, self.recorder.room, self.tried,
         )  # fmt: skip
 
-    @property
-    def outputs(self) -> Outputs:
-        """Where the compiled loops write outputs."""
-        return Outputs(self.t_out, self.left, self.out)
-
     def try_out(self, asked: float) -> None:
         """Compare the stated error with `asked` after a few periods, if many are left."""
-        self.asked = asked
-        try_out(self.looks.values, asked / SAFETY)
+        self.asked, values = asked, self.looks.values
+        if self.periods >= 1.0 + 10.0 * TRIAL_PERIODS:
+            values[loop.TRIAL] = values[loop.START] + TRIAL_PERIODS * self.period
+            values[loop.ACCEPTABLE] = asked / SAFETY
 
     @abstractmethod
     def circuit(self, sources: Sources) -> Circuit:
@@ -178,22 +137,13 @@ class Stepping(Integration):
         """Round-off of the voltage of every area's gap and, last, of the nodes, V."""
 
     @property
-    @abstractmethod
-    def capacitance(self) -> float:
-        """Capacitance of what holds the charge, at the areas at 0 V, F."""
-
-    @property
-    @abstractmethod
     def margin(self) -> float:
         """Smallest distance to a fold so far."""
+        return float(self.control["margin"])
 
     @abstractmethod
     def _failed(self, code: int, sources: Sources) -> Status:
         """Status of a run whose loop ended with a code other than DONE."""
-
-    def _add_reference(self) -> None:
-        """Make the reference areas that the loop has asked for."""
-        raise NotImplementedError
 
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `loopstate`."""
@@ -201,27 +151,8 @@ class Stepping(Integration):
             code = int(loop.march_on(self.circuit(sources), self.pace, self.loop_state(), looks, t_end))
             if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
                 self.recorder.drain(self.counters)
-            if code == loopstate.REFERENCE:
-                self._add_reference()
-            elif code != loopstate.PAUSED:
+            if code != loopstate.PAUSED:
                 return code
-
-    def _pass(self, periods: int, off: float, owed: float, collected: FloatArray) -> None:
-        """Advance the error by `periods` whole periods, each of which repeats the charge error of the integrated one.
-
-        `off` (V) is the error of the voltages of these periods, `owed` (V) that of the charge over the capacitance, and
-        `collected` the accumulated error of the charge before the integrated period.
-        """
-        self.branch[:, 0] += periods * self.period
-        self.control["branch_start"] += periods * self.period
-        self.peaks[:, readout.ERROR_U] += off
-        u = self.peaks[:, readout.PEAK_U]
-        self.peaks[:, readout.ERROR_F] += off * 2.0 * self.peaks[:, readout.PEAK_F] / np.where(u > 0.0, u, np.inf)
-        missed, spread = self.collected - collected
-        self.collected[0] += periods * missed
-        if self.pace.charge:
-            added = periods * float((np.abs(missed) + np.sqrt(spread)).max())
-            self.control["error_q"] += added + self.capacitance * owed
 
     def stated_peaks(self) -> FloatArray:
         """Peaks so far, of every area's gap and of the nodes, with their stated errors: estimates and round-off."""
@@ -237,20 +168,20 @@ class Stepping(Integration):
         peaks = self.stated_peaks()
         run.gaps, run.margin = peaks[self.gaps], self.margin
         run.node_error = float(peaks[-1, readout.ERROR_U])
-        if self.pace.charge:
-            run.charge_error = self._charge_error()
-
-    def _charge_error(self) -> float:
-        """Stated error of the charge, C; every step adds the round-off of the charge that is held."""
+        if not self.pace.charge:
+            return
         # Errors of unknown sign are the same in every period: they add up from one to the next, instead of cancelling.
         period, steps = self.problem.waveform.period, 1.0 + float(self.counters[readout.ACCEPTED])
         alike = (self.t - self.problem.t_start) / period - self.repeated if period else 0.0
         known, spread = float(self.control["error_q"]), max(self.collected[1].tolist(), default=0.0)
         estimate = SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
-        held = self.capacitance * (self.largest + max(self.peaks[:, readout.PEAK_U].tolist()))
+        held = self.capacitance * (self.largest + float(peaks[:, readout.PEAK_U].max()))
         moved = max(float(self.control["peak_q"]), *map(abs, self.y[-self.s_before.size :].tolist()))
-        # The relative error of the areas' polynomials is also a relative error of all charge moved.
-        return float(self.charge_safety * estimate + 4e-16 * held * steps + self.area_error * (held + moved))
+        # Every step adds the round-off of the charge that is held, and the relative error of the areas' polynomials is
+        # also a relative error of all charge moved.
+        run.charge_error = float(
+            self.charge_safety * estimate + 4e-16 * held * steps + self.area_error * (held + moved)
+        )
 
     def through(self, sources: Sources, t_end: float) -> Status:
         # A period that has been repeated may have led there already.
@@ -278,29 +209,25 @@ class Stepping(Integration):
             self.keep(KEPT_STEPS)
         else:
             # A period of too many steps to keep is not repeated: all later periods are integrated.
-            if self.keeps_all:
+            if 0 < int(self.counters[readout.KEPT]) <= len(self.kept.times):
                 self._repeat()
             self.keep(0)
             found[loop.NEXT] = math.inf
 
     def keep(self, steps: int) -> None:
         """Keep the steps from now on, at most `steps` of them."""
-        self.kept = loopstate.new_kept(steps, len(self.out))
+        # The loop fills in what it keeps: zeros would take longer than all of these steps.
+        self.kept = loopstate.Kept(np.empty((steps, 3)), np.empty((steps, len(self.out), ROWS)))
         if steps:
             self.counters[readout.KEPT] = 0
             self.recorder.drain(self.counters)
             self.kept_from = len(self.recorder.parts)
             self.before = self.y[-self.s_before.size :].copy(), self.collected.copy()
 
-    @property
-    def keeps_all(self) -> bool:
-        """Whether all steps since `keep` fitted into its array."""
-        return 0 < int(self.counters[readout.KEPT]) <= len(self.kept.times)
-
     def _repeat(self) -> None:
         """Repeat the kept period in place of all whole periods that follow."""
-        found, n_s, period = self.looks.values, self.s_before.size, self.period
-        periods = int(found[loop.LEFT])
+        found, n_s, period, stop = self.looks.values, self.s_before.size, self.period, self.problem.t_stop
+        periods, off, owed = int(found[loop.LEFT]), float(found[loop.DISTANCE]), float(found[loop.REMAINING])
         charge, collected = self.before
         drift = self.y[-n_s:] - charge
         drifts = np.zeros(len(self.out))
@@ -314,15 +241,29 @@ class Stepping(Integration):
         self.recorder.drain(self.counters)
         self.recorder.repeat(self.kept_from, periods, period)
         # The end of a period may be the end of the run but for the rounding of both.
-        reached, stop = self.t + periods * period, self.problem.t_stop
+        reached = self.t + periods * period
         self.control["t"] = stop if abs(stop - reached) <= same_time(stop) else reached
-        self._pass(periods, float(found[loop.DISTANCE]), float(found[loop.REMAINING]), collected)
+        self.branch[:, 0] += periods * period
+        self.control["branch_start"] += periods * period
+        # What the voltages (V), and the charge over the capacitance (V), are still off the periodic state; every period
+        # repeats the charge error of the integrated one.
+        self.peaks[:, readout.ERROR_U] += off
+        u = self.peaks[:, readout.PEAK_U]
+        self.peaks[:, readout.ERROR_F] += off * 2.0 * self.peaks[:, readout.PEAK_F] / np.where(u > 0.0, u, np.inf)
+        missed, spread = self.collected - collected
+        self.collected[0] += periods * missed
+        if self.pace.charge:
+            added = periods * float((np.abs(missed) + np.sqrt(spread)).max())
+            self.control["error_q"] += added + self.capacitance * owed
         self.repeated += periods
 
     def recorded(self) -> Recorded | None:
         """The recorded steps of the run so far."""
         self.recorder.drain(self.counters)
-        problem = self.problem
-        shown = problem.scene.shown
-        make = partial(bare_record, shown.network, shown.net)
-        return self.recorder.finish(problem.first, make)
+        return self.recorder.finish(self.problem.first, partial(_record, self.problem.scene.shown))
+
+
+def _record(shown: Scene, t: FloatArray, left: BoolArray, columns: FloatArray) -> Record:
+    """A record without charge from recorded states, shape (size, n_t), which of a stack are counted along the loop."""
+    turned = columns if shown.stack is None else shown.turn[:, None] * columns
+    return Record(shown.network, shown.net, t, left, turned.T, False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -191,9 +192,8 @@ def stream(
         count = whole_number("count", count, 1)
         require(chunk is None, "count", "given beside chunk", "one of them")
     circuit = overridden(circuit, sources, parameters)
-    problem = asked(
-        circuit, t_stop=t_stop, t_eval=None, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol
-    )  # fmt: skip
+    how: dict[str, Any] = {"t_stop": t_stop, "charge_law": charge_law, "area": area, "start": start}
+    problem = asked(circuit, charge=charge, rtol=rtol, **how)
     check_length(problem.waveform, problem.t_start, problem.t_stop)
     outputs = outputs_of(problem, step)
     if count is None:

@@ -27,10 +27,10 @@ _GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
 
 
 class Stopped(Exception):
-    """A period that could not be integrated."""
+    """A period that could not be integrated, or that leads to no periodic state, with the time (s) or the cause."""
 
-    def __init__(self, status: Status, t: float) -> None:
-        self.status, self.t = status, t
+    def __init__(self, status: Status, t: float | None = None, cause: str = "") -> None:
+        self.status, self.t, self.cause = status, t, cause
 
 
 class Period:

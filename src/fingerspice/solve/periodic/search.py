@@ -111,7 +111,7 @@ class Search:
             modes = network_modes(network, area)
             start, _, along = period.linear_state(modes)
             if not np.all(np.isfinite(start)):
-                raise SolveError(period_failure(problem, Status.NOT_PERIODIC, None, CHARGING))
+                raise Stopped(Status.NOT_PERIODIC, cause=CHARGING)
             x = along @ modes.shape.T - s @ modes.follow.T
             for i in np.flatnonzero(net.gap >= 0):
                 contact = network.contacts[i]
@@ -159,10 +159,9 @@ class Search:
 
     def _stepped(self, problem: Problem, tol: float) -> _Pass | None:
         """One pass by exponential steps; None where they fail before the end."""
-        none, scene, n = np.zeros(0), problem.scene, self.period.n
-        outputs = none, none.astype(bool)
+        scene, n = problem.scene, self.period.n
         while True:
-            one = stepping(problem, self.rtol, max(tol, FINEST), self.scale, self.top, *outputs, False)
+            one = stepping(problem, self.rtol, max(tol, FINEST), self.scale, self.top, False)
             try:
                 if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
                     return None
@@ -173,7 +172,7 @@ class Search:
         if isinstance(one, March):
             error = np.append(one.form.shape @ one.error[:n], one.error[n:])
             return _Pass(one.y, one.s_before, error, one.peaks.copy(), magnified, one.references.magnified)
-        end, system = one.state(), one.prepared.system
+        end, system = one.state(), one.system
         model, error = system.model, system.live[int(one.error[n])] @ one.error[:n]
         if model.mobile:
             error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
@@ -257,7 +256,7 @@ class Search:
                 self._mind_wandering(last, change, tol)
                 return last, step, defect
         cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
-        raise SolveError(period_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
+        raise Stopped(Status.NOT_PERIODIC, cause=cause)
 
     def _memory(self) -> float:
         """Largest ratio of the periodic state's error to an error of the voltages made in every period; 1 or more."""
@@ -275,7 +274,7 @@ class Search:
         moved = self._largest(np.where(held, change, 0.0))
         if moved > allowed:
             cause = f"a charge that nothing drains moves by {moved:.3g} V in every period"
-            raise SolveError(period_failure(self.period.problem, Status.NOT_PERIODIC, None, cause))
+            raise Stopped(Status.NOT_PERIODIC, cause=cause)
 
     def _holding(self, z: FloatArray) -> FloatArray:
         """z with its neutral modes adjusted so that the conserved charges have their initial values.
@@ -345,12 +344,8 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
     `rtol` bounds the error of the state alone, relative to the peaks over the period. Where round-off exceeds it, the
     stated error is larger than `rtol`, and no error is raised.
 
-    Raises
-    ------
-    InputError
-        For sources without a common period.
-    SolveError
-        Where a period cannot be integrated, or Newton's method does not converge.
+    Sources without a common period are refused; a period that cannot be integrated, or that leads to no
+    periodic state, is a `SolveError`.
     """
     if problem.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
@@ -358,7 +353,7 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
         period = Period(problem)
         found = Search(period, rtol).close() if problem.scene.coupled else _closed_form(period)
     except Stopped as stopped:
-        raise SolveError(period_failure(problem, stopped.status, stopped.t)) from None
+        raise SolveError(period_failure(problem, stopped.status, stopped.t, stopped.cause)) from None
     y = np.append(found.start, np.zeros(period.before.size))
     initial = State(period.begin, y, period.before, np.zeros(problem.scene.net.gap.size), problem.scene.charge_law)
     moved = period.begin - problem.t_start
@@ -374,7 +369,7 @@ def _closed_form(period: Period) -> Found:
     modes = period.modes
     start, end, _ = period.linear_state(modes)
     if not np.all(np.isfinite(start)):
-        raise SolveError(period_failure(period.problem, Status.NOT_PERIODIC, None, CHARGING))
+        raise Stopped(Status.NOT_PERIODIC, cause=CHARGING)
     sign = 1.0 if period.parts == 1 else -1.0
     defect = float(np.abs(modes.shape @ (sign * end - start)).max(initial=0.0))
     slope = np.diag(np.exp(-period.rates * period.span * period.parts))

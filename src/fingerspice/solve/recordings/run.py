@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.network import Network
 from fingerspice.results.outcome import Plan, State, Status
 from fingerspice.results.record import Record
@@ -58,13 +58,13 @@ def _kept(problem: Problem, rtol: float) -> tuple[Any, ...]:
     return scene.stack.kept, scene.charge_law, rounded_peak(scene.u_peak), *key
 
 
-def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None) -> Run | None:
+def solve(problem: Problem, rtol: float, progress: Progress | None = None) -> Run | None:
     """A run sample by sample; None where this method does not apply (no recording) or does not meet the error."""
     pieces = pieces_of(problem)
     one = None if pieces is None else ready(problem, rtol)
     if pieces is None or one is None:
         return None
-    refused = 0
+    refused, t_out, left = 0, problem.t_out, problem.left
     for share in BEGINNINGS:
         march = LaneMarch(problem, one, rtol, share)
         out = np.empty((march.width, t_out.size))
@@ -78,8 +78,7 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
             if run.excess(problem.rounding) > rtol:
                 # The peaks of the run stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
                 continue
-            look = partial(_look, replace(problem, charge=False), rtol)
-            run.continuous = closed_form(problem, look, rtol)
+            run.continuous = closed_form(replace(problem, charge=False), partial(_again, rtol=rtol), rtol)
             return run
         refused += march.refused
     return None
@@ -99,11 +98,11 @@ def _through(
     return Outcome.MET
 
 
-def _look(problem: Problem, rtol: float, t: FloatArray, left: BoolArray) -> Record:
-    """A record of the same run at other output times."""
-    run = solve(problem, rtol, t, left, None)
+def _again(problem: Problem, rtol: float) -> Run:
+    """The same run with other outputs."""
+    run = solve(problem, rtol)
     assert run is not None
-    return run.record(problem)
+    return run
 
 
 # Number of outputs in a window of a run that is not integrated sample by sample.
@@ -243,8 +242,8 @@ class ByWindows:
         problem = _between(whole, self.state.t, stop)
         scene = replace(whole.scene, network=within(whole.network, self.state.t, stop + whole.step))
         problem = replace(problem, scene=scene, initial=self.state)
-        run_at = at_breakpoints(problem, t)
-        run, self.method = integrated(problem, self.plan, run_at, np.zeros(t.size, bool), self.rtol, self.asked)
+        problem = problem.at(at_breakpoints(problem, t), np.zeros(t.size, bool))
+        run, self.method = integrated(problem, self.plan, self.rtol, self.asked)
         if run.gaps.shape == self.gaps.shape:
             run.gaps = np.maximum(run.gaps, self.gaps)
         self.last, self.gaps, self.state = run, run.gaps, run.state
