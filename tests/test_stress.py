@@ -13,7 +13,7 @@ from scenes import cases
 FIRST = 60
 
 
-@pytest.mark.parametrize("number", range(FIRST, FIRST + cases(60, 15)))
+@pytest.mark.parametrize("number", range(FIRST, FIRST + cases(60, 8)))
 def test_a_random_scene_is_right_or_refused_for_a_true_reason(number: int) -> None:
     assert stress.judge(stress.draw(0, number))
 

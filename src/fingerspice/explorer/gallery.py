@@ -61,7 +61,7 @@ def _run_scene(example: examples.Example) -> Solution:
     asked = Asked({"deck": example.deck, **example.asked})
     first, stop, _ = asked.times
     times = np.linspace(first, stop, 4001)
-    return simulate(asked.circuit, t_stop=stop, t_eval=times, charge_law=asked.request.charge_law, throw=False)
+    return simulate(asked.circuit, t_stop=stop, t_eval=times, charge_law=asked.charge_law, throw=False)
 
 
 def draw(entry: Entry, picture: Path) -> None:

@@ -69,7 +69,7 @@ class Explorer:
     port : int
         0 takes a free one.
     asked : mapping, optional
-        How the page runs the circuit first: keys and values as in `request.Request`.
+        How the page runs the circuit first: keys and values as the fields of `request.Asked`.
     framed : bool
         Whether a notebook on this computer may show the page in a frame; a cell then shows this object as the page.
 
@@ -141,15 +141,22 @@ class Explorer:
         self._thread.join()
 
     def answers(self, what: str, given: Any) -> Iterator[bytes]:
-        """The answer to what the page asks for, in the parts in which it is found."""
-        parts = _ACTIONS[what](given, self.circuit)
-        while True:
-            # Python's filters of warnings belong to the whole process, and two runs at once would not be faster.
-            with self._one_at_a_time:
-                found = next(parts, None)
-            if found is None:
-                return
-            yield framed(found)
+        """The answer to what the page asks for, in the parts in which it is found.
+
+        The last part says what went wrong if this program did.
+        """
+        parts = _parts(what, given, self.circuit)
+        try:
+            while True:
+                # Python's filters of warnings belong to the whole process, and two runs at once would not be faster.
+                with self._one_at_a_time:
+                    found = next(parts, None)
+                if found is None:
+                    return
+                yield framed(found)
+        except Exception as error:
+            text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
+            yield framed({"ok": False, "status": "FAULT", "message": text})
 
 
 def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
@@ -189,27 +196,23 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
     return explorer
 
 
-Action = Callable[[Any, Circuit | None], Iterator[dict[str, Any]]]
-
-
-def _whole(make: Callable[[Any, Circuit | None], dict[str, Any] | str]) -> Action:
-    """An action whose answer, or refusal, comes in one part."""
-
-    def parts(given: Any, own: Circuit | None) -> Iterator[dict[str, Any]]:
-        try:
-            found = make(given, own)
-        except (InputError, SolveError) as error:
-            found = {"ok": False, "message": str(error)}
-        yield {"ok": True, "text": found} if isinstance(found, str) else found
-
-    return parts
-
-
-#: What the page asks for.
-_ACTIONS: dict[str, Action] = {
-    "scene": scene.parts, "set": _whole(changed.applied), "means": _whole(scene.means),
-    "deck": _whole(scene.as_deck), "python": _whole(scene.as_python),
+#: What the page asks for, and what answers, in one part or in several.
+_ACTIONS: dict[str, Callable[[Any, Circuit | None], Any]] = {
+    "scene": scene.parts, "set": changed.applied, "means": scene.means, "deck": scene.as_deck,
+    "python": scene.as_python,
 }  # fmt: skip
+
+
+def _parts(what: str, given: Any, own: Circuit | None) -> Iterator[dict[str, Any]]:
+    """The parts of an answer, or a refusal."""
+    try:
+        found = _ACTIONS[what](given, own)
+    except (InputError, SolveError) as error:
+        found = {"ok": False, "message": str(error)}
+    if isinstance(found, Iterator):
+        yield from found
+    else:
+        yield {"ok": True, "text": found} if isinstance(found, str) else found
 
 
 def as_json(data: Any) -> bytes:
@@ -364,15 +367,7 @@ class _Handler(BaseHTTPRequestHandler):
             given = json.loads(self.rfile.read(int(length)))
         except (ValueError, RecursionError):
             raise _Refused(HTTPStatus.BAD_REQUEST, "the request is not JSON") from None
-        return "application/octet-stream", self._parts(what, given)
-
-    def _parts(self, what: str, given: Any) -> Iterator[bytes]:
-        """The parts of an answer, the last of which says what went wrong if this program did."""
-        try:
-            yield from self.explorer.answers(what, given)
-        except Exception as error:
-            text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
-            yield framed({"ok": False, "status": "FAULT", "message": text})
+        return "application/octet-stream", self.explorer.answers(what, given)
 
     def _discard(self) -> None:
         """Read what was sent with a refused request, up to a limit, so that the browser takes the answer."""

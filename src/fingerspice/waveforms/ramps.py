@@ -7,23 +7,57 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import check_range, in_windows, runs_through
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.waveform import Waveform, require, terms_of
+from fingerspice.waveforms.waveform import Waveform, check_range, require, terms_of
 
 # A waveform with at most this many knots is not divided into windows, however close together its knots are.
 FEW_KNOTS = 1000
 # Most points that the text of a PWL shows.
 MOST_SHOWN = 10_000
+#: Largest number of breakpoints listed at once; each takes about 40 bytes, the arrays computed from it included.
+MOST_LISTED = 20_000_000
+#: Number of breakpoints in a window of time; the values at all times in one window are looked up together.
+_WINDOW = 1_000_000
+
+
+def runs_through(first: float, last: float, count: int, t0: float, t1: float) -> FloatArray:
+    """Indices of the periods `first` to `last`, which cover t0 to t1 (s); each has `count` breakpoints.
+
+    More than `MOST_LISTED` breakpoints are refused.
+    """
+    total = (last - first + 1.0) * count
+    if not total <= MOST_LISTED:
+        raise InputError(
+            f"the source has {total:.3g} breakpoints from {t0:g} s to {t1:g} s; allowed: at most {MOST_LISTED:.0e} at "
+            "once: a shorter run, or a longer period"
+        )
+    return np.arange(first, last + 1.0)
+
+
+def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]:
+    """Indices of the times (s), grouped by windows that hold `_WINDOW` breakpoints at `rate` breakpoints per second.
+
+    The windows save memory: for the values at ten times in a year of square waves the breakpoints of at most ten
+    windows are listed, instead of all breakpoints of the year.
+    """
+    if t.size == 0:
+        return
+    window = np.floor(t * (rate / _WINDOW))
+    if window.min() == window.max():
+        yield slice(None)
+        return
+    order = np.argsort(window, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(window[order])) + 1)
 
 
 class Ramps(Waveform):
@@ -75,7 +109,7 @@ class Ramps(Waveform):
         t = real_numbers("t", t, "times in s")
         flat = t.ravel()
         out = np.empty(flat.size)
-        for window in in_windows(flat, self.breakpoint_rate() if self.period else 0.0):
+        for window in in_windows(flat, self.breakpoint_rate()):
             out[window] = self._values(flat[window], side)
         return out.reshape(t.shape)
 

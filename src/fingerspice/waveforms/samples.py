@@ -12,13 +12,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, read_only, real_number, real_numbers, whole_number
-from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import RANGES, check_range
 from fingerspice.waveforms.combinations import Product, Sum
 from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, check_count, read_table, wav_layout
 from fingerspice.waveforms.ramps import FEW_KNOTS, PWL, Ramps
-from fingerspice.waveforms.waveform import DC, Waveform, require
+from fingerspice.waveforms.waveform import DC, RANGES, Waveform, check_range, require
 
 # Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
 # to 0.46 of the rate.
@@ -29,32 +27,6 @@ AT_ONCE = 1 << 20
 ON_GRID, ROUNDING = 1e-9, 1e-15
 # Largest number of grid samples for each point of a PWL: beyond it, few long lines are faster taken one by one.
 MOST_PER_POINT = 8
-
-
-@jit
-def _along(
-    values: FloatArray, first: int, start: float, rate: float, t: FloatArray, left: bool
-) -> FloatArray:  # fmt: skip
-    """Values (V), at times `t` (s), of the straight lines between samples at a rate (Hz); exact at a sample's time.
-
-    `first` is the number of the first of the samples given; sample number 0 is at `start` (s).
-    """
-    out = np.empty(t.size)
-    last = first + values.size - 1
-    for i in range(t.size):
-        j = int(min(max((t[i] - start) * rate, float(first)), float(last)))
-        # Rounding may have given a neighbour of the sample at or before `t[i]`: correct the number.
-        while j < last and (start + (j + 1) / rate < t[i] or (not left and start + (j + 1) / rate == t[i])):
-            j += 1
-        while j > first and (start + j / rate > t[i] or (left and start + j / rate == t[i])):
-            j -= 1
-        here, after = start + j / rate, start + (j + 1) / rate
-        if t[i] <= here or j == last:
-            out[i] = values[j - first]
-        else:
-            here_v, after_v = values[j - first], values[j + 1 - first]
-            out[i] = here_v + (after_v - here_v) / (after - here) * (t[i] - here)
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,8 +194,8 @@ class Samples(Ramps):
 
     def _around(self, t0: float, t1: float) -> tuple[int, int]:
         """First index into `values`, and the one after the last, of two samples or more that determine a span (s)."""
-        low = min(max(math.floor(self._number_of(t0)) - 2, 0), self.count - 2)
-        return low, min(max(math.ceil(self._number_of(t1)) + 3, low + 2), self.count)
+        low = math.floor(min(max(self._number_of(t0) - 2.0, 0.0), self.count - 2))
+        return low, math.ceil(min(max(self._number_of(t1) + 3.0, low + 2), self.count))
 
     @property
     def course(self) -> tuple[float, float]:  # type: ignore[override]
@@ -251,11 +223,12 @@ class Samples(Ramps):
         return 0.0 if self.count <= FEW_KNOTS else self.count / ((self.count - 1) / self.rate)
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
-        flat = read_only(np.ascontiguousarray(flat))
-        first = round(min(max(self._number_of(float(flat[0])), 0.0), float(self.count))) if flat.size else 0
-        if first + flat.size <= self.count and np.array_equal(flat, self._times_of(first, first + flat.size)):
-            return self.values[first : first + flat.size].copy()
-        return _along(self.values, self._number, self.start, self.rate, flat, side == "left")
+        low, high = self._around(float(flat.min()), float(flat.max()))
+        times, values = self._times_of(low, high), self.between(low, high)
+        first = int(times.searchsorted(flat[0]))
+        if np.array_equal(flat, times[first : first + flat.size]):
+            return values[first : first + flat.size].copy()
+        return np.interp(flat, times, values)
 
 
 def _check_samples(values: FloatArray, first: int) -> None:
@@ -305,16 +278,6 @@ class _WavFile(Samples):
         if "values" in self.__dict__:
             return super()._read(first, last)
         return np.asarray(self.gain * self.layout.read(first, last))
-
-    def _values(self, flat: FloatArray, side: str) -> FloatArray:
-        if "values" in self.__dict__:
-            return super()._values(flat, side)
-        out = np.empty(flat.size)
-        block = np.floor((flat - self.start) * self.rate / AT_ONCE)
-        for one in np.unique(block):
-            here = block == one
-            out[here] = self.part(float(flat[here].min()), float(flat[here].max()))._values(flat[here], side)
-        return out
 
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         return self.part(float(start.min()), float(stop.max())).terms(start, stop)

@@ -19,8 +19,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray, positive_number, real
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.engine.collocation.loopstate import SAME_TIME
-from fingerspice.waveforms.bounds import in_windows, runs_through
-from fingerspice.waveforms.ramps import Ramps
+from fingerspice.waveforms.ramps import Ramps, in_windows, runs_through
 from fingerspice.waveforms.refining import POINTS, Refiner
 from fingerspice.waveforms.waveform import Waveform, require
 
@@ -168,23 +167,14 @@ def on_grid(t: FloatArray, start: float, step: float, slack: float) -> bool:
     return True
 
 
-@jit
 def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
     """For each mark, whether a time lies within the relative distance `slack` of it without being equal to it.
 
     Times and marks ascend.
     """
-    out = np.zeros(marks.size, np.bool_)
-    first = 0
-    for k in range(marks.size):
-        reach = slack * abs(marks[k])
-        while first < t.size and t[first] < marks[k] - reach:
-            first += 1
-        i = first
-        while i < t.size and t[i] <= marks[k] + reach:
-            out[k] |= t[i] != marks[k]
-            i += 1
-    return out
+    reach = slack * np.abs(marks)
+    near = t.searchsorted(marks + reach, "right") - t.searchsorted(marks - reach)
+    return np.asarray(near > t.searchsorted(marks, "right") - t.searchsorted(marks))
 
 
 def breakpoints_at(waveform: Waveform, t: float) -> FloatArray:
