@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import resource
+import subprocess
 import sys
 from pathlib import Path
 
@@ -132,3 +135,30 @@ def test_no_result_depends_on_where_a_walk_over_periods_is_cut(
     for name, (values, _, _) in whole.signals.items():
         np.testing.assert_array_equal(again.signals[name][0], values, err_msg=name)
     np.testing.assert_array_equal(again.state.y, whole.state.y)
+
+
+FAULTS = """
+import resource, sys
+import numpy as np
+from fingerspice.base.arrays import keep_freed_memory
+if "keep" in sys.argv:
+    keep_freed_memory()
+for _ in range(3):
+    np.ones(1 << 17)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(100):
+    np.ones(1 << 17)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the parameters are those of glibc's malloc")
+def test_freed_memory_is_kept_where_the_environment_asks_to_give_it_back() -> None:
+    def faults(*arguments: str) -> int:
+        environment = os.environ | {"MALLOC_TRIM_THRESHOLD_": "65536"}
+        command = [sys.executable, "-c", FAULTS, *arguments]
+        return int(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+
+    # A megabyte is 256 pages, and a hundred of them are used one after another.
+    assert faults() > 20_000
+    assert faults("keep") < 500

@@ -137,12 +137,8 @@ def stack(rng: np.random.Generator, law: str, parts: str) -> Stack:
 
 
 def engine_account(
-    step: Stack,
-    before: float = 0.0,
-    last_area: float = np.inf,
-    kept: float = 0.0,
-    missed: np.ndarray | None = None,
-) -> tuple[float, float]:
+    step: Stack, before: float = 0.0, last_area: float = np.inf, kept: float = 0.0, missed: np.ndarray | None = None
+) -> tuple[float, float]:  # fmt: skip
     """What stayed and the error after the engine's account of the step, with a jump before it from an area (m^2).
 
     With `missed` the modes are at rest, but for this error (V) at the points between the nodes, which is all of it.

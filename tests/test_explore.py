@@ -59,11 +59,6 @@ def explorer() -> Iterator[Explorer]:
     running.stop()
 
 
-def array(x: Any) -> FloatArray:
-    """An array of an answer, or of a page without a server, where it is text."""
-    return x if isinstance(x, np.ndarray) else np.frombuffer(base64.b64decode(x["f64"]), "<f8")
-
-
 def packed(values: list[float]) -> str:
     return base64.b64encode(np.array(values, "<f8").tobytes()).decode()
 
@@ -112,6 +107,13 @@ def unframed(content: bytes) -> dict[str, Any]:
     return found
 
 
+def baked(page: str) -> Any:
+    """The data of a page without a server."""
+    found = re.search(r'<script type="text/plain" id="baked">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return unframed(base64.b64decode(found[1]))
+
+
 def run_as_python(request: dict[str, Any], own: fs.Circuit | None = None) -> fs.Solution:
     names: dict[str, Any] = {}
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
@@ -142,7 +144,7 @@ def test_the_values_of_a_scene_are_those_of_simulate(explorer: Explorer) -> None
     }  # fmt: skip
     answer = post(explorer, request)
     assert answer["ok"], answer["message"]
-    t = array(answer["t"])
+    t = answer["t"]
     assert t.size == POINTS
     np.testing.assert_allclose(t, np.linspace(5e-3, 15e-3, POINTS), rtol=1e-14)
     with warnings.catch_warnings():
@@ -152,7 +154,7 @@ def test_the_values_of_a_scene_are_those_of_simulate(explorer: Explorer) -> None
             circuit, sources=fs.Square(150.0, 200.0), charge_law="mobile", rtol=1e-7, t_stop=15e-3, t_eval=t,
             charge=False,
         )  # fmt: skip
-    signals = {trace["name"]: array(trace["values"]) for trace in answer["traces"]}
+    signals = {trace["name"]: trace["values"] for trace in answer["traces"]}
     assert set(signals) == {"u_source", "u_gap", "f_el", "area", "friction"}
     for name, values in signals.items():
         np.testing.assert_array_equal(values, getattr(expected, name))
@@ -162,11 +164,11 @@ def test_the_values_of_a_scene_are_those_of_simulate(explorer: Explorer) -> None
     (stack,) = answer["stacks"]
     assert (stack["gap"], [layer["d"] for layer in stack["layers"]]) == ("Xgap", [1e-6, 4e-6, 350e-6])
     for layer, column in zip(stack["layers"], expected.u_layer.T, strict=True):
-        np.testing.assert_array_equal(array(layer["values"]), column)
+        np.testing.assert_array_equal(layer["values"], column)
     (friction,) = answer["harmonics"]
     lines = expected.spectrum("f_t", highest=20 * 200.0)
-    np.testing.assert_allclose(array(friction["frequency"]), lines.frequency)
-    np.testing.assert_allclose(array(friction["amplitude"]), lines.amplitude)
+    np.testing.assert_allclose(friction["frequency"], lines.frequency)
+    np.testing.assert_allclose(friction["amplitude"], lines.amplitude)
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda e: e.name)
@@ -454,7 +456,7 @@ def test_a_solution_opens_the_page_as_it_was_run(monkeypatch: pytest.MonkeyPatch
         }  # fmt: skip
         shown = post(running, start["own"]["request"])
         force = next(trace for trace in shown["traces"] if trace["signal"] == "f_el")
-        np.testing.assert_allclose(array(force["values"]).max(), solution.f_el.max(), rtol=1e-3)
+        np.testing.assert_allclose(force["values"].max(), solution.f_el.max(), rtol=1e-3)
     finally:
         running.stop()
 
@@ -550,9 +552,7 @@ PAUSES = ((0.0,), 5 * (2e-5,), 5 * (0.0,), 5 * (1e-4,))
 
 
 @pytest.mark.parametrize("pauses", PAUSES[: cases(4, 2)], ids=str)
-def test_the_command_serves_until_it_is_interrupted_and_leaves_no_file(
-    tmp_path: Path, pauses: tuple[float, ...]
-) -> None:
+def test_the_command_serves_until_interrupted_and_leaves_no_file(tmp_path: Path, pauses: tuple[float, ...]) -> None:
     (tmp_path / "pad.cir").write_text(SINE)
     with serving(tmp_path, "pad.cir") as (process, said):
         assert (said["command"], said["success"], said["title"]) == ("explore", True, "Table 1, sine of 100 Hz")
@@ -594,12 +594,10 @@ def test_the_static_page_needs_no_other_file_and_holds_the_run(command: Command,
     assert (result.code, answer["files"], answer["url"]) == (0, ["page.html"], None)
     page = (tmp_path / "page.html").read_text()
     assert not re.search(r'(src|href)="(?!data:)', page)
-    baked = re.search(r'<script type="application/json" id="baked">(.*?)</script>', page, re.DOTALL)
-    assert baked is not None
-    data = json.loads(baked[1])
+    data = baked(page)
     assert data["start"]["own"]["title"] == "</script> sine of 100 Hz"
     np.testing.assert_array_equal(
-        array(data["scenes"]["own"]["traces"][1]["values"]), scene({"deck": SINE, "last": 2})["traces"][1]["values"]
+        data["scenes"]["own"]["traces"][1]["values"], scene({"deck": SINE, "last": 2})["traces"][1]["values"]
     )
     assert command("explore", "pad.cir", "--static", "pad.cir").code == 2
     result = command("explore", "none.cir", "--no-browser", "--json")

@@ -212,9 +212,7 @@ simple = st.one_of(
 
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(a=simple, b=simple, c=simple)
-def test_sums_and_products_are_sums_and_products_of_values_in_python_and_in_the_table(
-    a: fs.Waveform, b: fs.Waveform, c: fs.Waveform
-) -> None:
+def test_sums_and_products_have_those_of_the_values(a: fs.Waveform, b: fs.Waveform, c: fs.Waveform) -> None:
     combined = (a + b) * c + a * b
     t = np.sort(np.modf(np.arange(1, 30) * 0.618033988749895)[0]) * 0.04
     expected = (a.value(t) + b.value(t)) * c.value(t) + a.value(t) * b.value(t)

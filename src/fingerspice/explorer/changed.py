@@ -39,10 +39,7 @@ def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]
 
 
 def in_scene(asked: Asked) -> tuple[list[dict[str, Any]], set[str], list[str]]:
-    """What the page says of each set of a request of which a value is still in force.
-
-    With it go the paths that the sets give, in lower case, and sentences about sets that mean nothing here.
-    """
+    """What the page says of each set with a value in force, the paths that sets give, and sets that mean nothing."""
     circuit, given, lost = asked.circuit._with(sets={}), [], []
     for entry in asked.sets:
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import dataclasses
 import math
 import warnings
@@ -137,7 +136,7 @@ def _numbers(what: str, given: Any) -> FloatArray:
     try:
         data = base64.b64decode(given if isinstance(given, str) else "?", validate=True)
         values = np.frombuffer(data, "<f8").astype(float)
-    except (ValueError, binascii.Error):
+    except ValueError:
         raise InputError(f"recording {what}: not base64 of doubles") from None
     allowed = f"2 to {MOST_SAMPLES:,}"
     require(2 <= values.size <= MOST_SAMPLES, f"recording {what}", f"{values.size:,} numbers", allowed)
@@ -236,10 +235,7 @@ class Asked:
 
     @cached_property
     def times(self) -> tuple[float, float, float | None]:
-        """First time shown and end of the run, s, and the period of the source, s, or None.
-
-        A run that is too long for a page that answers at once is refused.
-        """
+        """First time shown and end of the run, s, and the source's period, s, or None; too long a run is refused."""
         first, period = 0.0, self.waveform.period
         if period is not None and math.isfinite(period):
             stop = self.waveform.settled + self.periods * period

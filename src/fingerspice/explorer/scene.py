@@ -69,10 +69,7 @@ def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -
 
 
 def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[str, Any]]:
-    """The answer of `scene` but for ``figures``, ``harmonics`` and ``stacks``, and then these.
-
-    The traces can be drawn while the figures are computed, which takes longer than the run.
-    """
+    """The answer of `scene` without ``figures``, ``harmonics`` and ``stacks``, to be drawn at once, and then these."""
     answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
     solution = None
     with _noticing(answer):

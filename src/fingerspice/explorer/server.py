@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hmac
 import json
 import secrets
@@ -141,19 +140,22 @@ class Explorer:
         self._thread.join()
 
     def answers(self, what: str, given: Any) -> Iterator[bytes]:
-        """The answer to what the page asks for, in the parts in which it is found.
-
-        The last part says what went wrong if this program did.
-        """
-        parts = _parts(what, given, self.circuit)
+        """The answer to what the page asks for, in the parts in which it is found, or why there is none."""
         try:
+            # Python's filters of warnings belong to the whole process, and two runs at once would not be faster.
+            with self._one_at_a_time:
+                found = _ACTIONS[what](given, self.circuit)
+            if isinstance(found, str):
+                found = {"ok": True, "text": found}
+            parts = iter([found]) if isinstance(found, dict) else found
             while True:
-                # Python's filters of warnings belong to the whole process, and two runs at once would not be faster.
                 with self._one_at_a_time:
-                    found = next(parts, None)
-                if found is None:
+                    part = next(parts, None)
+                if part is None:
                     return
-                yield framed(found)
+                yield framed(part)
+        except (InputError, SolveError) as error:
+            yield framed({"ok": False, "message": str(error)})
         except Exception as error:
             text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
             yield framed({"ok": False, "status": "FAULT", "message": text})
@@ -203,23 +205,6 @@ _ACTIONS: dict[str, Callable[[Any, Circuit | None], Any]] = {
 }  # fmt: skip
 
 
-def _parts(what: str, given: Any, own: Circuit | None) -> Iterator[dict[str, Any]]:
-    """The parts of an answer, or a refusal."""
-    try:
-        found = _ACTIONS[what](given, own)
-    except (InputError, SolveError) as error:
-        found = {"ok": False, "message": str(error)}
-    if isinstance(found, Iterator):
-        yield from found
-    else:
-        yield {"ok": True, "text": found} if isinstance(found, str) else found
-
-
-def as_json(data: Any) -> bytes:
-    """Data as JSON: arrays of numbers as base64 of little-endian doubles, and null for what is not finite."""
-    return _dumped(data, lambda x: {"f64": base64.b64encode(np.ascontiguousarray(x, "<f8").tobytes()).decode("ascii")})
-
-
 def framed(data: Any) -> bytes:
     """Data as the JSON's length and the number of doubles (four bytes each), the JSON, and the doubles of all arrays.
 
@@ -238,18 +223,12 @@ def framed(data: Any) -> bytes:
             end += x.size
         return places[id(x)]
 
-    text = _dumped(data, place)
-    text += b" " * (-len(text) % 8)
-    return b"".join([struct.pack("<II", len(text), end), text, *arrays])
-
-
-def _dumped(data: Any, array: Callable[[FloatArray], Any]) -> bytes:
-    """Data as JSON, with `array` for its arrays, and null for what is not finite."""
-    text = json.dumps(data, default=array)
+    text = json.dumps(data, default=place)
     if "NaN" in text or "Infinity" in text:
-        # Seldom, and all data have to be gone through.
+        # Seldom, and all data have to be gone through: what is not finite is null.
         text = json.dumps(json.loads(text, parse_constant=lambda _: None))
-    return text.encode()
+    content = text.encode() + b" " * (-len(text) % 8)
+    return b"".join([struct.pack("<II", len(content), end), content, *arrays])
 
 
 class _Server(ThreadingHTTPServer):
@@ -313,7 +292,7 @@ class _Handler(BaseHTTPRequestHandler):
         except _Refused as error:
             self._discard()
             status, text = error.args
-            kind, parts = "application/json", iter([as_json({"ok": False, "message": text})])
+            kind, parts = "application/json", iter([json.dumps({"ok": False, "message": text}).encode()])
         part = next(parts)
         self.send_response(status)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
@@ -346,8 +325,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _file(self, what: str) -> tuple[str, Iterator[bytes]]:
         if what == "start":
-            start = as_json(scene.beginning(self.explorer.circuit, self.explorer.asked))
-            return "application/json", iter([start])
+            start = json.dumps(scene.beginning(self.explorer.circuit, self.explorer.asked))
+            return "application/json", iter([start.encode()])
         name = what or "index.html"
         if name not in self.explorer.files:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is no such file")

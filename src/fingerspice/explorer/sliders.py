@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import parse_number, spice_text
-from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import MEANINGS_OF_WAVEFORMS
 from fingerspice.circuit.devices import ParameterSpec
 from fingerspice.circuit.topology import driving_sources
@@ -39,42 +38,34 @@ _PREFIXED = ("m", "V", "A", "ohm", "ohm m", "F", "Hz", "s", "V/m")
 
 
 def sliders(base: Circuit, shown: Circuit) -> list[dict[str, Any]]:
-    """The sliders by element, those of the sources, the gap and the layers first.
-
-    `base` is the circuit of the deck, whose values set the ranges, so that these stay while a slider moves; `shown` has
-    the values of now.
-    """
+    """Sliders by element, of sources, gap and layers first; values of the deck's `base` set the ranges, which stay."""
     driving = {e.name for e in driving_sources(shown)}
     before = {e.name: e for e in base.elements}
     order = {"V": 0, "I": 0, "GAP": 1, "LAYER": 2, "SLAB": 2, "SKIN": 3, "SKIN_DISPERSIVE": 3}
-    groups = [
-        {"element": e.name, "device": e.device, "what": e.spec.what or e.device,
-         "sliders": list(_sliders(before[e.name], e, e.name in driving))}
-        for e in sorted(shown.elements, key=lambda e: order.get(e.device, 4))
-    ]  # fmt: skip
-    return [group for group in groups if group["sliders"]]
-
-
-def _sliders(base: Element, e: Element, drives: bool) -> Iterator[dict[str, Any]]:
-    """The sliders of one element; `base` is the element in the deck, and a source that does not drive gives an area."""
-    rows: list[tuple[str, str, float, bool, str, tuple[float, float, bool]]] = []
-    for spec in e.spec.parameters:
-        limits = _of_parameter(spec, base.values.get(spec.name, e.values[spec.name]))
-        rows.append((spec.name, spec.unit, e.values[spec.name], spec.first, spec.meaning, limits))
-    same = type(base.waveform) is type(e.waveform)
-    for name, unit in type(e.waveform).units.items() if e.waveform is not None else ():
-        value = getattr(e.waveform, name, None)
-        if isinstance(value, (int, float)):
-            own = getattr(base.waveform, name) if same else value
-            limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
-            # A source on an area node gives mm^2.
-            unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
-            rows.append((name, unit, value, name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, ""), limits))
-    for name, unit, value, first, meaning, (low, high, log) in rows:
-        yield {
-            "path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
-            "text": value_text(value, unit), "low": low, "high": high, "log": log, "first": first, "meaning": meaning,
-        }  # fmt: skip
+    groups = []
+    for e in sorted(shown.elements, key=lambda e: order.get(e.device, 4)):
+        old, drives = before[e.name], e.name in driving
+        rows: list[tuple[str, str, float, bool, str, tuple[float, float, bool]]] = []
+        for spec in e.spec.parameters:
+            limits = _of_parameter(spec, old.values.get(spec.name, e.values[spec.name]))
+            rows.append((spec.name, spec.unit, e.values[spec.name], spec.first, spec.meaning, limits))
+        same = type(old.waveform) is type(e.waveform)
+        for name, unit in type(e.waveform).units.items() if e.waveform is not None else ():
+            value = getattr(e.waveform, name, None)
+            if isinstance(value, (int, float)):
+                own = getattr(old.waveform, name) if same else value
+                # A source that does not drive is on an area node, and gives mm^2.
+                limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
+                unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
+                rows.append((name, unit, value, name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, ""), limits))
+        found = [
+            {"path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
+             "text": value_text(value, unit), "low": low, "high": high, "log": log, "first": first, "meaning": meaning}
+            for name, unit, value, first, meaning, (low, high, log) in rows
+        ]  # fmt: skip
+        if found:
+            groups.append({"element": e.name, "device": e.device, "what": e.spec.what or e.device, "sliders": found})
+    return groups
 
 
 def value_text(value: float, unit: str) -> str:

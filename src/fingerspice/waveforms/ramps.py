@@ -1,7 +1,4 @@
-"""Waveforms made of straight pieces: `PWL`, and the base class of all such waveforms.
-
-A subclass of `Ramps` only lists its knots.
-"""
+"""Waveforms made of straight pieces: `PWL`, and their base class `Ramps`, of which a subclass only lists its knots."""
 
 from __future__ import annotations
 
@@ -31,10 +28,7 @@ _WINDOW = 1_000_000
 
 
 def runs_through(first: float, last: float, count: int, t0: float, t1: float) -> FloatArray:
-    """Indices of the periods `first` to `last`, which cover t0 to t1 (s); each has `count` breakpoints.
-
-    More than `MOST_LISTED` breakpoints are refused.
-    """
+    """Indices of periods `first` to `last`, over t0 to t1 (s), of `count` breakpoints each; too many are refused."""
     total = (last - first + 1.0) * count
     if not total <= MOST_LISTED:
         raise InputError(
@@ -45,11 +39,7 @@ def runs_through(first: float, last: float, count: int, t0: float, t1: float) ->
 
 
 def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]:
-    """Indices of the times (s), grouped by windows that hold `_WINDOW` breakpoints at `rate` breakpoints per second.
-
-    The windows save memory: for the values at ten times in a year of square waves the breakpoints of at most ten
-    windows are listed, instead of all breakpoints of the year.
-    """
+    """Indices of times (s) by windows of `_WINDOW` breakpoints, so that ten values in a year of squares list few."""
     if t.size == 0:
         return
     window = np.floor(t * (rate / _WINDOW))
@@ -79,7 +69,7 @@ class Ramps(Waveform):
     @cached_property
     def _distinct(self) -> FloatArray:
         """Times of the knots, each once, s."""
-        return _once(np.unique(self.knots[0]))
+        return _once(self.knots[0])
 
     def _times(self, t0: float, t1: float) -> FloatArray:
         """Times of a periodic waveform's knots (s) over [t0, t1] and a period beyond; jumps appear twice."""
@@ -94,7 +84,7 @@ class Ramps(Waveform):
     def _edges(self, t0: float, t1: float) -> FloatArray:
         if self.period is None:
             return self._distinct[self._distinct.searchsorted(t0) : self._distinct.searchsorted(t1, "right")]
-        return _once(np.unique(self._times(t0, t1)))
+        return _once(self._times(t0, t1))
 
     @property
     def course(self) -> tuple[float, float]:  # type: ignore[override]
@@ -124,21 +114,16 @@ class Ramps(Waveform):
             index = edges.searchsorted(flat, "right" if side == "right" else "left")
             v0, slope = self._line(bounds[index], bounds[index + 1])
             return np.asarray(v0 + slope * (flat - bounds[index]))
-        if side == "right":
-            return np.interp(flat, times, values)
-        index = times.searchsorted(flat)
-        j = np.clip(index, 1, times.size - 1)
-        # Outside the knots the two nearest may be a jump, between which there is no slope.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            slope = (values[j] - values[j - 1]) / (times[j] - times[j - 1])
-            inside = values[j - 1] + slope * (flat - times[j - 1])
-        return np.where(index == 0, values[0], np.where(index == times.size, values[-1], inside))
+        out = np.interp(flat, times, values)
+        if side == "left":
+            # At a knot its own value, and at a jump that of the first of two knots.
+            j = np.minimum(times.searchsorted(flat), times.size - 1)
+            out = np.where(times[j] == flat, values[j], out)
+        return out
 
     def _line(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Values (V) at `start` and slopes (V/s) of the straight pieces between `start` and `stop` (s).
-
-        A piece is identified by its midpoint, which rounding cannot move into a neighbour.
-        """
+        """Values (V) at `start` and slopes (V/s) of the straight pieces between `start` and `stop` (s)."""
+        # A piece is identified by its midpoint, which rounding cannot move into a neighbour.
         times, values = self.knots
         middle = 0.5 * (start + stop)
         run = np.zeros(1)
@@ -176,13 +161,10 @@ class Ramps(Waveform):
 
 
 def _once(times: FloatArray) -> FloatArray:
-    """Ascending times (s) without each time that differs from the time before it only by rounding.
-
-    The last knot of a period and the first knot of the next period are such a pair.
-    """
-    keep = np.ones(times.size, bool)
-    keep[1:] = np.diff(times) > 1e-15 * np.abs(times[1:])
-    return times[keep]
+    """The times, ascending, each once; of those that differ only by rounding, as the end of a period and the start of
+    the next, the first."""
+    times = np.unique(times)
+    return times[np.diff(times, prepend=-np.inf) > 1e-15 * np.abs(times)]
 
 
 @dataclass(frozen=True)

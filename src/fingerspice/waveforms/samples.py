@@ -299,15 +299,28 @@ def as_samples(wave: Waveform) -> Samples | None:
 
 
 def _of_parts(wave: Sum | Product) -> Samples | None:
+    """A product of one recording and constants; or a sum of recordings on one grid, from the first sample of any to
+    the last one, and constants."""
     constants = [part.level for part in wave.parts if isinstance(part, DC)]
     others = [as_samples(part) for part in wave.parts if not isinstance(part, DC)]
-    known = [part for part in others if part is not None]
-    if not known or len(known) < len(others):
+    parts = [part for part in others if part is not None]
+    if not parts or len(parts) < len(others):
         return None
-    if isinstance(wave, Sum):
-        return _added(known, float(sum(constants)))
-    only = known[0]
-    return Samples(float(np.prod(constants)) * only.values, only.rate, only.start) if len(known) == 1 else None
+    first = min(parts, key=lambda part: part.start)
+    rate = first.rate
+    if isinstance(wave, Product):
+        return Samples(float(np.prod(constants)) * first.values, rate, first.start) if len(parts) == 1 else None
+    begins = [(part.start - first.start) * rate for part in parts]
+    if any(part.rate != rate for part in parts) or any(abs(x - round(x)) > ON_GRID for x in begins):
+        return None
+    end = max(round(x) + part.count for x, part in zip(begins, parts, strict=True))
+    # Recordings far apart would make a grid of mostly constant samples.
+    if end > MOST_PER_POINT * sum(part.count for part in parts):
+        return None
+    total = np.full(end, float(sum(constants)))
+    for x, part in zip(begins, parts, strict=True):
+        total += part.between(-round(x), end - round(x))
+    return Samples(total, rate, first.start)
 
 
 def _of_points(wave: PWL) -> Samples | None:
@@ -324,20 +337,3 @@ def _of_points(wave: PWL) -> Samples | None:
     if np.any(np.abs(t[0] + place / rate - t) > ON_GRID / rate + ROUNDING * np.abs(t)):
         return None
     return Samples(np.interp(np.arange(count + 1), place, wave.values), rate, float(t[0]))
-
-
-def _added(parts: list[Samples], constant: float) -> Samples | None:
-    """Sum of recordings on one grid, over the time from the first sample of any to the last one; None on several."""
-    first = min(parts, key=lambda part: part.start)
-    rate = first.rate
-    begins = [(part.start - first.start) * rate for part in parts]
-    if any(part.rate != rate for part in parts) or any(abs(x - round(x)) > ON_GRID for x in begins):
-        return None
-    ends = [round(x) + part.count for x, part in zip(begins, parts, strict=True)]
-    # Recordings far apart would make a grid of mostly constant samples.
-    if max(ends) > MOST_PER_POINT * sum(part.count for part in parts):
-        return None
-    total = np.full(max(ends), constant)
-    for x, part in zip(begins, parts, strict=True):
-        total += part.between(-round(x), max(ends) - round(x))
-    return Samples(total, rate, first.start)

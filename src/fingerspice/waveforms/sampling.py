@@ -168,10 +168,7 @@ def on_grid(t: FloatArray, start: float, step: float, slack: float) -> bool:
 
 
 def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
-    """For each mark, whether a time lies within the relative distance `slack` of it without being equal to it.
-
-    Times and marks ascend.
-    """
+    """For each mark, whether a time is within a share `slack` of it but not equal to it; times and marks ascend."""
     reach = slack * np.abs(marks)
     near = t.searchsorted(marks + reach, "right") - t.searchsorted(marks - reach)
     return np.asarray(near > t.searchsorted(marks, "right") - t.searchsorted(marks))
@@ -211,7 +208,11 @@ def source_table(
     # A breakpoint that differs from an end of the window only by rounding is that end, and bounds no extra segment.
     inner = inner[(inner > t0 + same_time(t0)) & (inner < t1 - same_time(t1))]
     edges = np.concatenate([[t0], inner, [t1]])
-    between = _rephased(edges, waveform.shortest_time())
+    # Long segments are divided, so that the rounding error of a phase stays small within each.
+    longest, between = _PERIODS_PER_SEGMENT * waveform.shortest_time(), edges
+    if np.any(np.diff(edges) > longest):
+        cuts = [np.linspace(a, b, max(1, math.ceil((b - a) / longest)) + 1)[:-1] for a, b in itertools.pairwise(edges)]
+        between = np.concatenate([*cuts, edges[-1:]])
     terms = waveform.terms(between[:-1], between[1:])
     if terms is not None:
         edges = between
@@ -235,12 +236,3 @@ def source_table(
         pieces.not_finite,
         pieces.rough,
     )
-
-
-def _rephased(edges: FloatArray, period: float) -> FloatArray:
-    """Edges (s) with further ones inserted, so that the rounding error of a phase stays small within each segment."""
-    longest = _PERIODS_PER_SEGMENT * period
-    if not np.any(np.diff(edges) > longest):
-        return edges
-    pieces = [np.linspace(a, b, max(1, math.ceil((b - a) / longest)) + 1)[:-1] for a, b in itertools.pairwise(edges)]
-    return np.concatenate([*pieces, edges[-1:]])
