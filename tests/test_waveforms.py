@@ -262,6 +262,7 @@ def test_a_run_gives_the_right_hand_value_at_a_time_that_is_an_edge_up_to_roundi
         (lambda: fs.Exp(0.0, 1.0, 0.0, 0.0, 1.0, 1.0), "EXP time constants"),
         (lambda: fs.Exp(0.0, 1.0, 2.0, 1.0, 1.0, 1.0), "EXP td2 is 1 s; allowed: >= td1 = 2 s"),
         (lambda: fs.AM(1.0, 1000.0, 10.0, depth=1.5), "AM depth is 1.5; allowed: 0 to 1"),
+        (lambda: fs.AM(1.0, 0.0, 10.0), "sine frequency is 0 Hz; allowed: > 0"),
         (lambda: fs.Square(1.0, 10.0, duty=1.0), "square duty is 1; allowed: between 0 and 1"),
         (lambda: fs.Triangle(1.0, -10.0), "triangle frequency is -10 Hz; allowed: > 0"),
         (lambda: fs.Sawtooth(1.0, math.nan), "Sawtooth frequency is nan"),

@@ -73,7 +73,7 @@ class Bar:
 
 @contextmanager
 def paced(what: str, first: float = 0.0) -> Iterator[Callable[..., None]]:
-    """A bar for work of which a share is done at first; it appears after one second. Gives what sets the share of now."""
+    """A bar for work of which a share is done at first, shown after one second; gives what sets the share of now."""
     bar, begun = Bar(what), time.perf_counter()
 
     # `pace` says the pace by the seconds taken.
