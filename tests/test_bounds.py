@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import resource
+import subprocess
 import sys
 from pathlib import Path
 
@@ -13,8 +16,7 @@ import fingerspice as fs
 from deck_edits import edited
 from fingerspice.engine.collocation import loopstate
 from fingerspice.solve.problem import MOST_BYTES
-from fingerspice.waveforms import bounds
-from fingerspice.waveforms.ramps import Ramps
+from fingerspice.waveforms import ramps
 from processes import ended, start
 from scenes import table1
 from waveform_cases import CASES, Case
@@ -27,11 +29,7 @@ SOURCE = "SIN(0 200 100)"
 ENDLESS = {
     "picoseconds": ("PULSE(0 200 0 1e-13 1e-13 8e-13 2e-12)", ".tran 10u 5m uic", "1.25e+10 breakpoints of its source"),
     "many squares": ("SQUARE(200 1e9)", ".tran 1 10 uic", "4e+10 breakpoints of its source; allowed: at most 4e+09"),
-    "listed squares": (
-        "SQUARE(200 10meg)",
-        ".tran 1m 1 uic",
-        "5e+07 breakpoints from 0 s to 1 s; allowed: at most 2e+07",
-    ),
+    "listed": ("SQUARE(200 10meg)", ".tran 1m 1 uic", "5e+07 breakpoints from 0 s to 1 s; allowed: at most 2e+07"),
     "outputs": (SOURCE, ".tran 10n 1 uic", "one of 1e+08 outputs with 19 signals, 15.2 GB; allowed: at most 2 GB"),
     "frequency": ("SIN(0 200 1e30)", ".tran 10u 5m uic", "5e+27 periods or time constants"),
     "time": (SOURCE, ".tran 1e11 1e12 uic", "1e+14 periods or time constants of its source; allowed: at most 1e+10"),
@@ -73,14 +71,16 @@ def test_ten_values_in_a_year_of_squares_need_no_list_of_its_edges() -> None:
     np.testing.assert_array_equal(square.value(edges, "left") - square.value(edges), [400.0, 400.0])
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if c.period and isinstance(c.waveform, Ramps)], ids=lambda c: c.name)
+@pytest.mark.parametrize(
+    "case", [c for c in CASES if c.period and isinstance(c.waveform, ramps.Ramps)], ids=lambda c: c.name
+)
 def test_values_do_not_depend_on_the_windows_they_are_looked_up_in(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     wave = case.waveform
     rng = np.random.default_rng(7)
     t = np.concatenate([rng.uniform(-0.01, 0.5, 300), wave.breakpoints(0.0, 0.5)]).reshape(-1, 1)
     whole = [wave.value(t, side) for side in ("left", "right")]
-    monkeypatch.setattr(bounds, "_WINDOW", 7)
-    assert len(list(bounds.in_windows(t.ravel(), wave.breakpoint_rate()))) > 20
+    monkeypatch.setattr(ramps, "_WINDOW", 7)
+    assert len(list(ramps.in_windows(t.ravel(), wave.breakpoint_rate()))) > 20
     for expected, side in zip(whole, ("left", "right"), strict=True):
         np.testing.assert_array_equal(wave.value(t, side), expected)
 
@@ -90,9 +90,8 @@ def test_the_peak_of_a_periodic_source_is_looked_for_in_one_period() -> None:
     assert fs.Pulse(5.0, 1.0, 1.0, 0.0, 0.0, 1e-3, 2e-3).peak(0.0, 1e9) == 5.0
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
+def test_numbers_that_no_calculation_bears_are_refused() -> None:
+    for make, said in (
         (lambda: fs.Sine(1e99, 100.0), "Sine amplitude is 1e+99 V; allowed: a size up to 1e+12"),
         (lambda: fs.Sine(1.0, 1e-320), "Sine frequency is 9.99989e-321 Hz; allowed: 0, or a size from 1e-30 to 1e+30"),
         (lambda: fs.Sine(1.0, 1.0, phase_deg=1e30), "Sine phase_deg is 1e+30 deg; allowed: a size up to 1e+09"),
@@ -101,18 +100,16 @@ def test_the_peak_of_a_periodic_source_is_looked_for_in_one_period() -> None:
         (lambda: fs.PWL((0.0, 1.0), (0.0, -1e13)), "PWL value is -1e+13 V"),
         (lambda: fs.Samples(np.array([0.0, 1e300]), 1.0), "a sample is 1e+300 V"),
         (lambda: fs.DC(1e99), "DC level is 1e+99 V"),
-    ],
-)
-def test_numbers_that_no_calculation_bears_are_refused(make: object, said: str) -> None:
-    with pytest.raises(fs.InputError) as caught:
-        make()  # type: ignore[operator]
-    assert caught.value.message.startswith(said)
+    ):
+        with pytest.raises(fs.InputError) as caught:
+            make()
+        assert caught.value.message.startswith(said)
 
 
-@pytest.mark.parametrize("line", [".ic v(top)=1e99", "C1 top 0 1n ic=1e99"])
-def test_voltages_to_start_from_are_bounded_as_sources_are(line: str) -> None:
-    with pytest.raises(fs.InputError, match=r"is 1e\+99 V; allowed: a size up to 1e\+12"):
-        fs.parse_netlist(edited((".end", f"{line}\n.end")))
+def test_voltages_to_start_from_are_bounded_as_sources_are() -> None:
+    for line in (".ic v(top)=1e99", "C1 top 0 1n ic=1e99"):
+        with pytest.raises(fs.InputError, match=r"is 1e\+99 V; allowed: a size up to 1e\+12"):
+            fs.parse_netlist(edited((".end", f"{line}\n.end")))
 
 
 def test_an_error_asked_for_that_underflows_is_met() -> None:
@@ -138,3 +135,30 @@ def test_no_result_depends_on_where_a_walk_over_periods_is_cut(
     for name, (values, _, _) in whole.signals.items():
         np.testing.assert_array_equal(again.signals[name][0], values, err_msg=name)
     np.testing.assert_array_equal(again.state.y, whole.state.y)
+
+
+FAULTS = """
+import resource, sys
+import numpy as np
+from fingerspice.base.arrays import keep_freed_memory
+if "keep" in sys.argv:
+    keep_freed_memory()
+for _ in range(3):
+    np.ones(1 << 17)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(100):
+    np.ones(1 << 17)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the parameters are those of glibc's malloc")
+def test_freed_memory_is_kept_where_the_environment_asks_to_give_it_back() -> None:
+    def faults(*arguments: str) -> int:
+        environment = os.environ | {"MALLOC_TRIM_THRESHOLD_": "65536"}
+        command = [sys.executable, "-c", FAULTS, *arguments]
+        return int(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+
+    # A megabyte is 256 pages, and a hundred of them are used one after another.
+    assert faults() > 20_000
+    assert faults("keep") < 500

@@ -137,19 +137,47 @@ def stack(rng: np.random.Generator, law: str, parts: str) -> Stack:
 
 
 def engine_account(
-    step: Stack, before: float = 0.0, last_area: float | None = None, kept: float = 0.0
-) -> tuple[float, float]:
-    """What stayed and the error after the engine's account of the step, with a jump before it from an area (m^2)."""
+    step: Stack, before: float = 0.0, last_area: float = np.inf, kept: float = 0.0, missed: np.ndarray | None = None
+) -> tuple[float, float]:  # fmt: skip
+    """What stayed and the error after the engine's account of the step, with a jump before it from an area (m^2).
+
+    With `missed` the modes are at rest, but for this error (V) at the points between the nodes, which is all of it.
+    """
     u, _, area = step.at(POINTS, 0.0)
-    w = np.array([m(POINTS) for m in step.modes])
-    places = np.array([e(POINTS[PLACES]) for e in step.errors])
+    if missed is None:
+        w = np.array([m(POINTS) for m in step.modes])
+        places = np.array([e(POINTS[PLACES]) for e in step.errors])
+    else:
+        w = np.array([np.full(ROWS, m(0.0)) for m in step.modes])
+        w[:, FIRST:] += missed
+        places = np.zeros((2, N_PLACES))
+        places[:, 1 : N_PLACES - 1] = missed
     r = np.zeros((rows.N_FLAT, ROWS))
     r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
     r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
     control, collected = np.zeros(1, readout.CONTROL)[0], np.array([[before], [0.0]])
-    control["last_q"] = 0.0 if last_area is None else 1.0 / last_area
+    control["last_q"] = 1.0 / last_area
     charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, kept, control, collected)
     return float(collected[0, 0]), float(control["error_q"])
+
+
+def judge(step: Stack | Net, total: list[float], account: Callable[[float], tuple[float, float]]) -> float:
+    """Compare the engine's account with `total`, what a unit of the errors is worth in the charge at the places, C.
+
+    What the trapezoids miss is a share of all that was added up, whatever is left of it. What was collected before adds
+    to it with its sign. Returns the scale of both, C.
+    """
+    held = np.array([step.held(x) for x in POINTS[PLACES]])
+    stays = np.array(total) - (held - held[0])
+    spread = np.abs(np.diff(stays, prepend=0.0)).sum()
+    scale = float(max(np.abs(stays).max(), np.abs(held).max()))
+    for before in (0.0, 3.0 * scale, -3.0 * scale):
+        collected, error = account(before)
+        assert collected - before == pytest.approx(stays[-1], abs=ROUGH * spread + 1e-9 * scale)
+        # Since the start of the run, where nothing was off.
+        want = np.max(np.abs(held + stays + before))
+        assert error == pytest.approx(want, rel=0.0, abs=2.0 * ROUGH * (want + spread))
+    return scale
 
 
 @every_law
@@ -159,25 +187,10 @@ def test_what_a_step_of_a_stack_leaves_in_the_charge_is_its_derivative_by_the_vo
     seed: int, parts: str, law: str
 ) -> None:
     step = stack(np.random.default_rng([seed, 3]), law, parts)
-    collected, error = engine_account(step)
-    fractions = POINTS[PLACES]
-    total = np.array([slope_of(lambda e, x=x: np.array([step.charge(x, e)[0]]))[0] for x in fractions])
-    held = np.array([step.held(x) for x in fractions])
-    stays = total - (held - held[0])
-    spread = np.cumsum(np.abs(np.diff(stays, prepend=0.0)))
-    scale = max(np.abs(stays).max(), np.abs(held).max())
-    assert collected == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
-    # Since the start of the run, where nothing was off.
-    # What the trapezoids miss is a share of all that was added up, whatever is left of it.
-    want = np.max(np.abs(held + stays))
-    assert error == pytest.approx(want, rel=0.0, abs=2.0 * ROUGH * (want + spread[-1]))
-    # What was collected before adds to it with its sign.
-    for before in (3.0 * scale, -3.0 * scale):
-        want = np.max(np.abs(held + stays + before))
-        rough = 2.0 * ROUGH * (want + spread[-1])
-        assert engine_account(step, before)[1] == pytest.approx(want, rel=0.0, abs=rough)
+    total = [step.charge(x, 0.5)[0] - step.charge(x, -0.5)[0] for x in POINTS[PLACES]]
+    scale = judge(step, total, lambda before: engine_account(step, before))
     # What stays with a sign that is not known is as likely to add as to take away.
-    both = engine_account(step, kept=3.0 * scale)[1]
+    error, both = engine_account(step)[1], engine_account(step, kept=3.0 * scale)[1]
     assert both == pytest.approx(np.hypot(error, 3.0 * scale), rel=1e-12, abs=0.0)
 
 
@@ -195,23 +208,9 @@ def test_both_ends_of_a_jump_s_move_are_off_in_its_charge() -> None:
 @every_law
 def test_what_a_stack_s_polynomials_miss_between_nodes_does_not_leak(law: str) -> None:
     # Modes that wriggle about their own by a polynomial that is zero at every node, and an error that is just that.
-    step = stack(np.random.default_rng(5), law, "leaks")
-    nodes = POINTS[:NODES]
-    wriggle = [Polynomial(m(nodes[0])) + 0.0 for m in step.modes]
-    size = 1e-3
-    missed = size * MISS
-    u, _, area = step.at(POINTS, 0.0)
-    w = np.array([m(POINTS) for m in wriggle])
-    w[:, FIRST:] += missed
-    places = np.zeros((2, N_PLACES))
-    places[:, 1 : N_PLACES - 1] = missed
-    r = np.zeros((rows.N_FLAT, ROWS))
-    r[rows.SOURCE], r[rows.U], r[rows.Q] = step.source(POINTS), u, 1.0 / area
-    r[rows.DQ], r[rows.X_GAP] = -slope_at(u) / area**2, step.gap @ w
-    control, collected = np.zeros(1, readout.CONTROL)[0], np.zeros((2, 1))
-    charge._account(step.model, step.gap, step.slow, w, r, H, places, 1.0, 0.0, 0.0, control, collected)
+    step, size = stack(np.random.default_rng(5), law, "leaks"), 1e-3
     leaked = size * H * 3e-7 * np.abs(step.slow).sum()
-    assert abs(collected[0, 0]) <= 1e-6 * leaked
+    assert abs(engine_account(step, missed=size * MISS)[0]) <= 1e-6 * leaked
 
 
 # A network --------------------------------------------------------------------------------------------------
@@ -340,18 +339,12 @@ def test_what_a_step_of_a_network_leaves_in_the_charge_is_its_derivative_by_the_
 ) -> None:
     step = network(np.random.default_rng([seed, 4]), law, parts, slow)
     places = np.array([e(POINTS[PLACES]) for e in step.errors])
-    fractions = POINTS[PLACES]
-    total = np.array([(step.charge(x, 0.5) - step.charge(x, -0.5)) for x in fractions])
-    held = np.array([step.held(x) for x in fractions])
-    stays = total - (held - held[0])
-    scale = max(np.abs(stays).max(), np.abs(held).max())
-    spread = np.cumsum(np.abs(np.diff(stays, prepend=0.0)))
-    for before in (0.0, 3.0 * scale, -3.0 * scale):
+
+    def account(before: float) -> tuple[float, float]:
         collected, control = engine_charge(step, places, np.zeros((5, len(places))), before)
-        assert collected[0] - before == pytest.approx(stays[-1], abs=ROUGH * spread[-1] + 1e-9 * scale)
-        want = np.max(np.abs(held + stays + before))
-        rough = 2.0 * ROUGH * (want + spread[-1])
-        assert control["error_q"] == pytest.approx(want, rel=0.0, abs=rough)
+        return float(collected[0]), float(control["error_q"])
+
+    judge(step, [step.charge(x, 0.5) - step.charge(x, -0.5) for x in POINTS[PLACES]], account)
 
 
 @every_law

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,55 +16,28 @@ H = 1e-3
 AREA0 = 35e-6
 
 
-@dataclass(frozen=True)
-class Cells:
+def solved(given: SimpleNamespace) -> tuple[np.ndarray, np.ndarray]:
+    """Currents of the cells (n_f, ROWS), and the distance to the fold (ROWS,), by elimination."""
+    fast = given.rates * H > STIFF
+    own = np.where(fast[:, None], given.d, given.lin - given.rates[:, None] * given.w)
+    free = given.tap @ own + given.tap_s @ given.ds
+    met = -given.tap[:, ~fast] @ given.tap[:, ~fast].T
+    currents, distance = np.empty_like(free), np.ones(ROWS)
+    one = np.eye(len(given.c))
+    for i in range(ROWS):
+        e, u = given.more[given.home, i], given.u[:, i]
+        held = np.diag(e * given.c)
+        pushed, turned = e * given.g * u + given.c * u * given.rate[given.home, i], held.copy()
+        for b, a in enumerate(given.home):
+            turned[b, given.cell[a]] += given.c[b] * u[b] * given.slope[a, i]
+        along = np.linalg.solve(one - met @ turned, free[:, i] + met @ pushed)
+        currents[:, i] = pushed + turned @ along
+        distance[i] = np.linalg.det(one - met @ turned) / np.linalg.det(one - met @ held)
+    return currents, distance
+
+
+def cells(seed: int, sizes: tuple[int, ...], fast: int) -> SimpleNamespace:
     """Modes, sources and cells of areas at every row of a step, with numbers like those of fingers."""
-
-    rates: np.ndarray
-    tap: np.ndarray
-    tap_s: np.ndarray
-    c: np.ndarray
-    g: np.ndarray
-    home: np.ndarray
-    cell: np.ndarray
-    w: np.ndarray
-    lin: np.ndarray
-    d: np.ndarray
-    s: np.ndarray
-    ds: np.ndarray
-    more: np.ndarray
-    slope: np.ndarray
-    rate: np.ndarray
-
-    @property
-    def stiff(self) -> np.ndarray:
-        return self.rates * H > STIFF
-
-    @property
-    def u(self) -> np.ndarray:
-        return self.tap @ self.w + self.tap_s @ self.s
-
-    def solved(self) -> tuple[np.ndarray, np.ndarray]:
-        """Currents of the cells (n_f, ROWS), and the distance to the fold (ROWS,), by elimination."""
-        fast = self.stiff
-        own = np.where(fast[:, None], self.d, self.lin - self.rates[:, None] * self.w)
-        free = self.tap @ own + self.tap_s @ self.ds
-        met = -self.tap[:, ~fast] @ self.tap[:, ~fast].T
-        currents, distance = np.empty_like(free), np.ones(ROWS)
-        one = np.eye(len(self.c))
-        for i in range(ROWS):
-            e, u = self.more[self.home, i], self.u[:, i]
-            held = np.diag(e * self.c)
-            given, turned = e * self.g * u + self.c * u * self.rate[self.home, i], held.copy()
-            for b, a in enumerate(self.home):
-                turned[b, self.cell[a]] += self.c[b] * u[b] * self.slope[a, i]
-            along = np.linalg.solve(one - met @ turned, free[:, i] + met @ given)
-            currents[:, i] = given + turned @ along
-            distance[i] = np.linalg.det(one - met @ turned) / np.linalg.det(one - met @ held)
-        return currents, distance
-
-
-def cells(seed: int, sizes: tuple[int, ...], fast: int) -> Cells:
     rng = np.random.default_rng(seed)
     n, n_f, n_area = sum(sizes) + 1, sum(sizes), len(sizes)
     rates = np.sort(rng.uniform(10.0, 3e4, n))
@@ -75,17 +48,19 @@ def cells(seed: int, sizes: tuple[int, ...], fast: int) -> Cells:
     # those of the cells are at most all of it.
     tap = np.linalg.qr(rng.normal(size=(n, n)))[0][:n_f] / np.sqrt(c * AREA0)[:, None]
     w = rng.normal(size=(n, ROWS)) * np.sqrt(c.mean() * AREA0) * 50.0
-    return Cells(
-        rates, tap, rng.normal(size=(n_f, 1)), c, c * rng.uniform(1e2, 1e4, n_f), home,
-        np.array([int(np.flatnonzero(home == a)[0]) for a in range(n_area)]), w,
-        rates[:, None] * w * rng.uniform(-1.0, 1.0, (n, ROWS)), rng.normal(size=(n, ROWS)) * 1e-5,
-        rng.normal(size=(1, ROWS)) * 100.0, rng.normal(size=(1, ROWS)) * 1e5,
-        AREA0 * rng.uniform(-0.15, 0.15, (n_area, ROWS)), AREA0 * rng.normal(size=(n_area, ROWS)) * 1e-3,
-        AREA0 * rng.normal(size=(n_area, ROWS)) * 10.0,
+    given = SimpleNamespace(
+        rates=rates, tap=tap, tap_s=rng.normal(size=(n_f, 1)), c=c, g=c * rng.uniform(1e2, 1e4, n_f), home=home,
+        cell=np.array([int(np.flatnonzero(home == a)[0]) for a in range(n_area)]), w=w,
+        lin=rates[:, None] * w * rng.uniform(-1.0, 1.0, (n, ROWS)), d=rng.normal(size=(n, ROWS)) * 1e-5,
+        s=rng.normal(size=(1, ROWS)) * 100.0, ds=rng.normal(size=(1, ROWS)) * 1e5,
+        more=AREA0 * rng.uniform(-0.15, 0.15, (n_area, ROWS)), slope=AREA0 * rng.normal(size=(n_area, ROWS)) * 1e-3,
+        rate=AREA0 * rng.normal(size=(n_area, ROWS)) * 10.0,
     )  # fmt: skip
+    given.u = tap @ w + given.tap_s @ given.s
+    return given
 
 
-def filled(given: Cells) -> Coupling:
+def filled(given: SimpleNamespace) -> Coupling:
     out = new_coupling(given.tap.shape[1], len(given.c), 1)
     fill_coupling(
         out, H, given.rates, -given.tap.T.copy(), given.tap, given.tap_s, given.c, given.g, given.home, given.cell
@@ -93,7 +68,7 @@ def filled(given: Cells) -> Coupling:
     return out
 
 
-def eta_of(x: Coupling, given: Cells) -> np.ndarray:
+def eta_of(x: Coupling, given: SimpleNamespace) -> np.ndarray:
     eta = x.from_modes @ given.w + x.from_rates @ given.lin + x.from_stiff @ given.d
     return np.ascontiguousarray(eta + x.from_slopes @ given.ds + x.from_sources @ given.s)
 
@@ -115,7 +90,7 @@ def test_currents_and_the_distance_to_the_fold_under_mobile(seed: int, sizes: tu
         n_area > 1, x, given.home, first, given.cell, moving, np.zeros((n_f, n_area + 1, ROWS)),
         np.zeros((n_f, n_f + 1, ROWS)), least,
     )  # fmt: skip
-    want, distance = given.solved()
+    want, distance = solved(given)
     j = np.empty_like(rho)
     cell_currents(x.root, rho, j)
     np.testing.assert_allclose(j, want, rtol=0.0, atol=1e-10 * np.abs(want).max())

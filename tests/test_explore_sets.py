@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import math
 import re
@@ -22,6 +20,7 @@ from fingerspice.explorer.request import asked_by
 from fingerspice.explorer.scene import as_python, scene
 from fingerspice.explorer.server import framed
 from fingerspice.explorer.sliders import read_source, text_of
+from test_explore import baked, run_as_python
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 DECKS = {example.name: example.deck for example in EXAMPLES}
@@ -43,15 +42,6 @@ def on_page(request: dict[str, Any], *entries: str) -> dict[str, Any]:
 def force(answer: dict[str, Any]) -> Any:
     assert answer["ok"], answer["message"]
     return next(trace["values"] for trace in answer["traces"] if trace["signal"] == "f_el")
-
-
-def run_as_python(request: dict[str, Any], own: fs.Circuit | None = None) -> fs.Solution:
-    names: dict[str, Any] = {}
-    with contextlib.redirect_stdout(io.StringIO()):
-        exec(as_python(request, own), names)
-    solution = names["solution"]
-    assert isinstance(solution, fs.Solution)
-    return solution
 
 
 @pytest.mark.parametrize("name", list(fs.parameters()))
@@ -102,18 +92,14 @@ def test_a_set_goes_to_one_finger_of_two() -> None:
     assert scene(request)["sets"][0]["name"] == "Fig4-100Hz"
 
 
-@pytest.mark.parametrize(
-    ("entry", "words"),
-    [
-        ("moits", "unknown set 'moits'; nearest: 'moist'"),
-        ("Xnone=moist", "lacks; allowed"),
+def test_a_set_that_does_not_fit_is_refused_in_a_sentence() -> None:
+    for entry, words in (
+        ("moits", "unknown set 'moits'; nearest: 'moist'"), ("Xnone=moist", "lacks; allowed"),
         (None, "allowed: the name of a set"),
         ("Fig4-100Hz", "the circuit has Vdrive, Vfast; allowed: one of these names"),
-    ],
-)
-def test_a_set_that_does_not_fit_is_refused_in_a_sentence(entry: Any, words: str) -> None:
-    with pytest.raises(fs.InputError, match=re.escape(words)):
-        applied({"deck": DECKS["tones"], "apply": entry})
+    ):  # fmt: skip
+        with pytest.raises(fs.InputError, match=re.escape(words)):
+            applied({"deck": DECKS["tones"], "apply": entry})
 
 
 def test_a_set_in_a_link_that_means_nothing_is_said_and_the_rest_is_shown() -> None:
@@ -146,15 +132,14 @@ def test_what_was_changed_before_is_in_the_link_so_that_another_explorer_shows_t
     assert before(circuit) == ({}, ["Vdrive"])
 
 
-@pytest.mark.parametrize(
-    "waveform",
-    [fs.Sine(1.5, 60.0), fs.Sine(200.0, 1e3, offset=-3.0), fs.Square(200.0, 5e3, 0.3), fs.AM(150.0, 1e4, 100.0, 0.5),
-     fs.Triangle(1 / 3, 70.0), fs.Sawtooth(20.0, 1e3), fs.DC(-5.0)],
-)  # fmt: skip
-def test_a_waveform_is_read_from_its_own_text(waveform: fs.Waveform) -> None:
-    text = text_of(waveform)
-    assert text is not None
-    assert read_source(text, fs.parse_netlist(SINE))[1] == waveform
+def test_a_waveform_is_read_from_its_own_text() -> None:
+    for waveform in (
+        *(fs.Sine(1.5, 60.0), fs.Sine(200.0, 1e3, offset=-3.0), fs.Square(200.0, 5e3, 0.3), fs.DC(-5.0)),
+        *(fs.AM(150.0, 1e4, 100.0, 0.5), fs.Triangle(1 / 3, 70.0), fs.Sawtooth(20.0, 1e3)),
+    ):
+        text = text_of(waveform)
+        assert text is not None
+        assert read_source(text, fs.parse_netlist(SINE))[1] == waveform
     assert text_of(fs.Sine(1.0, 60.0) + fs.Sine(1.0, 70.0)) is None
 
 
@@ -183,17 +168,13 @@ def test_arrays_are_behind_the_json_and_numbers_that_are_not_finite_are_null() -
     assert count == 5
 
 
-def test_the_command_takes_sets_as_run_does_and_refuses_those_that_mean_nothing(
-    command: Command, tmp_path: Path
-) -> None:
+def test_the_command_takes_sets_as_run_does_and_refuses_others(command: Command, tmp_path: Path) -> None:
     (tmp_path / "pad.cir").write_text(SINE)
     sets = ("--finger", "moist", "--coating", "Xcoat=3M", "--drive", "Fig4-5kHz", "--set", "Xgap.mu=0.5")
     result = command("explore", "pad.cir", *sets, "--set", "light", "--static", "page.html", "--json")
     assert result.code == 0, result.out
     assert json.loads(result.out)["sets"] == ["light", "moist", "3M", "Fig4-5kHz"]
-    baked = re.search(r'id="baked">(.*?)</script>', (tmp_path / "page.html").read_text(), re.DOTALL)
-    assert baked is not None
-    request = json.loads(baked[1])["start"]["own"]["request"]
+    request = baked((tmp_path / "page.html").read_text())["start"]["own"]["request"]
     assert (request["source"], request["sets"]) == ("Vdrive=SIN(0 200 5k)", "light,moist,3M,Fig4-5kHz")
     values = {path: request["overrides"][path] for path in ("Xgap.r", "Xgap.mu", "Xgap.fn", "Xskin.f")}
     assert values == {"Xgap.r": "100k", "Xgap.mu": "0.5", "Xgap.fn": "0.2", "Xskin.f": "5k"}

@@ -29,13 +29,9 @@ def dense(r: np.ndarray, k: np.ndarray) -> Dense:
     """x' = (k 1^T - I) diag(r) (x + k U), nothing reduced: eigenvalues of the whole matrix."""
     with mp.workdps(DIGITS):
         n = r.size
-        rate = [mp.mpf(float(x)) for x in r]
-        total = mp.fsum(mp.mpf(float(x)) for x in k)
-        share = [mp.mpf(float(x)) / total for x in k]
-        matrix = mp.matrix(n, n)
-        for i in range(n):
-            for j in range(n):
-                matrix[i, j] = (share[i] - (1 if i == j else 0)) * rate[j]
+        total = mp.fsum(k.tolist())
+        share = [mp.mpf(x) / total for x in k.tolist()]
+        matrix = (mp.matrix(share) * mp.ones(1, n) - mp.eye(n)) * mp.diag(r.tolist())
         values, left, right = mp.eig(matrix, left=True, right=True)
         drive = matrix * mp.matrix(share)
         found = sorted(range(n), key=lambda m: abs(values[m]))[1:]
@@ -70,12 +66,11 @@ def check_all(r: np.ndarray, k: np.ndarray) -> None:
 def check_mode(r: np.ndarray, k: np.ndarray, rate: float, gain: float, feed: np.ndarray, shape: np.ndarray) -> None:
     """(-I + k 1^T) diag(r) shape = -rate shape and gain = (r k) @ feed, both sums taken without rounding."""
     with mp.workdps(DIGITS):
-        h = [mp.mpf(float(a)) * mp.mpf(float(b)) for a, b in zip(r, shape, strict=True)]
-        total = mp.fsum(h)
-        left = np.array([float(-x + mp.mpf(float(q)) * total) for x, q in zip(h, k, strict=True)])
-        parts = [mp.mpf(float(a)) * mp.mpf(float(b)) * mp.mpf(float(c)) for a, b, c in zip(r, k, feed, strict=True)]
-        got, size = float(mp.fsum(parts)), float(mp.fsum(abs(x) for x in parts))
-        scale = np.array([float(abs(x)) for x in h]) + rate * np.abs(shape)
+        r_, k_, shape_, feed_ = (np.array([mp.mpf(float(x)) for x in row]) for row in (r, k, shape, feed))
+        h, parts = r_ * shape_, r_ * k_ * feed_
+        left = (k_ * h.sum() - h).astype(float)
+        got, size = float(parts.sum()), float(np.abs(parts).sum())
+        scale = np.abs(h).astype(float) + rate * np.abs(shape)
     bound = float((scale / np.sqrt(k)).max(initial=0.0)) + 1e-300
     np.testing.assert_allclose((left + rate * shape) / np.sqrt(k), 0.0, rtol=0, atol=1e-13 * bound)
     assert got == pytest.approx(gain, rel=0, abs=1e-13 * size + 1e-300)

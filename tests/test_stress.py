@@ -13,7 +13,7 @@ from scenes import cases
 FIRST = 60
 
 
-@pytest.mark.parametrize("number", range(FIRST, FIRST + cases(60, 15)))
+@pytest.mark.parametrize("number", range(FIRST, FIRST + cases(60, 8)))
 def test_a_random_scene_is_right_or_refused_for_a_true_reason(number: int) -> None:
     assert stress.judge(stress.draw(0, number))
 
@@ -46,6 +46,8 @@ MENDED = {
     (0, 4495): "right",  # The force's peak stood between the last two nodes of a panel.
     (0, 1304): "right",  # Runs were refused for the error of a node whose fast decay no gap feels.
     (0, 1596): "refused: fold",  # The path from where the steps had met the fold went back in time.
+    # Their gap voltage is near rounding of the source's, and a fold ends them.
+    **dict.fromkeys(((3, 12), (3, 68), (3, 214)), "refused: fold"),
 }
 # Others of these kinds, of which the first jumps to an area of 4.5e-13 m^2 past no fold, and in 4371 a sum of voltages
 # that turned was taken for a zero of the gap's.
@@ -115,10 +117,10 @@ def test_force_area_charge_and_stated_errors_are_judged(number: int, signal: str
 
 def test_the_counts_are_written_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "counts.json"
-    assert stress.main(["--scenes", "6", "--first", "60", "--json", str(path)]) == 0
+    assert stress.main(["--scenes", "3", "--first", "60", "--json", str(path)]) == 0
     found = json.loads(path.read_text())
-    assert (found["seed"], found["first"], found["scenes"]) == (0, 60, 6)
-    assert sum(found["counts"].values()) == 6
+    assert (found["seed"], found["first"], found["scenes"]) == (0, 60, 3)
+    assert sum(found["counts"].values()) == 3
     assert found["wrong"] == {}
     right = found["counts"]["right"]
     assert right > 0
@@ -126,9 +128,3 @@ def test_the_counts_are_written_as_json(tmp_path: Path, capsys: pytest.CaptureFi
         assert found["stated"][name]["judged"] == right
         assert found["stated"][name]["exceeded"] == len(found["stated"][name]["worst"])
     assert f"{right:7d} right" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("number", [12, 68, 214])
-def test_a_fold_is_no_result_however_little_the_gap_takes(number: int) -> None:
-    # Their gap voltage is near rounding of the source's, and a fold ends them.
-    assert stress.judge(stress.draw(3, number)).end == "refused: fold"

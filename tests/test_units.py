@@ -6,10 +6,11 @@ import contextlib
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fingerspice.base.units import format_si, parse_number, suggest_mega, suspicious_mega, unit_read_as_scale
+from scenes import cases
 
 VALUES = {
     "10": 10.0, ".5": 0.5, "5.": 5.0, "-3": -3.0, "+3": 3.0, "1e-6": 1e-6, "1E3": 1e3, "1e3k": 1e6, "1t": 1e12,
@@ -29,53 +30,43 @@ WRITTEN = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("text", "value"), VALUES.items())
-def test_numbers_have_the_value_that_spice_gives_them(text: str, value: float) -> None:
-    assert parse_number(text) == value
-
-
-def test_a_suffix_costs_no_rounding() -> None:
+def test_numbers_have_the_value_that_spice_gives_them_and_a_suffix_costs_no_rounding() -> None:
+    assert {text: parse_number(text) for text in VALUES} == VALUES
     assert parse_number("3.5u") == 3.5e-6
     assert [i for i in range(1000) if parse_number(f"{i}.1u") != float(f"{i}.1e-6")] == []
 
 
-@pytest.mark.parametrize(("text", "hint"), REFUSED.items())
-def test_what_is_no_number_or_read_differently_elsewhere_is_refused(text: str, hint: str) -> None:
-    with pytest.raises(ValueError, match=hint):
-        parse_number(text)
+def test_what_is_no_number_or_read_differently_elsewhere_is_refused() -> None:
+    for text, hint in REFUSED.items():
+        with pytest.raises(ValueError, match=hint):
+            parse_number(text)
 
 
-def test_a_capital_m_is_suspected_of_meaning_mega() -> None:
+def test_a_capital_m_is_suspected_of_meaning_mega_and_a_unit_that_spice_takes_for_a_scale_is_recognised() -> None:
     assert [t for t in ("1M", "0.2MOhm", "1MΩ", "-3e2M") if not suspicious_mega(t)] == []
     assert [t for t in ("1m", "0.2meg", "1MEG", "1MIL", "0.2mohm", "M", "x") if suspicious_mega(t)] == []
     assert suggest_mega("0.2MOhm") == "0.2meg"
+    for text, unit, word, taken in (
+        ("1F", "F", "farad", True), ("1farads", "F", "farad", True), ("0.5N", "N", "newton", True),
+        ("1f", "F", "farad", False), ("1uF", "F", "farad", False),
+    ):  # fmt: skip
+        assert unit_read_as_scale(text, unit, word) is taken
 
 
-def test_a_unit_that_spice_takes_for_a_scale_is_recognised() -> None:
-    assert unit_read_as_scale("1F", "F", "farad")
-    assert unit_read_as_scale("1farads", "F", "farad")
-    assert unit_read_as_scale("0.5N", "N", "newton")
-    assert not unit_read_as_scale("1f", "F", "farad")
-    assert not unit_read_as_scale("1uF", "F", "farad")
-
-
-def test_engineering_notation() -> None:
+def test_engineering_notation_which_without_a_unit_ends_in_the_prefix() -> None:
     assert {value: format_si(value, "m") for value in WRITTEN} == WRITTEN
-    assert format_si(-0.0, "m") == "0 m"
-
-
-def test_engineering_notation_without_a_unit_ends_in_the_prefix() -> None:
-    assert format_si(2e5, "") == "200 k"
-    assert format_si(1.0, "") == "1"
+    assert [format_si(-0.0, "m"), format_si(2e5, ""), format_si(1.0, "")] == ["0 m", "200 k", "1"]
     assert format_si(123.4, "V", digits=2) == "120 V"
 
 
+@settings(max_examples=cases(100, 40))
 @given(st.floats(min_value=1e-14, max_value=1e14))
 def test_engineering_notation_reads_back_to_its_digits(value: float) -> None:
     text = format_si(value, "").replace(" ", "").replace("M", "meg")
     assert parse_number(text) == pytest.approx(value, rel=1e-3)
 
 
+@settings(max_examples=cases(100, 40))
 @given(st.text(max_size=12))
 def test_any_text_is_a_finite_number_or_a_value_error(text: str) -> None:
     with contextlib.suppress(ValueError):

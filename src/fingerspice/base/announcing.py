@@ -73,12 +73,10 @@ class Bar:
 
 @contextmanager
 def paced(what: str, first: float = 0.0) -> Iterator[Callable[..., None]]:
-    """A bar for work of which a share is done at first: it appears after one second, with the time left.
-
-    Gives a function of the share that is done by now, and of what says the pace by the seconds taken.
-    """
+    """A bar for work of which a share is done at first, shown after one second; gives what sets the share of now."""
     bar, begun = Bar(what), time.perf_counter()
 
+    # `pace` says the pace by the seconds taken.
     def show(done: float, pace: Callable[[float], str] = lambda _: "") -> None:
         took = time.perf_counter() - begun
         if took > 1.0 and done > first and sys.stderr.isatty():

@@ -26,8 +26,7 @@ Array = TypeVar("Array", bound=np.ndarray[Any, Any])
 
 
 def aligned(shapes: Iterable[tuple[int, ...]]) -> list[FloatArray]:
-    """Arrays, not filled, that begin at multiples of 64 bytes: a vector across two lines of the cache takes twice as
-    long."""
+    """Arrays, not filled, that begin at multiples of 64 bytes, as no vector should cross the lines of the cache."""
     whole = [(shape, math.prod(shape)) for shape in shapes]
     raw = np.empty(8 + sum(size + 8 for _, size in whole))
     at, out = -(raw.ctypes.data // raw.itemsize) % 8, []
@@ -38,10 +37,7 @@ def aligned(shapes: Iterable[tuple[int, ...]]) -> list[FloatArray]:
 
 
 def read_only(x: Array) -> Array:
-    """A view that cannot be written, as compiled code takes what it only reads.
-
-    To the compiler an array that can be written is of another type, for which a loop would be compiled once more.
-    """
+    """A view that cannot be written, as compiled code takes what it only reads: another type would be compiled anew."""
     view = x.view()
     view.flags.writeable = False
     return view

@@ -28,10 +28,8 @@ def card_compiler() -> Any:
 
 @cache
 def for_card(compiled: Any) -> Any:
-    """A function that `base.compiled` compiled for the processor, and all that it calls, as functions of the card.
-
-    numba-cuda would do that by itself, but numba-cuda-mlir does not know numba's functions.
-    """
+    """A function that `base.compiled` compiled for the processor, and all that it calls, as functions of the card."""
+    # numba-cuda would do that by itself, but numba-cuda-mlir does not know numba's functions.
     function = compiled.py_func
     known = dict(function.__globals__)
     for name in function.__code__.co_names:

@@ -49,10 +49,7 @@ class Table:
 
 
 class Page(str):
-    """A report of blocks from top to bottom: a text, which has the same report as HTML in `html`.
-
-    Empty lines around a table have to be given.
-    """
+    """A text of blocks from top to bottom, and the same as HTML in `html`; empty lines around a table must be given."""
 
     __slots__ = ("blocks", "html")
     blocks: tuple[str | Table, ...]
@@ -61,16 +58,16 @@ class Page(str):
     def __new__(cls, blocks: Sequence[str | Table]) -> Page:
         page = super().__new__(cls, "\n".join(b.text() if isinstance(b, Table) else b for b in blocks))
         page.blocks = tuple(blocks)
-        page.html = "\n".join(
-            ["<div>", *(b.html() if isinstance(b, Table) else _text_html(b) for b in blocks), "</div>"]
-        )
+        parts = ["<div>"]
+        for block in blocks:
+            if isinstance(block, Table):
+                parts.append(block.html())
+                continue
+            # Text of several lines may be set in columns, which <pre> keeps.
+            text = "\n".join(html.escape(printable(line)) for line in block.split("\n"))
+            parts.append(f"<pre>{text}</pre>" if "\n" in text else f"<div>{text or '&nbsp;'}</div>")
+        page.html = "\n".join([*parts, "</div>"])
         return page
-
-
-def _text_html(text: str) -> str:
-    # Text of several lines may be set in columns, which <pre> keeps.
-    lines = [html.escape(printable(line)) for line in text.split("\n")]
-    return f"<pre>{chr(10).join(lines)}</pre>" if len(lines) > 1 else f"<div>{lines[0] or '&nbsp;'}</div>"
 
 
 class Shown:

@@ -58,10 +58,7 @@ def parse_number(text: str) -> float:
 
 
 def suspicious_mega(text: str) -> bool:
-    """Whether a number is written with a capital M, which SPICE reads as milli and people read as mega.
-
-    So it is for ``1M`` and ``0.2MOhm``, and not for ``0.2meg``, ``1MEG``, ``1MIL`` and ``0.2mohm``.
-    """
+    """Whether a number has a capital M, SPICE's milli that people read as mega: ``0.2MOhm``, and not ``1MEG``."""
     match = _MEGA.fullmatch(text)
     return match is not None and match[1][0] == "M"
 
@@ -73,10 +70,7 @@ def suggest_mega(text: str) -> str:
 
 
 def unit_read_as_scale(text: str, unit: str, word: str = "") -> bool:
-    """Whether a number is followed by nothing but a unit that SPICE takes for a scale, such as ``1F`` or ``1farads``.
-
-    The case of the unit's symbol counts, as ``1f`` is an ordinary femto; that of its name, in lower case, does not.
-    """
+    """Whether a number is followed by just a unit that SPICE takes for a scale: ``1F`` (not ``1f``), ``1farads``."""
     match = _NUMBER.fullmatch(text)
     return match is not None and (match[3] == unit or (word != "" and match[3].lower() in (word, f"{word}s")))
 

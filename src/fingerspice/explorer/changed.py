@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
 from typing import Any
 
@@ -10,31 +9,25 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import in_force, remembering
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.explorer.request import Asked
+from fingerspice.explorer.request import Asked, quiet
 from fingerspice.explorer.sliders import read_source, text_of, value_text
 from fingerspice.sets.parameters import parameters
 from fingerspice.waveforms.waveform import Waveform
 
 
-def menu() -> list[dict[str, str]]:
-    """The sets as plain data, for the page's menu."""
-    return [{"name": one.name, "kind": one.kind, "title": one.title} for one in parameters().values()]
-
-
+@quiet()
 def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
-    """What the set changes in the scene that a request names in its key ``apply``, as in `Request.sets`.
+    """What the set changes in the scene that a request names in its key ``apply``, as in `Asked.sets`.
 
     The answer has ``ok`` and ``message``; ``overrides`` (path to value as text), ``source`` (text, or None where the
-    set is no drive) and ``set``, the set's entry in `Request.sets`. `InputError` says why a set does not fit.
+    set is no drive) and ``set``, the set's entry in `Asked.sets`. `InputError` says why a set does not fit.
     """
     asked = dict(given) if isinstance(given, dict) else {}
     entry = asked.pop("apply", None)
     if not isinstance(entry, str):
         raise InputError("apply: allowed: the name of a set, or ELEMENT=NAME")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        circuit = Asked(asked, own).circuit
-        name, to, changes = _changes(circuit, entry)
+    circuit = Asked(asked, own).circuit
+    name, to, changes = _changes(circuit, entry)
     units = {path.lower(): parameter.unit for path, parameter in circuit.parameters.items()}
     overrides, source = {}, None
     for path, value in changes.items():
@@ -46,12 +39,9 @@ def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]
 
 
 def in_scene(asked: Asked) -> tuple[list[dict[str, Any]], set[str], list[str]]:
-    """What the page says of each set of a request of which a value is still in force.
-
-    With it go the paths that the sets give, in lower case, and sentences about sets that mean nothing here.
-    """
+    """What the page says of each set with a value in force, the paths that sets give, and sets that mean nothing."""
     circuit, given, lost = asked.circuit._with(sets={}), [], []
-    for entry in asked.request.sets:
+    for entry in asked.sets:
         try:
             name, to, changes = asked.base.remember(("set", entry), partial(_changes, asked.base, entry))
         except InputError as error:
@@ -91,7 +81,7 @@ def before(circuit: Circuit) -> tuple[dict[str, Any], list[str]]:
 
 
 def _source_text(circuit: Circuit, element: Element) -> str | None:
-    """The text of a source of now, as in `Request.source`; None where the page has none for it."""
+    """The text of a source of now, as in `Asked.source`; None where the page has none for it."""
     assert element.waveform is not None
     for text in (text_of(element.waveform), circuit.overrides.get(element.name)):
         try:
@@ -103,7 +93,7 @@ def _source_text(circuit: Circuit, element: Element) -> str | None:
 
 
 def _entry(circuit: Circuit, name: str) -> str | None:
-    """The set of that name as in `Request.sets`: applied to all, or as narrowly as gives its values in the circuit."""
+    """The set of that name as in `Asked.sets`: applied to all, or as narrowly as gives its values in the circuit."""
     values = circuit.sets[name]
     elements = dict.fromkeys(path.rpartition(".")[0] or path for path in values)
     inside = {e.rpartition(".")[0] for e in elements}
@@ -118,7 +108,7 @@ def _entry(circuit: Circuit, name: str) -> str | None:
 
 
 def _changes(circuit: Circuit, entry: str) -> tuple[str, str | None, dict[str, Any]]:
-    """Name and element of a set as in `Request.sets`, and what it gives to a circuit, by path."""
+    """Name and element of a set as in `Asked.sets`, and what it gives to a circuit, by path."""
     to, _, name = (part.strip() for part in entry.rpartition("="))
     one = parameters(name)
     return one.name, to or None, dict(one.apply(circuit, to or None).sets[one.name])

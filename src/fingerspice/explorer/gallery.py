@@ -18,7 +18,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.explorer import examples
 from fingerspice.explorer.request import Asked
 from fingerspice.explorer.scene import beginning, scene
-from fingerspice.explorer.server import as_json, pages
+from fingerspice.explorer.server import framed, pages
 from fingerspice.netlist.netlist import read_netlist
 from fingerspice.plots.drawing import save
 from fingerspice.results.solution import Solution
@@ -44,11 +44,8 @@ def decks(folder: Path) -> Iterator[Entry]:
         comments = [line[1:].strip() for line in lines[1:end] if line[:1] == "*"]
         about = re.split(r"Layers(?:,| and) contact|SI units|V\(area\)|In ngspice|Charge law:", " ".join(comments))[0]
         title = re.sub(r"Fingerpad on a (3M-coated )?touchscreen,? (with )?", "", lines[0]) or path.stem
-        yield Entry(path.stem, title[0].upper() + title[1:], about.strip(), path, partial(_run_deck, path))
-
-
-def _run_deck(path: Path) -> Solution:
-    return simulate(read_netlist(path))
+        title = title[0].upper() + title[1:]
+        yield Entry(path.stem, title, about.strip(), path, partial(lambda path: simulate(read_netlist(path)), path))
 
 
 def scenes() -> Iterator[Entry]:
@@ -61,7 +58,7 @@ def _run_scene(example: examples.Example) -> Solution:
     asked = Asked({"deck": example.deck, **example.asked})
     first, stop, _ = asked.times
     times = np.linspace(first, stop, 4001)
-    return simulate(asked.circuit, t_stop=stop, t_eval=times, charge_law=asked.request.charge_law, throw=False)
+    return simulate(asked.circuit, t_stop=stop, t_eval=times, charge_law=asked.charge_law, throw=False)
 
 
 def draw(entry: Entry, picture: Path) -> None:
@@ -75,18 +72,15 @@ _POLICY = "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsa
 
 
 def static_page(circuit: Circuit | None = None) -> str:
-    """The page as HTML that needs no other file: with the circuit's run, or with those of all example scenes.
-
-    Its sliders show the values, and do not move.
-    """
+    """The page as HTML that needs no other file, of a circuit's run or all example scenes; no slider moves on it."""
     files = {name: content.decode("utf-8") for name, content in pages().items()}
     start = beginning(circuit)
     if circuit is not None:
         start["examples"] = []
     shown = [{"name": "own", **start["own"]}] if circuit is not None else start["examples"]
     scenes = {one["name"]: scene({"last": 2, **one["request"]}, circuit) for one in shown}
-    # A script element may hold no "<" of its data. Modules import each other by the names of the import map.
-    baked = as_json({"start": start, "scenes": scenes}).decode("ascii").replace("<", "\\u003c")
+    baked = base64.b64encode(framed({"start": start, "scenes": scenes})).decode("ascii")
+    # Modules import each other by the names of the import map.
     bare = {
         name.removesuffix(".js"): re.sub(r'from "\./(\w+)\.js"', r'from "\1"', text)
         for name, text in files.items()
@@ -99,7 +93,7 @@ def static_page(circuit: Circuit | None = None) -> str:
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
         f"<style>{files['uplot.css']}\n{files['style.css']}</style>",
         f"<script>{files['uplot.js']}</script>",
-        f'<script type="application/json" id="baked">{baked}</script>',
+        f'<script type="text/plain" id="baked">{baked}</script>',
         f'<script type="importmap">{imports}</script>',
         f'<script type="module">{app}</script>',
     ]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import cached_property, lru_cache, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -21,7 +20,7 @@ from fingerspice.base.units import parse_number
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.topology import SLABS, count_of, driving_sources
-from fingerspice.explorer.sliders import gain_of, read_source
+from fingerspice.explorer.sliders import read_source
 from fingerspice.netlist.netlist import parse_netlist
 from fingerspice.results.solution import Solution
 from fingerspice.waveforms.combinations import Sum
@@ -64,88 +63,57 @@ class Recording(NamedTuple):
         return f"fs.Samples.from_wav({self.name!r}, {gain!r}, channel=0)"
 
 
-@dataclass(frozen=True)
-class Request:
-    """What the page asks for."""
-
-    deck: str  # Text of the netlist
-    overrides: Mapping[str, float] = field(default_factory=dict)  # Path to value, in the netlist's unit
-    # Text of another source, ``SQUARE(200 100)`` or ``NAME=SQUARE(200 100)``; empty for the deck's own
-    source: str = ""
-    charge_law: str | None = None  # None for the deck's own
-    area: str | float = "coupled"  # As in `simulate`
-    # ``own``: the data of SKIN are taken at its f; ``follow``: at the source's fundamental; ``dispersive``: at all
-    # frequencies
-    skin: str = "own"
-    rtol: float = 1e-6  # Largest error of gap voltage and force, relative to their peaks
-    # Length of the run in periods of the source; a source without a period runs to the deck's TSTOP
-    periods: float = 5.0
-    last: float | None = None  # How many of the last periods are shown; None for all of the run
-    recording: Recording | None = None  # The file dropped on the page, for the source ``RECORDING(gain)``
-    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME``; they change nothing, and
-    # the page shows their caveats
-    sets: tuple[str, ...] = ()
+_NAMES = (
+    *("deck", "overrides", "source", "charge_law", "area", "skin", "rtol", "periods", "last", "recording", "sets"),
+)  # fmt: skip
 
 
-_NAMES = tuple(f.name for f in dataclasses.fields(Request))
+def _read(name: str, given: Any) -> Any:
+    """A value of a request, checked; texts are as in a link."""
+    match name:
+        case "deck":
+            require(isinstance(given, str), name, f"of type {type(given).__name__}", "the text of a netlist")
+            require(len(given) <= LONGEST_DECK, name, f"{len(given):,} characters long", f"at most {LONGEST_DECK:,}")
+            return given
+        case "source":
+            require(isinstance(given, str), name, f"of type {type(given).__name__}", "text such as SQUARE(200 100)")
+            return given.strip()
+        case "charge_law" | "skin":
+            allowed = CHARGE_LAWS if name == "charge_law" else ("own", "follow", "dispersive")
+            require(given in allowed, name, _short(given), " or ".join(allowed))
+            return given
+        case "sets":
+            good = isinstance(given, str) and len(given) <= _LONGEST_SETS
+            require(good, name, _short(given), f"names with commas, at most {_LONGEST_SETS:,} characters")
+            return tuple(filter(None, map(str.strip, given.split(","))))
+        case "area" if given in _AREAS:
+            return str(given)
+        case "area":
+            area = given
+            with suppress(ValueError):
+                area = parse_number(given.strip()) if isinstance(given, str) else given
+            require(_is_number(area), name, _short(given), ", ".join(_AREAS) + " or a number of m^2")
+            return float(area)
+        case "overrides":
+            require(isinstance(given, dict), name, type(given).__name__, "an object from paths to numbers")
+            require(len(given) <= MOST_OVERRIDES, name, f"{len(given):,} values", f"at most {MOST_OVERRIDES}")
+            return {path: _override(path, value) for path, value in given.items()}
+        case "recording":
+            return _recording(given)
+    least, most = _RANGES[name]
+    require(_is_number(given) and least <= given <= most, name, _short(given), f"{least:g} to {most:g}")
+    return float(given)
 
 
-def request_of(given: Any) -> Request:
-    """A request from plain data; wrong values are refused, and names that are not known left out."""
-    keys = f"an object with the keys {', '.join(_NAMES)}"
-    require(isinstance(given, dict), "the request", type(given).__name__, keys)
-    asked = {name: given[name] for name in _NAMES if given.get(name) is not None}
-    deck: Any = asked.get("deck")
-    source, sets = asked.get("source", ""), asked.get("sets", "")
-    require(isinstance(deck, str), "deck", f"of type {type(deck).__name__}", "the text of a netlist")
-    require(len(deck) <= LONGEST_DECK, "deck", f"{len(deck):,} characters long", f"at most {LONGEST_DECK:,}")
-    require(isinstance(source, str), "source", f"of type {type(source).__name__}", "text such as SQUARE(200 100)")
-    for name, allowed in (("charge_law", CHARGE_LAWS), ("skin", ("own", "follow", "dispersive"))):
-        require(asked.get(name, allowed[0]) in allowed, name, _short(asked.get(name)), " or ".join(allowed))
-    good = isinstance(sets, str) and len(sets) <= _LONGEST_SETS
-    require(good, "sets", _short(sets), f"names with commas, at most {_LONGEST_SETS:,} characters")
-    asked |= {"source": source.strip(), "sets": tuple(filter(None, map(str.strip, sets.split(","))))}
-    if "area" in asked:
-        asked["area"] = _area(asked["area"])
-    for name, (least, most) in _RANGES.items():
-        if name in asked:
-            good = _is_number(asked[name]) and least <= asked[name] <= most
-            require(good, name, _short(asked[name]), f"{least:g} to {most:g}")
-            asked[name] = float(asked[name])
-    asked["overrides"] = _overrides(asked.get("overrides", {}))
-    if "recording" in asked:
-        asked["recording"] = _recording(asked["recording"])
-    return Request(**asked)
-
-
-def _area(given: Any) -> str | float:
-    """The area of a run: a mode's name, or a number of m^2, which a link gives as text."""
-    if given in _AREAS:
-        return str(given)
-    area = given
-    if isinstance(given, str):
-        with suppress(ValueError):
-            area = parse_number(given.strip())
-    require(_is_number(area), "area", _short(given), ", ".join(_AREAS) + " or a number of m^2")
-    return float(area)
-
-
-def _overrides(given: Any) -> dict[str, float]:
-    """Values by path; texts are numbers in SPICE's notation."""
-    require(isinstance(given, dict), "overrides", type(given).__name__, "an object from paths to numbers")
-    require(len(given) <= MOST_OVERRIDES, "overrides", f"{len(given):,} values", f"at most {MOST_OVERRIDES}")
-    found: dict[str, float] = {}
-    for path, value in given.items():
-        if isinstance(value, str) and value.strip().lower() == "inf":
-            found[path] = math.inf
-            continue
-        try:
-            number = parse_number(value.strip()) if isinstance(value, str) else value
-        except ValueError as error:
-            raise InputError(f"{path}: {error}") from None
-        require(_is_number(number), _short(path), _short(value), "a number, or text such as 3.5u")
-        found[path] = float(number)
-    return found
+def _override(path: str, value: Any) -> float:
+    if isinstance(value, str) and value.strip().lower() == "inf":
+        return math.inf
+    try:
+        number = parse_number(value.strip()) if isinstance(value, str) else value
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    require(_is_number(number), _short(path), _short(value), "a number, or text such as 3.5u")
+    return float(number)
 
 
 def _recording(given: Any) -> Recording:
@@ -168,12 +136,20 @@ def _numbers(what: str, given: Any) -> FloatArray:
     try:
         data = base64.b64decode(given if isinstance(given, str) else "?", validate=True)
         values = np.frombuffer(data, "<f8").astype(float)
-    except (ValueError, binascii.Error):
+    except ValueError:
         raise InputError(f"recording {what}: not base64 of doubles") from None
     allowed = f"2 to {MOST_SAMPLES:,}"
     require(2 <= values.size <= MOST_SAMPLES, f"recording {what}", f"{values.size:,} numbers", allowed)
     require(bool(np.isfinite(values).all()), f"recording {what}", "not finite", "finite numbers")
     return values
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Nothing inside warns: the scene itself says what there is to say."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def asked_by(solution: Solution) -> dict[str, Any]:
@@ -190,20 +166,44 @@ def asked_by(solution: Solution) -> dict[str, Any]:
 
 
 class Asked:
-    """A request with the circuit made of it.
+    """What the page asks for, with the circuit made of it; wrong values are refused, and unknown names left out.
 
     The circuit for which the page was opened, `own`, stands for its own text, and may have files and functions that a
     text from the page may not name.
     """
 
+    deck: str  # Text of the netlist
+    overrides: Mapping[str, float] = MappingProxyType({})  # Path to value, in the netlist's unit
+    # Text of another source, ``SQUARE(200 100)`` or ``NAME=SQUARE(200 100)``; empty for the deck's own
+    source: str = ""
+    charge_law: str | None = None  # None for the deck's own
+    area: str | float = "coupled"  # As in `simulate`
+    # ``own``: the data of SKIN are taken at its f; ``follow``: at the source's fundamental; ``dispersive``: at all
+    # frequencies
+    skin: str = "own"
+    rtol: float = 1e-6  # Largest error of gap voltage and force, relative to their peaks
+    # Length of the run in periods of the source; a source without a period runs to the deck's TSTOP
+    periods: float = 5.0
+    last: float | None = None  # How many of the last periods are shown; None for all of the run
+    recording: Recording | None = None  # The file dropped on the page, for the source ``RECORDING(gain)``
+    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME``; they change nothing, and
+    # the page shows their caveats
+    sets: tuple[str, ...] = ()
+
     base: Circuit  # The deck's
     circuit: Circuit  # With all changes
+    replaced: tuple[str, Waveform] | None = None  # What `source` says: the name of the source, and its new waveform
+    gain: float | None = None  # V, of a source that is a recording
     unknown: list[str]  # Sentences about names that mean nothing here
 
     def __init__(self, given: Any, own: Circuit | None = None) -> None:
-        asked = self.request = request_of(given)
-        base = own if own is not None and asked.deck == own.text else _parsed(asked.deck)
-        if asked.skin == "dispersive":
+        keys = f"an object with the keys {', '.join(_NAMES)}"
+        require(isinstance(given, dict), "the request", type(given).__name__, keys)
+        for name in _NAMES:
+            if name == "deck" or given.get(name) is not None:
+                setattr(self, name, _read(name, given.get(name)))
+        base = own if own is not None and self.deck == own.text else _parsed(self.deck)
+        if self.skin == "dispersive":
             base = base.remember("dispersive", partial(_dispersive, base))
         if base is not own and count_of(base) > MOST_ELEMENTS:
             raise InputError(
@@ -211,46 +211,44 @@ class Asked:
                 f"at most {MOST_ELEMENTS} on this page"
             )
         circuit = base
-        if asked.source:
-            name, waveform = read_source(asked.source, circuit, asked.recording)
+        if self.source:
+            name, waveform, self.gain = read_source(self.source, circuit, self.recording)
+            self.replaced = name, waveform
             circuit = circuit.replace({name: waveform})
         paths = {path.lower(): path for path in circuit.parameters}
-        known = {paths[path.lower()]: x for path, x in asked.overrides.items() if path.lower() in paths}
+        known = {paths[path.lower()]: x for path, x in self.overrides.items() if path.lower() in paths}
         self.unknown = [_unknown("name", str(name), _NAMES) for name in given if name not in _NAMES]
-        lost = [path for path in asked.overrides if path.lower() not in paths]
+        lost = [path for path in self.overrides if path.lower() not in paths]
         self.unknown += [_unknown("parameter", path, paths.values()) for path in lost]
         if known:
             circuit = circuit.replace(known)
-        if asked.skin == "follow":
-            fundamental = _source_of(circuit).fundamental
-            if fundamental is not None:
-                circuit = circuit.replace({f"{e.name}.f": fundamental.frequency for e in circuit.by_device("SKIN")})
         self.base, self.circuit = base, circuit
+        fundamental = self.waveform.fundamental if self.skin == "follow" else None
+        if fundamental is not None:
+            self.circuit = circuit.replace({f"{e.name}.f": fundamental.frequency for e in circuit.by_device("SKIN")})
 
     @cached_property
-    def source(self) -> Waveform:
+    def waveform(self) -> Waveform:
         """All sources as one waveform."""
-        return _source_of(self.circuit)
+        waveforms = network_of(self.circuit).waveforms
+        return waveforms[0] if len(waveforms) == 1 else Sum(waveforms)
 
     @cached_property
     def times(self) -> tuple[float, float, float | None]:
-        """First time shown and end of the run, s, and the period of the source, s, or None.
-
-        A run that is too long for a page that answers at once is refused.
-        """
-        request, first, period = self.request, 0.0, self.source.period
+        """First time shown and end of the run, s, and the source's period, s, or None; too long a run is refused."""
+        first, period = 0.0, self.waveform.period
         if period is not None and math.isfinite(period):
-            stop = self.source.settled + request.periods * period
-            if request.last is not None:
-                first = max(stop - request.last * period, 0.0)
+            stop = self.waveform.settled + self.periods * period
+            if self.last is not None:
+                first = max(stop - self.last * period, 0.0)
         else:
             period = None
             stop = self.circuit.tran.stop if self.circuit.tran is not None else 0.05
-            if request.recording is not None and gain_of(request.source) is not None:
-                _, values, times, rate = request.recording
+            if self.recording is not None and self.gain is not None:
+                _, values, times, rate = self.recording
                 stop = float(times[-1]) if times is not None else values.size / rate
         require(math.isfinite(stop) and stop > 0.0, "the run", f"{stop:g} s long", "more than 0 s")
-        count, edges = stop / self.source.shortest_time(), stop * self.source.breakpoint_rate()
+        count, edges = stop / self.waveform.shortest_time(), stop * self.waveform.breakpoint_rate()
         too_long = f"{stop:g} s long, {count:.3g} periods or time constants and {edges:.3g} jumps of its source"
         allowed = f"at most {MOST_TIMES:g} of each on this page"
         require(count <= MOST_TIMES and edges <= MOST_BREAKPOINTS, "the run", too_long, allowed)
@@ -259,7 +257,7 @@ class Asked:
     def points(self, first: float, last: float) -> tuple[int, str]:
         """The number of points of a curve between two times (s), and a warning where they are too few for its shape."""
         span = last - first
-        count, edges = span / self.source.shortest_time(), span * self.source.breakpoint_rate()
+        count, edges = span / self.waveform.shortest_time(), span * self.waveform.breakpoint_rate()
         wanted = max(_OF_OSCILLATION * count, _OF_PIECE * edges)
         points = int(min(max(POINTS, math.ceil(wanted)), MOST_POINTS))
         if 2.0 * points >= wanted:
@@ -288,11 +286,6 @@ def _dispersive(circuit: Circuit) -> Circuit:
         for e in circuit.elements
     )
     return dataclasses.replace(circuit, elements=elements)
-
-
-def _source_of(circuit: Circuit) -> Waveform:
-    waveforms = network_of(circuit).waveforms
-    return waveforms[0] if len(waveforms) == 1 else Sum(waveforms)
 
 
 def _unknown(kind: str, name: str, known: Iterable[str]) -> str:

@@ -19,10 +19,11 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Tran
 from fingerspice.explorer import changed, sliders
 from fingerspice.explorer.examples import EXAMPLES
-from fingerspice.explorer.request import Asked
+from fingerspice.explorer.request import Asked, quiet
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.signals import SIGNALS
 from fingerspice.results.solution import Solution
+from fingerspice.sets.parameters import parameters
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.comparison import large_signal
 from fingerspice.studies.export import export_netlist
@@ -40,7 +41,7 @@ _FIGURES = ("mean", "max", "min", "mean_periodic")
 def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     """Run what the page asks for, for the circuit `own` if the page was opened for it, which stands for its own text.
 
-    The keys of the request are those of `request.Request`; only ``deck`` is needed. The answer has ``ok``, ``status``
+    The keys of the request are those of `request.Asked`; only ``deck`` is needed. The answer has ``ok``, ``status``
     and ``message``; ``sliders``, ``sets``, ``waveform`` (text), ``warnings`` and ``unknown``; of a run ``t`` and
     ``traces`` (arrays in SI units), ``figures``, ``error``, ``plan``, ``harmonics``, ``stacks``, ``period``, ``t_stop``
     and ``failed_at``. A request that is refused, or a run that fails, says why in ``message``; neither raises an
@@ -59,16 +60,16 @@ def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -
     if circuit is not None:
         before, unsaid = changed.before(circuit)
         own = {"title": circuit.title, "request": {"deck": circuit.text, **before, **(asked or {})}, "unsaid": unsaid}
-    return {
-        "version": __version__, "own": own, "examples": examples, "waveforms": sliders.menu(), "sets": changed.menu(),
-    }  # fmt: skip
+    waveforms = [
+        {"kind": kind, "title": title, "arguments": [a._asdict() for a in arguments]}
+        for kind, (title, arguments) in sliders.WAVEFORMS.items()
+    ]
+    sets = [{"name": one.name, "kind": one.kind, "title": one.title} for one in parameters().values()]
+    return {"version": __version__, "own": own, "examples": examples, "waveforms": waveforms, "sets": sets}
 
 
 def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[str, Any]]:
-    """The answer of `scene` but for ``figures``, ``harmonics`` and ``stacks``, and then these.
-
-    The traces can be drawn while the figures are computed, which takes longer than the run.
-    """
+    """The answer of `scene` without ``figures``, ``harmonics`` and ``stacks``, to be drawn at once, and then these."""
     answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
     solution = None
     with _noticing(answer):
@@ -79,7 +80,7 @@ def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[st
                 "title": asked.circuit.title, "sliders": sliders.sliders(asked.base, asked.circuit), "sets": sets,
                 "unknown": [*asked.unknown, *without],
             }  # fmt: skip
-            answer["waveform"] = sliders.text_of(asked.source)
+            answer["waveform"] = sliders.text_of(asked.waveform)
             solution = _shown(asked)
             answer |= _traces(asked, solution)
         except InputError as error:
@@ -115,18 +116,19 @@ def _noticing(answer: dict[str, Any]) -> Iterator[None]:
     answer["warnings"] = list(dict.fromkeys(said))
 
 
-def deadline(seconds: float = LONGEST_RUN) -> Callable[[float], None]:
-    """A `progress` function that ends a run which takes longer; compiling, before the first call, does not count."""
-    begin: list[float] = []
+def deadline() -> Callable[[float], None]:
+    """A `progress` function that ends a run which takes too long; compiling, before the first call, does not count."""
+    begin: float | None = None
 
     def check(done: float) -> None:
-        begin.append(time.monotonic())
-        if begin[-1] - begin[0] > seconds:
+        nonlocal begin
+        now = time.monotonic()
+        begin = now if begin is None else begin
+        if now - begin > LONGEST_RUN:
             raise InputError(
-                f"the run was stopped after {seconds:g} s at {100.0 * done:.3g} % of its length; allowed: fewer "
+                f"the run was stopped after {LONGEST_RUN:g} s at {100.0 * done:.3g} % of its length; allowed: fewer "
                 "periods, or a larger error"
             )
-        del begin[1:]
 
     return check
 
@@ -135,10 +137,10 @@ def _shown(asked: Asked) -> Solution:
     """The run that is asked for, with outputs where it is shown."""
 
     def run(first: float, last: float) -> Solution:
-        request, times = asked.request, np.linspace(first, last, asked.points(first, last)[0])
+        times = np.linspace(first, last, asked.points(first, last)[0])
         return simulate(
-            asked.circuit, t_stop=stop, t_eval=times, charge_law=request.charge_law, area=request.area,
-            rtol=request.rtol, charge=False, throw=False, progress=deadline(),
+            asked.circuit, t_stop=stop, t_eval=times, charge_law=asked.charge_law, area=asked.area, rtol=asked.rtol,
+            charge=False, throw=False, progress=deadline(),
         )  # fmt: skip
 
     first, stop, _ = asked.times
@@ -216,47 +218,57 @@ def dispersive(e):
 circuit = dataclasses.replace(circuit, elements=tuple(map(dispersive, circuit.elements)))"""
 
 
+@quiet()
 def as_deck(given: dict[str, Any], own: Circuit | None = None) -> str:
     """The scene as one deck that fingerspice and ngspice run, with the length of the page's run and its outputs."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        asked = Asked(given, own)
-        circuit, (first, stop, _) = asked.circuit, asked.times
-        step = (stop - first) / asked.points(first, stop)[0]
-        tran = Tran(step, stop, uic=circuit.tran is None or circuit.tran.uic)
-        text = export_netlist(dataclasses.replace(circuit, tran=tran), charge_law=asked.request.charge_law)
+    asked = Asked(given, own)
+    circuit, (first, stop, _) = asked.circuit, asked.times
+    step = (stop - first) / asked.points(first, stop)[0]
+    tran = Tran(step, stop, uic=circuit.tran is None or circuit.tran.uic)
+    text = export_netlist(dataclasses.replace(circuit, tran=tran), charge_law=asked.charge_law)
     if len(text) > _LONGEST_EXPORT:
         raise InputError(f"the deck would have {len(text):,} characters; allowed: at most {_LONGEST_EXPORT:,}")
     return text
 
 
+@quiet()
 def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     """The scene as Python that gives the page's solution."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        asked = Asked(given, own)
-        sets, by_sets, _ = changed.in_scene(asked)
-        first, stop, _ = asked.times
-    request, circuit = asked.request, asked.circuit
-    name, waveform = "", None
-    if request.source:
-        name, waveform = sliders.read_source(request.source, asked.base, request.recording)
-    lines, changes = _beginning(request.deck, own, name)
-    if request.skin == "dispersive":
+    asked = Asked(given, own)
+    sets, by_sets, _ = changed.in_scene(asked)
+    first, stop, _ = asked.times
+    name, waveform = asked.replaced or ("", None)
+    lines = ["import dataclasses", "", "import numpy as np", "", "import fingerspice as fs", ""]
+    # The values changed before the page was opened are those of the user's own circuit.
+    mine = own if own is not None and asked.deck == own.text else None
+    before = mine.overrides if mine is not None else {}
+    known = {path.lower(): one.value for path, one in mine.parameters.items()} if mine is not None else {}
+    if mine is not None and mine.path is not None:
+        lines.append(f"circuit = fs.read_netlist({str(mine.path)!r})")
+    else:
+        deck = [f"    {line!r}" for line in asked.deck.splitlines(keepends=True)]
+        lines += ["circuit = fs.parse_netlist(", *deck, ")"]
+    lines += [
+        f"# Changed before, in Python: {path} = {' '.join(text.split())}"
+        for path, text in before.items()
+        if path.lower() not in (*known, name.lower())
+    ]
+    if asked.skin == "dispersive":
         lines += _DISPERSIVE.splitlines()
     for one in sets:
         to = f", {one['to']!r}" if one["to"] else ""
         lines.append(f"circuit = fs.parameters({one['name']!r}).apply(circuit{to})")
     if waveform is not None and name.lower() not in by_sets:
-        gain, code = sliders.gain_of(request.source), _AS_CODE.sub(r"fs.\1(", repr(waveform))
-        if request.recording is not None and gain is not None:
-            code = request.recording.python(gain)
+        code = _AS_CODE.sub(r"fs.\1(", repr(waveform))
+        if asked.recording is not None and asked.gain is not None:
+            code = asked.recording.python(asked.gain)
         lines.append(f"circuit = circuit.replace({{{name!r}: {code}}})")
-    known = {path.lower() for path in circuit.parameters}
-    changes |= {path: x for path, x in request.overrides.items() if path.lower() in known}
+    changes = {path: known[path.lower()] for path in before if path.lower() in known}
+    there = {path.lower() for path in asked.circuit.parameters}
+    changes |= {path: x for path, x in asked.overrides.items() if path.lower() in there}
     changes = {path: x for path, x in changes.items() if path.lower() not in by_sets}
-    if request.skin == "follow":
-        changes |= {f"{e.name}.f": e.values["f"] for e in circuit.by_device("SKIN")}
+    if asked.skin == "follow":
+        changes |= {f"{e.name}.f": e.values["f"] for e in asked.circuit.by_device("SKIN")}
     if changes:
         numbers = {path: 'float("inf")' if x == math.inf else repr(x) for path, x in changes.items()}
         inside = ", ".join(f"{path!r}: {number}" for path, number in numbers.items())
@@ -264,37 +276,13 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     lines += [
         "solution = fs.simulate(",
         f"    circuit, t_stop={stop!r}, t_eval=np.linspace({first!r}, {stop!r}, {asked.points(first, stop)[0]}),",
-        f"    charge_law={request.charge_law!r}, area={request.area!r}, rtol={request.rtol!r},",
-        ")",
-        "print(solution)",
-        "",
+        f"    charge_law={asked.charge_law!r}, area={asked.area!r}, rtol={asked.rtol!r},",
+        *(")", "print(solution)", ""),
     ]
     return "\n".join(lines)
 
 
-def _beginning(deck: str, own: Circuit | None, replaced: str) -> tuple[list[str], dict[str, float]]:
-    """The lines that make the circuit of a deck, and the values changed before the page was opened.
-
-    The source of the name `replaced` has got another waveform on the page.
-    """
-    lines = ["import dataclasses", "", "import numpy as np", "", "import fingerspice as fs", ""]
-    mine = own if own is not None and deck == own.text else None
-    if mine is not None and mine.path is not None:
-        lines.append(f"circuit = fs.read_netlist({str(mine.path)!r})")
-    else:
-        lines += ["circuit = fs.parse_netlist(", *(f"    {line!r}" for line in deck.splitlines(keepends=True)), ")"]
-    changes: dict[str, float] = {}
-    if mine is None:
-        return lines, changes
-    known = {path.lower(): parameter.value for path, parameter in mine.parameters.items()}
-    for path, text in mine.overrides.items():
-        if path.lower() in known:
-            changes[path] = known[path.lower()]
-        elif path.lower() != replaced.lower():
-            lines.append(f"# Changed before, in Python: {path} = {' '.join(text.split())}")
-    return lines, changes
-
-
+@quiet()
 def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     """Mean force of the periodic state under sines of the source's amplitude, at frequencies that the request names.
 
@@ -305,18 +293,16 @@ def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     good = isinstance(frequencies, list) and 0 < len(frequencies) <= 16
     if not good or not all(isinstance(x, (int, float)) and 1e-2 <= x <= 1e6 for x in frequencies or ()):
         raise InputError("frequencies: allowed: a list of at most 16 numbers from 0.01 to 1e6 Hz")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        asked = Asked({key: value for key, value in given.items() if key != "frequencies"}, own)
-        gaps, wave = asked.circuit.by_device("GAP"), asked.source
-        if not gaps:
-            raise InputError("the circuit has no GAP, and so no force")
-        if wave.fundamental is None:
-            raise InputError("the source has no one amplitude that sines could have; allowed: a periodic source")
-        (found,) = large_signal(
-            asked.circuit, np.asarray(frequencies, float), charge_law=asked.request.charge_law,
-            finger=gaps[0].name, rtol=max(asked.request.rtol, _RTOL), progress=deadline(),
-        )  # fmt: skip
+    asked = Asked({key: value for key, value in given.items() if key != "frequencies"}, own)
+    gaps, wave = asked.circuit.by_device("GAP"), asked.waveform
+    if not gaps:
+        raise InputError("the circuit has no GAP, and so no force")
+    if wave.fundamental is None:
+        raise InputError("the source has no one amplitude that sines could have; allowed: a periodic source")
+    (found,) = large_signal(
+        asked.circuit, np.asarray(frequencies, float), charge_law=asked.charge_law, finger=gaps[0].name,
+        rtol=max(asked.rtol, _RTOL), progress=deadline(),
+    )  # fmt: skip
     amplitude = format_si(float(np.max(found.amplitude)), "V")
     if not (isinstance(wave, Sine) and wave.offset == 0.0):
         amplitude += ", the source's fundamental,"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hmac
 import json
 import secrets
@@ -69,7 +68,7 @@ class Explorer:
     port : int
         0 takes a free one.
     asked : mapping, optional
-        How the page runs the circuit first: keys and values as in `request.Request`.
+        How the page runs the circuit first: keys and values as the fields of `request.Asked`.
     framed : bool
         Whether a notebook on this computer may show the page in a frame; a cell then shows this object as the page.
 
@@ -141,15 +140,25 @@ class Explorer:
         self._thread.join()
 
     def answers(self, what: str, given: Any) -> Iterator[bytes]:
-        """The answer to what the page asks for, in the parts in which it is found."""
-        parts = _ACTIONS[what](given, self.circuit)
-        while True:
+        """The answer to what the page asks for, in the parts in which it is found, or why there is none."""
+        try:
             # Python's filters of warnings belong to the whole process, and two runs at once would not be faster.
             with self._one_at_a_time:
-                found = next(parts, None)
-            if found is None:
-                return
-            yield framed(found)
+                found = _ACTIONS[what](given, self.circuit)
+            if isinstance(found, str):
+                found = {"ok": True, "text": found}
+            parts = iter([found]) if isinstance(found, dict) else found
+            while True:
+                with self._one_at_a_time:
+                    part = next(parts, None)
+                if part is None:
+                    return
+                yield framed(part)
+        except (InputError, SolveError) as error:
+            yield framed({"ok": False, "message": str(error)})
+        except Exception as error:
+            text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
+            yield framed({"ok": False, "status": "FAULT", "message": text})
 
 
 def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
@@ -189,32 +198,11 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
     return explorer
 
 
-Action = Callable[[Any, Circuit | None], Iterator[dict[str, Any]]]
-
-
-def _whole(make: Callable[[Any, Circuit | None], dict[str, Any] | str]) -> Action:
-    """An action whose answer, or refusal, comes in one part."""
-
-    def parts(given: Any, own: Circuit | None) -> Iterator[dict[str, Any]]:
-        try:
-            found = make(given, own)
-        except (InputError, SolveError) as error:
-            found = {"ok": False, "message": str(error)}
-        yield {"ok": True, "text": found} if isinstance(found, str) else found
-
-    return parts
-
-
-#: What the page asks for.
-_ACTIONS: dict[str, Action] = {
-    "scene": scene.parts, "set": _whole(changed.applied), "means": _whole(scene.means),
-    "deck": _whole(scene.as_deck), "python": _whole(scene.as_python),
+#: What the page asks for, and what answers, in one part or in several.
+_ACTIONS: dict[str, Callable[[Any, Circuit | None], Any]] = {
+    "scene": scene.parts, "set": changed.applied, "means": scene.means, "deck": scene.as_deck,
+    "python": scene.as_python,
 }  # fmt: skip
-
-
-def as_json(data: Any) -> bytes:
-    """Data as JSON: arrays of numbers as base64 of little-endian doubles, and null for what is not finite."""
-    return _dumped(data, lambda x: {"f64": base64.b64encode(np.ascontiguousarray(x, "<f8").tobytes()).decode("ascii")})
 
 
 def framed(data: Any) -> bytes:
@@ -235,18 +223,12 @@ def framed(data: Any) -> bytes:
             end += x.size
         return places[id(x)]
 
-    text = _dumped(data, place)
-    text += b" " * (-len(text) % 8)
-    return b"".join([struct.pack("<II", len(text), end), text, *arrays])
-
-
-def _dumped(data: Any, array: Callable[[FloatArray], Any]) -> bytes:
-    """Data as JSON, with `array` for its arrays, and null for what is not finite."""
-    text = json.dumps(data, default=array)
+    text = json.dumps(data, default=place)
     if "NaN" in text or "Infinity" in text:
-        # Seldom, and all data have to be gone through.
+        # Seldom, and all data have to be gone through: what is not finite is null.
         text = json.dumps(json.loads(text, parse_constant=lambda _: None))
-    return text.encode()
+    content = text.encode() + b" " * (-len(text) % 8)
+    return b"".join([struct.pack("<II", len(content), end), content, *arrays])
 
 
 class _Server(ThreadingHTTPServer):
@@ -310,7 +292,7 @@ class _Handler(BaseHTTPRequestHandler):
         except _Refused as error:
             self._discard()
             status, text = error.args
-            kind, parts = "application/json", iter([as_json({"ok": False, "message": text})])
+            kind, parts = "application/json", iter([json.dumps({"ok": False, "message": text}).encode()])
         part = next(parts)
         self.send_response(status)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
@@ -343,8 +325,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _file(self, what: str) -> tuple[str, Iterator[bytes]]:
         if what == "start":
-            start = as_json(scene.beginning(self.explorer.circuit, self.explorer.asked))
-            return "application/json", iter([start])
+            start = json.dumps(scene.beginning(self.explorer.circuit, self.explorer.asked))
+            return "application/json", iter([start.encode()])
         name = what or "index.html"
         if name not in self.explorer.files:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is no such file")
@@ -364,15 +346,7 @@ class _Handler(BaseHTTPRequestHandler):
             given = json.loads(self.rfile.read(int(length)))
         except (ValueError, RecursionError):
             raise _Refused(HTTPStatus.BAD_REQUEST, "the request is not JSON") from None
-        return "application/octet-stream", self._parts(what, given)
-
-    def _parts(self, what: str, given: Any) -> Iterator[bytes]:
-        """The parts of an answer, the last of which says what went wrong if this program did."""
-        try:
-            yield from self.explorer.answers(what, given)
-        except Exception as error:
-            text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
-            yield framed({"ok": False, "status": "FAULT", "message": text})
+        return "application/octet-stream", self.explorer.answers(what, given)
 
     def _discard(self) -> None:
         """Read what was sent with a refused request, up to a limit, so that the browser takes the answer."""

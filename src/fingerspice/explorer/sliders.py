@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import parse_number, spice_text
-from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import MEANINGS_OF_WAVEFORMS
 from fingerspice.circuit.devices import ParameterSpec
 from fingerspice.circuit.topology import driving_sources
@@ -39,42 +38,34 @@ _PREFIXED = ("m", "V", "A", "ohm", "ohm m", "F", "Hz", "s", "V/m")
 
 
 def sliders(base: Circuit, shown: Circuit) -> list[dict[str, Any]]:
-    """The sliders by element, those of the sources, the gap and the layers first.
-
-    `base` is the circuit of the deck, whose values set the ranges, so that these stay while a slider moves; `shown` has
-    the values of now.
-    """
+    """Sliders by element, of sources, gap and layers first; values of the deck's `base` set the ranges, which stay."""
     driving = {e.name for e in driving_sources(shown)}
     before = {e.name: e for e in base.elements}
     order = {"V": 0, "I": 0, "GAP": 1, "LAYER": 2, "SLAB": 2, "SKIN": 3, "SKIN_DISPERSIVE": 3}
-    groups = [
-        {"element": e.name, "device": e.device, "what": e.spec.what or e.device,
-         "sliders": list(_sliders(before[e.name], e, e.name in driving))}
-        for e in sorted(shown.elements, key=lambda e: order.get(e.device, 4))
-    ]  # fmt: skip
-    return [group for group in groups if group["sliders"]]
-
-
-def _sliders(base: Element, e: Element, drives: bool) -> Iterator[dict[str, Any]]:
-    """The sliders of one element; `base` is the element in the deck, and a source that does not drive gives an area."""
-    rows: list[tuple[str, str, float, bool, str, tuple[float, float, bool]]] = []
-    for spec in e.spec.parameters:
-        limits = _of_parameter(spec, base.values.get(spec.name, e.values[spec.name]))
-        rows.append((spec.name, spec.unit, e.values[spec.name], spec.first, spec.meaning, limits))
-    same = type(base.waveform) is type(e.waveform)
-    for name, unit in type(e.waveform).units.items() if e.waveform is not None else ():
-        value = getattr(e.waveform, name, None)
-        if isinstance(value, (int, float)):
-            own = getattr(base.waveform, name) if same else value
-            limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
-            # A source on an area node gives mm^2.
-            unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
-            rows.append((name, unit, value, name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, ""), limits))
-    for name, unit, value, first, meaning, (low, high, log) in rows:
-        yield {
-            "path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
-            "text": value_text(value, unit), "low": low, "high": high, "log": log, "first": first, "meaning": meaning,
-        }  # fmt: skip
+    groups = []
+    for e in sorted(shown.elements, key=lambda e: order.get(e.device, 4)):
+        old, drives = before[e.name], e.name in driving
+        rows: list[tuple[str, str, float, bool, str, tuple[float, float, bool]]] = []
+        for spec in e.spec.parameters:
+            limits = _of_parameter(spec, old.values.get(spec.name, e.values[spec.name]))
+            rows.append((spec.name, spec.unit, e.values[spec.name], spec.first, spec.meaning, limits))
+        same = type(old.waveform) is type(e.waveform)
+        for name, unit in type(e.waveform).units.items() if e.waveform is not None else ():
+            value = getattr(e.waveform, name, None)
+            if isinstance(value, (int, float)):
+                own = getattr(old.waveform, name) if same else value
+                # A source that does not drive is on an area node, and gives mm^2.
+                limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
+                unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
+                rows.append((name, unit, value, name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, ""), limits))
+        found = [
+            {"path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
+             "text": value_text(value, unit), "low": low, "high": high, "log": log, "first": first, "meaning": meaning}
+            for name, unit, value, first, meaning, (low, high, log) in rows
+        ]  # fmt: skip
+        if found:
+            groups.append({"element": e.name, "device": e.device, "what": e.spec.what or e.device, "sliders": found})
+    return groups
 
 
 def value_text(value: float, unit: str) -> str:
@@ -117,8 +108,10 @@ def _of_waveform(name: str, unit: str, value: float) -> tuple[float, float, bool
 
 #: Largest number of characters of a source's text.
 LONGEST = 20_000
-_CALL = re.compile(r"\s*([A-Za-z]+)\s*\(([^()]*)\)\s*")
-_NAMED = re.compile(r"\s*([\w.]+)\s*=\s*(.*)", re.DOTALL)
+_NAMED = re.compile(r"(?:\s*([\w.]+)\s*=)?\s*(.*)", re.DOTALL)
+#: The source that stands for the file dropped on the page.
+RECORDING = "RECORDING"
+_RECORDED = re.compile(rf"\s*{RECORDING}\s*\(([^()]*)\)\s*", re.IGNORECASE)
 
 
 class Argument(NamedTuple):
@@ -133,78 +126,74 @@ class Argument(NamedTuple):
     optional: bool = False
 
 
-def _hz(name: str, value: float) -> Argument:
-    return Argument(name, "Hz", value, 1.0, 1e5, True)
+def _usual(name: str, value: float, unit: str = "Hz", *, optional: bool = False) -> Argument:
+    """An argument with the range that it has as a parameter of a source."""
+    return Argument(name, unit, value, *_of_waveform(name, unit, value), optional)
 
 
-def _volt(name: str = "amplitude", value: float = 200.0) -> Argument:
-    return Argument(name, "V", value, 0.0 if name == "amplitude" else -400.0, 400.0)
-
-
-#: The source that stands for the file dropped on the page.
-RECORDING = "RECORDING"
-_AMPLITUDE, _FREQUENCY = _volt(), _hz("frequency", 100.0)
+_AMPLITUDE, _FREQUENCY = _usual("amplitude", 200.0, "V"), _usual("frequency", 100.0)
 #: By function: its name on the page, and its numbers in their order.
 WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
-    "SIN": ("Sine", (_volt("offset", 0.0), _AMPLITUDE, _FREQUENCY)),
-    "SQUARE": ("Square wave", (_AMPLITUDE, _FREQUENCY, Argument("duty", "", 0.5, 0.01, 0.99, optional=True))),
+    "SIN": ("Sine", (_usual("offset", 0.0, "V"), _AMPLITUDE, _FREQUENCY)),
+    "SQUARE": ("Square wave", (_AMPLITUDE, _FREQUENCY, _usual("duty", 0.5, "", optional=True))),
     "TRIANGLE": ("Triangle", (_AMPLITUDE, _FREQUENCY)),
     "SAWTOOTH": ("Sawtooth", (_AMPLITUDE, _FREQUENCY)),
     "AM": ("Carrier with envelope", (
-        *(_AMPLITUDE, _hz("carrier", 5e3), _hz("envelope", 50.0)), Argument("depth", "", 1.0, 0.0, 1.0, optional=True)
+        *(_AMPLITUDE, _usual("carrier", 5e3), _usual("envelope", 50.0), _usual("depth", 1.0, "", optional=True)),
     )),
     "BURST": ("Bursts", (
-        *(_AMPLITUDE, _hz("frequency", 5e3), Argument("cycles", "", 10.0, 1.0, 100.0)),
+        *(_AMPLITUDE, _usual("frequency", 5e3), Argument("cycles", "", 10.0, 1.0, 100.0)),
         Argument("every", "s", 10e-3, 1e-3, 1.0, True),
     )),
     "CHIRP": ("Chirp", (
-        _volt(value=150.0), _hz("from", 20.0), _hz("to", 1e3), Argument("duration", "s", 0.05, 1e-2, 3.0, True)
+        *(_usual("amplitude", 150.0, "V"), _usual("from", 20.0), _usual("to", 1e3)),
+        Argument("duration", "s", 0.05, 1e-2, 3.0, True),
     )),
     "EXP": ("Step that rises and falls", (
-        *(_volt("low", 0.0), _volt("high", 200.0), Argument("start", "s", 1e-3, 0.0, 0.05)),
+        *(_usual("low", 0.0, "V"), _usual("high", 200.0, "V"), Argument("start", "s", 1e-3, 0.0, 0.05)),
         *(Argument("rise", "s", 1e-3, 1e-5, 0.1, True), Argument("end", "s", 20e-3, 0.0, 0.1)),
         Argument("fall", "s", 2e-3, 1e-5, 0.1, True),
     )),
     RECORDING: ("Recording or table, dropped here", (Argument("gain", "V", 150.0, 0.0, 400.0),)),
-    "DC": ("Constant", (_volt("level", 200.0),)),
+    "DC": ("Constant", (_usual("level", 200.0, "V"),)),
 }  # fmt: skip
 #: Waveforms that the page can say as text; their numbers are those of the menu, one of them by another name.
 _TEXTS = {Sine: "SIN", Square: "SQUARE", Triangle: "TRIANGLE", Sawtooth: "SAWTOOTH", AM: "AM", DC: "DC"}
 _FIELDS = {"envelope": "modulation"}
 
 
-def menu() -> list[dict[str, Any]]:
-    """The menu as plain data."""
-    return [
-        {"kind": kind, "title": title, "arguments": [a._asdict() for a in arguments]}
-        for kind, (title, arguments) in WAVEFORMS.items()
-    ]
+def read_source(
+    text: str, circuit: Circuit, recording: Recording | None = None
+) -> tuple[str, Waveform, float | None]:  # fmt: skip
+    """The source's name, its new waveform, and the gain (V) of one that is a recording.
 
-
-def read_source(text: str, circuit: Circuit, recording: Recording | None = None) -> tuple[str, Waveform]:
-    """The source's name and its new waveform, from text such as ``SQUARE(200 100)`` or ``Vdrive=AM(200 5k 50)``.
-
-    No file is read, whatever the text names; ``RECORDING(150)`` is the recording given.
+    They are read from text such as ``SQUARE(200 100)`` or ``Vdrive=AM(200 5k 50)``. No file is read, whatever the text
+    names; ``RECORDING(150)`` is the recording given.
     """
     if len(text) > LONGEST:
         raise InputError(f"the source has {len(text):,} characters; allowed: at most {LONGEST:,}")
     names = {e.name.lower(): e.name for e in driving_sources(circuit)}
     named = _NAMED.fullmatch(text)
-    given = next(iter(names), "") if named is None else named[1]
+    assert named is not None
+    given = named[1] or next(iter(names), "")
     if given.lower() not in names:
         known = ", ".join(names.values()) or "none, as it has no source"
         raise InputError(f"{given or text!r} is not a source of the circuit; allowed: {known}")
-    gain = gain_of(text)
-    if gain is not None:
-        if recording is None:
-            raise InputError(
-                "the source is a recording, which a link does not carry; allowed: drop its file on the page"
-            )
-        return names[given.lower()], recording.waveform(gain)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FingerspiceWarning)
-        call = text if named is None else named[2]
-        return names[given.lower()], source_from_text(call, circuit, files=False)
+    name, recorded = names[given.lower()], _RECORDED.fullmatch(named[2])
+    if recorded is None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FingerspiceWarning)
+            return name, source_from_text(named[2], circuit, files=False), None
+    words = recorded[1].replace(",", " ").split()
+    if len(words) != 1:
+        raise InputError(f"{RECORDING} is given {len(words)} numbers; allowed: {RECORDING}(gain)")
+    try:
+        gain = parse_number(words[0])
+    except ValueError as error:
+        raise InputError(f"{RECORDING}: {error}") from None
+    if recording is None:
+        raise InputError("the source is a recording, which a link does not carry; allowed: drop its file on the page")
+    return name, recording.waveform(gain), gain
 
 
 def text_of(waveform: Waveform) -> str | None:
@@ -214,18 +203,3 @@ def text_of(waveform: Waveform) -> str | None:
         return None
     names = [_FIELDS.get(a.name, a.name) for a in WAVEFORMS[kind][1]]
     return f"{kind}({' '.join(value_text(getattr(waveform, name), waveform.units[name]) for name in names)})"
-
-
-def gain_of(text: str) -> float | None:
-    """The gain of a source that is a recording; None of another source."""
-    named = _NAMED.fullmatch(text)
-    call = _CALL.fullmatch(text if named is None else named[2])
-    if call is None or call[1].upper() != RECORDING:
-        return None
-    words = call[2].replace(",", " ").split()
-    if len(words) != 1:
-        raise InputError(f"{RECORDING} is given {len(words)} numbers; allowed: {RECORDING}(gain)")
-    try:
-        return parse_number(words[0])
-    except ValueError as error:
-        raise InputError(f"{RECORDING}: {error}") from None

@@ -16,7 +16,7 @@ from fingerspice.netlist.deck import KINDS
 from fingerspice.netlist.slips import is_unit, nearest
 from fingerspice.netlist.sources import Context, Source, read_source
 from fingerspice.netlist.words import Call, Directive, Number, Statement, Token, Value
-from fingerspice.waveforms.bounds import check_range
+from fingerspice.waveforms.waveform import check_range
 
 #: The parameter that gives the number of equal parts in parallel.
 _COPIES = "m"

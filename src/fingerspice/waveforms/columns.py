@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,6 +28,8 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 # Lines of comments; a comment behind numbers that blanks separate, where without a blank a semicolon separates cells.
 _COMMENTED = ("#", ";", "*")
 _COMMENT = re.compile(r"^(\s*[^\s;]+\s[^;]*\s);.*")
+# A line that begins with a number or NaN, in the first cell that is not empty, and so is no header.
+_FIRST_NUMBER = re.compile(r"[\s,;\"]*(?:[+-]?\.?\d|[+-]?(?:nan|inf)\b|$)", re.IGNORECASE)
 # Begins the line above each run in LTspice's export of a .step.
 _STEPPED = "Step Information:"
 # Largest number of column names shown in a message.
@@ -109,11 +112,8 @@ class Columns:
 
 
 def read_text_columns(path: Path, label: str | None = None) -> Columns:
-    """Columns of a text file, which has rows of numbers with the same count of cells; errors name the line.
-
-    The column named `label` holds words.
-    """
-    data, words = path.read_bytes(), dict[str, int]()
+    """Columns of a text file, with one count of cells in all rows; the column `label` has words. Errors name lines."""
+    data, words, place = path.read_bytes(), dict[str, int](), None
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     if b"\0" in data and not wide:
         raise InputError(f"'{path}' is no text; allowed: a table as text, or an NPZ file")
@@ -122,8 +122,6 @@ def read_text_columns(path: Path, label: str | None = None) -> Columns:
     except UnicodeDecodeError:
         # Windows' Latin-1, in which spreadsheets and LTspice write the micro sign.
         lines = data.decode("cp1252", "replace").splitlines()
-    if label is not None:
-        _number_words(path, lines, label, words)
     lines = [_COMMENT.sub(r"\1", line) if ";" in line else line for line in lines]
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
     steps = [one for one in numbered if one[1].startswith(_STEPPED)]
@@ -132,7 +130,13 @@ def read_text_columns(path: Path, label: str | None = None) -> Columns:
         raise InputError(f"{said}; allowed: one run: export one step, or keep the rows of one")
     numbered = [one for one in numbered if one not in steps]
     rows = [(number, line) for number, line in numbered if not line.lstrip().startswith(_COMMENTED)]
-    first = next((i for i, (_, line) in enumerate(rows) if _begins_with_number(line)), None)
+    if label is not None and rows:
+        # The rows of such a table need not begin with a number: they are those below the first.
+        named = [_unit(cell)[0].lower() for cell in _cells(rows[0][1], _separator(rows[0][1]))]
+        if label.lower() not in named:
+            raise InputError(f"'{path}' has no column {label!r} in its header; it has {', '.join(named)}")
+        place = named.index(label.lower())
+    first = next((i for i, (_, line) in enumerate(rows) if (i if label else _FIRST_NUMBER.match(line))), None)
     if first is None:
         raise InputError(f"'{path}' holds no rows of numbers")
     begin, line = rows[first]
@@ -147,28 +151,9 @@ def read_text_columns(path: Path, label: str | None = None) -> Columns:
     count = len(_cells(line, separator))
     header = [_unit(name) for name in _header(path, numbered, begin, separator, count)]
     names, units = zip(*header, strict=True) if header else ((), ())
-    table, faults = _numbers(path, rows[first:], separator, count)
+    table, faults = _numbers(path, rows[first:], separator, count, place, words)
     places = np.array([number for number, _ in rows[first:]])
     return Columns(path, names, table, units, places, faults, tuple(words))
-
-
-def _number_words(path: Path, lines: list[str], label: str, words: dict[str, int]) -> None:
-    """Write the words of one column as numbers, into the lines, and list them."""
-    place, separator = -1, None
-    for number, line in enumerate(lines):
-        if not line.strip() or line.lstrip().startswith(_COMMENTED):
-            continue
-        if place < 0:
-            separator = _separator(line)
-            names = [_unit(cell)[0].lower() for cell in _cells(line, separator)]
-            if label.lower() not in names:
-                raise InputError(f"'{path}' has no column {label!r} in its header; it has {', '.join(names)}")
-            place = names.index(label.lower())
-            continue
-        cells = _cells(line, separator)
-        if place < len(cells):
-            cells[place] = str(words.setdefault(cells[place], len(words)))
-            lines[number] = (separator or " ").join(cells)
 
 
 def _separator(line: str) -> str | None:
@@ -178,12 +163,6 @@ def _separator(line: str) -> str | None:
 def _cells(line: str, separator: str | None) -> list[str]:
     """Cells of a line without the quotes that spreadsheets put around them; None as separator splits at blanks."""
     return [cell.strip().strip('"').strip() for cell in line.strip().split(separator)]
-
-
-def _begins_with_number(line: str) -> bool:
-    """Whether the first cell of the line that is not empty is a number or NaN, so that the line is not a header."""
-    cells = (cell.strip('"') for cell in re.split(r"[\s,;]+", line.strip()))
-    return re.match(r"[+-]?\.?\d|[+-]?(?:nan|inf)\b|$", next(filter(None, cells), ""), re.IGNORECASE) is not None
 
 
 def _unit(header: str) -> tuple[str, str]:
@@ -222,15 +201,15 @@ def _header(
 
 
 def _numbers(
-    path: Path, rows: list[tuple[int, str]], separator: str | None, count: int
+    path: Path, rows: list[tuple[int, str]], separator: str | None, count: int, label: int | None, words: dict[str, int]
 ) -> tuple[FloatArray, dict[int, str]]:
-    """The numbers, shape (n_row, count), and the message about the first cell of each column that is none."""
+    """Numbers (n_row, count), the words of the column `label` as their numbers among `words`, and faults by column."""
     faults: dict[int, str] = {}
-    try:
-        return np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None), faults
-    except ValueError:
-        # NumPy reads neither SPICE's scales nor quoted cells, and its message does not help: read the rows one by one.
-        table = np.full((len(rows), count), np.nan)
+    with suppress(ValueError):
+        if label is None:
+            return np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None), faults
+    # NumPy reads neither SPICE's scales nor quoted cells, and its message does not help: read the rows one by one.
+    table = np.full((len(rows), count), np.nan)
     for (number, line), found in zip(rows, table, strict=True):
         _refuse_semicolons(path, number, line)
         cells = _cells(line, separator)
@@ -238,7 +217,7 @@ def _numbers(
             raise InputError(f"'{path}', line {number} has {len(cells)} cells; allowed: {count}, as in the first row")
         for column, cell in enumerate(cells):
             try:
-                found[column] = _number(cell)
+                found[column] = words.setdefault(cell, len(words)) if column == label else _number(cell)
             except ValueError as error:
                 reason = str(error) if cell else f"the cell in column {column} is empty; allowed: numbers"
                 faults.setdefault(column, f"'{path}', line {number}: {reason}")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_numbers
-from fingerspice.waveforms.bounds import runs_through
+from fingerspice.waveforms.ramps import runs_through
 from fingerspice.waveforms.waveform import DC, Sine, Waveform, as_waveform, require
 
 #: Most cycles of a part in a common period.
@@ -27,10 +27,13 @@ class _Combination(Waveform):
     parts: tuple[Waveform, ...]
     _joined: ClassVar[Callable[..., Any]]  # Sum or product of numbers or arrays
 
-    @staticmethod
-    def _joined_terms(a: FloatArray, b: FloatArray) -> FloatArray:
-        """Terms (m, k, 6) of the sum or product of two parts."""
-        raise NotImplementedError
+    _joined_terms: ClassVar[Callable[..., Any]]  # Terms (m, k, 6) of the sum or product of two parts, from theirs
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rate = sum(1.0 / part.shortest_time() for part in self.parts)
+        settled = max(part.settled for part in self.parts)
+        self._declare(period=_common_period(self.parts), settled=settled, _quick=1.0 / rate if rate else math.inf)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.asarray(self._joined(part.value(t, side) for part in self.parts))
@@ -46,10 +49,6 @@ class _Combination(Waveform):
     def breakpoints(self, t0: float, t1: float) -> FloatArray:
         return np.unique(np.concatenate([part.breakpoints(t0, t1) for part in self.parts]))
 
-    def shortest_time(self) -> float:
-        rate = sum(1.0 / part.shortest_time() for part in self.parts)
-        return 1.0 / rate if rate else math.inf
-
     def breakpoint_rate(self) -> float:
         return sum(part.breakpoint_rate() for part in self.parts)
 
@@ -58,35 +57,26 @@ class _Combination(Waveform):
         return max(part.precision for part in self.parts)
 
     @property
-    def settled(self) -> float:  # type: ignore[override]
-        return max(part.settled for part in self.parts)
-
-    @property
     def course(self) -> tuple[float, float]:  # type: ignore[override]
         first, last = zip(*(part.course for part in self.parts), strict=True)
         return min(first), max(last)
 
-    @cached_property
-    def period(self) -> float | None:  # type: ignore[override]
-        """Least common period of the parts (s); None unless it has at most `MOST_CYCLES` cycles of each."""
-        total: float | None = None
-        for part in self.parts:
-            if isinstance(part, DC):
-                continue
-            if part.period is None:
-                return None
-            if total is None:
-                total = part.period
-                continue
-            ratio = total / part.period
-            fraction = Fraction(ratio).limit_denominator(MOST_CYCLES)
-            if fraction.numerator > MOST_CYCLES or abs(float(fraction) - ratio) > _ROUNDING * ratio:
-                return None
-            total *= fraction.denominator
-        return total
-
     def _tones(self) -> list[float]:
         return [tone for part in self.parts if (tone := part.tone()) is not None]
+
+
+def _common_period(parts: tuple[Waveform, ...]) -> float | None:
+    """Least common period of waveforms (s); None unless it has at most `MOST_CYCLES` cycles of each."""
+    total: float | None = None
+    for period in (part.period for part in parts if not isinstance(part, DC)):
+        if period is None:
+            return None
+        ratio = 1.0 if total is None else total / period
+        fraction = Fraction(ratio).limit_denominator(MOST_CYCLES)
+        if fraction.numerator > MOST_CYCLES or abs(float(fraction) - ratio) > _ROUNDING * ratio:
+            return None
+        total = period if total is None else total * fraction.denominator
+    return total
 
 
 @dataclass(frozen=True)
@@ -95,10 +85,7 @@ class Sum(_Combination):
 
     parts: tuple[Waveform, ...]
     _joined = staticmethod(sum)
-
-    @staticmethod
-    def _joined_terms(a: FloatArray, b: FloatArray) -> FloatArray:
-        return np.concatenate([a, b], axis=1)
+    _joined_terms = staticmethod(lambda a, b: np.concatenate([a, b], axis=1))
 
     def tone(self) -> float | None:
         tones = self._tones()
@@ -166,8 +153,9 @@ class AM(_OfFactors):
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        Waveform.__post_init__(self)
         require(0.0 <= self.depth <= 1.0, "AM depth", f"{self.depth:g}", "0 to 1")
+        super().__post_init__()
 
     @cached_property
     def parts(self) -> tuple[Waveform, ...]:  # type: ignore[override]
@@ -187,7 +175,8 @@ class _Shifted(Waveform):
     _stretch: float  # Length of a stretch, s
 
     def __post_init__(self) -> None:
-        self._declare(waveform=as_waveform(self.waveform))
+        wave = as_waveform(self.waveform)
+        self._declare(waveform=wave, _quick=wave.shortest_time())
         super().__post_init__()
 
     @cached_property
@@ -208,9 +197,6 @@ class _Shifted(Waveform):
     @property
     def precision(self) -> float:  # type: ignore[override]
         return self.waveform.precision
-
-    def shortest_time(self) -> float:
-        return self.waveform.shortest_time()
 
     def cancelling(self, t0: float, t1: float) -> float:
         return self.waveform.cancelling(0.0, self._stretch)

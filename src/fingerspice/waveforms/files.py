@@ -6,7 +6,7 @@ import struct
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -61,10 +61,7 @@ class WavLayout:
     offset: int  # Position of the first sample, bytes
 
     def read(self, first: int, last: int) -> FloatArray:
-        """Samples number `first` to `last` - 1 as fractions of full scale, if the file still has them.
-
-        Integers are divided by half the range of their type, so that full scale is -1 to just below 1.
-        """
+        """Samples number `first` to `last` - 1 as fractions of full scale, -1 to just below 1 of integers."""
         width = int(self.kind[2])
         block = self.channels * width
         try:
@@ -261,31 +258,29 @@ def _chosen(
 
 def _npz_columns(path: Path) -> tuple[Columns, float | None]:
     """The arrays of an NPZ file as columns, and its rate (Hz) where it has one."""
-    rate: float | None = None
-    arrays: dict[str, FloatArray] = {}
+    rate, arrays, loaded = None, dict[str, FloatArray](), dict[str, Any]()
     try:
         with zipfile.ZipFile(path) as packed:
             size = sum(entry.file_size for entry in packed.infolist())
-        if size > 8 * MAX_SAMPLES:
-            raise InputError(f"'{path}' unpacks to {size / 1e9:.3g} GB; allowed: at most {8e-9 * MAX_SAMPLES:g} GB")
-        with np.load(path) as file:
-            for name in file.files:
-                array = file[name]
-                if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
-                    kind = getattr(array, "dtype", "another kind")
-                    raise InputError(f"'{path}': the array {name!r} is of {kind}; allowed: real numbers")
-                if array.ndim == 0 and name.lower() in _RATE_NAMES:
-                    rate = float(array)
-                elif array.ndim == 1:
-                    arrays[name] = array.astype(float)
-                else:
-                    problem = f"'{path}': the array {name!r} has shape {array.shape}"
-                    raise InputError(f"{problem}; allowed: one row a column, and one number named rate")
-    except InputError:
-        raise
+        if size <= 8 * MAX_SAMPLES:
+            with np.load(path) as file:
+                loaded = dict(file)
     # Exceptions of zipfile and NumPy for broken files, and for arrays of objects, which NumPy refuses to load.
     except (ValueError, OSError, zipfile.BadZipFile, EOFError, KeyError, MemoryError, NotImplementedError) as error:
         raise InputError(f"'{path}' cannot be read as NPZ: {str(error).partition('. ')[0]}") from None
+    if size > 8 * MAX_SAMPLES:
+        raise InputError(f"'{path}' unpacks to {size / 1e9:.3g} GB; allowed: at most {8e-9 * MAX_SAMPLES:g} GB")
+    for name, array in loaded.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
+            kind = getattr(array, "dtype", "another kind")
+            raise InputError(f"'{path}': the array {name!r} is of {kind}; allowed: real numbers")
+        if array.ndim == 0 and name.lower() in _RATE_NAMES:
+            rate = float(array)
+        elif array.ndim == 1:
+            arrays[name] = array.astype(float)
+        else:
+            problem = f"'{path}': the array {name!r} has shape {array.shape}"
+            raise InputError(f"{problem}; allowed: one row a column, and one number named rate")
     lengths = {array.size for array in arrays.values()}
     if len(lengths) > 1:
         shown = ", ".join(f"{name} {array.size}" for name, array in arrays.items())

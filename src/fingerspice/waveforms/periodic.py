@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_numbers
-from fingerspice.waveforms.bounds import runs_through
-from fingerspice.waveforms.ramps import Ramps
+from fingerspice.waveforms.ramps import Ramps, runs_through
 from fingerspice.waveforms.waveform import TAU, Waveform, require, terms_of
 
 
@@ -26,6 +25,9 @@ class _Periodic(Ramps):
     phase_deg: float = 0.0
     delay: float = 0.0
     _shift: ClassVar[float]  # Time of the shape's start, s
+    # Times of the knots in periods, values over the offset in amplitudes, and whether half of it is the other half
+    # turned over
+    _shape: ClassVar[tuple[tuple[float, ...], tuple[float, ...], bool]]
     units: ClassVar[dict[str, str]] = {
         "amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s"
     }  # fmt: skip
@@ -39,17 +41,12 @@ class _Periodic(Ramps):
         shift = first = self.delay - self.phase_deg / 360.0 / self.frequency
         if shift > 0.0:
             first = shift - math.ceil(shift / period - 1e-12) * period
-        turned = self.offset == 0.0 and self._shape()[2]
+        turned = self.offset == 0.0 and self._shape[2]
         self._declare(period=period, half_wave=turned, _shift=shift, _first=first, _origin=first)
-
-    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
-        """Times of the knots in periods, values over the offset in amplitudes, and whether half of it is the other
-        half turned over."""
-        raise NotImplementedError
 
     @cached_property
     def knots(self) -> tuple[FloatArray, FloatArray]:
-        x, y, _ = self._shape()
+        x, y, _ = self._shape
         return np.array(x) * self.period, self.offset + self.amplitude * np.array(y)
 
     def _times(self, t0: float, t1: float) -> FloatArray:
@@ -82,7 +79,8 @@ class Square(_Periodic):
         super().__init__(amplitude, frequency, offset, phase_deg, delay)
         require(0.0 < self.duty < 1.0, "square duty", f"{self.duty:g}", "between 0 and 1")
 
-    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
+    @property
+    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:  # type: ignore[override]
         return (0.0, 0.0, self.duty, self.duty, 1.0), (-1.0, 1.0, 1.0, -1.0, -1.0), self.duty == 0.5
 
 
@@ -90,16 +88,14 @@ class Square(_Periodic):
 class Triangle(_Periodic):
     """Triangle in phase with a sine: +amplitude at a quarter and -amplitude at three quarters of a period."""
 
-    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
-        return (0.0, 0.25, 0.75, 1.0), (0.0, 1.0, -1.0, 0.0), True
+    _shape = (0.0, 0.25, 0.75, 1.0), (0.0, 1.0, -1.0, 0.0), True
 
 
 @dataclass(frozen=True)
 class Sawtooth(_Periodic):
     """Rises from offset - amplitude to offset + amplitude over each period, and jumps back at its end."""
 
-    def _shape(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
-        return (0.0, 0.0, 1.0), (1.0, -1.0, 1.0), False
+    _shape = (0.0, 0.0, 1.0), (1.0, -1.0, 1.0), False
 
 
 @dataclass(frozen=True)

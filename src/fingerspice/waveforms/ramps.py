@@ -1,29 +1,53 @@
-"""Waveforms made of straight pieces: `PWL`, and the base class of all such waveforms.
-
-A subclass of `Ramps` only lists its knots.
-"""
+"""Waveforms made of straight pieces: `PWL`, and their base class `Ramps`, of which a subclass only lists its knots."""
 
 from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import check_range, in_windows, runs_through
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.waveform import Waveform, require, terms_of
+from fingerspice.waveforms.waveform import Waveform, check_range, require, terms_of
 
 # A waveform with at most this many knots is not divided into windows, however close together its knots are.
 FEW_KNOTS = 1000
 # Most points that the text of a PWL shows.
 MOST_SHOWN = 10_000
+#: Largest number of breakpoints listed at once; each takes about 40 bytes, the arrays computed from it included.
+MOST_LISTED = 20_000_000
+#: Number of breakpoints in a window of time; the values at all times in one window are looked up together.
+_WINDOW = 1_000_000
+
+
+def runs_through(first: float, last: float, count: int, t0: float, t1: float) -> FloatArray:
+    """Indices of periods `first` to `last`, over t0 to t1 (s), of `count` breakpoints each; too many are refused."""
+    total = (last - first + 1.0) * count
+    if not total <= MOST_LISTED:
+        raise InputError(
+            f"the source has {total:.3g} breakpoints from {t0:g} s to {t1:g} s; allowed: at most {MOST_LISTED:.0e} at "
+            "once: a shorter run, or a longer period"
+        )
+    return np.arange(first, last + 1.0)
+
+
+def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]:
+    """Indices of times (s) by windows of `_WINDOW` breakpoints, so that ten values in a year of squares list few."""
+    if t.size == 0:
+        return
+    window = np.floor(t * (rate / _WINDOW))
+    if window.min() == window.max():
+        yield slice(None)
+        return
+    order = np.argsort(window, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(window[order])) + 1)
 
 
 class Ramps(Waveform):
@@ -45,7 +69,7 @@ class Ramps(Waveform):
     @cached_property
     def _distinct(self) -> FloatArray:
         """Times of the knots, each once, s."""
-        return _once(np.unique(self.knots[0]))
+        return _once(self.knots[0])
 
     def _times(self, t0: float, t1: float) -> FloatArray:
         """Times of a periodic waveform's knots (s) over [t0, t1] and a period beyond; jumps appear twice."""
@@ -60,7 +84,7 @@ class Ramps(Waveform):
     def _edges(self, t0: float, t1: float) -> FloatArray:
         if self.period is None:
             return self._distinct[self._distinct.searchsorted(t0) : self._distinct.searchsorted(t1, "right")]
-        return _once(np.unique(self._times(t0, t1)))
+        return _once(self._times(t0, t1))
 
     @property
     def course(self) -> tuple[float, float]:  # type: ignore[override]
@@ -75,7 +99,7 @@ class Ramps(Waveform):
         t = real_numbers("t", t, "times in s")
         flat = t.ravel()
         out = np.empty(flat.size)
-        for window in in_windows(flat, self.breakpoint_rate() if self.period else 0.0):
+        for window in in_windows(flat, self.breakpoint_rate()):
             out[window] = self._values(flat[window], side)
         return out.reshape(t.shape)
 
@@ -90,21 +114,16 @@ class Ramps(Waveform):
             index = edges.searchsorted(flat, "right" if side == "right" else "left")
             v0, slope = self._line(bounds[index], bounds[index + 1])
             return np.asarray(v0 + slope * (flat - bounds[index]))
-        if side == "right":
-            return np.interp(flat, times, values)
-        index = times.searchsorted(flat)
-        j = np.clip(index, 1, times.size - 1)
-        # Outside the knots the two nearest may be a jump, between which there is no slope.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            slope = (values[j] - values[j - 1]) / (times[j] - times[j - 1])
-            inside = values[j - 1] + slope * (flat - times[j - 1])
-        return np.where(index == 0, values[0], np.where(index == times.size, values[-1], inside))
+        out = np.interp(flat, times, values)
+        if side == "left":
+            # At a knot its own value, and at a jump that of the first of two knots.
+            j = np.minimum(times.searchsorted(flat), times.size - 1)
+            out = np.where(times[j] == flat, values[j], out)
+        return out
 
     def _line(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Values (V) at `start` and slopes (V/s) of the straight pieces between `start` and `stop` (s).
-
-        A piece is identified by its midpoint, which rounding cannot move into a neighbour.
-        """
+        """Values (V) at `start` and slopes (V/s) of the straight pieces between `start` and `stop` (s)."""
+        # A piece is identified by its midpoint, which rounding cannot move into a neighbour.
         times, values = self.knots
         middle = 0.5 * (start + stop)
         run = np.zeros(1)
@@ -142,13 +161,10 @@ class Ramps(Waveform):
 
 
 def _once(times: FloatArray) -> FloatArray:
-    """Ascending times (s) without each time that differs from the time before it only by rounding.
-
-    The last knot of a period and the first knot of the next period are such a pair.
-    """
-    keep = np.ones(times.size, bool)
-    keep[1:] = np.diff(times) > 1e-15 * np.abs(times[1:])
-    return times[keep]
+    """The times, ascending, each once; of those that differ only by rounding, as the end of a period and the start of
+    the next, the first."""
+    times = np.unique(times)
+    return times[np.diff(times, prepend=-np.inf) > 1e-15 * np.abs(times)]
 
 
 @dataclass(frozen=True)

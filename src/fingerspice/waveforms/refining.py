@@ -150,10 +150,7 @@ class Refiner:
         return []
 
     def _try(self, piece: _Interval) -> tuple[FloatArray | None, FloatArray, float]:
-        """Series of an interval (or None if it errs too much), values at its nodes, and error between these, V.
-
-        If a value is not finite, the values are those at all points.
-        """
+        """Series (None if it errs too much), values at its nodes (or if one is not finite at all points), error, V."""
         lo, hi = piece.lo, piece.hi
         t, proven = piece.points(), _PROOF
         count = math.ceil((hi - lo) / self.shortest)
@@ -217,7 +214,13 @@ class Refiner:
         # Around a jump, a kink, or a NaN short series are expected; report only the short ones far from all of these.
         known = [*self.located, *(t for t, _ in real), *([] if self.not_finite is None else [self.not_finite])]
         apart = [t for t in self.narrow if all(abs(t - k) > 8.0 * self.step for k in known)]
-        apart = sorted(apart + self._edges_found())
+        if self.short:
+            # The first edge: short series whose change sums to more than `_STEEP` in a tenth of a step.
+            start, change = np.array(self.short).T
+            total = np.concatenate([[0.0], np.cumsum(change)])
+            after = np.searchsorted(start, start + 0.1 * self.step)
+            steep = np.flatnonzero(np.abs(total[after] - total[:-1]) > _STEEP * self.scale)
+            apart += [float(start[i + np.argmax(np.abs(change[i : after[i]]))]) for i in steep[:1]]
         told = []
         if real:
             t, dv = real[0]
@@ -229,18 +232,8 @@ class Refiner:
         if apart:
             told.append(
                 f"the source function has a feature narrower than the output step {self.step:.3g} s "
-                f"near t = {apart[0]:.9g} s; it was resolved where it was seen, but others may be missed: "
+                f"near t = {min(apart):.9g} s; it was resolved where it was seen, but others may be missed: "
                 "give Function(f, breaks=(...)) its edges"
             )
         for text in told:
             warnings.warn(text, FingerspiceWarning, stacklevel=2)
-
-    def _edges_found(self) -> list[float]:
-        """Time (s) of the first edge: short series whose change sums to more than `_STEEP` in a tenth of a step."""
-        if not self.short:
-            return []
-        t, change = np.array(self.short).T
-        total = np.concatenate([[0.0], np.cumsum(change)])
-        after = np.searchsorted(t, t + 0.1 * self.step)
-        steep = np.flatnonzero(np.abs(total[after] - total[:-1]) > _STEEP * self.scale)
-        return [float(t[i + np.argmax(np.abs(change[i : after[i]]))]) for i in steep[:1]]

@@ -12,13 +12,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, read_only, real_number, real_numbers, whole_number
-from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import RANGES, check_range
 from fingerspice.waveforms.combinations import Product, Sum
 from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, check_count, read_table, wav_layout
 from fingerspice.waveforms.ramps import FEW_KNOTS, PWL, Ramps
-from fingerspice.waveforms.waveform import DC, Waveform, require
+from fingerspice.waveforms.waveform import DC, RANGES, Waveform, check_range, require
 
 # Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
 # to 0.46 of the rate.
@@ -29,32 +27,6 @@ AT_ONCE = 1 << 20
 ON_GRID, ROUNDING = 1e-9, 1e-15
 # Largest number of grid samples for each point of a PWL: beyond it, few long lines are faster taken one by one.
 MOST_PER_POINT = 8
-
-
-@jit
-def _along(
-    values: FloatArray, first: int, start: float, rate: float, t: FloatArray, left: bool
-) -> FloatArray:  # fmt: skip
-    """Values (V), at times `t` (s), of the straight lines between samples at a rate (Hz); exact at a sample's time.
-
-    `first` is the number of the first of the samples given; sample number 0 is at `start` (s).
-    """
-    out = np.empty(t.size)
-    last = first + values.size - 1
-    for i in range(t.size):
-        j = int(min(max((t[i] - start) * rate, float(first)), float(last)))
-        # Rounding may have given a neighbour of the sample at or before `t[i]`: correct the number.
-        while j < last and (start + (j + 1) / rate < t[i] or (not left and start + (j + 1) / rate == t[i])):
-            j += 1
-        while j > first and (start + j / rate > t[i] or (left and start + j / rate == t[i])):
-            j -= 1
-        here, after = start + j / rate, start + (j + 1) / rate
-        if t[i] <= here or j == last:
-            out[i] = values[j - first]
-        else:
-            here_v, after_v = values[j - first], values[j + 1 - first]
-            out[i] = here_v + (after_v - here_v) / (after - here) * (t[i] - here)
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,8 +194,8 @@ class Samples(Ramps):
 
     def _around(self, t0: float, t1: float) -> tuple[int, int]:
         """First index into `values`, and the one after the last, of two samples or more that determine a span (s)."""
-        low = min(max(math.floor(self._number_of(t0)) - 2, 0), self.count - 2)
-        return low, min(max(math.ceil(self._number_of(t1)) + 3, low + 2), self.count)
+        low = math.floor(min(max(self._number_of(t0) - 2.0, 0.0), self.count - 2))
+        return low, math.ceil(min(max(self._number_of(t1) + 3.0, low + 2), self.count))
 
     @property
     def course(self) -> tuple[float, float]:  # type: ignore[override]
@@ -251,11 +223,18 @@ class Samples(Ramps):
         return 0.0 if self.count <= FEW_KNOTS else self.count / ((self.count - 1) / self.rate)
 
     def _values(self, flat: FloatArray, side: str) -> FloatArray:
-        flat = read_only(np.ascontiguousarray(flat))
-        first = round(min(max(self._number_of(float(flat[0])), 0.0), float(self.count))) if flat.size else 0
-        if first + flat.size <= self.count and np.array_equal(flat, self._times_of(first, first + flat.size)):
-            return self.values[first : first + flat.size].copy()
-        return _along(self.values, self._number, self.start, self.rate, flat, side == "left")
+        low, high = self._around(float(flat.min()), float(flat.max()))
+        values = self.between(low, high)
+        if 16 * flat.size < high - low:
+            # Few times need only the samples around each of them.
+            at = np.clip((flat - self.start) * self.rate - self._number, low, high - 1).astype(int)
+            near = np.unique(np.clip(at[:, None] + np.arange(-1, 3), low, high - 1))
+            return np.interp(flat, self.start + (self._number + near) / self.rate, values[near - low])
+        times = self._times_of(low, high)
+        first = int(times.searchsorted(flat[0]))
+        if np.array_equal(flat, times[first : first + flat.size]):
+            return values[first : first + flat.size].copy()
+        return np.interp(flat, times, values)
 
 
 def _check_samples(values: FloatArray, first: int) -> None:
@@ -306,16 +285,6 @@ class _WavFile(Samples):
             return super()._read(first, last)
         return np.asarray(self.gain * self.layout.read(first, last))
 
-    def _values(self, flat: FloatArray, side: str) -> FloatArray:
-        if "values" in self.__dict__:
-            return super()._values(flat, side)
-        out = np.empty(flat.size)
-        block = np.floor((flat - self.start) * self.rate / AT_ONCE)
-        for one in np.unique(block):
-            here = block == one
-            out[here] = self.part(float(flat[here].min()), float(flat[here].max()))._values(flat[here], side)
-        return out
-
     def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         return self.part(float(start.min()), float(stop.max())).terms(start, stop)
 
@@ -336,15 +305,28 @@ def as_samples(wave: Waveform) -> Samples | None:
 
 
 def _of_parts(wave: Sum | Product) -> Samples | None:
+    """A product of one recording and constants; or a sum of recordings on one grid, from the first sample of any to
+    the last one, and constants."""
     constants = [part.level for part in wave.parts if isinstance(part, DC)]
     others = [as_samples(part) for part in wave.parts if not isinstance(part, DC)]
-    known = [part for part in others if part is not None]
-    if not known or len(known) < len(others):
+    parts = [part for part in others if part is not None]
+    if not parts or len(parts) < len(others):
         return None
-    if isinstance(wave, Sum):
-        return _added(known, float(sum(constants)))
-    only = known[0]
-    return Samples(float(np.prod(constants)) * only.values, only.rate, only.start) if len(known) == 1 else None
+    first = min(parts, key=lambda part: part.start)
+    rate = first.rate
+    if isinstance(wave, Product):
+        return Samples(float(np.prod(constants)) * first.values, rate, first.start) if len(parts) == 1 else None
+    begins = [(part.start - first.start) * rate for part in parts]
+    if any(part.rate != rate for part in parts) or any(abs(x - round(x)) > ON_GRID for x in begins):
+        return None
+    end = max(round(x) + part.count for x, part in zip(begins, parts, strict=True))
+    # Recordings far apart would make a grid of mostly constant samples.
+    if end > MOST_PER_POINT * sum(part.count for part in parts):
+        return None
+    total = np.full(end, float(sum(constants)))
+    for x, part in zip(begins, parts, strict=True):
+        total += part.between(-round(x), end - round(x))
+    return Samples(total, rate, first.start)
 
 
 def _of_points(wave: PWL) -> Samples | None:
@@ -361,20 +343,3 @@ def _of_points(wave: PWL) -> Samples | None:
     if np.any(np.abs(t[0] + place / rate - t) > ON_GRID / rate + ROUNDING * np.abs(t)):
         return None
     return Samples(np.interp(np.arange(count + 1), place, wave.values), rate, float(t[0]))
-
-
-def _added(parts: list[Samples], constant: float) -> Samples | None:
-    """Sum of recordings on one grid, over the time from the first sample of any to the last one; None on several."""
-    first = min(parts, key=lambda part: part.start)
-    rate = first.rate
-    begins = [(part.start - first.start) * rate for part in parts]
-    if any(part.rate != rate for part in parts) or any(abs(x - round(x)) > ON_GRID for x in begins):
-        return None
-    ends = [round(x) + part.count for x, part in zip(begins, parts, strict=True)]
-    # Recordings far apart would make a grid of mostly constant samples.
-    if max(ends) > MOST_PER_POINT * sum(part.count for part in parts):
-        return None
-    total = np.full(max(ends), constant)
-    for x, part in zip(begins, parts, strict=True):
-        total += part.between(-round(x), max(ends) - round(x))
-    return Samples(total, rate, first.start)

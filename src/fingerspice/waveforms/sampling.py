@@ -19,8 +19,7 @@ from fingerspice.base.arrays import BoolArray, FloatArray, positive_number, real
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
 from fingerspice.engine.collocation.loopstate import SAME_TIME
-from fingerspice.waveforms.bounds import in_windows, runs_through
-from fingerspice.waveforms.ramps import Ramps
+from fingerspice.waveforms.ramps import Ramps, in_windows, runs_through
 from fingerspice.waveforms.refining import POINTS, Refiner
 from fingerspice.waveforms.waveform import Waveform, require
 
@@ -168,23 +167,11 @@ def on_grid(t: FloatArray, start: float, step: float, slack: float) -> bool:
     return True
 
 
-@jit
 def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
-    """For each mark, whether a time lies within the relative distance `slack` of it without being equal to it.
-
-    Times and marks ascend.
-    """
-    out = np.zeros(marks.size, np.bool_)
-    first = 0
-    for k in range(marks.size):
-        reach = slack * abs(marks[k])
-        while first < t.size and t[first] < marks[k] - reach:
-            first += 1
-        i = first
-        while i < t.size and t[i] <= marks[k] + reach:
-            out[k] |= t[i] != marks[k]
-            i += 1
-    return out
+    """For each mark, whether a time is within a share `slack` of it but not equal to it; times and marks ascend."""
+    reach = slack * np.abs(marks)
+    near = t.searchsorted(marks + reach, "right") - t.searchsorted(marks - reach)
+    return np.asarray(near > t.searchsorted(marks, "right") - t.searchsorted(marks))
 
 
 def breakpoints_at(waveform: Waveform, t: float) -> FloatArray:
@@ -221,7 +208,11 @@ def source_table(
     # A breakpoint that differs from an end of the window only by rounding is that end, and bounds no extra segment.
     inner = inner[(inner > t0 + same_time(t0)) & (inner < t1 - same_time(t1))]
     edges = np.concatenate([[t0], inner, [t1]])
-    between = _rephased(edges, waveform.shortest_time())
+    # Long segments are divided, so that the rounding error of a phase stays small within each.
+    longest, between = _PERIODS_PER_SEGMENT * waveform.shortest_time(), edges
+    if np.any(np.diff(edges) > longest):
+        cuts = [np.linspace(a, b, max(1, math.ceil((b - a) / longest)) + 1)[:-1] for a, b in itertools.pairwise(edges)]
+        between = np.concatenate([*cuts, edges[-1:]])
     terms = waveform.terms(between[:-1], between[1:])
     if terms is not None:
         edges = between
@@ -245,12 +236,3 @@ def source_table(
         pieces.not_finite,
         pieces.rough,
     )
-
-
-def _rephased(edges: FloatArray, period: float) -> FloatArray:
-    """Edges (s) with further ones inserted, so that the rounding error of a phase stays small within each segment."""
-    longest = _PERIODS_PER_SEGMENT * period
-    if not np.any(np.diff(edges) > longest):
-        return edges
-    pieces = [np.linspace(a, b, max(1, math.ceil((b - a) / longest)) + 1)[:-1] for a, b in itertools.pairwise(edges)]
-    return np.concatenate([*pieces, edges[-1:]])

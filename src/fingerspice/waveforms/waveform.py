@@ -22,13 +22,17 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.bounds import ANY_RANGE, RANGES, check_range
 
+#: Largest and smallest absolute value allowed of a nonzero number, by unit (the entry V also serves A).
+RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}
+#: The same limits for all other units.
+ANY_RANGE = (1e30, 1e-30)
 TAU = 2.0 * math.pi
 # Places in [0, 1], both ends among them, one in each of 512 equal parts: so irregular that no carrier is 0 at all.
 _SPREAD = np.append((np.arange(512) + np.modf(np.arange(512) * 0.6180339887498949)[0]) / 512.0, 1.0)
 #: Distance of neighbouring doubles, relative to their size.
 DOUBLE = 2.0**-52
+_GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
 
 
 @dataclass(frozen=True)
@@ -158,11 +162,20 @@ class Waveform:
         frequency = self.tone()
         if frequency is None:
             return None
-        period = self.period or 1.0 / frequency
+        start, stop = self.settled, self.settled + (self.period or 1.0 / frequency)
+        inner = self.breakpoints(start, stop)
+        edges = np.unique(np.concatenate([[start], inner[(inner > start) & (inner < stop)], [stop]]))
+        panel = min(0.5 / frequency, self.shortest_time())
+        total = 0j
+        for a, b in itertools.pairwise(edges):
+            # Gauss-Legendre quadrature of U(t) exp(-i Omega t) on panels between breakpoints.
+            cuts = np.linspace(a, b, max(1, math.ceil((b - a) / panel)) + 1)
+            half = 0.5 * np.diff(cuts)[:, None]
+            t = 0.5 * (cuts[1:] + cuts[:-1])[:, None] + half * _GAUSS_X
+            total += complex(np.sum(half * _GAUSS_W * self.value(t) * np.exp(-1j * TAU * frequency * t)))
         # The phase refers to a sine: U ~ Im(P exp(i Omega t)).
-        start = self.settled
-        p = 2j * fourier_integral(self, frequency, start, start + period) / period
-        if abs(p) <= 1e-12 * self.peak(start, start + period):
+        p = 2j * total / (self.period or 1.0 / frequency)
+        if abs(p) <= 1e-12 * self.peak(start, stop):
             return None
         return Fundamental(frequency, abs(p), math.atan2(p.imag, p.real))
 
@@ -233,27 +246,21 @@ def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
     return DC(real_number("a source", value, allowed))
 
 
+def check_range(what: str, values: ArrayLike, unit: str) -> None:
+    """Refuse finite numbers so large or so small that their products and quotients would overflow or underflow."""
+    largest, smallest = RANGES.get(unit, ANY_RANGE)
+    size = np.abs(values)
+    bad = np.flatnonzero(np.isfinite(size) & (((size < smallest) & (size > 0.0)) | (size > largest)))
+    if bad.size:
+        given = float(np.ravel(values)[bad[0]])
+        allowed = f"0, or a size from {smallest:g} to {largest:g}" if smallest else f"a size up to {largest:g}"
+        raise InputError(f"{what} is {given:g} {unit}".rstrip() + f"; allowed: {allowed}")
+
+
 def require(condition: bool, what: str, given: Any, allowed: str) -> None:
     """Refuse an argument that does not meet a condition: the message names the given value and the allowed ones."""
     if not condition:
         raise InputError(f"{what} is {given}; allowed: {allowed}")
-
-
-_GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
-
-
-def fourier_integral(waveform: Waveform, frequency: float, t0: float, t1: float) -> complex:
-    """Integral of U(t) exp(-i 2 pi f t) over [t0, t1] (s), by Gauss-Legendre quadrature between breakpoints."""
-    inner = waveform.breakpoints(t0, t1)
-    edges = np.unique(np.concatenate([[t0], inner[(inner > t0) & (inner < t1)], [t1]]))
-    panel = min(0.5 / frequency, waveform.shortest_time())
-    total = 0j
-    for a, b in itertools.pairwise(edges):
-        cuts = np.linspace(a, b, max(1, math.ceil((b - a) / panel)) + 1)
-        half = 0.5 * np.diff(cuts)[:, None]
-        t = 0.5 * (cuts[1:] + cuts[:-1])[:, None] + half * _GAUSS_X
-        total += complex(np.sum(half * _GAUSS_W * waveform.value(t) * np.exp(-1j * TAU * frequency * t)))
-    return total
 
 
 def terms_of(m: int, *terms: tuple[FloatArray | float, ...]) -> FloatArray:
@@ -271,10 +278,7 @@ class DC(Waveform):
 
     level: float = 0.0
     units: ClassVar[dict[str, str]] = {"level": "V"}
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._declare(course=(math.inf, -math.inf))
+    course = math.inf, -math.inf
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.full(real_numbers("t", t, "times in s").shape, self.level)

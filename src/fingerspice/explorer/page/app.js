@@ -6,7 +6,7 @@ import { read } from "./recording.js";
 import { Harmonics, Means, Traces } from "./plots.js";
 import { Stack } from "./stack.js";
 import { OWN, fromHash, ofExample, request, reset, toHash } from "./state.js";
-import { Parts, quantity, unbaked } from "./units.js";
+import { Parts, quantity } from "./units.js";
 
 const $ = (id) => document.getElementById(id);
 let examples = [];
@@ -29,7 +29,8 @@ let recording = null;
 let written = "";
 
 /** What a page without a server holds; null of a page with one. */
-const baked = $("baked") ? unbaked($("baked").textContent) : null;
+const bytes = $("baked") && Uint8Array.from(atob($("baked").textContent), (letter) => letter.charCodeAt(0));
+const baked = bytes && (await new Parts(new Response(bytes)).next());
 
 /** Ask for something: the parts of the answer, each by `next()`. */
 async function ask(what, body) {
@@ -169,7 +170,7 @@ function table() {
   const head = ["signal", "mean", "mean, last period", "smallest", "largest", ...(pinned ? ["pinned mean", "change"] : [])];
   const row = (tag, texts) => {
     const out = make("tr");
-    out.append(...texts.map((textContent) => make(tag, { textContent })));
+    for (const textContent of texts) make(tag, { textContent }, out);
     return out;
   };
   const rows = good.figures.map((f) => {

@@ -5,6 +5,11 @@ import { quantity, scale } from "./units.js";
 
 const COLOURS = ["#0a5a9c", "#b3400d", "#2c7a3f", "#7b3f9e", "#8a6d00", "#00707a", "#9c1f56", "#444"];
 const GREY = "#9aa3ad";
+const FONT = { font: "11px sans-serif", labelFont: "12px sans-serif" };
+/** A value as the legend shows it. */
+const shown = (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5))));
+/** Values in another unit, with gaps where there is none. */
+const times = (values, by) => Array.from(values, (v) => (v === null ? null : v * by));
 const PANELS = [
   { title: "voltage", signals: ["u_source", "u_gap", "u_layer", "v"], unit: "V", height: 145 },
   { title: "force", signals: ["f_el"], unit: "N", height: 115 },
@@ -13,16 +18,14 @@ const PANELS = [
 ];
 
 /** Values at other times, by straight lines; null outside. */
-function resampled(times, x, values) {
-  const out = new Array(times.length);
+function resampled(at, x, values) {
   let k = 0;
-  for (let i = 0; i < times.length; i += 1) {
-    while (k < x.length - 2 && x[k + 1] < times[i]) k += 1;
+  return Array.from(at, (t) => {
+    while (k < x.length - 2 && x[k + 1] < t) k += 1;
     const span = x[k + 1] - x[k];
-    const share = span > 0 ? (times[i] - x[k]) / span : 0;
-    out[i] = share < -1e-6 || share > 1 + 1e-6 || x.length < 2 ? null : values[k] + share * (values[k + 1] - values[k]);
-  }
-  return out;
+    const share = span > 0 ? (t - x[k]) / span : 0;
+    return share < -1e-6 || share > 1 + 1e-6 || x.length < 2 ? null : values[k] + share * (values[k + 1] - values[k]);
+  });
 }
 
 function extreme(lists) {
@@ -52,28 +55,28 @@ export class Traces {
     if (good && now.t.length > 1) layers.push({ run: now });
     if (pinned) layers.push({ run: pinned, dashed: true });
     this.failedAt = now.ok || inPeriods ? null : now.failed_at;
-    const times = x(base);
-    const [factor, unit] = inPeriods ? [1, "periods"] : scale(times[times.length - 1] || 0, "s");
+    const at = x(base);
+    const [factor, unit] = inPeriods ? [1, "periods"] : scale(at[at.length - 1] || 0, "s");
     const wanted = [];
     for (const panel of PANELS) {
       const series = layers.flatMap(({ run, grey, dashed }) =>
         run.traces.filter((t) => panel.signals.includes(t.signal)).map((t, i) => ({
           label: `${name(t)}${dashed ? ", pinned" : ""}${grey ? ", before" : ""}`, colour: grey ? GREY : COLOURS[i % COLOURS.length], dashed,
-          values: run === base ? t.values : resampled(times, x(run), t.values),
+          values: run === base ? t.values : resampled(at, x(run), t.values),
         })));
       if (series.length) wanted.push({ panel, series });
     }
     const key = JSON.stringify(wanted.map((w) => [w.panel.title, w.series.map((s) => [s.label, s.colour, s.dashed])]));
     if (key !== this.key) this.build(wanted, key);
     this.factor = factor;
-    const scaled = times.map((t) => t * factor);
+    const scaled = times(at, factor);
     wanted.forEach(({ panel, series }, i) => {
       const plot = this.plots[i];
       const [by, named] = scale(extreme(series.map((s) => s.values)), panel.unit);
       // All panels have one axis of time, below the last of them.
       if (i === wanted.length - 1) plot.axes[0].label = inPeriods ? "time (periods)" : `time (${unit})`;
       plot.axes[1].label = named ? `${panel.title} (${named})` : panel.title;
-      plot.setData([scaled, ...series.map((s) => s.values.map((v) => (v === null ? null : v * by)))]);
+      plot.setData([scaled, ...series.map((s) => times(s.values, by))]);
     });
   }
 
@@ -89,15 +92,14 @@ export class Traces {
     this.plots = wanted.map(({ panel, series }, i) => {
       const box = make("div", { className: "panel" }, this.parent);
       const line = (s) => ({ label: s.label, stroke: s.colour, width: s.dashed ? 1.2 : 1.6, dash: s.dashed ? [6, 4] : undefined,
-        pxAlign: 0, points: { show: false }, value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) });
+        pxAlign: 0, points: { show: false }, value: shown });
       const last = i === wanted.length - 1;
-      const font = { font: "11px sans-serif", labelFont: "12px sans-serif" };
       const options = {
         width: this.width(), height: panel.height + (last ? BELOW : 0), cursor: { sync: { key: "time" } },
         scales: { x: { time: false } }, legend: { markers: { dash: (u, k) => (u.series[k].dash ? "dashed" : "solid") } },
-        axes: [last ? { ...font, size: 32, labelSize: 18, label: "time" } : { ...font, size: 6, values: (_, splits) => splits.map(() => "") },
-          { ...font, size: 58, labelSize: 20, space: 16, label: "" }],
-        series: [{ label: "time", value: (_, v) => (v === null ? "–" : String(Number(v.toPrecision(5)))) }, ...series.map(line)],
+        axes: [last ? { ...FONT, size: 32, labelSize: 18, label: "time" } : { ...FONT, size: 6, values: (_, splits) => splits.map(() => "") },
+          { ...FONT, size: 58, labelSize: 20, space: 16, label: "" }],
+        series: [{ label: "time", value: shown }, ...series.map(line)],
         hooks: { draw: [(u) => this.mark(u)] },
       };
       return new uPlot(options, [[], ...series.map(() => [])], box);
@@ -187,7 +189,7 @@ class Small {
     if (!this.plot || this.plot.series.length !== series.length + 1) {
       this.clear();
       make("h2", { textContent: this.title }, this.parent);
-      const axis = { font: "11px sans-serif", labelFont: "12px sans-serif", labelSize: 18, label: "" };
+      const axis = { ...FONT, labelSize: 18, label: "" };
       this.plot = new uPlot({ width: this.width(), height: 190, scales,
         axes: [{ ...axis, size: 30 }, { ...axis, size: 52, space: 28 }], cursor: { show: false },
         legend: { show: series.length > 1 && Boolean(series[0].label), live: false },
@@ -208,15 +210,12 @@ export class Harmonics extends Small {
       this.clear();
       return;
     }
-    const lists = harmonics.map((h) => Array.from(h.amplitude));
-    const frequency = Array.from(harmonics[0].frequency);
-    const [by, unit] = scale(extreme(lists), "N");
-    const [fBy, fUnit] = scale(frequency[0], "Hz");
+    const [by, unit] = scale(extreme(harmonics.map((h) => h.amplitude)), "N");
+    const [fBy, fUnit] = scale(harmonics[0].frequency[0], "Hz");
     // Of several fingers, the bars of the later ones are narrower and stand inside those before them.
     const bars = harmonics.map((_, i) => uPlot.paths.bars({ size: [0.5 / (i + 1), 24 / (i + 1)] }));
     const series = harmonics.map((h, i) => ({ label: h.element, stroke: COLOURS[i], fill: `${COLOURS[i]}80`, paths: bars[i], points: { show: false } }));
-    const data = [frequency.map((f) => f * fBy), ...lists.map((l) => l.map((a) => a * by))];
-    this.draw(series, data, [`frequency (${fUnit})`, `amplitude (${unit})`],
+    this.draw(series, [times(harmonics[0].frequency, fBy), ...harmonics.map((h) => times(h.amplitude, by))], [`frequency (${fUnit})`, `amplitude (${unit})`],
       { x: { time: false, range: (u) => [0, u.data[0][u.data[0].length - 1] + u.data[0][0]] }, y: { range: (u, low, high) => [0, high * 1.05 || 1] } });
   }
 }
@@ -234,10 +233,9 @@ export class Means extends Small {
       return;
     }
     const [by, unit] = scale(extreme([all.map((p) => p[1]), all.map((p) => p[2])]), "N");
-    const times = (v) => (v === null ? null : v * by);
     const series = [{ stroke: COLOURS[0], width: 1.6, spanGaps: true, points: { show: true, size: 4 } },
       { stroke: COLOURS[1], width: 0, points: { show: true, size: 10, fill: COLOURS[1] } }];
-    this.draw(series, [all.map((p) => p[0]), all.map((p) => times(p[1])), all.map((p) => times(p[2]))],
+    this.draw(series, [all.map((p) => p[0]), ...[1, 2].map((i) => times(all.map((p) => p[i]), by))],
       ["frequency (Hz)", `mean force (${unit})`], { x: { time: false, distr: 3 }, y: { range: (u, low, high) => [0, high * 1.08 || 1] } });
     this.plot.axes[0].values = (u, splits) => splits.map((f) => (f !== null && /^1e/.test(f.toExponential()) ? quantity(f, "Hz", 2).replace(" Hz", "").replace("Hz", "") : ""));
     this.plot.redraw(false, true);

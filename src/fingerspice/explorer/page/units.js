@@ -1,6 +1,6 @@
 // Numbers in SPICE's notation, and quantities with a prefix.
 
-const SCALES = { t: 1e12, g: 1e9, meg: 1e6, k: 1e3, m: 1e-3, u: 1e-6, "µ": 1e-6, n: 1e-9, p: 1e-12, f: 1e-15 };
+const POWERS = { t: 12, g: 9, meg: 6, k: 3, m: -3, u: -6, "µ": -6, n: -9, p: -12, f: -15 };
 const NUMBER = /^([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(meg|[tgkmunpfµ])?[a-z]*$/i;
 
 /** The value of a text such as 3.5u, 0.2meg or, with a unit, 3.5um; null where it is none. */
@@ -12,8 +12,7 @@ export function parse(text) {
   if (!found[2]) return Number(found[1]);
   // The digits are joined with the exponent, so that 3.5u is the double nearest to 3.5e-6.
   const [digits, exponent] = found[1].toLowerCase().split("e");
-  const power = Math.round(Math.log10(SCALES[found[2].toLowerCase()]));
-  return Number(`${digits}e${Number(exponent || 0) + power}`);
+  return Number(`${digits}e${Number(exponent || 0) + POWERS[found[2].toLowerCase()]}`);
 }
 
 const PREFIXED = ["m", "V", "A", "ohm", "ohm m", "F", "Hz", "s", "V/m"];
@@ -45,21 +44,6 @@ export function quantity(value, unit, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   const [factor, name] = scale(Math.abs(value), unit);
   return `${Number((value * factor).toPrecision(digits))} ${name}`.trim();
-}
-
-/** Data of a JSON text whose arrays are given by what `array` makes of their entries. */
-function withArrays(text, array) {
-  return JSON.parse(text, (_, x) => (x && x.f64 !== undefined ? array(x.f64) : x));
-}
-
-/** Data with arrays from a page without a server, which holds them as text. */
-export function unbaked(text) {
-  return withArrays(text, (given) => {
-    const letters = atob(given);
-    const bytes = new Uint8Array(letters.length);
-    for (let i = 0; i < letters.length; i += 1) bytes[i] = letters.charCodeAt(i);
-    return new Float64Array(bytes.buffer);
-  });
 }
 
 /** The parts of an answer of the server, each as soon as it is there: two sizes, JSON, and arrays that are not copied. */
@@ -94,7 +78,7 @@ export class Parts {
     const buffer = await this.bytes(length + 8 * doubles);
     if (!buffer) throw new Error("its answer breaks off");
     const text = new TextDecoder().decode(new Uint8Array(buffer, 0, length));
-    return withArrays(text, ([at, count]) => new Float64Array(buffer, length + 8 * at, count));
+    return JSON.parse(text, (_, x) => (x && x.f64 ? new Float64Array(buffer, length + 8 * x.f64[0], x.f64[1]) : x));
   }
 }
 
