@@ -27,7 +27,6 @@ from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block
 from fingerspice.solve.recordings.form import PIECES, LaneForm
-from fingerspice.solve.recordings.march import LEAST_MARGIN
 from fingerspice.solve.recordings.pieces import driving
 from fingerspice.solve.recordings.run import ready
 from fingerspice.solve.simulation import asked
@@ -173,11 +172,7 @@ class _Intervals:
         self.x, self.m = np.ascontiguousarray(one.problem.waveform.value(one.t)), one.form.lanes.rates.size
         block, form, n = Block(one.form, self.x, self.h, True), one.form, one.t.size - 1
         peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
-        solved = (
-            block.solve(one.start, _STEPS[self.first + 2], _CLOSED * peak)
-            and block.on_one_branch
-            and block.margin > LEAST_MARGIN
-        )
+        solved = block.solve(one.start, _STEPS[self.first + 2], _CLOSED * peak) and block.on_one_branch
         if not solved or float(np.abs(form.gap(block.xi)).max()) > form.u_top:
             cause = "the run is not followed sample by sample, for its derivatives by samples"
             at = float(one.t[0])

@@ -101,7 +101,7 @@ class Stream:
             assert isinstance(self._source, BySamples)
             self._source.go_to(mark)
             other = self._stepped()
-            other.written, other.state = mark["written"], self._source.march.state()
+            other.written, other.state = mark["written"], self._source.march.state
             self._source = other
             mark, found = other.mark(), other.advance()
         self._ready.append((mark, *found))

@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -92,17 +92,19 @@ class LaneForm(ABC):
 
     @abstractmethod
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        """Rows of a record from `out` (`width`, n), which begins with those of `rows` and of the charges' rates."""
+        """Rows of a record from `out` (., n), the values of `rows` and the charges' rates."""
 
-    def width(self, problem: Problem) -> int:
-        """Number of rows of the outputs."""
-        return self.rows.k.size + self.flows
+    @cached_property
+    def judged(self) -> Shown:
+        """What has an error of its own beside gap voltage and force: voltages of the nodes, and the charges."""
+        charges = self.rows.k.size - self.flows
+        return Shown(*(np.concatenate([a, b[charges:]]) for a, b in zip(self.nodes, self.rows, strict=True)))
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
         leaks, kind = self.lanes.tap_s.size, MobileMarks if self.mobile else NetworkMarks if self.bent else StackMarks
-        more = self.lanes.feed.shape[1] - leaks, int(self.mobile), PIECES, int(own)
-        return _marks(kind, self.lanes.rates.size, self.active, self.inner, leaks, *more)
+        sizes = self.lanes.rates.size, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks
+        return kind(*((0,) * size for size in (*sizes, int(self.mobile), PIECES, int(own))))
 
     @property
     def bent(self) -> bool:
@@ -143,7 +145,7 @@ class LaneForm(ABC):
     def bend(self, xi: FloatArray) -> FloatArray:
         """N, V m^2."""
         found = self._polynomial(self.lanes.bend, xi)
-        return np.where(xi >= 0.0, found, -found)
+        return np.negative(found, out=found, where=xi < 0.0)
 
     def gap(self, xi: FloatArray) -> FloatArray:
         """Gap voltages, V."""
@@ -172,11 +174,6 @@ class LaneForm(ABC):
     def after(self, z: FloatArray, to: float) -> float:
         """Gap voltage (V) after a jump of the source to `to`; NaN where it meets a fold."""
         return float(self.gap(np.array(self.xi_at(z, to))))
-
-
-@lru_cache(maxsize=64)
-def _marks(kind: type[Marks], *sizes: int) -> Marks:
-    return kind(*((0,) * size for size in sizes))
 
 
 def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:

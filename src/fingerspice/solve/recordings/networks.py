@@ -194,14 +194,10 @@ class NetworkForm(LaneForm):
         sign[self.reduced.moving] = 1.0 if xi >= 0.0 else -1.0
         return State(t, y, s, sign, problem.scene.charge_law)
 
-    def width(self, problem: Problem) -> int:
-        return super().width(problem) if self.flows else problem.initial.y.size
-
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        if not self.flows:
-            n = self.reduced.absorbed.size
-            out[n:] = problem.initial.y[n:, None]
-        return out.T
+        # Charges that are not wanted stay as they are.
+        held = problem.initial.y[len(out) :, None] + np.zeros(out.shape[1])
+        return out.T if self.flows else np.concatenate([out, held]).T
 
 
 def finger(problem: Problem, rtol: float) -> NetworkForm | None:

@@ -22,7 +22,7 @@ from fingerspice.solve.problem import Problem, at_breakpoints
 from fingerspice.solve.recordings.form import LaneForm, rounded_peak, stack
 from fingerspice.solve.recordings.march import LaneMarch, Outcome
 from fingerspice.solve.recordings.networks import finger
-from fingerspice.solve.recordings.pieces import Piece, pieces_of
+from fingerspice.solve.recordings.pieces import pieces_of
 from fingerspice.solve.runs import Progress, Run, closed_form
 from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.simulation import integrated, own_rtol, state_error
@@ -37,25 +37,18 @@ BEGINNINGS = (1.0, 0.03)
 MOST_FORMS = 16
 
 
-def _decade(rtol: float) -> float:
-    return float(10.0 ** np.floor(np.log10(rtol)))
-
-
 def ready(problem: Problem, rtol: float) -> LaneForm | None:
-    """The scene prepared for this method, cached by decade; None where it does not apply."""
-    kept, *key = _kept(problem, rtol)
-    make = finger if problem.scene.stack is None else stack
-    one: LaneForm | None = kept_with(kept, ("followed", *key), MOST_FORMS, partial(make, problem, _decade(rtol)))
+    """The scene prepared for this method and a decade of errors; None where it does not apply.
+
+    It is cached with the scene, or with a stack for all sources of about its peak.
+    """
+    scene, decade = problem.scene, float(10.0 ** np.floor(np.log10(rtol)))
+    key: tuple[Any, ...] = "followed", decade, problem.charge, threading.get_ident()
+    if scene.stack is not None:
+        key = *key, scene.charge_law, rounded_peak(scene.u_peak)
+    kept, make = (scene.prepared, finger) if scene.stack is None else (scene.stack.kept, stack)
+    one: LaneForm | None = kept_with(kept, key, MOST_FORMS, partial(make, problem, decade))
     return one
-
-
-def _kept(problem: Problem, rtol: float) -> tuple[Any, ...]:
-    """Where preparations for a problem are cached, and the key; a stack's hold for all sources of about its peak."""
-    scene = problem.scene
-    key = _decade(rtol), problem.charge, threading.get_ident()
-    if scene.stack is None:
-        return scene.prepared, *key
-    return scene.stack.kept, scene.charge_law, rounded_peak(scene.u_peak), *key
 
 
 def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None) -> Run | None:
@@ -67,36 +60,26 @@ def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, pro
     refused = 0
     for share in BEGINNINGS:
         march = LaneMarch(problem, one, rtol, share)
-        out = np.empty((march.width, t_out.size))
-        outcome = _through(march, pieces, t_out, out, progress)
+        out = march.outputs_at(t_out)
+        for piece in pieces:
+            outcome = march.follow(piece, t_out, out)
+            if outcome is not Outcome.MET:
+                break
+            if progress is not None:
+                progress((march.t - problem.t_start) / (problem.t_stop - problem.t_start))
         if outcome is Outcome.LOST:
             return None
-        if outcome is Outcome.MET:
-            march.finish(t_out, out)
-            run = march.run(t_out, left, march.rows(t_out.size, out))
-            run.stats["rejected"] += refused
-            if run.excess(problem.rounding) > rtol:
-                # The peaks of the run stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
-                continue
-            look = partial(_look, replace(problem, charge=False), rtol)
-            run.continuous = closed_form(problem, look, rtol)
+        if outcome is Outcome.NOT_MET:
+            refused += march.refused
+            continue
+        march.finish(t_out, out)
+        run = march.run(t_out, left, one.recorded(problem, out))
+        run.stats["rejected"] += refused
+        # Else the peaks stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
+        if run.excess(problem.rounding) <= rtol:
+            run.continuous = closed_form(problem, partial(_look, replace(problem, charge=False), rtol), rtol)
             return run
-        refused += march.refused
     return None
-
-
-def _through(
-    march: LaneMarch, pieces: list[Piece], t_out: FloatArray, out: FloatArray, progress: Progress | None
-) -> Outcome:  # fmt: skip
-    """Integrate all pieces, up to the first that is not MET."""
-    problem = march.problem
-    for piece in pieces:
-        outcome = march.follow(piece, piece.values(march.wave), t_out, out)
-        if outcome is not Outcome.MET:
-            return outcome
-        if progress is not None:
-            progress((march.t - problem.t_start) / (problem.t_stop - problem.t_start))
-    return Outcome.MET
 
 
 def _look(problem: Problem, rtol: float, t: FloatArray, left: BoolArray) -> Record:
@@ -181,25 +164,20 @@ class BySamples:
 
     def advance(self) -> tuple[FloatArray, FloatArray] | None:
         """Times (s) and rows of the next piece; None where the method for recordings fails on it."""
-        piece, march, last = self.pieces[self.place], self.march, self.place + 1 == len(self.pieces)
-        end = self.outputs.total if last else self._until(piece.stop)
-        t = self.outputs.times(self.written, end)
-        run_at = t if self.outputs.rated else at_breakpoints(_between(self.problem, piece.start, piece.stop), t)
-        out = np.empty((march.width, t.size))
-        march.begin_outputs()
-        if march.follow(piece, piece.values(march.wave), run_at, out) is not Outcome.MET:
+        piece, march, o, last = self.pieces[self.place], self.march, self.outputs, self.place + 1 == len(self.pieces)
+        # All outputs up to the end of the piece, and a few more.
+        number = (piece.stop - o.start) * o.over if o.rated else (piece.stop - o.start) / o.over
+        end = o.total if last else min(max(math.ceil(number) - o.low + 2, self.written), o.total)
+        t = o.times(self.written, end)
+        run_at = t if o.rated else at_breakpoints(_between(self.problem, piece.start, piece.stop), t)
+        out = march.outputs_at(run_at)
+        if march.follow(piece, run_at, out) is not Outcome.MET:
             return None
         if last:
             march.finish(run_at, out)
         count = march.outputs
-        t, self.written, self.place = t[:count], self.written + count, self.place + 1
-        return t, march.rows(count, out)
-
-    def _until(self, t: float) -> int:
-        """A number of outputs that includes all outputs up to time t (s), and a few more."""
-        o = self.outputs
-        number = (t - o.start) * o.over if o.rated else (t - o.start) / o.over
-        return min(max(math.ceil(number) - o.low + 2, self.written), o.total)
+        self.written, self.place = self.written + count, self.place + 1
+        return t[:count], march.form.recorded(self.problem, out[:, :count])
 
     def run(self) -> Run:
         """The run so far, without outputs."""
