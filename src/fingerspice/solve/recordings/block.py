@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.engine.lanes.loops import begin, show, span, within
+from fingerspice.engine.lanes.loops import MORE, lead, show, span
 from fingerspice.engine.lanes.rows import rows_of
 from fingerspice.engine.lanes.weights import along
 from fingerspice.solve.recordings.form import PIECES, LaneForm
@@ -70,15 +70,8 @@ class _Window(NamedTuple):
 class Block:
     """A row of samples, at once in as many pieces as the form goes in.
 
-    Parameters
-    ----------
-    form : LaneForm
-    x : ndarray, shape (n + 1,)
-        The source at the samples, V.
-    h : ndarray, shape (n,) or (1,)
-        Distances of the samples, or their common distance, s.
-    starts_run : bool
-        Whether the run starts here, perhaps with a jump: the first piece is then checked at its start.
+    The source at the samples is x (V; n + 1,), their distances h (n,), or their common distance (1,), s. If the run
+    starts here, perhaps with a jump, the first piece is checked at its start.
     """
 
     def __init__(self, form: LaneForm, x: FloatArray, h: FloatArray, starts_run: bool) -> None:
@@ -91,8 +84,7 @@ class Block:
         self.first = self.count * np.arange(PIECES)
         self.marks, self.active = form.marks(self.own), form.active
         self.rates = np.maximum(form.lanes.rates, _STILL)
-        self.room, self.scratch = form.room(self.own)
-        self.still = form.weights(np.zeros(PIECES if self.own else 1))
+        self.room, self.weights = form.room(self.own)
         self.m = self.rates.size
         # States at the samples: the modes, and under `mobile` the gap voltage.
         self.kept = _scratch("kept", self.m + int(form.mobile), PIECES, self.count + 1)
@@ -108,16 +100,13 @@ class Block:
         left = np.exp(-self.rates[:, None, None] * np.maximum(since, 0.0))
         self.handed = np.where(np.tri(PIECES, 1 + PIECES, dtype=bool), left, 0.0)
 
-    def _span(
-        self, starts: FloatArray, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray
-    ) -> bool:  # fmt: skip
-        """`engine.lanes.loops.span` from modes `starts` (m, pieces) at the samples `first`."""
-        form, rows = self.form, rows_of(self.marks)
-        begin(self.marks, form.lanes, self.still, np.ascontiguousarray(starts), self.x[first], self.room)
-        kept[: self.m, :, 0], kept[self.m :, :, 0] = starts, self.room[rows.xi * PIECES :][:PIECES]
-        weights = self.scratch if self.own else form.weights(self.h / parts)
+    def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
+        """`engine.lanes.loops.span` from the modes in `kept` at the samples `first`."""
+        if not self.own:
+            self.form.weigh(self.h / parts, self.weights[1])
         return bool(span(
-            self.marks, form.lanes, weights, self.h, self.x, first, count, parts, tol, self.room, kept, self.left,
+            self.marks, self.form.lanes, self.weights, self.h, self.x, first, count, parts, tol, self.room, kept,
+            self.left,
         ))  # fmt: skip
 
     @property
@@ -135,15 +124,16 @@ class Block:
         """
         form, active, self.sweeps = self.form, self.active, 0
         # Least distances to the fold; the last sweep may stop before the end of the pieces.
-        margins = [1.0]
+        margins, folds = [1.0], rows_of(self.marks).fold * PIECES
         own = np.zeros((self.m, PIECES))
         along(form.lanes, self.h, self.x, self.first, self.count, own)
         starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[: self.m, None], own], axis=1))
         starts[active:] = 0.0
         for sweep in range(PIECES + 1):
-            stops = self._span(starts, self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
+            self.kept[: self.m, :, 0] = starts
+            stops = self._span(self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
             self.sweeps += 1
-            fold = self.room[rows_of(self.marks).fold * PIECES :][:PIECES] if form.mobile else np.zeros(1)
+            fold = self.room[folds:][:PIECES] if form.mobile else np.zeros(1)
             margins.append(1.0 - float(fold.max()))
             self.margin = min(margins[-2:])
             if stops:
@@ -164,7 +154,7 @@ class Block:
             # Passive modes have begun at 0 in every piece.
             self.kept[k] += np.cumsum(np.append(start[k], self.kept[k, :-1, -1]))[:, None]
         self.xi, self.sizes = _scratch("xi", self.n + 1), _scratch("sizes", PIECES, self.count)
-        show(*form.xi, self.x, self.first, self.count, self.n + 1, self.kept, self.xi)
+        show(form.xi[None], self.x, self.first, self.count, 0, self.n + 1, self.kept, self.xi[None])
         np.abs(self.xi[:-1], out=self.sizes.reshape(-1)[: self.n])
         self.sizes.reshape(-1)[self.n :] = 0.0
         largest = self.sizes.max(axis=1)
@@ -249,7 +239,7 @@ class Block:
         else:
             e, of_inverse = 1.0 / inverse - 1.0 / c.q0, np.zeros(PIECES)
             u, moved = (np.abs(x / (1.0 + c.kappa * e)).max(axis=0) for x in (1.0, e))
-        xi = window.xi + np.einsum("k,kij->ij", form.xi[1], window.off)
+        xi = window.xi + np.einsum("k,kij->ij", form.xi[1:], window.off)
         of_force = np.maximum(rises_at_first * over, rises * later)
         errors = [
             (np.abs(of(xi) - of(window.xi)).max(axis=1) + more).max()
@@ -279,13 +269,14 @@ class Block:
             first = np.maximum(place, 0)
             coarse = self.kept[:, lanes[:, None], first[:, None] + inside]
             fine = np.empty(coarse.shape)
-            self._span(coarse[: self.m, :, 0], self.first + first, width, 2 * parts, -1.0, fine)
+            fine[..., 0] = coarse[..., 0]
+            self._span(self.first + first, width, 2 * parts, -1.0, fine)
             found = fine - coarse
             found[:, place < 0] = 0.0
             if number == 0:
                 off, z, at = found, coarse, first
                 continue
-            in_xi, before = (np.abs(np.einsum("k,kij->ij", self.form.xi[1], x)).max(axis=1) for x in (found, off))
+            in_xi, before = (np.abs(np.einsum("k,kij->ij", self.form.xi[1:], x)).max(axis=1) for x in (found, off))
             worse = in_xi > before
             off[:, worse], z[:, worse], at[worse] = found[:, worse], coarse[:, worse], first[worse]
         index = (self.first + at)[:, None] + inside
@@ -322,8 +313,8 @@ class Block:
         x = self.x[number]
         if not since.any():
             return x, z
-        to, out, form = x + (self.x[number + 1] - x) * (since / length), np.empty_like(z), self.form
-        parts *= BETWEEN if self.form.bent else 1
-        still, (room, _) = form.weights(np.zeros(PIECES)), form.room(True)
-        within(form.marks(True), form.lanes, still, z, x, to, since, parts, room, out)
-        return to, out
+        to, form, (room, weights) = x + (self.x[number + 1] - x) * (since / length), self.form, self.form.room(True)
+        parts *= BETWEEN if form.bent else 1
+        still, out = np.zeros((1, self.m + 2)), np.empty((1, self.m + MORE, x.size))
+        lead(form.marks(True), form.lanes, weights, z[: self.m], x, to, since, parts, still, room, out)
+        return to, out[0, : len(z)]

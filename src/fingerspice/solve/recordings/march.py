@@ -174,13 +174,12 @@ class LaneMarch:
         last = first + int(np.searchsorted(t_out[first:], piece.stop - slack))
         if last == first:
             return
-        t, self.outputs, rows = t_out[first:last], last, out[:, first:last]
-        times = piece.times
+        t, times = t_out[first:last], piece.times
         if t.size == n and (
             on_grid(t, piece.start, piece.spacing, slack) if times is None else np.abs(t - times[:-1]).max() <= slack
         ):
             slope = np.diff(block.x[: n + 1]) / block.h[:n] if self.form.flows else block.x
-            self._show(block.x, slope, block.first, block.kept, block.xi[:n], rows)
+            self._show(block.x, slope, block.first, block.kept, block.xi[:n], out)
             return
         samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
         number = np.clip(np.searchsorted(samples, t + slack, side="right") - 1, 0, n - 1)
@@ -188,31 +187,35 @@ class LaneMarch:
         since = t - samples[number]
         since[np.abs(since) <= slack] = 0.0
         x, z = block.at(number, np.clip(since, 0.0, length), length, parts)
-        self._show_at(x, (block.x[number + 1] - block.x[number]) / length, z, rows)
+        self._show_at(x, (block.x[number + 1] - block.x[number]) / length, z, out)
 
     def _show_at(self, x: FloatArray, slope: FloatArray, z: FloatArray, out: FloatArray) -> None:
         """Write outputs as `_show`, from states (rows, n)."""
-        (k, columns), xi = self.form.xi, np.empty(x.size)
-        show(k, columns, x, _ONE_ROW, x.size, x.size, z[:, None], xi)
-        self._show(x, slope, _ONE_ROW, z[:, None], xi, out)
+        n, xi, kept = x.size, np.empty(x.size), z[:, None]
+        show(self.form.xi[None], x, _ONE_ROW, n, 0, n, kept, xi[None])
+        self._show(x, slope, _ONE_ROW, kept, xi, out)
 
     def _show(
         self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, xi: FloatArray, out: FloatArray
     ) -> None:  # fmt: skip
-        """Write outputs into the columns of `out`: from the source, its slope (V/s), and states as in `Block`."""
-        form, c, n = self.form, self.form.lanes, out.shape[1]
-        count, shown, first_flow = n if first.size == 1 else int(first[1]), form.rows, form.rows.k.size - form.flows
-        if shown.bends.any() or shown.by_area.any():
-            moved, inverse = form.moved(xi, x[:n]), form.inverse_area(xi) if form.mobile else xi
-        for i, (k, share) in enumerate(zip(shown.k.tolist(), shown.bends.tolist(), strict=True)):
-            by_area = shown.by_area[i]
-            show(0.0 if by_area else k, shown.columns[i], x, first, count, n, kept, out[i])
-            if by_area:
-                out[i] = out[i] * inverse + k * x[:n]
-            elif share != 0.0:
-                out[i] += share * moved
-            if i >= first_flow:
-                flow(c, k, shown.columns[i], share, x, slope, first, count, n, kept, out[i + form.flows])
+        """Write the next outputs into columns of `out`: from the source, its slope (V/s), states as in `Block`, and xi.
+
+        The latter has the shape (n,).
+        """
+        form, n, shown, start = self.form, xi.size, self.form.rows, self.outputs
+        count, charges, self.outputs = n if first.size == 1 else int(first[1]), len(shown.k) - form.flows, start + n
+        show(form.shown, x, first, count, start, n, kept, out)
+        rows = out[:, start : self.outputs]
+        if shown.by_area.any():
+            inverse = form.inverse_area(xi)
+            for i in np.flatnonzero(shown.by_area):
+                rows[i] = rows[i] * inverse + shown.k[i] * x[:n]
+        if shown.bends.any():
+            moved = form.moved(xi, x[:n])
+            for i in np.flatnonzero(shown.bends):
+                rows[i] += shown.bends[i] * moved
+        for by, share, own in zip(form.shown[charges:], shown.bends[charges:], rows[len(shown.k) :], strict=True):
+            flow(form.lanes, by, float(share), x, slope, first, count, kept, xi, own)
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
         """Write the outputs at the end of the run."""
@@ -221,8 +224,7 @@ class LaneMarch:
             # With the source's slope after the end of the run.
             here, later = self.wave.value([self.problem.t_stop, self.problem.t_stop + after]).tolist()
             x, slope = np.full(count, self.u_last), np.full(count, float(later - here) / after)
-            self._show_at(x, slope, np.repeat(self.z[:, None], count, axis=1), out[:, self.outputs :])
-        self.outputs = t_out.size
+            self._show_at(x, slope, np.repeat(self.z[:, None], count, axis=1), out)
 
     def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
         """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C)."""

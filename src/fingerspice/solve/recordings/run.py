@@ -22,7 +22,7 @@ from fingerspice.solve.problem import Problem, at_breakpoints
 from fingerspice.solve.recordings.form import LaneForm, rounded_peak, stack
 from fingerspice.solve.recordings.march import LaneMarch, Outcome
 from fingerspice.solve.recordings.networks import finger
-from fingerspice.solve.recordings.pieces import pieces_of
+from fingerspice.solve.recordings.pieces import Piece, pieces_of
 from fingerspice.solve.runs import Progress, Run, closed_form
 from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.simulation import integrated, own_rtol, state_error
@@ -51,12 +51,19 @@ def ready(problem: Problem, rtol: float) -> LaneForm | None:
     return one
 
 
-def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None) -> Run | None:
-    """A run sample by sample; None where this method does not apply (no recording) or does not meet the error."""
+def _prepared(problem: Problem, rtol: float) -> tuple[list[Piece], LaneForm] | None:
+    """The pieces of a run and the scene prepared for them; None where this method does not apply."""
     pieces = pieces_of(problem)
     one = None if pieces is None else ready(problem, rtol)
-    if pieces is None or one is None:
+    return None if pieces is None or one is None else (pieces, one)
+
+
+def solve(problem: Problem, rtol: float, t_out: FloatArray, left: BoolArray, progress: Progress | None) -> Run | None:
+    """A run sample by sample; None where this method does not apply (no recording) or does not meet the error."""
+    found = _prepared(problem, rtol)
+    if found is None:
         return None
+    pieces, one = found
     refused = 0
     for share in BEGINNINGS:
         march = LaneMarch(problem, one, rtol, share)
@@ -136,20 +143,18 @@ class BySamples:
 
     method = "relaxation"
 
-    def __init__(self, problem: Problem, outputs: Outputs, plan: Plan, rtol: float) -> None:
+    def __init__(
+        self, problem: Problem, outputs: Outputs, plan: Plan, rtol: float, pieces: list[Piece], march: LaneMarch
+    ) -> None:
         self.problem, self.outputs, self.plan, self.rtol = problem, outputs, plan, rtol
-        own = own_rtol(problem, plan, rtol)
-        pieces, one = pieces_of(problem), ready(problem, own)
-        assert pieces is not None
-        assert one is not None
-        self.pieces, self.march, self.place, self.written = pieces, LaneMarch(problem, one, own), 0, 0
+        self.pieces, self.march, self.place, self.written = pieces, march, 0, 0
 
     @staticmethod
-    def serve(problem: Problem, plan: Plan, rtol: float) -> bool:
-        """Whether a run can be integrated this way."""
-        if plan.tier != "coupled" or pieces_of(problem) is None:
-            return False
-        return ready(problem, own_rtol(problem, plan, rtol)) is not None
+    def of(problem: Problem, outputs: Outputs, plan: Plan, rtol: float) -> BySamples | None:
+        """A run that can be integrated this way, or None."""
+        own = own_rtol(problem, plan, rtol)
+        found = _prepared(problem, own) if plan.tier == "coupled" else None
+        return found and BySamples(problem, outputs, plan, rtol, found[0], LaneMarch(problem, found[1], own))
 
     @property
     def over(self) -> bool:
