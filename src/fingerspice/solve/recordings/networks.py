@@ -99,18 +99,11 @@ class Reduced:
 
 
 def _turns(nodes: list[tuple[str, str]], first: int) -> FloatArray:
-    """Direction of each cell of a path, 1 or -1, relative to that of cell `first`."""
-    turn = np.zeros(len(nodes))
-    turn[first] = 1.0
-    todo = [first]
-    while todo:
-        i = todo.pop()
-        for j in np.flatnonzero(turn == 0.0):
-            if set(nodes[i]) & set(nodes[j]):
-                head_to_tail = nodes[i][1] == nodes[j][0] or nodes[i][0] == nodes[j][1]
-                turn[j] = turn[i] if head_to_tail else -turn[i]
-                todo.append(int(j))
-    return turn
+    """Direction of each cell of a path, 1 or -1, relative to that of cell `first`: a current that all of them carry."""
+    ends = Counter(node for pair in nodes for node in pair)
+    inner = [[(a == node) - (b == node) for a, b in nodes] for node, count in ends.items() if count == 2]
+    current = np.linalg.svd(np.array(inner, float).reshape(-1, len(nodes)))[2][-1]
+    return np.asarray(np.round(current / current[first]))
 
 
 # Number of frequencies at which the gap's share is looked at.
