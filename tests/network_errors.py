@@ -14,6 +14,7 @@ import random
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,7 @@ class Network:
 class Beside:
     """The stated error of a quantity of a run, and the true one with what is not known of it, over the peak."""
 
-    network: Network
+    of: Any  # What was drawn, a `Network` or a `recording_errors.Recording`
     rtol: float
     quantity: str
     stated: float
@@ -117,35 +118,35 @@ def _signals(run: fs.Solution) -> dict[str, np.ndarray]:
     return found | {"v_nodes": np.column_stack(list(run.node_voltages.values()))}
 
 
+def beside(of: Any, runs: dict[float, fs.Solution], exact: fs.Solution) -> list[Beside]:
+    """The errors of runs by their tolerances, and what a tight run says of them."""
+    truth, found = _signals(exact), []
+    for rtol, one in runs.items():
+        for name, values in _signals(one).items():
+            peak = float(np.abs(truth[name]).max())
+            stated, doubt = (getattr(s.error, name) for s in (one, exact))
+            if stated is not None and peak > 0.0:
+                off, unknown = float(np.abs(values - truth[name]).max()), (doubt or 0.0) / peak + ROUNDING
+                found.append(Beside(of, rtol, name, stated / peak, off / peak, unknown))
+    return found
+
+
 def judge(network: Network) -> list[Beside] | str:
     """Stated and true errors of all quantities at all tolerances; or why there is none: a fold, or no tight run."""
     # Times that are no step ends, so that no output is more right than its step.
     t = np.sort(np.random.default_rng(network.number).uniform(0.0, network.stop, 400))
-
-    def run(rtol: float) -> fs.Solution:
-        return fs.simulate(
-            network.circuit, t_stop=network.stop, t_eval=t, charge_law=network.law, rtol=rtol, throw=False
-        )
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fs.FingerspiceWarning)
-        exact = run(TIGHT)
-        if exact.status not in (fs.Status.SUCCESS, fs.Status.ERROR_NOT_MET):
-            return exact.status.name
-        runs = {rtol: run(rtol) for rtol in RTOLS}
-    truth, found = _signals(exact), []
-    for rtol, one in runs.items():
+        exact, *runs = (
+            fs.simulate(network.circuit, t_stop=network.stop, t_eval=t, charge_law=network.law, rtol=rtol, throw=False)
+            for rtol in (TIGHT, *RTOLS)
+        )
+    if exact.status not in (fs.Status.SUCCESS, fs.Status.ERROR_NOT_MET):
+        return exact.status.name
+    for rtol, one in zip(RTOLS, runs, strict=True):
         if not one.success:
             return f"{one.status.name} at {rtol:g}"
-        for name, values in _signals(one).items():
-            peak = float(np.abs(truth[name]).max())
-            stated, doubt = (getattr(s.error, name) for s in (one, exact))
-            if stated is None or peak == 0.0:
-                continue
-            off = float(np.abs(values - truth[name]).max())
-            unknown = (doubt or 0.0) / peak + ROUNDING
-            found.append(Beside(network, rtol, name, stated / peak, off / peak, unknown))
-    return found
+    return beside(network, dict(zip(RTOLS, runs, strict=True)), exact)
 
 
 def table(found: Iterable[Beside], group: Callable[[Beside], str]) -> list[str]:
@@ -196,12 +197,10 @@ def main(arguments: list[str] | None = None) -> None:
     print("\n".join(table(found, lambda x: f"{x.quantity} at {x.rtol:g}")))
     print("\n".join(table(found, lambda x: x.quantity)))
     for part in ("around", "source", "law", "fingers", "area"):
-        print("\n".join(table(found, lambda x, part=part: f"{part}: {x.network.kind[part]}")))
+        print("\n".join(table(found, lambda x, part=part: f"{part}: {x.of.kind[part]}")))
     worst = sorted((x for x in found if not x.covered), key=lambda x: x.stated / x.true)[:20]
     for x in worst:
-        print(
-            f"not covered: network {x.network.number} {x.quantity} at {x.rtol:g}, {x.stated / x.true:.2g} of the true"
-        )
+        print(f"not covered: network {x.of.number} {x.quantity} at {x.rtol:g}, {x.stated / x.true:.2g} of the true")
 
 
 if __name__ == "__main__":

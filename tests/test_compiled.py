@@ -185,7 +185,7 @@ def test_what_is_said_to_compile_for_long_is_a_function_of_that_kind(name: str, 
     compiled = getattr(importlib.import_module(f"fingerspice.{module}"), function)
     assert compiled.targetoptions["nogil"]
     first = next(iter(inspect.signature(compiled.py_func).parameters.values()))
-    unions = {("engine.collocation.loop.march_on", "Circuit"), ("engine.lanes.loops.begin", "Marks")}
+    unions = {("engine.collocation.loop.march_on", "Circuit"), ("engine.lanes.loops.span", "Marks")}
     assert kind in ("", first.annotation) or (name, first.annotation) in unions
 
 

@@ -22,10 +22,16 @@ def judged() -> list[Beside]:
 
 
 @pytest.mark.parametrize("quantity", network_errors.QUANTITIES)
-def test_stated_errors_cover_the_true_ones_on_95_percent_of_random_networks(
+def test_stated_errors_cover_the_true_ones_on_95_percent_of_random_networks_and_are_not_far_above(
     judged: list[Beside], quantity: str
 ) -> None:
-    assert network_errors.coverage(x for x in judged if x.quantity == quantity) >= 0.95
+    these = [x for x in judged if x.quantity == quantity]
+    assert network_errors.coverage(these) >= 0.95
+    # A third of what is stated would not do, and nine of ten are at most ten times the true ones.
+    assert network_errors.coverage(dataclasses.replace(x, stated=x.stated / 3.0) for x in these) < 0.95
+    ratios = [x.ratio for x in these if x.ratio is not None]
+    assert len(ratios) > 50
+    assert np.mean(np.array(ratios) <= 10.0) >= 0.9
 
 
 @pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
@@ -40,21 +46,6 @@ def test_what_counts_as_true_is_what_radau_s_method_finds_too(number: int) -> No
     for name in ("u_gap", "f_el", "q_source"):
         ours, theirs = getattr(tight, name), getattr(other, name)
         assert np.abs(ours - theirs).max() <= (5e-8 if name == "q_source" else 1e-8) * np.abs(ours).max()
-
-
-@pytest.mark.parametrize("quantity", network_errors.QUANTITIES)
-def test_stated_errors_are_at_most_ten_times_the_true_ones_on_nine_of_ten_random_networks(
-    judged: list[Beside], quantity: str
-) -> None:
-    ratios = [x.ratio for x in judged if x.quantity == quantity and x.ratio is not None]
-    assert len(ratios) > 50
-    assert np.mean(np.array(ratios) <= 10.0) >= 0.9
-
-
-@pytest.mark.parametrize("quantity", network_errors.QUANTITIES)
-def test_a_third_of_what_is_stated_would_not_cover_95_percent(judged: list[Beside], quantity: str) -> None:
-    smaller = [dataclasses.replace(x, stated=x.stated / 3.0) for x in judged if x.quantity == quantity]
-    assert network_errors.coverage(smaller) < 0.95
 
 
 def test_the_networks_are_of_every_kind() -> None:

@@ -61,7 +61,7 @@ def by_hand(samples: fs.Samples, count: int) -> tuple[np.ndarray, np.ndarray, np
 
 def test_a_finger_in_a_network_follows_the_hand_written_equations() -> None:
     samples = recording(140)
-    t, u_gap, q = by_hand(samples, 100)
+    t, u_gap, q = by_hand(samples, cases(100, 40))
     for rtol in (1e-4, 1e-8):
         run = fs.simulate(floating(), sources=samples, t_eval=t, t_stop=130.0 / RATE, charge_law="local", rtol=rtol)
         assert run.method == "relaxation"
@@ -74,14 +74,7 @@ def test_stated_errors_cover_the_true_ones_and_what_was_asked_is_met() -> None:
     drawn = [recording_errors.draw(number, 300, network=True) for number in range(200, 200 + count)]
     found = [x for one in drawn for x in recording_errors.judge(one)]
     assert len(found) > 4 * count
-    assert np.mean([x.covered for x in found]) >= 0.95
-    for x in found:
-        if x.quantity in ("u_gap", "f_el"):
-            assert x.true <= x.rtol
-    for quantity in recording_errors.QUANTITIES:
-        ratios = [x.ratio for x in found if x.ratio is not None and x.quantity == quantity]
-        assert np.median(ratios) <= 4.0
-        assert np.mean(np.array(ratios) <= 10.0) >= 0.9
+    recording_errors.assert_that_stated_errors_hold(found)
 
 
 @pytest.mark.parametrize("name", ["amplifier", "ungrounded_user", "current_drive"])

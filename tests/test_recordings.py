@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 import mpmath
 import numpy as np
@@ -36,21 +37,29 @@ def follow(samples: fs.Waveform, t_stop: float, **options: object) -> fs.Solutio
     return fs.simulate(circuit, sources=samples, **given)  # type: ignore[arg-type]
 
 
+def by_reference(knots: np.ndarray, values: np.ndarray, t: np.ndarray, law: str = "local") -> Any:
+    segments = analytic.pwl_segments(list(zip(knots.tolist(), values.tolist(), strict=True)))
+    return analytic.transient(segments, t.tolist(), law=law, freq=100.0)
+
+
+def assert_met(run: fs.Solution, u_gap: np.ndarray, f_el: np.ndarray, rtol: float) -> None:
+    """The method, and that gap voltage and force are within what is stated and asked."""
+    assert run.method == "relaxation"
+    for name, true in (("u_gap", u_gap), ("f_el", f_el)):
+        off = np.abs(getattr(run, name) - true).max()
+        assert off <= min(rtol * np.abs(true).max(), getattr(run.error, name))
+
+
 @pytest.mark.parametrize("law", ["local", "mobile"])
-@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
-def test_samples_are_followed_as_the_reference_follows_them(law: str, rtol: float) -> None:
+def test_samples_are_followed_as_the_reference_follows_them(law: str) -> None:
     values = recording()
     knots = np.arange(values.size) / RATE
     t = np.sort(np.append(knots[1:-1], np.random.default_rng(1).uniform(0.0, knots[-2], 60)))
-    segments = analytic.pwl_segments(list(zip(knots.tolist(), values.tolist(), strict=True)))
-    exact = analytic.transient(segments, t.tolist(), law=law, freq=100.0)
-    run = follow(fs.Samples(values, RATE), float(knots[-2]), t_eval=t, charge_law=law, rtol=rtol)
-    assert run.method == "relaxation"
-    peaks = {"u_gap": np.abs(exact.u_gap).max(), "f_el": exact.force.max()}
-    off = {"u_gap": np.abs(run.u_gap - exact.u_gap).max(), "f_el": np.abs(run.f_el - exact.force).max()}
-    for name, peak in peaks.items():
-        assert off[name] <= min(rtol * peak, getattr(run.error, name))
-    assert np.abs(run.q_source - exact.q).max() <= run.error.q_source + 1e-12 * np.abs(exact.q).max()
+    exact = by_reference(knots, values, t, law)
+    for rtol in (1e-4, 1e-8):
+        run = follow(fs.Samples(values, RATE), float(knots[-2]), t_eval=t, charge_law=law, rtol=rtol)
+        assert_met(run, exact.u_gap, exact.force, rtol)
+        assert np.abs(run.q_source - exact.q).max() <= run.error.q_source + 1e-12 * np.abs(exact.q).max()
 
 
 @pytest.mark.parametrize(("rtol", "rate"), [(1e-4, 8e3), (1e-6, 48e3)])
@@ -58,13 +67,10 @@ def test_a_smooth_recording_is_right_at_samples_and_between_them(rtol: float, ra
     values = 180.0 * recording_errors.noise(7, 2000, rate, 0.01 * rate, 0.02 * rate)
     knots = np.arange(values.size) / rate
     t = np.sort(np.append(knots[1:-1:3], np.random.default_rng(1).uniform(0.0, knots[-2], 300)))
-    segments = analytic.pwl_segments(list(zip(knots.tolist(), values.tolist(), strict=True)))
-    exact = analytic.transient(segments, t.tolist(), law="local", freq=100.0)
+    exact = by_reference(knots, values, t)
     samples, stop = fs.Samples(values, rate), float(knots[-2])
     run = follow(samples, stop, t_eval=t, rtol=rtol)
-    for name, true in {"u_gap": exact.u_gap, "f_el": exact.force}.items():
-        off = np.abs(getattr(run, name) - true).max()
-        assert off <= min(rtol * np.abs(true).max(), getattr(run.error, name))
+    assert_met(run, exact.u_gap, exact.force, rtol)
     assert np.abs(run.q_source - exact.q).max() <= run.error.q_source <= 30.0 * rtol * np.abs(exact.q).max()
     # The outputs at samples, which are written by the block, are those written one by one.
     at_samples = follow(samples, stop, t_eval=knots[:-1], rtol=rtol)
@@ -81,8 +87,7 @@ def test_two_sources_of_a_circuit_may_have_recordings_at_different_rates() -> No
     knots = np.unique(np.concatenate([np.arange(160) / RATE, np.arange(110) / 5512.5]))
     knots, t = knots[knots < 0.019], np.random.default_rng(1).uniform(0.0, 0.018, 100)
     t.sort()
-    segments = analytic.pwl_segments(list(zip(knots.tolist(), sum(w(knots) for w in waves).tolist(), strict=True)))
-    exact = analytic.transient(segments, t.tolist(), law="local", freq=100.0)
+    exact = by_reference(knots, sum(w(knots) for w in waves), t)
     run = fs.simulate(
         fs.parse_netlist("\n".join(lines)), sources=dict(zip(("Vone", "Vtwo"), waves, strict=True)), t_stop=0.018,
         t_eval=t, rtol=1e-6, start="uncharged",
@@ -101,19 +106,11 @@ def test_what_the_sweeps_leave_is_stated(number: int) -> None:
 
 
 def test_stated_errors_cover_the_true_ones_and_what_was_asked_is_met() -> None:
-    count = cases(100, 7)
-    found = [
-        x for number in range(100, 100 + count) for x in recording_errors.judge(recording_errors.draw(number, 300))
-    ]
-    assert len(found) > 5 * count
-    assert np.mean([x.covered for x in found]) >= 0.95
-    for x in found:
-        if x.quantity in ("u_gap", "f_el"):
-            assert x.true <= x.rtol
-    for quantity in recording_errors.QUANTITIES:
-        ratios = [x.ratio for x in found if x.ratio is not None and x.quantity == quantity]
-        assert np.median(ratios) <= 4.0
-        assert np.mean(np.array(ratios) <= 10.0) >= 0.9
+    # The few have both laws, frozen and dispersive skins, and a film, in forms that other tests compile, too.
+    numbers = range(100, 200) if cases(1, 0) else (104, 113, 114, 115, 116, 118, 119)
+    found = [x for number in numbers for x in recording_errors.judge(recording_errors.draw(number, 300))]
+    assert len(found) > 5 * len(numbers)
+    recording_errors.assert_that_stated_errors_hold(found)
 
 
 @pytest.mark.parametrize("law", ["local", "mobile"])
@@ -183,17 +180,13 @@ def test_moments_are_integrals() -> None:
 
 
 @pytest.mark.parametrize("law", ["local", "mobile"])
-@pytest.mark.parametrize("rtol", [1e-3, 1e-6])
-def test_points_on_a_grid_are_followed_like_samples(law: str, rtol: float) -> None:
+def test_points_on_a_grid_are_followed_like_samples(law: str) -> None:
     number = np.append(0, np.cumsum(np.random.default_rng(5).integers(1, 4, 99)))
     t = number / RATE
     wave = fs.PWL(tuple(t), tuple(recording(300)[number]))
     exact = follow(wave, t[-1], t_eval=t, charge_law=law, rtol=1e-11, method="exponential")
-    run = follow(wave, t[-1], t_eval=t, charge_law=law, rtol=rtol)
-    assert run.method == "relaxation"
-    for name in ("u_gap", "f_el"):
-        off = np.abs(getattr(run, name) - getattr(exact, name)).max()
-        assert off <= min(getattr(run.error, name), rtol * np.abs(getattr(exact, name)).max())
+    for rtol in (1e-3, 1e-6):
+        assert_met(follow(wave, t[-1], t_eval=t, charge_law=law, rtol=rtol), exact.u_gap, exact.f_el, rtol)
 
 
 def test_sums_of_samples_are_samples_and_products_with_a_sine_are_not() -> None:
@@ -215,11 +208,10 @@ def test_a_loud_passage_does_not_spoil_the_stated_error() -> None:
     quiet = recording_errors.noise(3, 3000, 48e3, 50.0, 2e3)
     loudness = np.concatenate([np.full(1000, 0.02), np.full(1000, 0.9), np.full(1000, 0.02)])
     samples = fs.Samples(180.0 * quiet * loudness, 48e3)
-    how = {"sources": samples, "t_stop": 2990 / 48e3, "t_eval": np.arange(2990) / 48e3, "start": "uncharged"}
-    circuit = fs.parse_netlist(table1_deck())
-    exact = fs.simulate(circuit, **how, rtol=1e-11, method="exponential", jumps="none").u_gap
+    stop, t = 2990 / 48e3, np.arange(2990) / 48e3
+    exact = follow(samples, stop, t_eval=t, rtol=1e-11, method="exponential").u_gap
     for rtol in (1e-3, 1e-4, 1e-5, 1e-6):
-        run = fs.simulate(circuit, **how, rtol=rtol, charge=False, jumps="none")
+        run = follow(samples, stop, t_eval=t, rtol=rtol)
         assert run.method == "relaxation"
         off = np.abs(run.u_gap - exact).max()
         assert off <= run.error.u_gap <= 10.0 * off

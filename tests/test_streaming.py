@@ -321,7 +321,7 @@ def test_a_store_holds_the_run(scene: Path, command: Command, monkeypatch: pytes
 def test_a_killed_run_goes_on_to_the_same_bytes(scene: Path) -> None:
     assert ended(start(scene, *STREAM, "--out", "whole"))[0] == 0
     written, killed = scene / "parts" / "long.zarr" / "f_el" / "c", 0
-    for pieces_there in (*range(1, 34, cases(8, 16)), 40):
+    for pieces_there in (*range(1, 34, cases(8, 32)), 40):
         process = start(scene, *STREAM, "--out", "parts")
         while process.poll() is None and (not written.is_dir() or len(os.listdir(written)) < pieces_there):
             time.sleep(1e-3)

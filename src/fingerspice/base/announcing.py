@@ -15,9 +15,9 @@ _LOG = logging.getLogger("fingerspice")
 LONG = {
     ("engine.collocation.loop.march_on", "OneArea"): "the steps of a series stack, about 30 s",
     ("engine.collocation.loop.march_on", "ManyAreas"): "the steps of a network, about 60 s",
-    ("engine.lanes.loops.begin", "StackMarks"): "the steps of a recording, about 20 s",
-    ("engine.lanes.loops.begin", "MobileMarks"): "the steps of a recording, about 20 s",
-    ("engine.lanes.loops.begin", "NetworkMarks"): "the steps of a recording in a network, about 30 s",
+    ("engine.lanes.loops.span", "StackMarks"): "the steps of a recording, about 20 s",
+    ("engine.lanes.loops.span", "MobileMarks"): "the steps of a recording, about 20 s",
+    ("engine.lanes.loops.span", "NetworkMarks"): "the steps of a recording in a network, about 30 s",
     ("engine.implicit.run.advance", "Nodal"): "implicit steps, about 15 s",
     ("engine.lockstep.march.march", ""): "scenes in lockstep, about 20 s",
 }

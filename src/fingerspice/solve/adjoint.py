@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.engine.lanes.loops import AREAS, GAP, MORE, SQUARES, slopes_of, sum_back
+from fingerspice.engine.lanes.loops import AREAS, GAP, MORE, SQUARES, lead, sum_back
 from fingerspice.numerics.small import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status
@@ -25,8 +25,6 @@ from fingerspice.results.sensitivity import MEANS, SIGNALS, SampleGradient
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block
-from fingerspice.solve.recordings.form import PIECES
-from fingerspice.solve.recordings.march import LEAST_MARGIN
 from fingerspice.solve.recordings.pieces import driving
 from fingerspice.solve.recordings.run import ready
 from fingerspice.solve.simulation import asked
@@ -124,11 +122,7 @@ class _Intervals:
         form, n = self.form, self.t.size - 1
         block, start = Block(form, self.x, self.h, True), form.start(self.problem)[0][: self.m]
         peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
-        solved = (
-            block.solve(start, _STEPS[self.first + 2], _CLOSED * peak)
-            and block.on_one_branch
-            and block.margin > LEAST_MARGIN
-        )
+        solved = block.solve(start, _STEPS[self.first + 2], _CLOSED * peak) and block.on_one_branch
         if not solved or float(np.abs(form.gap(block.xi)).max()) > form.u_top:
             cause = "the run is not followed sample by sample, for its derivatives by samples"
             at = float(self.t[0])
@@ -138,17 +132,19 @@ class _Intervals:
         self.delta = _APART * np.where(sizes > 0.0, sizes, peak)
 
     def _slopes(self, at: IntArray, to: FloatArray, length: FloatArray, parts: int) -> FloatArray:
-        form, own, out = self.form, length.size > 1, np.empty((self.m + MORE, self.m + 2, at.size))
-        state, scratch = form.room(own)
-        weights = scratch if own else form.weights(length / parts)
-        still, z = form.weights(np.zeros(PIECES if own else 1)), np.ascontiguousarray(self.z[:, at])
-        slopes_of(
-            form.marks(own), form.lanes, still, z, self.x[at], to, length, parts, self.delta, (state, weights), out
-        )  # fmt: skip
-        return out
+        """Derivatives of what intervals lead to as `sum_back` takes them, by central differences."""
+        form, own, m = self.form, length.size > 1, self.m
+        state, weights = form.room(own)
+        if not own:
+            form.weigh(length / parts, weights[1])
+        apart, out = np.append(self.delta, self.delta[-1]), np.empty((2 * (m + 2), m + MORE, at.size))
+        shifts, z = np.concatenate([np.diag(apart), np.diag(-apart)]), np.ascontiguousarray(self.z[:, at])
+        lead(form.marks(own), form.lanes, weights, z, self.x[at], to, length, parts, shifts, state, out)
+        out *= np.tile(0.5 / apart, 2)[:, None, None]
+        return np.ascontiguousarray((out[: m + 2] - out[m + 2 :]).transpose(1, 0, 2))
 
     def slopes(self, at: IntArray, to: FloatArray, length: FloatArray, rows: BoolArray) -> list[FloatArray]:
-        """Derivatives (`slopes_of`) from the starts of the intervals `at`, where the source goes to `to` in a `length`.
+        """Derivatives (`_slopes`) from the starts of the intervals `at`, where the source goes to `to` in a `length`.
 
         They come twice: as of the shortest steps, and extrapolated. `rows` says which of them are wanted.
         """

@@ -46,11 +46,8 @@ class Stream:
     def __init__(self, problem: Problem, plan: Plan, outputs: Outputs, count: int, rtol: float, method: str) -> None:
         self.problem, self.plan, self.outputs, self.count, self.rtol = problem, plan, outputs, count, rtol
         self.done = 0
-        self._source: BySamples | ByWindows = (
-            BySamples(problem, outputs, plan, rtol)
-            if method == "auto" and BySamples.serve(problem, plan, rtol)
-            else ByWindows(problem, outputs, plan, rtol, method)
-        )
+        by_samples = BySamples.of(problem, outputs, plan, rtol) if method == "auto" else None
+        self._source: BySamples | ByWindows = by_samples or ByWindows(problem, outputs, plan, rtol, method)
         # Integrated pieces whose outputs no chunk has contained yet: the mark before each, times (s) and rows.
         self._ready: list[tuple[Mark, FloatArray, FloatArray]] = []
 
@@ -102,7 +99,7 @@ class Stream:
             assert isinstance(self._source, BySamples)
             self._source.go_to(mark)
             other = self._stepped()
-            other.written, other.state = mark["written"], self._source.march.state()
+            other.written, other.state = mark["written"], self._source.march.state
             self._source = other
             mark, found = other.mark(), other.advance()
         self._ready.append((mark, *found))

@@ -20,32 +20,34 @@ from fingerspice.engine.lanes.rows import (
 
 
 @jit_within_rows
-def _drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, shares: bool, state: FloatArray) -> None:
+def bent_drives_at(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
     """Drives at node j, from xi there, but for N, and from what 1/A - q0 multiplies there.
 
-    xi = X + B N(xi), where X is given, and B is the share of N at this node, or 0 if it has none. It is solved on the
-    tangent of N at node `before`, and once more on the one at the place that is found. Tangents have the slope -q / d,
-    d = q0 (q0 + q) - kappa q, where 1/A = q0 + q.
+    xi = X + B N(xi), where X is given, and B is the share of N at this node. It is solved on the tangent of N at the
+    node before, and once more on the one at the place that is found. Tangents have the slope -q / d,
+    d = q0 (q0 + q) - kappa q, where 1/A = q0 + q. For node 0 the start is changed: B = 0, and the rows of the last node
+    are taken.
     """
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     drives, x = leaks + 1, at.scratch
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
+    before, to, on = (j - 1, j, 1.0) if j > 0 else (0, NODES - 1, 0.0)
     # The share of xi, and with steps of `one` those of what 1/A - q0 multiplies.
-    one, on = weights_of(marks).one, 1.0 if shares else 0.0
-    share_at = weights_of(marks).node + (j - 1) * (1 + leaks) * one + one - 1
+    one = weights_of(marks).one
+    share_at = weights_of(marks).node + (to - 1) * (1 + leaks) * one + one - 1
     for i in range(lanes):
         there, bend = state[(at.xi + before) * lanes + i], state[(at.g + before * drives + leaks) * lanes + i]
         share, q = on * weights[share_at * wide + i * each], state[at.q * lanes + i]
-        without = state[(at.xi + j) * lanes + i]
+        without = state[(at.xi + to) * lanes + i]
         d = c.q0 * (c.q0 + q) - c.kappa * q
         xi = there + d * ((without + share * bend - there) / (d + share * q))
-        state[(x + 2) * lanes + i], state[(at.xi + j) * lanes + i] = without, xi
+        state[(x + 2) * lanes + i], state[(at.xi + to) * lanes + i] = without, xi
         state[x * lanes + i] = abs(xi) * c.scale + c.shift
     polynomial_rows(lanes, c.area, state[x * lanes :], state[(x + 1) * lanes :])
     polynomial_rows(lanes, c.slope, state[x * lanes :], state[(at.q + 1) * lanes :])
     polynomial_rows(lanes, c.bend, state[x * lanes :], state[(x + 4) * lanes :])
     for i in range(lanes):
-        xi, q = state[(at.xi + j) * lanes + i], state[(x + 1) * lanes + i]
+        xi, q = state[(at.xi + to) * lanes + i], state[(x + 1) * lanes + i]
         share, bend = on * weights[share_at * wide + i * each], state[(x + 4) * lanes + i]
         bend = bend if xi >= 0.0 else -bend
         d = c.q0 * (c.q0 + q) - c.kappa * q
@@ -53,20 +55,14 @@ def _drives_at(marks: Any, c: Any, weights: FloatArray, j: int, before: int, sha
         bend -= q * by
         found = xi + d * by
         q += state[(at.q + 1) * lanes + i] * (abs(found) - abs(xi))
-        state[(at.xi + j) * lanes + i] = found
+        state[(at.xi + to) * lanes + i] = found
         state[at.q * lanes + i] = q
-        state[(at.g + j * drives + leaks) * lanes + i] = bend
+        state[(at.g + to * drives + leaks) * lanes + i] = bend
         for t in range(leaks):
             w = state[(at.w + leaks + t) * lanes + i]
             w += (c.bent[t] + on * weights[(share_at + (1 + t) * one) * wide + i * each]) * bend
             state[(at.w + leaks + t) * lanes + i] = w
-            state[(at.g + j * drives + t) * lanes + i] = q * w
-
-
-@jit_within_rows
-def bent_drives_at(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
-    """The same at a later node, where N has its share."""
-    _drives_at(marks, c, weights, j, j - 1, True, state)
+            state[(at.g + to * drives + t) * lanes + i] = q * w
 
 
 @jit_within_rows
@@ -126,7 +122,7 @@ def smooth(marks: Any, c: Any, weights: FloatArray, a: float, state: FloatArray)
             state[(at.gone + k) * lanes + i] = z - soon
             state[(SOURCES + k) * lanes + i] = soon
     project(marks, c, 0, at.xi + last, state)
-    _drives_at(marks, c, weights, last, 0, False, state)
+    bent_drives_at(marks, c, weights, 0, state)
     for i in range(lanes):
         state[at.xi * lanes + i] = state[(at.xi + last) * lanes + i]
         state[(at.q + 2) * lanes + i] = rise_of(c.q0, c.kappa, state[at.q * lanes + i])

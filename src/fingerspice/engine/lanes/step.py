@@ -43,16 +43,17 @@ THIRD, SIXTH = 1.0 / 3.0, 1.0 / 6.0
 
 
 @jit_within_rows
-def drives_under_mobile(marks: Any, c: Any, weights: FloatArray, j: int, before: int, state: FloatArray) -> None:
+def _drives_under_mobile(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
     """Gap voltage and drives at node j, or for 0 at the end, from Y there, and from what multiplies 1/A - q0 there.
 
-    The equation is solved on the tangent of q at node `before`, and once more on the one at the place that is found.
+    The equation is solved on the tangent of q at the node before, and once more on the one at the place that is found.
     """
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     wide, each = (lanes, 1) if len(marks.own) > 0 else (1, 0)
     x, over, flat, one = at.scratch, 1.0 / c.q0, at.flat + (0 if j == 0 else 1), weights_of(marks).one
     # At the end X is known.
     on, until = 1.0 if j > 0 else 0.0, PLACES[len(marks.inner) - 1, j] if j > 0 else 1.0
+    before = j - 1 if j > 0 else len(marks.inner) + 1
     share_at = weights_of(marks).node + (max(j, 1) - 1) * (1 + leaks) * one + one - 1
     for i in range(lanes):
         source = state[i] + until * (state[lanes + i] - state[i])
@@ -84,12 +85,6 @@ def drives_under_mobile(marks: Any, c: Any, weights: FloatArray, j: int, before:
             w += on * weights[(share_at + (1 + t) * one) * wide + i * each] * last
             state[(at.w + leaks + t) * lanes + i] = w
             state[(at.g + j * (leaks + 1) + t) * lanes + i] = q * w
-
-
-@jit_within_rows
-def drives_under_mobile_at(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
-    """The same at a later node."""
-    drives_under_mobile(marks, c, weights, j, j - 1, state)
 
 
 @jit_within_rows
@@ -126,28 +121,25 @@ def _end_under_mobile(marks: Any, c: Any, weights: FloatArray, fades: bool, stat
     lanes, leaks, at = len(marks.lanes), len(marks.leaks), places(marks)
     _add_kinks(marks, c, weights, state)
     project(marks, c, 1, at.xi, state)
-    drives_under_mobile(marks, c, weights, 0, len(marks.inner) + 1, state)
+    _drives_under_mobile(marks, c, weights, 0, state)
     for t in range(leaks):
         for i in range(lanes):
             state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
 
 
-@jit_by_kind(StackMarks=_begin_at_once, MobileMarks=_begin_at_once, NetworkMarks=smooth)
-def _begin(marks: Any, c: Any, weights: FloatArray, a: float, state: FloatArray) -> bool:
-    """Prepare a step that begins at the part `a` of a sample; whether modes fade in it."""
+def _of_kind(*given: Any) -> Any:
+    """Stands for the functions below in Python; compiled code calls one of those named there."""
     raise NotImplementedError
 
 
-@jit_by_kind(StackMarks=_drives_of_stack, MobileMarks=drives_under_mobile_at, NetworkMarks=bent_drives_at)
-def _drives_at(marks: Any, c: Any, weights: FloatArray, j: int, state: FloatArray) -> None:
-    """Drives at a later node from what is predicted there."""
-    raise NotImplementedError
-
-
-@jit_by_kind(StackMarks=_end_of_stack, MobileMarks=_end_under_mobile, NetworkMarks=end_bent)
-def _end(marks: Any, c: Any, weights: FloatArray, fades: bool, state: FloatArray) -> None:
-    """From the modes at the end of a step, xi and the drives there, for the start of the next one."""
-    raise NotImplementedError
+# Prepare a step that begins at the part `a` of a sample: whether modes fade in it.
+_begin = jit_by_kind(StackMarks=_begin_at_once, MobileMarks=_begin_at_once, NetworkMarks=smooth)(_of_kind)
+# Drives at a later node j from what is predicted there.
+_drives_at = jit_by_kind(
+    StackMarks=_drives_of_stack, MobileMarks=_drives_under_mobile, NetworkMarks=bent_drives_at
+)(_of_kind)  # fmt: skip
+# From the modes at the end of a step, xi and the drives there, for the start of the next one.
+_end = jit_by_kind(StackMarks=_end_of_stack, MobileMarks=_end_under_mobile, NetworkMarks=end_bent)(_of_kind)
 
 
 @jit_rows
@@ -224,20 +216,8 @@ def _advance(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None
 
 
 @jit_within_rows
-def _add_kinks(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
-    """Add the response of modes that decay fast to what the cubics miss of the drives' kinks."""
-    count, first = len(marks.lanes) if len(marks.own) > 0 else 1, weights_of(marks).length
-    for k in range(len(marks.modes)):
-        quick = False
-        for i in range(count):
-            quick = quick or c.rates[k] * weights[first * count + i] >= QUICK
-        if quick:
-            _add_kinks_to(marks, c, k, weights, state)
-
-
-@jit_within_rows
 def _add_kinks_to(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatArray) -> None:
-    """The same to mode k.
+    """Add the response of mode k, which decays fast, to what the cubics miss of the drives' kinks.
 
     These begin at th with a straight line and a square, to which the response is known.
     """
@@ -267,6 +247,17 @@ def _add_kinks_to(marks: Any, c: Any, k: int, weights: FloatArray, state: FloatA
                 since = max(PLACES[inner - 1, j] - th, 0.0)
                 more -= weights[(p + j * drives + t) * wide + i * each] * since * (w + rise * since)
             state[(SOURCES + k) * lanes + i] += c.kinks[t] * size * more
+
+
+@jit_within_rows
+def _add_kinks(marks: Any, c: Any, weights: FloatArray, state: FloatArray) -> None:
+    count, first = len(marks.lanes) if len(marks.own) > 0 else 1, weights_of(marks).length
+    for k in range(len(marks.modes)):
+        quick = False
+        for i in range(count):
+            quick = quick or c.rates[k] * weights[first * count + i] >= QUICK
+        if quick:
+            _add_kinks_to(marks, c, k, weights, state)
 
 
 @jit_within_rows

@@ -39,9 +39,40 @@ _EARLY = 1.0
 
 
 @jit_rows
-def _series(n: int, share: float, h: FloatArray, m: FloatArray) -> None:
+def _moments(top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
+    """Integrals of exp(-y (1 - x)) x^j over [0, 1] for y = rate h (n,), into the rows j = 0 to `top` of m.
+
+    Behind them exp(-y) takes the last row of m, if some y is large: by its series at a 64th of y; 0 from 40 on.
+    """
+    n, longest, over = h.size, rate * h.max(), 1.0 / (top + 1)
+    terms, term = 1, 1.0
+    while term > 1e-17 and terms < 24:
+        term *= min(longest, _EARLY) / (top + 1 + terms)
+        terms += 1
+    highest, decay = m[top], m[NODES + 1]
     for i in range(n):
-        m[i] = 1.0 - share * h[i] * m[i]
+        highest[i] = 1.0
+    for j in range(terms, 0, -1):
+        share = rate / (top + 1 + j)
+        for i in range(n):
+            highest[i] = 1.0 - share * h[i] * highest[i]
+    for i in range(n):
+        highest[i] *= over
+    for j in range(top, 0, -1):
+        _below(n, rate, j, h, m[j], m[j - 1])
+    if longest > _EARLY:
+        for i in range(n):
+            decay[i] = 1.0
+        for j in range(16, 0, -1):
+            share = rate / (64.0 * j)
+            for i in range(n):
+                decay[i] = 1.0 - min(share * h[i], 0.625 / j) * decay[i]
+        for _ in range(6):
+            for i in range(n):
+                decay[i] *= decay[i]
+        _late(n, 1, rate, h, decay, m[0])
+        for j in range(1, top + 1):
+            _late(n, j, rate, h, m[j - 1], m[j])
 
 
 @jit_rows
@@ -52,47 +83,10 @@ def _below(n: int, rate: float, j: int, h: FloatArray, m: FloatArray, lower: Flo
 
 
 @jit_rows
-def _decays(n: int, rate: float, h: FloatArray, out: FloatArray) -> None:
-    """exp(-rate h), by its series at a 64th of the exponent; 0 from an exponent of 40 on."""
-    for i in range(n):
-        out[i] = 1.0
-    for j in range(16, 0, -1):
-        share = rate / (64.0 * j)
-        for i in range(n):
-            out[i] = 1.0 - min(share * h[i], 0.625 / j) * out[i]
-    for _ in range(6):
-        for i in range(n):
-            out[i] *= out[i]
-
-
-@jit_rows
 def _late(n: int, j: int, rate: float, h: FloatArray, lower: FloatArray, m: FloatArray) -> None:
     for i in range(n):
         y = rate * h[i]
         m[i] = (1.0 - j * lower[i]) / y if y > _EARLY else m[i]
-
-
-@jit
-def _moments(top: int, rate: float, h: FloatArray, m: FloatArray) -> None:
-    """Integrals of exp(-y (1 - x)) x^j over [0, 1] for y = rate h (n,), into the rows j = 0 to `top` of m."""
-    n, longest = h.size, rate * h.max()
-    terms, term = 1, 1.0
-    while term > 1e-17 and terms < 24:
-        term *= min(longest, _EARLY) / (top + 1 + terms)
-        terms += 1
-    highest = m[top]
-    highest[:] = 1.0
-    for j in range(terms, 0, -1):
-        _series(n, rate / (top + 1 + j), h, highest)
-    highest *= 1.0 / (top + 1)
-    for j in range(top, 0, -1):
-        _below(n, rate, j, h, m[j], m[j - 1])
-    if longest > _EARLY:
-        decay = m[NODES + 1]
-        _decays(n, rate, h, decay)
-        _late(n, 1, rate, h, decay, m[0])
-        for j in range(1, top + 1):
-            _late(n, j, rate, h, m[j - 1], m[j])
 
 
 @jit_rows
@@ -155,24 +149,14 @@ def _gather(
                 weights[p, row, i] += share * found[3 + j + node, i]
 
 
-@jit_rows
-def _feed(c: Any, k: int, found: FloatArray, own: FloatArray) -> None:
-    """Weights of each drive at each node in mode k, from those of the nodes."""
-    drives = c.feed.shape[1]
-    for j in range(found.shape[0]):
-        for t in range(drives):
-            for i in range(found.shape[1]):
-                own[j * drives + t, i] = c.feed[k, t] * found[j, i]
-
-
 @jit
 def weigh(c: Any, active: int, inner: int, h: FloatArray, weights: FloatArray) -> None:
     """Weights of steps of the lengths h (n,), into the rows (n,) of `weights` (`engine.lanes.rows.Weighed`)."""
     rates, n, m, count, leaks = c.rates, h.size, np.zeros((NODES + 2, h.size)), c.rates.size, c.tap_s.size
     drives, found = c.feed.shape[1], np.empty((3 + 2 * NODES, h.size))
     bent, nodes, places = drives - leaks, inner + 2, PLACES[inner - 1]
-    mode, length, first, one, _ = _weighed(count, active, inner, leaks, bent)
-    at_nodes = weights[first:].reshape((nodes - 1, 1 + leaks, one, n))
+    rows = _weighed(count, active, inner, leaks, bent)
+    at_nodes = weights[rows.node :].reshape((nodes - 1, 1 + leaks, rows.one, n))
     at_nodes[:] = 0.0
     for j in range(1, nodes):
         at = places[j]
@@ -181,7 +165,7 @@ def weigh(c: Any, active: int, inner: int, h: FloatArray, weights: FloatArray) -
             at_nodes[j - 1, p, 0] = by * (1.0 - at)
             at_nodes[j - 1, p, 1] = by * at
     for k in range(count):
-        own = weights[k * mode :]
+        own = weights[k * rows.mode :]
         for j in range(1, nodes):
             at = places[j]
             _moments(NODES if bent > 0 else j, rates[k] * at, h, m)
@@ -195,12 +179,14 @@ def weigh(c: Any, active: int, inner: int, h: FloatArray, weights: FloatArray) -
         _late_times(n, inner, rates[k], FADED if c.kappa > 0.0 else QUICK, h, own)
         copy_to(own[nodes + 1 : nodes + 3], found[1:3])
         _drive(n, BASIS[inner - 1][:nodes], h, m, found)
-        _feed(c, k, found[:nodes], own[nodes + 3 :])
+        for j in range(nodes * drives):
+            for i in range(n):
+                own[nodes + 3 + j, i] = c.feed[k, j % drives] * found[j // drives, i]
         if bent > 0:
             _drive(n, _QUARTIC, h, m[1:], found)
             for i in range(n):
-                own[mode - 1, i] = c.feed[k, leaks] * found[0, i]
-    copy_to(weights[length], h)
+                own[rows.mode - 1, i] = c.feed[k, leaks] * found[0, i]
+    copy_to(weights[rows.length], h)
 
 
 @jit_rows

@@ -1,20 +1,23 @@
-"""A block of a recording in lanes: its pieces followed from starts that are corrected, and windows of them checked.
+"""A block of a recording in lanes: its pieces followed from starts that are corrected, and windows of them judged.
 
 All pieces are followed at once (`engine.lanes.loops`). Their starts are first those of the circuit with its area held;
 after each sweep they are corrected by what the modes decay by in a piece, until xi no longer changes.
+
+A window of each piece, where the source moves most, is followed by steps half as long. The difference is the error of
+the window; a piece adds as much more as it is longer, and hands it on to the pieces after it, as the modes decay: once
+as if all errors were alike, and once as if they came by chance.
 """
 
 from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.engine.lanes.loops import begin, show, span, within
+from fingerspice.engine.lanes.loops import MORE, lead, show, span
 from fingerspice.engine.lanes.rows import rows_of
 from fingerspice.engine.lanes.weights import along
 from fingerspice.solve.recordings.form import PIECES, LaneForm
@@ -25,26 +28,33 @@ WINDOW, FEWEST = 1.0 / 16.0, 32
 BETWEEN = 4
 # The rate that stands for 0, 1/s.
 _STILL = 1e-9
+# Least distance to the fold that is followed.
+LEAST_MARGIN = 0.2
+# Stated over seen errors of the force, as seen in recordings of tests/recording_errors.py.
+OF_FORCE = 1.75
+# Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
+LUCK = 2.0
+# Arrays of the present thread, which its next block overwrites: memory that is new to a process costs time.
+_OF_THREAD = threading.local()
 
 
-class _OfThread(threading.local):
-    """Arrays of the present thread, which its next block overwrites: memory that is new to a process costs time."""
-
-    def __init__(self) -> None:
-        self.arrays: dict[str, FloatArray] = {}
-
-    def get(self, name: str, *shape: int) -> FloatArray:
-        size = math.prod(shape)
-        if name not in self.arrays or self.arrays[name].size < size:
-            self.arrays[name] = np.empty(size)
-        return self.arrays[name][:size].reshape(shape)
+def _scratch(name: str, *shape: int) -> FloatArray:
+    size, kept = math.prod(shape), vars(_OF_THREAD)
+    if name not in kept or kept[name].size < size:
+        kept[name] = np.empty(size)
+    return np.asarray(kept[name][:size].reshape(shape))
 
 
-_SCRATCH = _OfThread()
+class Judged(NamedTuple):
+    """Errors that are seen of a block, without safety."""
+
+    errors: FloatArray  # (4,): Of gap voltage (V), force (N), nodes (V) and charges (C)
+    alone: float  # Error of xi (V) that a single piece makes
+    alike: FloatArray  # (m,): Errors of the modes that the block hands on, as if they were alike
+    chance: FloatArray  # (m, m): Products of two, as if they came by chance
 
 
-@dataclass(frozen=True)
-class Window:
+class _Window(NamedTuple):
     """What steps half as long change in a window of every piece."""
 
     # z, off (rows, pieces, width + 1): States of the steps that are checked, and the differences; 0 in pieces that are
@@ -54,101 +64,77 @@ class Window:
     # source, xi (pieces, width + 1): V
     source: FloatArray
     xi: FloatArray
-    share: FloatArray  # (m, pieces): What a piece adds over what its window does, if all errors are alike
-    of_products: FloatArray  # (m, m, pieces): The same of products of two errors, if they come by chance
+    took: FloatArray  # (pieces,): Durations, s
 
 
 class Block:
     """A row of samples, at once in as many pieces as the form goes in.
 
-    Parameters
-    ----------
-    form : LaneForm
-    x : ndarray, shape (n + 1,)
-        The source at the samples, V.
-    h : ndarray, shape (n,) or (1,)
-        Distances of the samples, or their common distance, s.
-    starts_run : bool
-        Whether the run starts here, perhaps with a jump: the first piece is then checked at its start.
+    The source at the samples is x (V; n + 1,), their distances h (n,), or their common distance (1,), s. If the run
+    starts here, perhaps with a jump, the first piece is checked at its start.
     """
 
     def __init__(self, form: LaneForm, x: FloatArray, h: FloatArray, starts_run: bool) -> None:
-        self.form, self.n, self.own, self.pieces = form, x.size - 1, h.size > 1, PIECES
-        self.count = -(-self.n // self.pieces)
-        beyond = self.count * self.pieces - self.n
+        self.form, self.n, self.own, self.starts_run = form, x.size - 1, h.size > 1, starts_run
+        self.count = -(-self.n // PIECES)
         # The source stays at its last value behind the end.
-        self.x = _SCRATCH.get("x", x.size + beyond)
+        self.x = _scratch("x", self.count * PIECES + 1)
         self.x[: x.size], self.x[x.size :] = x, x[-1]
-        self.h = np.concatenate([h, np.zeros(beyond)]) if self.own and beyond else h
-        self.first = self.count * np.arange(self.pieces)
-        self.starts_run, self.marks, self.active = starts_run, form.marks(self.own), form.active
+        self.h = np.append(h, np.zeros(self.x.size - x.size)) if self.own else h
+        self.first = self.count * np.arange(PIECES)
+        self.marks, self.active = form.marks(self.own), form.active
         self.rates = np.maximum(form.lanes.rates, _STILL)
-        self.room, self.scratch = form.room(self.own)
-        self.still = form.weights(np.zeros(self.pieces if self.own else 1))
+        self.room, self.weights = form.room(self.own)
         self.m = self.rates.size
         # States at the samples: the modes, and under `mobile` the gap voltage.
-        self.kept = _SCRATCH.get("kept", self.m + int(form.mobile), self.pieces, self.count + 1)
-        self.left = np.zeros(self.rates.size)
-
-    @cached_property
-    def lengths(self) -> FloatArray:
-        """Durations of the pieces, s."""
-        if not self.own:
-            return np.full(self.pieces, self.count * self.h[0])
-        return np.asarray(self.h.reshape(self.pieces, self.count).sum(axis=1))
-
-    @cached_property
-    def handed(self) -> FloatArray:
-        """What is left at the start of each piece of the modes at the start of the block and the ends of the pieces.
-
-        Shape (m, pieces, 1 + pieces).
-        """
+        self.kept = _scratch("kept", self.m + int(form.mobile), PIECES, self.count + 1)
+        self.left = np.zeros(self.m)
+        # Durations of the pieces, s.
+        self.lengths = np.full(PIECES, self.count * self.h[0])
+        if self.own:
+            self.lengths = self.h.reshape(PIECES, self.count).sum(axis=1)
+        # (m, pieces, 1 + pieces): What is left at the start of each piece of the modes at the start of the block and
+        # the ends of the pieces.
         ends = np.concatenate([[0.0], np.cumsum(self.lengths)])
-        since = ends[: self.pieces, None] - ends[None, :]
+        since = ends[:PIECES, None] - ends[None, :]
         left = np.exp(-self.rates[:, None, None] * np.maximum(since, 0.0))
-        return np.asarray(np.where(np.tri(self.pieces, 1 + self.pieces, dtype=bool), left, 0.0))
-
-    def _weights(self, parts: int) -> FloatArray:
-        return self.scratch if self.own else self.form.weights(self.h / parts)
+        self.handed = np.where(np.tri(PIECES, 1 + PIECES, dtype=bool), left, 0.0)
 
     def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
+        """`engine.lanes.loops.span` from the modes in `kept` at the samples `first`."""
+        if not self.own:
+            self.form.weigh(self.h / parts, self.weights[1])
         return bool(span(
-            self.marks, self.form.lanes, self._weights(parts), self.h, self.x, first, count, parts, tol, self.room,
-            kept, self.left,
+            self.marks, self.form.lanes, self.weights, self.h, self.x, first, count, parts, tol, self.room, kept,
+            self.left,
         ))  # fmt: skip
-
-    def _begin(self, starts: FloatArray, first: IntArray, kept: FloatArray) -> None:
-        begin(self.marks, self.form.lanes, self.still, np.ascontiguousarray(starts), self.x[first], self.room)
-        kept[: self.m, :, 0], kept[self.m :, :, 0] = starts, self._row(rows_of(self.marks).xi)
-
-    def _row(self, number: int) -> FloatArray:
-        return self.room[number * self.pieces :][: self.pieces]
 
     @property
     def on_one_branch(self) -> bool:
-        """Whether the gap voltage at the end of a piece is that at the start of the next one, but for a percent."""
+        """Whether the gap voltage stays clear of folds, and is the same in the next piece, but for a percent."""
         off = self.kept[self.m :, :-1, -1] - self.kept[self.m :, 1:, 0]
-        return bool(np.all(np.abs(off) <= 0.01 * np.abs(self.kept[self.m :]).max(initial=0.0)))
+        near = np.all(np.abs(off) <= 0.01 * np.abs(self.kept[self.m :]).max(initial=0.0))
+        return bool(near) and self.margin > LEAST_MARGIN
 
     def solve(self, start: FloatArray, parts: int, tol: float) -> bool:
         """Follow all pieces from `start` (m,), until xi is known to `tol` (V); False where it is not.
 
-        The states at the samples go into `kept`.
+        The states at the samples go into `kept`, xi (V; n + 1,) into `xi`, its largest sizes in each piece and at the
+        next sample into `peaks`.
         """
         form, active, self.sweeps = self.form, self.active, 0
         # Least distances to the fold; the last sweep may stop before the end of the pieces.
-        margins = [1.0]
-        self.__dict__.pop("xi", None)
-        self.__dict__.pop("peaks", None)
-        own = np.zeros((self.m, self.pieces))
+        margins, folds = [1.0], rows_of(self.marks).fold * PIECES
+        own = np.zeros((self.m, PIECES))
         along(form.lanes, self.h, self.x, self.first, self.count, own)
         starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[: self.m, None], own], axis=1))
         starts[active:] = 0.0
-        for sweep in range(self.pieces + 1):
-            self._begin(starts, self.first, self.kept)
+        for sweep in range(PIECES + 1):
+            self.kept[: self.m, :, 0] = starts
             stops = self._span(self.first, self.count, parts, WINDOW * tol if sweep else -1.0, self.kept)
             self.sweeps += 1
-            margins.append(1.0 - float(self._row(rows_of(self.marks).fold).max()) if form.mobile else 1.0)
+            fold = self.room[folds:][:PIECES] if form.mobile else np.zeros(1)
+            margins.append(1.0 - float(fold.max()))
             self.margin = min(margins[-2:])
             if stops:
                 break
@@ -167,73 +153,145 @@ class Block:
         for k in range(active, self.m):
             # Passive modes have begun at 0 in every piece.
             self.kept[k] += np.cumsum(np.append(start[k], self.kept[k, :-1, -1]))[:, None]
+        self.xi, self.sizes = _scratch("xi", self.n + 1), _scratch("sizes", PIECES, self.count)
+        show(form.xi[None], self.x, self.first, self.count, 0, self.n + 1, self.kept, self.xi[None])
+        np.abs(self.xi[:-1], out=self.sizes.reshape(-1)[: self.n])
+        self.sizes.reshape(-1)[self.n :] = 0.0
+        largest = self.sizes.max(axis=1)
+        self.peaks = np.maximum(largest, np.append(largest[1:], abs(self.xi[-1])))
         return True
-
-    @cached_property
-    def xi(self) -> FloatArray:
-        """xi (V) at the samples, shape (n + 1,), after `solve`."""
-        (k, columns), out = self.form.xi, _SCRATCH.get("xi", self.n + 1)
-        show(k, columns, self.x, self.first, self.count, self.n + 1, self.kept, out)
-        return out
-
-    @property
-    def _by_piece(self) -> FloatArray:
-        """|xi| (V) at the samples of each piece, shape (pieces, count)."""
-        out = _SCRATCH.get("sizes", self.pieces, self.count)
-        np.abs(self.xi[:-1], out=out.reshape(-1)[: self.n])
-        out.reshape(-1)[self.n :] = 0.0
-        return out
-
-    @cached_property
-    def peaks(self) -> FloatArray:
-        """Largest |xi| (V) at the samples of each piece, and at the next one."""
-        own = self._by_piece.max(axis=1)
-        return np.asarray(np.maximum(own, np.append(own[1:], abs(self.xi[-1]))))
 
     def end(self) -> FloatArray:
         """The state at the last sample."""
         lane = (self.n - 1) // self.count
         return np.array(self.kept[:, lane, self.n - lane * self.count])
 
-    def check(self, parts: int) -> Window:
+    def judge(self, parts: int, peak: float, alike: FloatArray, chance: FloatArray) -> Judged:
+        """Errors of the block that has been followed in `parts` steps a sample.
+
+        The largest |xi| so far is `peak` (V); `alike` (m,) and `chance` (m, m) are those at the start, as in `Judged`.
+        """
+        form, c, window, active, m = self.form, self.form.lanes, self._check(parts), self.active, self.m
+        y, of_window = (self.rates[:, None] * took for took in (self.lengths, np.maximum(window.took, 1e-30)))
+        # What a piece adds over what its window does, if all errors are alike, and of products of two, if they come by
+        # chance.
+        share, of_products = (
+            np.expm1(-a) / np.expm1(-b) for a, b in ((y, of_window), (y[:, None] + y, of_window[:, None] + of_window))
+        )
+        if not form.bent:
+            # Nothing of passive modes decays: other windows add less than the one where the source moves most.
+            share[active:], of_products[active:, active:] = self.busy
+        own = window.off[:m, :, -1]
+        products = own[:, None] * own
+        handed, alike = self._hand_on(own * share, alike)
+        lucky, chance = self._hand_on(products * of_products, chance)
+
+        def added(columns: FloatArray, left: FloatArray) -> FloatArray:
+            """Of sums of the modes (C, m): by chance, or by errors that are alike where chance does not explain them.
+
+            `left` (m, pieces) is left of each mode of what a piece starts with, to which its own part is added.
+            """
+            there = lucky * left[:, None] * left + products * (of_products - 1.0)
+            by_chance = np.sqrt(np.maximum(np.einsum("ck,cl,kli->ci", columns, columns, there), 0.0))
+            there = np.abs(columns @ (handed * left + own * (share - 1.0)))
+            swept = np.abs(columns[:, :active]) * (self.left[:active] / OF_FORCE)
+            return np.asarray(np.maximum(by_chance, there - LUCK * by_chance) + swept @ left[:active])
+
+        over = added(np.vstack([c.shape, form.judged.columns]), np.ones(own.shape))
+        # An error that a fast mode brings into a piece changes the force as much as xi at the first sample allows.
+        decay = np.exp(-self.rates[:, None] * (self.h[self.first] if self.own else self.h))
+        later = added(c.shape[None], decay * np.ones(own.shape))[0]
+        alone = np.abs(np.einsum("k,kij->ij", c.shape, window.off[:m])).max()
+        alone += np.abs(c.shape @ (own * (share - 1.0))).max()
+        return Judged(self._errors(window, over, later, 1e-9 * peak + 1e-300), float(alone), alike, chance)
+
+    def _hand_on(self, added: FloatArray, before: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Errors at the start of each piece (*kinds, pieces), and at the end of the block.
+
+        Pieces add `added` (*kinds, pieces), and `before` (*kinds,) is there at the start. Of one error for each mode,
+        or of the products of two.
+        """
+        handed, lane = self.handed, (self.n - 1) // self.count
+        left = np.exp(-self.rates * self.lengths[lane])
+        if before.ndim == 2:
+            handed, left = handed[:, None] * handed, left[:, None] * left
+        at_starts = np.einsum("...ij,...j->...i", handed, np.concatenate([before[..., None], added], axis=-1))
+        return at_starts, left * at_starts[..., lane] + added[..., lane]
+
+    def _errors(self, window: _Window, over: FloatArray, later: FloatArray, least: float) -> FloatArray:
+        """Errors as in `Judged` from those of xi and of what `LaneForm.judged` shows, and of xi after the first sample.
+
+        Shape (1 + C, pieces) and (pieces,); `least` is the least |xi| (V) at which slopes are taken.
+        """
+        form, c, shown, (over, *others) = self.form, self.form.lanes, self.form.judged, over
+        top = np.maximum(self.peaks, least)
+        first = np.maximum(np.abs(self.xi[np.minimum(self.first, self.n)]) + over, least)
+        rises, rises_at_first = ((form.force(1.001 * xi) - form.force(xi)) / (1e-3 * xi) for xi in (top, first))
+        # What an error of xi changes at most, between 0 V and the peak: gap voltages, what `Shown.bends` multiplies
+        # (m^2), and 1/A (1/m^2/V).
+        between = np.stack([np.zeros(PIECES), top])
+        inverse = form.inverse_area(between)
+        if form.mobile:
+            u = inverse.max(axis=0) / c.q0 / self.margin
+            of_inverse = np.abs(form.slope(between)) * u
+            moved = (float(np.abs(self.x).max()) * of_inverse / inverse**2).max(axis=0)
+            of_inverse, rises, rises_at_first = of_inverse.max(axis=0), rises * u, rises_at_first * u
+        else:
+            e, of_inverse = 1.0 / inverse - 1.0 / c.q0, np.zeros(PIECES)
+            u, moved = (np.abs(x / (1.0 + c.kappa * e)).max(axis=0) for x in (1.0, e))
+        xi = window.xi + np.einsum("k,kij->ij", form.xi[1:], window.off)
+        of_force = np.maximum(rises_at_first * over, rises * later)
+        errors = [
+            (np.abs(of(xi) - of(window.xi)).max(axis=1) + more).max()
+            for of, more in ((form.gap, u * over), (form.force, of_force))
+        ]
+        found = np.einsum("ck,kij->cij", shown.columns, window.off[: self.m])
+        more = np.reshape(others, (-1, PIECES))
+        if shown.by_area.any():
+            whole = np.einsum("ck,kij->cij", shown.columns, window.z[: self.m])
+            other = form.inverse_area(xi)
+            changed = other * found + (other - form.inverse_area(window.xi)) * whole
+            found = np.where(shown.by_area[:, None, None], changed, found)
+            largest = np.abs(whole).max(axis=-1)
+            more = np.where(shown.by_area[:, None], more * u * c.q0 + largest * of_inverse * over, more)
+        if shown.bends.any():
+            found += shown.bends[:, None, None] * (form.moved(xi, window.source) - form.moved(window.xi, window.source))
+        found = np.abs(found).max(axis=-1, initial=0.0) + (more + np.abs(shown.bends)[:, None] * moved * over)
+        nodes = shown.k.size - form.flows
+        return np.array([*errors, found[:nodes].max(initial=0.0), found[nodes:].max(initial=0.0)])
+
+    def _check(self, parts: int) -> _Window:
         """Follow a window of every piece by twice as many steps."""
         width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + self.form.bent))))
-        lanes = np.arange(self.pieces)
+        lanes, inside = np.arange(PIECES), np.arange(width + 1)
         off, z, at = np.empty(0), np.empty(0), lanes
         for number, place in enumerate(self._windows(width)):
             first = np.maximum(place, 0)
-            coarse = self.kept[:, lanes[:, None], first[:, None] + np.arange(width + 1)]
+            coarse = self.kept[:, lanes[:, None], first[:, None] + inside]
             fine = np.empty(coarse.shape)
-            self._begin(coarse[: self.m, :, 0], self.first + first, fine)
+            fine[..., 0] = coarse[..., 0]
             self._span(self.first + first, width, 2 * parts, -1.0, fine)
             found = fine - coarse
             found[:, place < 0] = 0.0
             if number == 0:
                 off, z, at = found, coarse, first
                 continue
-            worse = self._in_xi(found) > self._in_xi(off)
+            in_xi, before = (np.abs(np.einsum("k,kij->ij", self.form.xi[1:], x)).max(axis=1) for x in (found, off))
+            worse = in_xi > before
             off[:, worse], z[:, worse], at[worse] = found[:, worse], coarse[:, worse], first[worse]
-        index = np.minimum((self.first + at)[:, None] + np.arange(width + 1), self.n)
-        took = np.full(self.pieces, width * self.h[0])
-        if self.own:
-            took = self.h[(self.first + at)[:, None] + np.arange(width)].sum(axis=1)
-        y, window = self.rates[:, None] * self.lengths, self.rates[:, None] * np.maximum(took, 1e-30)
-        share, of_products = (
-            np.expm1(-a) / np.expm1(-b) for a, b in ((y, window), (y[:, None] + y, window[:, None] + window))
-        )
-        if not self.form.bent:
-            # Nothing of passive modes decays: other windows add less than the one where the source moves most.
-            share[self.active :], of_products[self.active :, self.active :] = self.busy
-        return Window(z, off, self.x[index], self.xi[index], share, of_products)
+        index = (self.first + at)[:, None] + inside
+        took = self.h[index[:, :-1]].sum(axis=1) if self.own else np.full(PIECES, width * self.h[0])
+        index = np.minimum(index, self.n)
+        return _Window(z, off, self.x[index], self.xi[index], took)
 
     def _windows(self, width: int) -> list[IntArray]:
         """Where windows begin in each piece, -1 for none: where the source moves most, and at the start of a run.
 
         With N as a drive, errors are large where |xi| is, too.
         """
-        moves, whole = _SCRATCH.get("moves", self.pieces * self.count), self.count - self.count % width
+        moves, whole = _scratch("moves", PIECES * self.count), self.count - self.count % width
         np.abs(np.subtract(self.x[1:], self.x[:-1], out=moves), out=moves)
-        most = moves.reshape(self.pieces, self.count)[:, :whole].reshape(self.pieces, -1, width).max(axis=-1)
+        most = moves.reshape(PIECES, self.count)[:, :whole].reshape(PIECES, -1, width).max(axis=-1)
         # Windows end before the last sample.
         most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
         place = np.where(most.max(axis=1) >= 0.0, width * np.argmax(most, axis=1), -1)
@@ -244,27 +302,9 @@ class Block:
             place[0] = 0
         if not self.form.bent:
             return [place]
-        largest = np.minimum(
-            np.argmax(self._by_piece, axis=1) - width // 2, np.minimum(self.count, self.n - self.first) - width
-        )
+        ends = np.minimum(self.count, self.n - self.first) - width
+        largest = np.minimum(np.argmax(self.sizes, axis=1) - width // 2, ends)
         return [place, np.where(place >= 0, np.maximum(largest, 0), -1)]
-
-    def _in_xi(self, off: FloatArray) -> FloatArray:
-        """Largest changes of xi (V) in each lane by changes of the modes (m, pieces, width + 1)."""
-        return np.asarray(np.abs(np.einsum("k,kij->ij", self.form.xi[1], off)).max(axis=1))
-
-    def hand_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
-        """Errors at the start of each piece, and at the end of the block, shape (*kinds, pieces + 1).
-
-        Pieces add `added` (*kinds, pieces), and `before` (*kinds,) is there at the start. Of one error for each mode,
-        or of the products of two.
-        """
-        handed, lane = self.handed, (self.n - 1) // self.count
-        left = np.exp(-self.rates * self.lengths[lane])
-        if before.ndim == 2:
-            handed, left = handed[:, None] * handed, left[:, None] * left
-        at_starts = np.einsum("...ij,...j->...i", handed, np.concatenate([before[..., None], added], axis=-1))
-        return np.append(at_starts, (left * at_starts[..., lane] + added[..., lane])[..., None], axis=-1)
 
     def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
         """Source (V; n,) and states (rows, n) `since` (s) after samples with these numbers, in `parts` steps."""
@@ -273,8 +313,8 @@ class Block:
         x = self.x[number]
         if not since.any():
             return x, z
-        to, out, form = x + (self.x[number + 1] - x) * (since / length), np.empty_like(z), self.form
-        parts *= BETWEEN if self.form.bent else 1
-        still, (room, _) = form.weights(np.zeros(self.pieces)), form.room(True)
-        within(form.marks(True), form.lanes, still, z, x, to, since, parts, room, out)
-        return to, out
+        to, form, (room, weights) = x + (self.x[number + 1] - x) * (since / length), self.form, self.form.room(True)
+        parts *= BETWEEN if form.bent else 1
+        still, out = np.zeros((1, self.m + 2)), np.empty((1, self.m + MORE, x.size))
+        lead(form.marks(True), form.lanes, weights, z[: self.m], x, to, since, parts, still, room, out)
+        return to, out[0, : len(z)]

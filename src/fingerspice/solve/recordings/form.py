@@ -6,8 +6,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import NamedTuple, cast
+from functools import cached_property
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.polynomial import chebyshev as series_of
@@ -22,7 +22,6 @@ from fingerspice.engine.lanes.rows import (
     MobileMarks,
     NetworkMarks,
     StackMarks,
-    Weighed,
     rows_of,
     weighed,
 )
@@ -92,40 +91,38 @@ class LaneForm(ABC):
 
     @abstractmethod
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        """Rows of a record from `out` (`width`, n), which begins with those of `rows` and of the charges' rates."""
+        """Rows of a record from `out` (., n), the values of `rows` and the charges' rates."""
 
-    def width(self, problem: Problem) -> int:
-        """Number of rows of the outputs."""
-        return self.rows.k.size + self.flows
+    @cached_property
+    def judged(self) -> Shown:
+        """What has an error of its own beside gap voltage and force: voltages of the nodes, and the charges."""
+        charges = self.rows.k.size - self.flows
+        return Shown(*(np.concatenate([a, b[charges:]]) for a, b in zip(self.nodes, self.rows, strict=True)))
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
         leaks, kind = self.lanes.tap_s.size, MobileMarks if self.mobile else NetworkMarks if self.bent else StackMarks
-        more = self.lanes.feed.shape[1] - leaks, int(self.mobile), PIECES, int(own)
-        return _marks(kind, self.lanes.rates.size, self.active, self.inner, leaks, *more)
+        sizes = self.lanes.rates.size, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks
+        return kind(*((0,) * size for size in (*sizes, int(self.mobile), PIECES, int(own))))
 
     @property
     def bent(self) -> bool:
         """Whether N is a drive, as in a network."""
         return not self.mobile and self.lanes.feed.shape[1] > self.lanes.tap_s.size
 
-    @property
-    def weighed(self) -> Weighed:
-        """Rows of the weights."""
-        modes, leaks = self.lanes.rates.size, self.lanes.tap_s.size
-        return weighed(modes, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks)
-
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
-        """Arrays for the state of the lanes and for weights, which each lane has its `own` of, or all share."""
-        state, weights = aligned([(rows_of(self.marks(own)).end * PIECES,), (self.weighed.end, PIECES if own else 1)])
-        state[:], weights[:] = 0.0, 0.0
+        """Arrays for the state of the lanes, and for weights of steps (2, rows, 1 or lanes), each lane's `own` or not.
+
+        Those of steps of length 0 are there, for the others see `weigh`.
+        """
+        marks, wide = self.marks(own), PIECES if own else 1
+        state, weights = aligned([(rows_of(marks).end * PIECES,), (2, weighed(*map(len, marks[:5])).end, wide)])
+        self.weigh(np.zeros(wide), weights[0])
         return state, weights
 
-    def weights(self, h: FloatArray) -> FloatArray:
-        """Weights of steps of the lengths h (s), shape (n,): all steps of one length share those of (1,)."""
-        out = np.empty((self.weighed.end, h.size))
+    def weigh(self, h: FloatArray, out: FloatArray) -> None:
+        """Weights of steps of the lengths h (s), shape (n,), into `out` (rows, n)."""
         weigh(self.lanes, self.active, self.inner, h, out)
-        return out
 
     def _polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
         c, flat, out = self.lanes, np.ravel(xi), np.empty(np.size(xi))
@@ -143,7 +140,7 @@ class LaneForm(ABC):
     def bend(self, xi: FloatArray) -> FloatArray:
         """N, V m^2."""
         found = self._polynomial(self.lanes.bend, xi)
-        return np.where(xi >= 0.0, found, -found)
+        return np.negative(found, out=found, where=xi < 0.0)
 
     def gap(self, xi: FloatArray) -> FloatArray:
         """Gap voltages, V."""
@@ -158,25 +155,24 @@ class LaneForm(ABC):
         """What `Shown.bends` multiplies: N, or A s (V m^2)."""
         return np.asarray(source / self.inverse_area(xi)) if self.mobile else self.bend(xi)
 
-    @property
-    def xi(self) -> tuple[float, FloatArray]:
-        """xi as k s + columns z; under `mobile` the gap voltage, which stands behind the modes."""
+    @cached_property
+    def xi(self) -> FloatArray:
+        """xi by the source and the modes; under `mobile` the gap voltage, which stands behind the modes."""
         c = self.lanes
-        return (0.0, np.append(0.0 * c.shape, 1.0)) if self.mobile else (c.k, c.shape)
+        return np.append(0.0 * c.shape, [0.0, 1.0]) if self.mobile else np.append(c.k, c.shape)
+
+    @cached_property
+    def shown(self) -> FloatArray:
+        """What is recorded, by the source and the modes (C, 1 + m), but for what depends on the area."""
+        return np.column_stack([np.where(self.rows.by_area, 0.0, self.rows.k), self.rows.columns])
 
     def xi_at(self, z: FloatArray, source: float) -> float:
         """xi (V) at modes as in `start`."""
-        k, columns = self.xi
-        return float(k * source + columns @ z)
+        return float(self.xi[0] * source + self.xi[1:] @ z)
 
     def after(self, z: FloatArray, to: float) -> float:
         """Gap voltage (V) after a jump of the source to `to`; NaN where it meets a fold."""
         return float(self.gap(np.array(self.xi_at(z, to))))
-
-
-@lru_cache(maxsize=64)
-def _marks(kind: type[Marks], *sizes: int) -> Marks:
-    return kind(*((0,) * size for size in sizes))
 
 
 def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
@@ -192,23 +188,11 @@ def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
     return np.empty(0), 0.0
 
 
-class Curves(NamedTuple):
-    """1/A - q0, its derivative and N as polynomials of xi (`engine.lanes.rows.Lanes`)."""
-
-    area: FloatArray
-    slope: FloatArray
-    bend: FloatArray
-    scale: float
-    # missed, missed_bend: See `LaneForm`
-    missed: float
-    missed_bend: float
-    # rest, steep: See `engine.lanes.rows.Lanes`
-    rest: float
-    steep: float
-
-
-def curves(curve: FloatArray, q0: float, kappa: float, top: float, rtol: float) -> Curves | None:
-    """Polynomials up to the gap voltage `top` (V); None where no allowed degree is enough for errors of `rtol`."""
+def curves(
+    curve: FloatArray, q0: float, kappa: float, top: float, rtol: float
+) -> tuple[dict[str, Any], float, float] | None:
+    """The polynomials of `Lanes` and what goes with them, up to the gap voltage `top` (V), and `LaneForm.missed` and
+    `missed_bend`; None where no allowed degree is enough for errors of `rtol`."""
     tol = _AREA_SHARE * min(rtol, _COARSEST)
     at = np.cos(np.pi * (np.arange(_POINTS) + 0.5) / _POINTS)
     to_series = np.linalg.inv(_chebyshev(at, _POINTS))
@@ -236,8 +220,11 @@ def curves(curve: FloatArray, q0: float, kappa: float, top: float, rtol: float) 
     other[0] -= polyval(-1.0, other)
     scale = 2.0 / xi_top
     slope = np.append(scale * polyder(one), 0.0)
-    rest, steep = float(polyval(-1.0, one)), float(polyval(-1.0, slope))
-    return Curves(one, slope, other, scale, off_one / abs(float(inverse[0])), off_other, rest, steep)
+    found = {
+        "area": one, "slope": slope, "bend": other, "scale": scale, "shift": -1.0, "q0": q0, "kappa": kappa,
+        "rest": float(polyval(-1.0, one)), "steep": float(polyval(-1.0, slope)),
+    }  # fmt: skip
+    return found, off_one / abs(float(inverse[0])), off_other
 
 
 def _chebyshev(x: FloatArray, count: int) -> FloatArray:
@@ -299,18 +286,18 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
     peak = rounded_peak(scene.u_peak)
     system = system_of(scene, decade, BEYOND_PEAK * peak, _ONE_REFERENCE, peak)
     model, q0, stack = system.model, float(system.q0[0]), scene.stack
-    curve = curves(model.curve, q0, 0.0, system.u_top, rtol)
+    found = curves(model.curve, q0, 0.0, system.u_top, rtol)
     assert stack is not None
-    if curve is None or stack.gap is None or (stack.g_area[stack.gap] > 0.0 and not model.mobile):
+    if found is None or stack.gap is None or (stack.g_area[stack.gap] > 0.0 and not model.mobile):
         return None
+    curve, missed, missed_bend = found
     rates, gain, feed, taps, tap_s = system.rates[0], system.gain[0], system.feed[0], system.tap[0], system.tap_k
-    n, area0, shape, kinks, by = rates.size, model.area0, system.gap[0], np.full(tap_s.size, curve.steep), 1.0
-    missed_bend = curve.missed_bend
+    n, area0, shape, kinks, by = rates.size, model.area0, system.gap[0], np.full(tap_s.size, curve["steep"]), 1.0
     if model.mobile:
         # The last drive is A - 1/q0 times the source.
         feed = np.column_stack([feed, system.push[0] / area0])
-        kinks = np.append(kinks, -curve.steep / (q0 + curve.rest) ** 2)
-        shape, by, missed_bend = area0 * q0 * shape, area0, curve.missed * peak / q0
+        kinks = np.append(kinks, -curve["steep"] / (q0 + curve["rest"]) ** 2)
+        shape, by, missed_bend = area0 * q0 * shape, area0, missed * peak / q0
     columns, k, moves, nodes = by * system.shown[0], system.k_shown, np.zeros(system.k_shown.size), by * system.node[0]
     if problem.charge:
         column, stored, gain_of, feed_of, moved = _charge(system, stack)
@@ -318,34 +305,37 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
         columns, nodes, taps = (np.pad(rows, ((0, 0), (0, 1))) for rows in (columns, nodes, taps))
         columns, shape = np.vstack([columns, np.append(column, 1.0)]), np.append(shape, 0.0)
         k, moves = np.append(k, stored), np.append(moves, moved)
-    active, wide = roomy(n)
-    more = [tap_s.size] * max(LEAST_LEAKS - tap_s.size, 0)
-    taps, tap_s, kinks = np.insert(taps, more, 0.0, axis=0), np.insert(tap_s, more, 0.0), np.insert(kinks, more, 0.0)
-    feed = np.insert(feed, more, 0.0, axis=1)
-    lanes = Lanes(
-        wide(rates), wide(gain), wide(shape), float(model.k_gap), wide(taps), tap_s, np.zeros(tap_s.size),
-        wide(feed.T).T.copy(), curve.area, curve.slope, curve.bend, curve.scale, -1.0, q0, 0.0, kinks, curve.rest,
-        curve.steep, 0,
-    )  # fmt: skip
+    own = rates, gain, shape, float(model.k_gap), taps, tap_s, np.zeros(tap_s.size), feed
+    lanes, active, wide = roomy(Lanes(*own, kinks=kinks, fast=0, **curve), n)
     voltages = np.arange(k.size) < system.k_shown.size
     return StackForm(
         lanes, active, 1 if rtol >= BY_SIMPSON else 2, model.mobile,
         Shown(wide(columns), k, moves, voltages & model.mobile),
         Shown(wide(nodes), system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile)),
-        int(problem.charge), system.stress, float(model.k_gap), system.u_top, curve.missed, missed_bend,
+        int(problem.charge), system.stress, float(model.k_gap), system.u_top, missed, missed_bend,
         float(model.slow[-3]) * area0, system,
     )  # fmt: skip
 
 
-def roomy(n: int, least: int = 1) -> tuple[int, Callable[[FloatArray], FloatArray]]:
-    """The next larger of `SIZES`, and what gives rows (..., m) so many active modes in the place of the first n."""
-    active = next((size for size in SIZES if size >= max(n, least)), n)
+def roomy(lanes: Lanes, n: int, least: int = 1) -> tuple[Lanes, int, Callable[[FloatArray], FloatArray]]:
+    """The constants of n active modes and the others with as many modes and leaks as code is compiled for.
+
+    Also the number of active modes, and what makes room for them in rows (..., m).
+    """
+    active, leaks = next((size for size in SIZES if size >= max(n, least)), n), lanes.tap_s.size
+    more = [leaks] * max(LEAST_LEAKS - leaks, 0)
 
     def wide(rows: FloatArray) -> FloatArray:
         still = np.zeros((*rows.shape[:-1], active - n))
         return np.concatenate([rows[..., :n], still, rows[..., n:]], axis=-1)
 
-    return active, wide
+    lanes = lanes._replace(
+        rates=wide(lanes.rates), gain=wide(lanes.gain), shape=wide(lanes.shape),
+        taps=wide(np.insert(lanes.taps, more, 0.0, axis=0)), tap_s=np.insert(lanes.tap_s, more, 0.0),
+        bent=np.insert(lanes.bent, more, 0.0), kinks=np.insert(lanes.kinks, more, 0.0),
+        feed=wide(np.insert(lanes.feed, more, 0.0, axis=1).T).T.copy(),
+    )  # fmt: skip
+    return lanes, active, wide
 
 
 def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:

@@ -1,14 +1,9 @@
-"""Recordings of one finger, block by block in lanes (`solve.recordings.block`), with stated errors.
-
-A window of each piece, where the source moves most, is followed by steps half as long. The difference is the error of
-the window; a piece adds as much more as it is longer, and hands it on to the pieces after it, as the modes decay: once
-as if all errors were alike, and once as if they came by chance.
-"""
+"""Recordings of one finger, block by block in lanes (`solve.recordings.block`), with stated errors."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 from typing import Any
 
@@ -18,124 +13,14 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.lanes.loops import flow, show
 from fingerspice.results.outcome import State, Status
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.block import Block, Window
-from fingerspice.solve.recordings.form import PIECES, LaneForm, Shown
+from fingerspice.solve.recordings.block import OF_FORCE, Block, Judged
+from fingerspice.solve.recordings.form import PIECES, LaneForm
 from fingerspice.solve.recordings.pieces import Piece, driving, spacing_of
 from fingerspice.solve.runs import Run, excess_of
 from fingerspice.waveforms.sampling import on_grid
 
-# Stated over seen errors, of voltages, of the force and of charges: as seen in recordings of tests/recording_errors.py.
-SAFETY, OF_FORCE, OF_CHARGE = 2.25, 1.75, 2.5
-# Errors by chance look alike to so many times what they add up to, as windows show a part of them only.
-LUCK = 2.0
-
-
-@dataclass(frozen=True)
-class Judged:
-    """Errors that are seen of a block, without safety."""
-
-    errors: FloatArray  # (4,): Of gap voltage (V), force (N), nodes (V) and charges (C)
-    alone: float  # Error of xi (V) that a single piece makes
-    alike: FloatArray  # (m,): Errors of the modes that the block hands on, as if they were alike
-    chance: FloatArray  # (m, m): Products of two, as if they came by chance
-
-
-@dataclass(frozen=True)
-class _Steep:
-    """What an error of xi changes in each piece, at most: between 0 V and its peak."""
-
-    u: FloatArray  # (pieces,): Gap voltage, V/V
-    force: FloatArray  # N/V
-    moved: FloatArray  # What `Shown.bends` multiplies, m^2
-    inverse: FloatArray  # 1/A, 1/m^2/V
-
-
-def _steep(form: LaneForm, block: Block, top: FloatArray) -> _Steep:
-    c = form.lanes
-    inverse = form.inverse_area(np.stack([np.zeros(top.size), top]))
-    force = _slope_of_force(form, top)
-    if not form.mobile:
-        e = 1.0 / inverse - 1.0 / c.q0
-        u, moved = (np.abs(x / (1.0 + c.kappa * e)).max(axis=0) for x in (1.0, e))
-        return _Steep(u, force, moved, np.zeros(top.size))
-    u = inverse.max(axis=0) / c.q0 / block.margin
-    steep = np.abs(form.slope(np.stack([np.zeros(top.size), top]))) * u
-    source = float(np.abs(block.x).max())
-    return _Steep(u, force * u, (source * steep / inverse**2).max(axis=0), steep.max(axis=0))
-
-
-def _slope_of_force(form: LaneForm, xi: FloatArray) -> FloatArray:
-    """By |xi|, N/V."""
-    return np.asarray((form.force(1.001 * xi) - form.force(xi)) / (1e-3 * xi))
-
-
-def _changes(form: LaneForm, shown: Shown, window: Window, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Largest changes of quantities in windows, where xi goes to other values, and sums of the modes: (C, pieces)."""
-    m = form.lanes.rates.size
-    found, whole = np.einsum("ck,kij->cij", shown.columns, window.off[:m]), np.zeros((shown.k.size, 1, 1))
-    if shown.by_area.any():
-        whole = np.einsum("ck,kij->cij", shown.columns, window.z[:m])
-        inverse, other = form.inverse_area(window.xi), form.inverse_area(xi)
-        found = np.where(shown.by_area[:, None, None], other * found + (other - inverse) * whole, found)
-    if shown.bends.any():
-        moved = form.moved(xi, window.source) - form.moved(window.xi, window.source)
-        found += shown.bends[:, None, None] * moved
-    return np.abs(found).max(axis=-1, initial=0.0), np.abs(whole).max(axis=-1, initial=0.0)
-
-
-def judge(block: Block, parts: int, peak: float, alike: FloatArray, chance: FloatArray) -> Judged:
-    """Errors of a block that has been followed in `parts` steps a sample.
-
-    Parameters
-    ----------
-    peak : float
-        Largest |xi| so far, V.
-    alike, chance : ndarray, shape (m,) and (m, m)
-        Errors at the start, as in `Judged`.
-    """
-    form, active = block.form, block.active
-    c, window = form.lanes, block.check(parts)
-    own = window.off[: c.rates.size, :, -1]
-    products = own[:, None] * own
-    handed, lucky = block.hand_on(own * window.share, alike), block.hand_on(products * window.of_products, chance)
-    # What a piece adds beyond its window.
-    alike_more, chance_more = own * (window.share - 1.0), products * (window.of_products - 1.0)
-
-    def added(columns: FloatArray, left: FloatArray) -> FloatArray:
-        """Of sums of the modes (C, m): by chance, or by errors that are alike where chance does not explain them.
-
-        `left` (m, pieces) is left of each mode of what a piece starts with.
-        """
-        there = lucky[..., :-1] * left[:, None] * left + chance_more
-        by_chance = np.sqrt(np.maximum(np.einsum("ck,cl,kli->ci", columns, columns, there), 0.0))
-        there = np.abs(columns @ (handed[:, :-1] * left + alike_more))
-        swept = np.abs(columns[:, :active]) * (block.left[:active] / OF_FORCE)
-        return np.asarray(np.maximum(by_chance, there - LUCK * by_chance) + swept @ left[:active])
-
-    least = 1e-9 * peak + 1e-300
-    errors, charges = np.zeros(4), Shown._make(part[form.rows.k.size - form.flows :] for part in form.rows)
-    over, *others = added(np.vstack([c.shape, form.nodes.columns, charges.columns]), np.ones(own.shape))
-    top = np.maximum(block.peaks, least)
-    steep, xi = _steep(form, block, top), window.xi + np.einsum("k,kij->ij", form.xi[1], window.off)
-    # An error that a fast mode brings into a piece changes the force as much as xi at the first sample allows.
-    decay = np.exp(-block.rates[:, None] * (block.h[block.first] if block.own else block.h))
-    first_xi = np.maximum(np.abs(block.xi[np.minimum(block.first, block.n)]) + over, least)
-    at_first = _slope_of_force(form, first_xi) * (steep.u if form.mobile else 1.0) * over
-    of_force = np.maximum(at_first, steep.force * added(c.shape[None], decay * np.ones(own.shape))[0])
-    for i, of, more in ((0, form.gap, steep.u * over), (1, form.force, of_force)):
-        errors[i] = (np.abs(of(xi) - of(window.xi)).max(axis=1) + more).max()
-    for i, shown in ((2, form.nodes), (3, charges)):
-        found, whole = _changes(form, shown, window, xi)
-        more = np.reshape(others[: shown.k.size], (-1, own.shape[1]))
-        more = np.where(shown.by_area[:, None], more * steep.u * c.q0 + whole * steep.inverse * over, more)
-        more = more + np.abs(shown.bends)[:, None] * steep.moved * over
-        errors[i] = (found + more).max(initial=0.0)
-        others = others[shown.k.size :]
-    alone = np.abs(np.einsum("k,kij->ij", c.shape, window.off[: c.rates.size])).max()
-    alone += np.abs(c.shape @ (own * (window.share - 1.0))).max()
-    return Judged(errors, float(alone), handed[:, -1], lucky[..., -1])
-
-
+# Stated over seen errors, of voltages and of charges: as seen in recordings of tests/recording_errors.py.
+SAFETY, OF_CHARGE = 2.25, 2.5
 # Steps of a sample, by level.
 PARTS = (1, 2, 4, 8, 16, 32, 64)
 # Changes of starts that may be left, over the error asked for, and in pieces of fewer samples less; and over the
@@ -152,8 +37,6 @@ DIVIDED = 0.5
 # How fine steps must be is found on so many samples at the start of a run, below these relative errors: in a stack, and
 # in a network. For larger ones steps of a sample mostly do.
 FIRST, AT_ONCE = 1 << 14, (3e-7, 3e-6)
-# Least distance to the fold that is followed.
-LEAST_MARGIN = 0.2
 # What leaks by the error of the polynomial of 1/A over what is stored, times that error: as seen in offset recordings.
 LEAKED = 0.1
 _ONE_ROW = np.zeros(1, np.int64)
@@ -173,19 +56,25 @@ class Outcome(Enum):
 class LaneMarch:
     """A recording of one finger in progress, piece by piece."""
 
+    # What changes from piece to piece.
+    _MARKED = (
+        "t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak", "margin",
+        "z", "alike", "chance", "errors",
+    )  # fmt: skip
+
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
         # The error allowed is reduced to a `share` where errors of earlier pieces add up.
-        self.problem, self.form, self.rtol, self.share, self.width = problem, form, rtol, share, form.width(problem)
+        self.problem, self.form, self.rtol, self.share = problem, form, rtol, share
         wave = driving(problem)
         assert wave is not None
         # Time reached (s), and largest |U| of the source so far, V.
         self.wave, self.usual, self.t, self.loudest = wave, spacing_of(wave), problem.t_start, 0.0
-        held = float(np.abs(problem.initial.y).max(initial=0.0))
         # Of a source of current the scene knows no peak.
         self.expected = form.gain * (problem.scene.u_peak or wave.peak(0.0, problem.t_stop))
-        self.least = max(held, LEAST_PEAK * self.expected)
+        self.least = max(float(np.abs(problem.initial.y).max(initial=0.0)), LEAST_PEAK * self.expected)
         # Modes, behind them under `mobile` the gap voltage, and the source.
         self.z, self.u_last = form.start(problem)
+        # The number of `outputs` so far is that in the array they are written to.
         self.level, self.outputs, self.steps, self.refused, self.evaluated, self.margin = 0, 0, 0, 0, 0, 1.0
         # Errors of the modes so far, as if they were alike, and products of two, as if they came by chance.
         m = form.lanes.rates.size
@@ -194,23 +83,18 @@ class LaneMarch:
         self.peak, self.errors = 0.0, np.zeros(4)
 
     @property
-    def scale(self) -> float:
-        """Gap voltage to which errors are related, V."""
-        return max(self.loudest * self.form.gain, self.least)
+    def state(self) -> State:
+        """The state reached."""
+        return self.form.state(self.problem, self.z, self.t, self.u_last)
 
-    def begin_outputs(self) -> None:
-        """Start counting outputs from 0, for a new array of outputs."""
+    def outputs_at(self, t_out: FloatArray) -> FloatArray:
+        """An array for outputs at these times, which begin to be counted from 0."""
         self.outputs = 0
+        return np.empty((self.form.rows.k.size + self.form.flows, t_out.size))
 
-    @property
-    def slope_after(self) -> float:
-        """The source's slope after the end of the run, V/s."""
-        after = 1e-3 * self.usual
-        here, later = self.wave.value([self.problem.t_stop, self.problem.t_stop + after]).tolist()
-        return float(later - here) / after
-
-    def follow(self, piece: Piece, values: FloatArray, t_out: FloatArray, out: FloatArray) -> Outcome:
-        """Integrate a piece with the source's `values` (V), and write the outputs before its end as rows of `out`."""
+    def follow(self, piece: Piece, t_out: FloatArray, out: FloatArray) -> Outcome:
+        """Integrate a piece, and write the outputs before its end as rows of `out`."""
+        values = piece.values(self.wave)
         self.loudest = max(self.loudest, float(values.max()), -float(values.min()))
         if piece.grows:
             piece, values = self._growing(piece, values)
@@ -237,26 +121,28 @@ class LaneMarch:
 
     def _climb(self, block: Block, starts_at: float, share: float) -> tuple[Outcome, Judged | None, float]:
         """Solve a block, with ever more steps a sample until its error is met; its errors and their excess."""
-        seen: Judged | None = None
+        form, seen = self.form, None
         while True:
             parts, excess = PARTS[self.level], math.inf
             # Another sweep over short pieces costs little.
             left = max(OF_STARTS * min(block.count / SHORT, 1.0) * self.rtol, LEAST_CHANGE)
-            solved = block.solve(self.z, parts, left * self.scale)
-            self.evaluated += (self.form.inner + 1) * parts * block.n * block.sweeps
+            solved = block.solve(self.z, parts, left * max(self.loudest * form.gain, self.least))
+            self.evaluated += (form.inner + 1) * parts * block.n * block.sweeps
             if solved:
                 peak = float(block.peaks.max())
-                within = self.form.gap(np.array(peak)) <= self.form.u_top
-                if not (within and self._on_branch(block, starts_at, peak)):
+                # Under `mobile` the run stays on the branch on which it starts.
+                near = not form.mobile or abs(block.xi[0] - starts_at) <= 0.01 * peak
+                if not (near and block.on_one_branch and form.gap(np.array(peak)) <= form.u_top):
                     return Outcome.LOST, seen, excess
-                seen = judge(block, parts, max(peak, self.peak), self.alike, self.chance)
-                excess = self._excess(seen, max(peak, self.peak), share)
+                peak = max(peak, self.peak)
+                seen = block.judge(parts, peak, self.alike, self.chance)
+                excess = self._excess(seen, peak, share)
             if excess <= 1.0:
                 return Outcome.MET, seen, excess
             self.refused += parts * block.n
             if self.level + 1 == len(PARTS):
                 return Outcome.NOT_MET, seen, excess
-            finer = math.ceil(math.log(excess) / math.log(FINER[self.form.bent])) if excess < math.inf else 1
+            finer = math.ceil(math.log(excess) / math.log(FINER[form.bent])) if excess < math.inf else 1
             self.level = min(self.level + max(1, finer), len(PARTS) - 1)
 
     def _growing(self, piece: Piece, values: FloatArray) -> tuple[Piece, FloatArray]:
@@ -267,11 +153,6 @@ class LaneMarch:
         share[-1] = 1.0
         line = values[0] + share * (values[-1] - values[0])
         return replace(piece, times=piece.start + share * span), line
-
-    def _on_branch(self, block: Block, start: float, peak: float) -> bool:
-        """Whether the gap voltage stays clear of folds, and on the branch on which it starts."""
-        near = not self.form.mobile or abs(block.xi[0] - start) <= 0.01 * peak
-        return near and block.on_one_branch and block.margin > LEAST_MARGIN
 
     def _excess(self, seen: Judged, peak: float, share: float) -> float:
         """Excess of the stated over the allowed error, with a block's.
@@ -293,13 +174,12 @@ class LaneMarch:
         last = first + int(np.searchsorted(t_out[first:], piece.stop - slack))
         if last == first:
             return
-        t, self.outputs, rows = t_out[first:last], last, out[:, first:last]
-        times = piece.times
+        t, times = t_out[first:last], piece.times
         if t.size == n and (
             on_grid(t, piece.start, piece.spacing, slack) if times is None else np.abs(t - times[:-1]).max() <= slack
         ):
             slope = np.diff(block.x[: n + 1]) / block.h[:n] if self.form.flows else block.x
-            self._show(block.x, slope, block.first, block.kept, rows)
+            self._show(block.x, slope, block.first, block.kept, block.xi[:n], out)
             return
         samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
         number = np.clip(np.searchsorted(samples, t + slack, side="right") - 1, 0, n - 1)
@@ -307,49 +187,47 @@ class LaneMarch:
         since = t - samples[number]
         since[np.abs(since) <= slack] = 0.0
         x, z = block.at(number, np.clip(since, 0.0, length), length, parts)
-        self._show(x, (block.x[number + 1] - block.x[number]) / length, _ONE_ROW, z[:, None], rows)
+        self._show_at(x, (block.x[number + 1] - block.x[number]) / length, z, out)
 
-    def _show(self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, out: FloatArray) -> None:
-        """Write outputs into the columns of `out`: from the source, its slope (1/s), and modes as in `Block`."""
-        form, c, n = self.form, self.form.lanes, out.shape[1]
-        count, shown, first_flow = n if first.size == 1 else int(first[1]), form.rows, form.rows.k.size - form.flows
-        if shown.bends.any() or shown.by_area.any():
-            k, columns = form.xi
-            xi = np.empty(n)
-            show(k, columns, x, first, count, n, kept, xi)
-            moved, inverse = form.moved(xi, x[:n]), form.inverse_area(xi) if form.mobile else xi
-        for i, (k, share) in enumerate(zip(shown.k.tolist(), shown.bends.tolist(), strict=True)):
-            by_area = shown.by_area[i]
-            show(0.0 if by_area else k, shown.columns[i], x, first, count, n, kept, out[i])
-            if by_area:
-                out[i] = out[i] * inverse + k * x[:n]
-            elif share != 0.0:
-                out[i] += share * moved
-            if i >= first_flow:
-                flow(c, k, shown.columns[i], share, x, slope, first, count, n, kept, out[i + form.flows])
+    def _show_at(self, x: FloatArray, slope: FloatArray, z: FloatArray, out: FloatArray) -> None:
+        """Write outputs as `_show`, from states (rows, n)."""
+        n, xi, kept = x.size, np.empty(x.size), z[:, None]
+        show(self.form.xi[None], x, _ONE_ROW, n, 0, n, kept, xi[None])
+        self._show(x, slope, _ONE_ROW, kept, xi, out)
+
+    def _show(
+        self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, xi: FloatArray, out: FloatArray
+    ) -> None:  # fmt: skip
+        """Write the next outputs into columns of `out`: from the source, its slope (V/s), states as in `Block`, and xi.
+
+        The latter has the shape (n,).
+        """
+        form, n, shown, start = self.form, xi.size, self.form.rows, self.outputs
+        count, charges, self.outputs = n if first.size == 1 else int(first[1]), len(shown.k) - form.flows, start + n
+        show(form.shown, x, first, count, start, n, kept, out)
+        rows = out[:, start : self.outputs]
+        if shown.by_area.any():
+            inverse = form.inverse_area(xi)
+            for i in np.flatnonzero(shown.by_area):
+                rows[i] = rows[i] * inverse + shown.k[i] * x[:n]
+        if shown.bends.any():
+            moved = form.moved(xi, x[:n])
+            for i in np.flatnonzero(shown.bends):
+                rows[i] += shown.bends[i] * moved
+        for by, share, own in zip(form.shown[charges:], shown.bends[charges:], rows[len(shown.k) :], strict=True):
+            flow(form.lanes, by, float(share), x, slope, first, count, kept, xi, own)
 
     def finish(self, t_out: FloatArray, out: FloatArray) -> None:
         """Write the outputs at the end of the run."""
-        count = t_out.size - self.outputs
+        count, after = t_out.size - self.outputs, 1e-3 * self.usual
         if count:
-            here, slope = np.full(count, self.u_last), np.full(count, self.slope_after)
-            z = np.repeat(self.z[:, None, None], count, axis=2)
-            self._show(here, slope, _ONE_ROW, z, out[:, self.outputs :])
-        self.outputs = t_out.size
-
-    def rows(self, count: int, out: FloatArray) -> FloatArray:
-        """The first outputs as rows of a record."""
-        return self.form.recorded(self.problem, out[:, :count])
-
-    def state(self) -> State:
-        """The state reached."""
-        return self.form.state(self.problem, self.z, self.t, self.u_last)
-
-    def stated(self) -> tuple[FloatArray, float, float | None]:
-        """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C), so far."""
-        return self._stated(self.errors, self.peak)
+            # With the source's slope after the end of the run.
+            here, later = self.wave.value([self.problem.t_stop, self.problem.t_stop + after]).tolist()
+            x, slope = np.full(count, self.u_last), np.full(count, float(later - here) / after)
+            self._show_at(x, slope, np.repeat(self.z[:, None], count, axis=1), out)
 
     def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
+        """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C)."""
         form, u_peak = self.form, self.problem.scene.u_peak
         missed, at = form.missed, np.array(peak)
         u, force = float(form.gap(at)), float(form.force(at))
@@ -368,9 +246,7 @@ class LaneMarch:
 
     def mark(self) -> dict[str, Any]:
         """The state of the integration as plain data, which `stand` restores in another march through the same run."""
-        names = ("t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak", "margin")
-        arrays = {name: getattr(self, name).tolist() for name in ("z", "alike", "chance", "errors")}
-        return {name: getattr(self, name) for name in names} | arrays
+        return {name: np.asarray(getattr(self, name)).tolist() for name in self._MARKED}
 
     def stand(self, mark: dict[str, Any]) -> None:
         """Restore the state of another march through the same run."""
@@ -380,7 +256,7 @@ class LaneMarch:
     def run(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Run:
         """The run so far, with the given outputs."""
         stats = {"steps": self.steps, "rejected": self.refused, "zeros": 0}
-        run = Run(t, left, rows, Status.SUCCESS, self.evaluated, stats, self.state())
-        run.gaps, run.node_error, run.charge_error = self.stated()
+        run = Run(t, left, rows, Status.SUCCESS, self.evaluated, stats, self.state)
+        run.gaps, run.node_error, run.charge_error = self._stated(self.errors, self.peak)
         run.margin, run.by_layer = self.margin, self.problem.scene.stack is not None
         return run

@@ -31,7 +31,7 @@ from fingerspice.engine.lanes.rows import FADED, Lanes
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.form import LEAST_LEAKS, LaneForm, Shown, curves, roomy
+from fingerspice.solve.recordings.form import LaneForm, Shown, curves, roomy
 from fingerspice.solve.scenes import Scene
 from fingerspice.waveforms.samples import Samples, as_samples
 from fingerspice.waveforms.waveform import DC
@@ -61,14 +61,13 @@ class Reduced:
         self.kappa = max(-float(tap[self.gap] @ self.absorbed), 0.0)
         # The voltages of those of them that have a fixed leak, from w and the source: what 1/A - q0 multiplies.
         leaking = fed[net.g_total[fed] > 0.0]
-        wide = (0, max(LEAST_LEAKS - leaking.size, 0)), (0, 0)
-        taps, self.tap_s = np.pad(tap[leaking], wide), np.pad(tap_s[leaking, source], wide[0])
+        taps, self.tap_s = tap[leaking], tap_s[leaking, source]
         self.taps, self.bent = np.pad(taps, ((0, 0), (0, n_s))), taps @ self.absorbed
 
         def leaks(through: FloatArray) -> FloatArray:
             """Forcing by (q - q0) times each of these voltages; `through` (rows, n_f) is that by the currents."""
             own = through[:, net.g_total[fed] > 0.0] - np.outer(through @ turn, leaking == self.gap)
-            return np.pad(own * (net.g_total[leaking] / self.q0), ((0, 0), wide[0]))
+            return np.asarray(own * (net.g_total[leaking] / self.q0))
 
         # A charge is z = stored v + stored_s s + passed c_gap N + y, where y' = lost v + lost_s s and the change of the
         # leaks. One more mode is y + sum over k of lost_k / rate_k w_k, which no other mode drives.
@@ -100,18 +99,11 @@ class Reduced:
 
 
 def _turns(nodes: list[tuple[str, str]], first: int) -> FloatArray:
-    """Direction of each cell of a path, 1 or -1, relative to that of cell `first`."""
-    turn = np.zeros(len(nodes))
-    turn[first] = 1.0
-    todo = [first]
-    while todo:
-        i = todo.pop()
-        for j in np.flatnonzero(turn == 0.0):
-            if set(nodes[i]) & set(nodes[j]):
-                head_to_tail = nodes[i][1] == nodes[j][0] or nodes[i][0] == nodes[j][1]
-                turn[j] = turn[i] if head_to_tail else -turn[i]
-                todo.append(int(j))
-    return turn
+    """Direction of each cell of a path, 1 or -1, relative to that of cell `first`: a current that all of them carry."""
+    ends = Counter(node for pair in nodes for node in pair)
+    inner = [[(a == node) - (b == node) for a, b in nodes] for node, count in ends.items() if count == 2]
+    current = np.linalg.svd(np.array(inner, float).reshape(-1, len(nodes)))[2][-1]
+    return np.asarray(np.round(current / current[first]))
 
 
 # Number of frequencies at which the gap's share is looked at.
@@ -194,14 +186,10 @@ class NetworkForm(LaneForm):
         sign[self.reduced.moving] = 1.0 if xi >= 0.0 else -1.0
         return State(t, y, s, sign, problem.scene.charge_law)
 
-    def width(self, problem: Problem) -> int:
-        return super().width(problem) if self.flows else problem.initial.y.size
-
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        if not self.flows:
-            n = self.reduced.absorbed.size
-            out[n:] = problem.initial.y[n:, None]
-        return out.T
+        # Charges that are not wanted stay as they are.
+        held = problem.initial.y[len(out) :, None] + np.zeros(out.shape[1])
+        return out.T if self.flows else np.concatenate([out, held]).T
 
 
 def finger(problem: Problem, rtol: float) -> NetworkForm | None:
@@ -217,27 +205,25 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
     area0 = scene.area0.copy()
     area0[moving] = 1.0 / inverse_area(typical, scene.net.curves[moving])[0]
     one = Reduced(scene, source, area0, problem.charge)
-    curve = curves(scene.net.curves[moving], one.q0, one.kappa, scene.u_top, rtol)
+    polynomials = curves(scene.net.curves[moving], one.q0, one.kappa, scene.u_top, rtol)
     contact = problem.network.contacts[moving]
-    if not one.decays or curve is None or contact is None:
+    if not one.decays or polynomials is None or contact is None:
         return None
     shares = np.abs(one.shape[: one.absorbed.size] * one.absorbed)
     fading = (one.modes.rates > FADED * wave.rate) & (shares > ACTING * one.kappa)
     if rtol < OF_MANY and np.count_nonzero(fading) > 1:
         return None
-    active, wide = roomy(one.absorbed.size, LEAST_MODES)
+    curve, missed, missed_bend = polynomials
     # 1/A - q0 has the kink of 1/A, and N the part N''(0) xi |xi| / 2.
-    kinks = np.full(one.tap_s.size + 1, curve.steep)
-    kinks[-1] = 0.5 * curve.scale**2 * polyval(-1.0, polyder(curve.bend, 2))
-    lanes = Lanes(
-        wide(one.rates), wide(one.gain), wide(one.shape), one.k, wide(one.taps), one.tap_s, one.bent,
-        wide(one.feed.T).T.copy(), curve.area, curve.slope, curve.bend, curve.scale, -1.0, one.q0, one.kappa, kinks,
-        curve.rest, curve.steep, int(np.argmax(shares * one.modes.rates)),
-    )  # fmt: skip
+    kinks = np.full(one.tap_s.size + 1, curve["steep"])
+    kinks[-1] = 0.5 * curve["scale"] ** 2 * polyval(-1.0, polyder(curve["bend"], 2))
+    fast = int(np.argmax(shares * one.modes.rates))
+    own = one.rates, one.gain, one.shape, one.k, one.taps, one.tap_s, one.bent, one.feed
+    lanes, active, wide = roomy(Lanes(*own, kinks=kinks, fast=fast, **curve), one.absorbed.size, LEAST_MODES)
     rows, nodes = (shown._replace(columns=wide(shown.columns)) for shown in (one.rows, one.nodes))
     return NetworkForm(
         lanes, active, 2, False, rows, nodes, one.rates.size - one.absorbed.size, float(contact.stress(1.0)), share,
-        scene.u_top, curve.missed, curve.missed_bend, float(problem.network.capacitance(area0).sum()), one,
+        scene.u_top, missed, missed_bend, float(problem.network.capacitance(area0).sum()), one,
     )  # fmt: skip
 
 

@@ -37,65 +37,56 @@ BEGINNINGS = (1.0, 0.03)
 MOST_FORMS = 16
 
 
-def _decade(rtol: float) -> float:
-    return float(10.0 ** np.floor(np.log10(rtol)))
-
-
 def ready(problem: Problem, rtol: float) -> LaneForm | None:
-    """The scene prepared for this method, cached by decade; None where it does not apply."""
-    kept, *key = _kept(problem, rtol)
-    make = finger if problem.scene.stack is None else stack
-    one: LaneForm | None = kept_with(kept, ("followed", *key), MOST_FORMS, partial(make, problem, _decade(rtol)))
+    """The scene prepared for this method and a decade of errors; None where it does not apply.
+
+    It is cached with the scene, or with a stack for all sources of about its peak.
+    """
+    scene, decade = problem.scene, float(10.0 ** np.floor(np.log10(rtol)))
+    key: tuple[Any, ...] = "followed", decade, problem.charge, threading.get_ident()
+    if scene.stack is not None:
+        key = *key, scene.charge_law, rounded_peak(scene.u_peak)
+    kept, make = (scene.prepared, finger) if scene.stack is None else (scene.stack.kept, stack)
+    one: LaneForm | None = kept_with(kept, key, MOST_FORMS, partial(make, problem, decade))
     return one
 
 
-def _kept(problem: Problem, rtol: float) -> tuple[Any, ...]:
-    """Where preparations for a problem are cached, and the key; a stack's hold for all sources of about its peak."""
-    scene = problem.scene
-    key = _decade(rtol), problem.charge, threading.get_ident()
-    if scene.stack is None:
-        return scene.prepared, *key
-    return scene.stack.kept, scene.charge_law, rounded_peak(scene.u_peak), *key
+def _prepared(problem: Problem, rtol: float) -> tuple[list[Piece], LaneForm] | None:
+    """The pieces of a run and the scene prepared for them; None where this method does not apply."""
+    pieces = pieces_of(problem)
+    one = None if pieces is None else ready(problem, rtol)
+    return None if pieces is None or one is None else (pieces, one)
 
 
 def solve(problem: Problem, rtol: float, progress: Progress | None = None) -> Run | None:
     """A run sample by sample; None where this method does not apply (no recording) or does not meet the error."""
-    pieces = pieces_of(problem)
-    one = None if pieces is None else ready(problem, rtol)
-    if pieces is None or one is None:
+    found = _prepared(problem, rtol)
+    if found is None:
         return None
+    pieces, one = found
     refused, t_out, left = 0, problem.t_out, problem.left
     for share in BEGINNINGS:
         march = LaneMarch(problem, one, rtol, share)
-        out = np.empty((march.width, t_out.size))
-        outcome = _through(march, pieces, t_out, out, progress)
+        out = march.outputs_at(t_out)
+        for piece in pieces:
+            outcome = march.follow(piece, t_out, out)
+            if outcome is not Outcome.MET:
+                break
+            if progress is not None:
+                progress((march.t - problem.t_start) / (problem.t_stop - problem.t_start))
         if outcome is Outcome.LOST:
             return None
-        if outcome is Outcome.MET:
-            march.finish(t_out, out)
-            run = march.run(t_out, left, march.rows(t_out.size, out))
-            run.stats["rejected"] += refused
-            if run.excess(problem.rounding) > rtol:
-                # The peaks of the run stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
-                continue
+        if outcome is Outcome.NOT_MET:
+            refused += march.refused
+            continue
+        march.finish(t_out, out)
+        run = march.run(t_out, left, one.recorded(problem, out))
+        run.stats["rejected"] += refused
+        # Else the peaks stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
+        if run.excess(problem.rounding) <= rtol:
             run.continuous = closed_form(replace(problem, charge=False), partial(_again, rtol=rtol), rtol)
             return run
-        refused += march.refused
     return None
-
-
-def _through(
-    march: LaneMarch, pieces: list[Piece], t_out: FloatArray, out: FloatArray, progress: Progress | None
-) -> Outcome:  # fmt: skip
-    """Integrate all pieces, up to the first that is not MET."""
-    problem = march.problem
-    for piece in pieces:
-        outcome = march.follow(piece, piece.values(march.wave), t_out, out)
-        if outcome is not Outcome.MET:
-            return outcome
-        if progress is not None:
-            progress((march.t - problem.t_start) / (problem.t_stop - problem.t_start))
-    return Outcome.MET
 
 
 def _again(problem: Problem, rtol: float) -> Run:
@@ -152,20 +143,18 @@ class BySamples:
 
     method = "relaxation"
 
-    def __init__(self, problem: Problem, outputs: Outputs, plan: Plan, rtol: float) -> None:
+    def __init__(
+        self, problem: Problem, outputs: Outputs, plan: Plan, rtol: float, pieces: list[Piece], march: LaneMarch
+    ) -> None:
         self.problem, self.outputs, self.plan, self.rtol = problem, outputs, plan, rtol
-        own = own_rtol(problem, plan, rtol)
-        pieces, one = pieces_of(problem), ready(problem, own)
-        assert pieces is not None
-        assert one is not None
-        self.pieces, self.march, self.place, self.written = pieces, LaneMarch(problem, one, own), 0, 0
+        self.pieces, self.march, self.place, self.written = pieces, march, 0, 0
 
     @staticmethod
-    def serve(problem: Problem, plan: Plan, rtol: float) -> bool:
-        """Whether a run can be integrated this way."""
-        if plan.tier != "coupled" or pieces_of(problem) is None:
-            return False
-        return ready(problem, own_rtol(problem, plan, rtol)) is not None
+    def of(problem: Problem, outputs: Outputs, plan: Plan, rtol: float) -> BySamples | None:
+        """A run that can be integrated this way, or None."""
+        own = own_rtol(problem, plan, rtol)
+        found = _prepared(problem, own) if plan.tier == "coupled" else None
+        return found and BySamples(problem, outputs, plan, rtol, found[0], LaneMarch(problem, found[1], own))
 
     @property
     def over(self) -> bool:
@@ -180,25 +169,20 @@ class BySamples:
 
     def advance(self) -> tuple[FloatArray, FloatArray] | None:
         """Times (s) and rows of the next piece; None where the method for recordings fails on it."""
-        piece, march, last = self.pieces[self.place], self.march, self.place + 1 == len(self.pieces)
-        end = self.outputs.total if last else self._until(piece.stop)
-        t = self.outputs.times(self.written, end)
-        run_at = t if self.outputs.rated else at_breakpoints(_between(self.problem, piece.start, piece.stop), t)
-        out = np.empty((march.width, t.size))
-        march.begin_outputs()
-        if march.follow(piece, piece.values(march.wave), run_at, out) is not Outcome.MET:
+        piece, march, o, last = self.pieces[self.place], self.march, self.outputs, self.place + 1 == len(self.pieces)
+        # All outputs up to the end of the piece, and a few more.
+        number = (piece.stop - o.start) * o.over if o.rated else (piece.stop - o.start) / o.over
+        end = o.total if last else min(max(math.ceil(number) - o.low + 2, self.written), o.total)
+        t = o.times(self.written, end)
+        run_at = t if o.rated else at_breakpoints(_between(self.problem, piece.start, piece.stop), t)
+        out = march.outputs_at(run_at)
+        if march.follow(piece, run_at, out) is not Outcome.MET:
             return None
         if last:
             march.finish(run_at, out)
         count = march.outputs
-        t, self.written, self.place = t[:count], self.written + count, self.place + 1
-        return t, march.rows(count, out)
-
-    def _until(self, t: float) -> int:
-        """A number of outputs that includes all outputs up to time t (s), and a few more."""
-        o = self.outputs
-        number = (t - o.start) * o.over if o.rated else (t - o.start) / o.over
-        return min(max(math.ceil(number) - o.low + 2, self.written), o.total)
+        self.written, self.place = self.written + count, self.place + 1
+        return t[:count], march.form.recorded(self.problem, out[:, :count])
 
     def run(self) -> Run:
         """The run so far, without outputs."""
