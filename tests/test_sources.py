@@ -94,6 +94,8 @@ def test_what_follows_from_the_analysis_is_said() -> None:
         ("PWL(file=data.txt)", "'data.txt' cannot be read: a netlist given as text has no folder"),
         ("SINN(0 200 100)", "did you mean 'sin'?"),
         ("TRNOISE(1 2 3 4)", "unknown source 'TRNOISE'"),
+        ("DC(5 x=1)", "Vdrive: DC has no parameter 'x'; allowed: DC value"),
+        ("5 AC(1 90 r=2)", "Vdrive: AC has no parameter 'r'; allowed: AC [magnitude [phase]]"),
         ("SIN(0)", "SIN needs 2 values, 1 given"),
         ("SIN(0 1 2 3 4 5 6)", "SIN takes at most 6 values, 7 given"),
         ("SIN(0 200 0)", "sine frequency is 0 Hz; allowed: > 0"),
