@@ -61,12 +61,8 @@ def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
 
     The run is taken to end at `t_stop` (s), or at the deck's own end where that is None.
     """
-    stop = _end(circuit, t_stop)
+    stop = t_stop or (math.nan if circuit.tran is None else circuit.tran.stop)
     return circuit.remember(("notices", stop), lambda: (*directive_warnings(circuit), *_skin_warnings(circuit, stop)))
-
-
-def _end(circuit: Circuit, t_stop: float | None) -> float:
-    return t_stop or (circuit.tran.stop if circuit.tran is not None else math.nan)
 
 
 def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
@@ -125,7 +121,7 @@ def scenes_warnings(
             # A scene that cannot be run says so itself.
             with suppress(InputError):
                 yield from unusual_of_changed(circuit, circuit.varied({path: float(end)}))[1]
-    stop = _end(circuit, t_stop)
+    stop = t_stop or (math.nan if circuit.tran is None else circuit.tran.stop)
     if not any(path.startswith(f"{e.name}.") for e in driving(circuit) for path in scenes):
         yield from course_warnings(circuit, 0.0, stop, t_stop is None)
     if skin != "own":
