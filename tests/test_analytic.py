@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import mpmath as mp
 import numpy as np
@@ -286,11 +287,16 @@ def output_times(segments):
     return np.array(sorted(inner + [s[0] for s in segments]))
 
 
+@cache
+def collocated(name, law="local"):
+    segments, freq = SCENES[name]
+    return transient(segments, output_times(segments), freq=freq, law=law)
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_collocation_agrees_with_dop853_in_voltage_form_and_in_leaked_charge_form(name):
     segments, freq = SCENES[name]
-    t = output_times(segments)
-    run = transient(segments, t, freq=freq)
+    t, run = output_times(segments), collocated(name)
     peak = np.abs(run.u).max()
     voltage = dop853_voltage(segments, t, freq=freq)
     np.testing.assert_allclose(voltage, run.u, atol=1e-12 * peak, rtol=0)
@@ -302,8 +308,7 @@ def test_collocation_agrees_with_dop853_in_voltage_form_and_in_leaked_charge_for
 @pytest.mark.parametrize("name", [n for n in SCENES if "2 kV" not in n])
 def test_collocation_does_not_depend_on_its_family_order_or_tolerance(name, law):
     segments, freq = SCENES[name]
-    t = output_times(segments)
-    run = transient(segments, t, freq=freq, law=law)
+    t, run = output_times(segments), collocated(name, law)
     for options in ({"method": "gauss", "stages": 16}, {"stages": 9, "tol": 3e-15}):
         other = transient(segments, t, freq=freq, law=law, **options)
         for quantity in ("u", "q", "force", "area"):
@@ -456,6 +461,7 @@ def test_nothing_happens_at_zero_volts_and_a_picovolt_is_linear():
 # coupled transients: the figures of the pages -------------------------------------------------------------
 
 
+@cache
 def settled(wave, f, law="local"):
     segments = sine_segments(200.0, f, 1.0 / f) if wave == "sine" else square_segments(200.0, f, 1)
     run = periodic_state(segments, freq=f, law=law)

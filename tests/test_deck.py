@@ -63,7 +63,7 @@ def test_comments_of_every_kind_are_dropped() -> None:
     assert [s.name for s in read.statements] == ["R1", "R2", "V1"]
     (call,) = read.statements[2].body
     assert isinstance(call, Call)
-    assert call.args[0] == Token("a;b $ c.csv", Where("<netlist>", 6, 14), quoted=True)
+    assert call.args[0] == Token("a;b $ c.csv", Where("<netlist>", 6, 14))
     assert "needs a blank" in refusal("R1 a 0 1 $comment").message
 
 

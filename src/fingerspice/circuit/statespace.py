@@ -200,7 +200,7 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
             )
         hops, area = loop
         found = shared(circuit, ("stack", skin_at, circuit.work), lambda: _build(hops, area, skin_at, circuit.work))
-        return found if found.hops is hops else replace(found, hops=hops)
+        return replace(found, hops=hops)
 
     return circuit.remember(("stack", skin_at), make)
 

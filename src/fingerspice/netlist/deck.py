@@ -182,7 +182,7 @@ class Flattener:
         # A word of a resistor or capacitor names a parameter, those of a source are keywords (DC, SIN).
         bare: Bare = "name" if letter in "RC" else "nothing"
         body, params = scope.words(words.words[2:], bare), scope.pairs(words, bare)
-        self.deck.statements.append(Statement(name, letter, canonical, written, None, body, params, where))
+        self.deck.statements.append(Statement(name, letter, canonical, written, body, params, where))
 
     def _call(self, name: str, lexemes: list[Lexeme], instance: _Instance) -> None:
         """An X line: a native device becomes a statement, and a subcircuit is expanded."""
@@ -217,7 +217,7 @@ class Flattener:
             given = {key: value.value for key, value in params.items() if isinstance(value, Number)}
             _refuse_captured(native, given, words, scope)
             where = lexemes[0].where
-            self.deck.statements.append(Statement(name, "X", canonical, written, native, (), params, where))
+            self.deck.statements.append(Statement(name, native, canonical, written, (), params, where))
             return
         self._count(called, instance, device.where)
         ports = dict(zip(called.ports, instance.nodes(nodes), strict=True))

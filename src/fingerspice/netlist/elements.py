@@ -44,20 +44,19 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
 
     Warnings are added to `notes`.
     """
-    device = statement.device or statement.letter
+    device, nodes, names = statement.device, statement.nodes, statement.node_names
     beside = {key: statement.params[key] for key in DEVICES[device].beside if key in statement.params}
     own = statement._replace(params={k: v for k, v in statement.params.items() if k not in beside})
     read: dict[str, Any] = {}
     values: dict[str, float] = {}
-    match statement.letter:
-        case "X":
-            values = _device_values(own, notes)
+    match device:
+        case "V" | "I":
+            read["waveform"], read["ac"], differences = source_of(own, context)
+            notes.extend(differences)
         case "R" | "C":
             values, read["initial"] = _read_passive(own, notes)
         case _:
-            read["waveform"], read["ac"], differences = source_of(own, context)
-            notes.extend(differences)
-    nodes, names = statement.nodes, statement.node_names
+            values = _device_values(own, notes)
     element = Element(statement.name, device, nodes, names, MappingProxyType(values), where=statement.where, **read)
     for parameter, text in unusual(element):
         named = statement.params.get(parameter)
@@ -99,7 +98,7 @@ def source_of(statement: Statement, context: Context) -> Source:
         inner = last.params if isinstance(last, Call) else {}
         if not isinstance(last, Call | Token) or last.text.lower() != "pwl" or set(inner) & set(params):
             key = next(iter(params))
-            takes = ", ".join(p.capitalize() for p in DEVICES[statement.letter].beside)
+            takes = ", ".join(p.capitalize() for p in DEVICES[statement.device].beside)
             hint = f"; allowed: {takes}, besides its value" if takes else ""
             raise InputError(f"{statement.name} takes no parameter {key!r}{hint}", params[key].key)
         body[-1] = Call(last.text, last.args if isinstance(last, Call) else (), {**inner, **params}, last.where)
@@ -107,7 +106,7 @@ def source_of(statement: Statement, context: Context) -> Source:
 
 
 def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
-    name, device, params = statement.name, statement.device or "", statement.params
+    name, device, params = statement.name, statement.device, statement.params
     if statement.nodes[2] == "0":
         raise InputError(f"{name} has ground as its area; allowed: the area node of a GAP", statement.where)
     known = {p.name: p for p in DEVICES[device].parameters}
@@ -131,9 +130,9 @@ def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
 
 def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
     """Value of an R or C, and the start voltage (V) of a C."""
-    name, letter, params = statement.name, statement.letter, statement.params
-    kind, spec = DEVICES[letter], DEVICES[letter].parameter("value")
-    own = (*kind.aliases, _COPIES, *(("ic",) if letter == "C" else ()), *kind.data)
+    name, device, params = statement.name, statement.device, statement.params
+    kind, spec = DEVICES[device], DEVICES[device].parameter("value")
+    own = (*kind.aliases, _COPIES, *(("ic",) if device == "C" else ()), *kind.data)
     for key, part in params.items():
         if key not in own and not (key == "lser" and isinstance(part, Number) and part.value == 0.0):
             shown = ", ".join(f"{k}=" for k in (*own, *kind.beside))
@@ -150,7 +149,7 @@ def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, flo
     if copies is not None:
         if not isinstance(copies, Number) or not 1e-6 <= copies.value <= 1e6:
             raise InputError(f"{name} m is {copies.text!r}; allowed: a number of parts side by side", copies.where)
-        value = value / copies.value if letter == "R" else value * copies.value
+        value = value / copies.value if device == "R" else value * copies.value
     initial = params.get("ic")
     if isinstance(initial, Token):
         raise InputError(f"{name} IC is {initial.text!r}; allowed: a number V", initial.where)

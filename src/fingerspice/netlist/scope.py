@@ -25,11 +25,10 @@ Bare: TypeAlias = Literal["nothing", "name", "arithmetic"]
 
 
 class Token(NamedTuple):
-    """A word that is not a number, such as a keyword, a file name or `inf`; `quoted` if it was in double quotes."""
+    """A word that is not a number, such as a keyword, a file name, `inf`, or what was in double quotes."""
 
     text: str
     where: Where
-    quoted: bool = False
     key: Where | None = None  # Place of the key of a `key=value` pair
 
 
@@ -74,11 +73,10 @@ class Statement(NamedTuple):
     """One element of the flat circuit."""
 
     name: str  # Name as written, with the names of the enclosing calls in front: ``Xfinger.Xgap``
-    letter: str  # R, C, V, I, or X for a native device
+    device: str  # Entry of `DEVICES`
     # Nodes in lower case, ground as ``0``; a node inside a subcircuit has the names of the enclosing calls in front
     nodes: tuple[str, ...]
     node_names: tuple[str, ...]  # The same nodes as written
-    device: str | None  # A native device's name in upper case
     body: tuple[Word, ...]  # The words after the nodes; empty for an X
     params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
     where: Where  # Place of the name
@@ -164,7 +162,7 @@ class Scope:
         """Number or token of a word, string or expression; `bare` is what is evaluated without braces."""
         text, where = lexeme.text, lexeme.where
         if lexeme.kind == "string":
-            return Token(text, where, quoted=True)
+            return Token(text, where)
         if lexeme.kind == "expression" or (bare == "arithmetic" and _PLAIN_NUMBER.fullmatch(text)):
             return self.number(lexeme)
         if bare != "nothing" and self._is_arithmetic(text):
