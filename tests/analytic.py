@@ -53,58 +53,36 @@ from scipy.special import roots_jacobi, roots_legendre
 # ----------------------------------------------------------------------------------------------------------
 
 PAPER_TABLE1 = {
-    "mu0": 0.3,
-    "F_N_N": 0.5,
-    "eps_r_i": 3.9,
-    "eps_r_a": 1.0,
-    "eps0": 8.854e-12,
-    "d_i_um": 1.0,
-    "d_a_um": 3.5,
-    "d_sc_um": 350.0,
-    "R_a_ohm": 1e6,
-    "R_i_ohm": 2e5,
-    "m": 0.52,
-    "n": 1.41,
-    "alpha_mm2_per_Nm": 54.4,
-    "beta_mm_2mn": 32.0,
-    "c2_mm4_per_N2": 5000.0,
-}
+    "mu0": 0.3, "F_N_N": 0.5, "eps_r_i": 3.9, "eps_r_a": 1.0, "eps0": 8.854e-12,
+    "d_i_um": 1.0, "d_a_um": 3.5, "d_sc_um": 350.0, "R_a_ohm": 1e6, "R_i_ohm": 2e5,
+    "m": 0.52, "n": 1.41, "alpha_mm2_per_Nm": 54.4, "beta_mm_2mn": 32.0, "c2_mm4_per_N2": 5000.0,
+}  # fmt: skip
 """Table 1 exactly as printed, the printed unit in each key."""
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """One finger on one touchscreen, SI units.
+    """One finger on one touchscreen, SI units."""
 
-    Attributes
-    ----------
-    mu0 : friction coefficient.
-    force_normal : F_N, N.
-    eps0 : permittivity of free space, F/m (8.854e-12 as in Table 1, not CODATA).
-    eps_i, eps_a : relative permittivities of coating and gap.
-    d_i, d_a, d_sc : thicknesses of coating, gap and stratum corneum, m.
-    r_i, r_a : total resistances of coating and gap, Ohm (``math.inf``: no leakage).
-    m, n : exponents of Eqs. 5 and 6.
-    alpha : m^2 / N^m, Eq. 5.
-    beta : m^(2 - n), Eq. 6.
-    c2 : m^4 / N^2, Eq. 3.
-    """
-
-    mu0: float
-    force_normal: float
-    eps0: float
+    mu0: float  # friction coefficient
+    force_normal: float  # F_N, N
+    eps0: float  # permittivity of free space, F/m (8.854e-12 as in Table 1, not CODATA)
+    # eps_i, eps_a: relative permittivities of coating and gap
     eps_i: float
     eps_a: float
+    # d_i, d_a, d_sc: thicknesses of coating, gap and stratum corneum, m
     d_i: float
     d_a: float
     d_sc: float
+    # r_i, r_a: total resistances of coating and gap, Ohm (``math.inf``: no leakage)
     r_i: float
     r_a: float
+    # m, n: exponents of Eqs. 5 and 6
     m: float
     n: float
-    alpha: float
-    beta: float
-    c2: float
+    alpha: float  # m^2 / N^m, Eq. 5
+    beta: float  # m^(2 - n), Eq. 6
+    c2: float  # m^4 / N^2, Eq. 3
 
 
 def parameters_from_paper(table: dict[str, float]) -> Parameters:
@@ -148,17 +126,12 @@ def eps_sc(f: float) -> float:
 class Layer:
     """One series layer: a capacitance that scales with the ridge area, in parallel with leakage.
 
-    Attributes
-    ----------
-    c : capacitance per area, F/m^2 (Eq. 16 over A_R).
-    r_total : leakage resistance of the whole layer, Ohm, independent of the area.
-    r_area : leakage resistance times area, Ohm m^2 (rho d of Eq. 17): total resistance r_area / A_R.
-        Both resistances act in parallel; ``math.inf`` (default) leaves one out.
+    Both resistances act in parallel; ``math.inf`` (default) leaves one out.
     """
 
-    c: float
-    r_total: float = math.inf
-    r_area: float = math.inf
+    c: float  # capacitance per area, F/m^2 (Eq. 16 over A_R)
+    r_total: float = math.inf  # leakage resistance of the whole layer, Ohm, independent of the area
+    r_area: float = math.inf  # leakage resistance times area, Ohm m^2 (rho d of Eq. 17): in all r_area / A_R
 
 
 GAP = 1
@@ -399,14 +372,8 @@ def phasor_gains(f: float, a: float, layers: Sequence[Layer]) -> np.ndarray:
 def _table1_rc(f: float, a: float, params: Parameters) -> tuple[float, ...]:
     """(R_i, R_a, R_sc, C_i, C_a, C_sc) of Table 1 at frequency f and area a (Eqs. 16, 17)."""
     p = params
-    return (
-        p.r_i,
-        p.r_a,
-        rho_sc(f) * p.d_sc / a,
-        p.eps0 * p.eps_i * a / p.d_i,
-        p.eps0 * p.eps_a * a / p.d_a,
-        p.eps0 * eps_sc(f) * a / p.d_sc,
-    )
+    c_i, c_a, c_sc = p.eps0 * p.eps_i * a / p.d_i, p.eps0 * p.eps_a * a / p.d_a, p.eps0 * eps_sc(f) * a / p.d_sc
+    return p.r_i, p.r_a, rho_sc(f) * p.d_sc / a, c_i, c_a, c_sc
 
 
 def gap_gain_eq12(f: float, a: float, params: Parameters = TABLE1) -> float:
@@ -445,12 +412,11 @@ def gap_limit_eq15(f: float, params: Parameters = TABLE1) -> float:
 
 @dataclass(frozen=True)
 class CoupledPhasor:
-    """Result of `coupled_phasor`: complex gains U_x/U_0 (n_layers,), area m^2, mean and peak F_el in N."""
+    """Result of `coupled_phasor`: complex gains U_x/U_0 (n_layers,), area m^2, mean F_el in N."""
 
     gains: np.ndarray
     area: float
     mean_force: float
-    peak_force: float
 
     @property
     def gap_gain(self) -> complex:
@@ -458,22 +424,20 @@ class CoupledPhasor:
         return complex(self.gains[GAP])
 
 
-def coupled_phasor(
-    f: float, u0: float, params: Parameters = TABLE1, *, layers: Sequence[Layer] | None = None, k: float = 1.0
-) -> CoupledPhasor:
+def coupled_phasor(f: float, u0: float, params: Parameters = TABLE1, *, k: float = 1.0) -> CoupledPhasor:
     """Phasor solution with the mean-area coupling A = g(U_a0 / sqrt 2), iterated to rounding.
 
     Parameters
     ----------
-    f : frequency, Hz; the skin is evaluated there unless `layers` are given.
+    f : frequency, Hz; the skin is evaluated there.
     u0 : source amplitude, V.
-    params, layers, k : as in `transient`.
+    params, k : as in `transient`.
 
     Returns
     -------
     CoupledPhasor. The mean force is eps0 eps_a U_a0^2 A / (4 d_a^2).
     """
-    layers = tuple(layers) if layers is not None else table1_layers(f, params)
+    layers = table1_layers(f, params)
     a, last = float(area(0.0, params, k)), math.inf
     for _ in range(500):
         u_a0 = abs(phasor_gains(f, a, layers)[GAP]) * u0
@@ -484,7 +448,7 @@ def coupled_phasor(
         last = change
     gains = phasor_gains(f, a, layers)
     mean = params.eps0 * params.eps_a * (abs(gains[GAP]) * u0) ** 2 * a / (4.0 * params.d_a**2)
-    return CoupledPhasor(gains, a, mean, 2.0 * mean)
+    return CoupledPhasor(gains, a, mean)
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -499,7 +463,6 @@ class FrozenSine:
     f: float
     u0: float
     phase: float
-    area: float
     gains: np.ndarray
 
     def u(self, t: np.ndarray | float) -> np.ndarray:
@@ -519,15 +482,19 @@ def periodic_sine_frozen(
 ) -> FrozenSine:
     """Periodic response to U0 sin(2 pi f t + phase) at frozen area a (m^2), by Eqs. 9 and 11."""
     layers = tuple(layers) if layers is not None else table1_layers(f, params)
-    return FrozenSine(f, u0, phase, a, phasor_gains(f, a, layers))
+    return FrozenSine(f, u0, phase, phasor_gains(f, a, layers))
+
+
+DIGITS = 40
+"""Working digits of the frozen circuit."""
 
 
 class _FrozenCircuit:
     """du/dt = M u of the frozen stack under constant U, propagated by its eigenvectors in mpmath."""
 
-    def __init__(self, layers: Sequence[Layer], a: float, dps: int = 40) -> None:
-        self.dps, self.n = dps, len(layers)
-        with mp.workdps(dps):
+    def __init__(self, layers: Sequence[Layer], a: float) -> None:
+        self.n = len(layers)
+        with mp.workdps(DIGITS):
             am = mp.mpf(a)
             cap = [am * mp.mpf(x.c) for x in layers]
             g = [
@@ -543,12 +510,12 @@ class _FrozenCircuit:
                     self.matrix[i, j] = g[j] / cap[j] / cap[i] / total - (g[i] / cap[i] if i == j else 0)
             values, vectors = mp.eig(self.matrix)
             self.modes = None
-            if abs(mp.det(vectors)) > mp.mpf(10) ** (-dps // 3):
+            if abs(mp.det(vectors)) > mp.mpf(10) ** (-DIGITS // 3):
                 self.modes = (values, vectors, mp.inverse(vectors))
 
     def propagator(self, dt: float | mp.mpf) -> mp.matrix:
         """Matrix exponential of M dt."""
-        with mp.workdps(self.dps):
+        with mp.workdps(DIGITS):
             if self.modes is None:
                 return mp.expm(self.matrix * mp.mpf(dt))
             values, vectors, inverse = self.modes
@@ -556,7 +523,7 @@ class _FrozenCircuit:
 
     def advance(self, u: mp.matrix, dt: float | mp.mpf) -> mp.matrix:
         """Layer voltages dt seconds after `u` under constant U."""
-        with mp.workdps(self.dps):
+        with mp.workdps(DIGITS):
             return self.propagator(dt) * u
 
 
@@ -571,11 +538,11 @@ def piecewise_constant_frozen(
     a: float,
     layers: Sequence[Layer],
     *,
-    u_start: Sequence[float] | None = None,
     periodic: bool = False,
-    dps: int = 40,
 ) -> np.ndarray:
-    """Exact layer voltages of the frozen stack under a piecewise-constant source.
+    """Exact layer voltages of the frozen stack under a piecewise-constant source, from the uncharged state.
+
+    A jump of the source splits by 1/c_x.
 
     Parameters
     ----------
@@ -584,18 +551,15 @@ def piecewise_constant_frozen(
     t_out : output times in [t_0, t_n], s; values at an edge are right-hand values (at t_n: left-hand).
     a : area, m^2.
     layers : the stack.
-    u_start : layer voltages before t_0, V; default uncharged. The jump from their sum to levels[0] splits by
-        1/c_x.
-    periodic : ignore `u_start` and return the periodic state of period t_n - t_0.
-    dps : working digits.
+    periodic : return the periodic state of period t_n - t_0 instead.
 
     Returns
     -------
     array (len(t_out), n_layers), V, correctly rounded for all practical purposes.
     """
-    circuit = _FrozenCircuit(layers, a, dps)
+    circuit = _FrozenCircuit(layers, a)
     n = len(layers)
-    with mp.workdps(dps):
+    with mp.workdps(DIGITS):
         ts, lev = [mp.mpf(t) for t in edges], [mp.mpf(v) for v in levels]
         if periodic:
             phi, shift, previous = mp.eye(n), mp.zeros(n, 1), lev[-1]
@@ -608,7 +572,7 @@ def piecewise_constant_frozen(
             rhs[0] = lev[-1]
             u = mp.lu_solve(system, rhs)
         else:
-            u = mp.matrix([0] * n if u_start is None else [mp.mpf(x) for x in u_start])
+            u = mp.matrix([0] * n)
         starts = []
         for k, level in enumerate(lev):
             u = u + circuit.divider * (level - mp.fsum(u))
@@ -630,33 +594,23 @@ def square_frozen(
     *,
     layers: Sequence[Layer] | None = None,
     duty: float = 0.5,
-    dps: int = 40,
 ) -> np.ndarray:
     """Exact periodic layer voltages (len(t_out), n) under a square wave +-u0 at f Hz, +u0 on [0, duty/f)."""
     layers = tuple(layers) if layers is not None else table1_layers(f, params)
     period = 1.0 / f
     wrapped = [t - period * math.floor(t / period) for t in t_out]
-    return piecewise_constant_frozen(
-        [0.0, duty * period, period], [u0, -u0], wrapped, a, layers, periodic=True, dps=dps
-    )
+    return piecewise_constant_frozen([0.0, duty * period, period], [u0, -u0], wrapped, a, layers, periodic=True)
 
 
 def sine_frozen_from_rest(
-    f: float,
-    u0: float,
-    a: float,
-    t_out: Sequence[float],
-    layers: Sequence[Layer],
-    *,
-    phase: float = 0.0,
-    dps: int = 40,
+    f: float, u0: float, a: float, t_out: Sequence[float], layers: Sequence[Layer], *, phase: float = 0.0
 ) -> np.ndarray:
     """Exact layer voltages (len(t_out), n) under u0 sin(2 pi f t + phase) from the uncharged state at t = 0.
 
     Periodic phasor plus the decaying modes of the circuit; the jump at t = 0 (phase != 0) splits by 1/c_x.
     """
-    circuit = _FrozenCircuit(layers, a, dps)
-    with mp.workdps(dps):
+    circuit = _FrozenCircuit(layers, a)
+    with mp.workdps(DIGITS):
         om, am = 2 * mp.pi * mp.mpf(f), mp.mpf(a)
         z = [1 / (1 / mp.mpf(x.r_total) + am / mp.mpf(x.r_area) + 1j * om * mp.mpf(x.c) * am) for x in layers]
         total = mp.fsum(z)
@@ -677,13 +631,13 @@ Waveform = Callable[[np.ndarray], np.ndarray]
 Segment = tuple[float, float, Waveform, Waveform]
 
 
+def _hold(level: float) -> Waveform:
+    return lambda t: level + 0.0 * np.asarray(t)
+
+
 def constant_segments(edges: Sequence[float], levels: Sequence[float]) -> list[Segment]:
     """Piecewise-constant source: levels[k] V on [edges[k], edges[k+1]) s."""
-
-    def hold(level: float) -> Waveform:
-        return lambda t: level + 0.0 * np.asarray(t)
-
-    return [(edges[k], edges[k + 1], hold(v), hold(0.0)) for k, v in enumerate(levels)]
+    return [(edges[k], edges[k + 1], _hold(v), _hold(0.0)) for k, v in enumerate(levels)]
 
 
 def sine_segments(
@@ -691,14 +645,11 @@ def sine_segments(
 ) -> list[Segment]:
     """One segment of offset + u0 sin(2 pi f t + phase), V; phase in rad, times in s."""
     om = 2.0 * math.pi * f
-    return [
-        (
-            t_start,
-            t_end,
-            lambda t: offset + u0 * np.sin(om * np.asarray(t) + phase),
-            lambda t: u0 * om * np.cos(om * np.asarray(t) + phase),
-        )
-    ]
+
+    def value(t: np.ndarray) -> np.ndarray:
+        return offset + u0 * np.sin(om * np.asarray(t) + phase)
+
+    return [(t_start, t_end, value, lambda t: u0 * om * np.cos(om * np.asarray(t) + phase))]
 
 
 def square_segments(u0: float, f: float, periods: int, *, duty: float = 0.5) -> list[Segment]:
@@ -1136,7 +1087,7 @@ class Transient:
 
     def force_integral(self, t: float) -> float:
         """Integral of F_el from the start to t, N s, by the collocation quadrature."""
-        step = _find(self.steps, t, "left")
+        step = self.steps[_place(self.steps, t, "left")]
         x = np.array([2.0 * (t - step.t) / step.h - 1.0])
         return step.force_integral + step.h * float((self.nodes.antiderivative(x) @ step.force)[0])
 
@@ -1146,7 +1097,7 @@ class Transient:
 
     def current(self, t: float, slope: float) -> float:
         """Regular part of the current through the terminals at t (right-hand), A; `slope` = dU/dt in V/s."""
-        stack, step = self.stack, _find(self.steps, t, "right")
+        stack, step = self.stack, self.steps[_place(self.steps, t, "right")]
         u, a, da = (x[0] for x in _fields_on_step(stack, self.nodes, step, np.array([t])))
         j, c = stack.gap, stack.c[stack.gap]
         leak = u * (stack.g_total + a * stack.g_area)
@@ -1190,10 +1141,10 @@ def _refine(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, y: np.n
     return float(np.min(y))
 
 
-def _find(steps: Sequence[_Step], t: float, side: str) -> _Step:
-    starts = [s.t for s in steps]
-    j = (bisect.bisect_right(starts, t) if side == "right" else bisect.bisect_left(starts, t)) - 1
-    return steps[max(j, 0)]
+def _place(steps: Sequence[_Step], t: float, side: str) -> int:
+    """Number of the step that a time is in."""
+    found = (bisect.bisect_right if side == "right" else bisect.bisect_left)(steps, t, key=lambda step: step.t)
+    return max(found - 1, 0)
 
 
 def _fields_on_step(stack: _Stack, nodes: _Nodes, step: _Step, t: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -1210,11 +1161,6 @@ def _fields_at(stack: _Stack, nodes: _Nodes, step: _Step, theta: np.ndarray) -> 
     return stack.closed(drive, w, step.s, nearby)
 
 
-def _on_step(stack: _Stack, nodes: _Nodes, step: _Step, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Layer voltages (m, n) and area (m,) at times t inside one step."""
-    return _fields_on_step(stack, nodes, step, t)[:2]
-
-
 def _sample(run: Transient, t: np.ndarray, side: str) -> Transient:
     stack, nodes = run.stack, run.nodes
     u, a, q = np.full((len(t), stack.n), np.nan), np.full(len(t), np.nan), np.full(len(t), np.nan)
@@ -1222,20 +1168,18 @@ def _sample(run: Transient, t: np.ndarray, side: str) -> Transient:
         return replace(run, t=t, u=u, area=a, force=a.copy(), q=q)
     t_end = run.steps[-1].t + run.steps[-1].h
     groups: dict[int, list[int]] = {}
-    starts = [s.t for s in run.steps]
     for i, ti in enumerate(t):
-        if not starts[0] <= ti <= t_end * (1.0 + 1e-15):
+        if not run.steps[0].t <= ti <= t_end * (1.0 + 1e-15):
             if run.fold is not None and ti > t_end:
                 continue
-            raise ValueError(f"output time {ti} s outside [{starts[0]}, {t_end}] s")
-        j = (bisect.bisect_right(starts, ti) if side == "right" else bisect.bisect_left(starts, ti)) - 1
-        groups.setdefault(max(j, 0), []).append(i)
+            raise ValueError(f"output time {ti} s outside [{run.steps[0].t}, {t_end}] s")
+        groups.setdefault(_place(run.steps, ti, side), []).append(i)
     stored0 = stack.stored(run.u_before)
     for j, index in groups.items():
         step = run.steps[j]
         ti = t[index]
         try:
-            u[index], a[index] = _on_step(stack, nodes, step, ti)
+            u[index], a[index], _ = _fields_on_step(stack, nodes, step, ti)
         except _NoStep:
             # The last step before a fold may pass it by rounding.
             if run.fold is None:
@@ -1347,19 +1291,8 @@ class _Run:
         w, us, a = _collocate(stack, self.nodes, t, h, u, source, s, self.scale)
         g = stack.g_total[stack.gap] + a * stack.g_area[stack.gap]
         ua = us[:, stack.gap]
-        step = _Step(
-            t,
-            h,
-            s,
-            source,
-            w,
-            s * np.append(u[stack.gap], ua),
-            g * ua,
-            stack.sigma_per_u2 * ua**2 * a,
-            self.q_leak,
-            self.force_integral,
-            us[-1],
-        )
+        v, force = s * np.append(u[stack.gap], ua), stack.sigma_per_u2 * ua**2 * a
+        step = _Step(t, h, s, source, w, v, g * ua, force, self.q_leak, self.force_integral, us[-1])
         end = _fields_at(stack, self.nodes, step, np.array([1.0]))[0][0]
         return replace(step, u_end=end), us
 
@@ -1484,17 +1417,12 @@ def dc_operating_point(
     if frozen is not None or any(blocked):
         return divide(frozen if frozen is not None else 1.0)
     sign = 1.0 if source >= 0.0 else -1.0
-    v = (
-        brentq(
-            lambda v: v - sign * divide(float(area(v, params, k)))[gap],
-            0.0,
-            abs(source) + 1e-300,
-            xtol=1e-15 * abs(source) + 1e-300,
-            rtol=1e-15,
-        )
-        if source
-        else 0.0
-    )
+
+    def miss(v: float) -> float:
+        return v - sign * divide(float(area(v, params, k)))[gap]
+
+    high, xtol = abs(source) + 1e-300, 1e-15 * abs(source) + 1e-300
+    v = brentq(miss, 0.0, high, xtol=xtol, rtol=1e-15) if source else 0.0
     return divide(float(area(v, params, k)))
 
 
@@ -1510,7 +1438,6 @@ def transient(
     area_mode: str | float = "coupled",
     k: float = 1.0,
     start: str | Sequence[float] = "uncharged",
-    source_before: float | None = None,
     method: str = "radau",
     stages: int = 12,
     tol: float = 1e-14,
@@ -1531,8 +1458,7 @@ def transient(
         in m^2.
     k : work-of-adhesion factor, see `work_factor`.
     start : 'uncharged' (all layers at 0 V; U(t0) then jumps in, split by 1/c_x), 'dc' (operating point of
-        `source_before`, default U(t0)), or the layer voltages before t0 in V, whose sum is U before t0.
-    source_before : V, U just before the first segment, for start='dc'.
+        U(t0)), or the layer voltages before t0 in V, whose sum is U before t0.
     method, stages, tol : collocation family 'radau' or 'gauss', its stages, and the bound on the last two
         Legendre coefficients of every step relative to the peak source (or start) voltage.
 
@@ -1570,12 +1496,9 @@ def transient(
     if isinstance(start, str):
         if start not in ("uncharged", "dc"):
             raise ValueError(f"start must be 'uncharged', 'dc' or voltages, got {start!r}")
-        before = first if source_before is None else source_before
-        u = (
-            np.zeros(stack.n)
-            if start == "uncharged"
-            else dc_operating_point(before, layers, params, gap=gap, k=k, frozen=frozen)
-        )
+        u = np.zeros(stack.n)
+        if start == "dc":
+            u = dc_operating_point(first, layers, params, gap=gap, k=k, frozen=frozen)
     else:
         u = np.asarray(start, dtype=float)
     peak = max(float(np.max(np.abs(p[2](np.linspace(p[0], p[1], 65))))) for p in parts)
@@ -1590,25 +1513,8 @@ def transient(
         u = run.segment(t0, t1, u, source)
         if run.fold is not None:
             break
-    empty = np.empty(0)
-    result = Transient(
-        empty,
-        empty,
-        empty,
-        empty,
-        empty,
-        run.fold,
-        tuple(run.zeros),
-        stack,
-        nodes,
-        tuple(run.steps),
-        u_before,
-    )
-    return result.at(t_out)
-
-
-def _hold(level: float) -> Waveform:
-    return lambda t: level + 0.0 * np.asarray(t)
+    none = [np.empty(0)] * 5
+    return Transient(*none, run.fold, tuple(run.zeros), stack, nodes, tuple(run.steps), u_before).at(t_out)
 
 
 def periodic_state(
@@ -1621,7 +1527,6 @@ def periodic_state(
     gap: int = GAP,
     area_mode: str | float = "coupled",
     k: float = 1.0,
-    warm_up: int = 2,
     t_out: Sequence[float] = (),
     **options: object,
 ) -> Transient:
@@ -1630,7 +1535,6 @@ def periodic_state(
     Parameters
     ----------
     segments : one period of the source, from t = t0 to t0 + T.
-    warm_up : periods integrated from the uncharged state before the Newton iteration on the period map.
     t_out : output times within the period, s.
     Others as in `transient`.
 
@@ -1651,9 +1555,8 @@ def periodic_state(
             raise FoldError(run.fold.margin, run.fold.u_gap)
         return run.steps[-1].u_end
 
-    u = np.zeros(n)
-    for _ in range(max(warm_up, 1)):
-        u = end(u)
+    # Two periods from the uncharged state, before the Newton iteration on the period map
+    u = end(end(np.zeros(n)))
     scale = max(1e-300, float(np.max(np.abs(u))))
     basis = (np.eye(n) - 1.0 / n)[:, : n - 1]  # directions that keep the sum of the voltages
     base = end(u)
@@ -1679,6 +1582,7 @@ def periodic_state(
 # ----------------------------------------------------------------------------------------------------------
 
 
+@np.errstate(all="ignore")
 def _dop_pieces(
     rhs: Callable[[float, np.ndarray, float], np.ndarray],
     gap_voltage: Callable[[float, np.ndarray, float], float],
@@ -1694,20 +1598,6 @@ def _dop_pieces(
     A trial step far too long may overflow (less area, faster leakage): its error is then not finite and
     scipy's step control shortens it, so the floating-point warnings are switched off here.
     """
-    with np.errstate(all="ignore"):
-        return _dop_loop(rhs, gap_voltage, t, y, stops, rtol, atol, scale)
-
-
-def _dop_loop(
-    rhs: Callable[[float, np.ndarray, float], np.ndarray],
-    gap_voltage: Callable[[float, np.ndarray, float], float],
-    t: float,
-    y: np.ndarray,
-    stops: Sequence[float],
-    rtol: float,
-    atol: np.ndarray,
-    scale: float,
-) -> list[np.ndarray]:
     out, first = [], None
     ua = gap_voltage(t, y, 1.0)
     s = math.copysign(1.0, ua)
@@ -1716,15 +1606,8 @@ def _dop_loop(
         s = 1.0 if gap_voltage(t_try, y + (t_try - t) * rhs(t, y, 1.0), 1.0) >= 0.0 else -1.0
     for stop in stops:
         while t < stop:
-            solver = DOP853(
-                lambda t, y, s=s: rhs(t, y, s),
-                t,
-                y,
-                stop,
-                rtol=rtol,
-                atol=atol,
-                first_step=(None if first is None else min(first, stop - t)),
-            )
+            begin = None if first is None else min(first, stop - t)
+            solver = DOP853(lambda t, y, s=s: rhs(t, y, s), t, y, stop, rtol=rtol, atol=atol, first_step=begin)
             while solver.status == "running":
                 message = solver.step()
                 if solver.status == "failed":
@@ -1764,7 +1647,6 @@ def dop853_voltage(
     params: Parameters = TABLE1,
     freq: float,
     rtol: float = 1e-13,
-    u_start: Sequence[float] | None = None,
 ) -> np.ndarray:
     """`local` law in voltage form, C_x(A) u_x' = i - u_x/R_x with sum u_x' = U', by DOP853.
 
@@ -1779,7 +1661,7 @@ def dop853_voltage(
     def conductance(a: float) -> np.ndarray:
         return np.array([1.0 / x.r_total + a / x.r_area for x in layers])
 
-    u = np.zeros(3) if u_start is None else np.asarray(u_start, dtype=float)
+    u = np.zeros(3)
     found: dict[float, np.ndarray] = {}
     for t0, t1, source, slope in segments:
         u = u + share * (float(source(t0)) - u.sum())

@@ -72,7 +72,7 @@ STRANGERS = (
 )
 # Methods that call a part above their own, and load it only when they are called.
 LENT = {
-    "circuit.circuit.Circuit._waveform": "netlist.netlist",
+    "circuit.circuit.Circuit._replaced": "netlist.netlist",
     "circuit.circuit.Circuit.draw": "plots.schematic",
     "circuit.circuit.Circuit.explore": "explorer.server",
     "results.solution.Solution.plot": "plots.traces",

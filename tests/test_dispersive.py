@@ -11,7 +11,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.circuit.spectrum import energy_outside
+from fingerspice.circuit.notices import energy_outside
 from fingerspice.physics.ladder import SKIN_LADDER, Ladder
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
 from scenes import table1_deck

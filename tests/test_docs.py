@@ -14,7 +14,7 @@ import pytest
 import fingerspice as fs
 from fingerspice.base.units import SCALES, parse_number, spice_text
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
-from fingerspice.circuit.usual import SOURCES as USUAL_OF_SOURCES
+from fingerspice.circuit.devices import SOURCES as USUAL_OF_SOURCES
 from fingerspice.netlist.reader import DIRECTIVES
 from fingerspice.netlist.slips import ELSEWHERE
 from fingerspice.netlist.sources import SOURCES

@@ -21,16 +21,10 @@ AREA = "Varea area 0 35"
 X = "LAYER d=1u eps_r=2"
 ISLAND = "is floating: nothing connects it to ground"
 REFUSALS = {
-    "no source": ([COAT, GAP], "the circuit has no source"),
-    "two gaps one area": (
-        [V, f"Xone n0 n1 area {GAP_VALUES}", f"Xtwo n1 0 area {GAP_VALUES}"],
-        "Xone and Xtwo both drive the area node 'area'; allowed: one GAP per area",
-    ),
     "a layer on another area": (
         [V, COAT.replace(" area ", " Elsewhere "), GAP],
         "node 'Elsewhere' gives Xcoat its area, but no GAP and no DC source drives it",
     ),
-    "gap and source on one area": ([V, COAT, GAP, AREA], "Varea and Xgap both drive the area node 'area'"),
     "area driven by nothing": ([V, COAT, SLAB], "node 'area' gives Xcoat its area, but no GAP and no DC source"),
     "area driven twice": ([V, COAT, SLAB, AREA, "Vmore area 0 35"], "more than one source drives it"),
     "layers on two areas": (
@@ -42,12 +36,9 @@ REFUSALS = {
     "area of zero": ([V, COAT, SLAB, "Varea area 0 0"], "Varea drives an area: allowed is a DC value above 0"),
     "area below zero": ([V, COAT, SLAB, "Varea area 0 -35"], "Varea drives an area"),
     "dangling end": ([V, COAT, GAP.replace("n1 0", "n1 Loose")], "node 'Loose' is floating: only Xgap touches it"),
-    "open circuit": ([V, COAT, GAP.replace("n1", "n2")], "is floating: only"),
     "island": ([V, COAT, GAP, f"Xlost q r area {X}", f"Xmore q r area {X}"], ISLAND),
     "no ground": ([V.replace(" 0 ", " n9 ", 1), COAT, GAP.replace("n1 0", "n1 n9")], "no element touches ground"),
     "area node as a conductor": ([V, "Xcoat n0 area area LAYER d=1u eps_r=3.9", GAP], "is floating"),
-    "both ends on one node": ([V, COAT, GAP, f"Xloop n1 n1 area {X}"], "Xloop has both ends on node 'n1'"),
-    "parallel sources": ([V, "Vsecond n0 0 5", COAT, GAP], "Vdrive and Vsecond are voltage sources in parallel"),
     "antiparallel sources": ([V, "Vsecond 0 n0 5", COAT, GAP], "Vdrive and Vsecond are voltage sources in parallel"),
     "source loop": ([V, "Vb n0 n5 5", "Vc n5 0 5", COAT, GAP], "Vc closes a loop of voltage sources"),
     "no source in the loop": ([COAT.replace("n0", "0"), SLAB, AREA], "the circuit has no source"),
@@ -133,12 +124,6 @@ def test_replace_changes_one_parameter_and_changing_it_back_restores_the_circuit
         assert changed.replace({path: parameter.value}).elements == circuit.elements
         assert circuit.parameters[path].value == parameter.value
         assert path in changed.overrides
-
-
-def test_replace_takes_names_in_any_case_and_several_at_once() -> None:
-    changed = table1().replace({"xGAP.D": 3e-6, "XSKIN.f": 200.0})
-    assert changed.parameters["Xgap.d"].value == 3e-6
-    assert changed.parameters["Xskin.f"].value == 200.0
 
 
 def test_a_source_is_replaced_by_a_waveform_a_number_or_a_function() -> None:

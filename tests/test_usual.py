@@ -14,8 +14,7 @@ import fingerspice as fs
 from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.base.units import parse_number, spice_text
-from fingerspice.circuit.devices import DEVICES, ParameterSpec
-from fingerspice.circuit.usual import REST_AREA, SOURCES
+from fingerspice.circuit.devices import DEVICES, REST_AREA, SOURCES, ParameterSpec
 from scenes import deck, table1
 
 

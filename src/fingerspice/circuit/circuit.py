@@ -5,25 +5,21 @@ from __future__ import annotations
 import cmath
 import dataclasses
 import math
-import threading
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.pages import Page, Shown
-from fingerspice.circuit.devices import DEVICES, DeviceSpec
-from fingerspice.circuit.usual import check, concerns, unusual_of_changed, value_of
+from fingerspice.circuit.devices import DEVICES, DeviceSpec, check, concerns, unusual_of_changed, value_of
 from fingerspice.waveforms.waveform import Waveform, as_waveform
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
-_REMEMBERING = threading.Lock()
 T = TypeVar("T")
 #: A value in the netlist's unit, as a number or text, or a source's waveform or function of time (s); by path.
 Change = float | str | Waveform | Callable[[float], float]
@@ -79,17 +75,20 @@ class Element:
         """The device's entry in the registry."""
         return DEVICES[self.device]
 
-    @cached_property
-    def kept(self) -> dict[Any, Any]:
-        """Cache of `remember`."""
-        return {}
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """Every number of the device and of its waveform by name, with its unit."""
+        found = {p.name: Parameter(self.values[p.name], p.unit) for p in self.spec.parameters}
+        units = {} if self.waveform is None else type(self.waveform).units
+        given = {name: Parameter(getattr(self.waveform, name, math.nan), unit) for name, unit in units.items()}
+        return found | {name: p for name, p in given.items() if hasattr(self.waveform, name)}
 
     def remember(self, key: Any, make: Callable[[], T]) -> T:
         """The result of `make`, which depends on this element alone, for all circuits that contain it."""
-        if key not in self.kept:
-            self.kept[key] = make()
-        found: T = self.kept[key]
-        return found
+        kept: dict[Any, T] = vars(self).setdefault("kept", {})
+        if key not in kept:
+            kept[key] = make()
+        return kept[key]
 
 
 @dataclass(frozen=True)
@@ -182,12 +181,10 @@ class Circuit(Shown):
         kept: tuple[T] | None = self._memory.get(key)
         if kept is None:
             # Two threads may both call `make`, with the same result.
-            kept = (make(),)
-            with _REMEMBERING:
-                # Drop the oldest entry, so that a sweep over stop times cannot fill the memory.
-                if len(self._memory) >= 16:
-                    self._memory.pop(next(iter(self._memory)))
-                self._memory[key] = kept
+            self._memory[key] = kept = (make(),)
+            # Drop the oldest entries, so that a sweep over stop times cannot fill the memory.
+            for oldest in list(self._memory)[:-16]:
+                self._memory.pop(oldest, None)
         return kept[0]
 
     def __getitem__(self, name: str) -> Element:
@@ -210,13 +207,7 @@ class Circuit(Shown):
     @property
     def parameters(self) -> Mapping[str, Parameter]:
         """Every parameter by path (``Xgap.d``, ``Vdrive.amplitude``), with its value and unit as in the netlist."""
-        found: dict[str, Parameter] = {}
-        for e in self.elements:
-            found |= {f"{e.name}.{p.name}": Parameter(e.values[p.name], p.unit) for p in e.spec.parameters}
-            units = {} if e.waveform is None else type(e.waveform).units
-            given = {name: Parameter(getattr(e.waveform, name, math.nan), unit) for name, unit in units.items()}
-            found |= {f"{e.name}.{name}": p for name, p in given.items() if hasattr(e.waveform, name)}
-        return MappingProxyType(found)
+        return MappingProxyType({f"{e.name}.{name}": p for e in self.elements for name, p in e.parameters.items()})
 
     def draw(self, path: str | Path | None = None) -> Any:
         """Draw the schematic: a notebook shows it as SVG, and from a script ``draw().show()`` opens a window.
@@ -294,9 +285,14 @@ class Circuit(Shown):
         for path, value in changes.items():
             name, _, parameter = path.lower().rpartition(".")
             if path.lower() in elements and elements[path.lower()].device in "VI":
-                element = elements[path.lower()]
+                if isinstance(value, str):
+                    from fingerspice.netlist.netlist import source_from_text
+
+                    waveform = source_from_text(value, self)
+                else:
+                    waveform = as_waveform(value)
                 # The AC magnitude belonged to the source that is replaced.
-                elements[path.lower()] = dataclasses.replace(element, waveform=self._waveform(value), ac=None)
+                elements[path.lower()] = dataclasses.replace(elements[path.lower()], waveform=waveform, ac=None)
             elif name in elements:
                 elements[name], trap = _changed(elements[name], parameter, value, path)
                 traps |= {path.lower(): trap} if trap else {}
@@ -328,27 +324,17 @@ class Circuit(Shown):
             )
         return _unknown("parameter", path, [*self.parameters, *(e.name for e in self.by_device("V", "I"))])
 
-    def _waveform(self, given: Change) -> Waveform:
-        if not isinstance(given, str):
-            return as_waveform(given)
-        from fingerspice.netlist.netlist import source_from_text
-
-        return source_from_text(given, self)
-
 
 def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:
     """An element with a new value, and a warning about the value's notation, or None."""
-    units = {} if element.waveform is None else type(element.waveform).units
-    if parameter in element.values:
-        spec = element.spec.parameter(parameter)
-        value, note = value_of(path, given, spec, spec.unit)
-        values = MappingProxyType({**element.values, parameter: value})
-        return dataclasses.replace(element, values=values), note
-    if parameter in units:
-        value, note = value_of(path, given, None, units[parameter])
-        waveform = dataclasses.replace(element.waveform, **{parameter: value})  # type: ignore[type-var]
-        return dataclasses.replace(element, waveform=waveform), note
-    raise InputError(_unknown("parameter", path, [f"{element.name}.{name}" for name in (*element.values, *units)]))
+    known, own = element.parameters, parameter in element.values
+    if parameter not in known:
+        raise InputError(_unknown("parameter", path, [f"{element.name}.{name}" for name in known]))
+    value, note = value_of(path, given, element.spec.parameter(parameter) if own else None, known[parameter].unit)
+    if own:
+        return dataclasses.replace(element, values=MappingProxyType({**element.values, parameter: value})), note
+    waveform = dataclasses.replace(element.waveform, **{parameter: value})  # type: ignore[type-var]
+    return dataclasses.replace(element, waveform=waveform), note
 
 
 def _unknown(kind: str, given: str, known: list[str]) -> str:

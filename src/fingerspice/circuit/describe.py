@@ -11,8 +11,8 @@ from typing import Any
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.devices import shown
 from fingerspice.circuit.topology import driving
-from fingerspice.circuit.usual import shown
 from fingerspice.waveforms.combinations import Burst, Product, Repeat, Sum
 from fingerspice.waveforms.ramps import PWL
 from fingerspice.waveforms.samples import Samples
@@ -105,11 +105,8 @@ def drive_text(circuit: Circuit) -> str:
     Sources that were replaced are left out, since `changes_text` lists them.
     """
     replaced = {path.lower() for path in circuit.overrides} - _given_by_sets(circuit)
-    return _joined([
-        f"{e.name}: {_own_text(e)}"
-        for e in driving(circuit)
-        if e.waveform not in (None, DC(0.0)) and e.name.lower() not in replaced
-    ])  # fmt: skip
+    on = (e for e in driving(circuit) if e.waveform not in (None, DC(0.0)) and e.name.lower() not in replaced)
+    return _joined([f"{e.name}: {_own_text(e)}" for e in on])
 
 
 def changes_text(circuit: Circuit) -> str:
@@ -121,20 +118,19 @@ def changes_text(circuit: Circuit) -> str:
     now = {e.name.lower(): f"{e.name} = {_own_text(e)}" for e in circuit.elements if e.waveform is not None}
     now |= {path.lower(): f"{path} = {shown(p.value, p.unit)}" for path, p in circuit.parameters.items()}
     # A path may have been changed twice, in two spellings; of one that is unknown the last text counts.
-    last = {path.lower(): f"{path} = {_as_given(text)}" for path, text in circuit.overrides.items()}
+    last = {path.lower(): (path, text) for path, text in circuit.overrides.items()}
+    for key in last.keys() - now.keys():
+        path, text = last[key]
+        kind = text.partition("(")[0]
+        short = text if len(text) <= 40 else f"{kind}(...)" if kind.isidentifier() else f"{text[:36]} ..."
+        now[key] = f"{path} = {short}"
     given = _given_by_sets(circuit)
-    return _joined([*said, *(now.get(path, text) for path, text in last.items() if path not in given)])
+    return _joined([*said, *(now[path] for path in last if path not in given)])
 
 
 def _given_by_sets(circuit: Circuit) -> set[str]:
     """Paths of the values that sets of parameters gave and that still hold, in lower case."""
     return {path.lower() for kept, _ in in_force(circuit).values() for path in kept}
-
-
-def _as_given(text: str) -> str:
-    """The text to which a parameter was set, shortened if it is long."""
-    kind = text.partition("(")[0]
-    return text if len(text) <= 40 else f"{kind}(...)" if kind.isidentifier() else f"{text[:36]} ..."
 
 
 def heading(circuit: Circuit) -> str:
@@ -145,8 +141,7 @@ def heading(circuit: Circuit) -> str:
 
 def head_lines(circuit: Circuit) -> list[str]:
     """Lines at the top of a report: the heading, and the sources that are not 0, if there are any."""
-    drive = drive_text(circuit)
-    return [heading(circuit), *([drive] if drive else [])]
+    return [heading(circuit), *filter(None, [drive_text(circuit)])]
 
 
 def circuit_page(circuit: Circuit) -> Page:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -193,14 +193,15 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
 
     across = rows([cell.nodes for cell in cells])
     conductance = np.array([1.0 / e.values["value"] for e in resistors])
-    found = eliminate(rows([e.nodes for e in resistors]), rows([e.nodes for e in currents]), conductance, n_e)
-    delivered, together = found.source_currents(n_v)
+    over_resistors, over_currents = rows([e.nodes for e in resistors]), rows([e.nodes for e in currents])
+    from_e, from_i, into_e, into_i, factor = _eliminate(over_resistors, over_currents, conductance, n_e)
+    delivered, together = _source_currents(into_e, into_i, factor, n_v)
     s, x, order = slice(0, n_v), slice(n_v, n_e), [*range(n_v, n_e), *range(n_v)]
     through = np.zeros((n_v + n_i, len(cells)))
     through[:n_v] = across[:, s].T + together @ across[:, x].T
-    names = tree.names
+    names = list(tree.branches)
     at_node = np.array([potential[name] for name in names]).reshape(len(names), n_e + n_r)
-    whole = at_node[:, :n_e] + at_node[:, n_e:] @ found.from_e
+    whole = at_node[:, :n_e] + at_node[:, n_e:] @ from_e
     written = {node: name for el in branches for node, name in zip(el.nodes, el.node_names, strict=True)}
     shown = [i for i, name in enumerate(names) if name in written and name != "0"]
     return Network(
@@ -214,14 +215,14 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
         gaps=tuple(next((i for i, c in enumerate(cells) if c.element is a.gap), None) for a in areas),
         p=np.ascontiguousarray(across[:, x]),
         q=np.hstack([across[:, s], np.zeros((len(cells), n_i))]),
-        k=found.into_e[x, x],
-        b=np.hstack([found.into_e[x, s], found.into_i[x]]),
+        k=into_e[x, x],
+        b=np.hstack([into_e[x, s], into_i[x]]),
         through=through,
         delivered=delivered,
-        resistor_factor=found.factor[:, x],
-        resistor_factor_s=np.hstack([found.factor[:, s], np.zeros((len(resistors), n_i))]),
+        resistor_factor=factor[:, x],
+        resistor_factor_s=np.hstack([factor[:, s], np.zeros((len(resistors), n_i))]),
         node_names=tuple(written[names[i]] for i in shown),
-        nodes=np.hstack([whole[shown][:, order], (at_node[:, n_e:] @ found.from_i)[shown]]),
+        nodes=np.hstack([whole[shown][:, order], (at_node[:, n_e:] @ from_i)[shown]]),
     )
 
 
@@ -238,48 +239,17 @@ def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
     ]
 
 
-class Resistors(NamedTuple):
-    """What resistors do in a network, with the voltages of the tree's resistors eliminated.
-
-    The tree's other voltages are e = (s, x), those of its sources and its capacitors.
-    """
-
-    # from_e, from_i (n_r, n_e): Voltages of the tree's resistors by e, and by the currents of the current sources
-    from_e: FloatArray
-    from_i: FloatArray
-    # into_e, into_i (n_e, n_e): Currents into the cuts of the tree's sources and capacitors, by both
-    into_e: FloatArray
-    into_i: FloatArray
-    factor: FloatArray  # (n_resistor, n_e): Square roots of the power in each resistor, by e: into_e = factor' factor
-
-    def source_currents(self, n_v: int) -> tuple[FloatArray, FloatArray]:
-        """What the sources deliver to resistors, and the cuts of capacitors that are added to their own.
-
-        The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
-        capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
-
-        The first is (n_v + n_i, n + n_v + n_i), the current of each source (A) by the voltages of the capacitors and of
-        the n_v voltage sources and the currents of the others; the second (n_v, n), shares of the capacitors' cuts.
-        """
-        (n_e, n_i), factor = self.into_i.shape, self.factor
-        # The order of the result's columns: capacitors, voltage sources.
-        order = [*range(n_v, n_e), *range(n_v)]
-        together: FloatArray = np.zeros((n_v, n_e - n_v))
-        if factor.size:
-            together = np.asarray(-np.linalg.lstsq(factor[:, n_v:], factor[:, :n_v], rcond=None)[0].T, float)
-        into = np.hstack([self.into_e[:, order], self.into_i])
-        delivered: FloatArray = np.vstack([into[:n_v] + together @ into[n_v:], np.eye(n_i, n_e + n_i, n_e)])
-        size = np.linalg.norm(factor, axis=0)
-        rounding = np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.outer(size[:n_v], size[order])
-        delivered[:n_v, :n_e][rounding] = 0.0
-        return delivered, together
-
-
-def eliminate(over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_e: int) -> Resistors:
-    """Eliminate the voltages of the tree's resistors: given e, they minimise the dissipated power.
+def _eliminate(
+    over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_e: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Eliminate the voltages of the tree's resistors: given its other voltages e = (s, x), they minimise the power.
 
     `over_resistors` (n_resistor, n_e + n_r) and `over_currents` (n_i, n_e + n_r) are the voltages of all resistors and
     current sources by those of the tree's branches, its own resistors last; `conductance` (n_resistor,) is in S.
+
+    Returned are the voltages of the tree's resistors by e (n_r, n_e) and by the currents of the current sources
+    (n_r, n_i); the currents into the cuts of the tree's sources and capacitors by both, (n_e, n_e) and (n_e, n_i); and
+    the square roots of the power in each resistor by e (n_resistor, n_e), a factor f of these currents f^T f.
     """
     weight, (over_e, over_r) = np.sqrt(conductance)[:, None], np.hsplit(over_resistors, [n_e])
     orthogonal, upper = np.linalg.qr(weight * over_r)
@@ -287,7 +257,32 @@ def eliminate(over_resistors: FloatArray, over_currents: FloatArray, conductance
     from_i = -np.linalg.solve(upper, np.linalg.solve(upper.T, over_currents[:, n_e:].T))
     by_e, by_i = over_e + over_r @ from_e, over_r @ from_i
     into_i = over_e.T @ (conductance[:, None] * by_i) + over_currents[:, :n_e].T
-    return Resistors(from_e, from_i, by_e.T @ (conductance[:, None] * by_e), into_i, weight * by_e)
+    return from_e, from_i, by_e.T @ (conductance[:, None] * by_e), into_i, weight * by_e
+
+
+def _source_currents(
+    into_e: FloatArray, into_i: FloatArray, factor: FloatArray, n_v: int
+) -> tuple[FloatArray, FloatArray]:
+    """What the sources deliver to resistors, and the cuts of capacitors that are added to their own.
+
+    The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
+    capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
+
+    The first is (n_v + n_i, n + n_v + n_i), the current of each source (A) by the voltages of the capacitors and of the
+    n_v voltage sources and the currents of the others; the second (n_v, n), shares of the capacitors' cuts.
+    """
+    n_e, n_i = into_i.shape
+    # The order of the result's columns: capacitors, voltage sources.
+    order = [*range(n_v, n_e), *range(n_v)]
+    together: FloatArray = np.zeros((n_v, n_e - n_v))
+    if factor.size:
+        together = np.asarray(-np.linalg.lstsq(factor[:, n_v:], factor[:, :n_v], rcond=None)[0].T, float)
+    into = np.hstack([into_e[:, order], into_i])
+    delivered: FloatArray = np.vstack([into[:n_v] + together @ into[n_v:], np.eye(n_i, n_e + n_i, n_e)])
+    size = np.linalg.norm(factor, axis=0)
+    rounding = np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.outer(size[:n_v], size[order])
+    delivered[:n_v, :n_e][rounding] = 0.0
+    return delivered, together
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class Stack:
     area_given: float | None  # Area fixed by the deck, m^2
     hops: tuple[Hop, ...]  # The elements of the loop in order, from ground to ground
     # Whatever else is computed from the layers alone, shared by stacks that differ in their sources only
-    kept: dict[Any, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
+    kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def sources(self) -> tuple[tuple[Element, float], ...]:
@@ -98,14 +98,6 @@ class Stack:
         left_out = next((i for i in reversed(range(self.c.size)) if i != self.gap), 0)
         return (*(i for i in range(self.c.size) if i != left_out), left_out)
 
-    def between(self, hops: tuple[Hop, ...]) -> Stack:
-        """The stack of the same layers between other sources; it keeps what has been computed from the layers."""
-        changed = object.__new__(Stack)
-        vars(changed).update({**vars(self), "hops": hops})
-        for name in ("waveform", "_of_whole_layers"):
-            vars(changed).pop(name, None)
-        return changed
-
     @property
     def by_layer(self) -> Stack:
         """The stack with each layer as one capacitor without leak: its voltages are those that a run records."""
@@ -116,7 +108,7 @@ class Stack:
     def _of_whole_layers(self) -> Stack:
         c, none = 1.0 / np.add.reduceat(1.0 / self.c, self.first_cell), np.zeros(len(self.layers))
         one, sign = (1,) * len(self.layers), self.sign[self.first_cell]
-        return replace(self, cells=one, sign=sign, c=c, g_total=none, g_area=none, gap=self.gap_layer)
+        return replace(self, cells=one, sign=sign, c=c, g_total=none, g_area=none, gap=self.gap_layer, kept={})
 
     @cached_property
     def grouping(self) -> FloatArray:
@@ -208,7 +200,7 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
             )
         hops, area = loop
         found = shared(circuit, ("stack", skin_at, circuit.work), lambda: _build(hops, area, skin_at, circuit.work))
-        return found if found.hops is hops else found.between(hops)
+        return replace(found, hops=hops)
 
     return circuit.remember(("stack", skin_at), make)
 

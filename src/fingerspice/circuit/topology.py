@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from types import MappingProxyType
@@ -68,11 +68,8 @@ def find_branches(circuit: Circuit) -> tuple[tuple[Area, ...], list[Element]]:
 
 def driving(circuit: Circuit) -> list[Element]:
     """The V and I elements that do not give an area, of any circuit."""
-    if "driving" not in circuit.related:
-        areas = {e.nodes[2] for e in circuit.elements if e.spec.is_layer}
-        found = (e for e in circuit.by_device("V", "I") if areas.isdisjoint(e.nodes))
-        circuit.related["driving"] = {e.name for e in found}
-    return [e for e in circuit.elements if e.name in circuit.related["driving"]]
+    areas = {e.nodes[2] for e in circuit.elements if e.spec.is_layer}
+    return [e for e in circuit.by_device("V", "I") if areas.isdisjoint(e.nodes)]
 
 
 def driving_sources(circuit: Circuit) -> list[Element]:
@@ -153,11 +150,8 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
     for gap in circuit.by_device("GAP"):
         node = gap.nodes[2]
         if node in owners:
-            raise InputError(
-                f"{owners[node].name} and {gap.name} both drive the area node {gap.node_names[2]!r}; allowed: "
-                "one GAP per area",
-                gap.where,
-            )
+            both = f"{owners[node].name} and {gap.name} both drive the area node {gap.node_names[2]!r}"
+            raise InputError(f"{both}; allowed: one GAP per area", gap.where)
         owners[node] = gap
     at = _incidence(list(circuit.by_device("V", "I", "R", "C")))
     out = []
@@ -180,20 +174,15 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
 
 def _given_by_source(layer: Element, sources: list[Element], gaps: list[Element]) -> float:
     if len(sources) != 1:
+        what = f"node {layer.node_names[2]!r} gives {layer.name} its area, but "
+        what += "more than one source drives it" if sources else "no GAP and no DC source drives it"
+        allowed = f"one GAP, or one V element such as 'Varea {layer.node_names[2]} 0 35' (mm^2)"
         driven = "".join(f"; {gap.name} drives {gap.node_names[2]!r}" for gap in gaps)
-        raise InputError(
-            f"node {layer.node_names[2]!r} gives {layer.name} its area, but "
-            + ("no GAP and no DC source drives it" if not sources else "more than one source drives it")
-            + f"; allowed: one GAP, or one V element such as 'Varea {layer.node_names[2]} 0 35' (mm^2){driven}",
-            layer.where,
-        )
+        raise InputError(f"{what}; allowed: {allowed}{driven}", layer.where)
     source = sources[0]
     if not isinstance(source.waveform, DC) or source.nodes[1] != "0" or not 1e-30 <= source.waveform.level <= 1e30:
-        raise InputError(
-            f"{source.name} drives an area: allowed is a DC value above 0 (mm^2, from 1e-30 to 1e30) from the area "
-            "node to 0",
-            source.where,
-        )
+        allowed = "allowed is a DC value above 0 (mm^2, from 1e-30 to 1e30) from the area node to 0"
+        raise InputError(f"{source.name} drives an area: {allowed}", source.where)
     return source.waveform.level * 1e-6
 
 
@@ -232,29 +221,19 @@ def _refuse_floating(branches: list[Element]) -> None:
     for node, elements in sorted(at.items(), key=lambda item: item[0] == "0"):
         if len(elements) == 1:
             e = elements[0]
-            raise InputError(
-                f"node {_as_written(node, e)!r} is floating: only {e.name} touches it; allowed: two or more elements "
-                f"at every node{_lookalike(node, at)}",
-                e.where,
-            )
+            # Ground under another name, or a node of which this one may be a misspelling
+            near = get_close_matches(node, [other for other in at if other not in (node, "0")], 1, 0.7)
+            hint = f"; is {_as_written(near[0], at[near[0]][0])!r} the same node?" if near else ""
+            hint = "; ground is 0 or gnd" if node.startswith(_GROUNDS) else hint
+            alone = f"node {_as_written(node, e)!r} is floating: only {e.name} touches it"
+            raise InputError(f"{alone}; allowed: two or more elements at every node{hint}", e.where)
     if "0" not in at:
         raise InputError("no element touches ground; allowed: one node must be 0 (or gnd)")
     reached = _ways(branches, "0")
     for node, elements in at.items():
         if node not in reached:
-            e = elements[0]
-            raise InputError(
-                f"node {_as_written(node, e)!r} ({e.name}) is floating: nothing connects it to ground",
-                e.where,
-            )
-
-
-def _lookalike(node: str, at: Mapping[str, list[Element]]) -> str:
-    """Hint for the message: ground under another name, or a node of which this one may be a misspelling."""
-    if node.startswith(_GROUNDS):
-        return "; ground is 0 or gnd"
-    near = get_close_matches(node, [other for other in at if other not in (node, "0")], 1, 0.7)
-    return f"; is {_as_written(near[0], at[near[0]][0])!r} the same node?" if near else ""
+            what = f"node {_as_written(node, elements[0])!r} ({elements[0].name})"
+            raise InputError(f"{what} is floating: nothing connects it to ground", elements[0].where)
 
 
 class Tree:
@@ -262,12 +241,9 @@ class Tree:
 
     def __init__(self) -> None:
         self._parent: dict[str, str] = {}
-        self._branches: dict[str, list[tuple[str, int, float]]] = defaultdict(list)
+        # Of each node its branches: the other node, the branch's number, and the sign of its voltage from here
+        self.branches: dict[str, list[tuple[str, int, float]]] = defaultdict(list)
         self._count = 0
-
-    @property
-    def names(self) -> list[str]:
-        return list(self._branches)
 
     def _root(self, node: str) -> str:
         while self._parent.setdefault(node, node) != node:
@@ -281,8 +257,8 @@ class Tree:
         if a == b:
             return False
         self._parent[a] = b
-        self._branches[p].append((n, self._count, -1.0))
-        self._branches[n].append((p, self._count, 1.0))
+        self.branches[p].append((n, self._count, -1.0))
+        self.branches[n].append((p, self._count, 1.0))
         self._count += 1
         return True
 
@@ -292,7 +268,7 @@ class Tree:
         todo = ["0"]
         while todo:
             node = todo.pop()
-            for other, branch, sign in self._branches[node]:
+            for other, branch, sign in self.branches[node]:
                 if other not in out:
                     out[other] = out[node].copy()
                     out[other][branch] = sign
@@ -303,22 +279,17 @@ class Tree:
 def _refuse_source_conflicts(branches: list[Element]) -> None:
     tree, before = Tree(), list[Element]()
     for element in (e for e in branches if e.device == "V"):
-        if not tree.add(*element.nodes[:2]):
-            others = _path(before, *element.nodes[:2])
-            if len(others) == 1:
-                raise InputError(f"{others[0].name} and {element.name} are voltage sources in parallel", element.where)
-            names = ", ".join(e.name for e in others)
-            raise InputError(f"{element.name} closes a loop of voltage sources with {names}", element.where)
-        before.append(element)
-
-
-def _path(branches: list[Element], start: str, end: str) -> list[Element]:
-    """The branches on the path from one node to another; the given branches form no loop, so the path is unique."""
-    came, found, node = _ways(branches, start), list[Element](), end
-    while (step := came[node]) is not None:
-        found.append(step)
-        node = step.nodes[0] if step.nodes[1] == node else step.nodes[1]
-    return found
+        if tree.add(*element.nodes[:2]):
+            before.append(element)
+            continue
+        # The sources before form no loop: there is one way through them from one end to the other.
+        came, others, node = _ways(before, element.nodes[0]), list[str](), element.nodes[1]
+        while (step := came[node]) is not None:
+            others.append(step.name)
+            node = step.nodes[0] if step.nodes[1] == node else step.nodes[1]
+        if len(others) == 1:
+            raise InputError(f"{others[0]} and {element.name} are voltage sources in parallel", element.where)
+        raise InputError(f"{element.name} closes a loop of voltage sources with {', '.join(others)}", element.where)
 
 
 def _refuse_current_without_path(branches: list[Element]) -> None:
@@ -327,8 +298,7 @@ def _refuse_current_without_path(branches: list[Element]) -> None:
     for element in branches:
         for node in element.nodes[:2]:
             if element.device == "I" and node not in reached:
-                raise InputError(
-                    f"{element.name} is a current source without a path: node {_as_written(node, element)!r} is "
-                    "reached through current sources only; allowed: an R, C or layer that takes the current to ground",
-                    element.where,
-                )
+                where = f"node {_as_written(node, element)!r} is reached through current sources only"
+                allowed = "an R, C or layer that takes the current to ground"
+                problem = f"{element.name} is a current source without a path: {where}; allowed: {allowed}"
+                raise InputError(problem, element.where)

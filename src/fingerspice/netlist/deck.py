@@ -11,16 +11,14 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.files import MAX_BYTES, read_stream, read_text
 from fingerspice.netlist.lexer import MAX_NAME, Group, Lexeme, Line, group, lex
-from fingerspice.netlist.reader import DIRECTIVES, DirectiveLine, Reader, Subcircuit
-from fingerspice.netlist.scope import Bare, Scope
+from fingerspice.netlist.reader import DIRECTIVES, Deck, Reader, Subcircuit
+from fingerspice.netlist.scope import Bare, Directive, Number, Scope, Statement, Value
 from fingerspice.netlist.slips import nearest, stray_word, with_comma
-from fingerspice.netlist.words import Deck, Directive, Number, Statement, Value
 
 #: Largest number of characters of a title that are shown; the middle of a longer title is left out.
 LONGEST_TITLE = 200
@@ -30,25 +28,6 @@ MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 
 
-class Kind(NamedTuple):
-    """What is read of the elements with a letter, besides X, which has two nodes."""
-
-    what: str
-    # Kind of text that is evaluated without braces: a word of a resistor or capacitor names a parameter, those of a
-    # source are keywords (DC, SIN)
-    bare: Bare = "nothing"
-    value: tuple[str, ...] = ()  # Other names of the value
-    beside: tuple[str, ...] = ()  # LTspice's parasitics, which become elements: rser in series, all others in parallel
-    data: tuple[str, ...] = ()  # Data of a part that LTspice and Qucs-S write and no calculation uses
-
-
-KINDS = {
-    "R": Kind("resistor", "name", ("r", "resistance"), (), ("tol", "pwr", "tc1", "tc2")),
-    "C": Kind("capacitor", "name", ("c", "capacitance"), ("rser", "rpar", "cpar"),
-              ("tol", "v", "irms", "mfg", "pn", "type", "tc1", "tc2")),
-    "V": Kind("voltage source", beside=("rser", "cpar")),
-    "I": Kind("current source"),
-}  # fmt: skip
 _ELSEWHERE = {
     "A": "an XSPICE model",
     "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
@@ -162,9 +141,19 @@ class Flattener:
         self._expand(_Instance(root, scope))
 
     def _expand(self, instance: _Instance) -> None:
+        """Add the statements and directives of a call; an `.ic` line gets the canonical names of its nodes."""
         for line in instance.definition.elements:
             self._element(line, instance)
-        self.deck.directives += [_directive(read, instance) for read in instance.definition.directives]
+        for name, line, rest in instance.definition.directives:
+            words = group(lex(line, rest), probes=True)
+            args, params = instance.scope.words(words.words), dict[str, Value]()
+            for key, value in instance.scope.pairs(words).items():
+                probe = name == ".ic" and key.startswith("v(")
+                flat = f"v({instance.node(key[2:-1].strip())[0]})" if probe else key
+                if flat in params:
+                    raise InputError(f".ic gives node {flat[2:-1]!r} twice", value.key)
+                params[flat] = value
+            self.deck.directives.append(Directive(name, args, params, line.place, line.text[line.start :]))
 
     def _element(self, line: Line, instance: _Instance) -> None:
         lexemes = lex(line) or [Lexeme("", ",", line.start, line)]  # a line of commas has none
@@ -173,7 +162,7 @@ class Flattener:
         if first.kind != "word" or not (letter.isascii() and letter.isalpha()):
             problem = f"'{first.written}' is no element: a line begins with R, C, V, I, X or a dot, a comment with *"
             raise InputError(problem, where)
-        if letter != "X" and letter not in KINDS:
+        if letter != "X" and letter not in DEVICES:
             raise InputError(_unknown_element(lexemes), where)
         name = f"{instance.prefix}{first.text}"
         if len(name) > MAX_NAME:
@@ -184,14 +173,16 @@ class Flattener:
         if letter == "X":
             self._call(name, lexemes, instance)
             return
-        kind, scope, words = KINDS[letter], instance.scope, group(lexemes[1:], plain=2)
+        scope, words = instance.scope, group(lexemes[1:], plain=2)
         nodes = [word for word in words.words[:2] if isinstance(word, Lexeme)]
         if len(nodes) < 2 or (len(words.words) == 2 and not words.params):
             missing = "node" if len(nodes) < 2 else "value"
-            raise InputError(f"missing {missing}: a {kind.what} is written {name} node node value", where)
+            raise InputError(f"missing {missing}: a {DEVICES[letter].what} is written {name} node node value", where)
         canonical, written = zip(*instance.nodes(nodes), strict=True)
-        body, params = scope.words(words.words[2:], kind.bare), scope.pairs(words, kind.bare)
-        self.deck.statements.append(Statement(name, letter, canonical, written, None, body, params, where))
+        # A word of a resistor or capacitor names a parameter, those of a source are keywords (DC, SIN).
+        bare: Bare = "name" if letter in "RC" else "nothing"
+        body, params = scope.words(words.words[2:], bare), scope.pairs(words, bare)
+        self.deck.statements.append(Statement(name, letter, canonical, written, body, params, where))
 
     def _call(self, name: str, lexemes: list[Lexeme], instance: _Instance) -> None:
         """An X line: a native device becomes a statement, and a subcircuit is expanded."""
@@ -226,12 +217,20 @@ class Flattener:
             given = {key: value.value for key, value in params.items() if isinstance(value, Number)}
             _refuse_captured(native, given, words, scope)
             where = lexemes[0].where
-            self.deck.statements.append(Statement(name, "X", canonical, written, native, (), params, where))
+            self.deck.statements.append(Statement(name, native, canonical, written, (), params, where))
             return
         self._count(called, instance, device.where)
         ports = dict(zip(called.ports, instance.nodes(nodes), strict=True))
         called.called = True
-        inner = _scope_of(called, words, scope)
+        # Values on the X line are evaluated in the caller's scope, defaults in the subcircuit's.
+        inner = Scope((*called.defaults, *called.params), scope)
+        allowed = {default.key.text.lower(): default.key.text for default in called.defaults}
+        for parameter, (word, value) in words.params.items():
+            if parameter not in allowed:
+                hint = nearest(parameter, allowed) or f"; it has {' '.join(allowed.values()) or 'none'}"
+                raise InputError(f"subcircuit '{called.name}' has no parameter '{word.text}'{hint}", word.where)
+            inner.preset(parameter, scope.number(value))
+        _refuse_captured(called.name, inner.solve(), words, scope)
         self._expand(_Instance(called, inner, outside, f"{name}.", ports, (*instance.calls, called)))
 
     def _count(self, called: Subcircuit, instance: _Instance, where: Where) -> None:
@@ -248,34 +247,6 @@ class Flattener:
         self._expanded_text += called.characters
         if self._expanded_text > MAX_EXPANDED_TEXT:
             raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
-
-
-def _directive(read: DirectiveLine, instance: _Instance) -> Directive:
-    """An evaluated directive; an `.ic` line has the canonical names of its nodes, which are those of a call."""
-    line, scope = read.line, instance.scope
-    words = group(lex(line, read.rest), probes=True)
-    args, params = scope.words(words.words), scope.pairs(words)
-    if read.name == ".ic":
-        given, params = params, dict[str, Value]()
-        for key, value in given.items():
-            flat = f"v({instance.node(key[2:-1].strip())[0]})" if key.startswith("v(") else key
-            if flat in params:
-                raise InputError(f".ic gives node {flat[2:-1]!r} twice", value.key)
-            params[flat] = value
-    return Directive(read.name, args, params, line.place, line.text[line.start :])
-
-
-def _scope_of(called: Subcircuit, words: Group, caller: Scope) -> Scope:
-    """A call's parameters: values on the X line evaluated in the caller's scope, defaults in the subcircuit's."""
-    inner = Scope((*called.defaults, *called.params), caller)
-    allowed = {default.key.text.lower(): default.key.text for default in called.defaults}
-    for name, (key, value) in words.params.items():
-        if name not in allowed:
-            hint = nearest(name, allowed) or f"; it has {' '.join(allowed.values()) or 'none'}"
-            raise InputError(f"subcircuit '{called.name}' has no parameter '{key.text}'{hint}", key.where)
-        inner.preset(name, caller.number(value))
-    _refuse_captured(called.name, inner.solve(), words, caller)
-    return inner
 
 
 def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:

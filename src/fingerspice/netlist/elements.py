@@ -10,12 +10,10 @@ from typing import Any, Literal
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import exponent_and_scale
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
-from fingerspice.circuit.devices import DEVICES, ParameterSpec
-from fingerspice.circuit.usual import mega_note, unit_trap, unusual
-from fingerspice.netlist.deck import KINDS
+from fingerspice.circuit.devices import DEVICES, ParameterSpec, mega_note, unit_trap, unusual
+from fingerspice.netlist.scope import Call, Directive, Number, Statement, Token, Value
 from fingerspice.netlist.slips import is_unit, nearest
 from fingerspice.netlist.sources import Context, Source, read_source
-from fingerspice.netlist.words import Call, Directive, Number, Statement, Token, Value
 from fingerspice.waveforms.waveform import check_range
 
 #: The parameter that gives the number of equal parts in parallel.
@@ -46,21 +44,19 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
 
     Warnings are added to `notes`.
     """
-    device = statement.device or statement.letter
-    parasitics = KINDS[device].beside if device in KINDS else ()
-    beside = {key: statement.params[key] for key in parasitics if key in statement.params}
+    device, nodes, names = statement.device, statement.nodes, statement.node_names
+    beside = {key: statement.params[key] for key in DEVICES[device].beside if key in statement.params}
     own = statement._replace(params={k: v for k, v in statement.params.items() if k not in beside})
     read: dict[str, Any] = {}
     values: dict[str, float] = {}
-    match statement.letter:
-        case "X":
-            values = _device_values(own, notes)
+    match device:
+        case "V" | "I":
+            read["waveform"], read["ac"], differences = source_of(own, context)
+            notes.extend(differences)
         case "R" | "C":
             values, read["initial"] = _read_passive(own, notes)
         case _:
-            read["waveform"], read["ac"], differences = source_of(own, context)
-            notes.extend(differences)
-    nodes, names = statement.nodes, statement.node_names
+            values = _device_values(own, notes)
     element = Element(statement.name, device, nodes, names, MappingProxyType(values), where=statement.where, **read)
     for parameter, text in unusual(element):
         named = statement.params.get(parameter)
@@ -88,33 +84,29 @@ def source_of(statement: Statement, context: Context) -> Source:
     body, params = list(statement.body), statement.params
     last = body[-1] if body else None
     if "wavefile" in params and not any(isinstance(word, Call) for word in body):
-        body.append(_ltspice_wavefile(statement))
+        # LTspice's `wavefile=path [chan=n]`: 1 V at full scale, and the first channel if none is chosen.
+        path = params["wavefile"]
+        where = path.key or path.where
+        for key, value in params.items():
+            if key not in ("wavefile", "chan"):
+                problem = f"{statement.name} takes no parameter {key!r} beside wavefile=; allowed: chan="
+                raise InputError(problem, value.key)
+        channel = params.get("chan", Number(0.0, "0", where))
+        body.append(Call("wavefile", (path, Number(1.0, "1", where), channel), {}, where))
     elif params:
         # ngspice takes PWL(...) r=10m as well as PWL(... r=10m), and the brackets of PWL(file=...) may be left out.
         inner = last.params if isinstance(last, Call) else {}
         if not isinstance(last, Call | Token) or last.text.lower() != "pwl" or set(inner) & set(params):
             key = next(iter(params))
-            takes = ", ".join(p.capitalize() for p in KINDS[statement.letter].beside)
+            takes = ", ".join(p.capitalize() for p in DEVICES[statement.device].beside)
             hint = f"; allowed: {takes}, besides its value" if takes else ""
             raise InputError(f"{statement.name} takes no parameter {key!r}{hint}", params[key].key)
         body[-1] = Call(last.text, last.args if isinstance(last, Call) else (), {**inner, **params}, last.where)
     return read_source(statement.name, body, context, statement.where)
 
 
-def _ltspice_wavefile(statement: Statement) -> Call:
-    """LTspice's ``wavefile=path [chan=n]`` as a call: 1 V at full scale, and the first channel if none is chosen."""
-    path = statement.params["wavefile"]
-    where = path.key or path.where
-    for key, value in statement.params.items():
-        if key not in ("wavefile", "chan"):
-            problem = f"{statement.name} takes no parameter {key!r} beside wavefile=; allowed: chan="
-            raise InputError(problem, value.key)
-    channel = statement.params.get("chan", Number(0.0, "0", where))
-    return Call("wavefile", (path, Number(1.0, "1", where), channel), {}, where)
-
-
 def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
-    name, device, params = statement.name, statement.device or "", statement.params
+    name, device, params = statement.name, statement.device, statement.params
     if statement.nodes[2] == "0":
         raise InputError(f"{name} has ground as its area; allowed: the area node of a GAP", statement.where)
     known = {p.name: p for p in DEVICES[device].parameters}
@@ -138,15 +130,15 @@ def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
 
 def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
     """Value of an R or C, and the start voltage (V) of a C."""
-    name, letter, params = statement.name, statement.letter, statement.params
-    kind, spec = KINDS[letter], DEVICES[letter].parameter("value")
-    own = (*kind.value, _COPIES, *(("ic",) if letter == "C" else ()), *kind.data)
+    name, device, params = statement.name, statement.device, statement.params
+    kind, spec = DEVICES[device], DEVICES[device].parameter("value")
+    own = (*kind.aliases, _COPIES, *(("ic",) if device == "C" else ()), *kind.data)
     for key, part in params.items():
         if key not in own and not (key == "lser" and isinstance(part, Number) and part.value == 0.0):
             shown = ", ".join(f"{k}=" for k in (*own, *kind.beside))
             reason = ", there are no inductors here" if key == "lser" else ""
             raise InputError(f"{name} takes no parameter {key!r}{reason}; allowed: {shown}", part.key)
-    given = [*statement.body, *(params[key] for key in kind.value if key in params)]
+    given = [*statement.body, *(params[key] for key in kind.aliases if key in params)]
     if len(given) != 1:
         raise InputError(f"{name} needs one value in {spec.unit}, {len(given)} are given", statement.where)
     word = given[0]
@@ -157,7 +149,7 @@ def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, flo
     if copies is not None:
         if not isinstance(copies, Number) or not 1e-6 <= copies.value <= 1e6:
             raise InputError(f"{name} m is {copies.text!r}; allowed: a number of parts side by side", copies.where)
-        value = value / copies.value if letter == "R" else value * copies.value
+        value = value / copies.value if device == "R" else value * copies.value
     initial = params.get("ic")
     if isinstance(initial, Token):
         raise InputError(f"{name} IC is {initial.text!r}; allowed: a number V", initial.where)

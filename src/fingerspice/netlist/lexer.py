@@ -130,8 +130,18 @@ def lex(line: Line, start: int = 0) -> list[Lexeme]:
     while position < len(text):
         match = _LEX.match(text, position)
         if match is None:
-            lexemes.append(Lexeme("expression", _braced(line, position), position, line))
-            position += len(lexemes[-1].text) + 2
+            opening, depth = text[position], 0
+            if opening != "{":
+                problem = "'}' without an opening '{'" if opening == "}" else f"{opening} is never closed"
+                raise InputError(problem, line.where(position))
+            for brace in _BRACE.finditer(text, position):
+                depth += 1 if brace.group() == "{" else -1
+                if depth == 0:
+                    break
+            if depth != 0:
+                raise InputError("'{' is never closed", line.where(position))
+            lexemes.append(Lexeme("expression", text[position + 1 : brace.start()], position, line))
+            position = brace.end()
             continue
         mark, string, quoted, word = match.groups()
         if mark:
@@ -145,20 +155,6 @@ def lex(line: Line, start: int = 0) -> list[Lexeme]:
             lexemes.append(Lexeme("word", word, position, line))
         position = match.end()
     return lexemes
-
-
-def _braced(line: Line, position: int) -> str:
-    """Text between the opening brace at a position and the brace that closes it."""
-    opening = line.text[position]
-    if opening != "{":
-        problem = "'}' without an opening '{'" if opening == "}" else f"{opening} is never closed"
-        raise InputError(problem, line.where(position))
-    depth = 0
-    for match in _BRACE.finditer(line.text, position):
-        depth += 1 if match.group() == "{" else -1
-        if depth == 0:
-            return line.text[position + 1 : match.start()]
-    raise InputError("'{' is never closed", line.where(position))
 
 
 def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Group:

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from fingerspice.base.errors import FingerspiceWarning, InputError, Where
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element, Tran
+from fingerspice.circuit.devices import REST_AREA, unusual
 from fingerspice.circuit.loop import checked
-from fingerspice.circuit.usual import REST_AREA, unusual
 from fingerspice.netlist.deck import parse_deck, read_deck
 from fingerspice.netlist.elements import read_ac, read_elements, read_initial, read_options, read_tran, source_of
 from fingerspice.netlist.files import SourceFiles
-from fingerspice.netlist.reader import MAX_WARNINGS
+from fingerspice.netlist.reader import MAX_WARNINGS, Deck
 from fingerspice.netlist.slips import decimal_comma, with_comma
 from fingerspice.netlist.sources import Context
-from fingerspice.netlist.words import Deck
 from fingerspice.waveforms.waveform import DC, Waveform
 
 
@@ -81,7 +80,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
     work, unused = read_options(deck.named(".options"))
     initial, unused_starts = read_initial(deck.named(".ic"), elements, tran is None or tran.uic)
-    _warn_of_unusual(deck, elements, tran, initial, notes)
+    notes.extend(_unusual(deck, elements, tran, initial))
     more = len(notes) - MAX_WARNINGS
     if more > 1:
         notes[MAX_WARNINGS:] = [f"{more} more warnings are not shown"]
@@ -105,28 +104,25 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     return checked(circuit)
 
 
-def _warn_of_unusual(
-    deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initial: Mapping[str, float], notes: list[str]
-) -> None:
-    """Warn of unusual areas given by sources or start values, and of outputs too far apart for a source."""
+def _unusual(
+    deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initial: Mapping[str, float]
+) -> Iterator[str]:
+    """Warnings about unusual areas given by sources or start values, and outputs too far apart for a source."""
     nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
-    given: list[tuple[str, float, Where | None]]
-    given = [(f".ic v({node})", value, None) for node, value in initial.items() if node in nodes]
-    for e in elements:
-        if e.device == "V" and e.nodes[0] in nodes and isinstance(e.waveform, DC):
-            given.append((f"{e.name}, an area,", e.waveform.level, e.where))
-    for what, value, where in given:
-        text = REST_AREA.warning(what, value, "mm^2")
-        if text:
-            notes.append(f"{where}: {text}" if where else text)
+    for node in (node for node in initial if node in nodes):
+        if text := REST_AREA.warning(f".ic v({node})", initial[node], "mm^2"):
+            yield text
+    for e in (e for e in elements if e.device == "V" and e.nodes[0] in nodes):
+        if isinstance(e.waveform, DC) and (text := REST_AREA.warning(f"{e.name}, an area,", e.waveform.level, "mm^2")):
+            yield f"{e.where}: {text}"
     for e in elements if tran is not None else ():
         period = e.waveform.period if e.waveform is not None else None
         # A source whose frequency is unusual has a warning already.
         if tran is not None and period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
-            step, period_text = format_si(tran.step, "s"), format_si(period, "s")
-            notes.append(
+            step, longest = format_si(tran.step, "s"), format_si(period, "s")
+            yield (
                 f"{deck.named('.tran')[0].where}: {e.name}: TSTEP is {step}, longer than this source's period of "
-                f"{period_text}: the outputs do not show its course, and the figures of a run still do"
+                f"{longest}: the outputs do not show its course, and the figures of a run still do"
             )
 
 

@@ -14,9 +14,8 @@ from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.devices import layer_devices
 from fingerspice.netlist.files import LIBRARIES, MAX_BYTES, inside, library_changed, read_text
 from fingerspice.netlist.lexer import SPLIT, Assignment, Lexeme, Line, group, lex, logical_lines, split_lines
-from fingerspice.netlist.scope import definitions
+from fingerspice.netlist.scope import Directive, Statement, definitions
 from fingerspice.netlist.slips import ELSEWHERE, decimal_comma, greek_mu, nearest
-from fingerspice.netlist.words import Deck
 
 #: Limits of a netlist with its included files: a word takes up to 500 bytes of memory, and a line 200.
 MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000
@@ -29,6 +28,31 @@ _USED = tuple(".tran .ac .options .ic .param .subckt .ends .include .inc .lib .c
 _UNUSED = (".print", ".plot", ".save", ".probe", ".meas", ".measure", ".title")
 #: Every directive that may stand in a deck; `Reader._direct` says what is done with it.
 DIRECTIVES = (*_USED, ".option", *_UNUSED, ".nodeset", ".backanno", ".endc")
+
+
+@dataclass
+class Deck:
+    """A netlist, into which `Reader` and `deck.Flattener` enter what they find."""
+
+    text: str
+    path: Path | None  # Path of the file; None for a text
+    title: str = ""  # The first line in printable characters (see `errors.printable`)
+    statements: list[Statement] = field(default_factory=list)  # In the order of the file, subcircuit calls expanded
+    directives: list[Directive] = field(default_factory=list)  # Those with values
+    libraries: list[str] = field(default_factory=list)  # Included files of native devices, without folder; not read
+    files: list[Path] = field(default_factory=list)  # The other included files, which were read
+    unused: dict[str, None] = field(default_factory=dict)  # Ordered set of the directives without effect here
+    warnings: list[str] = field(default_factory=list)  # About what is probably not meant, each with its place
+    params: dict[str, float] = field(default_factory=dict)  # The deck's own parameters by lower-case name
+
+    @property
+    def file(self) -> str:
+        """The file's name as shown to the user."""
+        return "<netlist>" if self.path is None else str(self.path)
+
+    def named(self, name: str) -> list[Directive]:
+        """The directives of that name."""
+        return [directive for directive in self.directives if directive.name == name]
 
 
 class DirectiveLine(NamedTuple):
@@ -149,7 +173,7 @@ class Reader:
                 if text.strip() and closed and text.strip().lower() != closed.lower():
                     raise InputError(f".ends {text.strip()} closes .subckt {closed}: the names differ", place)
             case ".include" | ".inc" | ".lib":
-                self._include(*_file_name(read))
+                self._include(read)
             case ".control":
                 self._control = line
                 self.deck.unused[name] = None
@@ -164,10 +188,9 @@ class Reader:
             case _ if name in (".nodeset", ".backanno"):
                 pass  # These matter only to other simulators.
             case _ if name != ".global" or not set(text.lower().split()) <= {"gnd", "0"}:
-                known = nearest(name, DIRECTIVES) or f"; directives are {' '.join(_USED)}"
-                raise InputError(
-                    f"{name} is not supported{f': {ELSEWHERE[name]}' if name in ELSEWHERE else known}", place
-                )
+                hint = nearest(name, DIRECTIVES) or f"; directives are {' '.join(_USED)}"
+                hint = f": {ELSEWHERE[name]}" if name in ELSEWHERE else hint
+                raise InputError(f"{name} is not supported{hint}", place)
 
     def _subcircuit(self, read: DirectiveLine) -> Subcircuit:
         """The subcircuit whose definition begins with a line."""
@@ -202,7 +225,23 @@ class Reader:
             raise InputError(f"subcircuit '{name}' is defined twice, first at {first.where}", defined.where)
         return defined
 
-    def _include(self, name: str, where: Where) -> None:
+    def _include(self, read: DirectiveLine) -> None:
+        raw = read.line.text[read.rest :]
+        where = read.line.where(read.rest + len(raw) - len(raw.lstrip()))
+        name = raw.strip()
+        words = name.split()
+        if name[:1] in ("'", '"') and name:
+            inner, closed, after = name[1:].partition(name[0])
+            if not closed:
+                raise InputError(f"{name[0]} is never closed", where)
+            name, words = inner, [inner, *after.split()]
+        if not name.strip():
+            raise InputError(f"{read.name} needs a file name", read.line.place)
+        if len(words) > 1:
+            problem = "one file name is allowed; put a name with blanks in quotes"
+            if read.name == ".lib":
+                problem = "sections of a library are not supported: put the section into a file and .include it"
+            raise InputError(problem, where)
         folder = self._reading[-1].parent if self._reading else self._folder
         base = name.replace("\\", "/").rpartition("/")[2]
         if base.lower() in LIBRARIES.values():
@@ -226,27 +265,6 @@ class Reader:
             raise InputError(f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
         self._reading.append(path)
         shown = str(Path(self.deck.file).parent / path.relative_to(self._folder))
-        for inner in logical_lines(self.split(text, where), shown):
-            self._take(inner)
+        for line in logical_lines(self.split(text, where), shown):
+            self._take(line)
         self._reading.pop()
-
-
-def _file_name(read: DirectiveLine) -> tuple[str, Where]:
-    """The file name on an include line, and its place."""
-    raw = read.line.text[read.rest :]
-    where = read.line.where(read.rest + len(raw) - len(raw.lstrip()))
-    name = raw.strip()
-    words = name.split()
-    if name[:1] in ("'", '"') and name:
-        inner, closed, after = name[1:].partition(name[0])
-        if not closed:
-            raise InputError(f"{name[0]} is never closed", where)
-        name, words = inner, [inner, *after.split()]
-    if not name.strip():
-        raise InputError(f"{read.name} needs a file name", read.line.place)
-    if len(words) > 1:
-        problem = "one file name is allowed; put a name with blanks in quotes"
-        if read.name == ".lib":
-            problem = "sections of a library are not supported: put the section into a file and .include it"
-        raise InputError(problem, where)
-    return name, where

@@ -1,17 +1,16 @@
-"""Evaluation of a netlist's words: numbers, keywords, and expressions of parameters."""
+"""A netlist's words, and their evaluation: numbers, keywords, and expressions of parameters."""
 
 from __future__ import annotations
 
 import re
 from collections import ChainMap
 from collections.abc import Iterable, Mapping
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
-from fingerspice.base.errors import InputError
+from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number, suspicious_mega
 from fingerspice.netlist.expressions import CONSTANTS, RESERVED, Expression, Problem, compile_expression, compiled
 from fingerspice.netlist.lexer import Assignment, Group, Lexeme, Line
-from fingerspice.netlist.words import Call, Number, Token, Value, Word
 
 _NUMERIC = re.compile(r"[+-]|\.?[0-9]")
 _FILE_NAME = re.compile(r".*[/\\].*|.*\.[A-Za-z]\w*")
@@ -23,6 +22,64 @@ _PAIR = re.compile(r"[({]|[)}]|'[^']*'|(?<![\w.])([A-Za-z_]\w*)\s*=(?!=)|[<>!=]=
 #: Kinds of text that are evaluated without braces: nothing, a parameter's name, or also arithmetic. As in ngspice,
 #: `R1 a b rho` and `X1 a b sub w=2*rho` are allowed, but not `R1 a b 2*rho`.
 Bare: TypeAlias = Literal["nothing", "name", "arithmetic"]
+
+
+class Token(NamedTuple):
+    """A word that is not a number, such as a keyword, a file name, `inf`, or what was in double quotes."""
+
+    text: str
+    where: Where
+    key: Where | None = None  # Place of the key of a `key=value` pair
+
+
+class Number(NamedTuple):
+    """A number, or an expression's value."""
+
+    value: float  # The value in SI units
+    text: str  # As written, braces included
+    where: Where  # The place of its first character
+    # The number with a capital M from which the value was computed: M is milli, and perhaps meant as mega
+    mega: Token | None = None
+    key: Where | None = None  # Place of the key of a `key=value` pair
+
+
+Value: TypeAlias = Number | Token
+
+
+class Call(NamedTuple):
+    """A word with arguments in brackets: `SIN(0 200 100)` or `SIN (0 200 100)`."""
+
+    text: str  # The word
+    args: tuple[Value, ...]
+    params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
+    where: Where
+
+
+Word: TypeAlias = Number | Token | Call
+
+
+class Directive(NamedTuple):
+    """A line such as `.tran 10u 50m uic`."""
+
+    name: str  # Name in lower case, with its dot
+    args: tuple[Word, ...]
+    # Values of `key=value` pairs by key in lower case; `.ic v(area)=1` has the key ``v(area)`` of the flat circuit
+    params: dict[str, Value]
+    where: Where  # Place of the dot
+    text: str  # The line as written, continuations joined
+
+
+class Statement(NamedTuple):
+    """One element of the flat circuit."""
+
+    name: str  # Name as written, with the names of the enclosing calls in front: ``Xfinger.Xgap``
+    device: str  # Entry of `DEVICES`
+    # Nodes in lower case, ground as ``0``; a node inside a subcircuit has the names of the enclosing calls in front
+    nodes: tuple[str, ...]
+    node_names: tuple[str, ...]  # The same nodes as written
+    body: tuple[Word, ...]  # The words after the nodes; empty for an X
+    params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
+    where: Where  # Place of the name
 
 
 class Scope:
@@ -67,7 +124,7 @@ class Scope:
                     known[name] = compile_expression(text.text, text.place)
                 waiting = [n for n in known[name].names if n in self._definitions and n not in self.values]
                 if not waiting:
-                    self.preset(name, self._evaluate(known[name], text))
+                    self.preset(name, self.number(text))
                 elif any(n in known for n in waiting):
                     raise self._circle(known, name)  # a compiled definition without a value is on the stack: a circle
                 stack.extend(waiting)
@@ -87,20 +144,15 @@ class Scope:
         problem = f"parameters refer to each other in a circle: {' -> '.join(shown)}"
         return InputError(problem, self._definitions[path[0]].key.where)
 
-    def _evaluate(self, expression: Expression, lexeme: Lexeme) -> Number:
-        """Value of a lexeme's compiled expression in this scope."""
-        mega = None
-        if expression.mega:
-            mega = Token(expression.mega[0], lexeme.place(expression.mega[1]))
-        for name in expression.names:
-            mega = mega or self._mega.get(name)
-        return Number(expression.evaluate(self._visible, lexeme.place), lexeme.written, lexeme.where, mega)
-
     def number(self, lexeme: Lexeme) -> Number:
         """Value of a lexeme that must be arithmetic, with or without braces."""
         if lexeme.kind == "string":
             raise InputError(f"a number is needed, not the text {lexeme.written}", lexeme.where)
-        return self._evaluate(compile_expression(lexeme.text, lexeme.place), lexeme)
+        expression = compile_expression(lexeme.text, lexeme.place)
+        mega = Token(expression.mega[0], lexeme.place(expression.mega[1])) if expression.mega else None
+        for name in expression.names:
+            mega = mega or self._mega.get(name)
+        return Number(expression.evaluate(self._visible, lexeme.place), lexeme.written, lexeme.where, mega)
 
     def references(self, lexeme: Lexeme) -> dict[str, float]:
         """Values in this scope of the parameters in a lexeme; empty if the lexeme is not arithmetic."""
@@ -110,7 +162,7 @@ class Scope:
         """Number or token of a word, string or expression; `bare` is what is evaluated without braces."""
         text, where = lexeme.text, lexeme.where
         if lexeme.kind == "string":
-            return Token(text, where, quoted=True)
+            return Token(text, where)
         if lexeme.kind == "expression" or (bare == "arithmetic" and _PLAIN_NUMBER.fullmatch(text)):
             return self.number(lexeme)
         if bare != "nothing" and self._is_arithmetic(text):

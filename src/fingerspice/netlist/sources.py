@@ -11,8 +11,8 @@ from typing import NamedTuple, NoReturn
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import SmallSignal, Tran
 from fingerspice.netlist.files import SourceFiles
+from fingerspice.netlist.scope import Call, Number, Token, Word
 from fingerspice.netlist.slips import is_unit, nearest
-from fingerspice.netlist.words import Call, Number, Token, Word
 from fingerspice.waveforms.combinations import AM, Burst, Repeat
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.periodic import Chirp, Exp, Pulse, Sawtooth, Square, Triangle
@@ -207,6 +207,8 @@ SOURCES: Mapping[str, Function] = {
     ),
 }  # fmt: skip
 _KNOWN = ", ".join(name.upper() for name, function in SOURCES.items() if not function.refused)
+#: What is no source function, with what is allowed.
+_LEVELS = {"dc": "DC value", "ac": "AC [magnitude [phase]]"}
 _SFFM = "SFFM changed its argument order between ngspice versions; write the waveform as PWL"
 #: Names in LTspice, and a short one for the command line.
 _ALIASES = {"sine": "sin", "wav": "wavefile"}
@@ -249,16 +251,19 @@ def read_source(name: str, body: Sequence[Word], context: Context, where: Where)
                 numbers.append(words[0])
                 words.popleft()
             word = Call(key, tuple(numbers), {}, word.where)
+        if key in _LEVELS and word.params:
+            problem = f"{name}: {key.upper()} has no parameter {next(iter(word.params))!r}; allowed: {_LEVELS[key]}"
+            raise InputError(problem, next(iter(word.params.values())).key)
         if key == "dc":
             if len(word.args) != 1:
                 raise InputError(f"{name}: DC needs one value", word.where)
             level = _number(word.args[0], f"{name} DC")
         elif key == "ac":
             if ac is not None:
-                raise InputError(f"{name} has AC twice; allowed: AC [magnitude [phase]] once", word.where)
+                raise InputError(f"{name} has AC twice; allowed: {_LEVELS[key]} once", word.where)
             given = [_number(arg, f"{name} AC") for arg in word.args]
             if len(given) > 2:
-                problem = f"{name}: AC takes at most 2 values, {len(given)} given; allowed: AC [magnitude [phase]]"
+                problem = f"{name}: AC takes at most 2 values, {len(given)} given; allowed: {_LEVELS[key]}"
                 raise InputError(problem, word.where)
             ac = SmallSignal(*given)
         elif waveform is not None:

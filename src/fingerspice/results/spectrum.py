@@ -14,7 +14,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.loop import network_of
-from fingerspice.circuit.spectrum import NOTABLE, energy_outside
+from fingerspice.circuit.notices import NOTABLE, energy_outside
 from fingerspice.results.signals import Sealed, signal_of
 from fingerspice.waveforms.waveform import require
 

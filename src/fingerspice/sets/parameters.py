@@ -30,6 +30,8 @@ WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM
 #: Units that take a prefix in tables.
 _PREFIXED = ("m", "ohm", "V", "Hz", "N")
 DATA = Path(__file__).with_name("data")
+#: Where a work is found, by BibTeX's names, with the words before them in a sentence.
+_SAID = (("journal", ""), ("booktitle", ""), ("volume", "vol."), ("number", "no."), ("pages", "pp."), ("note", ""))
 #: Kinds of sets, in the order in which they are listed.
 KINDS = ("scene", "finger", "load", "coating", "drive")
 #: Elements of a value, with the devices to which it is given; a source is a V element that drives.
@@ -97,9 +99,6 @@ class Reference:
         return "\n".join([f"@{self.kind}{{{self.key},", *lines, "}"])
 
 
-_SAID = (("journal", ""), ("booktitle", ""), ("volume", "vol."), ("number", "no."), ("pages", "pp."), ("note", ""))
-
-
 def keys_in(text: str) -> list[str]:
     """The keys of references that a text names in brackets."""
     return re.findall(r"\[(\w+)\]", text)
@@ -123,15 +122,6 @@ def tables() -> Mapping[str, Mapping[str, Any]]:
     found = [tomllib.loads(file.read_text(encoding="utf-8")) for file in files if file.stem != "references"]
     found.sort(key=lambda one: KINDS.index(one["kind"]))
     return MappingProxyType({one["name"]: one for one in found})
-
-
-def _values_of(name: str) -> dict[str, SetValue]:
-    """The values of a set by path: those of the sets that it includes, and its own in their place."""
-    found: dict[str, SetValue] = {}
-    for other in tables()[name].get("includes", ()):
-        found |= _values_of(other)
-    own = (SetValue(**{**one, "value": float(one["value"])}) for one in tables()[name]["values"])
-    return found | {value.path: value for value in own}
 
 
 @dataclass(frozen=True, repr=False)
@@ -252,13 +242,13 @@ class ParameterSets(Shown, Mapping[str, ParameterSet]):
     """All named sets, by name."""
 
     def __getitem__(self, name: str) -> ParameterSet:
-        return _sets()[name]
+        return _set(name)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(_sets())
+        return iter(tables())
 
     def __len__(self) -> int:
-        return len(_sets())
+        return len(tables())
 
     def _page(self) -> Page:
         assumed = {one.name: f", {len(one.assumed)} assumed" if one.assumed else "" for one in self.values()}
@@ -267,12 +257,16 @@ class ParameterSets(Shown, Mapping[str, ParameterSet]):
 
 
 @cache
-def _sets() -> dict[str, ParameterSet]:
-    found = {}
-    for name, table in tables().items():
-        own = {key: table[key] for key in ("name", "title", "kind", "claims", "not_claimed")}
-        found[name] = ParameterSet(**own, values=MappingProxyType(_values_of(name)), waveform=table.get("waveform"))
-    return found
+def _set(name: str) -> ParameterSet:
+    """A set, with the values of the sets that it includes and its own in their place."""
+    table, values = tables()[name], dict[str, SetValue]()
+    for other in table.get("includes", ()):
+        values |= _set(other).values
+    for one in table["values"]:
+        value = SetValue(**{**one, "value": float(one["value"])})
+        values[value.path] = value
+    own = {key: table[key] for key in ("name", "title", "kind", "claims", "not_claimed")}
+    return ParameterSet(**own, values=MappingProxyType(values), waveform=table.get("waveform"))
 
 
 @overload
@@ -302,7 +296,7 @@ def parameters(name: str | None = None, kind: str | None = None) -> ParameterSet
         raise InputError(f"parameters is given {name!r}, a {type(name).__name__}; allowed: the name of a set")
     if kind is not None and kind not in KINDS:
         raise InputError(f"kind is {kind!r}; allowed: {', '.join(KINDS)}")
-    known = {own.lower(): one for own, one in _sets().items()}
+    known = {own.lower(): one for own, one in ParameterSets().items()}
     found = known.get(name.strip().lower())
     fitting = [one for one in known.values() if kind in (None, one.kind)]
     if found is None or found not in fitting:
@@ -361,7 +355,12 @@ def cite(circuit: Circuit, method: str) -> Citation:
     for name, (kept, changed) in in_force(circuit).items():
         one = parameters(name)
         given = {path: _given(one, circuit, path) for path in kept}
-        said.append(_sentence(one, given, changed))
+        own = [f"The set {name} ({one.title}) gave {', '.join(given)}"]
+        assumed = [path for path, values in given.items() if any(value.assumed for value in values)]
+        own += [f"assumed, not published: {', '.join(assumed)}"] if assumed else []
+        own += [f"changed since: {', '.join(changed)}"] if changed else []
+        gone = f"All values of the set {name} were changed since it was applied."
+        said.append(f"{'; '.join(own)}." if given else gone)
         # The works behind the values that were used; those that only say how far a value may vary are not cited.
         texts = [one.claims, *(value.source for values in given.values() for value in values)] if kept else []
         found |= {key: known[key] for text in texts for key in keys_in(text)}
@@ -374,17 +373,6 @@ def cite(circuit: Circuit, method: str) -> Citation:
         said.append(f"The method {method} is that of [{key}].")
         found[key] = known[key]
     return Citation(tuple(said), tuple(found.values()))
-
-
-def _sentence(one: ParameterSet, given: dict[str, list[SetValue]], changed: tuple[str, ...]) -> str:
-    """What a set gave to the circuit, what of it is assumed, and what was changed since."""
-    if not given:
-        return f"All values of the set {one.name} were changed since it was applied."
-    said = [f"The set {one.name} ({one.title}) gave {', '.join(given)}"]
-    assumed = [path for path, values in given.items() if any(value.assumed for value in values)]
-    said += [f"assumed, not published: {', '.join(assumed)}"] if assumed else []
-    said += [f"changed since: {', '.join(changed)}"] if changed else []
-    return f"{'; '.join(said)}."
 
 
 def _given(one: ParameterSet, circuit: Circuit, path: str) -> list[SetValue]:

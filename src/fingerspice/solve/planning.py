@@ -10,10 +10,9 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import format_si
-from fingerspice.circuit.notices import circuit_warnings, course_warnings
-from fingerspice.circuit.spectrum import spectrum_warning
+from fingerspice.circuit.devices import beyond_fingers
+from fingerspice.circuit.notices import circuit_warnings, course_warnings, spectrum_warning
 from fingerspice.circuit.topology import driving
-from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.engine.one_area.model import Model
 from fingerspice.physics.contact import inverse_area, inverse_area_range
 from fingerspice.results.outcome import Plan, Status

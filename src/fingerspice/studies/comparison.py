@@ -18,8 +18,8 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.arguments import Parameters, Sources, overridden, require_circuit
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import head_lines
-from fingerspice.circuit.response import linear_scene
-from fingerspice.circuit.usual import beyond_fingers
+from fingerspice.circuit.devices import beyond_fingers
+from fingerspice.circuit.loop import linear_scene
 from fingerspice.plots import drawing, lines
 from fingerspice.results.measures import weigh_outputs
 from fingerspice.results.phasor_solution import PhasorSolution

@@ -12,9 +12,9 @@ from fingerspice.base.arrays import FloatArray, positive_row
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.arguments import Parameters, Sources, area_given, overridden
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element
+from fingerspice.circuit.devices import beyond_fingers
+from fingerspice.circuit.loop import areas_at_rest, linear_scene, with_skin_held
 from fingerspice.circuit.network import build_network
-from fingerspice.circuit.response import areas_at_rest, linear_scene, with_skin_held
-from fingerspice.circuit.usual import beyond_fingers
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.results.phasor_solution import PhasorSolution
 from fingerspice.waveforms.waveform import Fundamental, require

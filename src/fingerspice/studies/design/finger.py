@@ -12,9 +12,8 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, Element
-from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.loop import areas_at_rest, network_of
 from fingerspice.circuit.network import Network
-from fingerspice.circuit.response import areas_at_rest
 from fingerspice.circuit.topology import find_branches
 from fingerspice.engine.inverse import drive_stack, hold
 from fingerspice.physics.contact import Contact, fixed_area_curve
