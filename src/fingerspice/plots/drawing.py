@@ -114,6 +114,9 @@ def save(figure: Figure, path: str | Path, *, about: Mapping[str, str] | None = 
 
 def engineering(peak: float, unit: str, least: float = 1.0) -> tuple[float, str]:
     """Factor and prefixed unit that scale `peak` to between `least` and 1000 `least`: (1e3, "ms") for 0.05 s."""
+    # Powers of a unit take no prefix: 1 kmm^2 would not be 1000 mm^2.
+    if "^" in unit:
+        return (1e6, "mm²") if unit == "m^2" else (1.0, unit)
     size = abs(peak) / least
     if not np.isfinite(size) or size == 0.0:
         return 1.0, unit

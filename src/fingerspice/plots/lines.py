@@ -100,8 +100,8 @@ def traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
 
 def scale_of(signal: Signal, traces: list[Trace], start: float, stop: float) -> tuple[float, str]:
     """Factor and unit of a panel."""
-    if signal.least == 0.0:
-        return (1e6, "mm²") if signal.unit == "m^2" else (1.0, "")
+    if signal.unit == "1":
+        return 1.0, ""
     peaks = [drawing.peak_of(t.x[(t.solution.t >= start) & (t.solution.t <= stop)]) for t in traces]
     return drawing.engineering(max(peaks, default=0.0), signal.unit, signal.least)
 
@@ -153,9 +153,10 @@ def draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = 
     """Draw the mean force as a horizontal line; with `told` the legend names it."""
     summary = trace.solution.summary()
     means = {"of the last period": summary.get("f_el_mean_periodic"), "of the run": summary.get("f_el_mean")}
-    for of, mean in [(of, mean) for of, mean in means.items() if mean is not None][:1]:
-        label = f"mean {of}, {factor * mean:.4g} {unit}" if told else "_"
-        ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
+    known = [(of, factor * mean) for of, mean in means.items() if mean is not None]
+    if known:
+        label = f"mean {known[0][0]}, {known[0][1]:.4g} {unit}" if told else "_"
+        ax.axhline(known[0][1], color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
 
 
 def finish_panel(ax: Axes, signal: Signal, unit: str, values: Sequence[FloatArray], room: int = PAGE) -> None:

@@ -156,10 +156,7 @@ def plot_panels(panels: Sequence[Panel]) -> Picture:
     figure, axes = drawing.new_figure(2, count, height=4.2, sharex="col", height_ratios=(2.4, 1.0))
     for top, bottom, panel in zip(axes[:count], axes[count:], panels, strict=True):
         largest = np.concatenate([curve.measured for curve in panel.curves])
-        # An area is shown in mm^2: a prefix would be squared with its unit.
-        factor, shown = (1e6, "mm²") if panel.unit == "m^2" else (1.0, "")
-        if panel.unit not in ("", "m^2"):
-            factor, shown = drawing.engineering(drawing.peak_of(largest), panel.unit, 0.05)
+        factor, shown = drawing.engineering(drawing.peak_of(largest), panel.unit, 0.05) if panel.unit else (1.0, "")
         bottom.axhline(0.0, color=drawing.GREY, linewidth=0.8)
         for number, curve in enumerate(panel.curves):
             order, color = np.argsort(curve.x, kind="stable"), drawing.CYCLE[number % len(drawing.CYCLE)]

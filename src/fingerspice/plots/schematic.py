@@ -231,11 +231,8 @@ def _label(element: Element, areas: Set[str]) -> tuple[str, ...]:
 
 
 def _quantity(value: float, unit: str) -> str:
-    # Powers of a unit take no prefix: 1 kmm^2 would not be 1000 mm^2.
-    if "^" in unit or unit == "":
-        return f"{value:.4g} {unit}".rstrip()
-    factor, prefixed = drawing.engineering(value, unit)
-    return f"{factor * value:.4g} {prefixed}".replace("ohm", "Ω")
+    factor, prefixed = drawing.engineering(value, unit) if unit else (1.0, "")
+    return f"{factor * value:.4g} {prefixed}".rstrip().replace("ohm", "Ω")
 
 
 def _sheet(

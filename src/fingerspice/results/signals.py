@@ -21,7 +21,7 @@ class Signal(NamedTuple):
     text: str  # Its long name
     short: str  # Its name in a legend
     axis: str  # Label of its panel in a picture, which signals of the same quantity share
-    least: float = 0.0  # A panel's unit has a prefix by which the peak is at least this number; 0 means no prefix
+    least: float = 1.0  # A panel's unit has a prefix by which the peak is at least this number
     from_zero: bool = False  # Whether the scale of a panel starts at 0
     of: str = ""  # "source", "layer", "gap" or "node" where each of these has a column
     ripple: bool = False  # Whether its summary has a ripple instead of an rms
@@ -46,7 +46,7 @@ SIGNALS = {
         lambda contact, f: contact.mu * (contact.f_n + f),
     ),
     "friction": Signal(
-        "1", "friction coefficient f_t / f_n", "coefficient", "Friction coefficient", 0.0, True, "gap", True, "f_t",
+        "1", "friction coefficient f_t / f_n", "coefficient", "Friction coefficient", 1.0, True, "gap", True, "f_t",
         lambda contact, f: f / contact.f_n,
     ),
     "q_source": Signal("C", "charge delivered by the source", "charge", "Charge", 2.0, of="source"),
