@@ -91,13 +91,15 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.studies.design.folds import fold_limits
+    from fingerspice.studies.design.folds import fold_limits, grid_of
 
     law = None if capability else "mobile"
     with Answering("limits", as_json, charge_law=law) as answer:
         circuit = read_circuit(deck, changes, source)
-        if not capability and (limit is not None or carrier is not None):
-            raise InputError("--limit and --carrier belong to --capability")
+        if not capability:
+            if limit is not None or carrier is not None:
+                raise InputError("--limit and --carrier belong to --capability")
+            grid_of(points, span)
         answer.update(**answers.of_circuit(circuit, law))
         largest, tone = number("--limit", limit), number("--carrier", carrier)
         results = Results(deck, circuit, out, name, overwrite, law)
