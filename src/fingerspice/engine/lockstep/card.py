@@ -33,10 +33,7 @@ _CARD = Lock()
 
 @lru_cache(maxsize=64)
 def thread_kernel(lengths: Lengths, rows: int, pieces: int) -> Callable[..., None]:
-    """The function of a thread, for the compiler: it integrates one scene, as `march` does.
-
-    It is for tables of so many rows, and at most so many pieces of a half period, 0 for a source without jumps.
-    """
+    """The function of a thread, for tables of so many rows and at most so many pieces of a half period, 0 for none."""
     global cuda
     cuda, integrate = card_compiler(), for_card(march_block)
     marks: Marks = marks_of(*lengths, lanes=1)
@@ -88,10 +85,7 @@ def _compiled(lengths: Lengths, rows: int, pieces: int) -> Any:
 
 
 def march_on_card(scenes: Scenes, source: Source, how: How, most_pieces: int, lengths: Lengths) -> FloatArray:
-    """Integrate scenes of a table as `march.march` does, and return its `out`.
-
-    The kernel is compiled for `most_pieces`, 0 for a source without jumps.
-    """
+    """Integrate scenes of a table as `march.march` does, and return its `out`; `most_pieces` as for `thread_kernel`."""
     table, pending, (gap, leaks), curves = scenes
     kernel = _compiled(lengths, table.shape[0], most_pieces)
     chosen = np.ascontiguousarray(table[:, pending])  # Not always in the order of the table

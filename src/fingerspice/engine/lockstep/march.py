@@ -176,16 +176,10 @@ def march(
 ) -> None:  # fmt: skip
     """Integrate scenes of a table, block by block, with each of two numbers of steps; the first may be none.
 
-    Parameters
-    ----------
-    block
-        From `scenes.new_block`.
-    out : ndarray, shape (2, 2 n_moment + 3, n)
-        For each run the means over it and over its last period, the peak (V), the relative error of the periodic
-        state, and the relative size of the last coefficient of the area's series. The latter is infinite where the
-        polynomial does not cover the voltages met.
-    traces : tuple of ndarray, each of shape (n, steps)
-        Gap voltage before every step of each run, V; (n, 0) for none.
+    `out` (2, 2 n_moment + 3, n) takes for each run the means over it and over its last period, the peak (V), the
+    relative error of the periodic state, and the relative size of the last coefficient of the area's series, which is
+    infinite where the polynomial does not cover the voltages met. The `traces` (n, steps) take the gap voltage before
+    every step of each run, V; they are (n, 0) for none.
     """
     lanes, n = len(marks[5]), scenes[1].size
     voltages = np.empty(lanes * traces[0].shape[1]), np.empty(lanes * traces[1].shape[1])

@@ -202,17 +202,10 @@ def march_samples(
 ) -> None:  # fmt: skip
     """Integrate scenes of a table under one recording, block by block, with each of two numbers of steps a sample.
 
-    Its peak is the amplitude of the one wave; the table's frequency is half that of the samples.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Samples relative to their peak.
-    how : tuple
-        Steps a sample in both runs, 0 for none in the first; and the largest gap voltage that the area's
-        polynomial covers, as a ratio to its estimate.
-    block, out
-        As for `march.march`, with the shares of `N_PORTION` portions of the run in place of the last period.
+    `values` are samples relative to their peak, which is the amplitude of the one wave; the table's frequency is half
+    that of the samples. `how` has the steps a sample in both runs, 0 for none in the first; and the largest gap voltage
+    that the area's polynomial covers, as a ratio to its estimate. `out` is as for `march.march`, with the shares of
+    `N_PORTION` portions of the run in place of the last period.
     """
     m_all, l_all, d_all, count, lanes = len(marks[0]), len(marks[2]), len(marks[3]) - 1, len(marks[4]), len(marks[5])
     omega, row = (CELL_ROWS * (m_all + 1) + OMEGA) * lanes, N_WEIGHTS * m_all * lanes
