@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -164,8 +163,8 @@ def android_threshold() -> Threshold:
     peak; if it is an rms value, the threshold is 3 dB higher, and every level above it 3 dB lower.
     """
     path = Path(__file__).with_name("least_perceptible_acceleration.csv")
-    rows = [row for row in csv.reader(path.read_text(encoding="utf-8").splitlines()) if not row[0].startswith("#")]
-    frequency, level = np.array(rows[1:], float).T
+    # The first row has the names of the columns.
+    frequency, level = np.genfromtxt(path, delimiter=",", encoding="utf-8", unpack=True)[:, 1:]
     return Threshold(
         "Android's least perceptible acceleration",
         frequency,
