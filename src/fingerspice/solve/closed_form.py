@@ -40,7 +40,7 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     scene, start = problem.scene, problem.initial
     area = scene.area0 if area is None else area
     key = ("modes", *area.tolist())
-    modes: Modes = kept_with(scene.prepared, key, MOST_MODES, lambda: scene.modes_at(area))
+    modes = kept_with(scene.prepared, key, MOST_MODES, lambda: scene.modes_at(area))
     n = modes.rates.size
     v0 = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before)
     tables = Tables(problem, 1e-13, no_chirps=True)

@@ -152,8 +152,7 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
                     area[i] = 1e-6 * circuit.initial.get(one.node, math.nan)
         return _state(scene, u, area, None)
 
-    found: State = kept_with(scene.prepared, ("initial", start), 3, make)
-    return found
+    return kept_with(scene.prepared, ("initial", start), 3, make)
 
 
 def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -86,8 +86,7 @@ def known_references(scene: Scene, decade: int, *, anew: bool = False) -> Known:
     key = ("references", decade, threading.get_ident())
     if anew:
         scene.prepared.pop(key, None)
-    found: Known = kept_with(scene.prepared, key, MOST_SETS, lambda: Known(scene, decade))
-    return found
+    return kept_with(scene.prepared, key, MOST_SETS, lambda: Known(scene, decade))
 
 
 def _fed(scene: Scene) -> IntArray:
@@ -131,9 +130,7 @@ def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
 def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
     """The arrays in `REFERRED` for reference areas (m^2) in one row, the round-off as in `Known`, and their shapes."""
     key = ("referred", scene.fixed, area.tobytes())
-    found: tuple[FloatArray, FloatArray, list[tuple[int, ...]]]
-    found = kept_with(scene.network.kept, key, MOST_KEPT, lambda: _refer(scene, area))
-    return found
+    return kept_with(scene.network.kept, key, MOST_KEPT, lambda: _refer(scene, area))
 
 
 def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:

@@ -69,8 +69,7 @@ def _prepared(scene: Scene, rtol: float, u_top: float) -> tuple[System, float]:
         system = system_of(scene, decade, u_top)
         return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
 
-    found: tuple[System, float] = kept_with(scene.prepared, ("system", decade, u_top), MOST_SYSTEMS, make)
-    return found
+    return kept_with(scene.prepared, ("system", decade, u_top), MOST_SYSTEMS, make)
 
 
 def system_of(

@@ -48,8 +48,7 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "
         raise InputError(f"unknown tier {tier!r}; allowed: auto, {', '.join(TIERS)}")
     asked = "coupled" if tier == "auto" and method != "auto" else tier
     key = ("plan", rtol, asked, problem.start, problem.charge, _stores(problem), problem.t_start, problem.t_stop)
-    plan: Plan = kept_with(problem.scene.prepared, key, MOST_PLANS, lambda: _plan(problem, rtol, asked))
-    return plan
+    return kept_with(problem.scene.prepared, key, MOST_PLANS, lambda: _plan(problem, rtol, asked))
 
 
 # The lightest valid tier and its reason; the largest relative change of 1/A, and the area it refers to (m^2).

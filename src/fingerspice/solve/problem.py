@@ -103,7 +103,7 @@ class Problem:
     def breakpoints(self) -> FloatArray:
         """The sources' breakpoints in the run, s; the waveform caches them if they are few."""
         kept, key = self.waveform.kept, ("breakpoints", self.t_start, self.t_stop)
-        edges: FloatArray = kept_with(kept, key, 1, lambda: self.waveform.breakpoints(self.t_start, self.t_stop))
+        edges = kept_with(kept, key, 1, lambda: self.waveform.breakpoints(self.t_start, self.t_stop))
         if edges.size > KEPT_BREAKPOINTS:
             kept.pop(key, None)
         return edges
@@ -138,7 +138,7 @@ def prepare(
     scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
     stop = _end(circuit, t_start, t_stop, t_eval)
     tran, wave = circuit.tran, scene.waveform
-    end: float = kept_with(wave.kept, ("end", stop), 1, lambda: on_breakpoint(wave, stop))
+    end = kept_with(wave.kept, ("end", stop), 1, lambda: on_breakpoint(wave, stop))
     return Problem(
         circuit, scene, t_start, end, t_start + (tran.start if tran else 0.0),
         tran.step if tran else (stop - t_start) / 1000.0,

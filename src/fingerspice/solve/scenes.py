@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -38,6 +38,9 @@ BEYOND_PEAK = 1.3
 DRIVEN_BY_CURRENT = 300.0
 
 
+Kept = TypeVar("Kept")
+
+
 class Freezing(NamedTuple):
     """The single frequency at which a dispersive skin's data are taken, and the error of doing so."""
 
@@ -45,12 +48,12 @@ class Freezing(NamedTuple):
     error: float  # Error of the gap voltage, relative to its peak
 
 
-def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], Any]) -> Any:
+def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], Kept]) -> Kept:
     """The entry of a cache under a key, of which at most `most` share the first part; else all of these make room.
 
     Other threads may remove entries at any time, so that the entry is looked up only once.
     """
-    found = prepared.get(key)
+    found: Kept | None = prepared.get(key)
     if found is None:
         kept = [name for name in list(prepared) if name[0] == key[0]]
         for name in kept if len(kept) >= most else ():

@@ -149,8 +149,7 @@ def after_the_end(problem: Problem) -> Sources | None:
     def make() -> Sources:
         return joined([source_table(w, stop, stop + problem.step, 1e-10, problem.step) for w in problem.waveforms])
 
-    after: Sources = kept_with(problem.waveform.kept, ("after", stop, problem.step), 1, make)
-    return after
+    return kept_with(problem.waveform.kept, ("after", stop, problem.step), 1, make)
 
 
 def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) -> IntArray:
