@@ -28,7 +28,7 @@ from fingerspice.engine.collocation.readout import (
     write_outputs,
 )
 from fingerspice.numerics.chebyshev import to_powers
-from fingerspice.numerics.lobatto import NODES, ROWS
+from fingerspice.numerics.lobatto import NODES
 from fingerspice.numerics.small import copy_to
 
 # Relative distance within which two times count as equal: a few units in the last place. So much the end of a step,
@@ -43,11 +43,6 @@ class Kept(NamedTuple):
 
     times: FloatArray  # (n_step, 3): Start, length and reached end of each step, s
     series: FloatArray  # (n_step, n_column, ROWS): Chebyshev coefficients of the output columns over the whole length
-
-
-def new_kept(steps: int, columns: int) -> Kept:
-    """Room for so many steps."""
-    return Kept(np.zeros((steps, 3)), np.zeros((steps, columns, ROWS)))
 
 
 def repeat(

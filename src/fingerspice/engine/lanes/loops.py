@@ -19,22 +19,22 @@ TILE = 8
 
 
 @jit_within
-def _begin(marks: Any, c: Any, still: FloatArray, starts: FloatArray, source: FloatArray, state: FloatArray) -> None:
-    """Put the lanes at the modes `starts` (m, lanes) under a source (lanes,).
-
-    `still` are the weights of a step of length 0.
-    """
-    at, lanes = places(marks), len(marks.lanes)
+def _put(marks: Any, starts: FloatArray, source: FloatArray, state: FloatArray) -> None:
+    """Put the lanes at the modes `starts` (m, lanes) under a source (lanes,), for a step of length 0."""
+    lanes = len(marks.lanes)
     state[:] = 0.0
     for i in range(lanes):
         state[2 * lanes + i] = source[i]
         for k in range(len(marks.modes)):
             state[(SOURCES + k) * lanes + i] = starts[k, i]
-    step(marks, c, still.reshape(-1), state, source, 0.0, 1.0)
-    if len(marks.mobile) > 0:
-        # On the way to the gap voltage the distance to the fold tells nothing.
-        for i in range(lanes):
-            state[at.fold * lanes + i] = state[(at.q + 2) * lanes + i] * state[(at.q + 1) * lanes + i]
+
+
+@jit_within
+def _settle(marks: Any, state: FloatArray) -> None:
+    """Forget the distance to the fold after a step of length 0, as it tells nothing on the way to the gap voltage."""
+    at, lanes = places(marks), len(marks.lanes)
+    for i in range(lanes if len(marks.mobile) > 0 else 0):
+        state[at.fold * lanes + i] = state[(at.q + 2) * lanes + i] * state[(at.q + 1) * lanes + i]
 
 
 @jit
@@ -54,11 +54,8 @@ def span(
     lanes, m, active = len(marks.lanes), len(marks.modes), len(marks.active)
     rows = m + len(marks.mobile)
     after, found = np.empty(TILE * lanes), np.empty(TILE * rows * lanes)
-    length, flat = np.empty(lanes), weights[1].reshape(-1)
-    _begin(marks, c, weights[0], kept[:, :, 0], x[first], state)
-    for i in range(lanes if rows > m else 0):
-        kept[m, i, 0] = state[(SOURCES + m) * lanes + i]
-    done = 0
+    length, still, flat, before, done = np.empty(lanes), weights[0].reshape(-1), weights[1].reshape(-1), x[first], 0
+    _put(marks, kept[:, :, 0], before, state)
     while done < count:
         size = min(TILE, count - done)
         for i in range(lanes):
@@ -69,8 +66,14 @@ def span(
                 for i in range(lanes):
                     length[i] = h[first[i] + done + k] / parts
                 weigh(c, active, len(marks.inner), length, weights[1])
-            for p in range(parts):
-                step(marks, c, flat, state, after[k * lanes :], p / parts, (p + 1) / parts)
+            # The first step has the length 0. One call for all, as the compiler puts it in place.
+            for p in range(-1 if done + k == 0 else 0, parts):
+                by, to = (still, before) if p < 0 else (flat, after[k * lanes :])
+                step(marks, c, by, state, to, max(p, 0) / parts, (p + 1) / parts if p >= 0 else 1.0)
+                if p < 0:
+                    _settle(marks, state)
+                    for i in range(lanes if rows > m else 0):
+                        kept[m, i, 0] = state[(SOURCES + m) * lanes + i]
             for i in range(rows * lanes):
                 found[k * rows * lanes + i] = state[SOURCES * lanes + i]
         off = 0.0
@@ -129,7 +132,7 @@ def lead(
     and the rows named above go into `out` (count, m + MORE, n). For `weights` and `state` see `span`.
     """
     lanes, m, last = len(marks.lanes), len(marks.modes), len(marks.inner) + 1
-    n, flat = x.size, weights[1].reshape(-1)
+    n, still, flat = x.size, weights[0].reshape(-1), weights[1].reshape(-1)
     modes, before, after, length = np.empty((m, lanes)), np.empty(lanes), np.empty(lanes), np.empty(lanes)
     found, u, q = np.empty((m + MORE, lanes)), np.empty(lanes), np.empty(lanes)
     for first in range(0, n, lanes):
@@ -143,17 +146,22 @@ def lead(
                 before[i], after[i] = x[j] + shifts[p, m], to[j] + shifts[p, m + 1]
                 for k in range(m):
                     modes[k, i] = z[k, j] + shifts[p, k]
-            _begin(marks, c, weights[0], modes, before, state)
+            _put(marks, modes, before, state)
             found[:] = 0.0
-            for part in range(parts):
-                for node in range(last + 1):
+            for part in range(-1, parts):
+                for node in range(last + 1 if part >= 0 else 2):
                     if node == 1:
-                        step(marks, c, flat, state, after, part / parts, (part + 1) / parts)
+                        by, source = (still, before) if part < 0 else (flat, after)
+                        a, b = (0.0, 1.0) if part < 0 else (part / parts, (part + 1) / parts)
+                        step(marks, c, by, state, source, a, b)
+                    if part < 0:
+                        _settle(marks, state)
+                        continue
                     # After a step its end is node 0 of the next one.
                     _gap_and_area(marks, c, node % last, state, u, q)
-                    by = WEIGHTS[last - 2, node]
+                    share = WEIGHTS[last - 2, node]
                     for i in range(lanes):
-                        area = by * length[i] / (c.q0 + q[i])
+                        area = share * length[i] / (c.q0 + q[i])
                         found[m + SQUARES, i] += u[i] * u[i] * area
                         found[m + AREAS, i] += area
             for i in range(min(lanes, n - first)):
