@@ -20,8 +20,8 @@ import numpy as np
 
 import fingerspice as fs
 from batch import PERIODS, REFERENCES, population, seconds, single
-from fingerspice.base.card import card_compiler
 from fingerspice.engine.lockstep import card as lockcard
+from fingerspice.engine.lockstep.card import card_compiler
 from fingerspice.studies.batch import ladder
 
 HERE = Path(__file__).resolve().parent

@@ -18,7 +18,7 @@ import numpy as np
 from scipy import signal
 
 import fingerspice as fs
-from fingerspice.numerics.hold import first_order_hold, moments
+from fingerspice.numerics.linear import first_order_hold, moments
 from timing import median_seconds
 
 HERE = Path(__file__).resolve().parent

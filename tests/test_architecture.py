@@ -16,14 +16,15 @@ from fingerspice.base.compiled import SHARED_FOLDERS
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "fingerspice"
 FILES = sorted(PACKAGE.rglob("*.py"))
-MAX_LINES = 400
-# Lines of all files together and of each package: as many as there are, rounded up. They are only ever lowered; what
+MAX_LINES = 600
+# Lines of all files together and of each package, and the number of files: as many as there are. They are only ever lowered; what
 # moves from one package to another takes its lines along.
-ALL_LINES = 44_180
+ALL_LINES = 41_375
+ALL_FILES = 150
 PACKAGE_LINES = {
-    "base": 1_101, "circuit": 2_582, "cli": 1_948, "engine": 9_342, "explorer": 1_603, "netlist": 2_565,
-    "numerics": 1_293, "physics": 514, "plots": 1_490, "results": 2_917, "sets": 399, "solve": 7_201,
-    "studies": 7_897, "torch": 513, "waveforms": 2_641,
+    "base": 1_038, "circuit": 2_412, "cli": 1_905, "engine": 8_709, "explorer": 1_495, "netlist": 2_515,
+    "numerics": 1_166, "physics": 508, "plots": 1_399, "results": 2_751, "sets": 386, "solve": 6_604,
+    "studies": 7_394, "torch": 456, "waveforms": 2_466,
 }  # fmt: skip
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.
@@ -37,11 +38,11 @@ MANY_PARAMETERS = {
     "cli.app.plan",
     "cli.app.compare",
     "cli.tools.explore",
-    "cli.design.limits",
-    "cli.design.design",
-    "cli.fit.fit",
+    "cli.studies.limits",
+    "cli.studies.design",
+    "cli.studies.fit",
     "cli.sweep.sweep",
-    "cli.fit.fit_contact",
+    "cli.studies.fit_contact",
     "studies.design.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
@@ -79,7 +80,7 @@ LENT = {
     "results.solution.Solution.explore": "explorer.server",
     "results.solution.Solution.sample_gradient": "solve.adjoint",
     "results.spectrum.Spectrum.plot": "plots.traces",
-    "results.phasor_solution.PhasorSolution.plot": "plots.traces",
+    "results.spectrum.PhasorSolution.plot": "plots.traces",
 }
 THIRD_PARTY = {
     "numerics": {"numpy", "numba"},
@@ -279,6 +280,7 @@ def functions(path: Path) -> Iterator[tuple[str, bool, int, int]]:
 
 def test_the_whole_grows_no_more() -> None:
     lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
+    assert len(lines) <= ALL_FILES
     every = sum(lines.values())
     assert every <= ALL_LINES, f"{every} lines in all; allowed: {ALL_LINES}, as something else becomes shorter"
     for package, allowed in PACKAGE_LINES.items():

@@ -12,8 +12,7 @@ import analytic as ref
 import fingerspice as fs
 from batches import check, population, singles, singly
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.engine.lockstep.step import marks_of
-from fingerspice.engine.lockstep.weights import moment_integrals, weigh
+from fingerspice.engine.lockstep.step import marks_of, moment_integrals, weigh
 from scenes import cases, table1
 
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")

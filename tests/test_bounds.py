@@ -14,9 +14,9 @@ import pytest
 
 import fingerspice as fs
 from deck_edits import edited
-from fingerspice.engine.collocation import loopstate
+from fingerspice.engine.collocation import readout
 from fingerspice.solve.problem import MOST_BYTES
-from fingerspice.waveforms import ramps
+from fingerspice.waveforms import periodic
 from processes import ended, start
 from scenes import table1
 from waveform_cases import CASES, Case
@@ -72,15 +72,15 @@ def test_ten_values_in_a_year_of_squares_need_no_list_of_its_edges() -> None:
 
 
 @pytest.mark.parametrize(
-    "case", [c for c in CASES if c.period and isinstance(c.waveform, ramps.Ramps)], ids=lambda c: c.name
+    "case", [c for c in CASES if c.period and isinstance(c.waveform, periodic.Ramps)], ids=lambda c: c.name
 )
 def test_values_do_not_depend_on_the_windows_they_are_looked_up_in(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     wave = case.waveform
     rng = np.random.default_rng(7)
     t = np.concatenate([rng.uniform(-0.01, 0.5, 300), wave.breakpoints(0.0, 0.5)]).reshape(-1, 1)
     whole = [wave.value(t, side) for side in ("left", "right")]
-    monkeypatch.setattr(ramps, "_WINDOW", 7)
-    assert len(list(ramps.in_windows(t.ravel(), wave.breakpoint_rate()))) > 20
+    monkeypatch.setattr(periodic, "_WINDOW", 7)
+    assert len(list(periodic.in_windows(t.ravel(), wave.breakpoint_rate()))) > 20
     for expected, side in zip(whole, ("left", "right"), strict=True):
         np.testing.assert_array_equal(wave.value(t, side), expected)
 
@@ -127,9 +127,9 @@ def test_no_result_depends_on_where_a_walk_over_periods_is_cut(
     calls: list[int] = []
     whole = fs.simulate(circuit, t_eval=t, t_stop=3.0, rtol=1e-6)
     assert whole.stats["repeated"] > 1000
-    part = loopstate._repeat
-    monkeypatch.setattr(loopstate, "AT_ONCE", 100)
-    monkeypatch.setattr(loopstate, "_repeat", lambda *a: calls.append(1) or part(*a))
+    part = readout._repeat
+    monkeypatch.setattr(readout, "AT_ONCE", 100)
+    monkeypatch.setattr(readout, "_repeat", lambda *a: calls.append(1) or part(*a))
     again = fs.simulate(circuit, t_eval=t, t_stop=3.0, rtol=1e-6)
     assert len(calls) > 1
     for name, (values, _, _) in whole.signals.items():

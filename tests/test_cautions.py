@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.circuit.notices import course_warnings, energy_outside, skin_error
+from fingerspice.circuit.describe import course_warnings, energy_outside, skin_error
 from fingerspice.waveforms.waveform import as_waveform
 from scenes import deck, finger, table1, table1_deck
 from waveform_cases import CASES

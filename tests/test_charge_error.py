@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.readout import N_PLACES
-from fingerspice.engine.many_areas import charge as many_charge
+from fingerspice.engine.many_areas import error as many_charge
 from fingerspice.engine.many_areas import form as blocks
 from fingerspice.engine.many_areas.form import Form
 from fingerspice.engine.one_area import charge, rows

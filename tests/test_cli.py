@@ -22,7 +22,7 @@ import xarray
 import fingerspice as fs
 from commands import QUICK, Command, Result, tree
 from deck_edits import edited
-from fingerspice.results.store import create
+from fingerspice.results.runfile import create
 
 OUT = {"out", "out/.gitignore"}
 """What stands where nobody named a folder, besides the results."""
@@ -308,7 +308,7 @@ def test_a_store_that_another_process_writes_is_refused(command: Command, monkey
         shutil.copytree("pad.zarr", "out/pad.zarr")
         create(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("fingerspice.cli.store.create", late)
+    monkeypatch.setattr("fingerspice.cli.sweep.create", late)
     done = command(*words)
     assert (done.code, done.out) == (2, "")
     assert busy in done.lines[-1]

@@ -18,7 +18,7 @@ from fingerspice.engine.one_area.rows import polynomial_rows
 from fingerspice.engine.one_area.system import area_error, area_missed, area_polynomial
 from fingerspice.numerics.lobatto import ROWS
 from fingerspice.physics.contact import Contact, fixed_area_curve, inverse_area, ridge_area, universal_curve
-from fingerspice.physics.ladder import SKIN_LADDER
+from fingerspice.physics.materials import SKIN_LADDER
 from scenes import cases, table1, table1_deck
 
 SEARCH = settings(max_examples=60, derandomize=True, deadline=None)

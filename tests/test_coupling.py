@@ -7,10 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fingerspice.engine.many_areas.coupling import STIFF, Coupling, fill_coupling, new_coupling
-from fingerspice.engine.many_areas.currents import Moving, answer_mobile, cell_currents
+from fingerspice.engine.many_areas.coupling import (
+    STIFF,
+    Coupling,
+    Moving,
+    answer_mobile,
+    cell_currents,
+    fill_coupling,
+    new_coupling,
+)
 from fingerspice.numerics.lobatto import ROWS
-from fingerspice.numerics.small import diagonalise
+from fingerspice.numerics.modes import diagonalise
 
 H = 1e-3
 AREA0 = 35e-6

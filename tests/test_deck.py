@@ -12,8 +12,7 @@ import pytest
 from fingerspice.base.errors import InputError, Where
 from fingerspice.netlist import reader
 from fingerspice.netlist.deck import parse_deck, read_deck
-from fingerspice.netlist.reader import Deck
-from fingerspice.netlist.scope import Call, Number, Statement, Token
+from fingerspice.netlist.reader import Call, Deck, Number, Statement, Token
 
 PAPER = """Fingerpad on a 3M-coated touchscreen, Table 1
 .include fingerspice.lib

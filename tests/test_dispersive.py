@@ -11,9 +11,8 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.circuit.notices import energy_outside
-from fingerspice.physics.ladder import SKIN_LADDER, Ladder
-from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
+from fingerspice.circuit.describe import energy_outside
+from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, Ladder, skin_permittivity, skin_resistivity
 from scenes import table1_deck
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.explorer.examples import EXAMPLES
+from fingerspice.explorer.beginnings import EXAMPLES
 from fingerspice.explorer.gallery import static_page
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")

@@ -14,12 +14,10 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
-from fingerspice.explorer.changed import applied, before
-from fingerspice.explorer.examples import EXAMPLES
-from fingerspice.explorer.request import asked_by
+from fingerspice.explorer.beginnings import EXAMPLES, applied, before
+from fingerspice.explorer.request import asked_by, read_source, text_of
 from fingerspice.explorer.scene import as_python, scene
 from fingerspice.explorer.server import framed
-from fingerspice.explorer.sliders import read_source, text_of
 from test_explore import baked, run_as_python
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"

@@ -12,8 +12,7 @@ from scipy.integrate import solve_ivp
 
 import fingerspice as fs
 from commands import Command
-from fingerspice.studies.feel import feel
-from fingerspice.studies.perception import (
+from fingerspice.studies.feel import (
     DIFFERENCE_DB,
     FINGERPAD,
     GRAVITY,
@@ -21,6 +20,7 @@ from fingerspice.studies.perception import (
     SkinMechanics,
     Threshold,
     android_threshold,
+    feel,
 )  # fmt: skip
 from scenes import deck, table1
 

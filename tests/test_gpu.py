@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.base import card
+from fingerspice.engine.lockstep import card
 from fingerspice.engine.lockstep.card import thread_kernel
 from scenes import cases
 

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from fingerspice.numerics.hold import first_order_hold
-from fingerspice.numerics.linear import respond
+from fingerspice.numerics.linear import first_order_hold, respond
 
 DT = 1e-6
 # Stretches of the recursion begin after the first sample.

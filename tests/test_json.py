@@ -14,7 +14,7 @@ import pytest
 import fingerspice as fs
 from commands import Command, Result
 from deck_edits import edited
-from fingerspice.cli.answers import COMMON, FIGURES, OWN
+from fingerspice.cli.terminal import COMMON, FIGURES, OWN
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 DOCUMENT = (Path(__file__).parents[1] / "docs" / "json.md").read_text()

@@ -18,8 +18,8 @@ from fingerspice.base.errors import LONGEST_MESSAGE, FingerspiceWarning, InputEr
 from fingerspice.circuit import topology
 from fingerspice.netlist import reader
 from fingerspice.netlist.deck import LONGEST_TITLE, MAX_DEPTH, parse_deck
-from fingerspice.netlist.scope import Number
-from fingerspice.netlist.slips import nearest
+from fingerspice.netlist.expressions import nearest
+from fingerspice.netlist.reader import Number
 
 MANY = 20_000
 

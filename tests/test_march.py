@@ -16,9 +16,8 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.solve.one_area import Track
-from fingerspice.solve.problem import prepare
+from fingerspice.solve.problem import Tables, prepare
 from fingerspice.solve.runs import integrate
-from fingerspice.solve.sources import Tables
 from scenes import table1
 
 every_law = pytest.mark.parametrize("law", ["local", "mobile"])

@@ -12,7 +12,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import NODES, POINTS
-from fingerspice.results import measures, steps
+from fingerspice.results import steps
 from scenes import cases, deck, table1
 
 LAWS = pytest.mark.parametrize("law", ["local", "mobile"])
@@ -167,13 +167,13 @@ def test_weights_of_outputs_integrate_cubics_between_jumps_and_lines_where_point
     second_half = np.flatnonzero(t == 1.5)[1]
     cubic[second_half] = 1.5**2
     exact = (0.25 - 0.5) + (1.5**2 - 1.0) + (27.0 - 1.5**3) / 3.0
-    assert 3.0 * measures.weigh_outputs(t, cubic).mean() == pytest.approx(exact, rel=1e-13)
+    assert 3.0 * steps.weigh_outputs(t, cubic).mean() == pytest.approx(exact, rel=1e-13)
 
 
 def test_weights_of_four_hundred_thousand_outputs_with_a_jump_at_every_tenth():
     # A loop over the pieces in Python took 18 s.
     t = np.repeat(np.linspace(0.0, 1.0, 360_001), np.where(np.arange(360_001) % 9 == 8, 2, 1))
-    weighed = measures.weigh_outputs(t, np.sin(7.0 * t))
+    weighed = steps.weigh_outputs(t, np.sin(7.0 * t))
     assert weighed.mean() == pytest.approx((1.0 - np.cos(7.0)) / 7.0, rel=1e-12)
 
 

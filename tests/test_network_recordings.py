@@ -11,7 +11,7 @@ import pytest
 
 import fingerspice as fs
 import recording_errors
-from fingerspice.solve.recordings import pieces
+from fingerspice.solve.recordings import block
 from network_reference import Floating
 from scenes import COAT, GAP, assignments, cases, deck
 
@@ -98,7 +98,7 @@ def test_decays_within_a_sample_are_shown_as_they_are(name: str) -> None:
 
 
 def test_chunks_are_the_whole_and_a_run_goes_on_where_another_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pieces, "PIECE", 512)
+    monkeypatch.setattr(block, "PIECE", 512)
     wave = recording(1500)
     circuit, how = driven("amplifier", wave), {"t_stop": 1400.0 / RATE, "rtol": 1e-6, "charge_law": "local"}
     whole = fs.simulate(circuit, t_eval=np.arange(1401) / RATE, **how)

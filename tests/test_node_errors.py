@@ -10,8 +10,7 @@ import pytest
 import fingerspice as fs
 from fingerspice.engine.collocation.readout import N_PLACES
 from fingerspice.engine.many_areas import error as many_error
-from fingerspice.engine.one_area import end as one_end
-from fingerspice.engine.one_area import rows
+from fingerspice.engine.one_area import rows, step
 from fingerspice.numerics.lobatto import END, FIRST, MISS, POINTS, ROWS
 
 PLACES = [0, FIRST, FIRST + 1, FIRST + 2, END]
@@ -69,11 +68,11 @@ def test_a_stack_s_nodes_are_off_by_what_modes_area_and_source_are(mobile: bool)
     r[rows.SOURCE], r[rows.U], r[rows.Q], r[rows.DQ], r[rows.X_GAP] = source, u, q, slope, gap @ w
     at = np.array(PLACES)
     want = (voltages(source[at], w[:, at] + places)[2] - voltages(source[at], w[:, at] - places)[2]) / 2.0
-    found = one_end.node_error(mobile, area0, node, k_node, gap, w, r, places)
+    found = step.node_error(mobile, area0, node, k_node, gap, w, r, places)
     assert found == pytest.approx(np.abs(want).max(), rel=1e-5, abs=0.0)
     # What a polynomial through the source's values misses is an error of the nodes too.
     r[rows.SOURCE, FIRST:] += MISS
-    alone = one_end.node_error(False, area0, node, k_node, gap, w, r, 0.0 * places)
+    alone = step.node_error(False, area0, node, k_node, gap, w, r, 0.0 * places)
     assert alone == pytest.approx(np.abs(k_node).max() * np.abs(MISS).max(), rel=1e-9, abs=0.0)
 
 

@@ -28,7 +28,7 @@ from analytic import (
 )
 from fingerspice.circuit.circuit import AcSweep
 from fingerspice.physics.phasor import coupled_area, layer_gains
-from fingerspice.studies.phasors import sweep_frequencies
+from fingerspice.studies.steady import sweep_frequencies
 from ngspice_tools import call_ngspice
 from scenes import deck, table1, table1_deck
 

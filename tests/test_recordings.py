@@ -13,7 +13,7 @@ import pytest
 import analytic
 import fingerspice as fs
 import recording_errors
-from fingerspice.numerics.hold import moments
+from fingerspice.numerics.linear import moments
 from fingerspice.waveforms.samples import as_samples
 from scenes import cases, table1_deck
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
-from fingerspice.solve.sources import LOOKS
+from fingerspice.solve.problem import LOOKS
 from fingerspice.waveforms.sampling import SourceTable, on_grid, source_table
 from scenes import cases, table1, table1_deck
 from waveform_cases import compiled

@@ -16,7 +16,7 @@ from matplotlib.transforms import Bbox
 
 import fingerspice as fs
 from commands import Command
-from fingerspice.plots.placement import place
+from fingerspice.plots.drawing import place
 from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic, put_beside
 from scenes import table1
 

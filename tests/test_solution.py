@@ -20,7 +20,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.base import files
 from fingerspice.base.files import write_aside
-from fingerspice.results.signals import SIGNALS
+from fingerspice.results.record import SIGNALS
 from scenes import deck, table1
 
 SQUARE = "SQUARE(200 100)"

@@ -10,12 +10,11 @@ import pytest
 
 import fingerspice as fs
 from analytic import sine_segments, transient
-from fingerspice.engine.implicit.step import dense_polynomial, dense_state, guess, linearise, step
+from fingerspice.engine.implicit import dense_polynomial, dense_state, guess, linearise, step
 from fingerspice.engine.network import rates
 from fingerspice.numerics.lobatto import Tableau, radau
 from fingerspice.solve.nodal import STAGES, STAGES_BESIDE, Collocation, radau_scheme
-from fingerspice.solve.problem import prepare
-from fingerspice.solve.sources import Tables, joined, values_at
+from fingerspice.solve.problem import Tables, joined, prepare, values_at
 from scenes import table1
 
 every_number = pytest.mark.parametrize("stages", [3, STAGES_BESIDE, STAGES])

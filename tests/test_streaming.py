@@ -22,7 +22,7 @@ import pytest
 import fingerspice as fs
 import recording_errors
 from commands import Command, tree
-from fingerspice.solve.recordings import pieces
+from fingerspice.solve.recordings import block as pieces
 from fingerspice.solve.recordings import run as recordings
 from fingerspice.waveforms import samples
 from processes import ended, no_room, start

@@ -17,7 +17,7 @@ from analytic import GAP, Layer, area, coupled_phasor, periodic_state, sine_segm
 from commands import Command
 from deck_edits import edited
 from fingerspice.circuit.circuit import AcSweep
-from fingerspice.studies.phasors import sweep_frequencies
+from fingerspice.studies.steady import sweep_frequencies
 from ngspice_tools import CIRCUITS, call_ngspice
 from scenes import table1
 

@@ -222,7 +222,7 @@ def test_a_batch_of_means_goes_in_lockstep(monkeypatch: pytest.MonkeyPatch) -> N
     def alone(*_: Any, **__: Any) -> None:
         raise AssertionError("a scene was run by itself")
 
-    monkeypatch.setattr("fingerspice.torch.scenes.simulate", alone)
+    monkeypatch.setattr("fingerspice.torch.simulator.simulate", alone)
     simulator = fs.torch.Simulator(table1(), {"Xgap.d": np.linspace(3e-6, 4e-6, 1000)}, rtol=1e-4)
     assert simulator().shape == (1000,)
 

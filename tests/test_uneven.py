@@ -9,9 +9,8 @@ import pytest
 from scipy import integrate
 
 import fingerspice as fs
-from fingerspice.engine.lanes.rows import INNER, QUICK, Lanes, weighed
-from fingerspice.engine.lanes.weights import weigh
-from fingerspice.solve.recordings.pieces import LEAST_POINTS
+from fingerspice.engine.lanes.rows import INNER, QUICK, Lanes, weigh, weighed
+from fingerspice.solve.recordings.block import LEAST_POINTS
 from scenes import cases
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"

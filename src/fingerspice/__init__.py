@@ -40,11 +40,11 @@ if TYPE_CHECKING:
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.comparison import large_signal as large_signal
-    from fingerspice.studies.design.capability import Capability as Capability
-    from fingerspice.studies.design.capability import capability as capability
     from fingerspice.studies.design.drive import InverseDrive as InverseDrive
     from fingerspice.studies.design.folds import FoldLimits as FoldLimits
     from fingerspice.studies.design.folds import fold_limits as fold_limits
+    from fingerspice.studies.design.inverse import Capability as Capability
+    from fingerspice.studies.design.inverse import capability as capability
     from fingerspice.studies.design.inverse import inverse_drive as inverse_drive
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
@@ -56,8 +56,8 @@ if TYPE_CHECKING:
     from fingerspice.studies.fit.materialfit import ColeCole as ColeCole
     from fingerspice.studies.fit.materialfit import MaterialFit as MaterialFit
     from fingerspice.studies.fit.materialfit import fit_material as fit_material
-    from fingerspice.studies.phasors import phasor as phasor
     from fingerspice.studies.steady import SteadyState as SteadyState
+    from fingerspice.studies.steady import phasor as phasor
     from fingerspice.studies.steady import steady_state as steady_state
     from fingerspice.studies.sweep.populations import sobol as sobol
     from fingerspice.studies.sweep.populations import sweep as sweep
@@ -66,13 +66,13 @@ if TYPE_CHECKING:
     from fingerspice.waveforms.combinations import Product as Product
     from fingerspice.waveforms.combinations import Repeat as Repeat
     from fingerspice.waveforms.combinations import Sum as Sum
+    from fingerspice.waveforms.periodic import PWL as PWL
     from fingerspice.waveforms.periodic import Chirp as Chirp
     from fingerspice.waveforms.periodic import Exp as Exp
     from fingerspice.waveforms.periodic import Pulse as Pulse
     from fingerspice.waveforms.periodic import Sawtooth as Sawtooth
     from fingerspice.waveforms.periodic import Square as Square
     from fingerspice.waveforms.periodic import Triangle as Triangle
-    from fingerspice.waveforms.ramps import PWL as PWL
     from fingerspice.waveforms.samples import Samples as Samples
     from fingerspice.waveforms.sampling import Function as Function
     from fingerspice.waveforms.waveform import DC as DC
@@ -82,14 +82,13 @@ if TYPE_CHECKING:
 _HOMES = {
     "circuit.circuit": ("Circuit",),
     "netlist.netlist": ("parse_netlist", "read_netlist"),
-    "waveforms.periodic": ("Chirp", "Exp", "Pulse", "Sawtooth", "Square", "Triangle"),
-    "waveforms.ramps": ("PWL",),
+    "waveforms.periodic": ("Chirp", "Exp", "Pulse", "Sawtooth", "Square", "Triangle", "PWL"),
     "waveforms.samples": ("Samples",),
     "waveforms.sampling": ("Function",),
     "waveforms.combinations": ("AM", "Burst", "Product", "Repeat", "Sum"),
     "waveforms.waveform": ("DC", "Sine", "Waveform"),
     "studies.batch.batch": ("batch",),
-    "studies.design.capability": ("Capability", "capability"),
+    "studies.design.inverse": ("Capability", "capability", "inverse_drive"),
     "studies.comparison": ("Comparison", "compare", "large_signal"),
     "base.errors": ("FingerspiceError", "FingerspiceWarning", "InputError"),
     "explorer.server": ("Explorer", "explore"),
@@ -99,8 +98,7 @@ _HOMES = {
     "studies.fit.circuitfit": ("Fit", "fit"),
     "studies.fit.materialfit": ("ColeCole", "MaterialFit", "fit_material"),
     "studies.design.drive": ("InverseDrive",),
-    "studies.design.inverse": ("inverse_drive",),
-    "studies.phasors": ("phasor",),
+    "studies.steady": ("phasor", "SteadyState", "steady_state"),
     "studies.design.folds": ("FoldLimits", "fold_limits"),
     "studies.sweep.populations": ("sobol", "sweep"),
     "results.runfile": ("load",),
@@ -109,7 +107,6 @@ _HOMES = {
     "solve.simulation": ("plan", "simulate"),
     "solve.streaming": ("stream",),
     "results.solution": ("Solution",),
-    "studies.steady": ("SteadyState", "steady_state"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = ["__version__", *sorted(_HOME)]

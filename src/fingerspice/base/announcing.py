@@ -18,7 +18,7 @@ LONG = {
     ("engine.lanes.loops.span", "StackMarks"): "the steps of a recording, about 20 s",
     ("engine.lanes.loops.span", "MobileMarks"): "the steps of a recording, about 20 s",
     ("engine.lanes.loops.span", "NetworkMarks"): "the steps of a recording in a network, about 30 s",
-    ("engine.implicit.run.advance", "Nodal"): "implicit steps, about 15 s",
+    ("engine.implicit.advance", "Nodal"): "implicit steps, about 15 s",
     ("engine.lockstep.march.march", ""): "scenes in lockstep, about 20 s",
 }
 _KEPT = {

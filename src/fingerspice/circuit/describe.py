@@ -1,23 +1,40 @@
-"""A circuit in words: its elements, its sources, the changes made after its deck was read; and its digests."""
+"""A circuit in words and its digests, checks of a call's arguments, and warnings before a run.
+
+These are about a circuit before it runs: directives without effect, unsuitable skin data, sources that miss it.
+
+What is said about a skin's data rests on the source's spectrum: its energy outside their band, and the error of data
+held at one frequency.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import math
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from functools import lru_cache
 from typing import Any
 
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray, IntArray, real_number
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.devices import shown
-from fingerspice.circuit.topology import driving
+from fingerspice.circuit.devices import shown, unusual_of_changed
+from fingerspice.circuit.loop import areas_at_rest, network_of, with_skin_held
+from fingerspice.circuit.statespace import build_stack
+from fingerspice.circuit.topology import driving, driving_sources, shared
+from fingerspice.physics.materials import SKIN_BAND
+from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.combinations import Burst, Product, Repeat, Sum
-from fingerspice.waveforms.ramps import PWL
-from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.periodic import PWL
+from fingerspice.waveforms.samples import Samples, as_samples
 from fingerspice.waveforms.sampling import Function
-from fingerspice.waveforms.waveform import DC, Waveform
+from fingerspice.waveforms.waveform import DC, Waveform, require
 
 
 def remembering(circuit: Circuit, name: str, values: Mapping[str, Any]) -> Circuit:
@@ -179,3 +196,397 @@ def _deck_value(value: float) -> str:
 def _joined(said: list[str]) -> str:
     more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
     return ", ".join([*said[:_MOST], *more])
+
+
+#: A waveform, a constant (V, or A of a current source), or a function of time (s).
+Source = Waveform | float | Callable[[float], float]
+Sources = Mapping[str, Source] | Source
+Parameters = Mapping[str, float]
+
+
+def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Parameters | None = None) -> Circuit:
+    """The circuit with the sources and parameters given in a call, with warnings about sources that stay on.
+
+    For a circuit with one source, its waveform, constant or function alone is enough; `parameters` is as in
+    `Circuit.replace`.
+    """
+    require_circuit(circuit)
+    if parameters:
+        given = f"a {type(parameters).__name__}"
+        require(isinstance(parameters, Mapping), "parameters", given, "a mapping such as {'Xgap.d': 3e-6}")
+        circuit = circuit.replace(parameters)
+    if sources is None or (isinstance(sources, Mapping) and not sources):
+        return circuit
+    driving = driving_sources(circuit)
+    if not isinstance(sources, Mapping):
+        has = f"one source, and the circuit has {', '.join(e.name for e in driving) or 'none'}"
+        allowed = f"a mapping such as {{{driving[0].name!r}: ...}}" if driving else "no sources"
+        require(len(driving) == 1, "sources", has, allowed)
+        sources = {driving[0].name: sources}
+    for name in sources:
+        if not isinstance(name, str):
+            raise InputError(f"sources names {name!r}, a {type(name).__name__}; allowed: names of V or I elements")
+        if circuit[name].device not in "VI":
+            raise InputError(f"sources names {name!r}, which is a {circuit[name].device}; allowed: a V or I element")
+    named = {name.lower() for name in sources}
+    on = [e.name for e in driving if e.name.lower() not in named and e.waveform not in (None, DC(0.0))]
+    if on and any(e.name.lower() in named for e in driving):
+        text = (
+            f"sources names {', '.join(sources)} only: {', '.join(on)} stays on, as in the deck; 0 would switch it off"
+        )
+        warnings.warn(text, FingerspiceWarning, stacklevel=3)
+        circuit = dataclasses.replace(circuit, warnings=(*circuit.warnings, text))
+    return circuit.replace({circuit[name].name: value for name, value in sources.items()})
+
+
+def require_circuit(circuit: Any) -> None:
+    """Refuse anything but a circuit, and say how a circuit is made."""
+    if not isinstance(circuit, Circuit):
+        raise InputError(
+            f"the circuit is a {type(circuit).__name__}; allowed: a Circuit, such as fs.read_netlist('deck.cir') gives"
+        )
+
+
+def area_given(area: Any) -> str | float:
+    """An area as one of the model's modes or a positive number, m^2."""
+    if isinstance(area, str):
+        require(area in ("coupled", "mean", "frozen"), "area", repr(area), "'coupled', 'mean', 'frozen' or m^2")
+        return area
+    number = real_number("area", area, "'coupled', 'mean', 'frozen' or a number in m^2")
+    require(math.isfinite(number) and number > 0.0, "area", f"{number:g} m^2", "a positive area in m^2")
+    return number
+
+
+# Largest relative difference of frequencies that are the same; and the words by which a warning about a SKIN begins.
+_SAME, _TAKES = 1e-9, "takes its data at f ="
+# Smallest relative error of the mean force that is given as a number.
+_LITTLE = 0.005
+# Directives that only ngspice needs, so that no warning is given about them.
+_FOR_NGSPICE = (".nodeset", ".options")
+# Smallest number of points that make a PWL a recording, which is meant to be run to its end and not to be a step in a
+# longer run; and the smallest fraction of a run that a recording fills without a warning.
+_RECORDED, _FILLED = 100, 0.01
+# Times (s) from `_CLOCK` on are those of a clock (this is a day in 1973, counted from 1970); times beyond the end of a
+# run by a factor of `_OTHER_UNIT` or more are probably in another unit.
+_CLOCK, _OTHER_UNIT = 1e8, 20.0
+# Largest number of samples of a spectrum, and largest number of periods over which a periodic source is evaluated.
+_MOST_SAMPLES = 2**17
+_PERIODS = 16
+# Number of pieces that represent a long run of a source without period, and number of frequencies at which gains are
+# computed.
+_PIECES, _GRID = 4, 49
+# Least length of a piece of a recording, s: two periods of the lowest frequency of the skin's data.
+_LEAST = 2.0 / SKIN_BAND[0]
+# Number of samples of a recording up to which straight lines between them are looked at instead.
+_FEW = 4096
+# A source is in a band if no more than this fraction of its energy is outside.
+NOTABLE = 0.01
+# The area's harmonics also drive currents through the skin. Skin data held at the fundamental cause an additional
+# relative error of at most COUPLING times the relative change of the area: 0.004 was found where the area changes by a
+# quarter (sine of 200 V and 100 Hz).
+COUPLING = 0.05
+
+
+def circuit_warnings(circuit: Circuit, t_stop: float | None) -> tuple[str, ...]:
+    """Warnings about directives without effect, and about a SKIN whose single frequency does not suit its source.
+
+    The run is taken to end at `t_stop` (s), or at the deck's own end where that is None.
+    """
+    stop = t_stop or (math.nan if circuit.tran is None else circuit.tran.stop)
+    return circuit.remember(("notices", stop), lambda: (*directive_warnings(circuit), *_skin_warnings(circuit, stop)))
+
+
+def directive_warnings(circuit: Circuit) -> tuple[str, ...]:
+    """Warnings about directives without effect."""
+    return tuple(f"{name} has no effect here" for name in circuit.unused if not name.startswith(_FOR_NGSPICE))
+
+
+def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) -> Iterator[str]:
+    """Warnings about sources that miss the run from `start` to `stop` (s), fill little of it, or are cut off by it.
+
+    A recording is cut off without a warning unless the deck's own TSTOP does it, as `by_deck` says.
+    """
+    for name, wave in ((e.name, e.waveform) for e in driving(circuit) if e.waveform is not None):
+        (first, last), recording = wave.course, as_samples(wave)
+        # Of a recording or table; 0 of other waveforms.
+        count = len(wave.times) if isinstance(wave, PWL) and wave.repeat is None else 0
+        count = count if recording is None else recording.count
+        if (count > 1 and last < start == 0.0) or stop <= first < math.inf:
+            until = f" to {last:g} s" if last < math.inf else " on"
+            yield (
+                f"{name} changes from {first:g} s{until} only, and covers nothing of the run from {start:g} s to "
+                f"{stop:g} s, in which it stays at {wave.value(stop, 'left'):.4g}{time_slip(first, last, stop)}"
+            )
+        elif count >= _RECORDED and last - first < _FILLED * (stop - start):
+            yield (
+                f"{name}: the recording, from {first:g} s to {last:g} s, is {100.0 * (last - first) / stop:.2g} % of "
+                f"the run to {stop:g} s, and constant in the rest; its times, or its rate, are probably in another unit"
+            )
+        elif by_deck and count >= _RECORDED and last > stop + (last - first) / (count - 1):
+            yield (
+                f"{name}: the recording ends at {last:g} s, and the run at the deck's TSTOP = {stop:g} s; --stop "
+                f"{last:.9g} takes all of it (in Python t_stop={last:.9g})"
+            )
+
+
+def time_slip(first: float, last: float, stop: float) -> str:
+    """End of a message about times from `first` to `last` (s) that are not in a run to `stop`: the likely slip."""
+    if first >= _CLOCK:
+        return "; its times are probably a clock's: subtract the first of them"
+    beyond = (first if first > stop else last) / stop
+    if _OTHER_UNIT <= beyond < math.inf:
+        unit = "ms" if beyond <= 1e3 * (1.0 + 1e-9) else "ms or us"
+        return f"; its times are probably in {unit}, and count as s here"
+    return f"; a run to {last:g} s contains it" if stop < last < math.inf else ""
+
+
+def scenes_warnings(
+    circuit: Circuit, t_stop: float | None, scenes: Mapping[str, FloatArray], skin: str = "own"
+) -> Iterator[str]:
+    """Warnings about several scenes: unusual values, sources that miss the run, a SKIN whose single frequency is wrong.
+
+    `t_stop` is as in `circuit_warnings`, `skin` as in `batch`, and `scenes` has the values (n,) of each parameter.
+    """
+    for path, values in scenes.items():
+        for end in sorted({values.min(), values.max()}):
+            # A scene that cannot be run says so itself.
+            with suppress(InputError):
+                yield from unusual_of_changed(circuit, circuit.varied({path: float(end)}))[1]
+    stop = t_stop or (math.nan if circuit.tran is None else circuit.tran.stop)
+    if not any(path.startswith(f"{e.name}.") for e in driving(circuit) for path in scenes):
+        yield from course_warnings(circuit, 0.0, stop, t_stop is None)
+    if skin != "own":
+        return
+    own = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
+    on = driving_sources(circuit) if own else []
+    clocks = [f"{e.name}.{name}" for e in on for name in ("frequency", "carrier")]
+    if not any(path in scenes for path in (*own, *clocks)):
+        yield from (text for text in circuit_warnings(circuit, t_stop) if _TAKES in text)
+    elif len(on) == 1 and on[0].waveform is not None and on[0].waveform.fundamental is not None:
+        fixed = np.array(on[0].waveform.fundamental.frequency)
+        at = next((scenes[path] for path in clocks if path in scenes), fixed)
+        for path in own:
+            f = scenes.get(path, np.array(circuit.parameters[path].value))
+            if np.any(np.abs(f / at - 1.0) > _SAME):
+                yield (
+                    f"{path.removesuffix('.f')} {_TAKES} {_span(f)}, the source's fundamental is {_span(at)}; with "
+                    "skin 'follow' they are taken at the fundamental"
+                )
+
+
+def _span(f: FloatArray) -> str:
+    low, high = float(f.min()), float(f.max())
+    return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+
+
+def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
+    skins = circuit.by_device("SKIN")
+    waves = network_of(circuit).waveforms if skins else ()
+    # With several sources only the user can know at which frequency the skin data should be taken.
+    if len(waves) != 1:
+        return
+    (wave,), fundamental, known = waves, waves[0].fundamental, 0.0 < stop < math.inf
+    for skin in skins:
+        f = skin.values["f"]
+        if fundamental is not None and abs(f / fundamental.frequency - 1.0) > _SAME:
+            yield (
+                f"{skin.name} {_TAKES} {f:g} Hz, the source's fundamental is "
+                f"{fundamental.frequency:g} Hz; {skin.name}.f={fundamental.frequency:g} would match"
+            )
+        elif fundamental is None and not (known and is_near(wave, stop, f)):
+            error = skin_error(circuit, wave, stop) if known else None
+            off = "may be 5 to 10 % off"
+            if error is not None:
+                off = f"is about {100.0 * abs(error):.2g} % too {'large' if error > 0.0 else 'small'}"
+            if error is not None and abs(error) < _LITTLE:
+                off = f"may be {100.0 * _LITTLE:g} % off"
+            yield (
+                f"{skin.name} {_TAKES} {f:g} Hz, and the source has no fundamental: the mean force {off}; "
+                f"SKIN_DISPERSIVE d={1e6 * skin.values['d']:g}u is right for any source"
+            )
+
+
+# Spectra
+
+
+def _enough(span: float, rate: float) -> int:
+    """Number of samples of a span (s), a power of two: at least `rate` per second, but at most `_MOST_SAMPLES`."""
+    return int(min(_MOST_SAMPLES, max(1024, 2 ** math.ceil(math.log2(span * rate)))))
+
+
+def _samples(waveform: Waveform, t0: float, t1: float, count: int) -> FloatArray:
+    """The source at the midpoints of `count` equal intervals."""
+    return np.asarray(waveform.value(t0 + (np.arange(count) + 0.5) * ((t1 - t0) / count)))
+
+
+@lru_cache(maxsize=4)
+def _window(count: int) -> FloatArray:
+    """Hann's window, cached because its cosines cost as much as the Fourier transform."""
+    return np.hanning(count)
+
+
+def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatArray, FloatArray]:
+    """Frequencies (Hz) up to about twice `highest` (Hz), and the source's energy at each, in arbitrary units.
+
+    For a periodic source the spectrum is taken over one period, and else over the run to `t_stop` (s) with a Hann
+    window, because the ends of the run would count as jumps. For a run of too many samples the spectra of several
+    pieces spread over the run are added. A source with values that are not finite has energy 0.
+    """
+    periodic = waveform.period is not None
+    t0 = waveform.settled if periodic else 0.0
+    span = waveform.period if waveform.period is not None else t_stop
+    rate, pieces = 4.0 * highest, 1
+    if not periodic and span * rate > _MOST_SAMPLES:
+        own = max(2.0 * waveform.breakpoint_rate(), 16.0 / waveform.shortest_time())
+        rate = min(rate, own or rate)
+        pieces = 1 if span * rate <= _MOST_SAMPLES else _PIECES
+    count = _enough(span, rate) // pieces
+    length = span if pieces == 1 else count / rate
+    total: FloatArray = np.zeros(1)
+    for start in np.linspace(t0, t0 + span - length, pieces).tolist():
+        u = _samples(waveform, start, start + length, count)
+        if not np.all(np.isfinite(u)):
+            return np.zeros(1), np.zeros(1)
+        total = total + np.abs(np.fft.rfft(u if periodic else u * _window(u.size))) ** 2
+    total[1:] *= 2.0
+    return np.arange(total.size) / length, total
+
+
+def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | None:
+    """As `_energies`, from the samples themselves: pieces spread over the run to `t_stop` (s); None for few samples."""
+    last = min(wave.count, math.floor((t_stop - wave.start) * wave.rate) + 1) if isinstance(wave, Samples) else 0
+    if not isinstance(wave, Samples) or last < _FEW:
+        return None
+    # End and spectrum are one entry, because another thread may replace it at any time.
+    end, frequencies, total = wave.kept.get("spectrum", (None, None, None))
+    if end != t_stop:
+        # A power of two, as the Fourier transform of a number with a large prime factor takes many times as long.
+        count = min(2 ** int(math.log2(last)), 2 ** math.ceil(math.log2(_LEAST * wave.rate)), _MOST_SAMPLES)
+        starts = np.unique(np.linspace(0, last - count, min(_PIECES, math.ceil(last / count))).astype(int))
+        total = np.zeros(count // 2 + 1)
+        for i in starts.tolist():
+            lines = np.fft.rfft(wave.between(i, i + count) * _window(count))
+            total += lines.real**2 + lines.imag**2
+        total[1:] *= 2.0
+        frequencies = np.arange(total.size) * (wave.rate / count)
+        wave.kept["spectrum"] = t_stop, frequencies, total
+    return frequencies, total
+
+
+def energy_outside(waveform: Waveform, t_stop: float, band: tuple[float, float] = SKIN_BAND) -> tuple[float, float]:
+    """Fractions of the source's energy in a run to `t_stop` (s) below and above a band (Hz); see `_energies`."""
+    low, high = band
+    # Above their rate, straight lines between samples of white noise have 0.3 % of its energy.
+    slow = isinstance(waveform, Samples) and waveform.rate <= high
+    f, energy = (_recorded(waveform, t_stop) if slow else None) or _energies(waveform, t_stop, high)
+    total = float(energy.sum())
+    # The window spreads a line over the neighbouring bins, so one bin below the band counts as inside.
+    below = f < low - (0.0 if waveform.period is not None else f[1] if f.size > 1 else 0.0)
+    return (float(energy[below].sum() / total), float(energy[f > high].sum() / total)) if total > 0.0 else (0.0, 0.0)
+
+
+def is_near(waveform: Waveform, t_stop: float, frequency: float) -> bool:
+    """Whether 99 % of a source's energy is within 5 % of a frequency (Hz), as of a carrier with a slow envelope.
+
+    In that band the skin's data change by 3 %.
+    """
+    found = _recorded(waveform, t_stop)
+    if found is not None:
+        # A coarse look at a recording suffices if it finds a fifth of the energy more than half an octave away.
+        (f, energy), blurred = found, 2.0 * found[0][1]
+        far = (f < frequency / 1.4 - blurred) | (f > 1.4 * frequency + blurred)
+        if energy[far].sum() > 0.2 * energy.sum() > 0.0:
+            return False
+    return sum(energy_outside(waveform, t_stop, (0.95 * frequency, 1.05 * frequency))) < NOTABLE
+
+
+@lru_cache(maxsize=4)
+def _places(step: float, count: int) -> tuple[IntArray, FloatArray, IntArray]:
+    """Where the lines at 0, `step`, ... (Hz), `count` of them, lie in the grid of gains, which is even in log f.
+
+    Cached, because the logarithms cost as much as the Fourier transform: the number of the grid's frequency below each
+    line that is not empty of lines, how far each line is above its own, and the first line of each.
+    """
+    f = np.clip(step * np.arange(count), *SKIN_BAND)
+    place = np.log(f / SKIN_BAND[0]) * ((_GRID - 1) / math.log(SKIN_BAND[1] / SKIN_BAND[0]))
+    below = np.minimum(place.astype(int), _GRID - 2)
+    cells, first = np.unique(below, return_index=True)
+    return cells, place - below, first
+
+
+def _squared_gains(circuit: Circuit) -> tuple[FloatArray, FloatArray] | None:
+    """Squared gains from the one source to each gap (_GRID, n_gap), with the skin's own data at each frequency and with
+    those held at one; None if they cannot be computed."""
+    networks = network_of(circuit), network_of(with_skin_held(circuit))
+    gaps = [gap for gap in networks[0].gaps if gap is not None]
+    grid, areas = np.geomspace(*SKIN_BAND, _GRID), areas_at_rest(networks[0])
+    try:
+        own, held = (np.abs(n.phasors(grid, areas, np.ones(1, complex))[:, gaps]) ** 2 for n in networks)
+    except np.linalg.LinAlgError:
+        return None
+    return own, held
+
+
+def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
+    """Relative error of the mean force due to SKIN's data held at one frequency, for a circuit with one source.
+
+    It is estimated by the relative error of the mean square of the gap voltage, from the linear response at the areas
+    at rest and the source's spectrum over the run to `t_stop` (s); of several fingers the largest error counts. Outside
+    the band of the skin's data the response at the band's ends is used. None if the response cannot be computed.
+    """
+    squares = shared(circuit, "squared gains", lambda: _squared_gains(circuit))
+    f, energy = _recorded(waveform, t_stop) or _energies(waveform, t_stop, SKIN_BAND[1])
+    if squares is None or f.size < 2:
+        return None
+    # Each line is divided between its two neighbours in the grid by linear weights in log f.
+    cells, above, first = _places(float(f[1]), energy.size)
+    near, high = np.zeros(_GRID), np.add.reduceat(energy * above, first)
+    near[cells] = np.add.reduceat(energy, first) - high
+    near[cells + 1] += high
+    right, held = (near @ square for square in squares)
+    if not (right.size and np.all(right > 0.0) and np.all(np.isfinite(held / right))):
+        return None
+    errors = held / right - 1.0
+    return float(errors[np.argmax(np.abs(errors))])
+
+
+def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str | None:
+    """A warning where a dispersive skin is driven outside the band of its data, or None."""
+    skins = circuit.by_device("SKIN_DISPERSIVE")
+    if not skins or not (math.isfinite(t_stop) and t_stop > 0.0):
+        return None
+    end, below, above = waveform.kept.get("outside", (None, 0.0, 0.0))
+    if end != t_stop:
+        below, above = energy_outside(waveform, t_stop)
+        waveform.kept["outside"] = t_stop, below, above
+    parts = [
+        f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}"
+        for share, where in ((below, f"below {SKIN_BAND[0]:g} Hz"), (above, f"above {SKIN_BAND[1] / 1e3:g} kHz"))
+        if share > NOTABLE
+    ]
+    where = f"lie outside the band of the data behind {skins[0].name}"
+    return f"of the source's energy {' and '.join(parts)} {where}" if parts else None
+
+
+def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity: float, t_stop: float) -> float:
+    """Error of the gap voltage, relative to its peak, if a dispersive skin's data are taken at one frequency (Hz).
+
+    It is the error of the linear response at one area (m^2) from the uncharged start to `t_stop` (s), by superposition
+    of phasors, plus an estimate of the error due to the change of the area, `sensitivity` relative to the area.
+    """
+    dispersive, frozen = build_stack(circuit), build_stack(circuit, skin_at=frequency)
+    gap = dispersive.gap_layer
+    assert gap is not None
+    span = min(t_stop, _PERIODS / frequency)
+    u = _samples(dispersive.waveform, 0.0, span, _enough(span, 200.0 * frequency))
+    # The run is padded with zeros to twice its length, because the discrete transform is cyclic.
+    lines = np.fft.rfft(u, 2 * u.size)
+    f = np.arange(1, lines.size) / (2.0 * span)
+    gains = [layer_gains(stack.admittance(f, np.array([area])))[:, gap] for stack in (dispersive, frozen)]
+    right, missed = (
+        np.fft.irfft(np.concatenate([[0.0], gain * lines[1:]]))[: u.size] for gain in (gains[0], gains[1] - gains[0])
+    )
+    peak = float(np.abs(right).max())
+    if not (peak > 0.0 and math.isfinite(peak)):
+        return math.inf
+    return float(np.abs(missed).max()) / peak + COUPLING * sensitivity

@@ -27,8 +27,7 @@ from fingerspice.base.units import (
     suspicious_mega,
     unit_read_as_scale,
 )
-from fingerspice.physics.ladder import SKIN_LADDER
-from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
+from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, skin_permittivity, skin_resistivity
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit, Element

@@ -15,7 +15,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element, T
-from fingerspice.physics.ladder import SKIN_LADDER
+from fingerspice.physics.materials import SKIN_LADDER
 from fingerspice.waveforms.waveform import DC
 
 #: Largest number of elements of a circuit, because every matrix of a network is dense.

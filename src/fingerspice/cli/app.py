@@ -10,9 +10,7 @@ import typer
 
 from fingerspice.base.arrays import positive_row
 from fingerspice.base.errors import InputError
-from fingerspice.cli import answers, options, tools
-from fingerspice.cli import design as designs
-from fingerspice.cli import fit as fits
+from fingerspice.cli import options, studies, terminal, tools
 from fingerspice.cli import sweep as sweeps
 from fingerspice.cli.options import area_from_text, read_circuit
 from fingerspice.cli.result_files import Results
@@ -54,22 +52,22 @@ def main() -> None:
 
 @app.command()
 def run(
-    deck: answers.Deck,
-    out: answers.Out = None,
-    name: answers.Name = None,
-    overwrite: answers.Overwrite = False,
-    rtol: answers.Rtol = 1e-8,
-    charge_law: answers.ChargeLaw = None,
+    deck: terminal.Deck,
+    out: terminal.Out = None,
+    name: terminal.Name = None,
+    overwrite: terminal.Overwrite = False,
+    rtol: terminal.Rtol = 1e-8,
+    charge_law: terminal.ChargeLaw = None,
     area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
     method: Annotated[
         str, typer.Option(help="auto, exponential, radau, scipy:LSODA, torchdiffeq:dopri5, ...")
     ] = "auto",
-    changes: answers.Set = None,
-    finger: answers.Finger = None,
-    coating: answers.Coating = None,
-    drive: answers.Drive = None,
-    source: answers.Source = None,
-    stop: answers.Stop = None,
+    changes: terminal.Set = None,
+    finger: terminal.Finger = None,
+    coating: terminal.Coating = None,
+    drive: terminal.Drive = None,
+    source: terminal.Source = None,
+    stop: terminal.Stop = None,
     start: Annotated[
         str, typer.Option(help="deck (as its .tran says), uncharged, dc, periodic; or TIME of the first output: 5m.")
     ] = "deck",
@@ -77,14 +75,14 @@ def run(
         str, typer.Option(help="Rows at jumps of the source: both, or none, so that time rises strictly.")
     ] = "both",
     csv: Annotated[bool, typer.Option("--csv", help="Write CSV instead of NetCDF.")] = False,
-    stream: answers.Streamed = False,
-    chunk: answers.Chunk = None,
-    signals: answers.Signals = None,
-    netcdf: answers.NetCdf = False,
+    stream: terminal.Streamed = False,
+    chunk: terminal.Chunk = None,
+    signals: terminal.Signals = None,
+    netcdf: terminal.NetCdf = False,
     feel: Annotated[bool, typer.Option("--feel", help="Say, and draw, what the hand feels of the friction.")] = False,
-    schematic: answers.Schematic = False,
-    as_json: answers.AsJson = False,
-    no_plot: answers.NoPlot = False,
+    schematic: terminal.Schematic = False,
+    as_json: terminal.AsJson = False,
+    no_plot: terminal.NoPlot = False,
 ) -> None:
     """Simulate DECK in time: a summary, a data file and a picture.
 
@@ -112,7 +110,7 @@ def run(
 
     with Answering("run", as_json, charge_law=charge_law, method=method, rtol=rtol, area=area) as answer:
         circuit = read_circuit(deck, changes, source, finger=finger, coating=coating, drive=drive)
-        answer.update(**answers.of_circuit(circuit, charge_law))
+        answer.update(**terminal.of_circuit(circuit, charge_law))
         circuit, start = options.with_times(circuit, stop, start)
         if circuit.tran is None:
             raise InputError(f"{deck} has no .tran line; allowed: .tran TSTEP TSTOP [TSTART [TMAX]] [uic], or --stop")
@@ -123,7 +121,7 @@ def run(
         how |= {"method": method, "start": start, "t_stop": t_stop}
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         if stream or chunk or signals or netcdf:
-            from fingerspice.cli.store import run_streamed
+            from fingerspice.cli.sweep import run_streamed
 
             if not stream:
                 raise InputError("--chunk, --signals and --netcdf go with --stream")
@@ -150,7 +148,7 @@ def run(
         with progress() as update:
             solution = simulate(circuit, **how, jumps=jumps, throw=False, progress=update)
         if as_json:
-            answer.update(**answers.of_run(solution))
+            answer.update(**terminal.of_run(solution))
         writes, fingers, unfelt = results.ready() if solution.t.size else [], [], None
         if feel and solution.success:
             try:
@@ -169,10 +167,10 @@ def run(
 
 @app.command()
 def ac(
-    deck: answers.Deck,
-    out: answers.Out = None,
-    name: answers.Name = None,
-    overwrite: answers.Overwrite = False,
+    deck: terminal.Deck,
+    out: terminal.Out = None,
+    name: terminal.Name = None,
+    overwrite: terminal.Overwrite = False,
     sweep: Annotated[
         str | None, typer.Option(metavar="'dec N F1 F2'", help="Sweep; the deck's .ac line by default.")
     ] = None,
@@ -182,12 +180,12 @@ def ac(
     ] = None,
     skin: Annotated[str, typer.Option(help="SKIN's data: swept, at each frequency; own, at its f.")] = "swept",
     finger: Annotated[str | None, typer.Option(metavar="GAP", help="Which of several GAPs.")] = None,
-    charge_law: answers.ChargeLaw = None,
-    rtol: answers.Rtol = 1e-8,
-    changes: answers.Set = None,
-    source: answers.Source = None,
-    as_json: answers.AsJson = False,
-    no_plot: answers.NoPlot = False,
+    charge_law: terminal.ChargeLaw = None,
+    rtol: terminal.Rtol = 1e-8,
+    changes: terminal.Set = None,
+    source: terminal.Source = None,
+    as_json: terminal.AsJson = False,
+    no_plot: terminal.NoPlot = False,
 ) -> None:
     """Phasor sweep of DECK: gap voltage, phase, area and mean force against frequency.
 
@@ -204,16 +202,16 @@ def ac(
     from fingerspice.circuit.circuit import AcSweep
     from fingerspice.netlist.netlist import sweep_from_text
     from fingerspice.plots.traces import plot_phasor
-    from fingerspice.results.phasor_solution import PhasorSolution, phasor_csv, phasor_tables
+    from fingerspice.results.spectrum import PhasorSolution, phasor_csv, phasor_tables
     from fingerspice.sets.parameters import parameters
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.comparison import large_signal
-    from fingerspice.studies.phasors import phasor, sweep_frequencies
+    from fingerspice.studies.steady import phasor, sweep_frequencies
 
     how = "steady_state" if area == "coupled" else "phasor"
     with Answering("ac", as_json, charge_law=charge_law, method=how, rtol=rtol, area=area, skin=skin) as answer:
         circuit = read_circuit(deck, changes, source)
-        answer.update(**answers.of_circuit(circuit, charge_law))
+        answer.update(**terminal.of_circuit(circuit, charge_law))
         gaps = [e.name.lower() for e in circuit.by_device("GAP")]
         if finger is not None and finger.lower() not in gaps and finger.lower() in map(str.lower, parameters()):
             raise InputError(
@@ -249,15 +247,15 @@ def ac(
 
 @app.command()
 def plan(
-    deck: answers.Deck,
-    rtol: answers.Rtol = 1e-8,
-    charge_law: answers.ChargeLaw = None,
+    deck: terminal.Deck,
+    rtol: terminal.Rtol = 1e-8,
+    charge_law: terminal.ChargeLaw = None,
     area: Annotated[str, typer.Option(help="coupled, mean, frozen, or an area in m^2.")] = "coupled",
-    stop: answers.Stop = None,
+    stop: terminal.Stop = None,
     charge: Annotated[bool, typer.Option(help="Whether the source's charge and current are wanted.")] = True,
-    changes: answers.Set = None,
-    source: answers.Source = None,
-    as_json: answers.AsJson = False,
+    changes: terminal.Set = None,
+    source: terminal.Source = None,
+    as_json: terminal.AsJson = False,
 ) -> None:
     """Tell which model DECK needs for the error asked for, and why, without a run.
 
@@ -272,27 +270,27 @@ def plan(
 
     with Answering("plan", as_json, charge_law=charge_law, rtol=rtol, area=area) as answer:
         circuit = read_circuit(deck, changes, source)
-        answer.update(**answers.of_circuit(circuit, charge_law))
+        answer.update(**terminal.of_circuit(circuit, charge_law))
         circuit, _ = options.with_times(circuit, stop)
         result = make(circuit, charge_law=charge_law, area=area_from_text(area), rtol=rtol, charge=charge)
         found = result.to_dict()
-        answer.update(**{key: found[key] for key in answers.OWN["plan"] if key in found and key != "area"})
+        answer.update(**{key: found[key] for key in terminal.OWN["plan"] if key in found and key != "area"})
         answer.update(plan_area=result.area)
         answer.give(lambda: "\n".join([*head_lines(circuit), "", str(result)]))
 
 
 @app.command()
 def compare(
-    deck: answers.Deck,
-    out: answers.Out = None,
-    name: answers.Name = None,
-    overwrite: answers.Overwrite = False,
-    rtol: answers.Rtol = 1e-8,
-    charge_law: answers.ChargeLaw = None,
-    changes: answers.Set = None,
-    source: answers.Source = None,
-    as_json: answers.AsJson = False,
-    no_plot: answers.NoPlot = False,
+    deck: terminal.Deck,
+    out: terminal.Out = None,
+    name: terminal.Name = None,
+    overwrite: terminal.Overwrite = False,
+    rtol: terminal.Rtol = 1e-8,
+    charge_law: terminal.ChargeLaw = None,
+    changes: terminal.Set = None,
+    source: terminal.Source = None,
+    as_json: terminal.AsJson = False,
+    no_plot: terminal.NoPlot = False,
 ) -> None:
     """Compare the periodic state of DECK with its phasor solution, and say what the ripple of the area does.
 
@@ -307,7 +305,7 @@ def compare(
 
     with Answering("compare", as_json, charge_law=charge_law, rtol=rtol) as answer:
         circuit = read_circuit(deck, changes, source)
-        answer.update(**answers.of_circuit(circuit, charge_law))
+        answer.update(**terminal.of_circuit(circuit, charge_law))
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         check_arguments(rtol)
         results.will_draw("_compare.png", lambda: result.plot(), unless=no_plot)
@@ -317,7 +315,7 @@ def compare(
 
 
 for _command in (
-    *(designs.limits, designs.design, fits.fit, fits.fit_contact, sweeps.sweep),
+    *(studies.limits, studies.design, studies.fit, studies.fit_contact, sweeps.sweep),
     *(tools.export, tools.figures, tools.explore, tools.sets, tools.check),
 ):
     app.command()(_command)

@@ -29,7 +29,7 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
     What comes later in this order has the last word. Gives the reader's warnings, without those about replaced values,
     and warnings about directives without effect.
     """
-    from fingerspice.circuit.notices import directive_warnings
+    from fingerspice.circuit.describe import directive_warnings
     from fingerspice.netlist.netlist import read_netlist
 
     with warnings.catch_warnings(record=True) as noticed:
@@ -88,10 +88,10 @@ def _with_values(circuit: Circuit, changes: list[str], named: list[str]) -> Circ
 
 def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
     """The circuit with every ``--source``; the source's name may be left out if the circuit has only one."""
-    from fingerspice.circuit.arguments import overridden
+    from fingerspice.circuit.describe import overridden
     from fingerspice.circuit.topology import driving_sources
     from fingerspice.netlist.netlist import source_from_text
-    from fingerspice.waveforms.ramps import MOST_SHOWN, PWL
+    from fingerspice.waveforms.periodic import MOST_SHOWN, PWL
     from fingerspice.waveforms.samples import Samples
 
     if not texts:

@@ -12,7 +12,7 @@ import typer
 
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
-from fingerspice.cli import answers
+from fingerspice.cli import terminal
 from fingerspice.cli.options import check_output, read_circuit, with_times
 from fingerspice.cli.result_files import FOLDER
 from fingerspice.cli.terminal import Answering, progress
@@ -20,7 +20,7 @@ from fingerspice.cli.terminal import Answering, progress
 
 def sets(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="A set; without it all are listed.")] = None,
-    as_json: answers.AsJson = False,
+    as_json: terminal.AsJson = False,
 ) -> None:
     """List the named sets of parameters, or show the values of one with their ranges and sources.
 
@@ -41,7 +41,7 @@ def sets(
 
 def check(
     store: Annotated[Path, typer.Argument(metavar="STORE", help="Folder that run --stream or sweep --store wrote.")],
-    as_json: answers.AsJson = False,
+    as_json: terminal.AsJson = False,
 ) -> None:
     """Verify that every chunk of a store is as it was written.
 
@@ -49,7 +49,7 @@ def check(
 
       fingerspice check out/long.zarr
     """
-    from fingerspice.results.store import check_store
+    from fingerspice.results.runfile import check_store
 
     with Answering("check", as_json) as answer:
         chunks = check_store(store)
@@ -59,13 +59,13 @@ def check(
 
 
 def export(
-    deck: answers.Deck,
+    deck: terminal.Deck,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The ngspice deck to write.")],
-    charge_law: answers.ChargeLaw = None,
-    changes: answers.Set = None,
-    source: answers.Source = None,
-    stop: answers.Stop = None,
-    as_json: answers.AsJson = False,
+    charge_law: terminal.ChargeLaw = None,
+    changes: terminal.Set = None,
+    source: terminal.Source = None,
+    stop: terminal.Stop = None,
+    as_json: terminal.AsJson = False,
 ) -> None:
     """Write DECK as one self-contained ngspice deck: bodies included, parameters folded in.
 
@@ -77,7 +77,7 @@ def export(
 
     with Answering("export", as_json, charge_law=charge_law) as answer:
         circuit = read_circuit(deck, changes, source)
-        answer.update(**answers.of_circuit(circuit, charge_law))
+        answer.update(**terminal.of_circuit(circuit, charge_law))
         circuit, _ = with_times(circuit, stop)
         check_output(output, deck)
         text = export_netlist(circuit, charge_law=charge_law)
@@ -88,16 +88,16 @@ def explore(
     deck: Annotated[
         Path | None, typer.Argument(metavar="[DECK]", help="Netlist file (.cir); the page has examples of its own.")
     ] = None,
-    changes: answers.Set = None,
-    finger: answers.Finger = None,
-    coating: answers.Coating = None,
-    drive: answers.Drive = None,
+    changes: terminal.Set = None,
+    finger: terminal.Finger = None,
+    coating: terminal.Coating = None,
+    drive: terminal.Drive = None,
     port: Annotated[int, typer.Option(help="Port of the loopback address; 0 takes a free one.")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the link, and open no browser.")] = False,
     static: Annotated[
         Path | None, typer.Option("--static", metavar="OUT.html", help="Write the page as one file, and serve nothing.")
     ] = None,
-    as_json: answers.AsJson = False,
+    as_json: terminal.AsJson = False,
 ) -> None:
     """Open a local page on which DECK's values move and the run follows; Ctrl-C ends it.
 
@@ -118,7 +118,7 @@ def explore(
         circuit, sets = None, {"finger": finger, "coating": coating, "drive": drive}
         if deck is not None:
             circuit = read_circuit(deck, changes, None, **sets)
-            answer.update(**answers.of_circuit(circuit, None))
+            answer.update(**terminal.of_circuit(circuit, None))
         for option, given in {"set": changes, **sets}.items():
             if given and deck is None:
                 raise InputError(f"--{option} {given[0]!r} is given without a deck; allowed: a netlist file before it")
@@ -143,13 +143,13 @@ def explore(
 
 
 def figures(
-    out: answers.Out = None,
+    out: terminal.Out = None,
     only: Annotated[list[int] | None, typer.Option(help="Only these of the paper's figures 2 to 5.")] = None,
     gallery: Annotated[
         bool,
         typer.Option("--gallery", help="The explorer's scenes instead, and the decks in the folder circuits."),
     ] = False,
-    as_json: answers.AsJson = False,
+    as_json: terminal.AsJson = False,
 ) -> None:
     """Draw the paper's Figs. 2 to 5 from scratch, each as PNG with its data as CSV; or a gallery.
 

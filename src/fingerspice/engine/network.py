@@ -22,7 +22,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.numerics import chebyshev
-from fingerspice.numerics.small import copy_to
+from fingerspice.numerics.modes import copy_to
 from fingerspice.physics.contact import inverse_area
 
 

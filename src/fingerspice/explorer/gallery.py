@@ -15,7 +15,7 @@ import numpy as np
 
 from fingerspice.base.errors import FingerspiceWarning
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.explorer import examples
+from fingerspice.explorer import beginnings
 from fingerspice.explorer.request import Asked
 from fingerspice.explorer.scene import beginning, scene
 from fingerspice.explorer.server import framed, pages
@@ -50,11 +50,11 @@ def decks(folder: Path) -> Iterator[Entry]:
 
 def scenes() -> Iterator[Entry]:
     """The example scenes of the explorer."""
-    for one in examples.EXAMPLES:
-        yield Entry(f"scene-{one.name}", one.title, one.note, Path(examples.__file__), partial(_run_scene, one))
+    for one in beginnings.EXAMPLES:
+        yield Entry(f"scene-{one.name}", one.title, one.note, Path(beginnings.__file__), partial(_run_scene, one))
 
 
-def _run_scene(example: examples.Example) -> Solution:
+def _run_scene(example: beginnings.Example) -> Solution:
     asked = Asked({"deck": example.deck, **example.asked})
     first, stop, _ = asked.times
     times = np.linspace(first, stop, 4001)

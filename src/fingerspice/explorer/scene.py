@@ -17,11 +17,11 @@ from fingerspice import __version__
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Tran
-from fingerspice.explorer import changed, sliders
-from fingerspice.explorer.examples import EXAMPLES
+from fingerspice.explorer import beginnings, request
+from fingerspice.explorer.beginnings import EXAMPLES
 from fingerspice.explorer.request import Asked, quiet
 from fingerspice.results.outcome import SolveError
-from fingerspice.results.signals import SIGNALS
+from fingerspice.results.record import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.sets.parameters import parameters
 from fingerspice.solve.simulation import simulate
@@ -58,11 +58,11 @@ def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -
     ]
     own = None
     if circuit is not None:
-        before, unsaid = changed.before(circuit)
+        before, unsaid = beginnings.before(circuit)
         own = {"title": circuit.title, "request": {"deck": circuit.text, **before, **(asked or {})}, "unsaid": unsaid}
     waveforms = [
         {"kind": kind, "title": title, "arguments": [a._asdict() for a in arguments]}
-        for kind, (title, arguments) in sliders.WAVEFORMS.items()
+        for kind, (title, arguments) in request.WAVEFORMS.items()
     ]
     sets = [{"name": one.name, "kind": one.kind, "title": one.title} for one in parameters().values()]
     return {"version": __version__, "own": own, "examples": examples, "waveforms": waveforms, "sets": sets}
@@ -75,12 +75,12 @@ def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[st
     with _noticing(answer):
         try:
             asked = Asked(given, own)
-            sets, _, without = changed.in_scene(asked)
+            sets, _, without = beginnings.in_scene(asked)
             answer |= {
-                "title": asked.circuit.title, "sliders": sliders.sliders(asked.base, asked.circuit), "sets": sets,
+                "title": asked.circuit.title, "sliders": request.sliders(asked.base, asked.circuit), "sets": sets,
                 "unknown": [*asked.unknown, *without],
             }  # fmt: skip
-            answer["waveform"] = sliders.text_of(asked.waveform)
+            answer["waveform"] = request.text_of(asked.waveform)
             solution = _shown(asked)
             answer |= _traces(asked, solution)
         except InputError as error:
@@ -235,7 +235,7 @@ def as_deck(given: dict[str, Any], own: Circuit | None = None) -> str:
 def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     """The scene as Python that gives the page's solution."""
     asked = Asked(given, own)
-    sets, by_sets, _ = changed.in_scene(asked)
+    sets, by_sets, _ = beginnings.in_scene(asked)
     first, stop, _ = asked.times
     name, waveform = asked.replaced or ("", None)
     lines = ["import dataclasses", "", "import numpy as np", "", "import fingerspice as fs", ""]

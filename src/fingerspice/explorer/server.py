@@ -23,7 +23,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError, printable
 from fingerspice.base.pages import in_notebook
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.explorer import changed, scene
+from fingerspice.explorer import beginnings, scene
 from fingerspice.explorer.request import asked_by
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.solution import Solution
@@ -200,7 +200,7 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
 
 #: What the page asks for, and what answers, in one part or in several.
 _ACTIONS: dict[str, Callable[[Any, Circuit | None], Any]] = {
-    "scene": scene.parts, "set": changed.applied, "means": scene.means, "deck": scene.as_deck,
+    "scene": scene.parts, "set": beginnings.applied, "means": scene.means, "deck": scene.as_deck,
     "python": scene.as_python,
 }  # fmt: skip
 

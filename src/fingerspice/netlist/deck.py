@@ -14,11 +14,20 @@ from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
-from fingerspice.netlist.files import MAX_BYTES, read_stream, read_text
-from fingerspice.netlist.lexer import MAX_NAME, Group, Lexeme, Line, group, lex
-from fingerspice.netlist.reader import DIRECTIVES, Deck, Reader, Subcircuit
-from fingerspice.netlist.scope import Bare, Directive, Number, Scope, Statement, Value
-from fingerspice.netlist.slips import nearest, stray_word, with_comma
+from fingerspice.netlist.expressions import nearest, stray_word, with_comma
+from fingerspice.netlist.lexer import MAX_BYTES, MAX_NAME, Group, Lexeme, Line, group, lex, read_stream, read_text
+from fingerspice.netlist.reader import (
+    DIRECTIVES,
+    Bare,
+    Deck,
+    Directive,
+    Number,
+    Reader,
+    Scope,
+    Statement,
+    Subcircuit,
+    Value,
+)
 
 #: Largest number of characters of a title that are shown; the middle of a longer title is left out.
 LONGEST_TITLE = 200

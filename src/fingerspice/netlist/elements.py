@@ -11,8 +11,8 @@ from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import exponent_and_scale
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Element, Tran
 from fingerspice.circuit.devices import DEVICES, ParameterSpec, mega_note, unit_trap, unusual
-from fingerspice.netlist.scope import Call, Directive, Number, Statement, Token, Value
-from fingerspice.netlist.slips import is_unit, nearest
+from fingerspice.netlist.expressions import is_unit, nearest
+from fingerspice.netlist.reader import Call, Directive, Number, Statement, Token, Value
 from fingerspice.netlist.sources import Context, Source, read_source
 from fingerspice.waveforms.waveform import check_range
 

@@ -14,9 +14,9 @@ from fingerspice.circuit.devices import REST_AREA, unusual
 from fingerspice.circuit.loop import checked
 from fingerspice.netlist.deck import parse_deck, read_deck
 from fingerspice.netlist.elements import read_ac, read_elements, read_initial, read_options, read_tran, source_of
-from fingerspice.netlist.files import SourceFiles
+from fingerspice.netlist.expressions import decimal_comma, with_comma
+from fingerspice.netlist.lexer import SourceFiles
 from fingerspice.netlist.reader import MAX_WARNINGS, Deck
-from fingerspice.netlist.slips import decimal_comma, with_comma
 from fingerspice.netlist.sources import Context
 from fingerspice.waveforms.waveform import DC, Waveform
 

@@ -10,13 +10,12 @@ from typing import NamedTuple, NoReturn
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import SmallSignal, Tran
-from fingerspice.netlist.files import SourceFiles
-from fingerspice.netlist.scope import Call, Number, Token, Word
-from fingerspice.netlist.slips import is_unit, nearest
+from fingerspice.netlist.expressions import is_unit, nearest
+from fingerspice.netlist.lexer import SourceFiles
+from fingerspice.netlist.reader import Call, Number, Token, Word
 from fingerspice.waveforms.combinations import AM, Burst, Repeat
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.periodic import Chirp, Exp, Pulse, Sawtooth, Square, Triangle
-from fingerspice.waveforms.ramps import PWL
+from fingerspice.waveforms.periodic import PWL, Chirp, Exp, Pulse, Sawtooth, Square, Triangle
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 

@@ -23,8 +23,8 @@ from fingerspice.base.files import write_aside
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import waveform_text
 from fingerspice.plots import drawing
+from fingerspice.plots.drawing import GROUND, Place, Placement, place
 from fingerspice.plots.picture import Picture
-from fingerspice.plots.placement import GROUND, Place, Placement, place
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

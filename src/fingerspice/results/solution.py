@@ -15,7 +15,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown
 from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status
-from fingerspice.results.signals import Sealed, Signalled, Signals, kept_rows, variables
+from fingerspice.results.record import Sealed, Signalled, Signals, kept_rows, variables
 from fingerspice.results.summary import Figured, Figures
 
 if TYPE_CHECKING:
@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.outcome import Plan
-    from fingerspice.results.sensitivity import SampleGradient, Sensitivity
+    from fingerspice.results.outcome import Plan, SampleGradient, Sensitivity
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import ClosedForm, Recorded
     from fingerspice.sets.parameters import Citation

@@ -14,8 +14,8 @@ from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines
 from fingerspice.numerics.lobatto import NODES
-from fingerspice.results.measures import Outputs, Stretch, Weighed
-from fingerspice.results.signals import attribute, sealed, signal_of
+from fingerspice.results.record import attribute, sealed, signal_of
+from fingerspice.results.steps import Outputs, Stretch, Weighed
 
 if TYPE_CHECKING:
     from fingerspice.results.solution import Solution

@@ -17,9 +17,8 @@ from typing import Any, overload
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
-from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.describe import in_force, remembering
+from fingerspice.circuit.describe import in_force, remembering, require_circuit
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.periodic import Square

@@ -18,14 +18,12 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.engine.lanes.loops import AREAS, GAP, MORE, SQUARES, lead, sum_back
-from fingerspice.numerics.small import AT, STEP, derivative
+from fingerspice.numerics.modes import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
-from fingerspice.results.outcome import Failure, SolveError, Status
-from fingerspice.results.sensitivity import MEANS, SIGNALS, SampleGradient
+from fingerspice.results.outcome import MEANS, SIGNALS, Failure, SampleGradient, SolveError, Status
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.block import Block
-from fingerspice.solve.recordings.pieces import driving
+from fingerspice.solve.recordings.block import Block, driving
 from fingerspice.solve.recordings.run import ready
 from fingerspice.solve.simulation import asked
 from fingerspice.waveforms.combinations import Sum

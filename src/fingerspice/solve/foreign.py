@@ -16,14 +16,13 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import InputError
-from fingerspice.engine.implicit import run as implicit
-from fingerspice.engine.implicit.step import NFEV
+from fingerspice.engine import implicit
+from fingerspice.engine.implicit import NFEV
 from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_signs, rates
 from fingerspice.results.outcome import Status
 from fingerspice.solve.nodal import STAGES, Collocation, radau_scheme, solve_coupled
-from fingerspice.solve.problem import ROUNDING, Problem
+from fingerspice.solve.problem import ROUNDING, Problem, Tables, segment_index, values_at
 from fingerspice.solve.runs import Progress, Run, apart, closed_form, gap_signals, integrate, nodes_apart
-from fingerspice.solve.sources import Tables, segment_index, values_at
 
 _QUIET = threading.Lock()
 SCIPY_METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")

@@ -13,18 +13,17 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray, views_of
 from fingerspice.circuit.network import network_modes
-from fingerspice.engine.collocation import loopstate, readout
+from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.exponential import new_tables
 from fingerspice.engine.collocation.loop import Looks, no_looks
-from fingerspice.engine.many_areas.begin import LEVEL_RATIO, ManyAreas, References
 from fingerspice.engine.many_areas.form import REFERRED, Form, new_work
+from fingerspice.engine.many_areas.step import LEVEL_RATIO, ManyAreas, References
 from fingerspice.engine.network import Sources
 from fingerspice.engine.one_area.system import area_error, area_missed, area_polynomials
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.results.outcome import Status
-from fingerspice.solve.problem import Problem
+from fingerspice.solve.problem import Problem, ramp
 from fingerspice.solve.scenes import Scene, kept_with
-from fingerspice.solve.sources import ramp
 from fingerspice.solve.stepping import Stepping
 
 # Number of sets of references cached with a scene: one for each thread and decade of tolerances.
@@ -236,16 +235,16 @@ class March(Stepping):
         taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
         more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
         self.step[0]["most"] = taken + int(more)
-        while (code := super().march(sources, t_end, looks)) == loopstate.REFERENCE:
+        while (code := super().march(sources, t_end, looks)) == readout.REFERENCE:
             self._add_reference()
         return code
 
     def _failed(self, code: int, sources: Sources) -> Status:
-        return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
+        return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
         # With sources that stay at these values.
-        return self.march(ramp(after, after, self.t), self.t, no_looks()) == loopstate.DONE
+        return self.march(ramp(after, after, self.t), self.t, no_looks()) == readout.DONE
 
     def _add_reference(self) -> None:
         """Add the reference areas that the compiled loop needs next, and that it has written to `wanted`."""

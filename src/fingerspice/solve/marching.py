@@ -5,9 +5,8 @@ from __future__ import annotations
 from fingerspice.results.outcome import Status
 from fingerspice.solve.many_areas import March
 from fingerspice.solve.one_area import Track, scale_of
-from fingerspice.solve.problem import Problem
+from fingerspice.solve.problem import Problem, Tables
 from fingerspice.solve.runs import Progress, Run, integrate
-from fingerspice.solve.sources import Tables
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError
 
 ATTEMPTS = 6

@@ -11,15 +11,14 @@ import numpy as np
 
 from fingerspice.base.announcing import tell
 from fingerspice.base.arrays import BoolArray, FloatArray
+from fingerspice.engine import implicit
 from fingerspice.engine.collocation.readout import TRIED
-from fingerspice.engine.implicit import run as implicit
-from fingerspice.engine.implicit.run import Passage, advance
-from fingerspice.engine.implicit.step import Nodal, Scheme, new_work
+from fingerspice.engine.implicit import Nodal, Passage, Scheme, advance, new_work
 from fingerspice.engine.network import Sources, new_room
 from fingerspice.numerics.lobatto import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
-from fingerspice.solve.problem import ROUNDING, Problem
+from fingerspice.solve.problem import ROUNDING, Problem, Tables, ramp, values_at
 from fingerspice.solve.runs import (
     PAST_FOLD,
     Integration,
@@ -31,7 +30,6 @@ from fingerspice.solve.runs import (
     integrate,
     nodes_apart,
 )
-from fingerspice.solve.sources import Tables, ramp, values_at
 
 # Stages of a run and of the coarser run, and the ratio of the coarser run's tolerance to the run's. The stated error is
 # the difference of the two runs. They need different orders as well: where edges or zeros cut the steps short, both
@@ -79,7 +77,7 @@ def radau_scheme(stages: int) -> Scheme:
 
 
 class Collocation(Integration):
-    """One integration in progress; see `engine.implicit.run.advance`."""
+    """One integration in progress; see `engine.implicit.advance`."""
 
     def __init__(
         self, problem: Problem, scheme: Scheme, tol: float, u_scale: float, progress: Progress | None = None

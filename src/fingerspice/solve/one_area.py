@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.engine.collocation import loopstate, readout
+from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
 from fingerspice.engine.collocation.exponential import forget, new_tables
 from fingerspice.engine.collocation.step_control import end_row
@@ -22,10 +22,9 @@ from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import sided
-from fingerspice.solve.initial import StackState, as_marched, from_stack, from_written, model_of, row_width
-from fingerspice.solve.problem import Problem
+from fingerspice.solve.problem import Problem, segment_of
 from fingerspice.solve.scenes import Scene, kept_with
-from fingerspice.solve.sources import segment_of
+from fingerspice.solve.starting import StackState, as_marched, from_stack, from_written, model_of, row_width
 from fingerspice.solve.stepping import OutOfRangeError, Stepping
 
 # Number of modal systems cached with a scene, one for each decade of tolerances, of up to 1 MB each.
@@ -127,12 +126,12 @@ class Track(Stepping):
         return OneArea(self.system, *SCRATCH.of(self.system), integral_table(), sources)
 
     def _failed(self, code: int, sources: Sources) -> Status:
-        if code == loopstate.OUT_OF_RANGE:
+        if code == readout.OUT_OF_RANGE:
             raise OutOfRangeError(self.system.u_top)
         if self.t > sources.edges[0]:
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
             self.control["u_before"], _ = source(*segment_of(sources, self.t, "left"))
-        return Status.TOO_MANY_STEPS if code == loopstate.TOO_MANY else self.stuck()
+        return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
 
     def state(self) -> State:
         c = self.control

@@ -10,17 +10,16 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import format_si
+from fingerspice.circuit.describe import circuit_warnings, course_warnings, spectrum_warning
 from fingerspice.circuit.devices import beyond_fingers
-from fingerspice.circuit.notices import circuit_warnings, course_warnings, spectrum_warning
 from fingerspice.circuit.topology import driving
 from fingerspice.engine.one_area.model import Model
 from fingerspice.physics.contact import inverse_area, inverse_area_range
 from fingerspice.results.outcome import Plan, Status
 from fingerspice.results.record import Record
-from fingerspice.solve.problem import Problem
+from fingerspice.solve.problem import Problem, shortest_event
 from fingerspice.solve.runs import Run
 from fingerspice.solve.scenes import kept_with
-from fingerspice.solve.sources import shortest_event
 from fingerspice.solve.stepping import FEWEST_PERIODS
 from fingerspice.waveforms.sampling import Function
 from fingerspice.waveforms.waveform import DOUBLE

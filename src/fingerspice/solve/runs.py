@@ -16,8 +16,7 @@ from fingerspice.engine.network import Sources, at_sources, new_room, rates
 from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status, last_tried
 from fingerspice.results.record import Record
 from fingerspice.results.steps import ClosedForm, Recorded
-from fingerspice.solve.problem import Problem
-from fingerspice.solve.sources import Tables, after_the_end, joined, segment_index, values_at
+from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, values_at
 from fingerspice.waveforms.sampling import breakpoints_at
 
 Progress = Callable[[float], None]

@@ -12,9 +12,9 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.describe import COUPLING, freezing_error
 from fingerspice.circuit.loop import areas_at_rest, loop_network, mean_areas, network_of
 from fingerspice.circuit.network import Modes, Network, network_modes
-from fingerspice.circuit.notices import COUPLING, freezing_error
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.engine.network import Net
 from fingerspice.engine.one_area.model import Model

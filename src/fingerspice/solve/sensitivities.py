@@ -16,12 +16,11 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
-from fingerspice.numerics.small import AT, derivative
-from fingerspice.results.outcome import SolveError, Status
-from fingerspice.results.sensitivity import MEANS, SIGNALS, Sensitivity
+from fingerspice.numerics.modes import AT, derivative
+from fingerspice.results.outcome import MEANS, SIGNALS, Sensitivity, SolveError, Status
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.pieces import driving
+from fingerspice.solve.recordings.block import driving
 from fingerspice.waveforms.combinations import Sum
 
 # Error asked of the runs that are compared, over the run's own, and the least one.

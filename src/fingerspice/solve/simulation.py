@@ -14,16 +14,15 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.circuit.arguments import Parameters, Sources, area_given, overridden
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.notices import circuit_warnings
+from fingerspice.circuit.describe import Parameters, Sources, area_given, circuit_warnings, overridden
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.closed_form import solve_algebraic, solve_linear
 from fingerspice.solve.marching import solve as solve_exponential
 from fingerspice.solve.nodal import solve_coupled
-from fingerspice.solve.periodic.search import close_period
+from fingerspice.solve.periodic import close_period
 from fingerspice.solve.planning import make_plan, run_warnings
 from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare, to_ends
 from fingerspice.solve.runs import ROUGH, Progress, Run, run_failure
@@ -302,7 +301,7 @@ def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | No
         if run.status not in (BEYOND_STACKS if is_stack else BEYOND_NETWORKS) or (is_stack and method == "exponential"):
             return run, "exponential"
         if is_stack and run.status is Status.FOLD:
-            from fingerspice.solve.folding import run_to_fold
+            from fingerspice.solve.closed_form import run_to_fold
 
             folded = run_to_fold(problem)
             if folded is not None:
@@ -312,7 +311,7 @@ def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | No
     # The implicit method is the last resort: its step length does not depend on fast modes.
     run = solve_coupled(problem, rtol, progress, reason)
     if is_stack and run.status is Status.FOLD:
-        from fingerspice.solve.folding import lead_to_fold
+        from fingerspice.solve.closed_form import lead_to_fold
 
         run = lead_to_fold(problem, run) or run
     return run, "radau"

@@ -9,10 +9,9 @@ from functools import partial
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
-from fingerspice.engine.collocation import loop, loopstate, readout
+from fingerspice.engine.collocation import loop, readout
 from fingerspice.engine.collocation.loop import Circuit, Looks
-from fingerspice.engine.collocation.loopstate import LoopState
-from fingerspice.engine.collocation.readout import Outputs
+from fingerspice.engine.collocation.readout import LoopState, Outputs
 from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Sources
 from fingerspice.numerics.lobatto import ROWS
@@ -81,7 +80,7 @@ class Stepping(Integration):
         longest = h_fixed or min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
         self.pace = Pace(tol, longest, h_fixed == 0.0, problem.charge)
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
-        self.step = np.zeros(1, loopstate.STEP)
+        self.step = np.zeros(1, readout.STEP)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
         self.branch = np.zeros((0, 2))  # (n, 2): As in `ManyAreas`
         self.out = np.empty((width, self.t_out.size))  # Output rows as columns
@@ -151,7 +150,7 @@ class Stepping(Integration):
             code = int(loop.march_on(self.circuit(sources), self.pace, self.loop_state(), looks, t_end))
             if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
                 self.recorder.drain(self.counters)
-            if code != loopstate.PAUSED:
+            if code != readout.PAUSED:
                 return code
 
     def stated_peaks(self) -> FloatArray:
@@ -187,12 +186,12 @@ class Stepping(Integration):
         # A period that has been repeated may have led there already.
         while self.t < t_end:
             code = self.march(sources, t_end, self.looks)
-            if code == loopstate.LOOKED_AT:
+            if code == readout.LOOKED_AT:
                 self._settle()
-            elif code == loopstate.EXCESSIVE:
+            elif code == readout.EXCESSIVE:
                 if excess_of(self.stated_peaks()[self.gaps], self.problem.rounding) > self.asked:
                     return Status.ERROR_NOT_MET
-            elif code != loopstate.DONE:
+            elif code != readout.DONE:
                 return self._failed(code, sources)
         return Status.SUCCESS
 
@@ -217,7 +216,7 @@ class Stepping(Integration):
     def keep(self, steps: int) -> None:
         """Keep the steps from now on, at most `steps` of them."""
         # The loop fills in what it keeps: zeros would take longer than all of these steps.
-        self.kept = loopstate.Kept(np.empty((steps, 3)), np.empty((steps, len(self.out), ROWS)))
+        self.kept = readout.Kept(np.empty((steps, 3)), np.empty((steps, len(self.out), ROWS)))
         if steps:
             self.counters[readout.KEPT] = 0
             self.recorder.drain(self.counters)
@@ -233,7 +232,7 @@ class Stepping(Integration):
         drifts = np.zeros(len(self.out))
         if self.problem.charge:
             drifts[-2 * n_s : -n_s] = drift
-        self.counters[readout.OUTPUT] = loopstate.repeat(
+        self.counters[readout.OUTPUT] = readout.repeat(
             self.kept, int(self.counters[readout.KEPT]), period, periods, drifts, int(self.counters[readout.OUTPUT]),
             self.outputs,
         )  # fmt: skip

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, positive_number, whole_number
-from fingerspice.circuit.arguments import Parameters, Sources, overridden
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.describe import Parameters, Sources, overridden
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution

@@ -11,16 +11,15 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.topology import find_branches
-from fingerspice.netlist.files import LIBRARIES, library_text
+from fingerspice.netlist.lexer import LIBRARIES, library_text
 from fingerspice.physics.contact import Contact
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged
-from fingerspice.waveforms.periodic import Exp, Pulse
-from fingerspice.waveforms.ramps import PWL
+from fingerspice.waveforms.periodic import PWL, Exp, Pulse
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import DC, Sine, Waveform
 

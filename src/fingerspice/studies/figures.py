@@ -24,8 +24,7 @@ from fingerspice.physics.materials import SKIN_BAND, skin_permittivity, skin_res
 from fingerspice.plots import drawing
 from fingerspice.results.solution import Solution
 from fingerspice.solve.runs import Progress
-from fingerspice.studies.phasors import phasor
-from fingerspice.studies.steady import steady_state
+from fingerspice.studies.steady import phasor, steady_state
 from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import Sine, Waveform, require
 

@@ -1,8 +1,12 @@
-"""Periodic state of a circuit under a periodic source, found by Newton's method, with its defect and stability."""
+"""Phasors of a circuit: gain, gap voltage, area and mean force against frequency (Eqs. 9 to 15).
+
+Periodic state of a circuit under a periodic source, found by Newton's method, with its defect and stability.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,24 +14,191 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray, whole_number
+from fingerspice.base.arrays import FloatArray, positive_row, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.base.units import format_si
-from fingerspice.circuit.arguments import Parameters, Sources, overridden
-from fingerspice.circuit.circuit import Circuit
-from fingerspice.results.outcome import ErrorEstimate, SolveError
-from fingerspice.results.sensitivity import Sensitivity
+from fingerspice.circuit.circuit import AcSweep, Circuit, Element
+from fingerspice.circuit.describe import Parameters, Sources, area_given, overridden
+from fingerspice.circuit.devices import beyond_fingers
+from fingerspice.circuit.loop import areas_at_rest, linear_scene, with_skin_held
+from fingerspice.circuit.network import build_network
+from fingerspice.physics.materials import SKIN_BAND
+from fingerspice.results.outcome import ErrorEstimate, Sensitivity, SolveError
 from fingerspice.results.solution import Solution
+from fingerspice.results.spectrum import PhasorSolution
 from fingerspice.results.summary import Figured, Figures
-from fingerspice.solve.periodic.search import close_period
+from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
 from fingerspice.solve.sensitivities import check_request, period_of, sensitivities_of
 from fingerspice.solve.simulation import rtol_given, run_problem
+from fingerspice.waveforms.waveform import Fundamental, require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+MAX_FREQUENCIES = 1_000_000
+
+
+def sweep_drive(
+    sources: tuple[tuple[Element, float], ...], fundamental: Fundamental | None, swept: bool
+) -> tuple[float, float, str]:
+    """The drive of a circuit: in a sweep the ``AC`` of its sources, if the deck has it, and else the fundamental.
+
+    Gives its amplitude (V, or A for a current source; NaN if there is neither), phase (rad), and their origin in words.
+    """
+    given = [(e, sign, e.ac) for e, sign in sources if e.ac is not None]
+    if swept and given:
+        # As in ngspice, a source without AC has an AC amplitude of 0.
+        total = sum(sign * ac.phasor for _, sign, ac in given)
+        words = [f"AC {ac.magnitude:g} {ac.phase_deg:g} of {e.name}" for e, _, ac in given]
+        return abs(total), math.atan2(total.imag, total.real), " and ".join(words)
+    names = " and ".join(e.name for e, _ in sources)
+    if fundamental is None:
+        return math.nan, 0.0, f"no fundamental of {names}"
+    return fundamental.amplitude, fundamental.phase, f"the fundamental of {names}"
+
+
+def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Remarks on the frequency of the skin's data, and warnings about extrapolation, for a sweep (Hz)."""
+    skins = {e.name: e.values["f"] for e in circuit.by_device("SKIN")}
+    own = ", ".join(f"{name} f = {x:g} Hz" for name, x in skins.items())
+    notes: tuple[str, ...] = ()
+    if skins and skin == "own":
+        notes = (f"the skin's data are held at the deck's own frequency ({own}) over the whole sweep",)
+    elif any(np.any(np.abs(f / x - 1.0) > 1e-9) for x in skins.values()):
+        notes = (f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})",)
+    swept = bool(circuit.by_device("SKIN_DISPERSIVE")) or (bool(skins) and skin != "own")
+    low, high = float(f.min()), float(f.max())
+    beyond = []
+    # The tolerance of 1e-6 allows for rounding of a sweep's end.
+    if low < SKIN_BAND[0] * (1.0 - 1e-6):
+        beyond.append(f"down to {low:g} Hz, {math.log10(SKIN_BAND[0] / low):.2g} decades below")
+    if high > SKIN_BAND[1] * (1.0 + 1e-6):
+        beyond.append(f"up to {high:g} Hz, {math.log10(high / SKIN_BAND[1]):.2g} decades above")
+    if not swept or not beyond:
+        return notes, ()
+    return notes, (
+        f"the sweep goes {' and '.join(beyond)} the 10 Hz to 100 kHz of the skin's data (Eqs. 18, 19): what it shows "
+        "there is extrapolated",
+    )
+
+
+def sweep_frequencies(sweep: AcSweep) -> FloatArray:
+    """Frequencies (Hz) of an ``.ac`` line, of which at most `MAX_FREQUENCIES` are allowed."""
+    base, ratio = (10.0 if sweep.scale == "dec" else 2.0), sweep.stop / sweep.start
+    count = sweep.points - 1.0 if sweep.scale == "lin" else math.log(ratio) / math.log(base) * sweep.points
+    if not count < MAX_FREQUENCIES:
+        raise InputError(f"the sweep has {count + 1.0:.3g} frequencies; allowed: at most {MAX_FREQUENCIES}")
+    if sweep.scale == "lin":
+        return np.linspace(sweep.start, sweep.stop, sweep.points)
+    n = math.floor(count + 1e-9)
+    out = sweep.start * base ** (np.arange(n + 1) / sweep.points)
+    return np.asarray(np.append(out, sweep.stop) if count - n > 1e-9 else out)
+
+
+def phasor(
+    circuit: Circuit,
+    frequency: ArrayLike | None = None,
+    *,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
+    area: str | float = "mean",
+    skin: str = "swept",
+    finger: str | None = None,
+) -> PhasorSolution:
+    """Phasor solution of a circuit.
+
+    Parameters
+    ----------
+    circuit : Circuit
+    frequency : array_like, optional
+        Hz, positive; the source's fundamental by default. If frequencies are given, the drive is the deck's
+        ``AC magnitude [phase]``, as in ngspice; without AC, or without frequencies, it is the source's fundamental.
+    sources, parameters
+        As in `simulate`.
+        Without a GAP the result has the node voltages, and every source's AC counts.
+    area : str or float
+        ``"mean"``: the area under the mean stress at the amplitude of the source's fundamental; ``"frozen"``: the area
+        at 0 V; or an area in m^2. An area that the deck fixes takes precedence over ``"mean"`` and ``"frozen"``.
+    skin : str
+        ``"swept"``: SKIN's data at each frequency; ``"own"``: its data at its own f, as in ngspice.
+    finger : str, optional
+        Name of the GAP whose figures are wanted; needed if the circuit has several.
+
+    Returns
+    -------
+    PhasorSolution
+
+    Raises
+    ------
+    InputError
+        If none of several GAPs is named, a network with a GAP has several sources, a fundamental is needed and missing,
+        a frequency or the area is not positive, or a result is not finite.
+    """
+    require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
+    area = area if isinstance(area, str) else area_given(area)
+    circuit = overridden(circuit, sources, parameters)
+    held = circuit if skin == "swept" else with_skin_held(circuit)
+    scene = None if finger is None and not circuit.by_device("GAP") else linear_scene(held, finger)
+    network = build_network(held) if scene is None else scene.network
+    alone = len(network.sources) == 1
+    fundamental = network.waveforms[0].fundamental if alone else None
+    asked = frequency if frequency is not None or fundamental is None else fundamental.frequency
+    if asked is None:
+        raise InputError("the source has no fundamental: give the frequencies in Hz")
+    f = positive_row("frequency", asked, "Hz")
+    driving = tuple((e, 1.0) for e in network.sources) if scene is None else scene.sources
+    amplitude, phase, drive = sweep_drive(driving, fundamental, frequency is not None)
+    if isinstance(area, str):
+        require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
+    if scene is None and math.isnan(amplitude):
+        raise InputError("no source has an amplitude; allowed: AC on a source, such as V1 in 0 AC 1, or one sine")
+    if scene is not None and area == "mean" and math.isnan(amplitude) and not scene.fixed:
+        raise InputError(
+            "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
+            "'frozen' or an area in m^2"
+        )
+    notes, warned = sweep_notes(circuit, f, skin)
+    with np.errstate(all="ignore"):
+        u = amplitude * np.exp(1j * phase)
+        if scene is None:
+            # Node voltages at the areas that the circuit gives; as in ngspice, the AC of every source counts.
+            s = [u] if alone else [0.0 if e.ac is None else e.ac.phasor for e in network.sources]
+            at = areas_at_rest(network) if isinstance(area, str) else np.full(len(network.areas), area)
+            areas = np.tile(at, (f.size, 1))
+            v = np.array([network.node_phasors(float(x), at, np.array(s, complex)) for x in f])
+            gain = u_gap = np.full(f.size, math.nan + 0j)
+            layers, size, force = np.zeros((f.size, 0), complex), gain.real, gain.real
+            results: tuple[NDArray[np.inexact], ...] = (v,)
+        else:
+            areas, v = np.array([scene.areas(float(x), area, amplitude) for x in f]), None
+            layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
+            gain, size = layers[:, scene.gap], areas[:, scene.finger].copy()
+            u_gap = gain * amplitude * np.exp(1j * phase)
+            stress = scene.contact.stress(np.abs(u_gap))
+            # At a constant area the mean force over a period of a sine is half its peak.
+            force = 0.5 * stress * size
+            results = (layers, size, *((u_gap, force) if math.isfinite(amplitude) else ()))
+            notes = (*notes, scene.note) if scene.note else notes
+        impedance = np.array([network.impedance(float(x), a) for x, a in zip(f, areas, strict=True)]) if alone else None
+    finite = np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
+    if not finite.all():
+        raise InputError(
+            f"the phasor at {f[np.argmin(finite)]:g} Hz is beyond the range of numbers; allowed: frequencies nearer to "
+            "the 10 Hz to 100 kHz of the skin's data, and values nearer to Table 1's"
+        )
+    if scene is not None:
+        warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
+    for text in warned:
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    return PhasorSolution(
+        f, gain, layers, u_gap, size, force, amplitude, () if scene is None else scene.layers, phase, drive, notes,
+        warned, circuit, impedance, network.node_names if scene is None else (), v,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, repr=False)

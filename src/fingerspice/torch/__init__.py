@@ -11,7 +11,7 @@ except ImportError:
         "fingerspice.torch needs torch, which is not installed; pip install 'fingerspice[torch]'"
     ) from None
 
-from fingerspice.torch.scenes import Drive as Drive
+from fingerspice.torch.simulator import Drive as Drive
 from fingerspice.torch.simulator import Simulator as Simulator
 
 __all__ = ["Drive", "Simulator"]

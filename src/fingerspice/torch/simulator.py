@@ -1,19 +1,259 @@
-"""A circuit as a module of PyTorch: values from the package's own runs, derivatives from differences of runs."""
+"""Scenes of one circuit as arrays, what the modules are asked for, and a drive's samples as a parameter.
+
+A circuit as a module of PyTorch: values from the package's own runs, derivatives from differences of runs.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from fingerspice.base.errors import InputError
-from fingerspice.circuit.arguments import require_circuit
+from fingerspice.base.arrays import FloatArray, positive_number, real_numbers
+from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.studies.batch.task import own_path
-from fingerspice.torch.scenes import Scenes, request, tensor_of
+from fingerspice.circuit.describe import require_circuit
+from fingerspice.results.outcome import MEANS, SIGNALS, SolveError
+from fingerspice.results.solution import Solution
+from fingerspice.solve.simulation import rtol_given, simulate
+from fingerspice.studies.batch.batch import batch
+from fingerspice.studies.batch.form import LEAST_RTOL, REFUSED, in_lockstep_by, own_path
+from fingerspice.studies.steady import SteadyState, steady_state
+from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.waveform import require
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """Runs of a circuit with other values of its parameters."""
+
+    circuit: Circuit
+    outputs: tuple[str, ...]  # Names out of `SIGNALS` and `MEANS`
+    t: FloatArray  # (n_t,): Times of the signals, s; empty where there are only means
+    t_stop: float | None  # End of every run, s; None where only the periodic state is asked for
+    periodic: bool  # Whether the periodic state is asked for, and not the run
+    rtol: float
+    alone: bool  # Whether one output was asked for by its name, not in a sequence
+
+    @property
+    def sizes(self) -> list[int]:
+        """How many numbers each output has."""
+        return [1 if name in MEANS else self.t.size for name in self.outputs]
+
+    def values(self, paths: Sequence[str], given: FloatArray, wanted: Sequence[str] = ()) -> FloatArray:
+        """The outputs one after the other, shape (n_scene, sum of `sizes`), at values `given` (n_scene, n_path).
+
+        With `wanted`, their derivatives by these parameters, shape (n_scene, sum of `sizes`, n_wanted).
+        """
+        if not self.t.size and (not wanted or in_lockstep_by(self.circuit, paths, self.outputs, self.rtol)):
+            # The means, or their derivatives, of all scenes at once.
+            found = batch(
+                self.circuit, dict(zip(paths, given.T, strict=True)), outputs=self.outputs, rtol=self.rtol,
+                periodic=self.periodic, t_stop=None if self.periodic else self.t_stop, gradients=wanted,
+            )  # fmt: skip
+            bad = np.flatnonzero(found["gradient_status" if wanted else "status"].to_numpy() >= REFUSED)
+            if bad.size:
+                raise InputError(f"{bad.size} of {len(given)} scenes cannot be run; {found.attrs['failures'][0]}")
+            return np.stack([found[f"d_{name}" if wanted else name].to_numpy() for name in self.outputs], axis=1)
+        rows = []
+        for i, row in enumerate(given):
+            with named("scene", i):
+                runs = self._runs(paths, row, wanted)
+                if wanted:
+                    by = [[getattr(run.sensitivities[path], name) for name, run in runs.items()] for path in wanted]
+                    rows.append(np.stack([np.hstack(column) for column in by], axis=-1))
+                else:
+                    rows.append(np.hstack([getattr(run, name) for name, run in runs.items()]))
+        return np.array(rows)
+
+    def given_back(self, found: Tensor) -> Tensor | dict[str, Tensor]:
+        """The outputs in a tensor (..., sum of `sizes`) by their names, or the one that was asked for alone."""
+        parts = dict(zip(self.outputs, found.split(self.sizes, dim=-1), strict=True))
+        parts = {name: part.squeeze(-1) if name in MEANS else part for name, part in parts.items()}
+        return parts[self.outputs[0]] if self.alone else parts
+
+    def _runs(
+        self, paths: Sequence[str], row: FloatArray, wanted: Sequence[str]
+    ) -> dict[str, Solution | SteadyState]:  # fmt: skip
+        """The run of a scene that has each output."""
+        circuit = self.circuit.varied(dict(zip(paths, row.tolist(), strict=True)))
+        of_period = [name for name in self.outputs if self.periodic and name in MEANS]
+        found: dict[str, Solution | SteadyState] = {}
+        if len(of_period) < len(self.outputs):
+            run = self.run(circuit, start="periodic" if self.periodic else "deck", sensitivities=wanted)
+            found = dict.fromkeys(self.outputs, run)
+        if of_period:
+            state = steady_state(circuit, rtol=self.rtol, points=4, charge=False, sensitivities=wanted)
+            found |= dict.fromkeys(of_period, state)
+        return found
+
+    def run(self, circuit: Circuit, **how: Any) -> Solution:
+        """A run of a circuit, with outputs at the times `t`, or at its end where there are only means."""
+        t = self.t if self.t.size else np.array([self.t_stop])
+        return simulate(circuit, t_stop=self.t_stop, t_eval=t, rtol=self.rtol, charge=False, **how)
+
+
+@contextmanager
+def named(what: str, number: int) -> Iterator[None]:
+    """Names the scene or drive in an error, and leaves out warnings about values that an optimiser has chosen."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FingerspiceWarning)
+            yield
+    except (InputError, SolveError) as error:
+        raise InputError(f"{what} {number}: {error}") from error
+
+
+def request(
+    circuit: Circuit, outputs: str | Sequence[str], t: ArrayLike | None, t_stop: float | None, periodic: bool,
+    rtol: float,
+) -> Scenes:  # fmt: skip
+    """The checked request."""
+    alone = isinstance(outputs, str)
+    names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    for name in names:
+        if name not in (*MEANS, *SIGNALS):
+            raise InputError(f"unknown output {name!r}; allowed: {', '.join((*MEANS, *SIGNALS))}")
+    require(len(names) > 0, "outputs", "empty", "one or more names")
+    require(len(set(names)) == len(names), "outputs", repr(names), "every name once")
+    signals = [name for name in names if name in SIGNALS]
+    times = None if t is None else real_numbers("t", t, "numbers in s")
+    if signals and (times is None or times.ndim != 1 or not times.size):
+        raise InputError(f"{signals[0]} is asked for, and t is {t!r}; allowed: a row of times in s")
+    if not signals and times is not None:
+        raise InputError(f"t is given, and no signal is asked for; allowed: outputs such as {', '.join(SIGNALS)}")
+    if t_stop is not None:
+        t_stop = positive_number("t_stop", t_stop, "s")
+    elif circuit.tran is not None:
+        t_stop = circuit.tran.stop
+    elif signals or not periodic:
+        raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+    times = np.zeros(0) if times is None else times
+    return Scenes(circuit, names, times, t_stop, bool(periodic), rtol_given(rtol, LEAST_RTOL), alone)
+
+
+def tensor_of(path: str, one: Tensor | ArrayLike) -> Tensor:
+    """A value in double precision on the processor."""
+    if not isinstance(one, Tensor):
+        one = torch.from_numpy(real_numbers(path, one, "a tensor or array of numbers").copy())
+    if one.is_complex() or one.dtype == torch.bool:
+        raise InputError(f"{path} is a tensor of {one.dtype}; allowed: real numbers")
+    return one.to("cpu", torch.float64)
+
+
+class Drive(torch.nn.Module):
+    """A circuit under a recording whose samples are the module's parameter `samples`, V.
+
+    The gradient by all samples costs a few runs, however many samples there are (`Solution.sample_gradient`).
+
+    Parameters
+    ----------
+    circuit : Circuit
+        One with one GAP.
+    samples : array_like, shape (..., n)
+        V; several rows are several drives.
+    rate : float
+        Samples per second; the first one is at 0 s.
+    outputs : str or sequence of str
+        As for `Simulator`.
+    t : array_like, optional
+        Times of the signals, s, ascending.
+    t_stop : float, optional
+        End of every run, s; the deck's TSTOP by default.
+    source : str, optional
+        The source that is replaced; needed where there are several.
+    rtol : float
+        Error of every run, as in `simulate`.
+
+    Raises
+    ------
+    InputError
+        If the circuit is another one, or a source, output or time is unknown or missing.
+    """
+
+    def __init__(
+        self,
+        circuit: Circuit,
+        samples: Tensor | ArrayLike,
+        rate: float,
+        outputs: str | Sequence[str] = "f_el_mean",
+        *,
+        t: ArrayLike | None = None,
+        t_stop: float | None = None,
+        source: str | None = None,
+        rtol: float = 1e-8,
+    ) -> None:
+        super().__init__()
+        require_circuit(circuit)
+        names = [element.name for element in circuit.elements if element.waveform is not None]
+        known = {name.lower(): name for name in names}
+        if source is None:
+            require(len(names) == 1, "source", "missing", f"one of {', '.join(names)}")
+            source = names[0]
+        require(source.lower() in known, "source", repr(source), f"one of {', '.join(names)}")
+        self._scenes = request(circuit, outputs, t, t_stop, False, rtol)
+        self._source, self._rate = known[source.lower()], positive_number("rate", rate, "Hz")
+        self.samples = torch.nn.Parameter(tensor_of("samples", samples).detach().clone())
+
+    def forward(self, samples: Tensor | ArrayLike | None = None) -> Tensor | dict[str, Tensor]:
+        """Run all drives.
+
+        Parameters
+        ----------
+        samples : tensor or array_like, shape (..., n), optional
+            Instead of the module's own, V.
+
+        Returns
+        -------
+        tensor, or dict of str to tensor
+            Of the shape (...) of the drives, and of one more dimension, the times, for signals. A dict by name if
+            several outputs were asked for.
+
+        Raises
+        ------
+        InputError
+            If a drive cannot be run; the message names it.
+        """
+        given = self.samples if samples is None else tensor_of("samples", samples)
+        require(given.ndim > 0, "samples", "one number", "a row of two or more")
+        found: Tensor = _DriveRun.apply(self, given)
+        return self._scenes.given_back(found)
+
+
+def _backward(ctx: Any, by_output: Tensor) -> tuple[None, Tensor]:
+    """Derivatives by the samples, from one way back through every run."""
+    scenes, out = ctx.scenes, np.zeros((len(ctx.runs), ctx.shape[-1]))
+    edges = np.cumsum([0, *scenes.sizes])
+    for i, (run, row) in enumerate(zip(ctx.runs, by_output.reshape(len(ctx.runs), -1).numpy(), strict=True)):
+        parts = zip(scenes.outputs, edges, edges[1:], strict=False)
+        weights = {name: row[a] if name in MEANS else row[a:b] for name, a, b in parts}
+        out[i] = run.sample_gradient(**weights).values
+    return None, torch.from_numpy(out).reshape(ctx.shape)
+
+
+# The methods have the names and signatures that torch calls.
+class _DriveRun(torch.autograd.Function):
+    """The outputs of drives of shape (..., n): a tensor of shape (..., number of outputs)."""
+
+    @staticmethod
+    def forward(ctx: Any, drive: Drive, samples: Tensor) -> Tensor:
+        scenes = drive._scenes
+        ctx.scenes, ctx.runs, ctx.shape = scenes, [], samples.shape
+        for i, row in enumerate(samples.detach().numpy().reshape(-1, samples.shape[-1])):
+            with named("drive", i):
+                ctx.runs.append(scenes.run(scenes.circuit, sources={drive._source: Samples(row, drive._rate)}))
+        rows = [np.hstack([getattr(run, name) for name in scenes.outputs]) for run in ctx.runs]
+        return torch.from_numpy(np.stack(rows)).reshape(*samples.shape[:-1], -1)
+
+    # Not a decorator: without torch, types are not known.
+    backward: Any = staticmethod(torch.autograd.function.once_differentiable(_backward))
 
 
 class Simulator(torch.nn.Module):

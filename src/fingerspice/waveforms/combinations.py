@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_numbers
-from fingerspice.waveforms.ramps import runs_through
+from fingerspice.waveforms.periodic import runs_through
 from fingerspice.waveforms.waveform import DC, Sine, Waveform, as_waveform, require
 
 #: Most cycles of a part in a common period.

@@ -13,25 +13,40 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import borrow, jit, jit_by_kind, jit_within
-from fingerspice.engine.collocation.loopstate import (
+from fingerspice.engine.collocation.readout import (
+    ACCEPTED,
     DONE,
+    ERROR_F,
+    ERROR_U,
     EXCESSIVE,
     GO_ON,
     LOOKED_AT,
+    PEAK_F,
+    PEAK_U,
+    REJECTED,
     RETRY,
     SAME_TIME,
     LoopState,
+    note,
 )  # fmt: skip
-from fingerspice.engine.collocation.readout import ACCEPTED, ERROR_F, ERROR_U, PEAK_F, PEAK_U, REJECTED, note
 from fingerspice.engine.collocation.step_control import NOT_FRESH, Pace, accept, allowed_factor, rung, shorten
-from fingerspice.engine.many_areas.begin import ManyAreas, begin_many, start_many
-from fingerspice.engine.many_areas.step import attempt_many, beyond_many, complete_many, end_many, refuse_many
-from fingerspice.engine.one_area.end import complete_one, end_one
+from fingerspice.engine.many_areas.step import (
+    ManyAreas,
+    attempt_many,
+    begin_many,
+    beyond_many,
+    complete_many,
+    end_many,
+    refuse_many,
+    start_many,
+)
 from fingerspice.engine.one_area.step import (
     OneArea,
     attempt_one,
     begin_one,
     beyond_one,
+    complete_one,
+    end_one,
     refuse_one,
     start_one,
 )  # fmt: skip
@@ -213,7 +228,7 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
     """Step to `t_end` (s; not past the last edge of the sources), writing outputs on the way.
 
     `pace` has the rules for the lengths of the steps, `state` is the integration so far, which is updated. Returns a
-    code of `engine.collocation.loopstate`.
+    code of `engine.collocation.readout`.
     """
     # Arrays without a reference count: it would cost an atomic operation at every access to a tuple.
     circuit, state = borrow(circuit), borrow(state)

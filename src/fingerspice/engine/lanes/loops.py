@@ -9,10 +9,9 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within, jit_within_rows
-from fingerspice.engine.lanes.rows import SOURCES, WEIGHTS, Marks, places, polynomial_rows, rise_of
+from fingerspice.engine.lanes.rows import SOURCES, WEIGHTS, Marks, places, polynomial_rows, rise_of, weigh
 from fingerspice.engine.lanes.step import step
-from fingerspice.engine.lanes.weights import weigh
-from fingerspice.numerics.small import copy_to
+from fingerspice.numerics.modes import copy_to
 
 # Samples that are read and written at once.
 TILE = 8

@@ -324,7 +324,7 @@ def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int,
         lane,
         # Length of the shortest step, s; in a run from rest, then the number of half periods after which it has settled
         lane,
-        (11, lanes),  # Scratch of `weights.weigh`
+        (11, lanes),  # Scratch of `step.weigh`
     )  # fmt: skip
     return found, scratch, stepping
 

@@ -1,4 +1,7 @@
-"""Error and peaks of a finished step of a network; `exponential.assess` and `readout` do the same for a stack."""
+"""A finished step of a network: its error and peaks, the charge that the sources deliver over it, and that one's error.
+
+`engine.collocation.exponential`, `engine.collocation.readout` and `engine.one_area.charge` do the same for a stack.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,35 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.collocation.exponential import Tables, between, largest, left_over
-from fingerspice.engine.collocation.readout import ERROR_U, N_PLACES
-from fingerspice.engine.collocation.zeros import first_wrong, leaves
-from fingerspice.engine.many_areas.form import LIN, PULL, USED, Form, Leaks, W, Work
-from fingerspice.engine.many_areas.rows import combine
+from fingerspice.engine.collocation.readout import (
+    ERROR_U,
+    N_PLACES,
+    Control,
+    row_of,
+)
+from fingerspice.engine.collocation.step_control import first_wrong, leaves
+from fingerspice.engine.many_areas import form as blocks
+from fingerspice.engine.many_areas.coupling import cell_currents
+from fingerspice.engine.many_areas.form import (
+    AREA,
+    CELL_U,
+    LIN,
+    MORE,
+    PULL,
+    SLOPE,
+    USED,
+    D,
+    Form,
+    J,
+    Leaks,
+    W,
+    Work,
+    clear,
+    combine,
+    mode_rates,
+    wanted,
+)
+from fingerspice.engine.one_area.charge import LOBE, integrate
 from fingerspice.numerics.lobatto import DERIVATIVE, END, MISS, NODES, POINTS, ROWS
 
 # A decay that is over within this fraction of the step, a third of the way to the first node, is not seen by the
@@ -220,3 +248,248 @@ def write_columns(
     for e in range(first_z, y.size):
         for i in range(ROWS):
             values[e, i] = y[e] + (values[e, i] if charge else 0.0)
+
+
+# Largest integral within a step of a function that changes its sign at every node, as the node polynomial does, over
+# the function's size and the step's length.
+_HALF_LOBE = 0.041
+
+
+@jit_rows
+def _leaks(
+    mobile: bool, h: float, c: float, g: float, u: FloatArray, more: FloatArray, leak: FloatArray, moved: FloatArray
+) -> None:
+    """A cell's current beyond the one at the reference area: the part to be integrated (A) and the charge stored (C).
+
+    The stored charge counts from the start of the step. Under `local` the charge on the area moves with the area: the
+    part of A - A0 at the start is exact, the rest is integrated along the polynomial of the voltage. The voltage's own
+    rate would not do, because a decayed mode contributes its rate times the rounding error of its voltage.
+    """
+    for i in range(ROWS):
+        leak[i] = g * more[i] * u[i]
+        moved[i] = c * (more[i] * u[i] - more[0] * u[0]) if mobile else c * more[0] * (u[i] - u[0])
+    if not mobile:
+        for i in range(NODES):
+            slope = 0.0
+            for m in range(NODES):
+                slope += DERIVATIVE[i, m] * u[m]
+            leak[i] += c * (more[i] - more[0]) * slope / h
+
+
+@jit_within
+def charge_rows(
+    form: Form, work: Work, leaks: Leaks, h: float, integral: FloatArray, z: FloatArray, current: FloatArray
+) -> None:  # fmt: skip
+    """Charge since the start of a step and current of each source at the nodes, into `z` and `current` (n_s, ROWS).
+
+    The derivatives of the modes, and the voltages and currents of the cells, have been put into `work`.
+    """
+    mobile, stored, stored_s, lost, lost_s = form.mobile, form.stored, form.stored_s, leaks.lost, leaks.lost_s
+    through, c, g, home = form.through, form.c, leaks.g, form.home
+    w, rate, s, ds = work.modes[W], work.modes[D], work.s, work.ds
+    u, more, j, room = work.cells[CELL_U], work.areas[MORE], work.cells[J], work.room
+    n = stored.shape[1]
+    collected, leak, moved = room[0], room[1], room[2]
+    for a in range(stored.shape[0]):
+        for i in range(ROWS):
+            z[a, i] = 0.0
+            current[a, i] = 0.0
+            collected[i] = 0.0
+        for k in range(n):
+            for i in range(ROWS):
+                current[a, i] += stored[a, k] * rate[k, i]
+                collected[i] += lost[a, k] * w[k, i]
+                z[a, i] += stored[a, k] * (w[k, i] - w[k, 0])
+        for k in range(s.shape[0]):
+            for i in range(ROWS):
+                current[a, i] += stored_s[a, k] * ds[k, i]
+                collected[i] += lost_s[a, k] * s[k, i]
+                z[a, i] += stored_s[a, k] * (s[k, i] - s[k, 0])
+        for i in range(ROWS):
+            current[a, i] += collected[i]
+        for b in range(c.size):
+            share = through[a, b]
+            if share == 0.0:
+                continue
+            _leaks(mobile, h, c[b], g[b], u[b], more[home[b]], leak, moved)
+            for i in range(ROWS):
+                current[a, i] += share * j[b, i]
+                collected[i] += share * leak[i]
+                z[a, i] += share * moved[i]
+        integrate(integral, h, collected, z[a])
+
+
+@jit
+def charge_error(
+    form: Form, work: Work, h: float, lost: FloatArray, g: FloatArray, theta: float, u: FloatArray, areas: FloatArray,
+    z: FloatArray, collected: FloatArray, control: Control,
+) -> None:  # fmt: skip
+    """Largest error of the charges over the part of a step that counts, from the signed error of the modes.
+
+    With du the error of a cell's voltage and dA that of its area, the error of a charge has a stored part, which goes
+    with du and dA at the time, and a lasting part: their leak and, under `local`, the integral of c (dA u' - A' du).
+    Interpolation errors change their sign at every node: they are stored, but over a whole step nothing of them leaks.
+    If a step is cut short, the lobe between the last two nodes lasts.
+
+    `work.places` (m, N_PLACES) are the errors of the modes, and `work.off` the interpolation errors of this step among
+    them (see `error.assess`). The leaks `g` are zero within a jump. `u` (n_f, ROWS) are the cells' voltages, and `z`
+    (n_s, ROWS) the charges gained. `collected` (2, n_s) has the lasting errors so far: the sum of those with a known
+    sign, and the sum of squares of the others.
+    """
+    places, missed, cell_slips = work.places, work.off, work.cell_slips
+    lasting, brief = work.slips[0], work.slips[1]
+    for k in range(places.shape[0]):
+        for p in range(N_PLACES):
+            brief[k, p] = missed[p - 1, k] if 0 < p < N_PLACES - 1 else (missed[4, k] if p == 0 else 0.0)
+            lasting[k, p] = places[k, p] - (brief[k, p] if p > 0 else 0.0)
+    _cell_errors(form, lasting, areas[SLOPE], cell_slips[0])
+    _cell_errors(form, brief, areas[SLOPE], cell_slips[1])
+    off_briefly = np.empty(N_PLACES)
+    for source in range(form.stored.shape[0]):
+        first, second, third = between(z[source])
+        swing, end, lobe, apart = 0.0, 0.0, 0.0, 0.0
+        if not form.mobile:
+            swing, end = _area_missed(form, source, u, areas[AREA])
+        for p in range(1, N_PLACES - 1):
+            leak = _leak(form, source, p, lost, g, brief, cell_slips[1], u, areas[MORE])
+            lobe = max(lobe, _HALF_LOBE * h * abs(leak))
+        for p in range(N_PLACES):
+            held = _held(form, source, p, brief, cell_slips[1], u, areas[MORE])
+            own = first if p == 1 else (second if p == 2 else (third if p == 3 else 0.0))
+            off_briefly[p] = max(abs(held), abs(own), swing, lobe)
+            apart = max(apart, abs(own - held) if 0 < p < N_PLACES - 1 else 0.0)
+        # After a step that is cut short its lobes last, and the difference between its charge and its modes. The signs
+        # of both are unknown.
+        kept = end if theta == 1.0 else math.sqrt(swing * swing + lobe * lobe + apart * apart)
+        collected[1, source] += kept * kept
+        added, last_leak, last_theta = 0.0, 0.0, 0.0
+        for p in range(N_PLACES):
+            row = row_of(p)
+            leak = _leak(form, source, p, lost, g, lasting, cell_slips[0], u, areas[MORE])
+            if p > 0:
+                reached = min(POINTS[row], theta)
+                part = (reached - last_theta) / (POINTS[row] - last_theta)
+                turned = 0.0 if form.mobile else _turned(form, source, p, cell_slips[0], u, areas[AREA])
+                added += part * (0.5 * h * (POINTS[row] - last_theta) * (leak + last_leak) + turned)
+                last_theta = POINTS[row]
+            last_leak = leak
+            now = _held(form, source, p, lasting, cell_slips[0], u, areas[MORE])
+            known = now + collected[0, source] + added
+            error = math.sqrt(known * known + off_briefly[p] * off_briefly[p] + collected[1, source])
+            control.error_q = max(control.error_q, error)
+            if last_theta > theta:
+                break
+        collected[0, source] += added
+
+
+@jit
+def _cell_errors(form: Form, places: FloatArray, slope: FloatArray, off: FloatArray) -> None:
+    """Errors of the cells' voltages (V) and, behind them, of the areas (m^2) at the places, from those of the modes."""
+    n_f = form.c.size
+    for p in range(N_PLACES):
+        for b in range(n_f):
+            for k in range(form.tap.shape[1]):
+                off[p, b] += form.tap[b, k] * places[k, p]
+        for a in range(form.cell.size):
+            if form.slow[a] >= 0:
+                off[p, n_f + a] = form.unit[a] * places[form.slow[a], p]
+            elif form.cell[a] >= 0:
+                off[p, n_f + a] = slope[a, row_of(p)] * off[p, form.cell[a]]
+
+
+@jit
+def _held(
+    form: Form, source: int, p: int, places: FloatArray, off: FloatArray, u: FloatArray, more: FloatArray
+) -> float:  # fmt: skip
+    """Stored part of a charge's error at a place, C."""
+    total = 0.0
+    row = row_of(p)
+    for k in range(form.stored.shape[1]):
+        total += form.stored[source, k] * places[k, p]
+    for b in range(form.c.size):
+        a = form.home[b]
+        moved = more[a, row] * off[p, b]
+        if form.mobile:
+            moved += u[b, row] * off[p, form.c.size + a]
+        total += form.through[source, b] * form.c[b] * moved
+    return total
+
+
+@jit
+def _leak(
+    form: Form, source: int, p: int, lost: FloatArray, g: FloatArray, places: FloatArray, off: FloatArray,
+    u: FloatArray, more: FloatArray,
+) -> float:  # fmt: skip
+    """Rate at which the error at a place adds to the lasting error of a charge by leaking, A."""
+    total = 0.0
+    row = row_of(p)
+    for k in range(lost.shape[1]):
+        total += lost[source, k] * places[k, p]
+    for b in range(g.size):
+        a = form.home[b]
+        both = more[a, row] * off[p, b] + u[b, row] * off[p, g.size + a]
+        total += form.through[source, b] * g[b] * both
+    return total
+
+
+@jit
+def _turned(form: Form, source: int, p: int, off: FloatArray, u: FloatArray, area: FloatArray) -> float:
+    """Integral of c (dA u' - A' du) from the place before, C."""
+    total = 0.0
+    row, last = row_of(p), row_of(p - 1)
+    for b in range(form.c.size):
+        a = form.home[b]
+        area_off = off[p, form.c.size + a] + off[p - 1, form.c.size + a]
+        both = area_off * (u[b, row] - u[b, last]) - (area[a, row] - area[a, last]) * (off[p, b] + off[p - 1, b])
+        total += 0.5 * form.through[source, b] * form.c[b] * both
+    return total
+
+
+@jit
+def _area_missed(form: Form, source: int, u: FloatArray, area: FloatArray) -> tuple[float, float]:
+    """Errors of the integral of c A u' by the interpolation of the areas, within a step and at its end, C.
+
+    Within the step the error is the lobe between two nodes. At the end the quadrature rule has twice the order, so that
+    the relative interpolation error counts squared.
+    """
+    way, end = 0.0, 0.0
+    for b in range(form.c.size):
+        a = form.home[b]
+        first, second, third = between(area[a])
+        worst = max(abs(first), abs(second), abs(third))
+        lobes = LOBE * abs(form.through[source, b]) * form.c[b] * worst * _way(u[b])
+        way += lobes
+        end += lobes * min(1.0, worst / area[a, 0])
+    return way, end
+
+
+@jit
+def _way(values: FloatArray) -> float:
+    """Total variation of values at the nodes."""
+    total = 0.0
+    for i in range(1, NODES):
+        total += abs(values[i] - values[i - 1])
+    return total
+
+
+@jit_within
+def step_charges(
+    form: Form, work: Work, leaks: Leaks, h: float, integral: FloatArray, sign: FloatArray, z: FloatArray,
+    current: FloatArray,
+) -> None:  # fmt: skip
+    """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
+    modes, cells, areas = work.modes, work.cells, work.areas
+    w, cell_u = modes[blocks.W], cells[blocks.CELL_U]
+    mode_rates(h, leaks.rates, w, modes[blocks.LIN], modes[blocks.PULL], False, modes[blocks.D])
+    clear(cell_u)
+    combine(form.tap, w[: form.shape.shape[0]], cell_u)
+    combine(form.tap_s, work.s, cell_u)
+    cell_currents(work.own.root, cells[blocks.RHO], cells[blocks.J])
+    if not form.mobile:
+        for a in range(form.cell.size):
+            if form.cell[a] >= 0 and form.slow[a] < 0:
+                wanted(
+                    True, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a],
+                    areas[blocks.U, a], areas[blocks.AREA, a], areas[blocks.SLOPE, a],
+                )  # fmt: skip
+    charge_rows(form, work, leaks, h, integral, z, current)

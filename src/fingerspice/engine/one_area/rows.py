@@ -14,7 +14,7 @@ from fingerspice.engine.network import term_at
 from fingerspice.engine.one_area.system import DEGREE, System
 from fingerspice.numerics import chebyshev
 from fingerspice.numerics.lobatto import NODES, POINTS, ROWS
-from fingerspice.numerics.small import copy_to
+from fingerspice.numerics.modes import copy_to
 from fingerspice.physics.contact import inverse_area
 
 # Rows of `Work.r`: source (V) and its slope (V/s), k_gap U, gap voltage and its guess (V), gap w, 1/A (1/m^2), its

@@ -1,4 +1,6 @@
-"""Runs under a recorded source, sample by sample, in pieces of fixed length.
+"""Recordings of one finger, block by block in lanes (`solve.recordings.block`), with stated errors.
+
+Runs under a recorded source, sample by sample, in pieces of fixed length.
 
 The error of each piece is judged at its end, independently of later pieces. Its outputs are therefore the same however
 long the run is, and whether all outputs are held in one array or streamed in chunks.
@@ -9,26 +11,269 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import dataclass, replace
+from enum import Enum
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.circuit.network import Network
+from fingerspice.engine.lanes.loops import flow, show
 from fingerspice.results.outcome import Plan, State, Status
 from fingerspice.results.record import Record
 from fingerspice.solve.problem import Problem, at_breakpoints
-from fingerspice.solve.recordings.form import LaneForm, rounded_peak, stack
-from fingerspice.solve.recordings.march import LaneMarch, Outcome
-from fingerspice.solve.recordings.networks import finger
-from fingerspice.solve.recordings.pieces import Piece, pieces_of
-from fingerspice.solve.runs import Progress, Run, closed_form
+from fingerspice.solve.recordings.block import OF_FORCE, Block, Judged, Piece, driving, pieces_of, spacing_of
+from fingerspice.solve.recordings.form import PIECES, LaneForm, finger, rounded_peak, stack
+from fingerspice.solve.runs import Progress, Run, closed_form, excess_of
 from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.simulation import integrated, own_rtol, state_error
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.sampling import on_breakpoint
+from fingerspice.waveforms.sampling import on_breakpoint, on_grid
 from fingerspice.waveforms.waveform import require
+
+# Stated over seen errors, of voltages and of charges: as seen in recordings of tests/recording_errors.py.
+SAFETY, OF_CHARGE = 2.25, 2.5
+# Steps of a sample, by level.
+PARTS = (1, 2, 4, 8, 16, 32, 64)
+# Changes of starts that may be left, over the error asked for, and in pieces of fewer samples less; and over the
+# voltages, as rounding leaves so much.
+OF_STARTS, LEAST_CHANGE, SHORT = 0.01, 1e-14, 1024
+# Excess below which the next block has steps twice as long, and what half the length divides an error by at least: in a
+# stack, and in a network.
+COARSER, FINER = 1.0 / 60.0, (8.0, 12.0)
+# Steps of a piece that grows in each lane, and the first one over the shortest time constant.
+GROWN, EARLY = 4, 0.05
+# Relative change of a voltage over that of the area which causes it, at most, under `local`: what scales with the area
+# divides the voltage with what does not.
+DIVIDED = 0.5
+# How fine steps must be is found on so many samples at the start of a run, below these relative errors: in a stack, and
+# in a network. For larger ones steps of a sample mostly do.
+FIRST, AT_ONCE = 1 << 14, (3e-7, 3e-6)
+# What leaks by the error of the polynomial of 1/A over what is stored, times that error: as seen in offset recordings.
+LEAKED = 0.1
+_ONE_ROW = np.zeros(1, np.int64)
+# The error of a piece is related to the peaks up to its end, or to this share of the largest gap voltage that the
+# source may cause: noise before the first loud sound need not be exact relative to itself.
+LEAST_PEAK = 1e-3
+# In the first sample of a network it is this share, as the errors of the polynomials stand beside a small peak there.
+LEAST_AT_START = 0.1
+
+
+class Outcome(Enum):
+    """Outcome of a piece: its error is met, or not met, or this method cannot integrate it (LOST)."""
+
+    MET, NOT_MET, LOST = range(3)
+
+
+class LaneMarch:
+    """A recording of one finger in progress, piece by piece."""
+
+    # What changes from piece to piece.
+    _MARKED = (
+        "t", "loudest", "u_last", "share", "level", "steps", "refused", "evaluated", "peak", "margin",
+        "z", "alike", "chance", "errors",
+    )  # fmt: skip
+
+    def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
+        # The error allowed is reduced to a `share` where errors of earlier pieces add up.
+        self.problem, self.form, self.rtol, self.share = problem, form, rtol, share
+        wave = driving(problem)
+        assert wave is not None
+        # Time reached (s), and largest |U| of the source so far, V.
+        self.wave, self.usual, self.t, self.loudest = wave, spacing_of(wave), problem.t_start, 0.0
+        # Of a source of current the scene knows no peak.
+        self.expected = form.gain * (problem.scene.u_peak or wave.peak(0.0, problem.t_stop))
+        self.least = max(float(np.abs(problem.initial.y).max(initial=0.0)), LEAST_PEAK * self.expected)
+        # Modes, behind them under `mobile` the gap voltage, and the source.
+        self.z, self.u_last = form.start(problem)
+        # The number of `outputs` so far is that in the array they are written to.
+        self.level, self.outputs, self.steps, self.refused, self.evaluated, self.margin = 0, 0, 0, 0, 0, 1.0
+        # Errors of the modes so far, as if they were alike, and products of two, as if they came by chance.
+        m = form.lanes.rates.size
+        self.alike, self.chance = np.zeros(m), np.zeros((m, m))
+        # Largest |xi| (V), and errors seen of gap voltage (V), force (N), nodes (V) and charges (C).
+        self.peak, self.errors = 0.0, np.zeros(4)
+
+    @property
+    def state(self) -> State:
+        """The state reached."""
+        return self.form.state(self.problem, self.z, self.t, self.u_last)
+
+    def outputs_at(self, t_out: FloatArray) -> FloatArray:
+        """An array for outputs at these times, which begin to be counted from 0."""
+        self.outputs = 0
+        return np.empty((self.form.rows.k.size + self.form.flows, t_out.size))
+
+    def follow(self, piece: Piece, t_out: FloatArray, out: FloatArray) -> Outcome:
+        """Integrate a piece, and write the outputs before its end as rows of `out`."""
+        values = piece.values(self.wave)
+        self.loudest = max(self.loudest, float(values.max()), -float(values.min()))
+        if piece.grows:
+            piece, values = self._growing(piece, values)
+        h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
+        starts_at = self.form.after(self.z, float(values[0]))
+        tries = self.steps == 0 and self.rtol < AT_ONCE[self.form.bent] and values.size > 4 * FIRST
+        for size in (FIRST, values.size - 1)[0 if tries else 1 :]:
+            block = Block(self.form, values[: size + 1], h[:size], self.steps == 0)
+            outcome, seen, excess = self._climb(block, starts_at, LEAST_AT_START if piece.grows else LEAST_PEAK)
+            if outcome is not Outcome.MET:
+                return outcome
+        assert seen is not None
+        parts, self.peak = PARTS[self.level], max(float(block.peaks.max()), self.peak)
+        self.errors = np.maximum(seen.errors, self.errors)
+        self.alike, self.chance, self.margin = seen.alike, seen.chance, min(self.margin, block.margin)
+        self.steps += parts * block.n
+        self._write(piece, block, parts, t_out, out)
+        self.z, self.t, self.u_last = block.end(), piece.stop, float(values[-1])
+        if piece.grows:
+            self.level = 0
+        elif excess < COARSER and self.level > 0:
+            self.level -= 1
+        return Outcome.MET
+
+    def _climb(self, block: Block, starts_at: float, share: float) -> tuple[Outcome, Judged | None, float]:
+        """Solve a block, with ever more steps a sample until its error is met; its errors and their excess."""
+        form, seen = self.form, None
+        while True:
+            parts, excess = PARTS[self.level], math.inf
+            # Another sweep over short pieces costs little.
+            left = max(OF_STARTS * min(block.count / SHORT, 1.0) * self.rtol, LEAST_CHANGE)
+            solved = block.solve(self.z, parts, left * max(self.loudest * form.gain, self.least))
+            self.evaluated += (form.inner + 1) * parts * block.n * block.sweeps
+            if solved:
+                peak = float(block.peaks.max())
+                # Under `mobile` the run stays on the branch on which it starts.
+                near = not form.mobile or abs(block.xi[0] - starts_at) <= 0.01 * peak
+                if not (near and block.on_one_branch and form.gap(np.array(peak)) <= form.u_top):
+                    return Outcome.LOST, seen, excess
+                peak = max(peak, self.peak)
+                seen = block.judge(parts, peak, self.alike, self.chance)
+                excess = self._excess(seen, peak, share)
+            if excess <= 1.0:
+                return Outcome.MET, seen, excess
+            self.refused += parts * block.n
+            if self.level + 1 == len(PARTS):
+                return Outcome.NOT_MET, seen, excess
+            finer = math.ceil(math.log(excess) / math.log(FINER[form.bent])) if excess < math.inf else 1
+            self.level = min(self.level + max(1, finer), len(PARTS) - 1)
+
+    def _growing(self, piece: Piece, values: FloatArray) -> tuple[Piece, FloatArray]:
+        """A piece on one line of the source, with steps that grow from a part of the shortest time constant on."""
+        span = piece.stop - piece.start
+        shortest = min(EARLY / float(self.form.lanes.rates.max()), span / (PIECES * GROWN))
+        share = np.append(0.0, np.geomspace(shortest / span, 1.0, PIECES * GROWN))
+        share[-1] = 1.0
+        line = values[0] + share * (values[-1] - values[0])
+        return replace(piece, times=piece.start + share * span), line
+
+    def _excess(self, seen: Judged, peak: float, share: float) -> float:
+        """Excess of the stated over the allowed error, with a block's.
+
+        It is related to a `share` of the largest gap voltage to expect at least.
+        """
+        gaps, _, _ = self._stated(np.maximum(seen.errors, self.errors), peak)
+        least = max(self.least, share * self.expected)
+        gaps[0, :2] = np.maximum(gaps[0, :2], [least, float(self.form.force(np.array(least)))])
+        excess = excess_of(gaps, self.problem.rounding) / self.rtol
+        if self.share < 1.0:
+            excess = max(excess, SAFETY * seen.alone / (self.share * self.rtol * max(peak, self.least)))
+        return excess
+
+    def _write(self, piece: Piece, block: Block, parts: int, t_out: FloatArray, out: FloatArray) -> None:
+        """Write the outputs before the end of a block."""
+        first, n = self.outputs, block.n
+        slack = 8e-16 * (abs(piece.start) + n * piece.spacing)
+        last = first + int(np.searchsorted(t_out[first:], piece.stop - slack))
+        if last == first:
+            return
+        t, times = t_out[first:last], piece.times
+        if t.size == n and (
+            on_grid(t, piece.start, piece.spacing, slack) if times is None else np.abs(t - times[:-1]).max() <= slack
+        ):
+            slope = np.diff(block.x[: n + 1]) / block.h[:n] if self.form.flows else block.x
+            self._show(block.x, slope, block.first, block.kept, block.xi[:n], out)
+            return
+        samples = piece.start + piece.spacing * np.arange(n) if times is None else times[:-1]
+        number = np.clip(np.searchsorted(samples, t + slack, side="right") - 1, 0, n - 1)
+        length = np.broadcast_to(block.h[:n], n)[number]
+        since = t - samples[number]
+        since[np.abs(since) <= slack] = 0.0
+        x, z = block.at(number, np.clip(since, 0.0, length), length, parts)
+        self._show_at(x, (block.x[number + 1] - block.x[number]) / length, z, out)
+
+    def _show_at(self, x: FloatArray, slope: FloatArray, z: FloatArray, out: FloatArray) -> None:
+        """Write outputs as `_show`, from states (rows, n)."""
+        n, xi, kept = x.size, np.empty(x.size), z[:, None]
+        show(self.form.xi[None], x, _ONE_ROW, n, 0, n, kept, xi[None])
+        self._show(x, slope, _ONE_ROW, kept, xi, out)
+
+    def _show(
+        self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, xi: FloatArray, out: FloatArray
+    ) -> None:  # fmt: skip
+        """Write the next outputs into columns of `out`: from the source, its slope (V/s), states as in `Block`, and xi.
+
+        The latter has the shape (n,).
+        """
+        form, n, shown, start = self.form, xi.size, self.form.rows, self.outputs
+        count, charges, self.outputs = n if first.size == 1 else int(first[1]), len(shown.k) - form.flows, start + n
+        show(form.shown, x, first, count, start, n, kept, out)
+        rows = out[:, start : self.outputs]
+        if shown.by_area.any():
+            inverse = form.inverse_area(xi)
+            for i in np.flatnonzero(shown.by_area):
+                rows[i] = rows[i] * inverse + shown.k[i] * x[:n]
+        if shown.bends.any():
+            moved = form.moved(xi, x[:n])
+            for i in np.flatnonzero(shown.bends):
+                rows[i] += shown.bends[i] * moved
+        for by, share, own in zip(form.shown[charges:], shown.bends[charges:], rows[len(shown.k) :], strict=True):
+            flow(form.lanes, by, float(share), x, slope, first, count, kept, xi, own)
+
+    def finish(self, t_out: FloatArray, out: FloatArray) -> None:
+        """Write the outputs at the end of the run."""
+        count, after = t_out.size - self.outputs, 1e-3 * self.usual
+        if count:
+            # With the source's slope after the end of the run.
+            here, later = self.wave.value([self.problem.t_stop, self.problem.t_stop + after]).tolist()
+            x, slope = np.full(count, self.u_last), np.full(count, float(later - here) / after)
+            self._show_at(x, slope, np.repeat(self.z[:, None], count, axis=1), out)
+
+    def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
+        """Peaks and stated errors as in `Run.gaps`, and stated errors of the nodes (V) and the charge (C)."""
+        form, u_peak = self.form, self.problem.scene.u_peak
+        missed, at = form.missed, np.array(peak)
+        u, force = float(form.gap(at)), float(form.force(at))
+        floor = 4e-16 * (peak + form.gain * max(u_peak, self.loudest))
+        floor += (1.0 / self.margin if form.mobile else DIVIDED) * missed * peak
+        floor += form.lanes.kappa * form.missed_bend
+        u_error = SAFETY * float(errors[0]) + floor
+        f_error = OF_FORCE * float(errors[1]) + (2.0 * floor / (u or 1.0) + missed) * force
+        node_error = SAFETY * float(errors[2]) + 4e-16 * (peak + u_peak) + floor
+        charge_error = None
+        if form.flows:
+            charge_error = OF_CHARGE * float(errors[3])
+            charge_error += form.missed_bend * float(np.abs(form.rows.bends[-form.flows :]).max())
+            charge_error += (LEAKED * missed + 4e-16 * (1.0 + self.steps)) * form.held * (self.problem.largest + peak)
+        return np.array([[u, force, u_error, f_error]]), node_error, charge_error
+
+    def mark(self) -> dict[str, Any]:
+        """The state of the integration as plain data, which `stand` restores in another march through the same run."""
+        return {name: np.asarray(getattr(self, name)).tolist() for name in self._MARKED}
+
+    def stand(self, mark: dict[str, Any]) -> None:
+        """Restore the state of another march through the same run."""
+        for name, value in mark.items():
+            setattr(self, name, np.array(value) if isinstance(value, list) else value)
+
+    def run(self, t: FloatArray, left: BoolArray, rows: FloatArray) -> Run:
+        """The run so far, with the given outputs."""
+        stats = {"steps": self.steps, "rejected": self.refused, "zeros": 0}
+        run = Run(t, left, rows, Status.SUCCESS, self.evaluated, stats, self.state)
+        run.gaps, run.node_error, run.charge_error = self._stated(self.errors, self.peak)
+        run.margin, run.by_layer = self.margin, self.problem.scene.stack is not None
+        return run
+
 
 # Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
 # and add up, a later piece cannot make up for errors of the earlier ones.

@@ -13,19 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, whole_number
-from fingerspice.base.card import require_card
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.notices import scenes_warnings
+from fingerspice.circuit.describe import require_circuit, scenes_warnings
+from fingerspice.engine.lockstep.card import require_card
 from fingerspice.results.outcome import SolveError
-from fingerspice.results.signals import SIGNALS
+from fingerspice.results.record import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import RTOL_RANGE, simulate
-from fingerspice.studies.batch.figures import Figures, Slopes
-from fingerspice.studies.batch.form import LockstepForm, lockstep_form, why_alone
-from fingerspice.studies.batch.ladder import Ladder
-from fingerspice.studies.batch.task import (
+from fingerspice.studies.batch.form import (
     FAILED,
     ONE_BY_ONE,
     REFUSED,
@@ -33,12 +29,16 @@ from fingerspice.studies.batch.task import (
     STATUS_NAMES,
     Answers,
     Gradients,
+    LockstepForm,
     Task,
     checked_scenes,
     frequencies,
     gradients_of,
+    lockstep_form,
     task_of,
+    why_alone,
 )
+from fingerspice.studies.batch.ladder import Figures, Ladder, Slopes
 from fingerspice.studies.steady import SteadyState, steady_state
 from fingerspice.waveforms.waveform import require
 

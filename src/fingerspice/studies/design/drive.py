@@ -1,28 +1,226 @@
-"""The drive that `inverse_drive` has found: its figures, page, picture and files."""
+"""The finger of an inverse drive: the gap voltage for a force wanted there, and the source voltage for that.
+
+The drive that `inverse_drive` has found: its figures, page, picture and files.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import BoolArray, ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside, write_csv
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, Element
 from fingerspice.circuit.describe import head_lines, heading
+from fingerspice.circuit.loop import areas_at_rest, network_of
+from fingerspice.circuit.network import Network
+from fingerspice.circuit.topology import find_branches
+from fingerspice.engine.inverse import drive_stack, hold
+from fingerspice.physics.contact import Contact, fixed_area_curve
 from fingerspice.plots import drawing
-from fingerspice.results.signals import Sealed
+from fingerspice.results.record import Sealed
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
+
+
+#: Source voltages for gap voltages u (V, shape (n,), positive in the direction of the source) at intervals h (s), and
+#: the samples at a limit: of `inverter(u, h, largest voltage (V), largest slew rate (V/s))`.
+Inverter = Callable[[FloatArray, float, float, float], tuple[FloatArray, BoolArray]]
+#: Gap voltages (V) at a rate (Hz) that rise in some steps, and then produce forces (N), on a carrier (Hz) if one is
+#: given: of `voltages(forces, rate, carrier, steps)`.
+Voltages = Callable[[FloatArray, float, float | None, int], FloatArray]
+
+# Default time in which the force rises to its first value, for networks other than a series stack, s.
+_LEAD = 2e-3
+# Over the length of the Fourier transform a signal is damped by exp(-_DAMPING), so that its end does not wrap round to
+# its beginning. The signal fills at most half of that length, so undoing the damping amplifies round-off by the square
+# root of that factor.
+_DAMPING = 14.0
+# Smallest response of the gap voltage to the source, relative to the largest over all frequencies; a smaller response
+# counts as none.
+_DEAF = 1e-9
+# Number of amplitudes of the carrier between which the mean force is interpolated.
+_GRID = 80
+
+
+@dataclass(frozen=True)
+class Finger:
+    """The one finger of a circuit with one source, under a charge law."""
+
+    circuit: Circuit
+    law: str
+    gap: Element
+    source: Element
+    contact: Contact
+    area: float | None  # Area fixed by the deck, m^2, or None
+    network: Network
+
+    @property
+    def lead(self) -> float:
+        """Default time in which the force rises, s: none for a stack, whose gap voltage jumps with the source."""
+        return _LEAD if self.network.stack is None else 0.0
+
+    @property
+    def sign(self) -> float:
+        """Sign of the GAP's voltage, from p to n, relative to the voltage along the source."""
+        stack = self.network.stack
+        if stack is None or stack.gap is None:
+            return 1.0
+        return float(stack.sign[stack.gap]) * stack.sources[0][1]
+
+    def inverter(self, u_max: float) -> Inverter:
+        """What computes the source voltage for gap voltages up to `u_max` (V).
+
+        A stack is inverted step by step; while a limit holds the source, its layers' state follows from the source.
+        """
+        stack = self.network.stack
+        if stack is None:
+            wish = _linear_inverse(self.network)
+        else:
+            assert stack.contact is not None
+            assert stack.gap is not None
+            gap, area = stack.gap, stack.area_given
+            curve = stack.contact.curve(1.2 * max(u_max, 1.0)) if area is None else fixed_area_curve(area)
+            cells = np.column_stack([stack.c, stack.g_total, stack.g_area])
+
+        def drive(u: FloatArray, h: float, limit: float, slew: float) -> tuple[FloatArray, BoolArray]:
+            out, held = np.empty(u.size), np.empty(u.size, np.bool_)
+            if stack is None:
+                hold(wish(u, h), limit, slew * h, out, held)
+            else:
+                drive_stack(u, h, curve, cells, gap, self.law == "mobile", limit, slew * h, out, held)
+            return out, held
+
+        return drive
+
+
+def the_finger(circuit: Circuit, charge_law: str | None) -> Finger:
+    """The finger and the source of a circuit that has one of each; others, and a delayed area, are refused."""
+    law = charge_law or circuit.charge_law or "local"
+    require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
+    gaps = circuit.by_device("GAP")
+    if len(gaps) != 1:
+        found = ", ".join(g.name for g in gaps) or "none"
+        raise InputError(f"an inverse drive is that of one finger; this circuit has the GAPs {found}; allowed: one GAP")
+    sources = [e for e in find_branches(circuit)[1] if e.device in "VI"]
+    if len(sources) != 1 or sources[0].device != "V":
+        found = ", ".join(e.name for e in sources) or "none"
+        raise InputError(f"an inverse drive is that of one V source; this circuit has {found}; allowed: one V element")
+    tau = gaps[0].values["tau"]
+    if tau > 0.0:
+        raise InputError(f"{gaps[0].name} has tau={tau:g} s: its area follows with a delay; allowed here: tau=0")
+    network = network_of(circuit)
+    (place,) = network.fingers
+    contact = network.contacts[place]
+    assert contact is not None
+    return Finger(circuit, law, gaps[0], sources[0], contact, network.areas[place].given, network)
+
+
+def _linear_inverse(net: Network) -> Callable[[FloatArray, float], FloatArray]:
+    """Inverts the linear response of a network at its areas at rest: source voltages from gap voltages and interval.
+
+    The signals are damped by exp(-a t), which evaluates the response at s = a + i omega. There it has no zero (a
+    floating body passes no direct voltage, a zero at s = 0), and the end of the signal does not wrap round.
+    """
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    areas = areas_at_rest(net)
+    leak, c = net.leak(areas), net.capacitance(areas)
+    gap = next(g for g in net.gaps if g is not None)
+
+    # It takes longer than the transforms, and is asked for again and again for drives of one length.
+    @lru_cache(maxsize=1)
+    def response(m: int, h: float) -> ComplexArray:
+        s = _DAMPING / (m * h) + 2j * np.pi * np.arange(m // 2 + 1) / (m * h)
+        y = leak + s[:, None] * c
+        kernel = net.k + np.einsum("ci,fc,cj->fij", net.p, y, net.p, optimize=True)
+        right = net.b[:, 0] + np.einsum("ci,fc,c->fi", net.p, y, net.q[:, 0], optimize=True)
+        x = np.linalg.solve(kernel, -right[:, :, None])[:, :, 0]
+        gain = x @ net.p[gap] + net.q[gap, 0]
+        if not np.all(np.abs(gain) > _DEAF * np.abs(gain).max(initial=0.0)):
+            raise InputError(
+                f"{net.sources[0].name} does not drive the gap at every frequency of the drive; allowed: a source with "
+                "a path to the GAP, and a lower rate"
+            )
+        return np.asarray(gain)
+
+    def wish(u: FloatArray, h: float) -> FloatArray:
+        n, m = u.size, next_fast_len(2 * u.size, real=True)
+        damp = np.exp(-_DAMPING / (m * h) * h * np.arange(m))
+        spectrum = rfft(np.append(u, np.full(m - n, u[-1])) * damp)
+        return np.asarray(irfft(spectrum / response(m, h), m)[:n] / damp[:n])
+
+    return wish
+
+
+def force_curve(finger: Finger, points: float | None, most: float) -> Voltages:
+    """What computes gap voltages for forces up to `most` (N), which are means over each period of a carrier.
+
+    `points` is the number of samples in a period of the carrier, between which the voltage is linear, or None without a
+    carrier.
+    """
+    from scipy.interpolate import CubicSpline
+
+    shape, weight = np.ones(1), np.ones(1)
+    if points is not None:
+        count = round(points) if abs(points - round(points)) < 1e-9 else round(8 * points)
+        at = np.sin(2.0 * np.pi * np.arange(count + 1) / points)
+        shape = np.abs(np.concatenate([at[:-1], 0.5 * (at[1:] + at[:-1])]))
+        # Simpson's rule between samples: the voltage is linear there, so the force is a parabola but for the change of
+        # the area.
+        weight = np.repeat([1.0 / 3.0, 2.0 / 3.0], count) / count
+
+    def force_at(u: FloatArray) -> FloatArray:
+        area = finger.contact.area(u) if finger.area is None else finger.area
+        return np.asarray(finger.contact.stress(u) * area)
+
+    def mean(amplitude: FloatArray) -> FloatArray:
+        return np.asarray(force_at(amplitude[:, None] * shape) @ weight)
+
+    top = 1.0
+    while mean(np.array([top]))[0] < 1.01 * most:
+        if top > 1e6:
+            raise InputError(
+                f"the force wanted, {most:g} N, is reached by no voltage: at 1 MV the gap has "
+                f"{float(mean(np.array([1e6]))[0]):.3g} N; allowed: less"
+            )
+        top *= 1.4
+    amplitude = top * np.arange(1, _GRID + 1) / _GRID
+    force = mean(amplitude)
+    rising = np.concatenate([[True], np.diff(force) > 0.0])
+    last = _GRID if rising.all() else int(np.argmin(rising))
+    root = np.sqrt(force[:last])
+    if root[-1] ** 2 < most:
+        raise InputError(f"the force wanted, {most:g} N, is reached by no voltage; allowed: at most "
+                         f"{root[-1] ** 2:.3g} N")  # fmt: skip
+    # The voltage over the root of the force, which at 0 V is that of a small voltage.
+    scale = float(force_at(np.array([1e-3]))[0]) / 1e-3**2
+    at_zero = math.sqrt(1.0 / float(weight @ shape**2) / scale)
+    spline = CubicSpline(np.append(0.0, root), np.append(at_zero, amplitude[:last] / root))
+
+    def voltages(force: FloatArray, rate: float, carrier: float | None, lead: int) -> FloatArray:
+        u = np.sqrt(force) * spline(np.sqrt(force))
+        # The rise has zero first and second derivative at both ends.
+        x = np.arange(lead) / max(lead, 1)
+        u = np.append(u[0] * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x)), u)
+        if carrier is not None:
+            u *= np.sin(2.0 * np.pi * carrier / rate * (np.arange(u.size) - lead))
+        return u
+
+    return voltages
+
 
 _FULL = 2.0**31
 

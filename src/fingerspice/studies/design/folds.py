@@ -14,12 +14,11 @@ from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
-from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import head_lines, heading
+from fingerspice.circuit.describe import head_lines, heading, require_circuit
 from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
 from fingerspice.results.outcome import SolveError, Status
-from fingerspice.solve.folding import meets_fold
+from fingerspice.solve.closed_form import meets_fold
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.runs import Progress
 from fingerspice.solve.simulation import run_problem

@@ -18,15 +18,23 @@ from fingerspice.base.announcing import Bar
 from fingerspice.base.arrays import FloatArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Table
-from fingerspice.circuit.arguments import require_circuit
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import meaning_of
-from fingerspice.circuit.notices import scenes_warnings
-from fingerspice.results.signals import SIGNALS
+from fingerspice.circuit.describe import meaning_of, require_circuit, scenes_warnings
+from fingerspice.results.record import SIGNALS
 from fingerspice.solve.simulation import rtol_given
 from fingerspice.studies.fit.circuitdata import IMPEDANCE, MEASURED, Data, Task, data_of
-from fingerspice.studies.fit.result import Drawn, FitResult, estimated, misfit_note, profile_of
-from fingerspice.studies.fit.search import FARTHEST, Fitted, Unknown, bounded, followed
+from fingerspice.studies.fit.result import (
+    FARTHEST,
+    Drawn,
+    FitResult,
+    Fitted,
+    Unknown,
+    bounded,
+    estimated,
+    followed,
+    misfit_note,
+    profile_of,
+)
 from fingerspice.waveforms.waveform import require
 
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.

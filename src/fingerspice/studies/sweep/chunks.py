@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 from fingerspice import __version__
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import digests
-from fingerspice.circuit.notices import scenes_warnings
-from fingerspice.results.store import CHECKSUM, Array, attributes_of, create
+from fingerspice.circuit.describe import digests, scenes_warnings
+from fingerspice.results.runfile import CHECKSUM, Array, attributes_of, create
 from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.task import LOCKSTEP, REFUSED, STATUS_NAMES, checked_scenes
+from fingerspice.studies.batch.form import LOCKSTEP, REFUSED, STATUS_NAMES, checked_scenes
 from fingerspice.studies.sweep.plan import Plan, Sequence
 from fingerspice.waveforms.waveform import require
 

@@ -15,7 +15,7 @@ from fingerspice.base.arrays import FloatArray, real_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.task import REFUSED
+from fingerspice.studies.batch.form import REFUSED
 from fingerspice.studies.sweep.plan import BITS, Plan, make_plan, with_sets
 from fingerspice.studies.sweep.workers import stored
 from fingerspice.waveforms.waveform import require

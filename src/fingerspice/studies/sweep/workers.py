@@ -21,7 +21,7 @@ from fingerspice.base.announcing import paced
 from fingerspice.base.arrays import keep_freed_memory, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.results.store import tidy
+from fingerspice.results.runfile import tidy
 from fingerspice.studies.batch.batch import MESSAGES
 from fingerspice.studies.sweep.chunks import Work, identity_at, make_work
 from fingerspice.studies.sweep.plan import Plan

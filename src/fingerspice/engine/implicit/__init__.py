@@ -1,1 +1,0 @@
-"""Radau collocation, the last resort."""
