@@ -47,9 +47,9 @@ class Figures:
     f_el_mean: float | NDArray[np.float64]  # N
     area_mean: float | NDArray[np.float64]  # m^2
 
-    def of_gap(self, name: str, i: int) -> float:
-        """A figure of one GAP."""
-        return float(np.atleast_1d(getattr(self, name))[i])
+    def of_gap(self, i: int) -> dict[str, float]:
+        """The figures of one GAP by their names."""
+        return {name: float(np.atleast_1d(value)[i]) for name, value in vars(self).items()}
 
 
 # Of every figure: its unit in tables, the factor from SI to that unit, and its name on the page and in the picture.
@@ -90,7 +90,7 @@ class Comparison(Shown):
         head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
         said = []
         for i, gap in enumerate(self.gaps):
-            reference, mean, coupled = (f.of_gap("f_el_mean", i) for f in (self.phasor, self.mean, self.coupled))
+            reference, mean, coupled = (f.of_gap(i)["f_el_mean"] for f in (self.phasor, self.mean, self.coupled))
             # Round before formatting, and add 0.0, so that -0.00 is not printed.
             total = round(100.0 * (coupled / reference - 1.0), 2) + 0.0
             waveform = round(100.0 * (mean / reference - 1.0), 2) + 0.0
@@ -112,9 +112,9 @@ class Comparison(Shown):
         start, stop = float(solution.t[0]), float(solution.t[-1])
         source_phase = solution.fundamental.phase if solution.fundamental else 0.0
         turns = 2.0 * np.pi * self.frequency * solution.t + source_phase
-        waves = [np.sin(turns + np.radians(p.of_gap("phase_deg", i))) for i in range(len(self.gaps))]
-        voltages = [p.of_gap("amplitude", i) * wave for i, wave in enumerate(waves)]
-        forces = [2.0 * p.of_gap("f_el_mean", i) * wave**2 for i, wave in enumerate(waves)]
+        waves = [np.sin(turns + np.radians(p.of_gap(i)["phase_deg"])) for i in range(len(self.gaps))]
+        voltages = [p.of_gap(i)["amplitude"] * wave for i, wave in enumerate(waves)]
+        forces = [2.0 * p.of_gap(i)["f_el_mean"] * wave**2 for i, wave in enumerate(waves)]
         for ax, keys, curves in zip(axes, (["u_source", "u_gap"], ["f_el"]), (voltages, forces), strict=False):
             signal, traces = SIGNALS[keys[-1]], picture.traces_of(runs, keys)
             factor, unit = picture.scale_of(signal, traces, start, stop)
@@ -163,7 +163,7 @@ class Comparison(Shown):
         out = []
         for i, gap in enumerate(self.gaps):
             for name, (unit, factor, *_) in _FIGURES.items():
-                p, m, c = (factor * f.of_gap(name, i) for f in (self.phasor, self.mean, self.coupled))
+                p, m, c = (factor * f.of_gap(i)[name] for f in (self.phasor, self.mean, self.coupled))
                 out.append((name if len(self.gaps) == 1 else f"{name}:{gap}", unit, p, m, c, c - p, c - m))
         return out
 
