@@ -190,13 +190,13 @@ def test_the_charge_is_what_every_layer_stores_and_leaks(name: str, r_coat: str,
 def held(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Lengths of the inputs given to the hold recursion."""
     calls: list[int] = []
-    recursion = closed_form.hold.first_order_hold
+    recursion = closed_form.linear.first_order_hold
 
     def counted(u: Any, *arguments: Any, **options: Any) -> Any:
         calls.append(len(u))
         return recursion(u, *arguments, **options)
 
-    monkeypatch.setattr(closed_form.hold, "first_order_hold", counted)
+    monkeypatch.setattr(closed_form.linear, "first_order_hold", counted)
     return calls
 
 

@@ -121,7 +121,7 @@ def run(
         how |= {"method": method, "start": start, "t_stop": t_stop}
         results = Results(deck, circuit, out, name, overwrite, charge_law)
         if stream or chunk or signals or netcdf:
-            from fingerspice.cli.sweep import run_streamed
+            from fingerspice.cli.store import run_streamed
 
             if not stream:
                 raise InputError("--chunk, --signals and --netcdf go with --stream")

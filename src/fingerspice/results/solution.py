@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.outcome import Plan, SampleGradient, Sensitivity
+    from fingerspice.results.outcome import Plan
+    from fingerspice.results.sensitivity import SampleGradient, Sensitivity
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import ClosedForm, Recorded
     from fingerspice.sets.parameters import Citation

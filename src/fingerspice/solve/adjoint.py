@@ -20,7 +20,8 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.engine.lanes.loops import AREAS, GAP, MORE, SQUARES, lead, sum_back
 from fingerspice.numerics.modes import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
-from fingerspice.results.outcome import MEANS, SIGNALS, Failure, SampleGradient, SolveError, Status
+from fingerspice.results.outcome import Failure, SolveError, Status
+from fingerspice.results.sensitivity import MEANS, SIGNALS, SampleGradient
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block, driving

@@ -17,7 +17,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.integrate import OdeSolution, solve_ivp
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.network import Modes
@@ -317,7 +316,7 @@ class _Path(NamedTuple):
     segment: Segment
     sign: float
     scale: FloatArray
-    solution: OdeSolution
+    solution: Any  # An `OdeSolution` of scipy
 
     @property
     def t(self) -> float:
@@ -411,6 +410,8 @@ def _path(problem: Problem, state: StackState, begun: tuple[Segment, float, floa
         margin, speed = at(z)
         along: FloatArray = np.concatenate([dy * margin, [margin, speed]]) * pace / scale
         return along
+
+    from scipy.integrate import solve_ivp
 
     begin = np.concatenate([y, [0.0, u]]) / scale
     far = 3.0 * at(begin)[0]

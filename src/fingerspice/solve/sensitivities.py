@@ -17,7 +17,8 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
 from fingerspice.numerics.modes import AT, derivative
-from fingerspice.results.outcome import MEANS, SIGNALS, Sensitivity, SolveError, Status
+from fingerspice.results.outcome import SolveError, Status
+from fingerspice.results.sensitivity import MEANS, SIGNALS, Sensitivity
 from fingerspice.results.solution import Solution
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import driving

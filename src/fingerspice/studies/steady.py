@@ -26,7 +26,8 @@ from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.loop import areas_at_rest, linear_scene, with_skin_held
 from fingerspice.circuit.network import build_network
 from fingerspice.physics.materials import SKIN_BAND
-from fingerspice.results.outcome import ErrorEstimate, Sensitivity, SolveError
+from fingerspice.results.outcome import ErrorEstimate, SolveError
+from fingerspice.results.sensitivity import Sensitivity
 from fingerspice.results.solution import Solution
 from fingerspice.results.spectrum import PhasorSolution
 from fingerspice.results.summary import Figured, Figures

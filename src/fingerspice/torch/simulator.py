@@ -20,7 +20,8 @@ from fingerspice.base.arrays import FloatArray, positive_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
-from fingerspice.results.outcome import MEANS, SIGNALS, SolveError
+from fingerspice.results.outcome import SolveError
+from fingerspice.results.sensitivity import MEANS, SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import batch

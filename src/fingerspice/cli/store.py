@@ -1,0 +1,290 @@
+"""A run on the disk (``run --stream``): a Zarr store that grows chunk by chunk, and can be continued after a crash.
+
+Every chunk of the run is one chunk of each array. The number of finished chunks is an attribute of the store's group,
+whose file is replaced atomically after the chunk's data have reached the disk.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import time
+import warnings
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fingerspice import __version__
+from fingerspice.base.announcing import paced
+from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.files import UNFINISHED, settle_on_disk, write_aside, write_durably
+from fingerspice.cli.options import check_output, time_from_text
+from fingerspice.cli.result_files import Results
+from fingerspice.cli.terminal import Answering
+from fingerspice.results.record import variables
+from fingerspice.results.runfile import CHECKSUM, SIGNATURE, Array, attributes_of, create, signature, tidy, zarr_library
+
+if TYPE_CHECKING:
+    from fingerspice.circuit.circuit import Circuit
+    from fingerspice.results.solution import Solution
+    from fingerspice.solve.streaming import Stream
+
+#: Attributes of the group: identity of the run, number of finished chunks, state to continue from, results so far, and
+#: the number of columns of each array, 0 for one without.
+RUN, DONE, MARK, SO_FAR, COLUMNS = "run", "chunks_done", "goes_on", "so_far", "arrays"
+# Number of bytes of the store that are copied at once.
+_PIECE = 1 << 25
+
+
+class Store:
+    """A store of one run in a folder.
+
+    `run` is its identity, all inputs that determine its results, as plain data; the run has `total` outputs, and a
+    chunk `count`. Within `lock`, no other process writes the store.
+    """
+
+    def __init__(self, path: Path, run: dict[str, Any], total: int, count: int) -> None:
+        self.zarr = zarr_library()
+        self.run = json.loads(json.dumps({**run, "kind of checksum": CHECKSUM}))
+        self.path, self.total, self.count = path, total, count
+        self.chunks, self.done, self.there = -(-total // count), 0, False  # Chunks of the whole run
+        self.mark: dict[str, Any] = {}
+        self.so_far: dict[str, Any] = {}
+        self.lock = ExitStack()
+
+    def _hold(self, folder: Path) -> None:
+        """Keep other processes from the store in a folder, also after it is renamed."""
+        # Without locks, as on some file systems, nothing is refused.
+        with suppress(OSError):
+            number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+            self.lock.callback(os.close, number)
+            try:
+                fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise self._busy() from None
+
+    def _busy(self) -> InputError:
+        return InputError(f"another process writes {self.path}; allowed: to wait for it, --name NAME, or another --out")
+
+    def open(self, overwrite: bool) -> None:
+        """Open an existing store of the same run, to continue it; with `overwrite` remove any store.
+
+        A folder that is no store is refused, as is a store that is damaged, of another run, or being written.
+        """
+        if not os.path.lexists(self.path):
+            return
+        self._hold(self.path)
+        try:
+            attributes = attributes_of(self.path)
+            whole = all(isinstance(attributes[key], dict) for key in (RUN, MARK, SO_FAR, COLUMNS))
+            sound = attributes.get(SIGNATURE, "") in ("", signature(attributes))
+            whole = whole and sound and isinstance(attributes[DONE], int) and attributes[DONE] >= 0
+        except (OSError, ValueError, KeyError, TypeError):
+            whole = False
+        if not whole:
+            raise InputError(f"{self.path} is there already and is no whole store of a run; allowed: --name or --out")
+        if overwrite:
+            shutil.rmtree(self.path)
+            return
+        self.there = True
+        for key, own in self.run.items():
+            held = attributes[RUN].get(key)
+            if held != own:
+                said = "" if len(f"{held}{own}") > 80 else f" ({held}, and this one {own})"
+                what = f"{'other' if key == 'signals' else 'another'} {key.replace('_', ' ')}{said}"
+                ways = "allowed: --name NAME, another --out, or --overwrite"
+                raise InputError(f"{self.path} holds a run of {what}; {ways}")
+        self.done, self.mark, self.so_far = attributes[DONE], attributes[MARK], attributes[SO_FAR]
+        written: set[Path] = set()
+        for name, columns in attributes[COLUMNS].items():
+            array = self._array(name, columns)
+            for place in ((chunk, *(0,) * bool(columns)) for chunk in range(self.done)):
+                if fault := array.fault(place):
+                    raise InputError(f"{self.path} is damaged: {array.file(place)} {fault}; allowed: --overwrite")
+                written.add(array.file(place))
+        # What a call that was killed has left.
+        tidy(self.path)
+        for file in self.path.glob("*/c/**/*"):
+            if file not in written and file.is_file():
+                file.unlink()
+
+    def _array(
+        self, name: str, columns: int, dims: tuple[str, ...] = (), attributes: Mapping[str, Any] | None = None
+    ) -> Array:
+        more = (columns,) if columns else ()
+        return Array(self.path / name, dims, (self.total, *more), (self.count, *more), attributes or {})
+
+    def write(self, chunk: int, solution: Solution, signals: list[str], about: dict[str, Any], mark: Any) -> None:
+        """Write a chunk, then record it as finished; `mark` is the state from which the run continues."""
+        data, coords = variables(solution, np.ones(solution.t.size, bool), signals)
+        data = {"time": coords["time"], **data}
+        columns = {name: values.shape[1] if values.ndim > 1 else 0 for name, (_, values, _) in data.items()}
+        names = {dim: one[1].tolist() for dim, one in coords.items() if dim != "time"}
+        arrays = {
+            name: self._array(name, columns[name], dims, said | {d: names[d] for d in dims[1:]})
+            for name, (dims, _, said) in data.items()
+        }
+        self.so_far = {
+            "method": solution.method, "area": solution.area_mode, "tier": solution.plan.tier,
+            "t_stop": solution.t_stop, "error": vars(solution.error), "fold_margin_min": solution.fold_margin_min,
+        }  # fmt: skip
+        try:
+            if not self.there:
+                self._create({**about, RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, COLUMNS: columns}, arrays)
+            for name, one in arrays.items():
+                place = (chunk, *(0,) * bool(columns[name]))
+                one.put(place, data[name][1])
+                settle_on_disk(one.file(place).parent)
+            head = json.loads((self.path / "zarr.json").read_text())
+            head["attributes"] |= {DONE: chunk + 1, MARK: mark, SO_FAR: self.so_far}
+            head["attributes"][SIGNATURE] = signature(head["attributes"])
+            write_durably(self.path / "zarr.json", json.dumps(head, indent=1).encode())
+        except OSError as error:
+            raise InputError(
+                f"cannot write {self.path}: {error.strerror or error}; {self.done} of {self.chunks} pieces are "
+                "written, and the same command goes on from there"
+            ) from None
+        self.done = chunk + 1
+
+    def _create(self, attributes: dict[str, Any], arrays: Mapping[str, Array]) -> None:
+        """Create the store, which is locked before it has its name; refused if another process was faster."""
+        aside = self.path.with_name(f"{UNFINISHED}{os.urandom(6).hex()}")
+        try:
+            create(aside, attributes, arrays, {}, os.urandom(6).hex())
+            self._hold(aside)
+            if self.path.exists():
+                raise self._busy()
+            # It fails where another process has just done the same.
+            aside.rename(self.path)
+            settle_on_disk(self.path.parent)
+            self.there = True
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+
+    def to_netcdf(self, path: Path) -> Path:
+        """Write the whole run as NetCDF, piece by piece."""
+        import h5netcdf
+
+        group = self.zarr.open_group(self.path, mode="r")
+        # In an order of their own: that of a folder differs from machine to machine.
+        arrays = dict(sorted(group.arrays()))
+        size = sum(array.nbytes for array in arrays.values()) + 2**20
+
+        def write(target: Path) -> None:
+            # HDF5 ends the process on a full disk: reserve the room first, so that a full disk raises an error here.
+            with target.open("wb") as room:
+                if hasattr(os, "posix_fallocate"):
+                    os.posix_fallocate(room.fileno(), 0, size)
+                elif shutil.disk_usage(target.parent).free < size:
+                    raise OSError(f"it takes {size / 1e9:.3g} GB, which the disk has not")
+            with h5netcdf.File(target, "w") as file:
+                file.dimensions["time"] = self.total
+                for name, array in arrays.items():
+                    names = array.metadata.dimension_names
+                    for dimension, length in zip(names[1:], array.shape[1:], strict=True):
+                        if dimension not in file.dimensions:
+                            file.dimensions[dimension] = length
+                    variable = file.create_variable(name, names, dtype="f8")
+                    for key, value in array.attrs.asdict().items():
+                        variable.attrs[key] = value if isinstance(value, str) else json.dumps(value)
+                    rows = max(1, _PIECE // (8 * max(1, int(np.prod(array.shape[1:])))))
+                    for at in range(0, self.total, rows):
+                        variable[at : at + rows] = array[at : at + rows]
+                file.attrs.update({k: value for k, value in group.attrs.asdict().items() if isinstance(value, str)})
+
+        return write_aside(path, write)
+
+
+def run_streamed(
+    answer: Answering, results: Results, circuit: Circuit, how: dict[str, Any], *, chunk: str | None,
+    signals: str | None, netcdf: bool,
+) -> None:  # fmt: skip
+    """Run a circuit, write its chunks to a store, and fill the answer; what a failed run has written stays."""
+    from fingerspice.solve.streaming import stream
+
+    path = results.folder / f"{results.name}.zarr"
+    # The store is a folder, so check that a file can be written next to it.
+    check_output(path.with_suffix(".zarr.part"), results.deck)
+    names = _names(signals, circuit)
+    charge = any(name in ("q_source", "i_source") for name in names)
+    run = stream(circuit, chunk=time_from_text("--chunk", chunk), charge=charge, **how)
+    if netcdf:
+        results.will_write(".nc", lambda file: store.to_netcdf(file))
+    store = Store(path, _identity(run, circuit, how, names), run.outputs.total, run.count)
+    with store.lock:
+        store.open(results.overwrite)
+        if store.done and store.done < store.chunks:
+            run.go_to(store.mark, store.done * store.count)
+        results.open()
+        begun, first, total = time.perf_counter(), store.done, run.outputs.total
+        answer.data["files"].append(str(path))
+        if first < store.chunks:
+            _fill(run, store, names, results)
+        took, span = time.perf_counter() - begun, run.problem.t_stop - run.problem.t_start
+        said = [f"{total:,} outputs of {span:g} s in {store.chunks:,} piece{'s' if store.chunks > 1 else ''}: {path}"]
+        if first < store.chunks:
+            said.append(f"{(store.chunks - first) / store.chunks * span / took:,.3g} times real time")
+        error = store.so_far["error"]
+        said.append(f"stated error {error['u_gap']:.2g} V of the gap voltage, {error['f_el']:.2g} N of the force")
+        if first:
+            said.append(f"the first {first:,} were there already")
+        found = {"chunks": store.chunks, "found": first, "outputs": total, "seconds": took}
+        answer.update(**store.so_far, stream=found)
+        answer.give(lambda: "; ".join(said), results.ready())
+
+
+def _names(signals: str | None, circuit: Circuit) -> list[str]:
+    """Keys of the signals that are written, of those that the circuit has."""
+    from fingerspice.results.record import SIGNALS
+
+    has = {"gap": circuit.by_device("GAP"), "layer": [e for e in circuit.elements if e.spec.is_layer]}
+    allowed = [name for name, signal in SIGNALS.items() if has.get(signal.of, True)]
+    if signals is None:
+        return ["u_gap", "f_el"] if has["gap"] else ["u_layer"] if has["layer"] else ["v"]
+    names = [name.strip() for name in signals.split(",")]
+    if unknown := [name for name in names if name not in allowed]:
+        raise InputError(f"--signals names {unknown[0]!r}; allowed: {', '.join(allowed)}")
+    return sorted(set(names), key=list(SIGNALS).index)
+
+
+def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[str]) -> dict[str, Any]:
+    """All inputs that determine the bytes of a store, by which a later call recognises its own store."""
+    from fingerspice.base.compiled import STAMP
+    from fingerspice.circuit.describe import digests
+
+    elements, sources = digests(circuit)
+    o, scene = run.outputs, run.problem.scene
+    return {
+        "circuit": elements, "source": sources, "rtol": how["rtol"], "charge_law": scene.charge_law,
+        "area": scene.area_mode, "method": how["method"], "start": str(how["start"]), "chunk": run.count,
+        "signals": names, "end": run.problem.t_stop, "output_times": [o.start, o.over, o.low, o.total],
+        "program": f"fingerspice {__version__} ({STAMP[:12]}), NumPy {np.__version__}",
+    }  # fmt: skip
+
+
+def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None:
+    """Compute and write all missing chunks; a chunk is written while the next one is computed."""
+    about = {key: text for key, text in results.about.items() if key != "files"}
+    known: set[str] = set()
+    writing: Future[None] | None = None
+    start, span = run.problem.t_start, run.problem.t_stop - run.problem.t_start
+    first = float(run.outputs.times(run.done, run.done + 1)[0])
+    with ThreadPoolExecutor(1) as writer, paced("simulating", (first - start) / span) as show:
+        for number, solution in enumerate(run, store.done):
+            for text in solution.warnings:
+                if text not in known:
+                    known.add(text)
+                    warnings.warn(text, FingerspiceWarning, stacklevel=2)
+            if writing is not None:
+                writing.result()
+            writing = writer.submit(store.write, number, solution, names, about, run.mark())
+            reached = solution.t_stop
+            show((reached - start) / span, lambda s, t=reached: f"{(t - first) / s:,.3g} times real time,")
+        if writing is not None:
+            writing.result()
