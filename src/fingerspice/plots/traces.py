@@ -12,8 +12,8 @@ from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.describe import changes_text, heading
 from fingerspice.physics.materials import SKIN_BAND
-from fingerspice.plots import drawing, picture
-from fingerspice.plots.picture import Drawn
+from fingerspice.plots import drawing, lines
+from fingerspice.plots.lines import Drawn
 from fingerspice.results.record import SIGNALS, Signal, signal_of
 from fingerspice.waveforms.waveform import require
 
@@ -53,25 +53,25 @@ def plot_solution(
     )  # fmt: skip
     left, right = axes[:: len(widths)], [] if zoomed is None else axes[1::2]
     for row, (signal, keys) in enumerate(panels):
-        traces = picture.traces_of(runs, keys)
-        factor, unit = picture.scale_of(signal, traces, start, stop)
+        traces = lines.traces_of(runs, keys)
+        factor, unit = lines.scale_of(signal, traces, start, stop)
         for trace in traces:
-            picture.draw_line(left[row], trace, factor, start, stop, runs, envelope=marks if dense else None)
+            lines.draw_line(left[row], trace, factor, start, stop, runs, envelope=marks if dense else None)
             if zoomed is not None:
-                picture.draw_line(right[row], trace._replace(label="_"), factor, *zoomed, runs)
+                lines.draw_line(right[row], trace._replace(label="_"), factor, *zoomed, runs)
         if keys == ["f_el"] and len(traces) == 1:
-            picture.draw_mean(left[row], traces[0], factor, unit, told=not right)
+            lines.draw_mean(left[row], traces[0], factor, unit, told=not right)
             if right:
-                picture.draw_mean(right[row], traces[0], factor, unit)
+                lines.draw_mean(right[row], traces[0], factor, unit)
                 drawing.legend_above(right[row], 1)
-        room = picture.HALF if right else picture.PAGE
-        picture.finish_panel(left[row], signal, unit, [factor * t.x for t in traces], room)
+        room = lines.HALF if right else lines.PAGE
+        lines.finish_panel(left[row], signal, unit, [factor * t.x for t in traces], room)
         if keys == ["f_t"] and len(traces) == 1:
-            picture.coefficient_axis((right or left)[row], traces[0].solution, factor)
-    picture.time_axis(left, runs, start, stop)
-    small = picture.about_all(runs)
+            lines.coefficient_axis((right or left)[row], traces[0].solution, factor)
+    lines.time_axis(left, runs, start, stop)
+    small = lines.about_all(runs)
     if zoomed is not None:
-        picture.time_axis(right, runs, *zoomed)
+        lines.time_axis(right, runs, *zoomed)
         for ax in right:
             # Times in an enlargement have many digits, so that only three tick labels have room.
             ax.locator_params(axis="x", nbins=3)
@@ -138,7 +138,7 @@ def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[tupl
 def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[float, float]:
     """Start and end of the drawn interval, s."""
     times = [run.solution.t for run in runs if run.solution.t.size]
-    first, last = min((float(t[0]) for t in times), default=0.0), max(picture.end_of(run.solution) for run in runs)
+    first, last = min((float(t[0]) for t in times), default=0.0), max(lines.end_of(run.solution) for run in runs)
     if window is None:
         return first, last
     ends = real_numbers("window", window, "two times in s, (start, stop)")
@@ -159,7 +159,7 @@ def _turns(
         t = run.solution.t
         kept = (t >= start) & (t <= stop)
         for key in panels[0][1]:
-            for x in picture.columns_of(run.solution, key).values():
+            for x in lines.columns_of(run.solution, key).values():
                 step = np.diff(x[kept])
                 # Turning points of round-off are not counted.
                 steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
@@ -196,7 +196,7 @@ def plot_spectrum(spectrum: Spectrum) -> Picture:
     """Amplitudes of the lines, or the density with its confidence interval, against frequency, on logarithmic axes."""
     figure, (ax,) = drawing.new_figure(1, height=3.4)
     signal = signal_of(spectrum.signal)
-    color, unit = picture.COLORS[signal.axis], spectrum.unit.replace("^2", "²")
+    color, unit = lines.COLORS[signal.axis], spectrum.unit.replace("^2", "²")
     label = f"{signal.text.capitalize()} {spectrum.signal.partition(':')[2]}".rstrip()
     if spectrum.amplitude is not None:
         least = _DRAWN * drawing.peak_of(spectrum.amplitude)

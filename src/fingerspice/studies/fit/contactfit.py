@@ -23,7 +23,7 @@ from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
 from fingerspice.physics.contact import Contact, ridge_area
-from fingerspice.studies.fit.circuitdata import SIGMA, Given, measured_of
+from fingerspice.studies.fit.measured import SIGMA, Given, measured_of
 from fingerspice.studies.fit.result import (
     Drawn,
     FitResult,

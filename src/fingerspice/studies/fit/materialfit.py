@@ -16,7 +16,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.physics.materials import EPS0, Ladder
-from fingerspice.studies.fit.circuitdata import ALLOWED, COLUMNS, likely_slips, read_table
+from fingerspice.studies.fit.measured import ALLOWED, COLUMNS, likely_slips, read_table
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
