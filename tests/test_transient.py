@@ -82,7 +82,7 @@ def test_source_current_equals_the_reference(law):
 def test_start_from_the_dc_operating_point(law):
     segments = ref.sine_segments(100.0, 100.0, 0.02, offset=80.0)
     t = np.linspace(0.0, 0.0199, 57)
-    expected = ref.transient(segments, t, law=law, freq=100.0, start="dc", source_before=80.0)
+    expected = ref.transient(segments, t, law=law, freq=100.0, start="dc")
     waveform = fs.Sine(100.0, 100.0, offset=80.0)
     circuit = table1(tran="10u 20m")
     solution = fs.simulate(circuit, sources={"Vdrive": waveform}, t_eval=t, charge_law=law, rtol=1e-10)
