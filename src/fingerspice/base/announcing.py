@@ -15,11 +15,11 @@ _LOG = logging.getLogger("fingerspice")
 LONG = {
     ("engine.collocation.loop.march_on", "OneArea"): "the steps of a series stack, about 30 s",
     ("engine.collocation.loop.march_on", "ManyAreas"): "the steps of a network, about 60 s",
-    ("engine.lanes.loops.span", "StackMarks"): "the steps of a recording, about 20 s",
-    ("engine.lanes.loops.span", "MobileMarks"): "the steps of a recording, about 20 s",
-    ("engine.lanes.loops.span", "NetworkMarks"): "the steps of a recording in a network, about 30 s",
+    ("engine.lanes.loops.span", "StackMarks"): "the steps of a recording, about 10 s",
+    ("engine.lanes.loops.span", "MobileMarks"): "the steps of a recording, about 10 s",
+    ("engine.lanes.loops.span", "NetworkMarks"): "the steps of a recording in a network, about 20 s",
     ("engine.implicit.advance", "Nodal"): "implicit steps, about 15 s",
-    ("engine.lockstep.march.march", ""): "scenes in lockstep, about 20 s",
+    ("engine.lockstep.march.march", ""): "scenes in lockstep, about 15 s",
 }
 _KEPT = {
     True: "only once: later runs find it on the disk",
