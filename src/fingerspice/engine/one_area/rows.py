@@ -28,14 +28,14 @@ class Work(NamedTuple):
 
     r: FloatArray  # (N_FLAT, ROWS): See above
     # base, w, pull, used, pull_before, left_before (n, ROWS): The modes without and with the nonlinear term, this term
-    # at them and as it was used for them, and both of the iteration before (see `iteration.converge`)
+    # at them and as it was used for them, and both of the iteration before (see `exponential.converge`)
     base: FloatArray
     w: FloatArray
     pull: FloatArray
     used: FloatArray
     pull_before: FloatArray
     left_before: FloatArray
-    # w0, weight (n,): The modes at the start of the step; effect of each on the gap voltage (see `iteration.weigh`)
+    # w0, weight (n,): The modes at the start of the step; effect of each on the gap voltage (see `exponential.weigh`)
     w0: FloatArray
     weight: FloatArray
     # places, carried (n, N_PLACES) and (n, N_PLACES - 1): Errors of the modes, and those carried over from earlier
