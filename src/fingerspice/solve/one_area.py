@@ -24,7 +24,7 @@ from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import sided
 from fingerspice.solve.problem import Problem, segment_of
 from fingerspice.solve.scenes import Scene, kept_with
-from fingerspice.solve.starting import StackState, as_marched, from_stack, from_written, model_of, row_width
+from fingerspice.solve.starting import StackState, as_marched, from_stack, from_written, model_of, row_width, to_stack
 from fingerspice.solve.stepping import OutOfRangeError, Stepping
 
 # Number of modal systems cached with a scene, one for each decade of tolerances, of up to 1 MB each.
@@ -100,21 +100,27 @@ class Track(Stepping):
     def __init__(
         self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True, h_fixed: float = 0.0
     ) -> None:
-        scene, start = problem.scene, problem.inner
+        scene = problem.scene
         self.system, self.area_error = _prepared(scene, rtol, top)
-        self.start, model, n, shown = start, self.system.model, start.y.size - 1, scene.shown.turn.size
+        model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
         # Of the layer through which the charge is computed.
         self.capacitance = float(model.slow[-3]) * model.area0
         super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown, h_fixed)
-        self.y = start.y.copy()
         self.error = np.zeros(n + 1)
-        self.control["u_before"] = start.u_before
         self.control["branch_length"] = np.inf
         self.control["margin"] = 1.0
-        if model.mobile and problem.initial.sign[0] != 0.0:
-            self.control["u_gap"], self.control["sign"] = start.u_gap, math.copysign(1.0, start.u_gap)
+        self._start_from(problem.inner)
         self.look_for_period(self.system.rates, np.ones(n), repeat and h_fixed == 0.0)
+
+    def _start_from(self, start: StackState) -> None:
+        self.start, self.y[:], self.control["u_before"] = start, start.y, start.u_before
+        if self.system.model.mobile and self.sign[0] != 0.0:
+            self.control["u_gap"], self.control["sign"] = start.u_gap, math.copysign(1.0, start.u_gap)
+
+    def again(self, initial: State, tol: float) -> None:
+        super().again(initial, tol)
+        self._start_from(to_stack(self.problem.scene, initial))
 
     @property
     def rounding(self) -> list[float]:

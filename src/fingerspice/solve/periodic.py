@@ -1,13 +1,13 @@
 """One period of a circuit for the search of its periodic state: tables of the sources, and the linear circuit's state.
 
 The search solves for the modes' amplitudes at the start of the period, so this module converts between them and the
-voltages of the tree capacitors, and gives the periodic state of the circuit with fixed areas as a first guess.
+voltages of the tree capacitors, and gives the periodic state of the circuit with its areas at 0 V as a first guess.
 
 The periodic state of any circuit, by Newton's method on the map of one period.
 
 The unknown z consists of the modes of the live voltages, for the areas at 0 V, and of the areas with a time constant,
 relative to their values at 0 V. The first derivative of the map is that of the linear circuit with its areas held at
-their means. Broyden's updates improve it from period to period; finite differences, which cost a period for each slow
+0 V. Broyden's updates improve it from period to period; finite differences, which cost a period for each slow
 mode, replace it only where these updates do not lead to convergence.
 """
 
@@ -15,13 +15,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.network import Modes, network_modes
+from fingerspice.circuit.network import Modes
 from fingerspice.engine.collocation import readout
 from fingerspice.numerics import linear
 from fingerspice.physics.contact import inverse_area
@@ -29,13 +31,14 @@ from fingerspice.results.outcome import SolveError, State, Status
 from fingerspice.solve.many_areas import March
 from fingerspice.solve.marching import GUESS, stepping
 from fingerspice.solve.nodal import pass_through
+from fingerspice.solve.one_area import Track
 from fingerspice.solve.problem import Problem, joined
 from fingerspice.solve.runs import period_failure
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
 from fingerspice.waveforms.sampling import SourceTable, source_table
 from fingerspice.waveforms.waveform import DC
 
-# Number of equidistant times of a period from which mean areas are computed.
+# Number of equidistant times of a period from which the mean of an area with a time constant is computed.
 SAMPLES = 64
 # Nodes and weights of Gauss-Legendre quadrature on [0, 1], for integrals over a voltage from 0 V to its value.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
@@ -47,6 +50,15 @@ class Stopped(Exception):
 
     def __init__(self, status: Status, t: float | None = None, cause: str = "") -> None:
         self.status, self.t, self.cause = status, t, cause
+
+
+@contextmanager
+def stops_told(problem: Problem) -> Iterator[None]:
+    """A search that is stopped ends in a `SolveError` that says why."""
+    try:
+        yield
+    except Stopped as stopped:
+        raise SolveError(period_failure(problem, stopped.status, stopped.t, stopped.cause)) from None
 
 
 class Period:
@@ -100,8 +112,6 @@ class Period:
             problem, t_start=self.begin, t_stop=self.end, first=self.begin, charge=False,
             initial=State(self.begin, problem.initial.y, self.before, np.zeros(net.gap.size), scene.charge_law),
         )  # fmt: skip
-        # (SAMPLES,): Times of `linear_state`, s.
-        self.times = self.begin + (self.end - self.begin) * (np.arange(SAMPLES) + 0.5) / SAMPLES
 
     def voltages(self, z: FloatArray) -> FloatArray:
         """Live voltages just before the period begins, V, shape (n,)."""
@@ -126,23 +136,25 @@ class Period:
             charge += part * network.capacitance(area) * u
         return np.asarray(self.modes.shape[:, held].T @ (net.p.T @ charge))
 
-    def linear_state(self, modes: Modes) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Periodic state of a circuit with fixed areas: its modes at the start, the end and SAMPLES times of the span.
+    def linear_state(self, times: FloatArray | list[float]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Periodic state of the circuit with its areas at 0 V: its modes at the span's start, its end, and `times` (s).
 
         A neutral mode starts from the amplitude that it keeps; NaN where a current charges it from period to period.
         """
-        rates = modes.rates
-        start, end, along = np.zeros(self.n), np.zeros(self.n), np.zeros((SAMPLES, self.n))
+        rates = self.modes.rates
+        start, end, along = np.zeros(self.n), np.zeros(self.n), np.zeros((len(times), self.n))
         for j, table in enumerate(self.tables):
-            gains = np.ascontiguousarray(modes.gains[:, j])
+            gains = np.ascontiguousarray(self.modes.gains[:, j])
             given = table.edges, table.terms, table.series
             if self.parts == 1:
                 v = linear.periodic_state(rates, gains, *given)
             else:
                 _, moved = linear.respond(rates, gains, *given, np.zeros(self.n), [])
                 v = -moved / (1.0 + np.exp(-rates * (table.edges[-1] - table.edges[0])))
-            rows, last = linear.respond(rates, gains, *given, v, self.times)
+            rows, last = linear.respond(rates, gains, *given, v, times)
             start, end, along = start + v, end + last, along + rows
+        if not np.all(np.isfinite(start)):
+            raise Stopped(Status.NOT_PERIODIC, cause=CHARGING)
         return start, end, along
 
 
@@ -179,8 +191,6 @@ _HELD_UP, _NOISE = 5, 1e-8
 _LONG = 0.1
 # A step longer than this times the voltage scale means that the search diverges.
 _ASTRAY = 1e3
-# Fixed-point iterations for the mean areas of the linear circuit's period.
-_AVERAGES = 3
 CHARGING = "a current source charges, from period to period, what nothing drains"
 
 
@@ -189,9 +199,9 @@ class Found(NamedTuple):
 
     start: FloatArray  # (n + n_slow,): Live voltages just before the period, V, and relative areas
     defect: float  # Largest change of a live voltage over a further period, V
-    # (n + n_slow, n + n_slow): Jacobian matrix of the period map, to about 1e-5; its variables are the modes and the
-    # areas with a time constant
-    map_slope: FloatArray
+    # Gives the Jacobian matrix of the period map, (n + n_slow, n + n_slow), to about 1e-5; its variables are the modes
+    # and the areas with a time constant
+    map_slope: Callable[[], FloatArray]
     # Error of the periodic state relative to the error of one period: a slow mode accumulates the errors of the periods
     # within its memory
     memory: float
@@ -220,6 +230,8 @@ class Search:
     def __init__(self, period: Period, rtol: float) -> None:
         self.period, self.rtol, self.passes = period, rtol, 0
         self.implicit = False
+        # The integration of every pass by exponential steps.
+        self.one: Track | March | None = None
         # The gap voltage that a stack's area curve reaches, V; 0: that of its scene.
         self.top = 0.0
         # A conserved charge is no unknown. If half a period is used, all voltages change sign: such a charge is 0.
@@ -227,42 +239,32 @@ class Search:
         self.slow = np.arange(period.rates.size) >= period.n
         problem = period.problem
         self.fingers = list(problem.network.fingers)
-        self.z, slope = self._guess()
+        self.z = self._guess()
         largest = float(np.abs(period.voltages(self.z)).max(initial=0.0))
         self.scale = max(problem.scene.u_peak, largest) or GUESS
-        self.solver = self._inverse(slope)
+        self.solver = self._inverse(np.diag(period.turned * np.exp(-period.rates * period.span)))
         self.z = self._holding(self.z)
         cells = [problem.network.gaps[i] for i in self.fingers]
         gap = problem.network.p[np.array(cells, int)] @ period.modes.shape
         # Derivative of every gap's voltage by z; its columns for areas with a time constant are 0.
         self.gap = np.hstack([gap, np.zeros((gap.shape[0], int(self.slow.sum())))])
 
-    def _guess(self) -> tuple[FloatArray, FloatArray]:
-        """The periodic state with every area held at its mean over the period, and the map's derivative there."""
+    def _guess(self) -> FloatArray:
+        """The periodic state with every area held at its value at 0 V; areas with a time constant at their mean."""
         period, problem = self.period, self.period.problem
-        network, net, area = problem.network, problem.scene.net, problem.scene.area0.copy()
-        s = np.column_stack([wave.value(period.times) for wave in problem.waveforms])
-        for _ in range(_AVERAGES):
-            modes = network_modes(network, area)
-            start, _, along = period.linear_state(modes)
-            if not np.all(np.isfinite(start)):
-                raise Stopped(Status.NOT_PERIODIC, cause=CHARGING)
+        net, modes, slow = problem.scene.net, period.modes, np.flatnonzero(problem.scene.net.slow >= 0)
+        times = period.begin + period.span * (np.arange(SAMPLES if slow.size else 0) + 0.5) / SAMPLES
+        start, _, along = period.linear_state(times)
+        relative = np.ones(slow.size)
+        if slow.size:
+            s = np.column_stack([wave.value(times) for wave in problem.waveforms])
             x = along @ modes.shape.T - s @ modes.follow.T
-            for i in np.flatnonzero(net.gap >= 0):
-                contact = network.contacts[i]
+            for k, i in enumerate(slow):
+                contact = problem.network.contacts[i]
                 assert contact is not None
                 u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
-                area[i] = float(np.mean(contact.area(np.abs(u))))
-        v = modes.shape @ start - modes.follow @ period.before
-        v = period.modes.inverse @ (v + period.modes.follow @ period.before)
-        v = np.where(period.neutral[: period.n], period.kept, v)
-        # Transform this decay from the modes at the mean areas to the modes at 0 V.
-        turn = period.modes.inverse @ modes.shape
-        decay = np.exp(-modes.rates * period.span)
-        slope = np.diag(np.exp(-period.rates * period.span))
-        slope[: period.n, : period.n] = turn @ (decay[:, None] * np.linalg.inv(turn))
-        slow = np.flatnonzero(net.slow >= 0)
-        return np.append(v, (area / problem.scene.area0)[slow]), period.turned[:, None] * slope
+                relative[k] = float(np.mean(contact.area(np.abs(u)))) / problem.scene.area0[i]
+        return np.append(np.where(period.neutral[: period.n], period.kept, start), relative)
 
     def _inverse(self, slope: FloatArray) -> FloatArray:
         """Inverse of 1 - slope for the entries of z that decay, and zero for the neutral modes."""
@@ -281,37 +283,39 @@ class Search:
         period, n = self.period, self.period.n
         y = np.concatenate([period.voltages(z), z[n:], np.zeros(period.before.size)])
         initial = dataclasses.replace(period.problem.initial, y=y)
-        problem = dataclasses.replace(period.problem, initial=initial)
         self.passes += 1
-        made = None if self.implicit else self._stepped(problem, tol)
+        made = None if self.implicit else self._stepped(initial, max(tol, FINEST))
         if made is None:
             # The exponential steps failed: the implicit method either succeeds or tells that no solution exists.
-            self.implicit, made = True, self._collocated(problem, tol)
+            self.implicit, made = True, self._collocated(dataclasses.replace(period.problem, initial=initial), tol)
         # Use the sources at the end of the pass: they equal those at the start only up to the sign and round-off.
         x = period.modes.inverse @ (made.end[:n] + period.modes.follow @ made.sources)
         error = np.append(period.modes.inverse @ made.error[:n], made.error[n : z.size])
         return made._replace(end=period.turned * np.append(x, made.end[n : z.size]), error=error)
 
-    def _stepped(self, problem: Problem, tol: float) -> _Pass | None:
+    def _stepped(self, initial: State, tol: float) -> _Pass | None:
         """One pass by exponential steps; None where they fail before the end."""
-        scene, n = problem.scene, self.period.n
+        period, scene = self.period, self.period.problem.scene
         while True:
-            one = stepping(problem, self.rtol, max(tol, FINEST), self.scale, self.top, False)
+            if self.one is None:
+                self.one = stepping(period.problem, self.rtol, tol, self.scale, self.top, False)
+            one = self.one
+            one.again(initial, tol * self.scale)
             try:
-                if one.through(self.period.sources, self.period.end) is not Status.SUCCESS:
+                if one.through(period.sources, period.end) is not Status.SUCCESS:
                     return None
                 break
             except OutOfRangeError as left:
-                self.top = 1.5 * left.top
+                self.top, self.one = 1.5 * left.top, None
         magnified = max(1.0, float(one.control["magnified"]))
         if isinstance(one, March):
-            error = np.append(one.form.shape @ one.error[:n], one.error[n:])
+            error = np.append(one.form.shape @ one.error[: period.n], one.error[period.n :])
             return _Pass(one.y, one.s_before, error, one.peaks.copy(), magnified, one.references.magnified)
         end, system = one.state(), one.system
-        model, error = system.model, system.live[int(one.error[n])] @ one.error[:n]
+        model, error = system.model, system.live[int(one.error[period.n])] @ one.error[: period.n]
         if model.mobile:
             error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
-        return _Pass(end.y, end.s_before, scene.turn * error, one.peaks, magnified, np.array([model.k_gap]))
+        return _Pass(end.y, end.s_before, scene.turn * error, one.peaks.copy(), magnified, np.array([model.k_gap]))
 
     def _collocated(self, problem: Problem, tol: float) -> _Pass:
         """One pass by the implicit method, with its error from a coarser pass."""
@@ -345,10 +349,13 @@ class Search:
                 self.implicit, tol = True, LOCAL_SHARE * self.rtol
             else:
                 break
-        memory, slope = self._memory(), self._slope()
-        slope = slope @ slope if period.parts == 2 else slope
         start = np.append(period.voltages(self.z), self.z[period.n :])
-        return Found(start, period.parts * defect, slope, memory, errors, self.passes / period.parts)
+        return Found(start, period.parts * defect, self._map_slope, self._memory(), errors, self.passes / period.parts)
+
+    def _map_slope(self) -> FloatArray:
+        with stops_told(self.period.problem):
+            slope = self._slope()
+        return slope @ slope if self.period.parts == 2 else slope
 
     def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
         """Solve for the periodic z; returns the last pass, the last step of z, and the defect of that pass, V."""
@@ -484,11 +491,9 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
     """
     if problem.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
-    try:
+    with stops_told(problem):
         period = Period(problem)
         found = Search(period, rtol).close() if problem.scene.coupled else _closed_form(period)
-    except Stopped as stopped:
-        raise SolveError(period_failure(problem, stopped.status, stopped.t, stopped.cause)) from None
     y = np.append(found.start, np.zeros(period.before.size))
     initial = State(period.begin, y, period.before, np.zeros(problem.scene.net.gap.size), problem.scene.charge_law)
     moved = period.begin - problem.t_start
@@ -502,12 +507,10 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
 def _closed_form(period: Period) -> Found:
     """The periodic state of a circuit with fixed areas."""
     modes = period.modes
-    start, end, _ = period.linear_state(modes)
-    if not np.all(np.isfinite(start)):
-        raise Stopped(Status.NOT_PERIODIC, cause=CHARGING)
+    start, end, _ = period.linear_state([])
     sign = 1.0 if period.parts == 1 else -1.0
     defect = float(np.abs(modes.shape @ (sign * end - start)).max(initial=0.0))
     slope = np.diag(np.exp(-period.rates * period.span * period.parts))
     # The only error of the closed form is round-off, which the run adds to its stated error itself.
     none = np.zeros((len(period.problem.network.fingers), 2))
-    return Found(period.voltages(start + period.kept), period.parts * defect, slope, 1.0, none, 1)
+    return Found(period.voltages(start + period.kept), period.parts * defect, lambda: slope, 1.0, none, 1)

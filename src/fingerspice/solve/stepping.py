@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from fingerspice.engine.collocation.readout import LoopState, Outputs
 from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Sources
 from fingerspice.numerics.lobatto import ROWS
-from fingerspice.results.outcome import Status
+from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.steps import Recorded, Recorder
 from fingerspice.solve.problem import Problem
@@ -66,6 +67,7 @@ class Stepping(Integration):
     area_error: float  # Relative error of the areas' polynomials
     capacitance: float  # Capacitance of what holds the charge, at the areas at 0 V, F
     charge_safety = 1.0  # Stated error of the charge over the estimate
+    fresh: list[Any] | None = None  # What an integration that begins `again` sets its arrays to
     # The stated error is compared with this after a few periods, where `try_out` was called. The tolerance was chosen
     # before the peaks of the gaps were known; if it proves too large, the run ends there and not at its end before it
     # is repeated.
@@ -107,6 +109,15 @@ class Stepping(Integration):
         self.periods = (problem.t_stop - start) / self.period * (1.0 + 1e-12)
         values[loop.NEXT] = start if repeat and self.periods >= FEWEST_PERIODS else math.inf
         self.looks = Looks(values, np.zeros(scale.size), scale)
+
+    def again(self, initial: State, tol: float) -> None:
+        """Go back to the start, with another initial state and another error of a step (V)."""
+        moved = self.controls, self.counters, self.step, self.peaks, self.collected, self.error, self.branch
+        self.fresh = self.fresh or [array.copy() for array in moved]
+        for array, first in zip(moved, self.fresh, strict=True):
+            array[:] = first
+        self.y[:], self.s_before[:], self.sign[:] = initial.y, initial.s_before, initial.sign
+        self.pace = self.pace._replace(tol=tol)
 
     @property
     def t(self) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -213,9 +213,6 @@ class SteadyState(Shown, Figured):
     rtol : float
     defect : float
         Largest change of a capacitor's or layer's voltage over a further period, V.
-    map_slope : ndarray, shape (n, n)
-        Derivative of the map of a period, to about 1e-5, in the circuit's modes: the independent voltages (one less
-        than the cells of a stack), and the areas with a time constant.
     memory : float
         Ratio of the error of the periodic state to the error of one period; large if a disturbance lasts many periods.
     error : ErrorEstimate
@@ -231,10 +228,10 @@ class SteadyState(Shown, Figured):
     problem: Problem
     rtol: float
     defect: float
-    map_slope: FloatArray
     memory: float
     error: ErrorEstimate
     periods: float
+    _slope: Callable[[], FloatArray]
     area: str | float = "coupled"
     asked: tuple[str, ...] = ()
 
@@ -260,6 +257,15 @@ class SteadyState(Shown, Figured):
         """Period of the source, s."""
         assert self.problem.waveform.period is not None
         return self.problem.waveform.period
+
+    @cached_property
+    def map_slope(self) -> FloatArray:
+        """Derivative of the map of a period, shape (n, n), to about 1e-5, integrated at the first access.
+
+        Its variables are the circuit's modes: the independent voltages (one less than the cells of a stack), and the
+        areas with a time constant.
+        """
+        return self._slope()
 
     @property
     def multipliers(self) -> FloatArray:
@@ -363,5 +369,5 @@ def steady_state(
     problem, found = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)
     error = ErrorEstimate(*map(float, found.gap_errors.max(axis=0, initial=0.0)))
     return SteadyState(
-        problem, rtol, found.defect, found.map_slope, found.memory, error, found.periods, area, tuple(sensitivities)
+        problem, rtol, found.defect, found.memory, error, found.periods, found.map_slope, area, tuple(sensitivities)
     )
