@@ -216,3 +216,18 @@ def test_a_loud_passage_does_not_spoil_the_stated_error() -> None:
         off = np.abs(run.u_gap - exact).max()
         assert off <= run.error.u_gap <= 10.0 * off
         assert run.error.u_gap <= rtol * np.abs(exact).max()
+
+
+def test_what_a_layer_with_a_long_memory_keeps_of_errors_is_stated_from_block_to_block() -> None:
+    # Five seconds are one block at 48 kHz; at 1 MHz a layer that leaks in seconds remembers the blocks before.
+    rate, n = 1e6, 700_000
+    samples = fs.Samples(60.0 + 180.0 * recording_errors.noise(3, n, rate, 10.0, 2e4), rate)
+    circuit = fs.parse_netlist(table1_deck()).replace({"Xcoat.r": 1e10, "Xgap.r": 1e10})
+    t = np.arange(0, n - 1, 997) / rate
+
+    def run(rtol: float) -> fs.Solution:
+        return fs.simulate(circuit, sources=samples, t_stop=t[-1], t_eval=t, rtol=rtol, charge=False)
+
+    exact = run(1e-10)
+    for rtol in (1e-4, 1e-6, 1e-8):
+        assert_met(run(rtol), exact.u_gap, exact.f_el, rtol)

@@ -191,6 +191,8 @@ class Block:
         products = own[:, None] * own
         handed, alike = self._hand_on(own * share, alike)
         lucky, chance = self._hand_on(products * of_products, chance)
+        # What the sweeps leave of the starts is left of the end, too.
+        alike = alike + np.copysign(self.left / OF_FORCE, alike)
 
         def added(columns: FloatArray, left: FloatArray) -> FloatArray:
             """Of sums of the modes (C, m): by chance, or by errors that are alike where chance does not explain them.
