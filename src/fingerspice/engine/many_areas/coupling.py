@@ -367,31 +367,31 @@ def answer_mobile(
 
 @jit_rows
 def answer_together(
-    home: IntArray, answer: FloatArray, cross: FloatArray, more: FloatArray, own: FloatArray, eta: FloatArray,
+    home: IntArray, answer: FloatArray, cross: FloatArray, more: FloatArray, share: FloatArray, eta: FloatArray,
     rho: FloatArray,
 ) -> None:  # fmt: skip
     """rho under `local` where the areas are coupled, improved from its last value by Gauss-Seidel sweeps.
 
     A sweep reduces the error to at most the fraction (A - A0)^2 / A0^2 of it. The step's own iteration, whose every
-    evaluation goes on from the last rho, reduces it further. `own` (n_f, ROWS) is scratch.
+    evaluation goes on from the last rho, reduces it further. `share` (n_f, ROWS) is scratch.
     """
     n_f = answer.size
+    for b in range(n_f):
+        e, own = more[home[b]], answer[b]
+        for i in range(ROWS):
+            share[b, i] = e[i] / (1.0 + e[i] * own)
     for _ in range(_SWEEPS):
         for b in range(n_f):
             for i in range(ROWS):
-                own[b, i] = eta[b, i]
+                rho[b, i] = eta[b, i]
+            # Only the cells of other areas count.
             for c in range(n_f):
                 x = cross[b, c]
                 if x != 0.0:
                     for i in range(ROWS):
-                        own[b, i] += x * rho[c, i]
-            if b + 1 == n_f or home[b + 1] != home[b]:
-                # The cells of an area are independent of one another: update all of them at once.
-                for c in range(n_f):
-                    if home[c] == home[b]:
-                        e = more[home[c]]
-                        for i in range(ROWS):
-                            rho[c, i] = e[i] * own[c, i] / (1.0 + e[i] * answer[c])
+                        rho[b, i] += x * rho[c, i]
+            for i in range(ROWS):
+                rho[b, i] *= share[b, i]
 
 
 @jit_rows

@@ -200,39 +200,23 @@ TO_RATES = np.ascontiguousarray(np.vstack([DERIVATIVE, BETWEEN.T @ DERIVATIVE]).
 @jit_rows
 def combine(matrix: FloatArray, rows: FloatArray, out: FloatArray) -> None:
     """out += matrix @ rows, at all rows of a step."""
-    n = matrix.shape[1]
     for c in range(matrix.shape[0]):
-        # Two at a time: the sum is fetched and put back half as often.
-        for k in range(0, n - 1, 2):
-            share, other = matrix[c, k], matrix[c, k + 1]
+        for k in range(matrix.shape[1]):
+            share = matrix[c, k]
             for i in range(ROWS):
-                out[c, i] += share * rows[k, i] + other * rows[k + 1, i]
-        if n % 2 == 1:
-            share = matrix[c, n - 1]
-            for i in range(ROWS):
-                out[c, i] += share * rows[n - 1, i]
+                out[c, i] += share * rows[k, i]
 
 
 @jit_rows
 def combine_from(matrix: FloatArray, rows: FloatArray, start: FloatArray, out: FloatArray) -> None:
     """out = start + matrix @ rows, at all rows of a step."""
-    n = matrix.shape[1]
     for c in range(matrix.shape[0]):
-        if n == 0:
+        for i in range(ROWS):
+            out[c, i] = start[c, i]
+        for k in range(matrix.shape[1]):
+            share = matrix[c, k]
             for i in range(ROWS):
-                out[c, i] = start[c, i]
-        else:
-            share = matrix[c, 0]
-            for i in range(ROWS):
-                out[c, i] = start[c, i] + share * rows[0, i]
-        for k in range(1, n - 1, 2):
-            share, other = matrix[c, k], matrix[c, k + 1]
-            for i in range(ROWS):
-                out[c, i] += share * rows[k, i] + other * rows[k + 1, i]
-        if n > 1 and n % 2 == 0:
-            share = matrix[c, n - 1]
-            for i in range(ROWS):
-                out[c, i] += share * rows[n - 1, i]
+                out[c, i] += share * rows[k, i]
 
 
 @jit_rows
