@@ -278,3 +278,23 @@ def test_what_has_no_gap_is_refused() -> None:
     divider = deck("V1 a 0 SIN(0 1 100)", "R1 a b 1k", "C1 b 0 1u", ".tran 1m 10m")
     with pytest.raises(InputError, match="the circuit has no GAP"):
         fs.simulate(divider, sensitivities=("R1.value",))
+
+
+def test_beside_a_zero_of_the_gap_voltage_the_area_changes_on_its_own_side(table_1: fs.Circuit) -> None:
+    # The runs that are compared have their zeros some 10 ns apart.
+    t = np.linspace(0.0, T_STOP, 3001)
+    u = fs.simulate(table_1, t_stop=T_STOP, t_eval=t, rtol=1e-9).u_gap
+    assert u is not None
+    i = int(np.flatnonzero(u[2000:-1] * u[2001:] < 0.0)[0]) + 2000
+    fine = np.linspace(t[i], t[i + 1], 101)
+    u = fs.simulate(table_1, t_stop=T_STOP, t_eval=fine, rtol=1e-10).u_gap
+    assert u is not None
+    zero = float(np.interp(0.0, u * np.sign(u[-1]), fine))
+    beside = zero + np.array([-2e-8, 2e-8])
+    run = fs.simulate(table_1, t_stop=T_STOP, t_eval=beside, rtol=1e-10, sensitivities=["Xcoat.r"])
+    assert run.u_gap is not None
+    by, away = run.sensitivities["Xcoat.r"], np.abs(run.u_gap)
+    assert np.all((1e-4 < away) & (away < 5e-3))
+    assert run.u_gap[0] * run.u_gap[1] < 0.0
+    rise = (analytic.area(1e-2) - analytic.area(0.0)) / 1e-2
+    np.testing.assert_allclose(by.area, rise * np.sign(run.u_gap) * by.u_gap, rtol=1e-3)
