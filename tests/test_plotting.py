@@ -361,7 +361,7 @@ def test_a_picture_shows_itself_in_a_notebook_and_without_a_window_says_what_to_
 
 WINDOW = """
 import sys, types
-from fingerspice.plots import drawing, lines, traces
+from fingerspice.plots import drawing, traces
 from fingerspice.studies import figures
 assert not any(name.startswith("matplotlib") for name in sys.modules)
 figure, _ = drawing.new_figure(1)

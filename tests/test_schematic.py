@@ -16,8 +16,7 @@ from matplotlib.transforms import Bbox
 
 import fingerspice as fs
 from commands import Command
-from fingerspice.plots.drawing import place
-from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic, put_beside
+from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic, place, put_beside
 from scenes import table1
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
