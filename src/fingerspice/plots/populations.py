@@ -56,8 +56,14 @@ def _along(
     rows, columns = ((len(names) + 2) // 2, 2) if names else (1, 1)
     figure, axes = drawing.new_figure(rows, columns, height=2.4 * rows, sharex=True)
     bands = max(1, len(names))
+    # Values of each place: one, or many, of which the middle nine tenths are shown.
+    low, middle, high = (values,) * 3 if values.ndim == 1 else np.nanquantile(values, [0.05, 0.5, 0.95], axis=-1)
     for j, ax in enumerate(axes[:bands]):
-        _band(ax, x, values, indices is None)
+        if values.ndim > 1:
+            ax.fill_between(x, low, high, color="0.85", linewidth=0.0, label="5 to 95 % of all")
+        if values.ndim == 1 or indices is None:
+            name = "median of all" if values.ndim > 1 else None
+            ax.plot(x, middle, color=drawing.CYCLE[0], linewidth=1.3, label=name)
         if indices is not None:
             _alone(ax, x, factor * indices[f"{output}_alone"].values[:, j], indices, j)
         ax.set_ylim(bottom=min(0.0, float(np.nanmin(values))))
@@ -97,17 +103,6 @@ def _alone(ax: Axes, x: FloatArray, values: FloatArray, indices: Dataset, j: int
     for k, colour in enumerate((drawing.BLUE, drawing.BLACK, drawing.VERMILION)):
         name = f"its {100 * float(indices['quantile'][k]):g} % quantile"
         ax.plot(x, values[:, k], linestyle=drawing.DASHES[k], color=colour, linewidth=1.3, label=name)
-
-
-def _band(ax: Axes, x: FloatArray, values: FloatArray, with_median: bool) -> None:
-    """Values (n_x,), or the middle nine tenths of those of each place, (n_x, n_scene)."""
-    if values.ndim == 1:
-        ax.plot(x, values, color=drawing.CYCLE[0], linewidth=1.3)
-        return
-    low, middle, high = np.nanquantile(values, [0.05, 0.5, 0.95], axis=-1)
-    ax.fill_between(x, low, high, color="0.85", linewidth=0.0, label="5 to 95 % of all")
-    if with_median:
-        ax.plot(x, middle, color=drawing.CYCLE[0], linewidth=1.3, label="median of all")
 
 
 def _shares(ax: Axes, indices: Dataset, output: str, x: FloatArray | None) -> None:

@@ -367,7 +367,7 @@ def _solution(file: Any) -> Solution:
         continuous = Recorded(whole_steps(begin, end), values, float(run["t_stop"]) - float(run["period"]), make)
     return Solution(
         t=t,
-        record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:].T),
+        record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:]),
         circuit=_circuit(file, run),
         continuous=continuous,
         stored=dict(run["summary"]),

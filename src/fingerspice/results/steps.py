@@ -19,11 +19,11 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.collocation.readout import RECORDED, Steps, new_steps
 from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS, TO_SERIES
-from fingerspice.results.record import Record, Signals, bare_record
+from fingerspice.results.record import Record, Signals
 from fingerspice.waveforms.sampling import same_time
 from fingerspice.waveforms.waveform import Waveform
 
-#: From times (s), a mask of left-hand values and states as columns to a record.
+#: From times (s), a mask of left-hand values and states as rows to a record.
 Make = Callable[[FloatArray, BoolArray, FloatArray], Signals]
 #: Parts of steps on each of which every signal is smooth, shape (4, p): the number of the step, the part of it from low
 #: to high as fractions of its length, and the duration (s), longer than the part itself if it stands for equal periods.
@@ -128,7 +128,7 @@ class Recorded:
         start, length, reached, reach = self.times[:4, index, None]
         left = fraction >= reach
         t = np.where(left, reached, start + fraction * length)
-        return t, self.make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size))
+        return t, self.make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size).T)
 
     def at_points(self, name: str, panels: Panels) -> tuple[FloatArray, FloatArray]:
         """Times (s) and a signal at the `POINTS` of panels, shape (p, ROWS) each."""
@@ -238,7 +238,7 @@ class ClosedForm:
         short = np.flatnonzero(end - begin <= _ROUNDINGS * np.spacing(np.abs(end)))
         first, last = values[short, :, :1], values[short, :, -1:]
         values[short] = first + POINTS[:NODES] * (last - first)
-        return Recorded(whole_steps(begin, end), values, since, partial(bare_record, record.network, record.net))
+        return Recorded(whole_steps(begin, end), values, since, partial(Record, record.network, record.net))
 
     def _marks(self, since: float, until: float) -> FloatArray | None:
         """Ends of the first panels, s; None if they are too many."""
