@@ -128,8 +128,8 @@ def test_every_key_is_documented() -> None:
 def test_nothing_but_json_is_printed_with_stderr_closed_too(tmp_path: Path) -> None:
     (tmp_path / "pad.cir").write_text(edited((".end", ".meas tran top max v(top)\n.end")))
     for words, code in (
-        ("run pad.cir --no-plot --set Xskin.f=200 --json 2>&-", 0),
-        ("run pad.cir --no-plot --charge-law mobile --set Xgap.d=10n --name thin --json 0<&- 2>&-", 1),
+        ("run pad.cir --no-plot --charge-law mobile --set Xgap.d=10n --set Xskin.f=200 --json 0<&- 2>&-", 1),
+        ("plan pad.cir --set Xskin.f=200 --json 2>&-", 0),
         ("run none.cir --json 2>&-", 2),
     ):
         line = f"{shlex.quote(sys.executable)} -m fingerspice {words}"

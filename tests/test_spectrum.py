@@ -61,6 +61,16 @@ def test_half_the_squares_of_the_lines_are_the_variance(sine: fs.Solution, tmp_p
     np.testing.assert_allclose(read.amplitude, friction.amplitude, rtol=0, atol=1e-11)  # type: ignore[arg-type]
 
 
+def test_a_run_whose_last_period_repeats_an_earlier_one_is_read_with_its_lines(tmp_path: Path) -> None:
+    # The steps in its file had the times of the earlier period, and its lines were lost.
+    run = fs.simulate(table1("SIN(0 200 5k)"), t_stop=0.02, rtol=1e-6)
+    assert run.stats["repeated"] > 20
+    again = fs.load(run.to_netcdf(tmp_path / "x.nc"))
+    for signal in ("f_t", "u_gap", "u_source"):
+        one, other = run.spectrum(signal), again.spectrum(signal)
+        np.testing.assert_allclose(other.amplitude, one.amplitude, rtol=0, atol=1e-11 * one.amplitude[0] + 1e-11)
+
+
 def test_the_lines_do_not_depend_on_the_outputs() -> None:
     few, many = (fs.steady_state(table1(), points=n).solution.spectrum() for n in (5, 400))
     np.testing.assert_allclose(few.amplitude, many.amplitude, rtol=0, atol=1e-10)

@@ -59,7 +59,7 @@ def sweep(
       fingerspice sweep circuits/population.toml
     """
     with Answering("sweep", as_json) as answer:
-        from fingerspice.plots.populations import plot_sweep
+        from fingerspice.plots.picture import plot_sweep
         from fingerspice.studies.sweep import populations
 
         asked, deck = _read(file)

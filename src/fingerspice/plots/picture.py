@@ -1,17 +1,29 @@
-"""The class of this package's figures, which appear in notebooks and can be shown in a window."""
+"""The class of this package's figures, which appear in notebooks and can be shown in a window.
+
+Pictures of sweeps (percentile bands or a histogram, and what is behind the variance) and of fits.
+"""
 
 from __future__ import annotations
 
 import io
 import sys
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import in_notebook
+from fingerspice.plots import drawing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from xarray import DataArray, Dataset
 
 #: Resolution (dots per inch) of the picture in a notebook, and the factor by which the notebook scales it down.
 _DPI, _SHARPER = 200, 2
@@ -88,3 +100,161 @@ _waiting: list[Picture] = []
 def _show_waiting() -> None:
     for picture in tuple(_waiting):
         picture.show()
+
+
+# Ratio of the largest to the smallest abscissa from which on the axis is logarithmic.
+_WIDE = 20.0
+
+
+def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> Picture:
+    """An output of `sweep` along its grid of one dimension, with the band from 5 to 95 %, or its histogram.
+
+    With the indices of `sobol` a panel for each parameter shows it at three quantiles, and the last one the indices.
+    """
+    one = found[output]
+    dims = [str(dim) for dim in one.dims if dim != "scene"]
+    if len(dims) > 1:
+        raise InputError(f"{output} has the dimensions {', '.join(dims)}; allowed in a picture: one beside scene")
+    values = one.transpose(*dims, *(["scene"] if "scene" in one.dims else [])).values
+    factor, unit = drawing.engineering(drawing.peak_of(np.nan_to_num(values)), one.attrs.get("units", ""), 0.05)
+    label = f"{output} [{unit}]" if unit else output
+    if dims:
+        figure = _along(found[dims[0]], factor * values, label, indices, factor, output)
+    else:
+        rows = 1 if indices is None else 2
+        figure, axes = drawing.new_figure(rows, height=2.4 * rows)
+        axes[0].hist(factor * np.ravel(values), bins=40, color=drawing.CYCLE[0])
+        drawing.dress(axes[0], "scenes", label)
+        if indices is not None:
+            _shares(axes[1], indices, output, None)
+    if "scene" in one.dims:
+        drawing.caption(figure, f"{found.sizes['scene']:,} scenes, seed {found.attrs.get('seed', 0)}")
+    return figure
+
+
+def _along(
+    grid: DataArray, values: FloatArray, label: str, indices: Dataset | None, factor: float, output: str
+) -> Picture:
+    """Band and median along the grid: one panel, or one for each parameter and one for its shares."""
+    unit, named = grid.attrs.get("units", ""), grid.dtype.kind in "OUT"
+    x = np.asarray(np.arange(grid.size) if named else grid.values, float)
+    names = [] if indices is None else [str(name) for name in indices.parameter.values]
+    rows, columns = ((len(names) + 2) // 2, 2) if names else (1, 1)
+    figure, axes = drawing.new_figure(rows, columns, height=2.4 * rows, sharex=True)
+    bands = max(1, len(names))
+    # Values of each place: one, or many, of which the middle nine tenths are shown.
+    low, middle, high = (values,) * 3 if values.ndim == 1 else np.nanquantile(values, [0.05, 0.5, 0.95], axis=-1)
+    for j, ax in enumerate(axes[:bands]):
+        if values.ndim > 1:
+            ax.fill_between(x, low, high, color="0.85", linewidth=0.0, label="5 to 95 % of all")
+        if values.ndim == 1 or indices is None:
+            name = "median of all" if values.ndim > 1 else None
+            ax.plot(x, middle, color=drawing.CYCLE[0], linewidth=1.3, label=name)
+        if indices is not None:
+            _alone(ax, x, factor * indices[f"{output}_alone"].values[:, j], indices, j)
+        ax.set_ylim(bottom=min(0.0, float(np.nanmin(values))))
+        drawing.dress(ax, label if j % columns == 0 else "")
+    told = axes[0].get_legend_handles_labels()
+    if len(told[0]) > 1:
+        figure.legend(*told, loc="outside upper center", ncols=len(told[0]), fontsize=drawing.FONT, frameon=False)
+    if indices is not None:
+        _shares(axes[bands], indices, output, x)
+    for ax in axes[bands + 1 :]:
+        ax.remove()
+    for ax in axes[: bands + 1][-columns:]:
+        drawing.dress(ax, xlabel=f"{grid.name} [{unit}]" if unit else str(grid.name))
+        ax.tick_params(labelbottom=True)
+    for ax in figure.axes:
+        if named:
+            # Names of sets of parameters instead of numbers, with a mark at each: nothing lies between them.
+            ax.set_xticks(range(x.size), [str(name) for name in grid.values], rotation=20.0 if x.size > 4 else 0.0)
+            ax.set_xlim(-0.3, x.size - 0.7)
+            for line in ax.lines:
+                line.set(marker="o", markersize=4.0)
+            continue
+        if x.min() > 0.0 and x.max() > _WIDE * x.min():
+            ax.set_xscale("log")
+        ax.set_xlim(x.min(), x.max() if x.size > 1 else None)
+    return figure
+
+
+def _alone(ax: Axes, x: FloatArray, values: FloatArray, indices: Dataset, j: int) -> None:
+    """Curves (n_x, n_quantile) where parameter `j` takes the quantiles of its distribution."""
+    at, unit = indices["at"].values[j], str(indices["unit"].values[j])
+    factor, unit = drawing.engineering(float(np.abs(at).max()), unit)
+    if unit.strip() == "1":
+        unit = "times"
+    told = f"{indices.parameter.values[j]}: {', '.join(f'{factor * one:.3g}' for one in at)} {unit}"
+    ax.set_title(drawing.drawable(told, 60), fontsize=drawing.FONT, loc="left", parse_math=False)
+    for k, colour in enumerate((drawing.BLUE, drawing.BLACK, drawing.VERMILION)):
+        name = f"its {100 * float(indices['quantile'][k]):g} % quantile"
+        ax.plot(x, values[:, k], linestyle=drawing.DASHES[k], color=colour, linewidth=1.3, label=name)
+
+
+def _shares(ax: Axes, indices: Dataset, output: str, x: FloatArray | None) -> None:
+    """Total index of every parameter with its interval, along the grid or as bars."""
+    total, low, high = (indices[f"{output}_total{kind}"].values for kind in ("", "_low", "_high"))
+    for j, name in enumerate(map(str, indices.parameter.values)):
+        color = drawing.CYCLE[j % len(drawing.CYCLE)]
+        if x is not None:
+            ax.fill_between(x, low[:, j], high[:, j], color=color, alpha=0.2, linewidth=0.0)
+            ax.plot(x, total[:, j], color=color, linewidth=1.3, label=name)
+        else:
+            off = [[max(total[j] - low[j], 0.0)], [max(high[j] - total[j], 0.0)]]
+            ax.bar([name], [total[j]], yerr=off, color=color, capsize=2.0)
+    drawing.dress(ax, "share of variance")
+    ax.set_ylim(0.0, max(1.05, float(np.max(high))))
+    if x is not None:
+        drawing.legend_within(ax, 44)
+
+
+# Letters of a legend across the page; beside other panels one curve needs none.
+_ROOM = 90
+
+
+class Curve(NamedTuple):
+    """Data that belong together, shape (n,) each: abscissa, measured and fitted values, and standard deviations."""
+
+    name: str
+    x: FloatArray
+    measured: FloatArray
+    fitted: FloatArray
+    sigma: FloatArray
+
+
+class Panel(NamedTuple):
+    """Curves of one quantity over one abscissa."""
+
+    curves: Sequence[Curve]
+    x_label: str
+    quantity: str
+    unit: str
+
+
+def plot_panels(panels: Sequence[Panel]) -> Picture:
+    """Data with error bars and the fit of several quantities side by side, each with its residuals below."""
+    count = len(panels)
+    figure, axes = drawing.new_figure(2, count, height=4.2, sharex="col", height_ratios=(2.4, 1.0))
+    for top, bottom, panel in zip(axes[:count], axes[count:], panels, strict=True):
+        largest = np.concatenate([curve.measured for curve in panel.curves])
+        factor, shown = drawing.engineering(drawing.peak_of(largest), panel.unit, 0.05) if panel.unit else (1.0, "")
+        bottom.axhline(0.0, color=drawing.GREY, linewidth=0.8)
+        for number, curve in enumerate(panel.curves):
+            order, color = np.argsort(curve.x, kind="stable"), drawing.CYCLE[number % len(drawing.CYCLE)]
+            x, measured, fitted, sigma = (values[order] for values in curve[1:])
+            style: dict[str, Any] = {"fmt": "o", "markersize": 3.5, "color": color, "elinewidth": 0.8, "capsize": 2.0}
+            top.errorbar(x, factor * measured, factor * sigma, label=curve.name, **style)
+            top.plot(x, factor * fitted, color=color, linewidth=1.3)
+            bottom.plot(x, (measured - fitted) / sigma, "o", markersize=3.5, color=color)
+        x = np.concatenate([curve.x for curve in panel.curves])
+        if x.min() > 0.0 and x.max() > _WIDE * x.min():
+            bottom.set_xscale("log")
+            # Plain numbers: 20, 50, 100, and no powers of ten.
+            bottom.xaxis.set_major_formatter(LogFormatter())
+            bottom.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
+        drawing.dress(top, f"{panel.quantity} [{shown}]" if shown else panel.quantity)
+        if len(panel.curves) > 1 or count == 1:
+            drawing.legend_within(top, _ROOM // count)
+        drawing.dress(bottom, "residual / sigma" if top is axes[0] else "", panel.x_label)
+    drawing.caption(figure, "dots: measured, with one standard deviation; lines: fitted")
+    return figure

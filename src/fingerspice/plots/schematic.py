@@ -1,6 +1,7 @@
 """The schematic of a circuit: its layers as a ladder, each a resistor beside a capacitor, with names and values.
 
-Symbols are strokes: points in inches around the symbol's centre, the first node above.
+Nodes are rows, elements stand in columns between them: a series stack becomes a ladder beside its source by the same
+rules as any network does. Symbols are strokes: points in inches around the symbol's centre, the first node above.
 """
 
 from __future__ import annotations
@@ -8,10 +9,11 @@ from __future__ import annotations
 import io
 import itertools
 import math
+import operator
 import textwrap
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib import image, rc_context
@@ -23,26 +25,139 @@ from fingerspice.base.files import write_aside
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import waveform_text
 from fingerspice.plots import drawing
-from fingerspice.plots.drawing import GROUND, Place, Placement, place
 from fingerspice.plots.picture import Picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_GROUND = "0"
+
+
+class Place(NamedTuple):
+    """Where one element stands."""
+
+    element: Element
+    column: int
+    # top, bottom: Rows of its upper and its lower node
+    top: int
+    bottom: int
+    upright: bool  # Whether its first node is the upper one
+
+    @property
+    def gap(self) -> int:
+        """The row below which the symbol stands, above the next one."""
+        return (self.top + self.bottom - 1) // 2
+
+
+class Placement(NamedTuple):
+    """Places of all elements, the row of every node, and its first and last column."""
+
+    places: list[Place]
+    rows: Mapping[str, int]
+    extents: dict[str, tuple[int, int]]
+
+
+def place(circuit: Circuit) -> Placement:
+    """Places in which no two elements, and no two nodes, meet."""
+    level = _levels(circuit)
+    order = list(_in_order(circuit, level))
+    # Nodes that cannot share a row get one each, and then every element has room in a new column.
+    single = {node: row for row, node in enumerate(sorted(level, key=level.__getitem__))}
+    found = _place_columns(order, level) or _place_columns(order, single)
+    assert found is not None
+    return found
+
+
+def _levels(circuit: Circuit) -> dict[str, int]:
+    """Level of every node below the driven ones, ground the last; the nodes of an element have different levels."""
+    nodes = list(dict.fromkeys(node for e in circuit.elements for node in e.nodes[:2]))
+    number = {node: k for k, node in enumerate(nodes)}
+    # With sources of 1 A and 1 ohm in place of every element, potentials fall from the driven nodes to ground.
+    matrix, driven = np.zeros((len(nodes), len(nodes))), np.zeros(len(nodes))
+    for e in circuit.elements:
+        p, n = number[e.nodes[0]], number[e.nodes[1]]
+        matrix[[p, n], [p, n]] += 1.0
+        matrix[[p, n], [n, p]] -= 1.0
+        sign = {"V": 1.0, "I": -1.0}.get(e.device, 0.0)
+        driven[p] += sign
+        driven[n] -= sign
+    potential = np.linalg.lstsq(matrix, driven, rcond=None)[0].round(9)
+    falling = sorted(nodes, key=lambda node: (node == _GROUND, -potential[number[node]], number[node]))
+    rank = {node: k for k, node in enumerate(falling)}
+    above: dict[str, set[str]] = {node: set() for node in nodes}
+    for e in circuit.elements:
+        upper, lower = sorted(e.nodes[:2], key=rank.__getitem__)
+        above[lower].add(upper)
+    level: dict[str, int] = {}
+    for node in falling:
+        level[node] = max((level[other] + 1 for other in above[node]), default=0)
+    # `falling` has ground last, so that no other node's level depends on it.
+    level[_GROUND] = 1 + max(level[node] for node in nodes if node != _GROUND)
+    return level
+
+
+def _in_order(circuit: Circuit, level: Mapping[str, int]) -> Iterator[tuple[Element, Element | None]]:
+    """Elements in the order in which they get places, each with the one above it: sources, then chain by chain."""
+    areas = {node for e in circuit.elements if e.spec.is_layer for node in e.nodes[2:]}
+    fixing = [e for e in circuit.by_device("V", "I") if areas & set(e.nodes[:2])]
+    yield from ((e, None) for e in circuit.by_device("V", "I") if e not in fixing)
+    below: dict[str, list[Element]] = {}
+    for e in circuit.elements:
+        if e.device not in "VI":
+            below.setdefault(min(e.nodes[:2], key=level.__getitem__), []).append(e)
+    for node in sorted(below, key=level.__getitem__):
+        waiting: list[tuple[Element, Element | None]] = [(e, None) for e in reversed(below.pop(node, []))]
+        while waiting:
+            e, before = waiting.pop()
+            yield e, before
+            lower = max(e.nodes[:2], key=level.__getitem__)
+            waiting += [(other, e) for other in reversed(below.pop(lower, []))]
+    yield from ((e, None) for e in fixing)
+
+
+def _place_columns(order: Sequence[tuple[Element, Element | None]], rows: Mapping[str, int]) -> Placement | None:
+    """Each element in the first column with room for it; None if nodes of one row would meet."""
+    places: dict[str, Place] = {}
+    taken: list[list[Place]] = []
+    extents: dict[str, tuple[int, int]] = {}
+    for element, before in order:
+        ends = element.nodes[:2]
+        top, bottom = sorted(rows[node] for node in ends)
+        preferred = [places[before.name].column] if before is not None else []
+        for column in (*preferred, *range(len(taken) + 1)):
+            room = column == len(taken) or all(p.bottom <= top or p.top >= bottom for p in taken[column])
+            so_far = {node: extents.get(node, (column, column)) for node in ends}
+            wider = {node: (min(lo, column), max(hi, column)) for node, (lo, hi) in so_far.items()}
+            after = {**extents, **wider}
+            if room and not any(
+                rows[node] == rows[other] and node != other and lo <= after[other][1] and after[other][0] <= hi
+                for node, (lo, hi) in wider.items()
+                for other in after
+            ):
+                break
+        else:
+            return None
+        if column == len(taken):
+            taken.append([])
+        places[element.name] = Place(element, column, top, bottom, rows[ends[0]] < rows[ends[1]])
+        taken[column].append(places[element.name])
+        extents = after
+    return Placement(list(places.values()), rows, extents)
+
+
 Stroke = Sequence[tuple[float, float]]
 #: Half the height of a part, and half the distance of a resistor from the capacitor beside it.
-HALF, APART = 0.24, 0.17
-_RADIUS = 0.17
+_HALF, _APART, _RADIUS = 0.24, 0.17, 0.17
 _ZIGZAG: Stroke = [(0.06 * (-1.0) ** k, 0.15 - 0.05 * (k + 0.5)) for k in range(6)]
-_RESISTOR: list[Stroke] = [[(0.0, HALF), (0.0, 0.15), *_ZIGZAG, (0.0, -0.15), (0.0, -HALF)]]
+_RESISTOR: list[Stroke] = [[(0.0, _HALF), (0.0, 0.15), *_ZIGZAG, (0.0, -0.15), (0.0, -_HALF)]]
 _CAPACITOR: list[Stroke] = [
     *([(-0.11, s * 0.035), (0.11, s * 0.035)] for s in (1.0, -1.0)),
-    *([(0.0, s * 0.035), (0.0, s * HALF)] for s in (1.0, -1.0)),
+    *([(0.0, s * 0.035), (0.0, s * _HALF)] for s in (1.0, -1.0)),
 ]
 _CIRCLE: list[Stroke] = [
     [(float(_RADIUS * np.cos(a)), float(_RADIUS * np.sin(a))) for a in np.linspace(0.0, 2.0 * np.pi, 61)],
-    *([(0.0, s * _RADIUS), (0.0, s * HALF)] for s in (1.0, -1.0)),
+    *([(0.0, s * _RADIUS), (0.0, s * _HALF)] for s in (1.0, -1.0)),
 ]
 _PLUS_MINUS: list[Stroke] = [
     [(-0.045, 0.085), (0.045, 0.085)], [(0.0, 0.04), (0.0, 0.13)], [(-0.045, -0.085), (0.045, -0.085)]
@@ -55,26 +170,27 @@ _PARTS = {
 }  # fmt: skip
 
 
-def symbol(element: Element) -> tuple[list[Stroke], float, float]:
-    """Strokes of an element's symbol, half its height, and half its width."""
+#: Strokes of an element's symbol, half its height, and half its width.
+Symbol = tuple[list[Stroke], float, float]
+
+
+def _symbol(element: Element) -> Symbol:
     if element.device in _PARTS:
         strokes, wide = _PARTS[element.device]
-        return strokes, HALF, wide
+        return strokes, _HALF, wide
     if element.device == "SKIN_DISPERSIVE":
         # Two cells stand for the many of the ladder, with dots in between.
-        away = HALF + 0.1
+        away = _HALF + 0.1
         dots: list[Stroke] = [[(0.0, y), (0.0, y + 0.02)] for y in (-0.06, -0.01, 0.04)]
-        return [*_cell(away, leaks=True), *dots, *_cell(-away, leaks=True)], 2.0 * HALF + 0.1, APART + 0.12
+        return [*_cell(away), *dots, *_cell(-away)], 2.0 * _HALF + 0.1, _APART + 0.12
     leak = element.values.get("r", element.values.get("rho", 0.0))
-    return _cell(0.0, leaks=bool(np.isfinite(leak))), HALF, APART + 0.12
+    return (_cell(0.0) if math.isfinite(leak) else _CAPACITOR), _HALF, _APART + 0.12
 
 
-def _cell(y: float, *, leaks: bool) -> list[Stroke]:
-    """A capacitor, and a resistor beside it where the layer leaks."""
-    if not leaks:
-        return _moved(_CAPACITOR, 0.0, y)
-    bars: list[Stroke] = [[(-APART, y + s * HALF), (APART, y + s * HALF)] for s in (1.0, -1.0)]
-    return [*_moved(_RESISTOR, -APART, y), *_moved(_CAPACITOR, APART, y), *bars]
+def _cell(y: float) -> list[Stroke]:
+    """A capacitor, and a resistor beside it."""
+    bars: list[Stroke] = [[(-_APART, y + s * _HALF), (_APART, y + s * _HALF)] for s in (1.0, -1.0)]
+    return [*_moved(_RESISTOR, -_APART, y), *_moved(_CAPACITOR, _APART, y), *bars]
 
 
 def _moved(strokes: Sequence[Stroke], x: float, y: float, up: float = 1.0) -> list[Stroke]:
@@ -159,34 +275,33 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
         count = f"{len(circuit.elements):,}"
         raise InputError(f"the circuit has {count} elements; allowed: at most {MOST_ELEMENTS} in a picture")
     figure, placed = Schematic(facecolor="white"), place(circuit)
-    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
-
-    def size(text: str, bold: bool) -> float:
-        """The width of a text, inches."""
-        font = FontProperties(size=drawing.FONT, weight="bold" if bold else "normal")
-        return float(renderer.get_text_width_height_descent(text, font, False)[0]) / float(figure.dpi)
-
     pairs = [pair for e in circuit.elements for pair in zip(e.nodes[:2], e.node_names[:2], strict=True)]
-    names = {node: drawing.drawable(name, _LONGEST) for node, name in reversed(pairs) if node != GROUND}
+    names = {node: drawing.drawable(name, _LONGEST) for node, name in reversed(pairs) if node != _GROUND}
     areas = {node for e in circuit.elements for node in e.nodes[2:]}
     # One area that no source gives goes without saying.
     told = areas if len(areas) > 1 or areas & set(names) else set()
-    labels = {p.element.name: _label(p.element, told) for p in placed.places}
+    labelled = [(p, _symbol(p.element), _label(p.element, told)) for p in placed.places]
     title = textwrap.wrap(drawing.drawable(circuit.title), 60) or [""]
-    widths = {node: size(name, False) for node, name in names.items()}
-    wide = {name: max(size(line, k == 0) for k, line in enumerate(lines)) for name, lines in labels.items()}
-    x, y, width, height = _sheet(placed, labels, wide, widths, max(size(line, True) for line in title), len(title))
+    columns, rows, width, height = _sheet(figure, placed, labelled, names, title)
     figure.set_size_inches(width, height)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set(xlim=(0.0, width), ylim=(0.0, height))
     ax.set_axis_off()
     for k, line in enumerate(title):
         _write(ax, _MARGIN, height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, bold=True)
-    strokes, dots = _wires(placed, x, y)
-    for p in placed.places:
-        strokes += _draw_element(ax, x, y, p, labels[p.element.name])
+    strokes, dots = _wires(placed, columns, rows)
+    for p, (symbol, tall, wide), label in labelled:
+        # The name of the node below needs the lowest line.
+        x, y = columns[p.column], 0.5 * (rows[p.gap] + rows[p.gap + 1] + _LINE)
+        if tint := _TINTS.get(p.element.device):
+            corner = (x - wide - 0.02, y - tall)
+            ax.add_patch(Rectangle(corner, 2.0 * wide + 0.04, 2.0 * tall, color=tint, alpha=0.2, linewidth=0))
+        for k, line in enumerate(label):
+            _write(ax, x + wide + _BESIDE, y + 0.5 * _LINE * len(label) - (k + 0.5) * _LINE, line, bold=k == 0)
+        strokes += _moved(symbol, x, y, 1.0 if p.upright else -1.0)
+        strokes += [[(x, rows[p.top]), (x, y + tall)], [(x, y - tall), (x, rows[p.bottom])]]
     for node, name in names.items():
-        _write(ax, x[placed.extents[node][0]] + 0.07, y[placed.rows[node]] + 0.08, name, color=drawing.BLUE)
+        _write(ax, columns[placed.extents[node][0]] + 0.07, rows[placed.rows[node]] + 0.08, name, color=drawing.BLUE)
     for stroke in strokes:
         ax.plot(*zip(*stroke, strict=True), color=drawing.BLACK, linewidth=1.0, solid_capstyle="round")
     for dot in dots:
@@ -200,6 +315,38 @@ def _write(ax: Axes, x: float, y: float, text: str, *, bold: bool = False, color
     """A line of text, its left middle at (x, y)."""
     weight = "bold" if bold else "normal"
     ax.text(x, y, text, fontsize=drawing.FONT, weight=weight, color=color, va="center", parse_math=False)
+
+
+def _sheet(
+    figure: Figure, placed: Placement, labelled: Sequence[tuple[Place, Symbol, Sequence[str]]],
+    names: Mapping[str, str], title: Sequence[str],
+) -> tuple[list[float], list[float], float, float]:  # fmt: skip
+    """Places of columns and rows, between which nothing meets, and width and height of the sheet (inches)."""
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+
+    def size(text: str, *, bold: bool = False) -> float:
+        """The width of a text, inches."""
+        font = FontProperties(size=drawing.FONT, weight="bold" if bold else "normal")
+        return float(renderer.get_text_width_height_descent(text, font, False)[0]) / float(figure.dpi)
+
+    columns = 1 + max(p.column for p in placed.places)
+    left, right, high = [0.2] * columns, [0.3] * columns, [0.0] * max(p.bottom for p in placed.places)
+    for p, (_, tall, wide), label in labelled:
+        beside = max(size(line, bold=k == 0) for k, line in enumerate(label))
+        left[p.column] = max(left[p.column], wide)
+        right[p.column] = max(right[p.column], wide + _BESIDE + beside)
+        high[p.gap] = max(high[p.gap], 2.0 * tall, _LINE * len(label))
+    for node, name in names.items():
+        column = placed.extents[node][0]
+        right[column] = max(right[column], 0.07 + size(name))
+    x = [_MARGIN + left[0]]
+    for before, own in itertools.pairwise(zip(left, right, strict=True)):
+        x.append(x[-1] + before[1] + _MARGIN + own[0])
+    width = max(x[-1] + right[-1] + _MARGIN, max(size(line, bold=True) for line in title) + 2.0 * _MARGIN)
+    # Names of nodes stand above their rows, also above the first one; ground hangs below the last.
+    above = [_MARGIN + 1.2 * _LINE * len(title) + _ROOM + _LINE, *(h + 2.0 * _ROOM + _LINE for h in high)]
+    height = sum(above) + 0.24 + _MARGIN
+    return x, [*itertools.accumulate(above, operator.sub, initial=height)][1:], width, height
 
 
 def _label(element: Element, areas: Set[str]) -> tuple[str, ...]:
@@ -235,52 +382,6 @@ def _quantity(value: float, unit: str) -> str:
     return f"{factor * value:.4g} {prefixed}".rstrip().replace("ohm", "Ω")
 
 
-def _sheet(
-    placed: Placement, labels: Mapping[str, tuple[str, ...]], widths: Mapping[str, float], names: Mapping[str, float],
-    title: float, lines: int,
-) -> tuple[list[float], list[float], float, float]:  # fmt: skip
-    """Places of columns and rows, between which nothing meets, width and height (inches), from the widths of texts."""
-    columns = 1 + max(p.column for p in placed.places)
-    gaps = max(p.bottom for p in placed.places)
-    left, right, high = [0.2] * columns, [0.3] * columns, [0.0] * gaps
-    for p in placed.places:
-        _, tall, wide = symbol(p.element)
-        name = p.element.name
-        left[p.column] = max(left[p.column], wide)
-        right[p.column] = max(right[p.column], wide + _BESIDE + widths[name])
-        high[p.gap] = max(high[p.gap], 2.0 * tall, _LINE * len(labels[name]))
-    for node, width in names.items():
-        column = placed.extents[node][0]
-        right[column] = max(right[column], 0.07 + width)
-    x = [_MARGIN + left[0]]
-    for before, own in itertools.pairwise(zip(left, right, strict=True)):
-        x.append(x[-1] + before[1] + _MARGIN + own[0])
-    width = max(x[-1] + right[-1] + _MARGIN, title + 2.0 * _MARGIN)
-    # Names of nodes stand above their rows, also above the first one; ground hangs below the last.
-    above = [_MARGIN + 1.2 * _LINE * lines + _ROOM + _LINE, *(h + 2.0 * _ROOM + _LINE for h in high)]
-    height = sum(above) + 0.24 + _MARGIN
-    y = [height - above[0]]
-    for step in above[1:]:
-        y.append(y[-1] - step)
-    return x, y, width, height
-
-
-def _draw_element(
-    ax: Axes, columns: Sequence[float], rows: Sequence[float], p: Place, label: Sequence[str]
-) -> list[Stroke]:
-    """Write an element's label; gives the strokes of its symbol and of its wires."""
-    strokes, tall, wide = symbol(p.element)
-    # The name of the node below needs the lowest line.
-    x, y = columns[p.column], 0.5 * (rows[p.gap] + rows[p.gap + 1] + _LINE)
-    if tint := _TINTS.get(p.element.device):
-        corner = (x - wide - 0.02, y - tall)
-        ax.add_patch(Rectangle(corner, 2.0 * wide + 0.04, 2.0 * tall, color=tint, alpha=0.2, linewidth=0))
-    for k, line in enumerate(label):
-        _write(ax, x + wide + _BESIDE, y + 0.5 * _LINE * len(label) - (k + 0.5) * _LINE, line, bold=k == 0)
-    moved = _moved(strokes, x, y, 1.0 if p.upright else -1.0)
-    return [*moved, [(x, rows[p.top]), (x, y + tall)], [(x, y - tall), (x, rows[p.bottom])]]
-
-
 def _wires(placed: Placement, x: Sequence[float], y: Sequence[float]) -> tuple[list[Stroke], Stroke]:
     """The rows of nodes with ground, and the points where three wires or more meet."""
     rows: list[Stroke] = []
@@ -292,9 +393,9 @@ def _wires(placed: Placement, x: Sequence[float], y: Sequence[float]) -> tuple[l
         ends = [p.column for p in placed.places if node in p.element.nodes[:2]]
         for column in sorted(set(ends)):
             meeting = ends.count(column) + (column > first) + (column < last)
-            if meeting + (node == GROUND and column == first) >= 3:
+            if meeting + (node == _GROUND and column == first) >= 3:
                 dots.append((x[column], height))
     # Ground hangs from the first column of its row.
     lines: list[Stroke] = [[(0.0, 0.0), (0.0, -0.14)]]
     lines += [[(-w, -d), (w, -d)] for w, d in ((0.13, 0.14), (0.08, 0.19), (0.03, 0.24))]
-    return [*rows, *_moved(lines, x[placed.extents[GROUND][0]], y[placed.rows[GROUND]])], dots
+    return [*rows, *_moved(lines, x[placed.extents[_GROUND][0]], y[placed.rows[_GROUND]])], dots

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray, real_numbers
+from fingerspice.base.arrays import FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.circuit.describe import changes_text, heading
+from fingerspice.circuit.describe import changes_text, drive_text, heading
 from fingerspice.physics.materials import SKIN_BAND
-from fingerspice.plots import drawing, lines
-from fingerspice.plots.lines import Drawn
-from fingerspice.results.record import SIGNALS, Signal, signal_of
+from fingerspice.plots import drawing
+from fingerspice.results.outcome import Status
+from fingerspice.results.record import SIGNALS, signal_of
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -30,6 +31,36 @@ if TYPE_CHECKING:
 MOST_DRAWN, ZOOMED, _LOUD = 30, 4, 0.7
 #: Smallest number of outputs in an oscillation for which its shape is visible.
 _FEWEST = 12
+#: An envelope divides the window into at most this many parts, each at least one oscillation long.
+_PARTS = 240
+#: Number of letters for which a legend has room: across the page, and over the left one of two columns.
+_PAGE, _HALF = 90, 50
+#: Line widths (points) in one panel: later lines are narrower and dashed, so that all stay visible where they coincide.
+_WIDTHS = (2.0, 1.5, 1.2, 1.0)
+#: A source is drawn wide and pale, and the other lines are drawn on top of it.
+_PALE: dict[str, Any] = {"linewidth": 3.2, "alpha": 0.45, "linestyle": "-", "solid_capstyle": "butt"}
+#: Colour of a panel's line where there is one, by its label.
+COLORS = {
+    "Voltage": drawing.BLUE, "Charge": drawing.BLUE, "Current": drawing.BLUE, "Ridge area": drawing.GREEN,
+    "Friction": drawing.PURPLE, "Friction coefficient": drawing.PURPLE, "Distance to the fold": drawing.BLACK,
+    "Force": drawing.VERMILION, "Stress": drawing.VERMILION,
+}  # fmt: skip
+
+
+class Drawn(NamedTuple):
+    """A run in a picture, with its name in the legend."""
+
+    solution: Solution
+    label: str
+
+
+class Trace(NamedTuple):
+    """One line of a panel: a signal's values `x` in a run, its label, and matplotlib's line style."""
+
+    solution: Solution
+    label: str
+    x: FloatArray
+    style: dict[str, Any]
 
 
 def plot_solution(
@@ -42,36 +73,33 @@ def plot_solution(
     runs = _runs(solution, others)
     panels = _panels(runs, signals)
     start, stop = _window(runs, window)
-    marks, heights = _turns(runs, panels, start, stop)
+    marks, heights = _turns(runs, panels[0], start, stop)
     dense = marks.size > 2 * MOST_DRAWN
     zoomed = _zoom(marks, heights, start, stop)
-    shares = [1.5 if signal.axis == "Voltage" else 1.1 for signal, _ in panels]
+    shares = [1.5 if signal_of(keys[0]).axis == "Voltage" else 1.1 for keys in panels]
     widths = [1.0] if zoomed is None else [1.5, 1.0]
     figure, axes = drawing.new_figure(
         len(panels), len(widths), height=max(3.4, 0.7 + 1.15 * sum(shares)), height_ratios=shares, width_ratios=widths,
         sharex="col", sharey="row",
     )  # fmt: skip
     left, right = axes[:: len(widths)], [] if zoomed is None else axes[1::2]
-    for row, (signal, keys) in enumerate(panels):
-        traces = lines.traces_of(runs, keys)
-        factor, unit = lines.scale_of(signal, traces, start, stop)
-        for trace in traces:
-            lines.draw_line(left[row], trace, factor, start, stop, runs, envelope=marks if dense else None)
-            if zoomed is not None:
-                lines.draw_line(right[row], trace._replace(label="_"), factor, *zoomed, runs)
+    for row, keys in enumerate(panels):
+        traces, factor, unit = draw_panel(left[row], runs, keys, start, stop, marks if dense else None)
+        if zoomed is not None:
+            for trace in traces:
+                _draw_line(right[row], trace._replace(label="_"), factor, *zoomed, time_unit(runs)[0])
         if keys == ["f_el"] and len(traces) == 1:
-            lines.draw_mean(left[row], traces[0], factor, unit, told=not right)
+            _draw_mean(left[row], traces[0], factor, unit, told=not right)
             if right:
-                lines.draw_mean(right[row], traces[0], factor, unit)
+                _draw_mean(right[row], traces[0], factor, unit)
                 drawing.legend_above(right[row], 1)
-        room = lines.HALF if right else lines.PAGE
-        lines.finish_panel(left[row], signal, unit, [factor * t.x for t in traces], room)
+        finish_panel(left[row], keys, traces, factor, unit, _HALF if right else _PAGE)
         if keys == ["f_t"] and len(traces) == 1:
-            lines.coefficient_axis((right or left)[row], traces[0].solution, factor)
-    lines.time_axis(left, runs, start, stop)
-    small = lines.about_all(runs)
+            _coefficient_axis((right or left)[row], traces[0].solution, factor)
+    time_axis(left, runs, start, stop)
+    small = about_all(runs)
     if zoomed is not None:
-        lines.time_axis(right, runs, *zoomed)
+        time_axis(right, runs, *zoomed)
         for ax in right:
             # Times in an enlargement have many digits, so that only three tick labels have room.
             ax.locator_params(axis="x", nbins=3)
@@ -85,6 +113,9 @@ def plot_solution(
     drawing.caption(figure, small, drawing.GREY if all(run.solution.success for run in runs) else drawing.VERMILION)
     figure.align_ylabels(left)
     return figure
+
+
+# What is drawn: runs, panels, interval
 
 
 def _runs(solution: Solution, others: Any) -> list[Drawn]:
@@ -110,35 +141,29 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     return [Drawn(s, label) for s, label in zip(every, labels, strict=True)]
 
 
-def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[tuple[Signal, list[str]]]:
-    """Panels from top to bottom, each with its first signal and the names of all."""
+def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[list[str]]:
+    """Names of the signals of each panel, from top to bottom: those of one quantity share one."""
     every = [run.solution.record for run in runs]
     if signals is None:
         inside = "u_layer" if any(s.layers for s in every) else "v"
         contact = any(s.gaps for s in every)
         signals = ["u_source", *(("u_gap", "f_el", "area", "f_t") if contact else (inside,))]
-    asked = [signals] if isinstance(signals, str) else list(signals)
     known = {name: None for s in every for key in SIGNALS for name in (key, *s.names(key)) if s.names(key)}
-    panels: list[tuple[Signal, list[str]]] = []
-    for name in asked:
+    panels: dict[str, list[str]] = {}
+    for name in [signals] if isinstance(signals, str) else signals:
         if name not in known:
             near = get_close_matches(str(name), known, 1, 0.0)
             allowed = ", ".join([*(name for name in known if ":" not in name), "and name:element"])
             raise InputError(f"unknown signal {name!r}; nearest: {near[0]!r}; allowed: {allowed}")
-        signal = signal_of(name)
-        same = [keys for other, keys in panels if other.axis == signal.axis]
-        if same:
-            same[0].append(name)
-        else:
-            panels.append((signal, [name]))
+        panels.setdefault(signal_of(name).axis, []).append(name)
     require(bool(panels), "signals", "empty", "one name or more")
-    return panels
+    return list(panels.values())
 
 
 def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[float, float]:
     """Start and end of the drawn interval, s."""
     times = [run.solution.t for run in runs if run.solution.t.size]
-    first, last = min((float(t[0]) for t in times), default=0.0), max(lines.end_of(run.solution) for run in runs)
+    first, last = min((float(t[0]) for t in times), default=0.0), max(_end_of(run.solution) for run in runs)
     if window is None:
         return first, last
     ends = real_numbers("window", window, "two times in s, (start, stop)")
@@ -150,16 +175,14 @@ def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[floa
     return start, stop
 
 
-def _turns(
-    runs: list[Drawn], panels: list[tuple[Signal, list[str]]], start: float, stop: float
-) -> tuple[FloatArray, FloatArray]:
-    """Times (s) and values of the turning points, two per oscillation, of the first panel's most oscillating signal."""
+def _turns(runs: list[Drawn], keys: Sequence[str], start: float, stop: float) -> tuple[FloatArray, FloatArray]:
+    """Times (s) and values of the turning points, two per oscillation, of a panel's most oscillating signal."""
     best = np.zeros(0), np.zeros(0)
     for run in runs:
         t = run.solution.t
         kept = (t >= start) & (t <= stop)
-        for key in panels[0][1]:
-            for x in lines.columns_of(run.solution, key).values():
+        for key in keys:
+            for x in _columns_of(run.solution, key).values():
                 step = np.diff(x[kept])
                 # Turning points of round-off are not counted.
                 steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
@@ -188,6 +211,196 @@ def _zoom(marks: FloatArray, heights: FloatArray, start: float, stop: float) -> 
     return max(start, float(marks[0]) - around), min(stop, float(marks[-1]) + around)
 
 
+def _end_of(solution: Solution) -> float:
+    """Time at which the run stopped, s."""
+    return float(max([solution.state.t, *solution.t[-1:]]))
+
+
+def _columns_of(solution: Solution, key: str) -> dict[str, FloatArray]:
+    """A signal by name; empty if this run lacks the element, which another run of the picture may have."""
+    kind, colon, _ = key.partition(":")
+    return solution.by_name(key) if not colon or key in solution.record.names(kind) else {}
+
+
+# Panels and their lines
+
+
+def draw_panel(
+    ax: Axes, runs: Sequence[Drawn], keys: Sequence[str], start: float, stop: float, envelope: FloatArray | None = None
+) -> tuple[list[Trace], float, str]:
+    """Draw signals of one quantity from `start` to `stop` (s), and give the lines with factor and unit of the panel.
+
+    With the times (s) of their turning points `envelope` it is their envelopes.
+    """
+    traces, signal, factor, unit = _traces_of(runs, keys), signal_of(keys[0]), 1.0, ""
+    if signal.unit != "1":
+        peaks = [drawing.peak_of(t.x[(t.solution.t >= start) & (t.solution.t <= stop)]) for t in traces]
+        factor, unit = drawing.engineering(max(peaks, default=0.0), signal.unit, signal.least)
+    for trace in traces:
+        _draw_line(ax, trace, factor, start, stop, time_unit(runs)[0], envelope)
+    return traces, factor, unit
+
+
+def _traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
+    """The lines of one panel; the colour of a finger, or of a run among several, is the same in every panel."""
+    out: list[Trace] = []
+    gaps = list(dict.fromkeys(gap for run in runs for gap in run.solution.gaps))
+    above = 0
+    # If the source is the same in all runs, it is drawn once, without the name of a run.
+    shared = len({run.solution.u_source.tobytes() for run in runs}) == 1
+    for number, run in enumerate(runs):
+        for key in keys:
+            found = _columns_of(run.solution, key)
+            for place, (name, x) in enumerate(found.items()):
+                kind, _, element = name.partition(":")
+                source = kind == "u_source"
+                if source and shared and number > 0:
+                    continue
+                label = element if kind == "v" else f"{SIGNALS[kind].short} {element}".rstrip()
+                if len(gaps) > 1 and element in gaps:
+                    color = drawing.CYCLE[gaps.index(element) % len(drawing.CYCLE)]
+                elif len(runs) > 1 and not (source and shared):
+                    color = drawing.CYCLE[number % len(drawing.CYCLE)]
+                elif source:
+                    color = (drawing.GREY, *drawing.CYCLE[::-1])[place % (len(drawing.CYCLE) + 1)]
+                elif len(found) == 1 and len(keys) <= 2:
+                    color = COLORS[SIGNALS[kind].axis]
+                else:
+                    color = drawing.CYCLE[above % len(drawing.CYCLE)]
+                style = _PALE if source else {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
+                above += not source
+                if run.label and not (source and shared):
+                    label = f"{label}, {run.label}"
+                out.append(Trace(run.solution, label, x, {"color": color, **style}))
+    return out
+
+
+def _draw_line(
+    ax: Axes, trace: Trace, factor: float, start: float, stop: float, scale: float, envelope: FloatArray | None = None
+) -> None:
+    """Draw a line, or its envelope, of times multiplied by `scale`."""
+    t = trace.solution.t
+    # One output beyond each end of the window is drawn too, so that the line reaches the edges of the picture.
+    first, last = max(int(np.searchsorted(t, start)) - 1, 0), int(np.searchsorted(t, stop, side="right")) + 1
+    t, x = t[first:last], factor * trace.x[first:last]
+    if envelope is None:
+        t, x = drawing.thin(t, x)
+        ax.plot(scale * t, x, label=trace.label, **{"solid_joinstyle": "round", **trace.style})
+        return
+    middle, spans = _envelope_spans(t, start, stop, envelope)
+    low, high = np.minimum.reduceat(x, spans)[::2], np.maximum.reduceat(x, spans)[::2]
+    pale = "alpha" in trace.style
+    ax.fill_between(scale * middle, low, high, color=trace.style["color"], alpha=0.3 if pale else 0.2, linewidth=0.0)
+    edge = {**trace.style, "linewidth": 1.6 if pale else 0.7 * trace.style["linewidth"]}
+    ax.plot(scale * middle, low, **edge)
+    ax.plot(scale * middle, high, **edge, label=trace.label)
+
+
+def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray) -> tuple[FloatArray, IntArray]:
+    """The middles (s) of an envelope's parts, and the first output and the one after the last of each part's span."""
+    lengths = np.diff(turns)
+    parts = (stop - start) / (2.0 * float(np.median(lengths)))
+    edges = np.linspace(start, stop, max(1, int(min(parts, _PARTS))) + 1)
+    middle = 0.5 * (edges[:-1] + edges[1:])
+    # A span contains an oscillation, and so a maximum and a minimum, also where oscillations are longer than most, as
+    # at the beginning of a chirp. A pause between bursts is no oscillation: what is beside it is much shorter.
+    beside = np.pad(lengths, 1, mode="edge")
+    oscillation = 2.0 * np.median([beside[:-2], lengths, beside[2:]], axis=0)
+    here = np.clip(np.searchsorted(turns, middle) - 1, 0, lengths.size - 1)
+    whole = np.maximum(edges[1] - edges[0], oscillation[here])
+    # At the ends of the window a span is one-sided, and as long as any other.
+    begin = np.maximum(np.minimum(middle - 0.5 * whole, stop - whole), start)
+    first = np.searchsorted(t, begin)
+    after = np.minimum(np.searchsorted(t, np.minimum(begin + whole, stop)), t.size - 1)
+    kept = after > first
+    return middle[kept], np.column_stack([first, after])[kept].ravel()
+
+
+def _draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:
+    """Draw the mean force as a horizontal line; with `told` the legend names it."""
+    summary = trace.solution.summary()
+    means = {"of the last period": summary.get("f_el_mean_periodic"), "of the run": summary.get("f_el_mean")}
+    known = [(of, factor * mean) for of, mean in means.items() if mean is not None]
+    if known:
+        label = f"mean {known[0][0]}, {known[0][1]:.4g} {unit}" if told else "_"
+        ax.axhline(known[0][1], color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
+
+
+def finish_panel(
+    ax: Axes, keys: Sequence[str], traces: Sequence[Trace], factor: float, unit: str, room: int = _PAGE
+) -> None:
+    """Labels, limits and legend of a panel; `room` is the number of letters that the legend has room for."""
+    signal = signal_of(keys[0])
+    drawing.dress(ax, f"{signal.axis} [{unit}]" if unit else signal.axis)
+    if signal.from_zero:
+        drawing.from_zero(ax)
+    else:
+        ax.ticklabel_format(axis="y", useOffset=False)
+        drawing.flat(ax, np.concatenate([np.zeros(0), *(factor * trace.x for trace in traces)]))
+    drawing.legend_within(ax, room)
+
+
+def _coefficient_axis(ax: Axes, solution: Solution, factor: float) -> None:
+    """Add a second scale to the friction panel: friction force divided by the normal load."""
+    ((_, contact),) = solution.record.fingers
+    load = factor * contact.f_n
+    right = ax.secondary_yaxis("right", functions=(partial(np.multiply, 1.0 / load), partial(np.multiply, load)))
+    right.set_ylabel("coefficient", fontsize=drawing.FONT, color=drawing.GREY)
+    right.tick_params(labelsize=drawing.FONT - 0.5, color="#999999", labelcolor=drawing.GREY)
+    right.spines["right"].set_color("#999999")
+
+
+def time_unit(runs: Sequence[Drawn]) -> tuple[float, str]:
+    """Factor and unit of the time axis."""
+    return drawing.engineering(max(max(_end_of(run.solution), drawing.peak_of(run.solution.t)) for run in runs), "s")
+
+
+def time_axis(axes: Sequence[Axes], runs: Sequence[Drawn], start: float, stop: float) -> None:
+    """Set limits (s) and label of the time axis, and mark where a run stopped early."""
+    factor, unit = time_unit(runs)
+    span = (stop - start) or 1.0
+    stopped = [r.solution for r in runs if r.solution.status not in (Status.SUCCESS, Status.ERROR_NOT_MET)]
+    early = [end for end in map(_end_of, stopped) if start <= end <= stop]
+    # Extend the axis to the right of the end, to show that the run stopped early.
+    wide = 1.08 if early else 1.0
+    for ax in axes:
+        ax.set_xlim(factor * start, factor * (start + span * wide))
+        ax.ticklabel_format(axis="x", useOffset=False)
+        for end in early:
+            if len(runs) == 1:
+                ax.axvspan(factor * end, factor * (start + wide * span), color="#EEEEEE", zorder=0.5)
+            ax.axvline(factor * end, color=drawing.VERMILION, linewidth=1.2, linestyle=drawing.DASHES[3])
+    if early:
+        axes[0].text(
+            factor * early[0], 0.98, "stopped ", transform=axes[0].get_xaxis_transform(), ha="right", va="top",
+            fontsize=drawing.FONT - 0.5, color=drawing.VERMILION,
+        )  # fmt: skip
+    axes[-1].set_xlabel(f"Time [{unit}]", fontsize=drawing.FONT)
+
+
+def about_all(runs: Sequence[Drawn]) -> str:
+    """Circuit, method and error of several runs: first the facts that all runs share, then each run's own facts."""
+    facts = []
+    for s, _ in runs:
+        area, force = (f"area: {s.area_mode}", f", {s.error.f_el:.2g} N") if s.gaps else ("", "")
+        facts.append((
+            heading(s.circuit), drive_text(s.circuit), f"{s.charge_law} charge law", area,
+            f"method {s.method}, rtol {s.rtol:.2g}", f"error estimate {s.error.u_gap:.2g} V{force}",
+        ))  # fmt: skip
+    if len(runs) == 1:
+        end = [] if runs[0].solution.success else [runs[0].solution.message]
+        return " · ".join([fact for fact in facts[0] if fact] + end)
+    shared = [f for i, f in enumerate(facts[0]) if f and all(other[i] == f for other in facts)]
+    own = []
+    for run, fact in zip(runs, facts, strict=True):
+        # Leave out the first fact (title and changed parameters), because the run's label has the changes.
+        differs = [f for i, f in enumerate(fact[1:], 1) if f and any(other[i] != f for other in facts)]
+        own.append(f"{run.label}: {', '.join(differs)}" if differs else run.label)
+    title = runs[0].solution.circuit.title
+    alike = all(run.solution.circuit.title == title for run in runs)
+    return " · ".join([*([title] if alike and title not in shared else []), *shared, *own])
+
+
 #: Amplitudes below this fraction of the largest are not drawn: they are mostly numerical errors of the run.
 _DRAWN = 1e-6
 
@@ -196,7 +409,7 @@ def plot_spectrum(spectrum: Spectrum) -> Picture:
     """Amplitudes of the lines, or the density with its confidence interval, against frequency, on logarithmic axes."""
     figure, (ax,) = drawing.new_figure(1, height=3.4)
     signal = signal_of(spectrum.signal)
-    color, unit = lines.COLORS[signal.axis], spectrum.unit.replace("^2", "²")
+    color, unit = COLORS[signal.axis], spectrum.unit.replace("^2", "²")
     label = f"{signal.text.capitalize()} {spectrum.signal.partition(':')[2]}".rstrip()
     if spectrum.amplitude is not None:
         least = _DRAWN * drawing.peak_of(spectrum.amplitude)

@@ -156,14 +156,14 @@ class Signals(Sealed):
 
 
 class StoredRecord(Signals):
-    """Outputs of a run as they were read from a file: signals ``key`` or ``key:element`` as columns (n, n_t)."""
+    """Outputs of a run as they were read from a file: signals ``key`` or ``key:element`` as rows (n_t, n)."""
 
     def __init__(
         self, names: Sequence[str], sources: tuple[str, ...], fingers: tuple[tuple[str, Contact], ...], t: FloatArray,
-        left: BoolArray | None, columns: FloatArray,
+        left: BoolArray | None, rows: FloatArray,
     ) -> None:  # fmt: skip
         own: dict[str, dict[str, FloatArray]] = {key: {} for key in SIGNALS}
-        for name, column in zip(names, columns, strict=True):
+        for name, column in zip(names, rows.T, strict=True):
             key, _, element = name.partition(":")
             own[key][element] = np.ascontiguousarray(column)
         self.t, self.sources, self.fingers = t, sources, fingers
@@ -309,7 +309,7 @@ class Record(Signals):
     # (n_t, size): The state as in `engine.network`; with `has_charge` the sources' currents follow in the last columns,
     # and without it the columns of the charges may be missing
     rows: FloatArray
-    has_charge: bool
+    has_charge: bool = False
 
     def __post_init__(self) -> None:
         network = self.network
@@ -452,8 +452,3 @@ class Record(Signals):
         n = self._x.shape[1]
         rows = zip(self.network.node_names, self.network.nodes, strict=True)
         return {name: sealed(self._voltage(row[:n], row[n:])) for name, row in rows}
-
-
-def bare_record(network: Network, net: Net, t: FloatArray, left: BoolArray, rows: FloatArray) -> Record:
-    """A record without charge, from states as columns, shape (size, n_t)."""
-    return Record(network, net, t, left, rows.T, False)

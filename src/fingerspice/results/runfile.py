@@ -364,10 +364,10 @@ def _solution(file: Any) -> Solution:
         begin, end = period[::NODES, 0], period[NODES - 1 :: NODES, 0]
         values = period[:, 1:].reshape(begin.size, NODES, -1).transpose(0, 2, 1)
         make = partial(StoredRecord, tuple(map(str, run["between"])), sources, fingers)
-        continuous = Recorded(whole_steps(begin, end, values), float(run["t_stop"]) - float(run["period"]), make)
+        continuous = Recorded(whole_steps(begin, end), values, float(run["t_stop"]) - float(run["period"]), make)
     return Solution(
         t=t,
-        record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:].T),
+        record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:]),
         circuit=_circuit(file, run),
         continuous=continuous,
         stored=dict(run["summary"]),

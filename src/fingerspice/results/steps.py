@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
@@ -20,12 +19,15 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.collocation.readout import RECORDED, Steps, new_steps
 from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import BARYCENTRIC, BETWEEN, NODES, POINTS, TO_SERIES
-from fingerspice.results.record import Record, Signals, bare_record
+from fingerspice.results.record import Record, Signals
 from fingerspice.waveforms.sampling import same_time
 from fingerspice.waveforms.waveform import Waveform
 
-#: From times (s), a mask of left-hand values and states as columns to a record.
+#: From times (s), a mask of left-hand values and states as rows to a record.
 Make = Callable[[FloatArray, BoolArray, FloatArray], Signals]
+#: Parts of steps on each of which every signal is smooth, shape (4, p): the number of the step, the part of it from low
+#: to high as fractions of its length, and the duration (s), longer than the part itself if it stands for equal periods.
+Panels = FloatArray
 
 #: Most steps recorded by the compiled loop before Python collects them, and most numbers at their nodes.
 CAPACITY, _AT_ONCE = 512, 16_384
@@ -35,55 +37,16 @@ MOST_NUMBERS = 8_000_000
 _KNOWN, _MOST_KNOWN = 8, 4096
 
 
-class Panels(NamedTuple):
-    """Parts of a run on each of which every signal is smooth."""
-
-    step: IntArray  # (p,)
-    # low, high (p,): The part of that step that the panel covers, as fractions of its length
-    low: FloatArray
-    high: FloatArray
-    # (p,): Duration, s; longer than the panel itself if the panel represents several equal periods
-    duration: FloatArray
-
-    def take(self, which: IntArray | BoolArray) -> Panels:
-        """Some of the panels."""
-        return Panels(self.step[which], self.low[which], self.high[which], self.duration[which])
-
-    def halved(self) -> Panels:
-        """The two halves of every panel."""
-        middle, half = 0.5 * (self.low + self.high), 0.5 * self.duration
-        low, high = np.append(self.low, middle), np.append(middle, self.high)
-        return Panels(np.tile(self.step, 2), low, high, np.tile(half, 2))
-
-    def fractions(self, points: FloatArray) -> FloatArray:
-        """Points in [0, 1] of each panel as fractions of its step, shape (p, n)."""
-        # Written so that the points 0 and 1 give exactly `low` and `high`.
-        return np.asarray(self.low[:, None] * (1.0 - points) + self.high[:, None] * points)
-
-
-#: Consecutive steps: times (6, k) and values (k, n_column, NODES). Rows of the times are the start of each step, its
-#: length, the end reached (s), the part of the length that was reached, the number of equal periods that the step
-#: stands for, and the time (s) from its own to the first of them and from each to the next. Values are those at the
-#: nodes of the whole step, which may extend beyond the end reached.
-Block = tuple[FloatArray, FloatArray]
-
-
-def whole_steps(begin: FloatArray, end: FloatArray, values: FloatArray) -> tuple[Block, ...]:
-    """Steps that were reached whole and stand for themselves."""
-    one = np.ones(begin.size)
-    return ((np.array([begin, end - begin, end, one, one, 0.0 * one]), values),)
-
-
 class Recorder:
     """Collects the steps of one integration after each call of its compiled loop."""
 
     def __init__(self, columns: int) -> None:
         self.columns, self.numbers = columns, 0
         self.room: Steps = new_steps(min(CAPACITY, 1 + _AT_ONCE // max(columns, 1)), columns)
-        self.parts: list[Block] = []
+        self.parts: list[tuple[FloatArray, FloatArray]] = []  # Times and values as in `Recorded`
 
     def drain(self, counters: IntArray) -> None:
-        """Collect the steps that the loop has recorded, as a block; none of them where there are too many."""
+        """Collect the steps that the loop has recorded; none of them where there are too many."""
         count = int(counters[RECORDED])
         counters[RECORDED] = 0
         self.numbers += count * self.columns * NODES
@@ -95,21 +58,27 @@ class Recorder:
             self.parts.append((times, self.room.values[:count].copy()))
 
     def repeat(self, since: int, periods: int, period: float) -> None:
-        """Let the blocks from number `since` on also represent the `periods` periods that follow them."""
+        """Let the parts from number `since` on also represent the `periods` periods that follow them."""
         again = np.array([[periods], [period]])
         for times, values in self.parts[since:] if periods > 0 else ():
             self.parts.append((np.concatenate([times[:4], again.repeat(len(values), axis=1)]), values))
 
     def finish(self, first: float, make: Make) -> Recorded | None:
         """The run recorded since `first` (s); None where nothing, or too much, was recorded."""
-        return Recorded(tuple(self.parts), first, make) if self.parts else None
+        if not self.parts:
+            return None
+        times, values = zip(*self.parts, strict=True)
+        return Recorded(np.concatenate(times, axis=1), np.concatenate(values), first, make)
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Steps of a run since a time (s), with its signals at any fraction of each step."""
+    """Consecutive steps of a run since a time (s), with its signals at any fraction of each step."""
 
-    parts: tuple[Block, ...]
+    # (6, k): Start of each step, its length, the end reached (s), the part of the length that was reached, the number
+    # of equal periods that it stands for, and the time (s) from its own to the first of them and from each to the next
+    times: FloatArray
+    values: FloatArray  # (k, n_column, NODES): At the nodes of the whole step, which may extend beyond the end reached
     first: float
     make: Make
     # Records at places that were asked for, as signals are mostly asked for at the same places one after another
@@ -121,79 +90,80 @@ class Recorded:
         """These steps; None where they begin after `since` (s)."""
         return self if since >= self.first - 1e-9 * (until - since) else None
 
-    @cached_property
-    def steps(self) -> Block:
-        """All of them as one block."""
-        times, values = zip(*self.parts, strict=True)
-        return np.concatenate(times, axis=1), np.concatenate(values)
-
     def panels(self, since: float, until: float) -> Panels:
         """Parts of the steps between two times (s); equal periods are one panel with the duration of all of them."""
-        start, length, reached, reach, count, period = self.steps[0]
+        start, length, reached, reach, count, period = self.times
         begin, end = start + period, reached + period
         slack = same_time(1.0) * np.abs(end)
-        index = np.arange(start.size)
+        index = np.arange(float(start.size))
         if ((begin >= since - slack) & (end + (count - 1) * period <= until + slack)).all():
-            return Panels(index, np.zeros(index.size), reach, count * reach * length)
+            return np.array([index, 0.0 * index, reach, count * reach * length])
         period = np.where(count > 1, period, 1.0)
         # Of the periods that a step represents, those from number `first` to `last` lie wholly inside.
         first = np.clip(np.ceil((since - slack - begin) / period), 0, count)
         last = np.clip(np.floor((until + slack - end) / period), -1, count - 1)
-        found = [(np.zeros_like(reach), reach, np.maximum(last - first + 1.0, 0.0))]
+        found = [(index, 0.0 * reach, reach, np.maximum(last - first + 1.0, 0.0) * reach * length)]
         for k, once in ((first - 1.0, True), (last + 1.0, last + 1.0 != first - 1.0)):
             cut = once & (k >= 0) & (k < count)
             low = np.maximum((since - begin - k * period) / length, 0.0)
             # A part that ends with the interval, to rounding, ends where its step does: on the left of a possible jump.
             whole = end + k * period <= until + slack
             high = np.where(whole, reach, np.minimum((until - begin - k * period) / length, reach))
-            found.append((low, high, np.where(cut & (high - low > slack / length), 1.0, 0.0)))
-        index = np.tile(index, 3)
-        low, high, weight = (np.concatenate(x) for x in zip(*found, strict=True))
-        return Panels(index, low, high, weight * (high - low) * length[index]).take(weight > 0.0)
+            found.append((index, low, high, np.where(cut & (high - low > slack / length), (high - low) * length, 0.0)))
+        every = np.concatenate(found, axis=1)
+        return every[:, every[3] > 0.0]
 
     @cached_property
     def _whole(self) -> tuple[FloatArray, Signals]:
         """Times (k, ROWS) and the record at the points of every step, up to the end that it reached."""
-        times, values = self.steps
-        columns = np.concatenate([values, values @ BETWEEN], axis=2)
-        fraction = times[3, :, None] * POINTS
-        short = np.flatnonzero(times[3] != 1.0)
+        columns = np.concatenate([self.values, self.values @ BETWEEN], axis=2)
+        fraction = self.times[3, :, None] * POINTS
+        short = np.flatnonzero(self.times[3] != 1.0)
         if short.size:
-            columns[short] = np.einsum("pcn,pqn->pcq", values[short], _basis(fraction[short]))
+            columns[short] = np.einsum("pcn,pqn->pcq", self.values[short], _basis(fraction[short]))
         return self._record(slice(None), fraction, columns.transpose(1, 0, 2))
 
     def _record(self, index: IntArray | slice, fraction: FloatArray, columns: FloatArray) -> tuple[FloatArray, Signals]:
         """Times at fractions of steps, and the record there of states, shape (n_column, *fraction.shape)."""
-        start, length, reached, reach = self.steps[0][:4, index, None]
+        start, length, reached, reach = self.times[:4, index, None]
         left = fraction >= reach
         t = np.where(left, reached, start + fraction * length)
-        return t, self.make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size))
+        return t, self.make(t.ravel(), left.ravel(), columns.reshape(columns.shape[0], t.size).T)
 
     def at_points(self, name: str, panels: Panels) -> tuple[FloatArray, FloatArray]:
         """Times (s) and a signal at the `POINTS` of panels, shape (p, ROWS) each."""
-        own = (panels.low == 0.0) & (panels.high == self.steps[0][3, panels.step])
+        step = panels[0].astype(int)
+        own = (panels[1] == 0.0) & (panels[2] == self.times[3, step])
         if not own.any():
-            return self.values_at(name, panels.step, panels.fractions(POINTS))
+            return self.values_at(name, panels, POINTS)
         # Panels that are whole steps share one record for all signals.
         t_own, record = self._whole
-        t, x = t_own[panels.step], record.one(name).reshape(t_own.shape)[panels.step]
+        t, x = t_own[step], record.one(name).reshape(t_own.shape)[step]
         if not own.all():
-            t[~own], x[~own] = self.values_at(name, panels.step[~own], panels.fractions(POINTS)[~own])
+            t[~own], x[~own] = self.values_at(name, panels[:, ~own], POINTS)
         return t, x
 
-    def values_at(self, name: str, index: IntArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Times (s) and a signal at fractions (p, n) of the steps with these indices (p,), shape (p, n) each."""
+    def values_at(self, name: str, panels: Panels, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Times (s) and a signal at places of panels, from 0 to 1, shape (n,) or (p, n); shape (p, n) each."""
+        index, (low, high) = panels[0].astype(int), panels[1:3, :, None]
+        # Written so that the places 0 and 1 give exactly `low` and `high`.
+        fraction = low * (1.0 - places) + high * places
         key = index.tobytes(), fraction.tobytes()
         found = self._known.get(key)
         if found is None:
-            columns = np.einsum("pcn,pqn->cpq", self.steps[1][index], _basis(fraction))
-            found = self._record(index, fraction, columns)
+            found = self._record(index, fraction, np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction)))
             if fraction.size <= _MOST_KNOWN:
                 while len(self._known) >= _KNOWN:
                     self._known.pop(next(iter(self._known)), None)
                 self._known[key] = found
         t, record = found
         return t, record.one(name).reshape(t.shape)
+
+
+def whole_steps(begin: FloatArray, end: FloatArray) -> FloatArray:
+    """Times, as in `Recorded`, of steps that were reached whole and stand for themselves."""
+    one = np.ones(begin.size)
+    return np.array([begin, end - begin, end, one, one, 0.0 * one])
 
 
 def _basis(fraction: FloatArray) -> FloatArray:
@@ -241,13 +211,20 @@ class ClosedForm:
         begin, end = marks[:-1], marks[1:]
         done: list[FloatArray] = []
         peaks: dict[str, float] = {}
+        # Signals that follow from the gap voltage are smooth where it is, except at its zeros.
+        voltages = [name for name in names if name.startswith(("u_", "v:"))]
         for _ in range(_MOST_ROUNDS):
-            wrong = self._is_rough(names, begin, end, peaks)
+            record, place = self._at_points(begin, end)
+            middle, wrong = 0.5 * (begin + end), np.zeros(begin.size, bool)
+            for name in voltages:
+                x = record.one(name)[place]
+                peaks[name] = max(peaks.get(name, 0.0), float(np.abs(x).max(initial=0.0)))
+                wrong |= missed(x) > max(max(_MISSED, self.error) * peaks[name], self.rounding)
+            wrong &= (middle > begin) & (middle < end)
             done.append(begin[~wrong])
             if not wrong.any():
                 break
-            middle = 0.5 * (begin[wrong] + end[wrong])
-            begin, end = np.sort(np.append(begin[wrong], middle)), np.sort(np.append(middle, end[wrong]))
+            begin, end = (np.sort(np.append(side[wrong], middle[wrong])) for side in (begin, end))
             if begin.size + sum(x.size for x in done) > MOST_PANELS:
                 return None
         marks = np.append(np.sort(np.concatenate(done)), marks[-1])
@@ -261,7 +238,7 @@ class ClosedForm:
         short = np.flatnonzero(end - begin <= _ROUNDINGS * np.spacing(np.abs(end)))
         first, last = values[short, :, :1], values[short, :, -1:]
         values[short] = first + POINTS[:NODES] * (last - first)
-        return Recorded(whole_steps(begin, end, values), since, partial(bare_record, record.network, record.net))
+        return Recorded(whole_steps(begin, end), values, since, partial(Record, record.network, record.net))
 
     def _marks(self, since: float, until: float) -> FloatArray | None:
         """Ends of the first panels, s; None if they are too many."""
@@ -272,10 +249,9 @@ class ClosedForm:
             return None
         inner = self.waveform.breakpoints(since, until)
         edges = np.unique(np.concatenate([[since], inner[(inner > since) & (inner < until)], [until]]))
-        pieces = np.maximum(np.ceil(np.diff(edges) / longest), 1.0)
-        if pieces.sum() > MOST_PANELS:
+        count = np.maximum(np.ceil(np.diff(edges) / longest), 1.0).astype(int)
+        if count.sum() > MOST_PANELS:
             return None
-        count = pieces.astype(int)
         number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         return np.append(np.repeat(edges[:-1], count) + number * np.repeat(np.diff(edges) / count, count), edges[-1])
 
@@ -284,28 +260,11 @@ class ClosedForm:
         left = np.broadcast_to(POINTS >= 1.0, (begin.size, POINTS.size))
         t = np.where(left, end[:, None], begin[:, None] + POINTS * (end - begin)[:, None])
         order = np.lexsort((~left.ravel(), t.ravel()))
-        place = np.empty(order.size, int)
-        place[order] = np.arange(order.size)
-        return self.look(t.ravel()[order], left.ravel()[order]), place.reshape(t.shape)
-
-    def _is_rough(self, names: Sequence[str], begin: FloatArray, end: FloatArray, peaks: dict[str, float]) -> BoolArray:
-        """Whether some voltage's interpolation error on a panel is too large, shape (p,)."""
-        record, place = self._at_points(begin, end)
-        wrong = np.zeros(begin.size, bool)
-        for name in names:
-            if not name.startswith(("u_", "v:")):
-                # Signals that follow from the gap voltage are smooth where it is, except at its zeros.
-                continue
-            values = record.one(name)[place]
-            peaks[name] = max(peaks.get(name, 0.0), float(np.abs(values).max(initial=0.0)))
-            wrong |= missed(values) > max(max(_MISSED, self.error) * peaks[name], self.rounding)
-        return wrong & (0.5 * (begin + end) > begin) & (0.5 * (begin + end) < end)
+        return self.look(t.ravel()[order], left.ravel()[order]), np.argsort(order).reshape(t.shape)
 
     def _zeros(self, names: Sequence[str], marks: FloatArray, record: Record, place: IntArray) -> Iterator[FloatArray]:
         """Zeros of gap voltages (s) within panels, where the area has a kink."""
-        for name in names:
-            if name.partition(":")[0] != "u_gap":
-                continue
+        for name in (name for name in names if name.partition(":")[0] == "u_gap"):
             values = record.one(name)[place[:, :NODES]]
             for i in np.flatnonzero((values.max(axis=1) > self.rounding) & (values.min(axis=1) < -self.rounding)):
                 roots = chebyshev.chebroots(values[i] @ TO_SERIES[:, :NODES])
@@ -313,7 +272,6 @@ class ClosedForm:
                 yield marks[i] + (marks[i + 1] - marks[i]) * 0.5 * (1.0 + inside)
 
 
-_NODES = POINTS[:NODES]
 #: Smallest tolerance of the interpolation error of a panel, relative to the signal's peak.
 _FINEST = 1e-12
 #: Most halves of panels that are evaluated, in addition to four for each panel.
@@ -321,7 +279,7 @@ _MOST_CUT = 4096
 #: Most times that one panel is halved.
 _MOST_SEARCHES = 60
 #: Gauss-Lobatto weights on [0, 1]: exact for polynomials of degree 23.
-_WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * _NODES - 1.0) ** 2)
+_WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * POINTS[:NODES] - 1.0) ** 2)
 
 
 @dataclass(frozen=True)
@@ -344,6 +302,12 @@ class Weighed:
         return complex(2j * (turning * self.x).sum())
 
 
+def _halved(panels: Panels) -> Panels:
+    step, low, high, duration = panels
+    middle, half = 0.5 * (low + high), 0.5 * duration
+    return np.concatenate([(step, low, middle, half), (step, middle, high, half)], axis=1)
+
+
 class Stretch:
     """A run between two times (s), with weights and extremes of every signal, more exact than its error `rtol`.
 
@@ -354,14 +318,18 @@ class Stretch:
     def __init__(self, run: Recorded, since: float, until: float, rtol: float, longest: float = math.inf) -> None:
         self.run, self.span, self.rtol = run, (since, until), rtol
         self.panels = run.panels(since, until)
-        while (long := self.panels.duration > longest).any():
-            self.panels = _joined([self.panels.take(~long), self.panels.take(long).halved()])
+        while (long := self.panels[3] > longest).any():
+            self.panels = np.concatenate([self.panels[:, ~long], _halved(self.panels[:, long])], axis=1)
+
+    def finely(self, longest: float) -> Stretch:
+        """The same with panels as short as that (s)."""
+        return Stretch(self.run, *self.span, self.rtol, longest)
 
     def weigh(self, name: str) -> Weighed:
         """A signal with weights for its means."""
         t, x = self.run.at_points(name, self.panels)
         error = missed(x) / (float(np.abs(x).max(initial=0.0)) or 1.0)
-        share = self.panels.duration / self.panels.duration.sum()
+        share = self.panels[3] / self.panels[3].sum()
         # Gauss-Lobatto weights integrate polynomials up to twice the degree of the interpolant exactly. If the terms of
         # the series fall geometrically, the quadrature error is about the interpolation error to the power 1.85; 1.5 is
         # on the safe side.
@@ -374,9 +342,8 @@ class Stretch:
         # An interpolation error shifts the place of an extreme, which changes the signal there by its square only.
         weighed, panels = self._cut(name, max(_FINEST, 1e-3 * self.rtol))
         found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
-        panel, place = np.array([p for p, _, _ in found]), np.array([x for _, x, _ in found])
-        panels = panels.take(panel)
-        _, exact = self.run.values_at(name, panels.step, panels.fractions(place[:, None]))
+        places = np.array([[place] for _, place, _ in found])
+        _, exact = self.run.values_at(name, panels[:, [panel for panel, _, _ in found]], places)
         low, high = exact[:, 0].tolist()
         return min(low, float(weighed.x.min())), max(high, float(weighed.x.max()))
 
@@ -394,26 +361,21 @@ class Stretch:
         panels, parts = self.panels, []
         t, x = self.run.at_points(name, panels)
         smooth = tol * float(np.abs(x).max(initial=0.0))
-        most = _MOST_CUT + 4 * panels.step.size
+        most = _MOST_CUT + 4 * len(t)
         for left in range(_MOST_SEARCHES, 0, -1):
-            wrong = (missed(x) > smooth) & (panels.duration > shortest)
+            wrong = (missed(x) > smooth) & (panels[3] > shortest)
             if most <= 0 or left == 1:
                 # Panels that are still not smooth hold round-off, or a jump that round-off has shifted across an end.
                 wrong[:] = False
-            parts.append((panels.take(~wrong), t[~wrong, :NODES], x[~wrong, :NODES]))
+            parts.append((panels[:, ~wrong].T, t[~wrong, :NODES], x[~wrong, :NODES]))
             if not wrong.any():
                 break
-            panels = panels.take(wrong).halved()
-            most -= panels.step.size
+            panels = _halved(panels[:, wrong])
             t, x = self.run.at_points(name, panels)
-        every = _joined([part[0] for part in parts])
-        t, x = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
-        share = every.duration / every.duration.sum()
-        return Weighed(t, share[:, None] * _WEIGHTS, x), every
-
-
-def _joined(parts: Sequence[Panels]) -> Panels:
-    return Panels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+            most -= len(t)
+        every, t, x = map(np.concatenate, zip(*parts, strict=True))
+        share = every[:, 3] / every[:, 3].sum()
+        return Weighed(t, share[:, None] * _WEIGHTS, x), every.T
 
 
 class Outputs:

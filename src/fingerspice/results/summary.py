@@ -123,7 +123,7 @@ class Figures:
         # Charges and currents are those of the outputs alone.
         last = self._last_outputs if self.last is not None and name.startswith(("q_", "i_")) else self.last
         if isinstance(last, Stretch):
-            return Stretch(last.run, *last.span, last.rtol, longest).weigh(name), True
+            return last.finely(longest).weigh(name), True
         return None if last is None else (last.weigh(name), False)
 
     def between(self) -> tuple[list[str], FloatArray] | None:
@@ -133,12 +133,16 @@ class Figures:
         """
         if not isinstance(self.last, Stretch):
             return None
-        fine = Stretch(self.last.run, *self.last.span, self.last.rtol)
+        fine = self.last.finely(math.inf)
         names = [name for key in _BETWEEN for name in self.signals.names(key)]
-        if fine.panels.step.size * NODES * len(names) > MOST_BETWEEN:
+        if fine.panels.shape[1] * NODES * len(names) > MOST_BETWEEN:
             return None
-        columns = fine.at_nodes(names, _MISSED)
-        table = np.column_stack([x.ravel() for x in columns])
+        t, *columns = fine.at_nodes(names, _MISSED)
+        # Steps that stand for equal periods have the times of the one that was integrated.
+        period = self.solution.period
+        assert period is not None
+        t = t + period * np.maximum(np.ceil((fine.span[0] - t[:, :1]) / period - 1e-9), 0.0)
+        table = np.column_stack([x.ravel() for x in (t, *columns)])
         return (names, table) if table.size <= MOST_BETWEEN else None
 
     @cached_property

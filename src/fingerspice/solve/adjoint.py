@@ -21,8 +21,7 @@ from fingerspice.engine.lanes.loops import AREAS, GAP, MORE, SQUARES, lead, sum_
 from fingerspice.numerics.modes import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status
-from fingerspice.results.sensitivity import MEANS, SIGNALS, SampleGradient
-from fingerspice.results.solution import Solution
+from fingerspice.results.solution import MEANS, SIGNALS, SampleGradient, Solution
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block, driving
 from fingerspice.solve.recordings.run import ready

@@ -18,8 +18,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.loop import network_of
 from fingerspice.numerics.modes import AT, derivative
 from fingerspice.results.outcome import SolveError, Status
-from fingerspice.results.sensitivity import MEANS, SIGNALS, Sensitivity
-from fingerspice.results.solution import Solution
+from fingerspice.results.solution import MEANS, SIGNALS, Sensitivity, Solution
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import driving
 from fingerspice.waveforms.combinations import Sum

@@ -273,7 +273,6 @@ class Stepping(Integration):
         return self.recorder.finish(self.problem.first, partial(_record, self.problem.scene.shown))
 
 
-def _record(shown: Scene, t: FloatArray, left: BoolArray, columns: FloatArray) -> Record:
-    """A record without charge from recorded states, shape (size, n_t), which of a stack are counted along the loop."""
-    turned = columns if shown.stack is None else shown.turn[:, None] * columns
-    return Record(shown.network, shown.net, t, left, turned.T, False)
+def _record(shown: Scene, t: FloatArray, left: BoolArray, rows: FloatArray) -> Record:
+    """A record without charge from recorded states, shape (n_t, size), which of a stack are counted along the loop."""
+    return Record(shown.network, shown.net, t, left, rows if shown.stack is None else shown.turn * rows)

@@ -19,8 +19,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import Parameters, Sources, head_lines, overridden, require_circuit
 from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.loop import linear_scene
-from fingerspice.plots import drawing, lines
-from fingerspice.results.record import SIGNALS
+from fingerspice.plots import drawing, traces
 from fingerspice.results.solution import Solution
 from fingerspice.results.spectrum import PhasorSolution
 from fingerspice.results.steps import weigh_outputs
@@ -108,7 +107,7 @@ class Comparison(Shown):
         more = 0.53 * (len(self.gaps) - 1)
         figure, axes = drawing.new_figure(3, height=5.6 + 1.67 * more, height_ratios=[1.3, 1.3, 0.75 + more])
         solution, p = self.solution, self.phasor
-        runs = [lines.Drawn(solution, "")]
+        runs = [traces.Drawn(solution, "")]
         start, stop = float(solution.t[0]), float(solution.t[-1])
         source_phase = solution.fundamental.phase if solution.fundamental else 0.0
         turns = 2.0 * np.pi * self.frequency * solution.t + source_phase
@@ -116,18 +115,15 @@ class Comparison(Shown):
         voltages = [p.of_gap(i)["amplitude"] * wave for i, wave in enumerate(waves)]
         forces = [2.0 * p.of_gap(i)["f_el_mean"] * wave**2 for i, wave in enumerate(waves)]
         for ax, keys, curves in zip(axes, (["u_source", "u_gap"], ["f_el"]), (voltages, forces), strict=False):
-            signal, traces = SIGNALS[keys[-1]], lines.traces_of(runs, keys)
-            factor, unit = lines.scale_of(signal, traces, start, stop)
-            for trace in traces:
-                lines.draw_line(ax, trace, factor, start, stop, runs)
-            t = lines.time_unit(runs)[0] * solution.t
+            drawn, factor, unit = traces.draw_panel(ax, runs, keys, start, stop)
+            t = traces.time_unit(runs)[0] * solution.t
             style: dict[str, Any] = {"color": drawing.BLACK, "linestyle": drawing.DASHES[3], "linewidth": 1.5}
-            for trace, curve in zip(traces[-len(curves) :], curves, strict=True):
+            for trace, curve in zip(drawn[-len(curves) :], curves, strict=True):
                 ax.plot(t, factor * curve, label=f"{trace.label}, phasor", **style)
-            lines.finish_panel(ax, signal, unit, [factor * trace.x for trace in traces])
-        lines.time_axis(axes[:2], runs, start, stop)
+            traces.finish_panel(ax, keys, drawn, factor, unit)
+        traces.time_axis(axes[:2], runs, start, stop)
         self._draw_table(axes[2])
-        drawing.caption(figure, f"{lines.about_all(runs)} · periodic state; the phasor is of the fundamental alone")
+        drawing.caption(figure, f"{traces.about_all(runs)} · periodic state; the phasor is of the fundamental alone")
         figure.align_ylabels(axes[:2])
         return figure
 

@@ -27,8 +27,7 @@ from fingerspice.circuit.loop import areas_at_rest, linear_scene, with_skin_held
 from fingerspice.circuit.network import build_network
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.results.outcome import ErrorEstimate, SolveError
-from fingerspice.results.sensitivity import Sensitivity
-from fingerspice.results.solution import Solution
+from fingerspice.results.solution import Sensitivity, Solution
 from fingerspice.results.spectrum import PhasorSolution
 from fingerspice.results.summary import Figured, Figures
 from fingerspice.solve.periodic import close_period

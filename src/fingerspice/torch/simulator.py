@@ -21,8 +21,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.results.outcome import SolveError
-from fingerspice.results.sensitivity import MEANS, SIGNALS
-from fingerspice.results.solution import Solution
+from fingerspice.results.solution import MEANS, SIGNALS, Solution
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import batch
 from fingerspice.studies.batch.form import LEAST_RTOL, REFUSED, in_lockstep_by, own_path

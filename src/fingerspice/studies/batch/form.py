@@ -25,7 +25,7 @@ from fingerspice.engine.lockstep.scenes import CELL_ROWS, LARGEST_X, N_OTHERS
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import universal_curve_array
 from fingerspice.physics.materials import EPS0
-from fingerspice.results.sensitivity import MEANS
+from fingerspice.results.solution import MEANS
 from fingerspice.solve.simulation import rtol_given
 from fingerspice.waveforms.combinations import AM, Sum
 from fingerspice.waveforms.periodic import Pulse, Square

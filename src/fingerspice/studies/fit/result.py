@@ -274,7 +274,7 @@ class FitResult(Shown):
 
     def plot(self) -> Picture:
         """Data and fit, of contacts of every relation, with the residuals below."""
-        from fingerspice.plots.populations import Curve, Panel, plot_panels
+        from fingerspice.plots.picture import Curve, Panel, plot_panels
 
         panels = []
         for names, columns, *labels in self._panels():
