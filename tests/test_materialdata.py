@@ -11,7 +11,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
-from fingerspice.studies.fit.measured import read_table
+from fingerspice.studies.fit.materialfit import read_table
 from scenes import cases
 
 F = np.geomspace(*SKIN_BAND, 41)

@@ -1,7 +1,4 @@
-"""Measured areas and friction forces of a finger, and what a contact's parameters predict of them.
-
-Fit of a GAP's contact to measured areas and friction forces: alpha, m, beta, n, mu and c2 with their intervals.
-"""
+"""Fit of a GAP's contact to measured areas and friction forces: alpha, m, beta, n, mu and c2 with their intervals."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +22,9 @@ from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
 from fingerspice.physics.contact import Contact, ridge_area
 from fingerspice.studies.fit.measured import SIGMA, Given, measured_of
 from fingerspice.studies.fit.result import (
-    Drawn,
     FitResult,
     Fitted,
     Problem,
-    Unknown,
     bounded,
     estimated,
     followed,
@@ -37,6 +32,9 @@ from fingerspice.studies.fit.result import (
     profile_of,
 )
 from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from fingerspice.plots.populations import Drawn
 
 #: Measured columns and conditions, with their units.
 MEASURED = {"area": "m^2", "area_sliding": "m^2", "f_t": "N"}
@@ -46,10 +44,21 @@ NAMES = {
     "area": "ridge area at rest", "indentation": "ridge area by indentation",
     "area_sliding": "ridge area while sliding", "f_t": "friction force",
 }  # fmt: skip
+PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
+# Misfit (rms, relative) of a relation from which on it is warned about.
+_TOO_MUCH = 0.2
+# The share of its value that a measured value without sigma is off by, at first.
+_SHARE = 0.1
+# The share of an error's variance below which a relation has no part in it.
+_NO_PART = 1e-9
+# Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
+# this; they are no smaller than the last, as are singular values that count, relative to the largest.
+_ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
+# Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
+_FEWEST = 0.5
 
 
-@dataclass(frozen=True)
-class Relation:
+class Relation(NamedTuple):
     """Measured values of one kind with their conditions, in SI units."""
 
     kind: str  # A key of `NAMES`
@@ -84,7 +93,7 @@ def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, .
     several = [given] if isinstance(given, (str, Path, Mapping)) else given
     if not isinstance(several, Sequence) or not several:
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, a table's path, or a list")
-    found: dict[tuple[str, bool], Relation] = {}
+    found: dict[tuple[str, bool], list[Any]] = {}
     for number, one in enumerate(several, 1):
         place = "the data" if len(several) == 1 else f"data {number}"
         columns, place, _ = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
@@ -105,21 +114,17 @@ def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, .
         at, u, depth = columns.get("fn", none + fn), columns.get("u_gap", none), columns.get("indentation")
         if depth is not None and np.any(u != 0.0):
             raise InputError(f"{place} have the columns indentation and u_gap; allowed: indentations without voltage")
-        own = []
         for name in measured:
             values, sigma = columns[name], columns.get(sigmas[name])
             if name == "area" and depth is not None:
-                own.append(Relation("indentation", values, sigma, at, none, depth))
+                found.setdefault(("indentation", sigma is None), []).append((values, sigma, at, none, depth))
             if name != "area" or depth is None or "fn" in columns:
-                own.append(Relation(name, values, sigma, at, u, none))
-        for relation in own:
-            key = relation.kind, relation.sigma is None
-            if key in found:
-                known = {name: x for name, x in vars(found[key]).items() if isinstance(x, np.ndarray)}
-                joined: Any = {name: np.concatenate([x, getattr(relation, name)]) for name, x in known.items()}
-                relation = replace(relation, **joined)
-            found[key] = relation
-    return tuple(found.values())
+                found.setdefault((name, sigma is None), []).append((values, sigma, at, u, none))
+    # Values of one kind are one relation, whichever data they come from.
+    return tuple(
+        Relation(kind, *(None if x[0] is None else np.concatenate(x) for x in zip(*own, strict=True)))  # type: ignore
+        for (kind, _), own in found.items()
+    )
 
 
 def _meaning(name: str, names: Sequence[str]) -> tuple[str, str, str | None]:
@@ -130,7 +135,7 @@ def _meaning(name: str, names: Sequence[str]) -> tuple[str, str, str | None]:
 
 
 @dataclass(frozen=True)
-class ContactTask(Problem):
+class Task(Problem):
     """The fit of a contact; the scale of a relation without sigma is the standard deviation of the logarithms."""
 
     gap: str  # Name of the GAP
@@ -155,19 +160,24 @@ class ContactTask(Problem):
             parts.append(found - relation.values if relation.sigma is not None else np.log(found / relation.values))
         return np.concatenate(parts) / self.scale
 
-
-PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
-# Misfit (rms, relative) of a relation from which on it is warned about.
-_TOO_MUCH = 0.2
-# The share of its value that a measured value without sigma is off by, at first.
-_SHARE = 0.1
-# The share of an error's variance below which a relation has no part in it.
-_NO_PART = 1e-9
-# Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
-# this; they are no smaller than the last, as are singular values that count, relative to the largest.
-_ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
-# Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
-_FEWEST = 0.5
+    def remedy(self, names: tuple[str, ...]) -> str:
+        """The measurement that would tell one parameter, or two apart."""
+        bare = {name.rpartition(".")[2] for name in names}
+        kinds = {one.kind for one in self.relations}
+        loads = [one.fn for one in self.relations if one.kind != "indentation"]
+        what = "over a wider range of loads"
+        if bare <= {"alpha", "m_exp"}:
+            alike = not loads or float(np.ptp(np.concatenate(loads))) == 0.0
+            what = "the area at a second load as well" if alike else f"the area {what}"
+        elif bare <= {"beta", "n_exp"} and "indentation" in kinds:
+            what = "the area over a wider range of indentations"
+        elif bare <= {"beta", "n_exp"}:
+            what = "the area against the indentation as well"
+        elif "area" not in kinds and "c2" in bare:
+            what = "the area at rest as well"
+        elif bare & {"beta", "n_exp"}:
+            what = "the area against the indentation, or under a higher voltage"
+        return f"Measure {what}, or fix one of them."
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -216,11 +226,12 @@ class ContactFit(FitResult):
         return " ".join(f"{path.rpartition('.')[2]}={one.value:.6g}" for path, one in self.estimates.items())
 
     def _page(self) -> Page:
-        lines = [f"contact of {self.gap}: {self._head(f'{self._count} values')}"]
+        about = []
         for one, misfit in zip(self.relations, self.misfits, strict=True):
             known = "sigma as given" if one.sigma is not None else "sigma estimated from the residuals"
-            lines.append(f"{one.name}: {one.values.size} values, residual {100.0 * misfit:.3g} % rms; {known}")
-        return Page([*lines, *self._lines(), "", f"in the deck: {self.gap} ... {self.line}"])
+            about.append(f"{one.name}: {one.values.size} values, residual {100.0 * misfit:.3g} % rms; {known}")
+        head = f"contact of {self.gap}: {len(self.estimates)} parameters fitted to {self.count} values"
+        return self._paged(head, about, "", f"in the deck: {self.gap} ... {self.line}")
 
     def _panels(self) -> list[Drawn]:
         panels: list[Drawn] = []
@@ -324,10 +335,10 @@ def fit_contact(
     # What is fitted in its logarithm cannot start at 0.
     begin |= {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default or 0.0 for name in names if own[name] == 0.0}
     scale = np.concatenate([np.full(one.values.size, _SHARE) if one.sigma is None else one.sigma for one in relations])
-    unknowns = tuple(Unknown(f"{gap}.{name}") for name in names)
+    paths = tuple(f"{gap}.{name}" for name in names)
     limits = {named(path): pair for path, pair in (bounds or {}).items()}
-    start, box = bounded(circuit.varied(begin), unknowns, scale.size, limits)
-    task = ContactTask(start, unknowns, box, scale, gap, relations)
+    start, box = bounded(circuit.varied(begin), paths, scale.size, limits)
+    task = Task(start, paths, paths, box, scale, gap, relations)
     wanted = task.profiled(profiles if isinstance(profiles, bool) else [named(path) for path in profiles])
     task, best, pools = _solved(task)
     if not best.found:
@@ -344,14 +355,14 @@ def fit_contact(
     sized = zip(relations, predicted, task.split(task.scale), strict=True)
     notes = _further_notes(task, best, pools)
     found = ContactFit(
-        **estimated(task, best, error, reach, lambda names: _remedy(task, names), notes),
+        **estimated(task, best, error, reach, task.remedy, notes),
         circuit=fitted,
         gap=gap,
         relations=relations,
         predicted=tuple(predicted),
         sigma=tuple(one.sigma if one.sigma is not None else share * values for one, values, share in sized),
-        freedom=scale.size - len(unknowns),
-        reach=dict(zip(task.names, reach, strict=True)),
+        freedom=scale.size - len(paths),
+        reach=dict(zip(paths, reach.tolist(), strict=True)),
     )
     for relation, misfit in zip(relations, found.misfits, strict=True):
         if misfit > _TOO_MUCH:
@@ -406,7 +417,7 @@ class Pool(NamedTuple):
     freedom: float
 
 
-def _solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
+def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
     """Least squares, with the standard deviation of every pool that has none from its own residuals.
 
     Returns the task with the standard deviations found, the fit, and the pools: ridge areas against the load come from
@@ -435,30 +446,26 @@ def _solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
     return task, best, pools
 
 
-def _errors(best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, list[float]]:
+def _errors(best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, FloatArray]:
     """Standard errors of the logarithms, and Student's t with the degrees of freedom of Satterthwaite.
 
     (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946.) Each pool has its own variance, known from its own
-    residuals, and a part in the variance of a parameter.
+    residuals, and a part in the variance of a parameter; without a measure of one that has a part, nothing is known.
     """
     from scipy.stats import norm, t
 
-    covariance = best.covariance
+    covariance, left = best.covariance, np.array([pool.freedom for pool in pools])
     parts = np.array([np.sum((covariance @ best.by_log[pool.at].T) ** 2, axis=1) for pool in pools])
-    error, reach = np.sqrt(np.diag(covariance)), []
-    for k, own in enumerate(parts.T):
-        shares = zip((own / max(float(own.sum()), 1e-300)).tolist(), (pool.freedom for pool in pools), strict=True)
-        felt = [(share, left) for share, left in shares if share > _NO_PART]
-        inverse = sum(share**2 / left if left >= _FEWEST else math.inf for share, left in felt)
-        if math.isinf(inverse):
-            error[k] = math.inf
-            reach.append(math.inf)
-        else:
-            reach.append(float(t.ppf(0.975, 1.0 / inverse) if inverse > 0.0 else norm.ppf(0.975)))
-    return error, reach
+    shares = parts / np.maximum(parts.sum(axis=0), 1e-300)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        each = shares**2 / np.where(left >= _FEWEST, left, 0.0)[:, None]
+        inverse = np.where(shares > _NO_PART, each, 0.0).sum(axis=0)
+        reach = np.where(inverse > 0.0, t.ppf(0.975, 1.0 / inverse), norm.ppf(0.975))
+    reach[np.isinf(inverse)] = math.inf
+    return np.where(np.isinf(inverse), math.inf, np.sqrt(np.diag(covariance))), reach
 
 
-def _further_notes(task: ContactTask, best: Fitted, pools: Sequence[Pool]) -> list[str]:
+def _further_notes(task: Task, best: Fitted, pools: Sequence[Pool]) -> list[str]:
     found = []
     for pool in pools:
         if pool.freedom < _FEWEST:
@@ -476,22 +483,3 @@ def _further_notes(task: ContactTask, best: Fitted, pools: Sequence[Pool]) -> li
             f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
         )
     return found
-
-
-def _remedy(task: ContactTask, names: tuple[str, ...]) -> str:
-    """The measurement that would tell one parameter, or two apart."""
-    bare = {name.rpartition(".")[2] for name in names}
-    kinds = {one.kind for one in task.relations}
-    loads = np.concatenate([one.fn for one in task.relations if one.kind != "indentation"] or [np.ones(1)])
-    what = "over a wider range of loads"
-    if bare <= {"alpha", "m_exp"}:
-        what = "the area at a second load as well" if float(np.ptp(loads)) == 0.0 else f"the area {what}"
-    elif bare <= {"beta", "n_exp"} and "indentation" in kinds:
-        what = "the area over a wider range of indentations"
-    elif bare <= {"beta", "n_exp"}:
-        what = "the area against the indentation as well"
-    elif "area" not in kinds and "c2" in bare:
-        what = "the area at rest as well"
-    elif bare & {"beta", "n_exp"}:
-        what = "the area against the indentation, or under a higher voltage"
-    return f"Measure {what}, or fix one of them."
