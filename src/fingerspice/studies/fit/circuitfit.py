@@ -230,9 +230,8 @@ class Fit(FitResult):
         return [(names, (x, data.values, self.predicted, self.sigma), label, signal, MEASURED[data.signal])]
 
     def to_dict(self) -> dict[str, Any]:
-        """The fit as plain numbers and texts; `parameters` has a row for each."""
         return {
-            **self._plain(),
+            **super().to_dict(),
             "groups": list(self.circuits),
             "signal": self.data.signal,
             "count": int(self.data.values.size),

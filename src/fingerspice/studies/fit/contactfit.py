@@ -56,6 +56,10 @@ _NO_PART = 1e-9
 _ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
 # Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
 _FEWEST = 0.5
+#: Relations whose values have one standard deviation, as they come from the same instrument: what was measured, in
+#: words; places among the residuals; and number of values less what the parameters take up of them, which is infinite
+#: where the standard deviation is given.
+Pool = tuple[str, IntArray, float]
 
 
 class Relation(NamedTuple):
@@ -249,10 +253,9 @@ class ContactFit(FitResult):
         return panels
 
     def to_dict(self) -> dict[str, Any]:
-        """The fit as plain numbers and texts; `parameters` has a row for each."""
         return {
             "gap": self.gap,
-            **self._plain(),
+            **super().to_dict(),
             "relations": [
                 {"kind": one.kind, "count": int(one.values.size), "misfit": misfit}
                 for one, misfit in zip(self.relations, self.misfits, strict=True)
@@ -407,16 +410,6 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
     return tuple(name for name in PARAMETERS if name in bare)
 
 
-class Pool(NamedTuple):
-    """Relations whose values have one standard deviation, as they come from the same instrument."""
-
-    name: str  # What was measured, in words
-    at: IntArray  # Places of their values among the residuals
-    # Number of values less what the parameters take up of them; infinity where the standard deviation is given, and
-    # does not follow from the residuals
-    freedom: float
-
-
 def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
     """Least squares, with the standard deviation of every pool that has none from its own residuals.
 
@@ -431,12 +424,12 @@ def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
         members.setdefault(key, []).append((relation.name, at))
     begin = task.initial
     for _ in range(_ROUNDS):
-        best, pools, scale = followed(task.residuals, task.bounds, begin), [], task.scale.copy()
+        best, pools, scale = followed(task.residuals, task.bounds, begin), list[Pool](), task.scale.copy()
         leverage = np.sum(orth(best.by_log, _LEAST) ** 2, axis=1)
         for (_, unknown), own in members.items():
             at = np.concatenate([at for _, at in own])
             freedom = at.size - float(leverage[at].sum()) if unknown else math.inf
-            pools.append(Pool(" and the ".join(name for name, _ in own), at, freedom))
+            pools.append((" and the ".join(name for name, _ in own), at, freedom))
             if _FEWEST <= freedom < math.inf:
                 spread = float(np.sqrt(np.sum(best.residual[at] ** 2) / freedom))
                 scale[at] = np.maximum(scale[at] * spread, _LEAST)
@@ -454,28 +447,27 @@ def _errors(best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, FloatArray
     """
     from scipy.stats import norm, t
 
-    covariance, left = best.covariance, np.array([pool.freedom for pool in pools])
-    parts = np.array([np.sum((covariance @ best.by_log[pool.at].T) ** 2, axis=1) for pool in pools])
+    covariance, left = best.covariance, np.array([freedom for _, _, freedom in pools])
+    parts = np.array([np.sum((covariance @ best.by_log[at].T) ** 2, axis=1) for _, at, _ in pools])
     shares = parts / np.maximum(parts.sum(axis=0), 1e-300)
     with np.errstate(divide="ignore", invalid="ignore"):
         each = shares**2 / np.where(left >= _FEWEST, left, 0.0)[:, None]
         inverse = np.where(shares > _NO_PART, each, 0.0).sum(axis=0)
         reach = np.where(inverse > 0.0, t.ppf(0.975, 1.0 / inverse), norm.ppf(0.975))
-    reach[np.isinf(inverse)] = math.inf
-    return np.where(np.isinf(inverse), math.inf, np.sqrt(np.diag(covariance))), reach
+    known = np.isfinite(inverse)
+    return np.where(known, np.sqrt(np.diag(covariance)), math.inf), np.where(known, reach, math.inf)
 
 
 def _further_notes(task: Task, best: Fitted, pools: Sequence[Pool]) -> list[str]:
     found = []
-    for pool in pools:
-        if pool.freedom < _FEWEST:
+    for name, at, freedom in pools:
+        if freedom < _FEWEST:
             found.append(
-                f"Of the {pool.name} there are hardly more values ({pool.at.size}) than parameters, which leaves no "
-                "measure of their errors: measure more of them, or give sigma."
+                f"Of the {name} there are hardly more values ({at.size}) than parameters, which leaves no measure of "
+                "their errors: measure more of them, or give sigma."
             )
-        if math.isinf(pool.freedom):
-            own = misfit_note(float(np.sum(best.residual[pool.at] ** 2)), pool.at.size)
-            found += [note.replace("The residuals", f"The residuals of the {pool.name}", 1) for note in own]
+        if math.isinf(freedom):
+            found += misfit_note(float(np.sum(best.residual[at] ** 2)), at.size, f" of the {name}")
     fitted = {path.rpartition(".")[2] for path in task.names}
     if "c2" in fitted and "mu" not in fitted:
         mu = task.circuit[task.gap].values["mu"]

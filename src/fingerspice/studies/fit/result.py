@@ -326,8 +326,8 @@ class FitResult(Shown):
             lines.append("[[Correlations]] (unreported correlations are < 0.100)")
         return "\n".join([*lines, *(f"    C({a}, {b}) = {both:+.4f}" for a, b, both in pairs)])
 
-    def _plain(self) -> dict[str, Any]:
-        """Parameters, correlations, notes and profiles as plain numbers and texts."""
+    def to_dict(self) -> dict[str, Any]:
+        """The fit as plain numbers and texts; `parameters` has a row for each."""
         return {
             "parameters": [vars(e) for e in self.estimates.values()],
             "correlation": self.correlation.tolist(),
@@ -379,16 +379,16 @@ def estimated(
     }  # fmt: skip
 
 
-def misfit_note(square: float, freedom: int) -> list[str]:
+def misfit_note(square: float, freedom: int, of: str = "") -> list[str]:
     """A sentence about residuals that are far larger than their given sigma, else none."""
     from scipy.stats import chi2
 
     if freedom < 1 or chi2.sf(square, freedom) > _UNLIKELY:
         return []
     return [
-        f"The residuals are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains in less "
-        "than one of a thousand cases: the circuit does not describe these data, or sigma is too small, and so are the "
-        "intervals."
+        f"The residuals{of} are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains in "
+        "less than one of a thousand cases: the circuit does not describe these data, or sigma is too small, and so "
+        "are the intervals."
     ]
 
 
