@@ -126,18 +126,21 @@ def test_what_one_voltage_cannot_tell_is_said(circuit: fs.Circuit) -> None:
         assert "Measure at a second voltage as well" in note
 
 
-def test_a_network_is_fitted_by_differences() -> None:
+def test_a_network_is_fitted_by_differences_and_its_skin_follows_the_source() -> None:
     circuit = fs.read_netlist(CIRCUITS / "amplifier.cir")
-    path, source = (next(p for p in circuit.parameters if p.endswith(end)) for end in ("gap.d", ".amplitude"))
+    ends = "gap.d", "skin.f", ".amplitude", ".frequency"
+    path, skin, amplitude, frequency = (next(p for p in circuit.parameters if p.endswith(end)) for end in ends)
     gap = 0.9 * circuit.parameters[path].value
-    amplitudes = np.array([0.5, 1.0]) * circuit.parameters[source].value
-    force = [fs.steady_state(circuit, parameters={path: gap, source: a}).f_el_mean for a in amplitudes]
-    found = fs.fit(circuit, {source: amplitudes, "f_el_mean": force}, [path], starts=1, rtol=1e-8)
+    data = {amplitude: np.array([0.5, 1.0]) * circuit.parameters[amplitude].value, frequency: np.array([50.0, 200.0])}
+    at = [{path: gap, skin: f, amplitude: u, frequency: f} for u, f in zip(*data.values(), strict=True)]
+    data["f_el_mean"] = np.array([fs.steady_state(circuit, parameters=one).f_el_mean for one in at])
+    found = fs.fit(circuit, data, [path], skin="follow", starts=1, rtol=1e-8)
     assert found.estimates[path].value == pytest.approx(gap, rel=1e-5)
-    two = fs.read_netlist(CIRCUITS / "two_fingers.cir")
-    path = next(path for path in two.parameters if path.endswith("gap.d"))
-    with pytest.raises(InputError, match="the circuit has 2 GAPs; allowed: one"):
-        fs.fit(two, ONE, [path])
+    two, endless = fs.read_netlist(CIRCUITS / "two_fingers.cir"), dataclasses.replace(circuit, tran=None)
+    for other, said in ((two, "the circuit has 2 GAPs; allowed: one"), (endless, "the deck has no .tran, and average")):
+        path = next(path for path in other.parameters if path.endswith("gap.d"))
+        with pytest.raises(InputError, match=said):
+            fs.fit(other, ONE, [path], average="run")
 
 
 def test_shares_that_fit_to_the_last_bit_are_the_likelier_errors(
@@ -179,6 +182,7 @@ def by(**groups: object) -> dict[str, object]:
         ([1.0, 2.0], {}, "data is a list"),
         (ONE, {"parameters": "Xgap.d"}, "a sequence of paths"),
         (ONE, {"parameters": ["Xgap.tau"]}, "fitted in its logarithm"),
+        (ONE | {"Xskin.f": [100.0]}, {"skin": "follow", "starts": 1}, r"skin='follow' and Xskin\.f are both given"),
         (ONE, {"charge_law": "moving"}, "charge_law is 'moving'; allowed: 'local' or 'mobile'"),
         (ONE | {"voltage": [100.0]}, {}, "a column 'voltage', which is no param.*, such as X"),
         ({"frequency": [1e3], "impedance": [-1e5]}, {}, "magnitudes above 0"),

@@ -7,7 +7,7 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,26 +21,14 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import meaning_of, require_circuit, scenes_warnings
-from fingerspice.circuit.devices import MEASURED as USUAL
-from fingerspice.circuit.devices import MEASURING
-from fingerspice.circuit.statespace import build_stack, is_stack
+from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.results.record import SIGNALS
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import batch
 from fingerspice.studies.batch.form import REFUSED
-from fingerspice.studies.fit.measured import IMPEDANCE, MEANS, MEASURED, Data, data_of
-from fingerspice.studies.fit.result import (
-    FARTHEST,
-    FitResult,
-    Fitted,
-    Problem,
-    bounded,
-    estimated,
-    followed,
-    misfit_note,
-    profile_of,
-)
+from fingerspice.studies.fit.measured import IMPEDANCE, MEASURED, Data, data_of
+from fingerspice.studies.fit.result import FitResult, Fitted, Problem, bounded, estimated, followed, profile_of
 from fingerspice.studies.steady import phasor
 from fingerspice.waveforms.waveform import Sine, require
 
@@ -108,7 +96,8 @@ class Task(Problem):
     def _signal(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The predicted signal over time (n,), and its derivatives by the parameters (n, n_parameter)."""
         circuit = self._scene(values, 0)
-        fundamental = build_stack(circuit).waveform.fundamental if self.skin == "follow" and is_stack(circuit) else None
+        waves = network_of(circuit).waveforms
+        fundamental = waves[0].fundamental if self.skin == "follow" and len(waves) == 1 else None
         if fundamental is not None:
             circuit = circuit.varied({f"{e.name}.f": fundamental.frequency for e in circuit.by_device("SKIN")})
         run = simulate(
@@ -313,6 +302,11 @@ def fit(
     gaps = len(circuit.by_device("GAP"))
     if gaps > 1 or (gaps == 0 and measured.signal != IMPEDANCE):
         raise InputError(f"the circuit has {gaps} GAPs; allowed: one, to which the data belong")
+    if average == "run" and circuit.tran is None and measured.name.endswith("_mean"):
+        raise InputError("the deck has no .tran, and average is 'run'; allowed: a deck with .tran, or 'periodic'")
+    own = {f"{e.name}.f" for e in circuit.by_device("SKIN")} & {*measured.conditions, *paths}
+    if skin == "follow" and own and measured.name.endswith("_mean"):
+        raise InputError(f"skin='follow' and {own.pop()} are both given; allowed: one of them")
     start, box = bounded(circuit, paths, measured.values.size * (1 if measured.phase is None else 2), bounds or {})
     bar, begun, count = Bar("fitting", endless=True), time.perf_counter(), itertools.count(1)
 
@@ -323,7 +317,7 @@ def fit(
 
     task = Task(start, names, paths, box, measured.scale, measured, places, average, skin, rtol, charge_law, watch)
     wanted = task.profiled(profiles)
-    for text in filter(None, _unusual(circuit, measured, skin)):
+    for text in filter(None, (*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin))):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     try:
         return _fitted(task, starts, wanted)
@@ -374,27 +368,13 @@ def _request(
     return data, tuple(names), tuple(paths), places
 
 
-def _unusual(circuit: Circuit, data: Data, skin: str) -> Iterator[str]:
-    """Warnings about data that are probably in another unit, and about a skin's frequency."""
-    if data.signal in USUAL:
-        largest = float(np.abs(data.values).max())
-        yield USUAL[data.signal].warning(f"the data's largest {data.name}", largest, MEASURED[data.signal]) or ""
-    for path, x in data.conditions.items():
-        if data.signal in MEANS and path.endswith(".amplitude"):
-            yield MEASURING.warning(f"the data's largest {path}", float(x[np.abs(x).argmax()]), "V") or ""
-    yield from scenes_warnings(circuit, None, data.conditions, skin)
-
-
 def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
     """The fit, with the profiles `wanted`."""
     from scipy.stats import norm, t
 
     data, n = free.data, free.data.values.size
-    # Where no bounds are given, nothing is looked for far from the start: there are no likely values, and slow runs.
-    (low, high), near, far = free.bounds.T, free.initial / FARTHEST, free.initial * FARTHEST
-    walls = np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
-    task = dataclasses.replace(free, bounds=walls)
-    ends = [followed(task.residuals, walls, begin) for begin in _starts(task, starts)]
+    task = dataclasses.replace(free, bounds=free.walls)
+    ends = [followed(task.residuals, task.bounds, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
     if not best.found:
         raise InputError(
@@ -419,7 +399,7 @@ def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
     found = Fit(
         **estimated(
             task, best, error, np.full(error.size, reach), lambda _: remedy,
-            misfit_note(best.objective, freedom) if data.sigma is not None else [],
+            best.beyond_sigma(..., freedom) if data.sigma is not None else [],
         ),
         data=data,
         predicted=data.values + (best.residual * task.scale)[:n],

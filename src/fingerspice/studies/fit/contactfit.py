@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,16 +22,7 @@ from fingerspice.circuit.devices import DEVICES
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
 from fingerspice.physics.contact import Contact, ridge_area
 from fingerspice.studies.fit.measured import SIGMA, Given, measured_of
-from fingerspice.studies.fit.result import (
-    FitResult,
-    Fitted,
-    Problem,
-    bounded,
-    estimated,
-    followed,
-    misfit_note,
-    profile_of,
-)
+from fingerspice.studies.fit.result import FitResult, Fitted, Problem, bounded, estimated, followed, profile_of
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -190,7 +182,7 @@ class ContactFit(FitResult):
 
     Attributes
     ----------
-    circuit, estimates, correlation, evaluations, closed, notes, profiles
+    circuit, estimates, correlation, count, evaluations, closed, notes, profiles
         As of `Fit`.
     gap : str
         Name of the GAP.
@@ -263,14 +255,11 @@ class ContactFit(FitResult):
         }
 
     def _columns(self) -> dict[str, Any]:
-        every = self.relations
-        columns = {"fn": "fn", "u_gap": "u_gap", "indentation": "indentation", "measured": "values"}
-        return {
-            "relation": [one.kind for one in every for _ in one.values],
-            **{name: np.concatenate([getattr(one, own) for one in every]) for name, own in columns.items()},
-            "fitted": np.concatenate(self.predicted),
-            "sigma": np.concatenate(self.sigma),
-        }
+        rows = zip(*((one.fn, one.u_gap, one.indentation, one.values) for one in self.relations), strict=True)
+        names = ("fn", "u_gap", "indentation", "measured", "fitted", "sigma")
+        columns = map(np.concatenate, (*rows, self.predicted, self.sigma))
+        kinds = [one.kind for one in self.relations for _ in one.values]
+        return {"relation": kinds, **dict(zip(names, columns, strict=True))}
 
 
 def fit_contact(
@@ -394,13 +383,9 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
     """The parameters to fit, in the order of the netlist."""
     if given is None:
         kinds, voltage = {one.kind for one in relations}, any(np.any(one.u_gap != 0.0) for one in relations)
-        areas = bool(kinds & {"area", "area_sliding"})
-        needed = {
-            "alpha": areas, "m_exp": areas, "beta": "indentation" in kinds or (areas and voltage),
-            "mu": "f_t" in kinds, "c2": "area_sliding" in kinds,
-        }  # fmt: skip
-        needed["n_exp"] = needed["beta"]
-        return tuple(name for name in PARAMETERS if needed[name])
+        loaded = bool(kinds & {"area", "area_sliding"})
+        pressed = "indentation" in kinds or (loaded and voltage)
+        return tuple(compress(PARAMETERS, (loaded, loaded, pressed, pressed, "f_t" in kinds, "area_sliding" in kinds)))
     if isinstance(given, str) or not given:
         raise InputError(f"parameters is {given!r}; allowed: a sequence of {', '.join(PARAMETERS)}")
     bare = [name.rpartition(".")[2].lower() for name in given]
@@ -467,7 +452,7 @@ def _further_notes(task: Task, best: Fitted, pools: Sequence[Pool]) -> list[str]
                 "their errors: measure more of them, or give sigma."
             )
         if math.isinf(freedom):
-            found += misfit_note(float(np.sum(best.residual[at] ** 2)), at.size, f" of the {name}")
+            found += best.beyond_sigma(at, at.size, f" of the {name}")
     fitted = {path.rpartition(".")[2] for path in task.names}
     if "c2" in fitted and "mu" not in fitted:
         mu = task.circuit[task.gap].values["mu"]

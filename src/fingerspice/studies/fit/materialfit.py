@@ -130,15 +130,10 @@ def _kind(name: str, file: str) -> tuple[str, float, float, float]:
         r"(?P<what>[^\[(/]*?)\s*(?:[\[(](?P<bracket>[^\])]*)[\])]|/\s*(?P<slash>.+))?", name.strip().strip("\"'")
     )
     what, unit = (match["what"].strip(), (match["bracket"] or match["slash"] or "").strip()) if match else ("", "")
-
-    def known(what: str) -> list[tuple[str, str, str, int, float, float]]:
-        return [kind for kind in _KINDS if re.fullmatch(kind[1], what, re.IGNORECASE)]
-
-    kinds = known(what)
-    if not kinds and "_" in what and not unit:
+    if "_" in what and not unit and not any(re.fullmatch(names, what, re.IGNORECASE) for _, names, *_ in _KINDS):
         # A name such as f_kHz ends with its unit.
         what, _, unit = what.rpartition("_")
-        kinds = known(what)
+    kinds = [kind for kind in _KINDS if re.fullmatch(kind[1], what, re.IGNORECASE)]
     for column, _, units, metres, power, factor in kinds:
         if not unit:
             return column, 1.0, power, factor

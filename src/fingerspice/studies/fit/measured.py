@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.devices import MEASURED as USUAL
+from fingerspice.circuit.devices import MEASURING
 from fingerspice.circuit.topology import driving_sources
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_columns
 
@@ -21,7 +23,7 @@ from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_
 MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V", "impedance": "ohm"}
 #: The one measured quantity that is no mean, and the column that may stand beside it.
 IMPEDANCE, PHASE = "impedance", "impedance_phase"
-MEANS = ("f_el", "f_t", "friction", "area")
+_MEANS = ("f_el", "f_t", "friction", "area")
 _TIME = "t"
 _UNITS = MEASURED | {f"{signal}_mean": unit for signal, unit in MEASURED.items()} | {_TIME: "s", PHASE: "deg"}
 SIGMA = "sigma"
@@ -111,11 +113,9 @@ def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> M
 
 def _unit_factor(unit: str, base: str, what: str) -> float:
     """A header's unit over the unit `base`; the prefix of an area is squared with it."""
-    known = {"": 1.0} | ({} if base else {"%": 0.01})
-    if base == "m^2":
-        known |= {prefix + base: factor**2 for prefix, factor in _PREFIXES.items()} | {"mm2": 1e-6, "mm²": 1e-6}
-    elif base:
-        known |= {prefix + base: factor for prefix, factor in _PREFIXES.items()}
+    power = 2 if base == "m^2" else 1
+    known = {prefix + base: factor**power for prefix, factor in _PREFIXES.items()} if base else {"%": 0.01}
+    known |= {"": 1.0} | (dict.fromkeys(("mm2", "mm²"), 1e-6) if power == 2 else {})
     if unit in known:
         return known[unit]
     scaled = ", with k, m, u or n before it where need be" if base else ""
@@ -151,6 +151,15 @@ class Data:
         scale = own if self.sigma is None else self.sigma
         # An error of the complex impedance, equal in all directions, is as large across as along.
         return scale if self.phase is None else np.concatenate([scale, np.degrees(scale / sizes)])
+
+    def unusual(self) -> Iterator[str]:
+        """Warnings about measured values and amplitudes that are probably in another unit."""
+        if self.signal in USUAL:
+            largest = float(np.abs(self.values).max())
+            yield USUAL[self.signal].warning(f"the data's largest {self.name}", largest, MEASURED[self.signal]) or ""
+        for path, x in self.conditions.items():
+            if self.signal in _MEANS and path.endswith(".amplitude"):
+                yield MEASURING.warning(f"the data's largest {path}", float(x[np.abs(x).argmax()]), "V") or ""
 
     @property
     def varying(self) -> dict[str, FloatArray]:
@@ -189,7 +198,7 @@ def data_of(circuit: Circuit, given: Given, by: str | None = None) -> Data:
         if by is not None or "no rows of numbers" not in refused.message:
             raise
         raise InputError(f"{refused.message}; allowed: numbers, and names in the column that groups names") from None
-    names = {f"{name}_mean": name for name in MEANS}
+    names = {f"{name}_mean": name for name in _MEANS}
     names |= {name: name for name in MEASURED if name != IMPEDANCE} if _TIME in columns else {IMPEDANCE: IMPEDANCE}
     measured = [name for name in columns if name in names]
     if len(measured) != 1:
@@ -234,7 +243,7 @@ def _refuse_signs(name: str, values: FloatArray, place: str, first: int) -> None
     if name == IMPEDANCE or name.endswith("_mean"):
         told = [(values[i], f"in row {i + first}") for i in np.flatnonzero(low)[:1]]
     else:
-        told = [(values.mean(), "on average")] if name in MEANS and values.mean() < 0.0 else []
+        told = [(values.mean(), "on average")] if name in _MEANS and values.mean() < 0.0 else []
     for value, where in told:
         raise InputError(f"{place}: {name} is {f'{value:g} {_UNITS[name]}'.rstrip()} {where}; allowed: {allowed}")
 
@@ -252,7 +261,7 @@ def _path(circuit: Circuit, name: str) -> str:
     if name.lower() not in known:
         near = difflib.get_close_matches(name.lower(), known, 1, 0.0)
         hint = f", such as {known[near[0]]}" if near else ""
-        allowed = ", ".join((*(f"{signal}_mean" for signal in MEANS), IMPEDANCE, PHASE, SIGMA, _TIME))
+        allowed = ", ".join((*(f"{signal}_mean" for signal in _MEANS), IMPEDANCE, PHASE, SIGMA, _TIME))
         raise InputError(
             f"the data have a column {name!r}, which is no parameter of the circuit; allowed: {allowed} with a signal, "
             f"and conditions{hint}"

@@ -34,10 +34,12 @@ REFUSED = 1e6
 _CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
 # Step of the differences in a parameter's logarithm, at which those of fourth order are exact to rounding.
 _STEP = 1e-3
-#: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
-FARTHEST = 1e3
+# A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
+_FARTHEST = 1e3
 # Singular values of the derivatives below this share of the largest are rounding.
 _LEAST = 1e-9
+# Residuals this unlikely by noise of the given sigma are named.
+_UNLIKELY = 1e-3
 
 
 def bounded(
@@ -81,6 +83,12 @@ class Problem:
     def initial(self) -> FloatArray:
         """Values to start from."""
         return np.array([self.circuit.parameters[path].value for path in self.paths])
+
+    @property
+    def walls(self) -> FloatArray:
+        """Bounds also where none are given, far from the start: there are no likely values, and slow runs."""
+        (low, high), near, far = self.bounds.T, self.initial / _FARTHEST, self.initial * _FARTHEST
+        return np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
 
     def misses(self, values: FloatArray) -> FloatArray:
         """Residuals over their scale, shape (n,)."""
@@ -140,6 +148,19 @@ class Fitted(NamedTuple):
         spread = 1.0 / np.maximum(singular, _LEAST * max(float(singular.max()), 1e-300))
         return np.asarray((right.T * spread**2) @ right)
 
+    def beyond_sigma(self, at: Any, freedom: int, of: str = "") -> list[str]:
+        """A sentence about residuals, at some places of them, that are far larger than their given sigma, else none."""
+        from scipy.stats import chi2
+
+        square = float(np.sum(self.residual[at] ** 2))
+        if freedom < 1 or chi2.sf(square, freedom) > _UNLIKELY:
+            return []
+        return [
+            f"The residuals{of} are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains in "
+            "less than one of a thousand cases: the circuit does not describe these data, or sigma is too small, and "
+            "so are the intervals."
+        ]
+
 
 def followed(
     residuals: Callable[[FloatArray], tuple[FloatArray, FloatArray]], bounds: FloatArray, begin: FloatArray,
@@ -182,8 +203,6 @@ _TOGETHER, _NOTABLE, _UNKNOWN = 0.98, 0.05, 0.7
 _AT_BOUND = 1e-6
 # An interval that reaches farther than this, in the logarithm, has no ends.
 _NO_END = 50.0
-# Residuals this unlikely by noise of the given sigma are named.
-_UNLIKELY = 1e-3
 # Of profiles: growth of the distance from the value, in its logarithm, and error of an interval's end over that
 # distance; error of the other parameters on the way; ratio of the interval's parts from which on it is called skewed.
 _GROWTH, _END, _ROUGHLY, _SKEWED = 1.6, 0.01, 1e-4, 1.2
@@ -379,19 +398,6 @@ def estimated(
     }  # fmt: skip
 
 
-def misfit_note(square: float, freedom: int, of: str = "") -> list[str]:
-    """A sentence about residuals that are far larger than their given sigma, else none."""
-    from scipy.stats import chi2
-
-    if freedom < 1 or chi2.sf(square, freedom) > _UNLIKELY:
-        return []
-    return [
-        f"The residuals{of} are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains in "
-        "less than one of a thousand cases: the circuit does not describe these data, or sigma is too small, and so "
-        "are the intervals."
-    ]
-
-
 def profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profile:
     """The profile of a parameter; in its interval the objective is at most by `room` worse than the best."""
     from scipy.optimize import brentq
@@ -425,7 +431,7 @@ def profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profi
     for sign, word, bound in zip((-1, 1), ("below", "above"), task.bounds[place].tolist(), strict=True):
         begin = np.delete(best.values, place)
         with np.errstate(divide="ignore"):
-            farthest = min(math.log(FARTHEST), abs(float(np.log(bound)) - here))
+            farthest = min(math.log(_FARTHEST), abs(float(np.log(bound)) - here))
         near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
         while look(here + sign * far) <= limit and far < farthest:
             near, far = far, min(_GROWTH * far, farthest)
