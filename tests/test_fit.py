@@ -136,11 +136,19 @@ def test_a_network_is_fitted_by_differences_and_its_skin_follows_the_source() ->
     data["f_el_mean"] = np.array([fs.steady_state(circuit, parameters=one).f_el_mean for one in at])
     found = fs.fit(circuit, data, [path], skin="follow", starts=1, rtol=1e-8)
     assert found.estimates[path].value == pytest.approx(gap, rel=1e-5)
-    two, endless = fs.read_netlist(CIRCUITS / "two_fingers.cir"), dataclasses.replace(circuit, tran=None)
-    for other, said in ((two, "the circuit has 2 GAPs; allowed: one"), (endless, "the deck has no .tran, and average")):
-        path = next(path for path in other.parameters if path.endswith("gap.d"))
-        with pytest.raises(InputError, match=said):
-            fs.fit(other, ONE, [path], average="run")
+
+
+@pytest.mark.parametrize(
+    ("deck", "changes", "said"),
+    [
+        ("two_fingers.cir", {}, "the circuit has 2 GAPs; allowed: one"),
+        ("fingerpad.cir", {"tran": None}, "the deck has no .tran, and average is 'run'; allowed"),
+    ],
+)
+def test_circuits_that_have_no_such_mean_are_refused(deck: str, changes: dict[str, Any], said: str) -> None:
+    circuit = dataclasses.replace(fs.read_netlist(CIRCUITS / deck), **changes)
+    with pytest.raises(InputError, match=said):
+        fs.fit(circuit, ONE, [next(path for path in circuit.parameters if path.endswith("gap.d"))], average="run")
 
 
 def test_shares_that_fit_to_the_last_bit_are_the_likelier_errors(
@@ -344,9 +352,9 @@ def test_each_group_has_its_own_parameters_and_all_share_the_others(circuit: fs.
 
 
 def test_groups_of_impedances_are_fitted_by_differences(quiet: fs.Circuit) -> None:
-    f = np.geomspace(20.0, 2e4, 5)
+    f = np.geomspace(20.0, 2e4, 3)
     z = [fs.phasor(quiet.replace({"Xgap.d": d}), f, skin="swept").impedance for d in GAPS.values()]
-    data = {"frequency": np.tile(f, 2), "impedance": np.abs(np.concatenate(z)), "finger": np.repeat([1.0, 2.0], 5)}
+    data = {"frequency": np.tile(f, 2), "impedance": np.abs(np.concatenate(z)), "finger": np.repeat([1.0, 2.0], 3)}
     # An AC of the deck is not the amplitude of the meter.
     for circuit in (quiet, fs.parse_netlist(table1_deck("SIN(0 1 100) AC 500"))):
         found = fs.fit(circuit, data, ["Xgap.d"], groups={"finger": ["Xgap.d"]}, skin="follow")
