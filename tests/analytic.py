@@ -369,6 +369,11 @@ def phasor_gains(f: float, a: float, layers: Sequence[Layer]) -> np.ndarray:
     return z / z.sum()
 
 
+def impedance(f: float, a: float, layers: Sequence[Layer]) -> complex:
+    """What a source sees of layers in series, ohm, at f in Hz and area a in m^2 (Eq. 9)."""
+    return sum(1.0 / (1.0 / x.r_total + a / x.r_area + 2j * math.pi * f * x.c * a) for x in layers)
+
+
 def _table1_rc(f: float, a: float, params: Parameters) -> tuple[float, ...]:
     """(R_i, R_a, R_sc, C_i, C_a, C_sc) of Table 1 at frequency f and area a (Eqs. 16, 17)."""
     p = params

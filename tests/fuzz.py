@@ -33,8 +33,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.netlist.deck import LONGEST_TITLE
 from fingerspice.netlist.netlist import source_from_text, sweep_from_text
 from fingerspice.netlist.reader import MAX_WARNINGS
-from fingerspice.studies.fit.materialfit import fit_material
-from fingerspice.studies.fit.measured import read_table
+from fingerspice.studies.fit.materialfit import fit_material, read_table
 
 #: One input may take so long, s, and so much memory, MiB; and the whole run so much more than its first quarter, MiB.
 SECONDS, ROOM, MEMORY = 10, 1024, 100

@@ -81,10 +81,10 @@ def test_true_values_are_found_again_from_four_relations(circuit: fs.Circuit) ->
     again = circuit.replace(found.values)
     assert fs.simulate(again).f_el_mean == fs.simulate(found.circuit).f_el_mean
     # The line stands in a deck as it is.
-    deck = (CIRCUITS / "fingerpad.cir").read_text(encoding="utf-8")
-    old = "fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
-    assert old in deck
-    read = fs.parse_netlist(deck.replace(old, f"fn=0.5 {found.line}").replace(".include fingerspice.lib", ""))
+    text = (CIRCUITS / "fingerpad.cir").read_text(encoding="utf-8").replace(".include fingerspice.lib", "")
+    before, own, after = text.partition("mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000")
+    assert own
+    read = fs.parse_netlist(f"{before}{found.line}{after}")
     assert read["Xgap"].values["c2"] == pytest.approx(4000.0)
 
 
@@ -109,9 +109,9 @@ def test_a_power_law_has_the_intervals_of_linear_regression(circuit: fs.Circuit)
 
     data = finger(np.random.default_rng(1), 0.05)[0]
     found = fs.fit_contact(circuit, data)
-    x, y = np.log(FN), np.log(1e6 * data["area"])
+    x = np.log(FN)
     design = np.column_stack([np.ones(x.size), x])
-    best, square, *_ = np.linalg.lstsq(design, y, rcond=None)
+    best, square, *_ = np.linalg.lstsq(design, np.log(1e6 * data["area"]), rcond=None)
     error = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * square[0] / (x.size - 2))
     alpha, m = found.estimates["Xgap.alpha"], found.estimates["Xgap.m_exp"]
     assert alpha.value == pytest.approx(math.exp(best[0]), rel=1e-6)
@@ -160,17 +160,18 @@ def test_areas_under_voltage_alone_do_not_tell_beta_from_n(circuit: fs.Circuit) 
 
 
 def test_a_wrong_unit_is_warned_about(circuit: fs.Circuit) -> None:
-    with pytest.warns(fs.FingerspiceWarning, match="Xgap alpha is 4.8e.07 mm.2/N.m, outside .*the usual range"):
-        fs.fit_contact(circuit, {"fn": FN, "area": resting(FN)})
-    heavy = {"fn": 1e3 * FN, "area": 1e-6 * resting(FN)}
+    rough = np.exp(0.5 * np.random.default_rng(0).standard_normal(FN.size))
+    for area, said in (
+        (resting(FN), "Xgap alpha is 4.8e.07 mm.2/N.m, outside .*the usual range"),
+        (1e-6 * resting(FN) * rough, "the ridge area at rest misses the data by .* % rms"),
+    ):
+        with pytest.warns(fs.FingerspiceWarning, match=said):
+            fs.fit_contact(circuit, {"fn": FN, "area": area})
     with (
         pytest.warns(fs.FingerspiceWarning, match="the data's largest fn is 2 kN, .*it is in newton, not millinewton"),
         pytest.raises(fs.InputError, match="fitted values do not go with the circuit's others: Xgap has no contact"),
     ):
-        fs.fit_contact(circuit, heavy)
-    rough = np.exp(0.5 * np.random.default_rng(0).standard_normal(FN.size))
-    with pytest.warns(fs.FingerspiceWarning, match="the ridge area at rest misses the data by .* % rms"):
-        fs.fit_contact(circuit, {"fn": FN, "area": 1e-6 * resting(FN) * rough})
+        fs.fit_contact(circuit, {"fn": 1e3 * FN, "area": 1e-6 * resting(FN)})
 
 
 def test_report_page_picture_and_profile_go_with_the_intervals(circuit: fs.Circuit) -> None:
@@ -187,8 +188,8 @@ def test_report_page_picture_and_profile_go_with_the_intervals(circuit: fs.Circu
 
 
 def test_the_command_reads_the_tables_of_the_examples(command: Command, tmp_path: Path) -> None:
-    tables = [str(CIRCUITS / name) for name in ("contact.csv", "indentation.csv")]
-    result = command("fit-contact", *tables, str(CIRCUITS / "fingerpad.cir"), "--out", str(tmp_path), "--json")
+    contact, indentation, pad = (str(CIRCUITS / name) for name in ("contact.csv", "indentation.csv", "fingerpad.cir"))
+    result = command("fit-contact", contact, indentation, pad, "--out", str(tmp_path), "--json")
     assert result.code == 0
     answer = json.loads(result.out)
     rows = {row["path"]: row for row in answer["parameters"]}
@@ -202,9 +203,12 @@ def test_the_command_reads_the_tables_of_the_examples(command: Command, tmp_path
     lines = (tmp_path / "fingerpad_contact.csv").read_text().splitlines()
     assert lines[0] == "relation,fn,u_gap,indentation,measured,fitted,sigma"
     assert len(lines) == 32
-    some = command("fit-contact", tables[0], str(CIRCUITS / "fingerpad.cir"), "--free", "mu", "--no-plot", "--json",
-                   "--out", str(tmp_path), "--overwrite")  # fmt: skip
+    options = ("--free", "mu", "--no-plot", "--json", "--overwrite", "--out", str(tmp_path))
+    some = command("fit-contact", contact, pad, *options)
     assert [row["path"] for row in json.loads(some.out)["parameters"]] == ["Xgap.mu"]
+
+
+AREAS = {"fn": [1.0, 2.0], "area": [3e-5, 4e-5]}
 
 
 @pytest.mark.parametrize(
@@ -217,10 +221,10 @@ def test_the_command_reads_the_tables_of_the_examples(command: Command, tmp_path
         ({"area": [3e-5], "f_t": [0.1], "sigma": [0.1]}, {}, "'sigma': which of the measured columns it belongs to"),
         ({"indentation": [1e-3] * 2, "u_gap": [1.0, 2.0], "area": [3e-5] * 2}, {}, "indentations without voltage"),
         (5.0, {}, "data is a float; allowed: a mapping of columns"),
-        ({"fn": [1.0, 2.0], "area": [3e-5, 4e-5]}, {"parameters": ["alpha", "Xgap.alpha"]}, "alpha is named twice"),
-        ({"fn": [1.0, 2.0], "area": [3e-5, 4e-5]}, {"parameters": ["d"]}, "parameters is 'd'; allowed: alpha, m_exp"),
-        ({"fn": [1.0, 2.0], "area": [3e-5, 4e-5]}, {"finger": "Xno"}, "finger is 'Xno'; allowed: the name of a GAP"),
-        ({"fn": [1.0, 2.0], "area": [3e-5, 4e-5]}, {"bounds": {"mu": (0.1, 1.0)}}, r"bounds names Xgap\.mu, which"),
+        (AREAS, {"parameters": ["alpha", "Xgap.alpha"]}, "alpha is named twice"),
+        (AREAS, {"parameters": ["d"]}, "parameters is 'd'; allowed: alpha, m_exp"),
+        (AREAS, {"finger": "Xno"}, "finger is 'Xno'; allowed: the name of a GAP"),
+        (AREAS, {"bounds": {"mu": (0.1, 1.0)}}, r"bounds names Xgap\.mu, which"),
     ],
 )
 def test_bad_requests(circuit: fs.Circuit, data: Columns, options: dict[str, object], said: str) -> None:
@@ -229,16 +233,16 @@ def test_bad_requests(circuit: fs.Circuit, data: Columns, options: dict[str, obj
 
 
 def test_circuits_without_one_contact_are_refused(circuit: fs.Circuit) -> None:
-    two = fs.read_netlist(CIRCUITS / "two_fingers.cir")
-    data = {"fn": FN, "area": 1e-6 * resting(FN)}
-    with pytest.raises(fs.InputError, match="several GAPs; allowed: finger= one of"):
-        fs.fit_contact(two, data)
+    two, data = fs.read_netlist(CIRCUITS / "two_fingers.cir"), {"fn": FN, "area": 1e-6 * resting(FN)}
+    for other, said in (
+        (two, "several GAPs; allowed: finger= one of"),
+        (circuit.replace({"Xgap.a_fix": 30.0}), r"Xgap.a_fix is 30 mm\^2; allowed: 0"),
+        (deck("V1 a 0 1", "R1 a b 1k", "C1 b 0 1u", ".tran 1u 1m"), "this circuit has no GAP"),
+    ):
+        with pytest.raises(fs.InputError, match=said):
+            fs.fit_contact(other, data)
     name = two.by_device("GAP")[1].name
     assert fs.fit_contact(two, data, finger=name).values[f"{name}.alpha"] == pytest.approx(48.0, rel=1e-6)
-    with pytest.raises(fs.InputError, match=r"Xgap.a_fix is 30 mm\^2; allowed: 0"):
-        fs.fit_contact(circuit.replace({"Xgap.a_fix": 30.0}), data)
-    with pytest.raises(fs.InputError, match="this circuit has no GAP"):
-        fs.fit_contact(deck("V1 a 0 1", "R1 a b 1k", "C1 b 0 1u", ".tran 1u 1m"), data)
 
 
 def test_tables_with_bad_units_are_refused(circuit: fs.Circuit, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 
 import fingerspice as fs
 from fingerspice.physics.materials import EPS0, SKIN_BAND, skin_permittivity, skin_resistivity
-from fingerspice.studies.fit.measured import read_table
+from fingerspice.studies.fit.materialfit import read_table
 from scenes import cases
 
 F = np.geomspace(*SKIN_BAND, 41)
@@ -65,29 +64,28 @@ def test_a_header_that_cannot_be_is_refused(tmp_path: Path, head: str, said: str
 
 
 @pytest.mark.parametrize(
-    ("slip", "named"),
+    ("order", "power", "factors", "named"),
     [
-        (lambda t: t * [2.0 * np.pi, 1.0, 1.0], "the frequency is in rad/s"),
-        (lambda t: t * [1e-3, 1.0, 1.0], "the frequency is in kHz"),
-        (lambda t: t * [1.0, 100.0, 1.0], "the resistivity is in ohm cm"),
-        (lambda t: t * [1.0, 1e-3, 1.0], "the resistivity is in kohm m"),
-        (lambda t: t ** [1.0, -1.0, 1.0], "the second column is a conductivity in S/m"),
-        (lambda t: t ** [1.0, -1.0, 1.0] * [1.0, 1e3, 1.0], "the second column is a conductivity in mS/m"),
-        (lambda t: t[:, [0, 2, 1]], "resistivity and permittivity have changed places"),
-        (lambda t: t[:, [1, 0, 2]], "frequency and resistivity have changed places"),
-        (lambda t: t[:, [2, 1, 0]], "frequency and permittivity have changed places"),
+        ([0, 1, 2], 1, [2.0 * np.pi, 1.0, 1.0], "the frequency is in rad/s"),
+        ([0, 1, 2], 1, [1e-3, 1.0, 1.0], "the frequency is in kHz"),
+        ([0, 1, 2], 1, [1.0, 100.0, 1.0], "the resistivity is in ohm cm"),
+        ([0, 1, 2], 1, [1.0, 1e-3, 1.0], "the resistivity is in kohm m"),
+        ([0, 1, 2], -1, [1.0, 1.0, 1.0], "the second column is a conductivity in S/m"),
+        ([0, 1, 2], -1, [1.0, 1e3, 1.0], "the second column is a conductivity in mS/m"),
+        ([0, 2, 1], 1, [1.0, 1.0, 1.0], "resistivity and permittivity have changed places"),
+        ([1, 0, 2], 1, [1.0, 1.0, 1.0], "frequency and resistivity have changed places"),
+        ([2, 1, 0], 1, [1.0, 1.0, 1.0], "frequency and permittivity have changed places"),
     ],
 )
-def test_the_likely_slip_is_named(slip: Callable[[np.ndarray], np.ndarray], named: str) -> None:
+def test_the_likely_slip_is_named(order: list[int], power: int, factors: list[float], named: str) -> None:
     # A slip of a factor of 6 is a fifth off a material, one of 1000 is none.
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            fs.fit_material(slip(TABLE))
+            fs.fit_material((TABLE ** [1, power, 1] * factors)[:, order])
+            said = str(caught[0].message)
         except fs.InputError as error:
             said = str(error)
-        else:
-            said = str(caught[0].message)
     assert "% (rms) from any causal and passive material (Kramers-Kronig); likely " in said
     assert named in said
 

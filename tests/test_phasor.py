@@ -22,6 +22,7 @@ from analytic import (
     gap_limit_eq14,
     gap_limit_eq15,
     gap_phase_eq13,
+    impedance,
     phasor_gains,
     table1_layers,
     work_factor,
@@ -299,8 +300,7 @@ def test_the_source_sees_the_layers_in_series_and_what_stands_beside_them():
     swept = fs.phasor(table1(), f)
 
     def of_layers(x: float, area: float) -> complex:
-        w = 2j * np.pi * x
-        return sum(1.0 / (1.0 / y.r_total + area / y.r_area + w * y.c * area) for y in table1_layers(x))
+        return impedance(x, area, table1_layers(x))
 
     known = np.array([of_layers(x, area) for x, area in zip(f, swept.area, strict=True)])
     np.testing.assert_allclose(swept.impedance, known, rtol=1e-12)

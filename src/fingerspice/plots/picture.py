@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.backend_bases import FigureManagerBase
@@ -210,51 +210,35 @@ def _shares(ax: Axes, indices: Dataset, output: str, x: FloatArray | None) -> No
 
 # Letters of a legend across the page; beside other panels one curve needs none.
 _ROOM = 90
+#: A panel of measured and fitted values: to which curve each row belongs, by name; columns (n,) of the abscissa, the
+#: measured and fitted values and the standard deviations; what the abscissa is, the quantity, and its unit.
+Drawn = tuple[Sequence[str], Sequence[FloatArray], str, str, str]
 
 
-class Curve(NamedTuple):
-    """Data that belong together, shape (n,) each: abscissa, measured and fitted values, and standard deviations."""
-
-    name: str
-    x: FloatArray
-    measured: FloatArray
-    fitted: FloatArray
-    sigma: FloatArray
-
-
-class Panel(NamedTuple):
-    """Curves of one quantity over one abscissa."""
-
-    curves: Sequence[Curve]
-    x_label: str
-    quantity: str
-    unit: str
-
-
-def plot_panels(panels: Sequence[Panel]) -> Picture:
+def plot_panels(panels: Sequence[Drawn]) -> Picture:
     """Data with error bars and the fit of several quantities side by side, each with its residuals below."""
     count = len(panels)
     figure, axes = drawing.new_figure(2, count, height=4.2, sharex="col", height_ratios=(2.4, 1.0))
-    for top, bottom, panel in zip(axes[:count], axes[count:], panels, strict=True):
-        largest = np.concatenate([curve.measured for curve in panel.curves])
-        factor, shown = drawing.engineering(drawing.peak_of(largest), panel.unit, 0.05) if panel.unit else (1.0, "")
+    for top, bottom, (names, columns, x_label, quantity, unit) in zip(axes[:count], axes[count:], panels, strict=True):
+        factor, shown = drawing.engineering(drawing.peak_of(columns[1]), unit, 0.05) if unit else (1.0, "")
         bottom.axhline(0.0, color=drawing.GREY, linewidth=0.8)
-        for number, curve in enumerate(panel.curves):
-            order, color = np.argsort(curve.x, kind="stable"), drawing.CYCLE[number % len(drawing.CYCLE)]
-            x, measured, fitted, sigma = (values[order] for values in curve[1:])
+        order, curves = np.argsort(columns[0], kind="stable"), list(dict.fromkeys(names))
+        for number, name in enumerate(curves):
+            rows, color = order[np.array(names)[order] == name], drawing.CYCLE[number % len(drawing.CYCLE)]
+            x, measured, fitted, sigma = (values[rows] for values in columns)
             style: dict[str, Any] = {"fmt": "o", "markersize": 3.5, "color": color, "elinewidth": 0.8, "capsize": 2.0}
-            top.errorbar(x, factor * measured, factor * sigma, label=curve.name, **style)
+            top.errorbar(x, factor * measured, factor * sigma, label=name, **style)
             top.plot(x, factor * fitted, color=color, linewidth=1.3)
             bottom.plot(x, (measured - fitted) / sigma, "o", markersize=3.5, color=color)
-        x = np.concatenate([curve.x for curve in panel.curves])
+        x = columns[0]
         if x.min() > 0.0 and x.max() > _WIDE * x.min():
             bottom.set_xscale("log")
             # Plain numbers: 20, 50, 100, and no powers of ten.
             bottom.xaxis.set_major_formatter(LogFormatter())
             bottom.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
-        drawing.dress(top, f"{panel.quantity} [{shown}]" if shown else panel.quantity)
-        if len(panel.curves) > 1 or count == 1:
+        drawing.dress(top, f"{quantity} [{shown}]" if shown else quantity)
+        if len(curves) > 1 or count == 1:
             drawing.legend_within(top, _ROOM // count)
-        drawing.dress(bottom, "residual / sigma" if top is axes[0] else "", panel.x_label)
+        drawing.dress(bottom, "residual / sigma" if top is axes[0] else "", x_label)
     drawing.caption(figure, "dots: measured, with one standard deviation; lines: fitted")
     return figure

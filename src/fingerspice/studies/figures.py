@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -44,23 +43,20 @@ Xskin   skin  0    area  SKIN  d=350u f=100
 """Table 1 under a sine of 200 V and 100 Hz (Fig. 4, left), as in `circuits/fingerpad.cir`."""
 
 
+#: Source amplitudes of Fig. 3, and of Figs. 4 and 5, V; and the frequencies of the latter, Hz.
+U0_FORCE, U0_TIME = 140.0, 200.0
+FREQUENCIES = (100.0, 5000.0)
+# Letters of units in a data file.
+_ASCII = str.maketrans({"µ": "u", "²": "^2", "Ω": "ohm"})
+
+
 def table1_circuit(*, dispersive: bool = False) -> Circuit:
     """The circuit of `TABLE1_DECK`; with `dispersive` its skin has its own data at every frequency."""
-    text = TABLE1_DECK
-    if dispersive:
-        text = text.replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE d=350u")
-    return parse_netlist(text)
+    own = TABLE1_DECK.replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE d=350u")
+    return parse_netlist(own if dispersive else TABLE1_DECK)
 
 
-U0_FORCE, U0_TIME = 140.0, 200.0
-"""Source amplitudes of Fig. 3, and of Figs. 4 and 5, V."""
-
-FREQUENCIES = (100.0, 5000.0)
-"""Frequencies of Figs. 4 and 5, Hz."""
-
-
-@dataclass(frozen=True)
-class Variation:
+class Variation(NamedTuple):
     """One panel of Fig. 3: a parameter, its values, and the circuit parameters that it changes."""
 
     # title, symbol, unit: Texts of the picture; the symbol is in TeX
@@ -74,9 +70,7 @@ class Variation:
 
     def apply(self, circuit: Circuit, value: float) -> Circuit:
         """The circuit with this parameter at `value`, in `unit`."""
-        factor = value / self.base
-        now = circuit.parameters
-        return circuit.varied({path: factor * now[path].value for path in self.paths})
+        return circuit.varied({path: value / self.base * circuit.parameters[path].value for path in self.paths})
 
 
 def variations() -> tuple[Variation, ...]:
@@ -149,7 +143,7 @@ def figure_3(points: int = 46) -> Drawn:
             force, style = base, {"color": drawing.BLACK, "linewidth": 1.8}
             if value != variation.base:
                 force = phasor(variation.apply(circuit, value), f).f_el_mean
-                columns[f"f_el_mean [N] {variation.name}={value:g} {_ASCII[variation.unit]}"] = force
+                columns[f"f_el_mean [N] {variation.name}={value:g} {variation.unit.translate(_ASCII)}"] = force
                 color, dash = next(others)
                 style = {"color": color, "linestyle": dash, "linewidth": 1.5}
             ax.semilogx(f, force, label=f"${variation.symbol}$ = {value:.3g} {variation.unit}", **style)
@@ -164,10 +158,6 @@ def figure_3(points: int = 46) -> Drawn:
     for ax in axes[2:]:
         drawing.dress(ax, "", "Frequency $f$ [Hz]")
     return figure, columns
-
-
-#: Units of the parameters of Fig. 3, as in its data file.
-_ASCII = {"µm": "um", "mm²": "mm^2", "MΩ": "Mohm"}
 
 
 def time_response(shape: type[Sine] | type[Square], frequency: float, *, dispersive: bool = False) -> Solution:
@@ -187,10 +177,9 @@ def two_periods(solution: Solution) -> dict[str, FloatArray]:
     The last row of the first copy is left out if it repeats the first row of the second copy.
     """
     assert solution.period is not None
-    t = solution.t - solution.t[0]
+    t, end = solution.t - solution.t[0], solution.t.size - 1
     # A period that ends at a jump ends with a left-hand row and the right-hand row that begins the next period.
-    end = t.size - 1
-    rows = np.concatenate([np.arange(end), np.arange(end), [] if t[-1] == t[-2] else [end]]).astype(int)
+    rows = np.array([*range(end), *range(end), *([] if t[-1] == t[-2] else [end])])
     shift = np.where(np.arange(rows.size) < end, 0.0, solution.period)
     names = ("u_source", "u_gap", "f_el", "area")
     return {"t": t[rows] + shift, **{name: getattr(solution, name)[rows] for name in names}}

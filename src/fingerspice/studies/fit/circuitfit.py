@@ -2,41 +2,43 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import time
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.announcing import Bar
-from fingerspice.base.arrays import FloatArray, whole_number
+from fingerspice.base.arrays import FloatArray, IntArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.pages import Page, Table
-from fingerspice.circuit.circuit import Circuit
+from fingerspice.base.pages import Page
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import meaning_of, require_circuit, scenes_warnings
+from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.topology import driving_sources
 from fingerspice.results.record import SIGNALS
-from fingerspice.solve.simulation import rtol_given
-from fingerspice.studies.fit.circuitdata import IMPEDANCE, MEASURED, Data, Task, data_of
-from fingerspice.studies.fit.result import (
-    FARTHEST,
-    Drawn,
-    FitResult,
-    Fitted,
-    Unknown,
-    bounded,
-    estimated,
-    followed,
-    misfit_note,
-    profile_of,
-)
-from fingerspice.waveforms.waveform import require
+from fingerspice.solve.simulation import rtol_given, simulate
+from fingerspice.studies.batch.batch import batch
+from fingerspice.studies.batch.form import REFUSED
+from fingerspice.studies.fit.measured import IMPEDANCE, MEASURED, Data, data_of
+from fingerspice.studies.fit.result import FitResult, Fitted, Problem, bounded, estimated, followed, profile_of
+from fingerspice.studies.steady import phasor
+from fingerspice.waveforms.waveform import Sine, require
 
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+    from fingerspice.plots.picture import Drawn
+
+# Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's.
+_SLOPES = 1e-6
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
 _SPREAD, _FOLLOWED = 4.0, 3
 # Errors of unknown size are equal shares of the data unless errors equal for all are likelier by this logarithm. The
@@ -44,6 +46,90 @@ _SPREAD, _FOLLOWED = 4.0, 3
 _CLEARLY, _CHOOSING = 2.0, 4
 # Error of the means by which starts are compared.
 _ROUGH = 1e-5
+
+
+@dataclass(frozen=True)
+class Task(Problem):
+    """The fit of a circuit's parameters; how it is run is said by `fit`."""
+
+    data: Data
+    places: dict[str, IntArray]  # (n,): Path to the place among the values of that which each measurement has
+    average: str
+    skin: str
+    rtol: float
+    charge_law: str | None
+    watch: Callable[[], None]  # Called before every evaluation
+
+    def compared(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        self.watch()
+        if self.data.signal == IMPEDANCE:
+            return super().compared(values)
+        found, by = self._means(values) if self.data.t is None else self._signal(values)
+        return (found - self.data.values) / self.scale, by * values / self.scale[:, None]
+
+    def _scene(self, values: FloatArray, row: int) -> Circuit:
+        """The circuit of one measurement."""
+        changes = {path: float(x[row]) for path, x in self.data.conditions.items()}
+        return self.circuit.varied(changes | {path: float(values[at[row]]) for path, at in self.places.items()})
+
+    def misses(self, values: FloatArray) -> FloatArray:
+        """Of impedances, at the area that the deck's amplitude causes."""
+        data, on, n = self.data, driving_sources(self.circuit), self.data.values.size
+        # Rows that differ in a sine's frequency alone are one sweep; with AC, a sweep would have its amplitude.
+        conditions, z = dict(data.conditions), np.empty(n, complex)
+        plain = len(on) == 1 and isinstance(on[0].waveform, Sine) and all(e.ac is None for e in self.circuit.elements)
+        f = conditions.pop(f"{on[0].name}.frequency", None) if plain else None
+        others = [*conditions.values(), *self.places.values(), np.arange(n) if f is None else np.zeros(n)]
+        _, first, sweep = np.unique(np.array(others), axis=1, return_index=True, return_inverse=True)
+        for number, row in enumerate(first.tolist()):
+            rows = sweep.ravel() == number
+            at, skin = None if f is None else f[rows], "swept" if self.skin == "follow" else "own"
+            found = phasor(self._scene(values, row), at, skin=skin).impedance
+            if found is None:
+                raise InputError("several sources see no impedance; allowed: a circuit with one source")
+            z[rows] = found
+        off = np.abs(z) - data.values
+        if data.phase is not None:
+            off = np.append(off, np.remainder(np.angle(z, deg=True) - data.phase + 180.0, 360.0) - 180.0)
+        return np.asarray(off / self.scale)
+
+    def _signal(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The predicted signal over time (n,), and its derivatives by the parameters (n, n_parameter)."""
+        circuit = self._scene(values, 0)
+        waves = network_of(circuit).waveforms
+        fundamental = waves[0].fundamental if self.skin == "follow" and len(waves) == 1 else None
+        if fundamental is not None:
+            circuit = circuit.varied({f"{e.name}.f": fundamental.frequency for e in circuit.by_device("SKIN")})
+        run = simulate(
+            circuit, t_eval=self.data.t, rtol=self.rtol, charge_law=self.charge_law, charge=False,
+            sensitivities=self.paths,
+        )  # fmt: skip
+        by = [getattr(run.sensitivities[path], self.data.name) for path in self.paths]
+        return getattr(run, self.data.name), np.array(by).T
+
+    def _means(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `_signal`, of means, from batches; the derivatives with an error that suits least squares."""
+        by = np.zeros((self.data.values.size, values.size))
+        slopes, found = (
+            self.scenes(values[None], rtol, gradients)
+            for rtol, gradients in ((max(self.rtol, _SLOPES), tuple(self.places)), (self.rtol, ()))
+        )
+        for one, status in ((slopes, "gradient_status"), (found, "status")):
+            if np.any(one[status].to_numpy() >= REFUSED):
+                raise InputError(one.attrs["failures"][0])
+        for i, at in enumerate(self.places.values()):
+            by[np.arange(at.size), at] = slopes[f"d_{self.data.name}"].to_numpy()[:, i]
+        return found[self.data.name].to_numpy(), by
+
+    def scenes(self, values: FloatArray, rtol: float, gradients: tuple[str, ...] = ()) -> Dataset:
+        """A batch of all measurements, with every row of `values` (n_row, n_parameter) one after the other."""
+        table = {path: np.tile(x, len(values)) for path, x in self.data.conditions.items()}
+        table |= {path: values[:, at].ravel() for path, at in self.places.items()}
+        law, circuit = self.charge_law, self.circuit
+        return batch(
+            circuit if law is None else dataclasses.replace(circuit, charge_law=law), table, outputs=(self.data.name,),
+            rtol=rtol, periodic=self.average == "periodic", skin=self.skin, gradients=gradients,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -68,6 +154,8 @@ class Fit(FitResult):
         likelier equal shares of the values, over these.
     objectives : tuple of float
         That reached from every start that was followed.
+    count : int
+        Number of residuals.
     freedom : int
         Data less parameters, and less one where the residuals say whether errors are equal or shares.
     evaluations : int
@@ -96,50 +184,43 @@ class Fit(FitResult):
     def _rms(self) -> float:
         return float(np.sqrt(np.mean(self.residual**2)))
 
-    @property
-    def _count(self) -> int:
-        return self.data.target.size
-
     def _page(self) -> Page:
         data = self.data
         share = 100.0 * self._rms / (float(np.abs(data.values).max()) or 1.0)
-        equal = float(np.ptp(self.sigma)) <= 1e-9 * float(self.sigma.max())
-        noise = f"estimated from the residuals, {'equal for all' if equal else 'as equal shares of the values'}"
-        lines: list[str | Table] = [
-            self._head(f"{data.values.size} values of {data.name}"),
-            f"residual {self._rms:.3g} {MEASURED[data.signal]} rms, {share:.2g} % of the largest value; "
-            f"sigma {'as given' if data.sigma is not None else noise}",
+        known = "as given"
+        if data.sigma is None:
+            equal = float(np.ptp(self.sigma)) <= 1e-9 * float(self.sigma.max())
+            known = f"estimated from the residuals, {'equal for all' if equal else 'as equal shares of the values'}"
+        about = [
+            f"residual {self._rms:.3g} {MEASURED[data.signal]} rms, {share:.2g} % of the largest value; sigma {known}"
         ]
         if data.groups is not None:
-            lines.append(f"groups by {data.groups.column}: {', '.join(data.groups.labels)}")
-        return Page([*lines, *self._lines()])
+            about.append(f"groups by {data.groups.column}: {', '.join(data.groups.labels)}")
+        head = f"{len(self.estimates)} parameters fitted to {data.values.size} values of {data.name}"
+        return self._paged(head, about)
 
     def _panels(self) -> list[Drawn]:
-        data = self.data
+        data, known = self.data, self.circuit.parameters
         signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal
         signal = f"mean {signal}" if data.name.endswith("_mean") else signal
+        names, x, label = ["measured and fitted"] * data.values.size, data.t, "time [s]"
         varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
-        names = ["measured and fitted"] * data.values.size
-        if data.t is not None:
-            x, label = data.t, "time [s]"
-        elif varying:
+        if x is None and varying:
             (path, x), others = varying[0], varying[1:]
-            unit = self.circuit.parameters[path].unit
+            unit = known[path].unit
             label = meaning_of(self.circuit, path) + (f" [{unit}]" if unit else "")
             keys = [] if data.groups is None else [[f"{data.groups.column} = {one}" for one in data.groups.of]]
             for path, values in others:
-                unit = self.circuit.parameters[path].unit
-                keys.append([f"{meaning_of(self.circuit, path)} = {y:g} {unit}".rstrip() for y in values])
+                keys.append([f"{meaning_of(self.circuit, path)} = {y:g} {known[path].unit}".rstrip() for y in values])
             if keys:
                 names = [", ".join(told) for told in zip(*keys, strict=True)]
-        else:
+        elif x is None:
             x, label = np.arange(1.0, data.values.size + 1.0), "measurement"
         return [(names, (x, data.values, self.predicted, self.sigma), label, signal, MEASURED[data.signal])]
 
     def to_dict(self) -> dict[str, Any]:
-        """The fit as plain numbers and texts; `parameters` has a row for each."""
         return {
-            **self._plain(),
+            **super().to_dict(),
             "groups": list(self.circuits),
             "signal": self.data.signal,
             "count": int(self.data.values.size),
@@ -214,10 +295,19 @@ def fit(
     """
     require_circuit(circuit)
     starts, rtol = whole_number("starts", starts, 1), rtol_given(rtol)
-    measured, unknowns = _request(circuit, data, parameters, groups)
+    measured, names, paths, places = _request(circuit, data, parameters, groups)
     require(average in ("periodic", "run"), "average", repr(average), "'periodic' or 'run'")
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
-    start, box = bounded(circuit, unknowns, measured.target.size, bounds or {})
+    require(charge_law in (None, *CHARGE_LAWS), "charge_law", repr(charge_law), " or ".join(map(repr, CHARGE_LAWS)))
+    gaps = len(circuit.by_device("GAP"))
+    if gaps > 1 or (gaps == 0 and measured.signal != IMPEDANCE):
+        raise InputError(f"the circuit has {gaps} GAPs; allowed: one, to which the data belong")
+    if average == "run" and circuit.tran is None and measured.name.endswith("_mean"):
+        raise InputError("the deck has no .tran, and average is 'run'; allowed: a deck with .tran, or 'periodic'")
+    own = {f"{e.name}.f" for e in circuit.by_device("SKIN")} & {*measured.conditions, *paths}
+    if skin == "follow" and own and measured.name.endswith("_mean"):
+        raise InputError(f"skin='follow' and {own.pop()} are both given; allowed: one of them")
+    start, box = bounded(circuit, paths, measured.values.size * (1 if measured.phase is None else 2), bounds or {})
     bar, begun, count = Bar("fitting", endless=True), time.perf_counter(), itertools.count(1)
 
     def watch() -> None:
@@ -225,10 +315,9 @@ def fit(
         if time.perf_counter() - begun > 1.0:
             bar.show(note=f"evaluation {number}")
 
-    task = Task(start, unknowns, box, measured.scale, measured, average, skin, rtol, charge_law, watch)
+    task = Task(start, names, paths, box, measured.scale, measured, places, average, skin, rtol, charge_law, watch)
     wanted = task.profiled(profiles)
-    said = [*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin)]
-    for text in filter(None, said):
+    for text in filter(None, (*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin))):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     try:
         return _fitted(task, starts, wanted)
@@ -236,23 +325,63 @@ def fit(
         bar.stop()
 
 
+def _request(
+    circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, parameters: Sequence[str],
+    groups: Mapping[str, Sequence[str]] | None,
+) -> tuple[Data, tuple[str, ...], tuple[str, ...], dict[str, IntArray]]:  # fmt: skip
+    """The checked data; and names, paths and places, as `Task` has them, of what is to be fitted to them."""
+    if isinstance(parameters, str) or not parameters:
+        raise InputError(f"parameters is {parameters!r}; allowed: a sequence of paths such as ['Xgap.d', 'Xgap.r']")
+    known = {path.lower(): path for path in circuit.parameters}
+    for path in parameters:
+        if path.lower() not in known:
+            circuit.varied({path: 1.0})
+    fitted = [known[path.lower()] for path in parameters]
+    by: str | None = None
+    separate: Sequence[str] = ()
+    if groups is not None:
+        wanted = "a mapping of a column of the data to the parameters of each group, such as {'finger': ['Xgap.d']}"
+        ((by, separate),) = groups.items() if isinstance(groups, Mapping) and len(groups) == 1 else (("", ""),)
+        if not isinstance(by, str) or isinstance(separate, str) or not separate:
+            raise InputError(f"groups is {groups!r}; allowed: {wanted}")
+        if by.lower() in known:
+            raise InputError(f"groups names the column {by!r}, which is a parameter; allowed: {wanted}")
+    for path in separate:
+        if known.get(path.lower()) not in fitted:
+            raise InputError(f"groups names {path!r}, which is not fitted; allowed: {', '.join(fitted)}")
+    data = data_of(circuit, given, by)
+    own = {known[path.lower()] for path in separate}
+    names, paths, places = list[str](), list[str](), dict[str, IntArray]()
+    for path in fitted:
+        value = circuit.parameters[path].value
+        require(fitted.count(path) == 1, path, "named twice", "once")
+        if path in data.conditions:
+            raise InputError(f"{path} is to be fitted, and is a condition of the data; allowed: one of both")
+        if not (math.isfinite(value) and value > 0.0):
+            raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
+        places[path], labels = np.full(data.values.size, len(names)), [path]
+        if data.groups is not None and path in own:
+            places[path] += [data.groups.labels.index(label) for label in data.groups.of]
+            labels = [f"{path}[{label}]" for label in data.groups.labels]
+        names += labels
+        paths += [path] * len(labels)
+    return data, tuple(names), tuple(paths), places
+
+
 def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
     """The fit, with the profiles `wanted`."""
     from scipy.stats import norm, t
 
     data, n = free.data, free.data.values.size
-    # Where no bounds are given, nothing is looked for far from the start: there are no likely values, and slow runs.
-    (low, high), near, far = free.bounds.T, free.initial / FARTHEST, free.initial * FARTHEST
-    walls = np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
-    task = replace(free, bounds=walls)
-    ends = [followed(task.residuals, walls, begin) for begin in _starts(task, starts)]
+    task = dataclasses.replace(free, bounds=free.walls)
+    ends = [followed(task.residuals, task.bounds, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
     if not best.found:
         raise InputError(
             "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
             "circuit that runs under the conditions of the data"
         )
-    freedom = best.residual.size - len(task.unknowns)
+    freedom = best.residual.size - len(task.names)
     if data.sigma is None and data.t is None and data.signal != IMPEDANCE and freedom >= _CHOOSING:
         task, ends = _with_likelier_noise(task, ends, best)
         best = min(ends, key=lambda end: end.objective)
@@ -264,30 +393,29 @@ def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
     elif freedom > 0:
         variance, reach = best.objective / freedom, float(t.ppf(0.975, freedom))
     error, remedy = np.sqrt(np.diag(best.covariance) * variance), data.remedy(task.circuit)
-
-    def of_group(label: str) -> Circuit:
-        own = zip(task.unknowns, best.values.tolist(), strict=True)
-        return task.circuit.varied({one.path: value for one, value in own if one.label in (None, label)})
-
+    of = () if data.groups is None else data.groups.of
+    # The geometric mean of one value is that value to the last digit.
+    means = {path: best.values[np.unique(at)] for path, at in task.places.items()}
     found = Fit(
         **estimated(
-            task, best, error, [reach] * error.size, lambda _: remedy,
-            misfit_note(best.objective, freedom) if data.sigma is not None else [],
+            task, best, error, np.full(error.size, reach), lambda _: remedy,
+            best.beyond_sigma(..., freedom) if data.sigma is not None else [],
         ),
         data=data,
         predicted=data.values + (best.residual * task.scale)[:n],
         sigma=data.sigma if data.sigma is not None else math.sqrt(variance) * task.scale[:n],
         objectives=tuple(end.objective for end in ends),
         freedom=freedom,
-        # The geometric mean of one value is that value to the last digit.
-        circuit=task.circuit.varied(
-            {path: float(np.prod(best.values[own] ** (1.0 / len(own)))) for path, own in task.places.items()}
-        ),
-        circuits={label: of_group(label) for label in (data.groups.labels if data.groups is not None else ())},
+        circuit=task.circuit.varied({path: float(np.prod(x ** (1.0 / x.size))) for path, x in means.items()}),
+        circuits={
+            label: task.circuit.varied({path: float(best.values[at[row]]) for path, at in task.places.items()})
+            for row, label in enumerate(of)
+            if label not in of[:row]
+        },
     )  # fmt: skip
     # Of chi squared and F with one degree of freedom, quantiles are the squares of those of the normal distribution
     # and of Student's (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
-    task, room = replace(task, bounds=free.bounds), variance * reach**2
+    task, room = dataclasses.replace(task, bounds=free.bounds), variance * reach**2
     found.profiles.update((name, profile_of(task, best, found.estimates[name], room)) for name in wanted)
     return found
 
@@ -297,52 +425,16 @@ def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[
 
     The largest likelihood of normal errors of unknown size is RSS^(-n/2) over the product of the scales.
     """
-    predicted = np.abs(task.data.target + best.residual * task.scale)
+    predicted = np.abs(task.data.values + best.residual * task.scale)
     if not np.all(predicted > 0.0) or best.objective == 0.0:
         return task, ends
-    shares = replace(task, scale=predicted)
+    shares = dataclasses.replace(task, scale=predicted)
     others = [followed(shares.residuals, shares.bounds, end.values) for end in ends]
     least, n = min(end.objective for end in others), predicted.size
     equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
-    likelier = 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY
+    # Shares that fit to the last bit are the likelier ones.
+    likelier = least == 0.0 or 0.5 * n * math.log(least) + float(np.log(predicted).sum()) < equal + _CLEARLY
     return (shares, others) if likelier else (task, ends)
-
-
-def _request(
-    circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, parameters: Sequence[str],
-    groups: Mapping[str, Sequence[str]] | None,
-) -> tuple[Data, tuple[Unknown, ...]]:  # fmt: skip
-    """The checked data, and what is to be fitted to them."""
-    if isinstance(parameters, str) or not parameters:
-        raise InputError(f"parameters is {parameters!r}; allowed: a sequence of paths such as ['Xgap.d', 'Xgap.r']")
-    known = {path.lower(): path for path in circuit.parameters}
-    for path in parameters:
-        if path.lower() not in known:
-            circuit.varied({path: 1.0})
-    paths = tuple(known[path.lower()] for path in parameters)
-    by: str | None = None
-    separate: Sequence[str] = ()
-    if groups is not None:
-        wanted = "a mapping of a column of the data to the parameters of each group, such as {'finger': ['Xgap.d']}"
-        ((by, separate),) = groups.items() if isinstance(groups, Mapping) and len(groups) == 1 else (("", ""),)
-        if not isinstance(by, str) or isinstance(separate, str) or not separate:
-            raise InputError(f"groups is {groups!r}; allowed: {wanted}")
-        if by.lower() in known:
-            raise InputError(f"groups names the column {by!r}, which is a parameter; allowed: {wanted}")
-    for path in separate:
-        if known.get(path.lower()) not in paths:
-            raise InputError(f"groups names {path!r}, which is not fitted; allowed: {', '.join(paths)}")
-    data = data_of(circuit, given, by)
-    for path in paths:
-        value = circuit.parameters[path].value
-        require(paths.count(path) == 1, path, "named twice", "once")
-        if path in data.conditions:
-            raise InputError(f"{path} is to be fitted, and is a condition of the data; allowed: one of both")
-        if not (math.isfinite(value) and value > 0.0):
-            raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
-    own = {known[path.lower()] for path in separate}
-    labels = data.groups.labels if data.groups is not None else ()
-    return data, tuple(Unknown(path, label) for path in paths for label in (labels if path in own else (None,)))
 
 
 def _starts(task: Task, count: int) -> list[FloatArray]:

@@ -1,7 +1,4 @@
-"""Measured areas and friction forces of a finger, and what a contact's parameters predict of them.
-
-Fit of a GAP's contact to measured areas and friction forces: alpha, m, beta, n, mu and c2 with their intervals.
-"""
+"""Fit of a GAP's contact to measured areas and friction forces: alpha, m, beta, n, mu and c2 with their intervals."""
 
 from __future__ import annotations
 
@@ -9,8 +6,9 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,19 +22,11 @@ from fingerspice.circuit.devices import DEVICES
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
 from fingerspice.physics.contact import Contact, ridge_area
 from fingerspice.studies.fit.measured import SIGMA, Given, measured_of
-from fingerspice.studies.fit.result import (
-    Drawn,
-    FitResult,
-    Fitted,
-    Problem,
-    Unknown,
-    bounded,
-    estimated,
-    followed,
-    misfit_note,
-    profile_of,
-)
+from fingerspice.studies.fit.result import FitResult, Fitted, Problem, bounded, estimated, followed, profile_of
 from fingerspice.waveforms.waveform import require
+
+if TYPE_CHECKING:
+    from fingerspice.plots.picture import Drawn
 
 #: Measured columns and conditions, with their units.
 MEASURED = {"area": "m^2", "area_sliding": "m^2", "f_t": "N"}
@@ -46,10 +36,25 @@ NAMES = {
     "area": "ridge area at rest", "indentation": "ridge area by indentation",
     "area_sliding": "ridge area while sliding", "f_t": "friction force",
 }  # fmt: skip
+PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
+# Misfit (rms, relative) of a relation from which on it is warned about.
+_TOO_MUCH = 0.2
+# The share of its value that a measured value without sigma is off by, at first.
+_SHARE = 0.1
+# The share of an error's variance below which a relation has no part in it.
+_NO_PART = 1e-9
+# Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
+# this; they are no smaller than the last, as are singular values that count, relative to the largest.
+_ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
+# Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
+_FEWEST = 0.5
+#: Relations whose values have one standard deviation, as they come from the same instrument: what was measured, in
+#: words; places among the residuals; and number of values less what the parameters take up of them, which is infinite
+#: where the standard deviation is given.
+Pool = tuple[str, IntArray, float]
 
 
-@dataclass(frozen=True)
-class Relation:
+class Relation(NamedTuple):
     """Measured values of one kind with their conditions, in SI units."""
 
     kind: str  # A key of `NAMES`
@@ -84,7 +89,7 @@ def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, .
     several = [given] if isinstance(given, (str, Path, Mapping)) else given
     if not isinstance(several, Sequence) or not several:
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, a table's path, or a list")
-    found: dict[tuple[str, bool], Relation] = {}
+    found: dict[tuple[str, bool], list[Any]] = {}
     for number, one in enumerate(several, 1):
         place = "the data" if len(several) == 1 else f"data {number}"
         columns, place, _ = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
@@ -105,21 +110,17 @@ def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, .
         at, u, depth = columns.get("fn", none + fn), columns.get("u_gap", none), columns.get("indentation")
         if depth is not None and np.any(u != 0.0):
             raise InputError(f"{place} have the columns indentation and u_gap; allowed: indentations without voltage")
-        own = []
         for name in measured:
             values, sigma = columns[name], columns.get(sigmas[name])
             if name == "area" and depth is not None:
-                own.append(Relation("indentation", values, sigma, at, none, depth))
+                found.setdefault(("indentation", sigma is None), []).append((values, sigma, at, none, depth))
             if name != "area" or depth is None or "fn" in columns:
-                own.append(Relation(name, values, sigma, at, u, none))
-        for relation in own:
-            key = relation.kind, relation.sigma is None
-            if key in found:
-                known = {name: x for name, x in vars(found[key]).items() if isinstance(x, np.ndarray)}
-                joined: Any = {name: np.concatenate([x, getattr(relation, name)]) for name, x in known.items()}
-                relation = replace(relation, **joined)
-            found[key] = relation
-    return tuple(found.values())
+                found.setdefault((name, sigma is None), []).append((values, sigma, at, u, none))
+    # Values of one kind are one relation, whichever data they come from.
+    return tuple(
+        Relation(kind, *(None if x[0] is None else np.concatenate(x) for x in zip(*own, strict=True)))  # type: ignore
+        for (kind, _), own in found.items()
+    )
 
 
 def _meaning(name: str, names: Sequence[str]) -> tuple[str, str, str | None]:
@@ -130,7 +131,7 @@ def _meaning(name: str, names: Sequence[str]) -> tuple[str, str, str | None]:
 
 
 @dataclass(frozen=True)
-class ContactTask(Problem):
+class Task(Problem):
     """The fit of a contact; the scale of a relation without sigma is the standard deviation of the logarithms."""
 
     gap: str  # Name of the GAP
@@ -155,19 +156,24 @@ class ContactTask(Problem):
             parts.append(found - relation.values if relation.sigma is not None else np.log(found / relation.values))
         return np.concatenate(parts) / self.scale
 
-
-PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
-# Misfit (rms, relative) of a relation from which on it is warned about.
-_TOO_MUCH = 0.2
-# The share of its value that a measured value without sigma is off by, at first.
-_SHARE = 0.1
-# The share of an error's variance below which a relation has no part in it.
-_NO_PART = 1e-9
-# Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
-# this; they are no smaller than the last, as are singular values that count, relative to the largest.
-_ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
-# Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
-_FEWEST = 0.5
+    def remedy(self, names: tuple[str, ...]) -> str:
+        """The measurement that would tell one parameter, or two apart."""
+        bare = {name.rpartition(".")[2] for name in names}
+        kinds = {one.kind for one in self.relations}
+        loads = [one.fn for one in self.relations if one.kind != "indentation"]
+        what = "over a wider range of loads"
+        if bare <= {"alpha", "m_exp"}:
+            alike = not loads or float(np.ptp(np.concatenate(loads))) == 0.0
+            what = "the area at a second load as well" if alike else f"the area {what}"
+        elif bare <= {"beta", "n_exp"} and "indentation" in kinds:
+            what = "the area over a wider range of indentations"
+        elif bare <= {"beta", "n_exp"}:
+            what = "the area against the indentation as well"
+        elif "area" not in kinds and "c2" in bare:
+            what = "the area at rest as well"
+        elif bare & {"beta", "n_exp"}:
+            what = "the area against the indentation, or under a higher voltage"
+        return f"Measure {what}, or fix one of them."
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -176,7 +182,7 @@ class ContactFit(FitResult):
 
     Attributes
     ----------
-    circuit, estimates, correlation, evaluations, closed, notes, profiles
+    circuit, estimates, correlation, count, evaluations, closed, notes, profiles
         As of `Fit`.
     gap : str
         Name of the GAP.
@@ -216,11 +222,12 @@ class ContactFit(FitResult):
         return " ".join(f"{path.rpartition('.')[2]}={one.value:.6g}" for path, one in self.estimates.items())
 
     def _page(self) -> Page:
-        lines = [f"contact of {self.gap}: {self._head(f'{self._count} values')}"]
+        about = []
         for one, misfit in zip(self.relations, self.misfits, strict=True):
             known = "sigma as given" if one.sigma is not None else "sigma estimated from the residuals"
-            lines.append(f"{one.name}: {one.values.size} values, residual {100.0 * misfit:.3g} % rms; {known}")
-        return Page([*lines, *self._lines(), "", f"in the deck: {self.gap} ... {self.line}"])
+            about.append(f"{one.name}: {one.values.size} values, residual {100.0 * misfit:.3g} % rms; {known}")
+        head = f"contact of {self.gap}: {len(self.estimates)} parameters fitted to {self.count} values"
+        return self._paged(head, about, "", f"in the deck: {self.gap} ... {self.line}")
 
     def _panels(self) -> list[Drawn]:
         panels: list[Drawn] = []
@@ -238,10 +245,9 @@ class ContactFit(FitResult):
         return panels
 
     def to_dict(self) -> dict[str, Any]:
-        """The fit as plain numbers and texts; `parameters` has a row for each."""
         return {
             "gap": self.gap,
-            **self._plain(),
+            **super().to_dict(),
             "relations": [
                 {"kind": one.kind, "count": int(one.values.size), "misfit": misfit}
                 for one, misfit in zip(self.relations, self.misfits, strict=True)
@@ -249,14 +255,11 @@ class ContactFit(FitResult):
         }
 
     def _columns(self) -> dict[str, Any]:
-        every = self.relations
-        columns = {"fn": "fn", "u_gap": "u_gap", "indentation": "indentation", "measured": "values"}
-        return {
-            "relation": [one.kind for one in every for _ in one.values],
-            **{name: np.concatenate([getattr(one, own) for one in every]) for name, own in columns.items()},
-            "fitted": np.concatenate(self.predicted),
-            "sigma": np.concatenate(self.sigma),
-        }
+        rows = zip(*((one.fn, one.u_gap, one.indentation, one.values) for one in self.relations), strict=True)
+        names = ("fn", "u_gap", "indentation", "measured", "fitted", "sigma")
+        columns = map(np.concatenate, (*rows, self.predicted, self.sigma))
+        kinds = [one.kind for one in self.relations for _ in one.values]
+        return {"relation": kinds, **dict(zip(names, columns, strict=True))}
 
 
 def fit_contact(
@@ -324,10 +327,10 @@ def fit_contact(
     # What is fitted in its logarithm cannot start at 0.
     begin |= {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default or 0.0 for name in names if own[name] == 0.0}
     scale = np.concatenate([np.full(one.values.size, _SHARE) if one.sigma is None else one.sigma for one in relations])
-    unknowns = tuple(Unknown(f"{gap}.{name}") for name in names)
+    paths = tuple(f"{gap}.{name}" for name in names)
     limits = {named(path): pair for path, pair in (bounds or {}).items()}
-    start, box = bounded(circuit.varied(begin), unknowns, scale.size, limits)
-    task = ContactTask(start, unknowns, box, scale, gap, relations)
+    start, box = bounded(circuit.varied(begin), paths, scale.size, limits)
+    task = Task(start, paths, paths, box, scale, gap, relations)
     wanted = task.profiled(profiles if isinstance(profiles, bool) else [named(path) for path in profiles])
     task, best, pools = _solved(task)
     if not best.found:
@@ -344,14 +347,14 @@ def fit_contact(
     sized = zip(relations, predicted, task.split(task.scale), strict=True)
     notes = _further_notes(task, best, pools)
     found = ContactFit(
-        **estimated(task, best, error, reach, lambda names: _remedy(task, names), notes),
+        **estimated(task, best, error, reach, task.remedy, notes),
         circuit=fitted,
         gap=gap,
         relations=relations,
         predicted=tuple(predicted),
         sigma=tuple(one.sigma if one.sigma is not None else share * values for one, values, share in sized),
-        freedom=scale.size - len(unknowns),
-        reach=dict(zip(task.names, reach, strict=True)),
+        freedom=scale.size - len(paths),
+        reach=dict(zip(paths, reach.tolist(), strict=True)),
     )
     for relation, misfit in zip(relations, found.misfits, strict=True):
         if misfit > _TOO_MUCH:
@@ -380,13 +383,9 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
     """The parameters to fit, in the order of the netlist."""
     if given is None:
         kinds, voltage = {one.kind for one in relations}, any(np.any(one.u_gap != 0.0) for one in relations)
-        areas = bool(kinds & {"area", "area_sliding"})
-        needed = {
-            "alpha": areas, "m_exp": areas, "beta": "indentation" in kinds or (areas and voltage),
-            "mu": "f_t" in kinds, "c2": "area_sliding" in kinds,
-        }  # fmt: skip
-        needed["n_exp"] = needed["beta"]
-        return tuple(name for name in PARAMETERS if needed[name])
+        loaded = bool(kinds & {"area", "area_sliding"})
+        pressed = "indentation" in kinds or (loaded and voltage)
+        return tuple(compress(PARAMETERS, (loaded, loaded, pressed, pressed, "f_t" in kinds, "area_sliding" in kinds)))
     if isinstance(given, str) or not given:
         raise InputError(f"parameters is {given!r}; allowed: a sequence of {', '.join(PARAMETERS)}")
     bare = [name.rpartition(".")[2].lower() for name in given]
@@ -396,17 +395,7 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
     return tuple(name for name in PARAMETERS if name in bare)
 
 
-class Pool(NamedTuple):
-    """Relations whose values have one standard deviation, as they come from the same instrument."""
-
-    name: str  # What was measured, in words
-    at: IntArray  # Places of their values among the residuals
-    # Number of values less what the parameters take up of them; infinity where the standard deviation is given, and
-    # does not follow from the residuals
-    freedom: float
-
-
-def _solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
+def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
     """Least squares, with the standard deviation of every pool that has none from its own residuals.
 
     Returns the task with the standard deviations found, the fit, and the pools: ridge areas against the load come from
@@ -420,12 +409,12 @@ def _solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
         members.setdefault(key, []).append((relation.name, at))
     begin = task.initial
     for _ in range(_ROUNDS):
-        best, pools, scale = followed(task.residuals, task.bounds, begin), [], task.scale.copy()
+        best, pools, scale = followed(task.residuals, task.bounds, begin), list[Pool](), task.scale.copy()
         leverage = np.sum(orth(best.by_log, _LEAST) ** 2, axis=1)
         for (_, unknown), own in members.items():
             at = np.concatenate([at for _, at in own])
             freedom = at.size - float(leverage[at].sum()) if unknown else math.inf
-            pools.append(Pool(" and the ".join(name for name, _ in own), at, freedom))
+            pools.append((" and the ".join(name for name, _ in own), at, freedom))
             if _FEWEST <= freedom < math.inf:
                 spread = float(np.sqrt(np.sum(best.residual[at] ** 2) / freedom))
                 scale[at] = np.maximum(scale[at] * spread, _LEAST)
@@ -435,40 +424,35 @@ def _solved(task: ContactTask) -> tuple[ContactTask, Fitted, list[Pool]]:
     return task, best, pools
 
 
-def _errors(best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, list[float]]:
+def _errors(best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, FloatArray]:
     """Standard errors of the logarithms, and Student's t with the degrees of freedom of Satterthwaite.
 
     (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946.) Each pool has its own variance, known from its own
-    residuals, and a part in the variance of a parameter.
+    residuals, and a part in the variance of a parameter; without a measure of one that has a part, nothing is known.
     """
     from scipy.stats import norm, t
 
-    covariance = best.covariance
-    parts = np.array([np.sum((covariance @ best.by_log[pool.at].T) ** 2, axis=1) for pool in pools])
-    error, reach = np.sqrt(np.diag(covariance)), []
-    for k, own in enumerate(parts.T):
-        shares = zip((own / max(float(own.sum()), 1e-300)).tolist(), (pool.freedom for pool in pools), strict=True)
-        felt = [(share, left) for share, left in shares if share > _NO_PART]
-        inverse = sum(share**2 / left if left >= _FEWEST else math.inf for share, left in felt)
-        if math.isinf(inverse):
-            error[k] = math.inf
-            reach.append(math.inf)
-        else:
-            reach.append(float(t.ppf(0.975, 1.0 / inverse) if inverse > 0.0 else norm.ppf(0.975)))
-    return error, reach
+    covariance, left = best.covariance, np.array([freedom for _, _, freedom in pools])
+    parts = np.array([np.sum((covariance @ best.by_log[at].T) ** 2, axis=1) for _, at, _ in pools])
+    shares = parts / np.maximum(parts.sum(axis=0), 1e-300)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        each = shares**2 / np.where(left >= _FEWEST, left, 0.0)[:, None]
+        inverse = np.where(shares > _NO_PART, each, 0.0).sum(axis=0)
+        reach = np.where(inverse > 0.0, t.ppf(0.975, 1.0 / inverse), norm.ppf(0.975))
+    known = np.isfinite(inverse)
+    return np.where(known, np.sqrt(np.diag(covariance)), math.inf), np.where(known, reach, math.inf)
 
 
-def _further_notes(task: ContactTask, best: Fitted, pools: Sequence[Pool]) -> list[str]:
+def _further_notes(task: Task, best: Fitted, pools: Sequence[Pool]) -> list[str]:
     found = []
-    for pool in pools:
-        if pool.freedom < _FEWEST:
+    for name, at, freedom in pools:
+        if freedom < _FEWEST:
             found.append(
-                f"Of the {pool.name} there are hardly more values ({pool.at.size}) than parameters, which leaves no "
-                "measure of their errors: measure more of them, or give sigma."
+                f"Of the {name} there are hardly more values ({at.size}) than parameters, which leaves no measure of "
+                "their errors: measure more of them, or give sigma."
             )
-        if math.isinf(pool.freedom):
-            own = misfit_note(float(np.sum(best.residual[pool.at] ** 2)), pool.at.size)
-            found += [note.replace("The residuals", f"The residuals of the {pool.name}", 1) for note in own]
+        if math.isinf(freedom):
+            found += best.beyond_sigma(at, at.size, f" of the {name}")
     fitted = {path.rpartition(".")[2] for path in task.names}
     if "c2" in fitted and "mu" not in fitted:
         mu = task.circuit[task.gap].values["mu"]
@@ -476,22 +460,3 @@ def _further_notes(task: ContactTask, best: Fitted, pools: Sequence[Pool]) -> li
             f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
         )
     return found
-
-
-def _remedy(task: ContactTask, names: tuple[str, ...]) -> str:
-    """The measurement that would tell one parameter, or two apart."""
-    bare = {name.rpartition(".")[2] for name in names}
-    kinds = {one.kind for one in task.relations}
-    loads = np.concatenate([one.fn for one in task.relations if one.kind != "indentation"] or [np.ones(1)])
-    what = "over a wider range of loads"
-    if bare <= {"alpha", "m_exp"}:
-        what = "the area at a second load as well" if float(np.ptp(loads)) == 0.0 else f"the area {what}"
-    elif bare <= {"beta", "n_exp"} and "indentation" in kinds:
-        what = "the area over a wider range of indentations"
-    elif bare <= {"beta", "n_exp"}:
-        what = "the area against the indentation as well"
-    elif "area" not in kinds and "c2" in bare:
-        what = "the area at rest as well"
-    elif bare & {"beta", "n_exp"}:
-        what = "the area against the indentation, or under a higher voltage"
-    return f"Measure {what}, or fix one of them."

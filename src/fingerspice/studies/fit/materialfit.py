@@ -1,9 +1,12 @@
-"""Fits of a passive ladder to measured resistivity and permittivity, and the consistency of such data."""
+"""Fits of a passive ladder to measured resistivity and permittivity, tables of such data, and their consistency."""
 
 from __future__ import annotations
 
+import csv
 import math
+import re
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,13 +18,16 @@ from fingerspice.base.arrays import ComplexArray, FloatArray, positive_number, r
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
+from fingerspice.netlist.lexer import read_text
 from fingerspice.physics.materials import EPS0, Ladder
-from fingerspice.studies.fit.measured import ALLOWED, COLUMNS, likely_slips, read_table
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+#: Columns of measured materials, and what they may be in words.
+COLUMNS = ("frequency", "resistivity", "permittivity")
+ALLOWED = "frequency (Hz), resistivity (ohm m), relative permittivity"
 MOST_POLES = 12
 # The densely placed poles that stand for any causal and passive material: number per decade, and decades beyond the
 # band.
@@ -33,6 +39,114 @@ NOTABLE, TOO_MUCH = 0.1, 0.3
 _SMALL, _FEWEST, _COURSE = 0.03, 10, 0.5
 # Range allowed of data in Hz, ohm m and 1: wide enough for any material, and narrow enough to avoid overflow.
 _LEAST, _MOST = 1e-20, 1e20
+_PREFIXES = {
+    "": 1.0, "G": 1e9, "M": 1e6, "k": 1e3, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9, "p": 1e-12
+}  # fmt: skip
+_PREFIX, _METRES = f"(?P<prefix>[{''.join(_PREFIXES)}]?)", {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_METRE = "(?P<metre>cm|mm|m)"
+_FREQUENCY = "f|freq|frequency|frequenz|hz"
+_PERMITTIVITY = (
+    "eps|eps_r|epsr|eps'|eps_r'|epsilon|epsilon_r|ε|ε_r|εr|ε'|eps_r_sc|permittivity|relative permittivity|"
+    "relative_permittivity|dielectric constant|dk"
+)
+# What a column may hold by its name and unit, of which several with a name the first is that without a unit: the one of
+# `COLUMNS` that it tells, patterns of its names and units, the power of the metre in these, and the power and factor
+# that make of its values in SI units those of the column.
+_KINDS = (
+    ("frequency", _FREQUENCY, f"{_PREFIX}[Hh]z|1/s", 0, 1.0, 1.0),
+    ("frequency", _FREQUENCY, "rad/s", 0, 1.0, 0.5 / np.pi),
+    ("frequency", "w|omega|ω|angular frequency|angular_frequency", "rad/s|1/s", 0, 1.0, 0.5 / np.pi),
+    ("resistivity", "rho|ρ|rho_sc|resistivity|resistance",
+     f"{_PREFIX}(?:[Oo]hms?|[\u03a9\u2126])[ *·.-]?{_METRE}", 1, 1.0, 1.0),
+    ("resistivity", "sigma|σ|kappa|conductivity|conductance", f"{_PREFIX}S/{_METRE}", -1, -1.0, 1.0),
+    ("permittivity", _PERMITTIVITY, "1|-", 0, 1.0, 1.0),
+    ("permittivity", _PERMITTIVITY, f"{_PREFIX}F/{_METRE}", -1, 1.0, 1.0 / EPS0),
+)  # fmt: skip
+# Possible slips of the user, each with the function from the table as given to the table as meant.
+_SLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
+    ("the frequency is in rad/s", lambda t: t * (0.5 / np.pi, 1.0, 1.0)),
+    ("the second column is a conductivity in S/m", lambda t: t ** (1.0, -1.0, 1.0)),
+    ("the frequency is in kHz", lambda t: t * (1e3, 1.0, 1.0)),
+    ("the resistivity is in ohm cm", lambda t: t * (1.0, 1e-2, 1.0)),
+    ("the resistivity is in kohm m", lambda t: t * (1.0, 1e3, 1.0)),
+    ("resistivity and permittivity have changed places", lambda t: t[:, [0, 2, 1]]),
+    ("frequency and resistivity have changed places", lambda t: t[:, [1, 0, 2]]),
+    ("frequency and permittivity have changed places", lambda t: t[:, [2, 1, 0]]),
+    ("the columns are resistivity, permittivity, frequency", lambda t: t[:, [2, 0, 1]]),
+    ("the columns are permittivity, frequency, resistivity", lambda t: t[:, [1, 2, 0]]),
+    ("the second column is a conductivity in mS/m", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e3, 1.0)),
+    ("the second column is a conductivity in uS/cm", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e4, 1.0)),
+    ("the second column is a conductivity in S/cm", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e-2, 1.0)),
+    ("the frequency is in MHz", lambda t: t * (1e6, 1.0, 1.0)),
+    ("the permittivity is in F/m", lambda t: t * (1.0, 1.0, 1.0 / EPS0)),
+)
+
+
+def read_table(path: Path) -> FloatArray:
+    """Rows of frequency (Hz), resistivity (ohm m) and relative permittivity from a text file of three columns.
+
+    Columns are separated by commas, tabs or semicolons; with semicolons decimal commas are allowed. A line of names
+    may give quantities, order and units of the columns; conductivities and angular frequencies are converted.
+    """
+    try:
+        lines = read_text(path, str(path)).splitlines(keepends=True)
+        mark = next((mark for mark in ";\t" if any(mark in line for line in lines)), ",")
+        rows = [row for row in csv.reader(lines, delimiter=mark) if row and not row[0].lstrip().startswith("#")]
+    except csv.Error as error:
+        raise InputError(f"{path} cannot be read as CSV: {error}") from error
+    head: list[str] = []
+    numbers = []
+    for place, row in enumerate(rows):
+        try:
+            numbers.append([float(x.replace(",", ".") if mark == ";" else x) for x in row])
+        except ValueError:
+            if place > 0:
+                raise InputError(f"{path}, row {place + 1}: {','.join(row)!r}; allowed: three numbers") from None
+            head = row
+    if any(len(row) != 3 for row in numbers):
+        raise InputError(f"{path} has rows that are not three numbers; allowed: {ALLOWED}")
+    table = np.array(numbers, float).reshape(-1, 3)
+    if len(head) != 3:
+        return table
+    # Columns with unknown names fill the places that the others leave.
+    named: dict[str, FloatArray] = {}
+    others = []
+    for name, x in zip(head, table.T, strict=True):
+        column, scale, power, factor = _kind(name, str(path))
+        if not column:
+            others.append(x)
+            continue
+        if column in named:
+            names = ", ".join(head)
+            raise InputError(f"{path}: two columns are a {column} by their names, {names}; allowed: {ALLOWED}")
+        with np.errstate(divide="ignore"):
+            named[column] = (scale * x) ** power * factor
+    return np.column_stack([named[name] if name in named else others.pop(0) for name in COLUMNS])
+
+
+def _kind(name: str, file: str) -> tuple[str, float, float, float]:
+    """The column that a name in a header tells, or "", its unit's size, and power and factor as in `_KINDS`."""
+    match = re.fullmatch(
+        r"(?P<what>[^\[(/]*?)\s*(?:[\[(](?P<bracket>[^\])]*)[\])]|/\s*(?P<slash>.+))?", name.strip().strip("\"'")
+    )
+    what, unit = (match["what"].strip(), (match["bracket"] or match["slash"] or "").strip()) if match else ("", "")
+    if "_" in what and not unit and not any(re.fullmatch(names, what, re.IGNORECASE) for _, names, *_ in _KINDS):
+        # A name such as f_kHz ends with its unit.
+        what, _, unit = what.rpartition("_")
+    kinds = [kind for kind in _KINDS if re.fullmatch(kind[1], what, re.IGNORECASE)]
+    for column, _, units, metres, power, factor in kinds:
+        if not unit:
+            return column, 1.0, power, factor
+        found = re.fullmatch(units, unit)
+        if found:
+            parts = found.groupdict()
+            size = _PREFIXES[parts.get("prefix") or ""] * _METRES[parts.get("metre") or "m"] ** metres
+            return column, size, power, factor
+    if kinds:
+        raise InputError(
+            f"{file}: the unit of column {name.strip()!r} is not known; allowed: Hz, rad/s, ohm m, S/m, and 1 or F/m"
+        )
+    return "", 1.0, 1.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -288,10 +402,19 @@ def _doubt(table: FloatArray, found: Consistency) -> str:
     course = found.rms > _SMALL and found.frequency.size >= _FEWEST and found.systematic > _COURSE
     if found.rms <= NOTABLE and not course:
         return ""
-    slips = likely_slips(table, lambda other: _consistency(*_admittivity(other)).rms, found.rms)
+    slips = []
+    for text, meant in _SLIPS:
+        other = meant(table)
+        other = other[np.argsort(other[:, 0])]
+        if np.all(np.diff(other[:, 0]) > 0.0):
+            slips.append((_consistency(*_admittivity(other)).rms, text))
+    best = min((rms for rms, _ in slips), default=np.inf)
+    # Two at most, that reduce the misfit to less than a third: those with the same factor, such as kHz and kohm m,
+    # cannot be distinguished.
+    likely = [text for rms, text in slips if rms <= min(1.1 * best, found.rms / 3.0)][:2]
     said = f"the data are {100.0 * found.rms:.2g} % (rms) from any causal and passive material (Kramers-Kronig)"
-    if slips:
-        said += f"; likely {' or '.join(slips)}"
+    if likely:
+        said += f"; likely {' or '.join(likely)}"
     elif course:
         said += ", not by noise but along a smooth course, as of a drift or of a wrong scale of a column"
     if found.rms > TOO_MUCH:

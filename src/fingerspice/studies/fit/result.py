@@ -19,14 +19,13 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.files import write_csv
-from fingerspice.base.pages import Shown, Table
+from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.numerics.modes import AT, derivative
 from fingerspice.results.outcome import SolveError
 
 if TYPE_CHECKING:
-    from fingerspice.plots.picture import Picture
-
+    from fingerspice.plots.picture import Drawn, Picture
 
 #: What data that cannot be predicted are off by, over their scale.
 REFUSED = 1e6
@@ -34,40 +33,29 @@ REFUSED = 1e6
 _CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
 # Step of the differences in a parameter's logarithm, at which those of fourth order are exact to rounding.
 _STEP = 1e-3
-#: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
-FARTHEST = 1e3
+# A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
+_FARTHEST = 1e3
 # Singular values of the derivatives below this share of the largest are rounding.
 _LEAST = 1e-9
-
-
-class Unknown(NamedTuple):
-    """What is fitted: a parameter in all measurements, or in those of one group."""
-
-    path: str
-    label: str | None = None  # Name of the group
-
-    @property
-    def name(self) -> str:
-        """The path, with the group in brackets."""
-        return self.path if self.label is None else f"{self.path}[{self.label}]"
+# Residuals this unlikely by noise of the given sigma are named.
+_UNLIKELY = 1e-3
 
 
 def bounded(
-    circuit: Circuit, unknowns: Sequence[Unknown], count: int, given: Mapping[str, tuple[float, float]]
+    circuit: Circuit, paths: Sequence[str], count: int, given: Mapping[str, tuple[float, float]]
 ) -> tuple[Circuit, FloatArray]:
     """The circuit to start from, and smallest and largest values, shape (n_parameter, 2): 0 and infinity by default.
 
-    A start outside its bounds moves to the nearer one, with a warning. Fewer data (`count`) than unknowns are refused.
+    A start outside its bounds moves to the nearer one, with a warning. Fewer data (`count`) than `paths` are refused.
     """
-    if count < len(unknowns):
-        raise InputError(f"{count} data cannot tell {len(unknowns)} parameters; allowed: at least as many data")
-    paths = [one.path for one in unknowns]
+    if count < len(paths):
+        raise InputError(f"{count} data cannot tell {len(paths)} parameters; allowed: at least as many data")
     for path in given:
         if path.lower() not in map(str.lower, paths):
             raise InputError(f"bounds names {path}, which is not fitted; allowed: {', '.join(paths)}")
-    lower = {path.lower(): tuple(pair) for path, pair in given.items()}
-    out = [lower.get(path.lower(), (0.0, math.inf)) for path in paths]
-    for path, pair in zip(paths, out, strict=True):
+    lower, out = {path.lower(): tuple(pair) for path, pair in given.items()}, []
+    for path in paths:
+        pair = lower.get(path.lower(), (0.0, math.inf))
         if len(pair) != 2 or not 0.0 <= pair[0] < pair[1]:
             raise InputError(f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
         value = circuit.parameters[path].value
@@ -76,6 +64,7 @@ def bounded(
             said = f"{path} is {value:g}, outside its bounds {pair[0]:g} to {pair[1]:g}: it starts at {moved:g}"
             warnings.warn(said, FingerspiceWarning, stacklevel=3)
             circuit = circuit.varied({path: moved})
+        out.append(pair)
     return circuit, np.array(out, float)
 
 
@@ -84,19 +73,21 @@ class Problem:
     """What is fitted; its classes compare what the circuit predicts with the data."""
 
     circuit: Circuit  # With the values to start from
-    unknowns: tuple[Unknown, ...]
+    names: tuple[str, ...]  # What is fitted: paths, with the group in brackets where a parameter has a value in each
+    paths: tuple[str, ...]  # The path of each
     bounds: FloatArray  # (n_parameter, 2): Smallest and largest values
     scale: FloatArray  # (n,): By which residuals are divided
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the unknowns."""
-        return tuple(one.name for one in self.unknowns)
-
-    @property
     def initial(self) -> FloatArray:
         """Values to start from."""
-        return np.array([self.circuit.parameters[one.path].value for one in self.unknowns])
+        return np.array([self.circuit.parameters[path].value for path in self.paths])
+
+    @property
+    def walls(self) -> FloatArray:
+        """Bounds also where none are given, far from the start: there are no likely values, and slow runs."""
+        (low, high), near, far = self.bounds.T, self.initial / _FARTHEST, self.initial * _FARTHEST
+        return np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
 
     def misses(self, values: FloatArray) -> FloatArray:
         """Residuals over their scale, shape (n,)."""
@@ -119,7 +110,7 @@ class Problem:
             return np.full(self.scale.size, REFUSED), np.zeros((self.scale.size, values.size))
 
     def profiled(self, wanted: bool | Sequence[str]) -> list[str]:
-        """The unknowns whose profiles are wanted, in the circuit's own spelling."""
+        """The names whose profiles are wanted, in the circuit's own spelling."""
         if isinstance(wanted, bool):
             return list(self.names) if wanted else []
         known = {name.lower(): name for name in self.names}
@@ -156,6 +147,19 @@ class Fitted(NamedTuple):
         spread = 1.0 / np.maximum(singular, _LEAST * max(float(singular.max()), 1e-300))
         return np.asarray((right.T * spread**2) @ right)
 
+    def beyond_sigma(self, at: Any, freedom: int, of: str = "") -> list[str]:
+        """A sentence about residuals, at some places of them, that are far larger than their given sigma, else none."""
+        from scipy.stats import chi2
+
+        square = float(np.sum(self.residual[at] ** 2))
+        if freedom < 1 or chi2.sf(square, freedom) > _UNLIKELY:
+            return []
+        return [
+            f"The residuals{of} are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains in "
+            "less than one of a thousand cases: the circuit does not describe these data, or sigma is too small, and "
+            "so are the intervals."
+        ]
+
 
 def followed(
     residuals: Callable[[FloatArray], tuple[FloatArray, FloatArray]], bounds: FloatArray, begin: FloatArray,
@@ -189,6 +193,8 @@ def followed(
     return Fitted(values, residual, by, float(residual @ residual), int(found.nfev), found.status > 0 and ended)
 
 
+# Results
+
 # Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
 # the error of a parameter, in its logarithm, from which on nothing is known of it.
 _TOGETHER, _NOTABLE, _UNKNOWN = 0.98, 0.05, 0.7
@@ -196,16 +202,9 @@ _TOGETHER, _NOTABLE, _UNKNOWN = 0.98, 0.05, 0.7
 _AT_BOUND = 1e-6
 # An interval that reaches farther than this, in the logarithm, has no ends.
 _NO_END = 50.0
-# Residuals this unlikely by noise of the given sigma are named.
-_UNLIKELY = 1e-3
 # Of profiles: growth of the distance from the value, in its logarithm, and error of an interval's end over that
 # distance; error of the other parameters on the way; ratio of the interval's parts from which on it is called skewed.
 _GROWTH, _END, _ROUGHLY, _SKEWED = 1.6, 0.01, 1e-4, 1.2
-
-
-#: A panel of a picture: to which curve each row belongs; abscissa, measured, fitted and standard deviation; what the
-#: abscissa is, the quantity, and its unit.
-Drawn = tuple[Sequence[str], Sequence[FloatArray], str, str, str]
 
 
 @dataclass(frozen=True)
@@ -259,6 +258,7 @@ class FitResult(Shown):
     estimates: dict[str, Estimate]
     correlation: FloatArray
     objective: float
+    count: int
     freedom: int
     evaluations: int
     closed: bool
@@ -274,14 +274,9 @@ class FitResult(Shown):
 
     def plot(self) -> Picture:
         """Data and fit, of contacts of every relation, with the residuals below."""
-        from fingerspice.plots.picture import Curve, Panel, plot_panels
+        from fingerspice.plots.picture import plot_panels
 
-        panels = []
-        for names, columns, *labels in self._panels():
-            at = np.array(names)
-            curves = [Curve(name, *(x[at == name] for x in columns)) for name in dict.fromkeys(names)]
-            panels.append(Panel(curves, *labels))
-        return plot_panels(panels)
+        return plot_panels(self._panels())
 
     def to_csv(self, path: str | Path) -> Path:
         """Write conditions (in the units of the netlist; of a contact in SI units), data, prediction and sigma as CSV.
@@ -295,22 +290,13 @@ class FitResult(Shown):
         return write_csv(path, columns, zip(*columns.values(), strict=True))
 
     @property
-    def _count(self) -> int:
-        """Number of residuals."""
-        return self.freedom + len(self.estimates)
-
-    @property
     def _pairs(self) -> list[tuple[str, str, float]]:
         """Every two parameters, and the correlation of their errors."""
         named = itertools.combinations(enumerate(self.estimates), 2)
         return [(a, b, float(self.correlation[i, j])) for (i, a), (j, b) in named]
 
-    def _head(self, values: str) -> str:
-        effort = f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
-        return f"{len(self.estimates)} parameters fitted to {values}, {effort}"
-
-    def _lines(self) -> list[str | Table]:
-        """Table of the parameters, correlations, profiles and notes, as a report has them."""
+    def _paged(self, head: str, about: Sequence[str], *end: str) -> Page:
+        """A page of what was fitted to what (`head`), the residuals (`about`), and everything else."""
         rows = [
             (
                 e.path, f"{e.value:.6g}", f"{e.error:.2g}", f"{100.0 * e.error / e.value:.2g} %",
@@ -318,16 +304,16 @@ class FitResult(Shown):
             )
             for e in self.estimates.values()
         ]  # fmt: skip
-        lines: list[str | Table] = [
-            "", Table(("parameter", "value", "error", "", "95 % interval", "unit", "started at", ""), rows)
-        ]  # fmt: skip
+        table = Table(("parameter", "value", "error", "", "95 % interval", "unit", "started at", ""), rows)
+        effort = f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
+        lines: list[str | Table] = [f"{head}, {effort}", *about, "", table]
         pairs = [f"{a}, {b}: {both:+.3f}" for a, b, both in self._pairs if abs(both) > 0.1]
         if pairs:
             lines += ["", "correlations beyond 0.1: " + "; ".join(pairs)]
         for one in self.profiles.values():
             ends = f"{one.low:.4g} to {one.high:.4g} {self.estimates[one.path].unit}, {one.shape}"
             lines.append(f"profile of {one.path}: {ends}".replace(" ,", ","))
-        return [*lines, *(["", *self.notes] if self.notes else [])]
+        return Page([*lines, *(["", *self.notes] if self.notes else []), *end])
 
     def report(self) -> str:
         """Statistics, parameters and correlations in the layout of lmfit's ``fit_report``.
@@ -335,7 +321,7 @@ class FitResult(Shown):
         As there, the criteria of Akaike and Bayes are n log(chi-square / n) + 2 k, and + k log(n), of n data and k
         parameters.
         """
-        estimates, square, count, k = self.estimates, self.objective, self._count, len(self.estimates)
+        estimates, square, count, k = self.estimates, self.objective, self.count, len(self.estimates)
         level = count * math.log(max(square, 1e-300) / count)
         wide = max(map(len, estimates)) + 1
         lines = [
@@ -353,15 +339,13 @@ class FitResult(Shown):
         for name, e in estimates.items():
             share = f"({100.0 * e.error / e.value:.2f}%) (init = {e.initial:.7g})"
             lines.append(f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} {share}")
-        pairs = [pair for pair in self._pairs if abs(pair[2]) >= 0.1]
+        pairs = sorted((pair for pair in self._pairs if abs(pair[2]) >= 0.1), key=lambda pair: -abs(pair[2]))
         if pairs:
             lines.append("[[Correlations]] (unreported correlations are < 0.100)")
-            pairs.sort(key=lambda pair: -abs(pair[2]))
-            lines += [f"    C({a}, {b}) = {both:+.4f}" for a, b, both in pairs]
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"    C({a}, {b}) = {both:+.4f}" for a, b, both in pairs)])
 
-    def _plain(self) -> dict[str, Any]:
-        """Parameters, correlations, notes and profiles as plain numbers and texts."""
+    def to_dict(self) -> dict[str, Any]:
+        """The fit as plain numbers and texts; `parameters` has a row for each."""
         return {
             "parameters": [vars(e) for e in self.estimates.values()],
             "correlation": self.correlation.tolist(),
@@ -374,7 +358,7 @@ class FitResult(Shown):
 
 
 def estimated(
-    task: Problem, best: Fitted, error: FloatArray, reach: Sequence[float],
+    task: Problem, best: Fitted, error: FloatArray, reach: FloatArray,
     remedy: Callable[[tuple[str, ...]], str], more: Sequence[str],
 ) -> dict[str, Any]:  # fmt: skip
     """Fields of a `FitResult` from the best fit.
@@ -383,12 +367,11 @@ def estimated(
     one or two parameters what would tell them, and `more` are further notes.
     """
     estimates, notes = {}, []
-    for one, start, value, off, far, box in zip(
-        task.unknowns, task.initial.tolist(), best.values.tolist(), error.tolist(), reach, task.bounds, strict=True
-    ):
+    numbers = (x.tolist() for x in (task.initial, best.values, error, reach))
+    for name, path, box, start, value, off, far in zip(task.names, task.paths, task.bounds, *numbers, strict=True):
         at_bound = bool(np.any(np.abs(value / box[np.isfinite(box) & (box > 0.0)] - 1.0) < _AT_BOUND))
         ratio = math.exp(far * off) if far * off < _NO_END else math.inf
-        name, unit = one.name, task.circuit.parameters[one.path].unit
+        unit = task.circuit.parameters[path].unit
         estimates[name] = Estimate(name, unit, value, start, value * off, value / ratio, value * ratio, at_bound)
         if at_bound:
             own = f"{value:g} {unit}".rstrip()
@@ -396,7 +379,7 @@ def estimated(
     covariance = best.covariance
     spread = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(spread, spread)
-    for (i, a), (j, b) in itertools.combinations(enumerate(estimates), 2):
+    for (i, a), (j, b) in itertools.combinations(enumerate(task.names), 2):
         if abs(correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
             notes.append(
                 f"{a} and {b} are not told apart (correlation {correlation[i, j]:+.4f}): they change these data in "
@@ -405,26 +388,13 @@ def estimated(
     named = " ".join(notes)
     notes += [
         f"Of {name} these data tell next to nothing: its error is larger than itself. {remedy((name,))}"
-        for name, off in zip(estimates, error.tolist(), strict=True)
+        for name, off in zip(task.names, error.tolist(), strict=True)
         if not off < _UNKNOWN and name not in named
     ]
     return {
-        "estimates": estimates, "correlation": correlation, "objective": best.objective,
+        "estimates": estimates, "correlation": correlation, "objective": best.objective, "count": best.residual.size,
         "evaluations": best.evaluations, "closed": best.closed, "notes": (*notes, *more),
     }  # fmt: skip
-
-
-def misfit_note(square: float, freedom: int) -> list[str]:
-    """A sentence about residuals that are far larger than their given sigma, else none."""
-    from scipy.stats import chi2
-
-    if freedom < 1 or chi2.sf(square, freedom) > _UNLIKELY:
-        return []
-    return [
-        f"The residuals are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains in less "
-        "than one of a thousand cases: the circuit does not describe these data, or sigma is too small, and so are the "
-        "intervals."
-    ]
 
 
 def profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profile:
@@ -460,7 +430,7 @@ def profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profi
     for sign, word, bound in zip((-1, 1), ("below", "above"), task.bounds[place].tolist(), strict=True):
         begin = np.delete(best.values, place)
         with np.errstate(divide="ignore"):
-            farthest = min(math.log(FARTHEST), abs(float(np.log(bound)) - here))
+            farthest = min(math.log(_FARTHEST), abs(float(np.log(bound)) - here))
         near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
         while look(here + sign * far) <= limit and far < farthest:
             near, far = far, min(_GROWTH * far, farthest)
