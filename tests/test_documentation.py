@@ -17,7 +17,7 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
-from fingerspice.explorer.beginnings import EXAMPLES
+from fingerspice.explorer.gallery import EXAMPLES
 from scenes import cases
 
 ROOT = Path(__file__).parents[1]

@@ -31,7 +31,7 @@ import fingerspice as fs
 from commands import Command
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.explorer.beginnings import EXAMPLES
+from fingerspice.explorer.gallery import EXAMPLES
 from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS, WAVEFORMS
 from fingerspice.explorer.scene import as_deck, as_python, scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages

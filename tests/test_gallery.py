@@ -11,7 +11,7 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
-from fingerspice.explorer.beginnings import EXAMPLES
+from fingerspice.explorer.gallery import EXAMPLES
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 

@@ -17,7 +17,7 @@ import fingerspice as fs
 import sets_page
 from commands import Command
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.explorer.beginnings import EXAMPLES
+from fingerspice.explorer.gallery import EXAMPLES
 from fingerspice.sets.parameters import DATA, ELEMENTS, KINDS, WAVEFORMS, keys_in, references, tables
 
 ROOT = Path(__file__).parents[1]

@@ -123,7 +123,7 @@ def explore(
             if given and deck is None:
                 raise InputError(f"--{option} {given[0]!r} is given without a deck; allowed: a netlist file before it")
         if static is not None:
-            from fingerspice.explorer.gallery import static_page
+            from fingerspice.explorer.server import static_page
 
             check_output(static, deck)
             page = static_page(circuit)

@@ -1,4 +1,4 @@
-"""One scene of the explorer, without any state: traces, figures, sentences, and its text as a deck or as Python."""
+"""One scene of the explorer, without any state: traces, figures, sentences, sets, and its text as deck or Python."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import math
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from fingerspice import __version__
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import Circuit, Tran
-from fingerspice.explorer import beginnings, request
-from fingerspice.explorer.beginnings import EXAMPLES
-from fingerspice.explorer.request import Asked, quiet
+from fingerspice.circuit.circuit import Circuit, Element, Tran
+from fingerspice.circuit.describe import in_force, remembering
+from fingerspice.circuit.topology import driving_sources
+from fingerspice.explorer.request import Asked, quiet, read_source, sliders, text_of, value_text
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
 from fingerspice.results.solution import Solution
@@ -27,7 +27,7 @@ from fingerspice.sets.parameters import parameters
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.comparison import large_signal
 from fingerspice.studies.export import export_netlist
-from fingerspice.waveforms.waveform import Sine
+from fingerspice.waveforms.waveform import Sine, Waveform
 
 #: Traces of each kind, and harmonics.
 MOST_TRACES, HARMONICS = 8, 20
@@ -51,23 +51,6 @@ def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     return traces | rest
 
 
-def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """What the page needs first: its menus, and the scene to begin with."""
-    examples = [
-        {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
-    ]
-    own = None
-    if circuit is not None:
-        before, unsaid = beginnings.before(circuit)
-        own = {"title": circuit.title, "request": {"deck": circuit.text, **before, **(asked or {})}, "unsaid": unsaid}
-    waveforms = [
-        {"kind": kind, "title": title, "arguments": [a._asdict() for a in arguments]}
-        for kind, (title, arguments) in request.WAVEFORMS.items()
-    ]
-    sets = [{"name": one.name, "kind": one.kind, "title": one.title} for one in parameters().values()]
-    return {"version": __version__, "own": own, "examples": examples, "waveforms": waveforms, "sets": sets}
-
-
 def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[str, Any]]:
     """The answer of `scene` without ``figures``, ``harmonics`` and ``stacks``, to be drawn at once, and then these."""
     answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
@@ -75,12 +58,12 @@ def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[st
     with _noticing(answer):
         try:
             asked = Asked(given, own)
-            sets, _, without = beginnings.in_scene(asked)
+            sets, _, without = in_scene(asked)
             answer |= {
-                "title": asked.circuit.title, "sliders": request.sliders(asked.base, asked.circuit), "sets": sets,
+                "title": asked.circuit.title, "sliders": sliders(asked.base, asked.circuit), "sets": sets,
                 "unknown": [*asked.unknown, *without],
             }  # fmt: skip
-            answer["waveform"] = request.text_of(asked.waveform)
+            answer["waveform"] = text_of(asked.waveform)
             solution = _shown(asked)
             answer |= _traces(asked, solution)
         except InputError as error:
@@ -118,12 +101,11 @@ def _noticing(answer: dict[str, Any]) -> Iterator[None]:
 
 def deadline() -> Callable[[float], None]:
     """A `progress` function that ends a run which takes too long; compiling, before the first call, does not count."""
-    begin: float | None = None
+    begin = math.inf
 
     def check(done: float) -> None:
         nonlocal begin
-        now = time.monotonic()
-        begin = now if begin is None else begin
+        begin = min(begin, now := time.monotonic())
         if now - begin > LONGEST_RUN:
             raise InputError(
                 f"the run was stopped after {LONGEST_RUN:g} s at {100.0 * done:.3g} % of its length; allowed: fewer "
@@ -177,14 +159,12 @@ def _traces(asked: Asked, solution: Solution) -> dict[str, Any]:
 def _stacks(solution: Solution) -> list[dict[str, Any]]:
     """The layers on each contact area with their thickness and voltage, for the drawing of the stack."""
     stacks: dict[str, dict[str, Any]] = {}
-    voltages = solution.by_name("u_layer")
-    for name in solution.layers:
-        e = solution.circuit[name]
+    for name, values in solution.by_name("u_layer").items():
+        e = solution.circuit[name.partition(":")[2]]
         stack = stacks.setdefault(e.nodes[2], {"gap": None, "layers": []})
         if e.device == "GAP":
-            stack["gap"] = name
-        values = voltages[f"u_layer:{name}"]
-        stack["layers"].append({"name": name, "device": e.device, "d": e.values["d"], "values": values})
+            stack["gap"] = e.name
+        stack["layers"].append({"name": e.name, "device": e.device, "d": e.values["d"], "values": values})
     return [stack for stack in stacks.values() if stack["gap"] is not None][:MOST_TRACES]
 
 
@@ -203,6 +183,104 @@ def _harmonics(solution: Solution, period: float | None) -> list[dict[str, Any]]
              "amplitude": found.amplitude, "mean": found.mean}
         )  # fmt: skip
     return out
+
+
+@quiet()
+def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
+    """What the set changes in the scene that a request names in its key ``apply``, as in `Asked.sets`.
+
+    The answer has ``ok`` and ``message``; ``overrides`` (path to value as text), ``source`` (text, or None where the
+    set is no drive) and ``set``, the set's entry in `Asked.sets`. `InputError` says why a set does not fit.
+    """
+    entry = given.get("apply") if isinstance(given, dict) else None
+    if not isinstance(entry, str):
+        raise InputError("apply: allowed: the name of a set, or ELEMENT=NAME")
+    circuit = Asked(given, own).circuit
+    name, to, changes = _changes(circuit, entry)
+    units = {path.lower(): parameter.unit for path, parameter in circuit.parameters.items()}
+    overrides, source = {}, None
+    for path, value in changes.items():
+        if not isinstance(value, Waveform):
+            overrides[path] = value_text(value, units[path.lower()])
+        elif source is None:
+            source = f"{path}={text_of(value)}" if len(driving_sources(circuit)) > 1 else text_of(value)
+    return {"ok": True, "message": "", "overrides": overrides, "source": source, "set": f"{to}={name}" if to else name}
+
+
+def in_scene(asked: Asked) -> tuple[list[dict[str, Any]], set[str], list[str]]:
+    """What the page says of each set with a value in force, the paths that sets give, and sets that mean nothing."""
+    circuit, given, lost = asked.circuit._with(sets={}), [], []
+    for entry in asked.sets:
+        try:
+            name, to, changes = asked.base.remember(("set", entry), partial(_changes, asked.base, entry))
+        except InputError as error:
+            lost.append(f"set {entry!r}, which is left out: {error}")
+            continue
+        given.append((name, to))
+        circuit = remembering(circuit, name, changes)
+    force = in_force(circuit)
+    said = [
+        {"name": name, "to": to, "title": parameters(name).title, "caveat": parameters(name).not_claimed,
+         "assumed": list(parameters(name).assumed), "changed": list(force[name][1])}
+        for name, to in given
+        if name in force and force[name][0]
+    ]  # fmt: skip
+    return said, {path.lower() for kept, _ in force.values() for path in kept}, lost
+
+
+def before(circuit: Circuit) -> tuple[dict[str, Any], list[str]]:
+    """What had been changed in a circuit before the page was opened, as the request's overrides, source and sets.
+
+    With it go the names of replaced sources that it does not say: a request has one, and a recording or a function has
+    no text.
+    """
+    known = {path.lower(): (path, parameter) for path, parameter in circuit.parameters.items()}
+    given = {path.lower() for path in circuit.overrides}
+    replaced = [e for e in circuit.elements if e.waveform is not None and e.name.lower() in given]
+    texts = {e.name: text for e in replaced if (text := _source_text(circuit, e)) is not None}
+    said = list(texts)[:1]
+    overrides = {
+        known[path][0]: value_text(known[path][1].value, known[path][1].unit)
+        for path in sorted(given & set(known))
+        if path.rpartition(".")[0] not in map(str.lower, said)
+    }
+    sets = ",".join(filter(None, (_entry(circuit, name) for name in circuit.sets)))
+    found = {"overrides": overrides, "source": "".join(texts[name] for name in said), "sets": sets}
+    return {key: value for key, value in found.items() if value}, [e.name for e in replaced if e.name not in said]
+
+
+def _source_text(circuit: Circuit, element: Element) -> str | None:
+    """The text of a source of now, as in `Asked.source`; None where the page has none for it."""
+    assert element.waveform is not None
+    for text in (text_of(element.waveform), circuit.overrides.get(element.name)):
+        try:
+            if text is not None and read_source(f"{element.name}={text}", circuit)[1] == element.waveform:
+                return f"{element.name}={text}"
+        except InputError:
+            continue
+    return None
+
+
+def _entry(circuit: Circuit, name: str) -> str | None:
+    """The set of that name as in `Asked.sets`: applied to all, or as narrowly as gives its values in the circuit."""
+    values = circuit.sets[name]
+    elements = dict.fromkeys(path.rpartition(".")[0] or path for path in values)
+    inside = {e.rpartition(".")[0] for e in elements}
+    for to in (None, *elements, *sorted(inside - {""}, key=len, reverse=True)):
+        try:
+            found = parameters(name).apply(circuit, to).sets[name]
+        except InputError:
+            continue
+        if values == found or (to is not None and values.items() <= found.items()):
+            return f"{to}={name}" if to else name
+    return None
+
+
+def _changes(circuit: Circuit, entry: str) -> tuple[str, str | None, dict[str, Any]]:
+    """Name and element of a set as in `Asked.sets`, and what it gives to a circuit, by path."""
+    to, _, name = (part.strip() for part in entry.rpartition("="))
+    one = parameters(name)
+    return one.name, to or None, dict(one.apply(circuit, to or None).sets[one.name])
 
 
 #: Characters of an exported deck beyond which the page does not take it.
@@ -235,7 +313,7 @@ def as_deck(given: dict[str, Any], own: Circuit | None = None) -> str:
 def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     """The scene as Python that gives the page's solution."""
     asked = Asked(given, own)
-    sets, by_sets, _ = beginnings.in_scene(asked)
+    sets, by_sets, _ = in_scene(asked)
     first, stop, _ = asked.times
     name, waveform = asked.replaced or ("", None)
     lines = ["import dataclasses", "", "import numpy as np", "", "import fingerspice as fs", ""]
@@ -293,7 +371,7 @@ def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     good = isinstance(frequencies, list) and 0 < len(frequencies) <= 16
     if not good or not all(isinstance(x, (int, float)) and 1e-2 <= x <= 1e6 for x in frequencies or ()):
         raise InputError("frequencies: allowed: a list of at most 16 numbers from 0.01 to 1e6 Hz")
-    asked = Asked({key: value for key, value in given.items() if key != "frequencies"}, own)
+    asked = Asked(given, own)
     gaps, wave = asked.circuit.by_device("GAP"), asked.waveform
     if not gaps:
         raise InputError("the circuit has no GAP, and so no force")
