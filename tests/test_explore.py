@@ -31,9 +31,8 @@ import fingerspice as fs
 from commands import Command
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.explorer.gallery import EXAMPLES
 from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS, WAVEFORMS
-from fingerspice.explorer.scene import as_deck, as_python, scene
+from fingerspice.explorer.scene import EXAMPLES, as_deck, as_python, scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
 from scenes import cases
 

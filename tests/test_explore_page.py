@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.explorer.gallery import EXAMPLES
+from fingerspice.explorer.scene import EXAMPLES
 from fingerspice.explorer.server import static_page
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from fingerspice.results.outcome import Status as Status
     from fingerspice.results.runfile import load as load
     from fingerspice.results.solution import Solution as Solution
-    from fingerspice.sets.parameters import Citation as Citation
-    from fingerspice.sets.parameters import ParameterSet as ParameterSet
-    from fingerspice.sets.parameters import parameters as parameters
+    from fingerspice.sets import Citation as Citation
+    from fingerspice.sets import ParameterSet as ParameterSet
+    from fingerspice.sets import parameters as parameters
     from fingerspice.solve.simulation import plan as plan
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream
@@ -61,32 +61,31 @@ if TYPE_CHECKING:
     from fingerspice.studies.steady import steady_state as steady_state
     from fingerspice.studies.sweep.populations import sobol as sobol
     from fingerspice.studies.sweep.populations import sweep as sweep
-    from fingerspice.waveforms.combinations import AM as AM
-    from fingerspice.waveforms.combinations import Burst as Burst
-    from fingerspice.waveforms.combinations import Product as Product
-    from fingerspice.waveforms.combinations import Repeat as Repeat
-    from fingerspice.waveforms.combinations import Sum as Sum
     from fingerspice.waveforms.periodic import PWL as PWL
-    from fingerspice.waveforms.periodic import Chirp as Chirp
-    from fingerspice.waveforms.periodic import Exp as Exp
+    from fingerspice.waveforms.periodic import Burst as Burst
     from fingerspice.waveforms.periodic import Pulse as Pulse
+    from fingerspice.waveforms.periodic import Repeat as Repeat
     from fingerspice.waveforms.periodic import Sawtooth as Sawtooth
     from fingerspice.waveforms.periodic import Square as Square
     from fingerspice.waveforms.periodic import Triangle as Triangle
     from fingerspice.waveforms.samples import Samples as Samples
     from fingerspice.waveforms.sampling import Function as Function
+    from fingerspice.waveforms.waveform import AM as AM
     from fingerspice.waveforms.waveform import DC as DC
+    from fingerspice.waveforms.waveform import Chirp as Chirp
+    from fingerspice.waveforms.waveform import Exp as Exp
+    from fingerspice.waveforms.waveform import Product as Product
     from fingerspice.waveforms.waveform import Sine as Sine
+    from fingerspice.waveforms.waveform import Sum as Sum
     from fingerspice.waveforms.waveform import Waveform as Waveform
 
 _HOMES = {
     "circuit.circuit": ("Circuit",),
     "netlist.netlist": ("parse_netlist", "read_netlist"),
-    "waveforms.periodic": ("Chirp", "Exp", "Pulse", "Sawtooth", "Square", "Triangle", "PWL"),
+    "waveforms.periodic": ("Burst", "Pulse", "PWL", "Repeat", "Sawtooth", "Square", "Triangle"),
     "waveforms.samples": ("Samples",),
     "waveforms.sampling": ("Function",),
-    "waveforms.combinations": ("AM", "Burst", "Product", "Repeat", "Sum"),
-    "waveforms.waveform": ("DC", "Sine", "Waveform"),
+    "waveforms.waveform": ("AM", "Chirp", "DC", "Exp", "Product", "Sine", "Sum", "Waveform"),
     "studies.batch.batch": ("batch",),
     "studies.design.inverse": ("Capability", "capability", "inverse_drive"),
     "studies.comparison": ("Comparison", "compare", "large_signal"),
@@ -103,7 +102,7 @@ _HOMES = {
     "studies.sweep.populations": ("sobol", "sweep"),
     "results.runfile": ("load",),
     "results.outcome": ("Plan", "SolveError", "Status"),
-    "sets.parameters": ("Citation", "ParameterSet", "parameters"),
+    "sets": ("Citation", "ParameterSet", "parameters"),
     "solve.simulation": ("plan", "simulate"),
     "solve.streaming": ("stream",),
     "results.solution": ("Solution",),

@@ -30,7 +30,7 @@ def sets(
 
       fingerspice sets moist
     """
-    from fingerspice.sets.parameters import parameters
+    from fingerspice.sets import parameters
 
     with Answering("sets", as_json) as answer:
         found = parameters() if name is None else parameters(name)
@@ -164,7 +164,7 @@ def figures(
         if gallery and only:
             raise InputError("--only and --gallery are both given; allowed: one of them")
         if gallery:
-            from fingerspice.explorer.gallery import decks, draw, scenes
+            from fingerspice.explorer.scene import decks, draw, scenes
 
             # The decks are those of `circuits` below the current folder.
             entries, folder = [*decks(Path("circuits")), *scenes()], folder / "gallery"

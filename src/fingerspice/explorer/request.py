@@ -28,10 +28,9 @@ from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.topology import SLABS, count_of, driving_sources
 from fingerspice.netlist.netlist import parse_netlist, source_from_text
 from fingerspice.results.solution import Solution
-from fingerspice.waveforms.combinations import AM, Sum
 from fingerspice.waveforms.periodic import PWL, Sawtooth, Square, Triangle
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import DC, Sine, Waveform, require
+from fingerspice.waveforms.waveform import AM, DC, Sine, Sum, Waveform, require
 
 #: Numbers of waveforms that the page shows at once; the others it shows on request.
 _FIRST_OF_SOURCES = (

@@ -25,7 +25,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError, printable
 from fingerspice.base.pages import in_notebook
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.explorer import gallery, scene
+from fingerspice.explorer import scene
 from fingerspice.explorer.request import asked_by
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.solution import Solution
@@ -86,13 +86,9 @@ class Explorer:
     """
 
     def __init__(
-        self,
-        circuit: Circuit | None = None,
-        port: int = 0,
-        *,
-        asked: Mapping[str, Any] | None = None,
+        self, circuit: Circuit | None = None, port: int = 0, *, asked: Mapping[str, Any] | None = None,
         framed: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if not 0 <= port <= 65535:
             raise InputError(f"port is {port}; allowed: 0 to 65535, where 0 takes a free one")
         self.token = secrets.token_urlsafe(24)
@@ -240,7 +236,7 @@ _STATIC_POLICY = "default-src 'none'; script-src 'unsafe-inline' data:; style-sr
 def static_page(circuit: Circuit | None = None) -> str:
     """The page as HTML that needs no other file, of a circuit's run or all example scenes; no slider moves on it."""
     files = {name: content.decode("utf-8") for name, content in pages().items()}
-    start = gallery.beginning(circuit)
+    start = scene.beginning(circuit)
     if circuit is not None:
         start["examples"] = []
     shown = [{"name": "own", **start["own"]}] if circuit is not None else start["examples"]
@@ -363,7 +359,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _file(self, what: str) -> tuple[str, Iterator[bytes]]:
         if what == "start":
-            start = json.dumps(gallery.beginning(self.explorer.circuit, self.explorer.asked))
+            start = json.dumps(scene.beginning(self.explorer.circuit, self.explorer.asked))
             return "application/json", iter([start.encode()])
         name = what or "index.html"
         if name not in self.explorer.files:

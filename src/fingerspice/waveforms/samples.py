@@ -13,10 +13,9 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, read_only, real_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.combinations import Product, Sum
 from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, check_count, read_table, wav_layout
 from fingerspice.waveforms.periodic import FEW_KNOTS, PWL, Ramps
-from fingerspice.waveforms.waveform import DC, RANGES, Waveform, check_range, require
+from fingerspice.waveforms.waveform import DC, RANGES, Product, Sum, Waveform, check_range, require
 
 # Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
 # to 0.46 of the rate.

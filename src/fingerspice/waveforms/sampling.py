@@ -3,8 +3,6 @@
 Between its breakpoints a function is represented by Chebyshev series, which are refined until they reproduce the
 function at points that are not interpolation nodes. Where refining does not help there is a jump that was not
 declared: its time is located and becomes an edge of a segment, with a warning.
-
-Fit of a function by Chebyshev series, refined until they reproduce it at points that are not their nodes.
 """
 
 from __future__ import annotations
@@ -271,9 +269,8 @@ class _Interval(NamedTuple):
     lo: float
     hi: float
     depth: int = 0  # Number of halvings that led to it
-    # misfit, largest: Misfit (V) before the last halving, and the largest misfit before any of the halvings
-    misfit: float = math.inf
-    largest: float = 0.0
+    misfit: float = math.inf  # V, before the last halving
+    largest: float = 0.0  # V, the largest misfit before any of the halvings
     idle: int = 0  # Number of halvings in a row that did not reduce the misfit
 
     def halves(self, misfit: float = math.inf, largest: float = 0.0, idle: int = 0) -> list[_Interval]:
@@ -309,7 +306,7 @@ class Refiner:
     not_finite: float | None = None  # Time (s) of the first NaN or inf
     rough: float = 0.0  # Largest misfit (V) taken for round-off of the function's values
     # allowed, deep: Largest allowed and present number of intervals that were halved more than `_DEEP` times
-    allowed: int = _MOST_DEEP
+    allowed: int = field(default_factory=lambda: _MOST_DEEP)
     deep: int = 0
 
     def cover(self, a: float, b: float) -> bool:
