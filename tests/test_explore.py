@@ -580,8 +580,8 @@ def test_the_memory_of_the_command_stays_as_it_is_while_a_slider_moves(tmp_path:
             return int(status.partition("VmRSS:")[2].split()[0]) / 1024.0
 
         # An answer holds 0.1 MB of arrays, and its run 0.5 MB.
-        count = cases(200, 50)
-        assert -memory_after(0, count) + memory_after(count, cases(800, 200)) < 60.0
+        count = cases(200, 40)
+        assert -memory_after(0, count) + memory_after(count, cases(800, 160)) < 60.0
         connection.close()
 
 

@@ -176,9 +176,7 @@ def quiet() -> Iterator[None]:
         yield
 
 
-def read_source(
-    text: str, circuit: Circuit, recording: Recording | None = None
-) -> tuple[str, Waveform, float | None]:  # fmt: skip
+def read_source(text: str, circuit: Circuit, recording: Recording | None = None) -> tuple[str, Waveform, float | None]:
     """The source's name, its new waveform, and the gain (V) of one that is a recording.
 
     They are read from text such as ``SQUARE(200 100)`` or ``Vdrive=AM(200 5k 50)``. No file is read, whatever the text
@@ -252,9 +250,7 @@ class Recording(NamedTuple):
         return f"fs.Samples.from_wav({self.name!r}, {gain!r}, channel=0)"
 
 
-_NAMES = (
-    "deck", "overrides", "source", "charge_law", "area", "skin", "rtol", "periods", "last", "recording", "sets",
-)  # fmt: skip
+_NAMES = ("deck", "overrides", "source", "charge_law", "area", "skin", "rtol", "periods", "last", "recording", "sets")
 
 
 def _read(name: str, given: Any) -> Any:

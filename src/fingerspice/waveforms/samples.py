@@ -58,9 +58,7 @@ class Samples(Ramps):
         require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
 
     @classmethod
-    def from_wav(
-        cls, path: str | Path, gain: float, channel: int | None = None, *, at_once: bool = True
-    ) -> Samples:  # fmt: skip
+    def from_wav(cls, path: str | Path, gain: float, channel: int | None = None, *, at_once: bool = True) -> Samples:
         """One channel of a WAV file of integers (8 to 64 bits) or floats, at any rate.
 
         Parameters
