@@ -190,7 +190,7 @@ def test_a_malformed_file_gives_the_same_values_or_the_same_refusal_at_once_and_
     sound = pieced("i3", extensible=True, before=odd)
     files += [sound[:length] for length in range(1, len(sound))]
     files += [sound[:at] + bytes([value]) + sound[at + 1 :] for at in range(80) for value in (0, 255)]
-    for data in files[:: cases(1, 2)]:
+    for data in files:
         path.write_bytes(data)
         whole_file, in_pieces = read_both_ways(path, 0)
         assert whole_file == in_pieces, data

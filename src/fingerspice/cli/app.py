@@ -203,7 +203,7 @@ def ac(
     from fingerspice.netlist.netlist import sweep_from_text
     from fingerspice.plots.traces import plot_phasor
     from fingerspice.results.spectrum import PhasorSolution, phasor_csv, phasor_tables
-    from fingerspice.sets import parameters
+    from fingerspice.sets.parameters import parameters
     from fingerspice.solve.simulation import check_arguments
     from fingerspice.studies.comparison import large_signal
     from fingerspice.studies.steady import phasor, sweep_frequencies

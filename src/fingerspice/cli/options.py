@@ -61,7 +61,7 @@ def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | Non
 
 
 def _with_set(circuit: Circuit, option: str, text: str) -> Circuit:
-    from fingerspice.sets import parameters
+    from fingerspice.sets.parameters import parameters
 
     element, equals, name = (part.strip() for part in text.rpartition("="))
     try:

@@ -30,7 +30,7 @@ def sets(
 
       fingerspice sets moist
     """
-    from fingerspice.sets import parameters
+    from fingerspice.sets.parameters import parameters
 
     with Answering("sets", as_json) as answer:
         found = parameters() if name is None else parameters(name)

@@ -27,7 +27,7 @@ from fingerspice.plots.drawing import save
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
 from fingerspice.results.solution import Solution
-from fingerspice.sets import parameters
+from fingerspice.sets.parameters import parameters
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.comparison import large_signal
 from fingerspice.studies.export import export_netlist

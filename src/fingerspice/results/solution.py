@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fingerspice.results.sensitivity import SampleGradient, Sensitivity
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import ClosedForm, Recorded
-    from fingerspice.sets import Citation
+    from fingerspice.sets.parameters import Citation
     from fingerspice.waveforms.waveform import Fundamental
 
 
@@ -350,6 +350,6 @@ class Solution(Sealed, Shown, Signalled, Figured):
         Citation
             ``print`` shows the text and the BibTeX, which is also in `Citation.bibtex`.
         """
-        from fingerspice.sets import cite
+        from fingerspice.sets.parameters import cite
 
         return cite(self.circuit, self.method)

@@ -55,24 +55,15 @@ class Waveform:
     numbers, under the names of the attributes below, when they are made.
     """
 
-    units: ClassVar[dict[str, str]] = {}
-    """Unit of each numeric field."""
-
-    period: float | None = None
-    """Period in s after any delay, or None."""
-
+    units: ClassVar[dict[str, str]] = {}  #: Unit of each numeric field
+    period: float | None = None  #: Period in s after any delay, or None
+    settled: float = 0.0  #: Time (s) from which the waveform is periodic
+    #: Distance of neighbouring numbers of the kind that the values are computed in, relative to their size
     precision: float = DOUBLE
-    """Distance of neighbouring numbers of the kind that the values are computed in, relative to their size."""
-
-    settled: float = 0.0
-    """Time (s) from which the waveform is periodic."""
-
+    #: Times (s) before the first and after the second of which the waveform is constant
     course: tuple[float, float] = (-math.inf, math.inf)
-    """Times (s) before the first and after the second of which the waveform is constant."""
-
+    #: Whether each half period after `settled` is the negative of the half period before it
     half_wave: bool = False
-    """Whether each half period after `settled` is the negative of the half period before it."""
-
     # Times (s, ascending) at which the waveform is not smooth, and the shortest time scale (s) between them.
     _breaks: tuple[float, ...] = ()
     _quick: float = math.inf

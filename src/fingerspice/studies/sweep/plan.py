@@ -15,7 +15,7 @@ from fingerspice.base.arrays import FloatArray, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
-from fingerspice.sets import KINDS, parameters
+from fingerspice.sets.parameters import KINDS, parameters
 from fingerspice.studies.batch.form import own_path
 from fingerspice.waveforms.waveform import Waveform, require
 
