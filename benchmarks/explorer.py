@@ -24,7 +24,7 @@ import numpy as np
 from playwright.sync_api import sync_playwright
 
 from baseline import revision
-from fingerspice.explorer.beginnings import EXAMPLES
+from fingerspice.explorer.scene import EXAMPLES
 from fingerspice.explorer.server import pages
 
 HERE = Path(__file__).resolve().parent

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from fingerspice.explorer.gallery import Entry, decks, draw, scenes
+from fingerspice.explorer.scene import Entry, decks, draw, scenes
 
 HERE = Path(__file__).parent
 CIRCUITS = HERE.parent / "circuits"

@@ -51,7 +51,7 @@ MANY_PARAMETERS = {
     "studies.sweep.populations.sweep",
     "studies.steady.steady_state",
     "solve.streaming.stream",
-    "torch.simulator.Simulator.__init__",
+    "torch.Simulator.__init__",
 }
 # Functions over the limits, with their lines and parameters: no other may be, and these may only shrink.
 LARGER = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,18 +15,27 @@ import fingerspice as fs
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 
 
-@pytest.fixture
-def kept() -> Iterator[list[object]]:
-    """What garbage collection finds is kept here, and it does not start by itself."""
-    yield gc.garbage
-    gc.set_debug(0)
-    gc.garbage.clear()
-    gc.enable()
+@contextlib.contextmanager
+def collected() -> Iterator[list[object]]:
+    """What garbage collection finds of what is made inside; all that is there before is left aside, as it is much."""
+    gc.disable()
+    gc.freeze()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    found: list[object] = []
+    try:
+        yield found
+        gc.collect()
+        found.extend(gc.garbage)
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.unfreeze()
+        gc.enable()
 
 
 @pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
 @pytest.mark.parametrize("name", ["fingerpad", "fingerpad_dispersive", "two_fingers", "screen_protector", "recording"])
-def test_a_run_with_changed_parameters_leaves_no_cycle(name: str, kept: list[object]) -> None:
+def test_a_run_with_changed_parameters_leaves_no_cycle(name: str) -> None:
     circuit = fs.read_netlist(CIRCUITS / f"{'fingerpad' if name == 'recording' else name}.cir")
     gap = next(path for path in circuit.parameters if path.endswith("ap.d"))
     if name == "recording":
@@ -39,19 +49,14 @@ def test_a_run_with_changed_parameters_leaves_no_cycle(name: str, kept: list[obj
 
     # The first run compiles, and fills caches.
     use(1.01)
-    gc.collect()
-    gc.disable()
-    gc.set_debug(gc.DEBUG_SAVEALL)
-    use(1.02)
-    gc.collect()
-    assert [type(one).__name__ for one in kept if type(one).__module__.startswith("fingerspice")] == []
+    with collected() as found:
+        use(1.02)
+    assert [type(one).__name__ for one in found if type(one).__module__.startswith("fingerspice")] == []
 
 
-def test_garbage_collection_would_find_a_cycle(kept: list[object]) -> None:
-    gc.disable()
-    gc.set_debug(gc.DEBUG_SAVEALL)
-    run = fs.simulate(fs.read_netlist(CIRCUITS / "fingerpad.cir"), t_stop=1e-3)
-    run.__dict__["own"] = run
-    del run
-    gc.collect()
-    assert "Solution" in {type(one).__name__ for one in kept}
+def test_garbage_collection_would_find_a_cycle() -> None:
+    with collected() as found:
+        run = fs.simulate(fs.read_netlist(CIRCUITS / "fingerpad.cir"), t_stop=1e-3)
+        run.__dict__["own"] = run
+        del run
+    assert "Solution" in {type(one).__name__ for one in found}

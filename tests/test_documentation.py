@@ -1,9 +1,10 @@
-"""The documentation: the code of every page runs, its links lead somewhere, and no public name is missing."""
+"""The documentation: the code of every page runs, its links lead somewhere, no public name is missing; the gallery."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
 import io
 import os
 import re
@@ -13,15 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 
 import fingerspice as fs
 from commands import Command
-from fingerspice.explorer.beginnings import EXAMPLES
+from fingerspice.explorer.scene import EXAMPLES
 from scenes import cases
 
 ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
+CIRCUITS, DOCS = ROOT / "circuits", ROOT / "docs"
 PAGES = sorted({ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md")} - {DOCS / "gallery" / "index.md"})
 LANGUAGES = {"python", "sh", "spice", "text", "csv", "toml", "{toctree}"}
 NOT_RUN = "<!-- not run:"
@@ -82,7 +84,7 @@ RUNNING = [p for p in PAGES if any(b.language in ("python", "sh") for b in block
 @pytest.mark.parametrize("page", RUNNING, ids=id_of)
 def test_the_code_of_a_page_runs_from_its_start_to_its_end(page: Path, command: Command, tmp_path: Path) -> None:
     os.environ["MPLBACKEND"] = "Agg"
-    shutil.copytree(ROOT / "circuits", tmp_path / "circuits")
+    shutil.copytree(CIRCUITS, tmp_path / "circuits")
     population = tmp_path / "circuits" / "population.toml"
     population.write_text(population.read_text().replace("n = 16384", f"n = {cases(16384, 256)}"))
     names: dict[str, object] = {"__name__": "__main__"}
@@ -141,7 +143,7 @@ def test_the_gallery_has_every_deck_and_every_scene(monkeypatch: pytest.MonkeyPa
     monkeypatch.syspath_prepend(str(DOCS))
     gallery = importlib.import_module("gallery")
     entries = {entry.name: entry for _, entry, _ in gallery.entries()}
-    decks, scenes = ROOT.glob("circuits/*.cir"), (f"scene-{example.name}" for example in EXAMPLES)
+    decks, scenes = CIRCUITS.glob("*.cir"), (f"scene-{example.name}" for example in EXAMPLES)
     assert set(entries) == {*(path.stem for path in decks), *scenes}
     assert all(f"]({name}.png)" in gallery.page() for name in entries)
     assert "where fingers feel best" in entries["click"].about
@@ -149,6 +151,48 @@ def test_the_gallery_has_every_deck_and_every_scene(monkeypatch: pytest.MonkeyPa
         gallery.draw(entries[name], tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
     assert not entries["scene-fold"].run().success
+
+
+@pytest.mark.parametrize("name", ["texture_recording", "click", "am_bump", "chirp", "burst"])
+def test_every_deck_of_a_signal_runs_to_its_end_without_a_warning(name: str, recwarn: pytest.WarningsRecorder) -> None:
+    run = fs.simulate(fs.read_netlist(CIRCUITS / f"{name}.cir"), rtol=1e-4)
+    assert not recwarn.list
+    assert run.warnings == ()
+    assert run.t[-1] == run.t_stop
+    # It can be felt: a friction that changes by a tenth of itself, well below the breakdown of air.
+    assert np.ptp(run.f_t) > 0.1 * run.f_t.min()
+    assert np.abs(run.u_gap).max() < 300.0
+
+
+def test_the_recording_is_what_its_script_makes() -> None:
+    spec = importlib.util.spec_from_file_location("texture", CIRCUITS / "texture.py")
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    path = CIRCUITS / "texture.wav"
+    shipped = fs.Samples.from_wav(path, 2.0**15)
+    assert shipped.rate == script.RATE
+    # The sine of another machine may round differently.
+    np.testing.assert_allclose(shipped.values, script.texture(), atol=1)
+    assert path.stat().st_size < 100_000
+
+
+def test_the_command_draws_the_decks_below_and_the_scenes(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "circuits").mkdir()
+    shutil.copy(CIRCUITS / "click.cir", tmp_path / "circuits")
+    some = EXAMPLES[:: cases(1, 7)]
+    monkeypatch.setattr("fingerspice.explorer.scene.EXAMPLES", some)
+    result = command("figures", "--gallery", "--out", "out")
+    assert result.code == 0
+    drawn = {path.stem for path in (tmp_path / "out" / "gallery").glob("*.png")}
+    assert drawn == {"click", *(f"scene-{one.name}" for one in some)}
+    assert all(name in result.out for name in drawn)
+    result = command("figures", "--gallery", "--only", "4")
+    assert result.code == 2
+    assert "--only and --gallery are both given" in result.err
 
 
 def test_every_picture_of_a_page_can_be_drawn_and_is_shown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -31,9 +31,8 @@ import fingerspice as fs
 from commands import Command
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.explorer.beginnings import EXAMPLES
 from fingerspice.explorer.request import LONGEST_DECK, MOST_POINTS, POINTS, WAVEFORMS
-from fingerspice.explorer.scene import as_deck, as_python, scene
+from fingerspice.explorer.scene import EXAMPLES, as_deck, as_python, scene
 from fingerspice.explorer.server import MOST_BYTES, Explorer, pages
 from scenes import cases
 
@@ -581,8 +580,8 @@ def test_the_memory_of_the_command_stays_as_it_is_while_a_slider_moves(tmp_path:
             return int(status.partition("VmRSS:")[2].split()[0]) / 1024.0
 
         # An answer holds 0.1 MB of arrays, and its run 0.5 MB.
-        count = cases(200, 50)
-        assert -memory_after(0, count) + memory_after(count, cases(800, 200)) < 60.0
+        count = cases(200, 40)
+        assert -memory_after(0, count) + memory_after(count, cases(800, 160)) < 60.0
         connection.close()
 
 

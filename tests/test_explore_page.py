@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.explorer.beginnings import EXAMPLES
-from fingerspice.explorer.gallery import static_page
+from fingerspice.explorer.scene import EXAMPLES
+from fingerspice.explorer.server import static_page
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")
 CHROMIUM = shutil.which("chromium")

@@ -17,7 +17,7 @@ import fingerspice as fs
 import sets_page
 from commands import Command
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.explorer.beginnings import EXAMPLES
+from fingerspice.explorer.scene import EXAMPLES
 from fingerspice.sets.parameters import DATA, ELEMENTS, KINDS, WAVEFORMS, keys_in, references, tables
 
 ROOT = Path(__file__).parents[1]
@@ -383,7 +383,7 @@ def test_a_stored_run_with_a_function_or_an_included_file_still_cites(pad: fs.Ci
 
 def test_a_run_of_scipys_method_cites_scipy_and_works_that_only_give_a_range_are_not_cited(pad: fs.Circuit) -> None:
     made = with_set("Forsbach2021", pad)
-    cited = fs.simulate(made, method="scipy:LSODA", t_stop=1e-3, rtol=1e-4).cite()
+    cited = fs.simulate(made, method="scipy:LSODA", t_stop=1e-4, rtol=1e-4).cite()
     assert [r.key for r in cited.references] == ["Forsbach2021", "fingerspice", "Hess2020", "SciPy"]
     assert cited.references[-1].doi == "10.1038/s41592-019-0686-2"
     assert "The method scipy:LSODA" in str(cited)

@@ -61,32 +61,31 @@ if TYPE_CHECKING:
     from fingerspice.studies.steady import steady_state as steady_state
     from fingerspice.studies.sweep.populations import sobol as sobol
     from fingerspice.studies.sweep.populations import sweep as sweep
-    from fingerspice.waveforms.combinations import AM as AM
-    from fingerspice.waveforms.combinations import Burst as Burst
-    from fingerspice.waveforms.combinations import Product as Product
-    from fingerspice.waveforms.combinations import Repeat as Repeat
-    from fingerspice.waveforms.combinations import Sum as Sum
     from fingerspice.waveforms.periodic import PWL as PWL
-    from fingerspice.waveforms.periodic import Chirp as Chirp
-    from fingerspice.waveforms.periodic import Exp as Exp
+    from fingerspice.waveforms.periodic import Burst as Burst
     from fingerspice.waveforms.periodic import Pulse as Pulse
+    from fingerspice.waveforms.periodic import Repeat as Repeat
     from fingerspice.waveforms.periodic import Sawtooth as Sawtooth
     from fingerspice.waveforms.periodic import Square as Square
     from fingerspice.waveforms.periodic import Triangle as Triangle
     from fingerspice.waveforms.samples import Samples as Samples
     from fingerspice.waveforms.sampling import Function as Function
+    from fingerspice.waveforms.waveform import AM as AM
     from fingerspice.waveforms.waveform import DC as DC
+    from fingerspice.waveforms.waveform import Chirp as Chirp
+    from fingerspice.waveforms.waveform import Exp as Exp
+    from fingerspice.waveforms.waveform import Product as Product
     from fingerspice.waveforms.waveform import Sine as Sine
+    from fingerspice.waveforms.waveform import Sum as Sum
     from fingerspice.waveforms.waveform import Waveform as Waveform
 
 _HOMES = {
     "circuit.circuit": ("Circuit",),
     "netlist.netlist": ("parse_netlist", "read_netlist"),
-    "waveforms.periodic": ("Chirp", "Exp", "Pulse", "Sawtooth", "Square", "Triangle", "PWL"),
+    "waveforms.periodic": ("Burst", "Pulse", "PWL", "Repeat", "Sawtooth", "Square", "Triangle"),
     "waveforms.samples": ("Samples",),
     "waveforms.sampling": ("Function",),
-    "waveforms.combinations": ("AM", "Burst", "Product", "Repeat", "Sum"),
-    "waveforms.waveform": ("DC", "Sine", "Waveform"),
+    "waveforms.waveform": ("AM", "Chirp", "DC", "Exp", "Product", "Sine", "Sum", "Waveform"),
     "studies.batch.batch": ("batch",),
     "studies.design.inverse": ("Capability", "capability", "inverse_drive"),
     "studies.comparison": ("Comparison", "compare", "large_signal"),

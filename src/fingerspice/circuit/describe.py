@@ -30,11 +30,10 @@ from fingerspice.circuit.statespace import build_stack
 from fingerspice.circuit.topology import driving, driving_sources, shared
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
-from fingerspice.waveforms.combinations import Burst, Product, Repeat, Sum
-from fingerspice.waveforms.periodic import PWL
+from fingerspice.waveforms.periodic import PWL, Burst, Repeat
 from fingerspice.waveforms.samples import Samples, as_samples
 from fingerspice.waveforms.sampling import Function
-from fingerspice.waveforms.waveform import DC, Waveform, require
+from fingerspice.waveforms.waveform import DC, Product, Sum, Waveform, require
 
 
 def remembering(circuit: Circuit, name: str, values: Mapping[str, Any]) -> Circuit:

@@ -25,8 +25,7 @@ from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.topology import Area, Hop, loop_of, shared
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import EPS0, skin_permittivity, skin_resistivity
-from fingerspice.waveforms.combinations import Product, Sum
-from fingerspice.waveforms.waveform import DC, Waveform
+from fingerspice.waveforms.waveform import DC, Product, Sum, Waveform
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ def explore(
             if given and deck is None:
                 raise InputError(f"--{option} {given[0]!r} is given without a deck; allowed: a netlist file before it")
         if static is not None:
-            from fingerspice.explorer.gallery import static_page
+            from fingerspice.explorer.server import static_page
 
             check_output(static, deck)
             page = static_page(circuit)
@@ -164,7 +164,7 @@ def figures(
         if gallery and only:
             raise InputError("--only and --gallery are both given; allowed: one of them")
         if gallery:
-            from fingerspice.explorer.gallery import decks, draw, scenes
+            from fingerspice.explorer.scene import decks, draw, scenes
 
             # The decks are those of `circuits` below the current folder.
             entries, folder = [*decks(Path("circuits")), *scenes()], folder / "gallery"

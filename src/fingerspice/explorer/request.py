@@ -6,12 +6,12 @@ What the page asks for: its values checked, and the circuit and the times of its
 from __future__ import annotations
 
 import base64
-import dataclasses
 import math
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
 from fingerspice.circuit.describe import MEANINGS_OF_WAVEFORMS
@@ -28,10 +28,9 @@ from fingerspice.circuit.loop import network_of
 from fingerspice.circuit.topology import SLABS, count_of, driving_sources
 from fingerspice.netlist.netlist import parse_netlist, source_from_text
 from fingerspice.results.solution import Solution
-from fingerspice.waveforms.combinations import AM, Sum
 from fingerspice.waveforms.periodic import PWL, Sawtooth, Square, Triangle
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import DC, Sine, Waveform, require
+from fingerspice.waveforms.waveform import AM, DC, Sine, Sum, Waveform, require
 
 #: Numbers of waveforms that the page shows at once; the others it shows on request.
 _FIRST_OF_SOURCES = (
@@ -56,11 +55,10 @@ def sliders(base: Circuit, shown: Circuit) -> list[dict[str, Any]]:
     order = {"V": 0, "I": 0, "GAP": 1, "LAYER": 2, "SLAB": 2, "SKIN": 3, "SKIN_DISPERSIVE": 3}
     groups = []
     for e in sorted(shown.elements, key=lambda e: order.get(e.device, 4)):
-        old, drives = before[e.name], e.name in driving
-        rows: list[tuple[str, str, float, bool, str, tuple[float, float, bool]]] = []
+        old, drives, rows = before[e.name], e.name in driving, list[tuple[Any, ...]]()
         for spec in e.spec.parameters:
             limits = _of_parameter(spec, old.values.get(spec.name, e.values[spec.name]))
-            rows.append((spec.name, spec.unit, e.values[spec.name], spec.first, spec.meaning, limits))
+            rows.append((spec.name, spec.unit, e.values[spec.name], *limits, spec.first, spec.meaning))
         same = type(old.waveform) is type(e.waveform)
         for name, unit in type(e.waveform).units.items() if e.waveform is not None else ():
             value = getattr(e.waveform, name, None)
@@ -69,11 +67,13 @@ def sliders(base: Circuit, shown: Circuit) -> list[dict[str, Any]]:
                 # A source that does not drive is on an area node, and gives mm^2.
                 limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
                 unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
-                rows.append((name, unit, value, name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, ""), limits))
+                rows.append(
+                    (name, unit, value, *limits, name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, ""))
+                )
         found = [
             {"path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
              "text": value_text(value, unit), "low": low, "high": high, "log": log, "first": first, "meaning": meaning}
-            for name, unit, value, first, meaning, (low, high, log) in rows
+            for name, unit, value, low, high, log, first, meaning in rows
         ]  # fmt: skip
         if found:
             groups.append({"element": e.name, "device": e.device, "what": e.spec.what or e.device, "sliders": found})
@@ -150,22 +150,16 @@ WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
     "SQUARE": ("Square wave", (_AMPLITUDE, _FREQUENCY, _usual("duty", 0.5, "", optional=True))),
     "TRIANGLE": ("Triangle", (_AMPLITUDE, _FREQUENCY)),
     "SAWTOOTH": ("Sawtooth", (_AMPLITUDE, _FREQUENCY)),
-    "AM": ("Carrier with envelope", (
-        *(_AMPLITUDE, _usual("carrier", 5e3), _usual("envelope", 50.0), _usual("depth", 1.0, "", optional=True)),
-    )),
-    "BURST": ("Bursts", (
-        *(_AMPLITUDE, _usual("frequency", 5e3), Argument("cycles", "", 10.0, 1.0, 100.0)),
-        Argument("every", "s", 10e-3, 1e-3, 1.0, True),
-    )),
-    "CHIRP": ("Chirp", (
-        *(_usual("amplitude", 150.0, "V"), _usual("from", 20.0), _usual("to", 1e3)),
-        Argument("duration", "s", 0.05, 1e-2, 3.0, True),
-    )),
-    "EXP": ("Step that rises and falls", (
-        *(_usual("low", 0.0, "V"), _usual("high", 200.0, "V"), Argument("start", "s", 1e-3, 0.0, 0.05)),
-        *(Argument("rise", "s", 1e-3, 1e-5, 0.1, True), Argument("end", "s", 20e-3, 0.0, 0.1)),
-        Argument("fall", "s", 2e-3, 1e-5, 0.1, True),
-    )),
+    "AM": ("Carrier with envelope",
+           (_AMPLITUDE, _usual("carrier", 5e3), _usual("envelope", 50.0), _usual("depth", 1.0, "", optional=True))),
+    "BURST": ("Bursts", (_AMPLITUDE, _usual("frequency", 5e3), Argument("cycles", "", 10.0, 1.0, 100.0),
+                         Argument("every", "s", 10e-3, 1e-3, 1.0, True))),
+    "CHIRP": ("Chirp", (_usual("amplitude", 150.0, "V"), _usual("from", 20.0), _usual("to", 1e3),
+                        Argument("duration", "s", 0.05, 1e-2, 3.0, True))),
+    "EXP": ("Step that rises and falls",
+            (_usual("low", 0.0, "V"), _usual("high", 200.0, "V"), Argument("start", "s", 1e-3, 0.0, 0.05),
+             Argument("rise", "s", 1e-3, 1e-5, 0.1, True), Argument("end", "s", 20e-3, 0.0, 0.1),
+             Argument("fall", "s", 2e-3, 1e-5, 0.1, True))),
     RECORDING: ("Recording or table, dropped here", (Argument("gain", "V", 150.0, 0.0, 400.0),)),
     "DC": ("Constant", (_usual("level", 200.0, "V"),)),
 }  # fmt: skip
@@ -174,9 +168,15 @@ _TEXTS = {Sine: "SIN", Square: "SQUARE", Triangle: "TRIANGLE", Sawtooth: "SAWTOO
 _FIELDS = {"envelope": "modulation"}
 
 
-def read_source(
-    text: str, circuit: Circuit, recording: Recording | None = None
-) -> tuple[str, Waveform, float | None]:  # fmt: skip
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Nothing inside warns: the scene itself says what there is to say."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def read_source(text: str, circuit: Circuit, recording: Recording | None = None) -> tuple[str, Waveform, float | None]:
     """The source's name, its new waveform, and the gain (V) of one that is a recording.
 
     They are read from text such as ``SQUARE(200 100)`` or ``Vdrive=AM(200 5k 50)``. No file is read, whatever the text
@@ -185,17 +185,15 @@ def read_source(
     if len(text) > LONGEST:
         raise InputError(f"the source has {len(text):,} characters; allowed: at most {LONGEST:,}")
     names = {e.name.lower(): e.name for e in driving_sources(circuit)}
-    named = _NAMED.fullmatch(text)
-    assert named is not None
-    given = named[1] or next(iter(names), "")
+    given, said = _NAMED.fullmatch(text).groups()  # type: ignore[union-attr]
+    given = given or next(iter(names), "")
     if given.lower() not in names:
         known = ", ".join(names.values()) or "none, as it has no source"
         raise InputError(f"{given or text!r} is not a source of the circuit; allowed: {known}")
-    name, recorded = names[given.lower()], _RECORDED.fullmatch(named[2])
+    name, recorded = names[given.lower()], _RECORDED.fullmatch(said)
     if recorded is None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FingerspiceWarning)
-            return name, source_from_text(named[2], circuit, files=False), None
+        with quiet():
+            return name, source_from_text(said, circuit, files=False), None
     words = recorded[1].replace(",", " ").split()
     if len(words) != 1:
         raise InputError(f"{RECORDING} is given {len(words)} numbers; allowed: {RECORDING}(gain)")
@@ -252,9 +250,7 @@ class Recording(NamedTuple):
         return f"fs.Samples.from_wav({self.name!r}, {gain!r}, channel=0)"
 
 
-_NAMES = (
-    *("deck", "overrides", "source", "charge_law", "area", "skin", "rtol", "periods", "last", "recording", "sets"),
-)  # fmt: skip
+_NAMES = ("deck", "overrides", "source", "charge_law", "area", "skin", "rtol", "periods", "last", "recording", "sets")
 
 
 def _read(name: str, given: Any) -> Any:
@@ -333,14 +329,6 @@ def _numbers(what: str, given: Any) -> FloatArray:
     return values
 
 
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Nothing inside warns: the scene itself says what there is to say."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
 def asked_by(solution: Solution) -> dict[str, Any]:
     """How a run was made, as far as a request can say it."""
     area: str | float = solution.area_mode
@@ -406,11 +394,10 @@ class Asked:
             circuit = circuit.replace({name: waveform})
         paths = {path.lower(): path for path in circuit.parameters}
         known = {paths[path.lower()]: x for path, x in self.overrides.items() if path.lower() in paths}
-        self.unknown = [_unknown("name", str(name), _NAMES) for name in given if name not in _NAMES]
         lost = [path for path in self.overrides if path.lower() not in paths]
+        self.unknown = [_unknown("name", str(name), _NAMES) for name in given if name not in _NAMES]
         self.unknown += [_unknown("parameter", path, paths.values()) for path in lost]
-        if known:
-            circuit = circuit.replace(known)
+        circuit = circuit.replace(known) if known else circuit
         self.base, self.circuit = base, circuit
         fundamental = self.waveform.fundamental if self.skin == "follow" else None
         if fundamental is not None:
@@ -468,13 +455,11 @@ def _parsed(text: str) -> Circuit:
 
 def _dispersive(circuit: Circuit) -> Circuit:
     """The circuit with the data of every skin at all frequencies."""
-    elements = tuple(
-        dataclasses.replace(e, device="SKIN_DISPERSIVE", values=MappingProxyType({"d": e.values["d"]}))
-        if e.device == "SKIN"
-        else e
-        for e in circuit.elements
-    )
-    return dataclasses.replace(circuit, elements=elements)
+    elements = list(circuit.elements)
+    for i, e in enumerate(elements):
+        if e.device == "SKIN":
+            elements[i] = replace(e, device="SKIN_DISPERSIVE", values=MappingProxyType({"d": e.values["d"]}))
+    return replace(circuit, elements=tuple(elements))
 
 
 def _unknown(kind: str, name: str, known: Iterable[str]) -> str:

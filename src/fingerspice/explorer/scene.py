@@ -1,4 +1,4 @@
-"""One scene of the explorer, without any state: traces, figures, sentences, and its text as a deck or as Python."""
+"""Scenes of the explorer, without any state: what a request gives, its text as deck or Python, examples, pictures."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fingerspice import __version__
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import Circuit, Tran
-from fingerspice.explorer import beginnings, request
-from fingerspice.explorer.beginnings import EXAMPLES
-from fingerspice.explorer.request import Asked, quiet
+from fingerspice.base.units import format_si, spice_text
+from fingerspice.circuit.circuit import Circuit, Element, Tran
+from fingerspice.circuit.describe import in_force, remembering
+from fingerspice.circuit.topology import driving_sources
+from fingerspice.explorer.request import WAVEFORMS, Asked, quiet, read_source, sliders, text_of, value_text
+from fingerspice.netlist.netlist import read_netlist
+from fingerspice.plots.drawing import save
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
 from fingerspice.results.solution import Solution
@@ -27,7 +31,7 @@ from fingerspice.sets.parameters import parameters
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.comparison import large_signal
 from fingerspice.studies.export import export_netlist
-from fingerspice.waveforms.waveform import Sine
+from fingerspice.waveforms.waveform import Sine, Waveform
 
 #: Traces of each kind, and harmonics.
 MOST_TRACES, HARMONICS = 8, 20
@@ -51,23 +55,6 @@ def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     return traces | rest
 
 
-def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """What the page needs first: its menus, and the scene to begin with."""
-    examples = [
-        {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
-    ]
-    own = None
-    if circuit is not None:
-        before, unsaid = beginnings.before(circuit)
-        own = {"title": circuit.title, "request": {"deck": circuit.text, **before, **(asked or {})}, "unsaid": unsaid}
-    waveforms = [
-        {"kind": kind, "title": title, "arguments": [a._asdict() for a in arguments]}
-        for kind, (title, arguments) in request.WAVEFORMS.items()
-    ]
-    sets = [{"name": one.name, "kind": one.kind, "title": one.title} for one in parameters().values()]
-    return {"version": __version__, "own": own, "examples": examples, "waveforms": waveforms, "sets": sets}
-
-
 def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[str, Any]]:
     """The answer of `scene` without ``figures``, ``harmonics`` and ``stacks``, to be drawn at once, and then these."""
     answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
@@ -75,12 +62,12 @@ def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[st
     with _noticing(answer):
         try:
             asked = Asked(given, own)
-            sets, _, without = beginnings.in_scene(asked)
+            sets, _, without = in_scene(asked)
             answer |= {
-                "title": asked.circuit.title, "sliders": request.sliders(asked.base, asked.circuit), "sets": sets,
+                "title": asked.circuit.title, "sliders": sliders(asked.base, asked.circuit), "sets": sets,
                 "unknown": [*asked.unknown, *without],
             }  # fmt: skip
-            answer["waveform"] = request.text_of(asked.waveform)
+            answer["waveform"] = text_of(asked.waveform)
             solution = _shown(asked)
             answer |= _traces(asked, solution)
         except InputError as error:
@@ -118,12 +105,11 @@ def _noticing(answer: dict[str, Any]) -> Iterator[None]:
 
 def deadline() -> Callable[[float], None]:
     """A `progress` function that ends a run which takes too long; compiling, before the first call, does not count."""
-    begin: float | None = None
+    begin = math.inf
 
     def check(done: float) -> None:
         nonlocal begin
-        now = time.monotonic()
-        begin = now if begin is None else begin
+        begin = min(begin, now := time.monotonic())
         if now - begin > LONGEST_RUN:
             raise InputError(
                 f"the run was stopped after {LONGEST_RUN:g} s at {100.0 * done:.3g} % of its length; allowed: fewer "
@@ -177,14 +163,12 @@ def _traces(asked: Asked, solution: Solution) -> dict[str, Any]:
 def _stacks(solution: Solution) -> list[dict[str, Any]]:
     """The layers on each contact area with their thickness and voltage, for the drawing of the stack."""
     stacks: dict[str, dict[str, Any]] = {}
-    voltages = solution.by_name("u_layer")
-    for name in solution.layers:
-        e = solution.circuit[name]
+    for name, values in solution.by_name("u_layer").items():
+        e = solution.circuit[name.partition(":")[2]]
         stack = stacks.setdefault(e.nodes[2], {"gap": None, "layers": []})
         if e.device == "GAP":
-            stack["gap"] = name
-        values = voltages[f"u_layer:{name}"]
-        stack["layers"].append({"name": name, "device": e.device, "d": e.values["d"], "values": values})
+            stack["gap"] = e.name
+        stack["layers"].append({"name": e.name, "device": e.device, "d": e.values["d"], "values": values})
     return [stack for stack in stacks.values() if stack["gap"] is not None][:MOST_TRACES]
 
 
@@ -203,6 +187,104 @@ def _harmonics(solution: Solution, period: float | None) -> list[dict[str, Any]]
              "amplitude": found.amplitude, "mean": found.mean}
         )  # fmt: skip
     return out
+
+
+@quiet()
+def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
+    """What the set changes in the scene that a request names in its key ``apply``, as in `Asked.sets`.
+
+    The answer has ``ok`` and ``message``; ``overrides`` (path to value as text), ``source`` (text, or None where the
+    set is no drive) and ``set``, the set's entry in `Asked.sets`. `InputError` says why a set does not fit.
+    """
+    entry = given.get("apply") if isinstance(given, dict) else None
+    if not isinstance(entry, str):
+        raise InputError("apply: allowed: the name of a set, or ELEMENT=NAME")
+    circuit = Asked(given, own).circuit
+    name, to, changes = _changes(circuit, entry)
+    units = {path.lower(): parameter.unit for path, parameter in circuit.parameters.items()}
+    overrides, source = {}, None
+    for path, value in changes.items():
+        if not isinstance(value, Waveform):
+            overrides[path] = value_text(value, units[path.lower()])
+        elif source is None:
+            source = f"{path}={text_of(value)}" if len(driving_sources(circuit)) > 1 else text_of(value)
+    return {"ok": True, "message": "", "overrides": overrides, "source": source, "set": f"{to}={name}" if to else name}
+
+
+def in_scene(asked: Asked) -> tuple[list[dict[str, Any]], set[str], list[str]]:
+    """What the page says of each set with a value in force, the paths that sets give, and sets that mean nothing."""
+    circuit, given, lost = asked.circuit._with(sets={}), [], []
+    for entry in asked.sets:
+        try:
+            name, to, changes = asked.base.remember(("set", entry), partial(_changes, asked.base, entry))
+        except InputError as error:
+            lost.append(f"set {entry!r}, which is left out: {error}")
+            continue
+        given.append((name, to))
+        circuit = remembering(circuit, name, changes)
+    force = in_force(circuit)
+    said = [
+        {"name": name, "to": to, "title": parameters(name).title, "caveat": parameters(name).not_claimed,
+         "assumed": list(parameters(name).assumed), "changed": list(force[name][1])}
+        for name, to in given
+        if name in force and force[name][0]
+    ]  # fmt: skip
+    return said, {path.lower() for kept, _ in force.values() for path in kept}, lost
+
+
+def before(circuit: Circuit) -> tuple[dict[str, Any], list[str]]:
+    """What had been changed in a circuit before the page was opened, as the request's overrides, source and sets.
+
+    With it go the names of replaced sources that it does not say: a request has one, and a recording or a function has
+    no text.
+    """
+    known = {path.lower(): (path, parameter) for path, parameter in circuit.parameters.items()}
+    given = {path.lower() for path in circuit.overrides}
+    replaced = [e for e in circuit.elements if e.waveform is not None and e.name.lower() in given]
+    texts = {e.name: text for e in replaced if (text := _source_text(circuit, e)) is not None}
+    said = list(texts)[:1]
+    overrides = {
+        known[path][0]: value_text(known[path][1].value, known[path][1].unit)
+        for path in sorted(given & set(known))
+        if path.rpartition(".")[0] not in map(str.lower, said)
+    }
+    sets = ",".join(filter(None, (_entry(circuit, name) for name in circuit.sets)))
+    found = {"overrides": overrides, "source": "".join(texts[name] for name in said), "sets": sets}
+    return {key: value for key, value in found.items() if value}, [e.name for e in replaced if e.name not in said]
+
+
+def _source_text(circuit: Circuit, element: Element) -> str | None:
+    """The text of a source of now, as in `Asked.source`; None where the page has none for it."""
+    assert element.waveform is not None
+    for text in (text_of(element.waveform), circuit.overrides.get(element.name)):
+        try:
+            if text is not None and read_source(f"{element.name}={text}", circuit)[1] == element.waveform:
+                return f"{element.name}={text}"
+        except InputError:
+            continue
+    return None
+
+
+def _entry(circuit: Circuit, name: str) -> str | None:
+    """The set of that name as in `Asked.sets`: applied to all, or as narrowly as gives its values in the circuit."""
+    values = circuit.sets[name]
+    elements = dict.fromkeys(path.rpartition(".")[0] or path for path in values)
+    inside = {e.rpartition(".")[0] for e in elements}
+    for to in (None, *elements, *sorted(inside - {""}, key=len, reverse=True)):
+        try:
+            found = parameters(name).apply(circuit, to).sets[name]
+        except InputError:
+            continue
+        if values == found or (to is not None and values.items() <= found.items()):
+            return f"{to}={name}" if to else name
+    return None
+
+
+def _changes(circuit: Circuit, entry: str) -> tuple[str, str | None, dict[str, Any]]:
+    """Name and element of a set as in `Asked.sets`, and what it gives to a circuit, by path."""
+    to, _, name = (part.strip() for part in entry.rpartition("="))
+    one = parameters(name)
+    return one.name, to or None, dict(one.apply(circuit, to or None).sets[one.name])
 
 
 #: Characters of an exported deck beyond which the page does not take it.
@@ -235,7 +317,7 @@ def as_deck(given: dict[str, Any], own: Circuit | None = None) -> str:
 def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     """The scene as Python that gives the page's solution."""
     asked = Asked(given, own)
-    sets, by_sets, _ = beginnings.in_scene(asked)
+    sets, by_sets, _ = in_scene(asked)
     first, stop, _ = asked.times
     name, waveform = asked.replaced or ("", None)
     lines = ["import dataclasses", "", "import numpy as np", "", "import fingerspice as fs", ""]
@@ -293,7 +375,7 @@ def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     good = isinstance(frequencies, list) and 0 < len(frequencies) <= 16
     if not good or not all(isinstance(x, (int, float)) and 1e-2 <= x <= 1e6 for x in frequencies or ()):
         raise InputError("frequencies: allowed: a list of at most 16 numbers from 0.01 to 1e6 Hz")
-    asked = Asked({key: value for key, value in given.items() if key != "frequencies"}, own)
+    asked = Asked(given, own)
     gaps, wave = asked.circuit.by_device("GAP"), asked.waveform
     if not gaps:
         raise InputError("the circuit has no GAP, and so no force")
@@ -310,3 +392,168 @@ def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
         "ok": True, "message": "", "frequency": found.frequency, "force": found.f_el_mean, "gap": gaps[0].name,
         "amplitude": amplitude,
     }  # fmt: skip
+
+
+class Example(NamedTuple):
+    """One scene of the page's menu: a deck, and what the page asks for with it."""
+
+    name: str  # Short name, which stands in the page's address
+    # title, note: What the menu and the page say about it
+    title: str
+    note: str
+    deck: str
+    asked: Mapping[str, object] = {}  # Further keys of the request, as in `scene`
+
+
+_COAT = "Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg"
+_ALL_TONES = "Xskin   skin  0    area  SKIN_DISPERSIVE d=350u"
+
+
+def _skin(frequency: str, node: str = "0") -> str:
+    return f"Xskin   skin  {node:<4} area  SKIN  d=350u f={frequency}"
+
+
+def _gap(*, d: str = "3.5u", r: str = "1meg", fn: str = "0.5", mu: str = "0.3") -> str:
+    return (
+        f"Xgap    top   skin area  GAP   d={d} eps_r=1 r={r} fn={fn} mu={mu}\n"
+        "+                              alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
+    )
+
+
+def _gap_of(finger: str) -> str:
+    """The gap of Table 1 with the values in which a named set of parameters differs from the normal finger."""
+    normal, values = parameters("normal").values, parameters(finger).values
+    changed = [v for path, v in values.items() if v.element == "gap" and v.value != normal[path].value]
+    return _gap(**{v.parameter: spice_text(v.value) if v.unit else f"{v.value:g}" for v in changed})
+
+
+def _deck(title: str, *lines: str) -> str:
+    return "\n".join([title, ".include fingerspice.lib", *lines, ".end", ""])
+
+
+def _finger(title: str, source: str, skin: str, tran: str, *more: str, gap: str = "") -> str:
+    """Table 1's finger on one source."""
+    return _deck(title, f"Vdrive  drive 0          {source}", *more, _COAT, gap or _gap(), skin, f".tran {tran} uic")
+
+
+_AMPLIFIER = _deck(
+    "Finger behind an amplifier with a safety resistor, 5 kHz",
+    "Vdrive  amp   0          SIN(0 200 5k)",
+    "Rout    amp   drive      47k",
+    "Ccable  drive 0          150p",
+    *(_COAT, _gap(), _skin("5k"), ".tran 0.5u 1m uic"),
+)
+_UNGROUNDED = _finger(
+    "User not grounded, 5 kHz", "SIN(0 200 5k)", _skin("5k", "body"), "0.5u 1m",
+    "Rbody   body  far        1.5k", "Cbody   far   0          150p",
+)  # fmt: skip
+_TWO = _deck(
+    "Two fingers on one screen, 5 kHz",
+    "Vdrive  drive 0           SIN(0 200 5k)",
+    ".subckt finger drive body area fn=0.5",
+    *(_COAT, _gap(fn="{fn}"), _skin("5k", "body"), ".ends"),
+    "Xfirm   drive body firm   finger fn=0.5",
+    "Xlight  drive body light  finger fn=0.2",
+    "Rbody   body  far         1.5k",
+    "Cbody   far   0           150p",
+    ".tran 0.5u 1m uic",
+)
+_TONES = _deck(
+    "Two tones on a dispersive skin",
+    "Vdrive  drive fast       SIN(0 120 100)",
+    "Vfast   fast  0          SIN(0 80 5k)",
+    *(_COAT, _gap(), _ALL_TONES, ".tran 1u 30m uic"),
+)
+EXAMPLES: tuple[Example, ...] = (
+    Example("sine", "Sine, 100 Hz (Fig. 4, left)", "Table 1: the layers leak, and the force follows the sine.",
+            _finger("Table 1, sine of 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m")),
+    Example("sine-5k", "Sine, 5 kHz (Fig. 4, right)", "At 5 kHz the capacitances divide the voltage.",
+            _finger("Table 1, sine of 5 kHz", "SIN(0 200 5k)", _skin("5k"), "0.2u 1m")),
+    Example("square", "Square wave, 100 Hz (Fig. 5, left)", "After each edge the gap's voltage leaks away.",
+            _finger("Table 1, square wave of 100 Hz", "SQUARE(200 100)", _skin("100"), "10u 50m")),
+    Example("square-5k", "Square wave, 5 kHz (Fig. 5, right)", "The force is nearly constant.",
+            _finger("Table 1, square wave of 5 kHz", "SQUARE(200 5k)", _skin("5k"), "0.2u 1m")),
+    Example("ungrounded", "User not grounded", "The body's capacitance to ground takes voltage.", _UNGROUNDED),
+    Example("two-fingers", "Two fingers of one hand", "A firm and a light finger share a body that floats.", _TWO),
+    Example("amplifier", "Amplifier's limit", "A safety resistor and the cable take voltage at high frequencies.",
+            _AMPLIFIER),
+    Example("tones", "Two tones, dispersive skin", "The skin's data at all frequencies, for two tones at once.", _TONES,
+            {"periods": 3}),
+    Example("am", "AM texture", "A carrier of 5 kHz whose envelope of 50 Hz is what the finger feels.",
+            _finger("AM texture", "SIN(0 200 5k)", _skin("5k"), "2u 40m"),
+            {"source": "AM(200 5k 50)", "periods": 2}),
+    Example("click", "Click", "A damped sine of 250 Hz, where fingers feel best.",
+            _finger("Click", "SIN(0 200 250 0 250)", _ALL_TONES, "10u 40m")),
+    Example("chirp", "Chirp, 20 Hz to 1 kHz", "All frequencies that fingers feel, one after the other.",
+            _finger("Chirp", "CHIRP(150 20 1k 0.1)", _ALL_TONES, "20u 0.1")),
+    Example("bursts", "Bursts of 5 kHz", "Ten cycles every 10 ms: the finger feels 100 Hz.",
+            _finger("Bursts of 5 kHz", "SIN(0 200 5k)", _ALL_TONES, "5u 50m"), {"source": "BURST(200 5k 10 10m)"}),
+    Example("wet", "Moist finger", "Sweat in the gap conducts: the set moist, whose leak and friction are assumed.",
+            _finger("Moist finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_gap_of("moist"))),
+    Example("dry", "Dry finger", "The gap hardly leaks: the set dry, whose leak and friction are assumed.",
+            _finger("Dry finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_gap_of("dry"))),
+    Example("fold", "Fold of the mobile law", "A thin gap under the mobile charge law: no solution, and why.",
+            _finger("A gap of 10 nm under the law mobile", "SIN(0 200 100)", _skin("100"), "10u 50m",
+                    gap=_gap(d="10n")), {"charge_law": "mobile"}),
+)  # fmt: skip
+"""The scenes of the menu, the first of which is shown at the start."""
+
+
+def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """What the page needs first: its menus, and the scene to begin with."""
+    examples = [
+        {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
+    ]
+    own = None
+    if circuit is not None:
+        changed, unsaid = before(circuit)
+        own = {"title": circuit.title, "request": {"deck": circuit.text, **changed, **(asked or {})}, "unsaid": unsaid}
+    waveforms = [
+        {"kind": kind, "title": title, "arguments": [a._asdict() for a in arguments]}
+        for kind, (title, arguments) in WAVEFORMS.items()
+    ]
+    sets = [{"name": one.name, "kind": one.kind, "title": one.title} for one in parameters().values()]
+    return {"version": __version__, "own": own, "examples": examples, "waveforms": waveforms, "sets": sets}
+
+
+class Entry(NamedTuple):
+    """One picture of the gallery."""
+
+    name: str  # Of its file, without the suffix
+    # title, about: What it shows, in a line, and the comment of the deck or the note of the scene
+    title: str
+    about: str
+    origin: Path  # File that it is drawn from
+    run: Callable[[], Solution]  # Runs it
+
+
+def decks(folder: Path) -> Iterator[Entry]:
+    """The decks of a folder; their comments explain them."""
+    for path in sorted(folder.glob("*.cir")):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        end = lines.index(".include fingerspice.lib") if ".include fingerspice.lib" in lines else len(lines)
+        comments = [line[1:].strip() for line in lines[1:end] if line[:1] == "*"]
+        about = re.split(r"Layers(?:,| and) contact|SI units|V\(area\)|In ngspice|Charge law:", " ".join(comments))[0]
+        title = re.sub(r"Fingerpad on a (3M-coated )?touchscreen,? (with )?", "", lines[0]) or path.stem
+        title = title[0].upper() + title[1:]
+        yield Entry(path.stem, title, about.strip(), path, partial(lambda path: simulate(read_netlist(path)), path))
+
+
+def scenes() -> Iterator[Entry]:
+    """The example scenes of the explorer."""
+    for one in EXAMPLES:
+        yield Entry(f"scene-{one.name}", one.title, one.note, Path(__file__), partial(_run_scene, one))
+
+
+def _run_scene(example: Example) -> Solution:
+    asked = Asked({"deck": example.deck, **example.asked})
+    first, stop, _ = asked.times
+    times = np.linspace(first, stop, 4001)
+    return simulate(asked.circuit, t_stop=stop, t_eval=times, charge_law=asked.charge_law, throw=False)
+
+
+def draw(entry: Entry, picture: Path) -> None:
+    """Run an entry, and draw source, gap voltage and friction."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FingerspiceWarning)
+        save(entry.run().plot(("u_source", "u_gap", "f_t")), picture, dpi=110.0)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import hmac
 import json
+import re
 import secrets
 import socket
 import struct
@@ -23,7 +25,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError, printable
 from fingerspice.base.pages import in_notebook
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.explorer import beginnings, scene
+from fingerspice.explorer import scene
 from fingerspice.explorer.request import asked_by
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.solution import Solution
@@ -84,13 +86,9 @@ class Explorer:
     """
 
     def __init__(
-        self,
-        circuit: Circuit | None = None,
-        port: int = 0,
-        *,
-        asked: Mapping[str, Any] | None = None,
+        self, circuit: Circuit | None = None, port: int = 0, *, asked: Mapping[str, Any] | None = None,
         framed: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if not 0 <= port <= 65535:
             raise InputError(f"port is {port}; allowed: 0 to 65535, where 0 takes a free one")
         self.token = secrets.token_urlsafe(24)
@@ -200,7 +198,7 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
 
 #: What the page asks for, and what answers, in one part or in several.
 _ACTIONS: dict[str, Callable[[Any, Circuit | None], Any]] = {
-    "scene": scene.parts, "set": beginnings.applied, "means": scene.means, "deck": scene.as_deck,
+    "scene": scene.parts, "set": scene.applied, "means": scene.means, "deck": scene.as_deck,
     "python": scene.as_python,
 }  # fmt: skip
 
@@ -229,6 +227,42 @@ def framed(data: Any) -> bytes:
         text = json.dumps(json.loads(text, parse_constant=lambda _: None))
     content = text.encode() + b" " * (-len(text) % 8)
     return b"".join([struct.pack("<II", len(content), end), content, *arrays])
+
+
+#: What the page as one file may load.
+_STATIC_POLICY = "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data: blob:"
+
+
+def static_page(circuit: Circuit | None = None) -> str:
+    """The page as HTML that needs no other file, of a circuit's run or all example scenes; no slider moves on it."""
+    files = {name: content.decode("utf-8") for name, content in pages().items()}
+    start = scene.beginning(circuit)
+    if circuit is not None:
+        start["examples"] = []
+    shown = [{"name": "own", **start["own"]}] if circuit is not None else start["examples"]
+    scenes = {one["name"]: scene.scene({"last": 2, **one["request"]}, circuit) for one in shown}
+    baked = base64.b64encode(framed({"start": start, "scenes": scenes})).decode("ascii")
+    # Modules import each other by the names of the import map.
+    bare = {
+        name.removesuffix(".js"): re.sub(r'from "\./(\w+)\.js"', r'from "\1"', text)
+        for name, text in files.items()
+        if name.endswith(".js") and name != "uplot.js"
+    }
+    app = bare.pop("app")
+    encoded = {name: base64.b64encode(text.encode()).decode("ascii") for name, text in bare.items()}
+    imports = json.dumps({"imports": {name: f"data:text/javascript;base64,{text}" for name, text in encoded.items()}})
+    parts = [
+        f'<meta http-equiv="Content-Security-Policy" content="{_STATIC_POLICY}">',
+        f"<style>{files['uplot.css']}\n{files['style.css']}</style>",
+        f"<script>{files['uplot.js']}</script>",
+        f'<script type="text/plain" id="baked">{baked}</script>',
+        f'<script type="importmap">{imports}</script>',
+        f'<script type="module">{app}</script>',
+    ]
+    replaced = ('<link rel="stylesheet"', "<script src", '<script type="module"')
+    lines = files["index.html"].splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith(replaced))
+    return "\n".join([*lines[:first], *parts, *(x for x in lines[first:] if not x.startswith(replaced)), ""])
 
 
 class _Server(ThreadingHTTPServer):

@@ -13,11 +13,10 @@ from fingerspice.circuit.circuit import SmallSignal, Tran
 from fingerspice.netlist.expressions import is_unit, nearest
 from fingerspice.netlist.lexer import SourceFiles
 from fingerspice.netlist.reader import Call, Number, Token, Word
-from fingerspice.waveforms.combinations import AM, Burst, Repeat
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.periodic import PWL, Chirp, Exp, Pulse, Sawtooth, Square, Triangle
+from fingerspice.waveforms.periodic import PWL, Burst, Pulse, Repeat, Sawtooth, Square, Triangle
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import DC, Sine, Waveform
+from fingerspice.waveforms.waveform import AM, DC, Chirp, Exp, Sine, Waveform
 
 _KEPT_BYTES = 2**25  # A larger WAV file is read in parts when needed: 32 MiB are six minutes of 16 bits at 48 kHz.
 

@@ -38,7 +38,7 @@ from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, S
 from fingerspice.results.record import StoredRecord, kept_rows, variables
 from fingerspice.results.solution import Solution
 from fingerspice.results.steps import Recorded, whole_steps
-from fingerspice.waveforms import combinations, periodic, samples
+from fingerspice.waveforms import periodic, samples
 from fingerspice.waveforms import waveform as waveforms
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
 from fingerspice.waveforms.waveform import Fundamental, Waveform
@@ -206,9 +206,9 @@ MOST_NUMBERS = 8_000_000
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
-        waveforms.DC, waveforms.Sine, periodic.Chirp, periodic.Exp, periodic.PWL, periodic.Pulse, periodic.Square,
-        periodic.Triangle, periodic.Sawtooth, combinations.Sum, combinations.Product, combinations.AM,
-        combinations.Burst, combinations.Repeat, samples.Samples,
+        waveforms.DC, waveforms.Sine, waveforms.Chirp, waveforms.Exp, periodic.PWL, periodic.Pulse, periodic.Square,
+        periodic.Triangle, periodic.Sawtooth, waveforms.Sum, waveforms.Product, waveforms.AM, periodic.Burst,
+        periodic.Repeat, samples.Samples,
     )
 }  # fmt: skip
 # Attributes of a circuit that a file holds as they are.

@@ -20,9 +20,8 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import in_force, remembering, require_circuit
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.waveforms.combinations import AM
 from fingerspice.waveforms.periodic import Square
-from fingerspice.waveforms.waveform import Sine, Waveform
+from fingerspice.waveforms.waveform import AM, Sine, Waveform
 
 #: Waveforms of drives, by the name that a set gives.
 WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM}

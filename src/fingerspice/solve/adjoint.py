@@ -26,9 +26,8 @@ from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import Block, driving
 from fingerspice.solve.recordings.run import ready
 from fingerspice.solve.simulation import asked
-from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.samples import Samples, as_samples
-from fingerspice.waveforms.waveform import DC, Waveform
+from fingerspice.waveforms.waveform import DC, Sum, Waveform
 
 # Steps of an interval: of the first two numbers, or below this `rtol` of the second and third, and twice as many while
 # these differ; and the error wanted, relative to the largest derivative, over `rtol`.

@@ -21,9 +21,8 @@ from fingerspice.engine.one_area.model import Model
 from fingerspice.engine.one_area.system import build_system
 from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import fixed_area_curve
-from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.sampling import is_sampled
-from fingerspice.waveforms.waveform import Fundamental, Waveform, require
+from fingerspice.waveforms.waveform import Fundamental, Sum, Waveform, require
 
 # Error allowed for taking a dispersive skin's data at one frequency, relative to the error asked for.
 FREEZING_SHARE = 0.3

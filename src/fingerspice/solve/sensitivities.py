@@ -21,7 +21,7 @@ from fingerspice.results.outcome import SolveError, Status
 from fingerspice.results.solution import MEANS, SIGNALS, Sensitivity, Solution
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import driving
-from fingerspice.waveforms.combinations import Sum
+from fingerspice.waveforms.waveform import Sum
 
 # Error asked of the runs that are compared, over the run's own, and the least one.
 _SHARE, _FINEST = 1e-3, 3e-13

@@ -19,9 +19,9 @@ from fingerspice.netlist.lexer import LIBRARIES, library_text
 from fingerspice.physics.contact import Contact
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged
-from fingerspice.waveforms.periodic import PWL, Exp, Pulse
+from fingerspice.waveforms.periodic import PWL, Pulse
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import DC, Sine, Waveform
+from fingerspice.waveforms.waveform import DC, Exp, Sine, Waveform
 
 EDGE = 1e-9
 """Rise time (s) of an ideal jump in the export, since ngspice has none; a thousandth of TSTEP if that is shorter."""

@@ -1,7 +1,4 @@
-"""Reader of text tables such as CSV: finds separators, header and units, and refuses bad cells with their line.
-
-Recordings from files: WAV, tables as text (CSV and the like), and tables as NPZ.
-"""
+"""Recordings and tables from files: WAV, text such as CSV, and NPZ; what is wrong in a file is refused by its line."""
 
 from __future__ import annotations
 
@@ -119,23 +116,9 @@ class Columns:
 
 def read_text_columns(path: Path, label: str | None = None) -> Columns:
     """Columns of a text file, with one count of cells in all rows; the column `label` has words. Errors name lines."""
-    data, words, place = path.read_bytes(), dict[str, int](), None
-    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    if b"\0" in data and not wide:
-        raise InputError(f"'{path}' is no text; allowed: a table as text, or an NPZ file")
-    try:
-        lines = data.decode("utf-16" if wide else "utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        # Windows' Latin-1, in which spreadsheets and LTspice write the micro sign.
-        lines = data.decode("cp1252", "replace").splitlines()
-    lines = [_COMMENT.sub(r"\1", line) if ";" in line else line for line in lines]
-    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    steps = [one for one in numbered if one[1].startswith(_STEPPED)]
-    if len(steps) > 1:
-        said = f"'{path}', line {steps[1][0]}: the table holds {len(steps)} runs of .step, here {steps[1][1].strip()!r}"
-        raise InputError(f"{said}; allowed: one run: export one step, or keep the rows of one")
-    numbered = [one for one in numbered if one not in steps]
+    numbered = _lines(path)
     rows = [(number, line) for number, line in numbered if not line.lstrip().startswith(_COMMENTED)]
+    place = None
     if label is not None and rows:
         # The rows of such a table need not begin with a number: they are those below the first.
         named = [_unit(cell)[0].lower() for cell in _cells(rows[0][1], _separator(rows[0][1]))]
@@ -155,11 +138,31 @@ def read_text_columns(path: Path, label: str | None = None) -> Columns:
         raise InputError(f"'{path}', line {begin}: {said}")
     separator = _separator(line)
     count = len(_cells(line, separator))
-    header = [_unit(name) for name in _header(path, numbered, begin, separator, count)]
+    above = [one for one in numbered if one[0] < begin][-1:]
+    header = [_unit(name) for name in _header(path, *above[0], separator, count)] if above else []
     names, units = zip(*header, strict=True) if header else ((), ())
-    table, faults = _numbers(path, rows[first:], separator, count, place, words)
+    table, faults, words = _numbers(path, rows[first:], separator, count, place)
     places = np.array([number for number, _ in rows[first:]])
-    return Columns(path, names, table, units, places, faults, tuple(words))
+    return Columns(path, names, table, units, places, faults, words)
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """The lines of a text file that are not empty, by their numbers from 1, without comments behind numbers."""
+    data = path.read_bytes()
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if b"\0" in data and not wide:
+        raise InputError(f"'{path}' is no text; allowed: a table as text, or an NPZ file")
+    try:
+        lines = data.decode("utf-16" if wide else "utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        # Windows' Latin-1, in which spreadsheets and LTspice write the micro sign.
+        lines = data.decode("cp1252", "replace").splitlines()
+    lines = [_COMMENT.sub(r"\1", line) if ";" in line else line for line in lines]
+    steps = [(number, line) for number, line in enumerate(lines, 1) if line.startswith(_STEPPED)]
+    if len(steps) > 1:
+        said = f"'{path}', line {steps[1][0]}: the table holds {len(steps)} runs of .step, here {steps[1][1].strip()!r}"
+        raise InputError(f"{said}; allowed: one run: export one step, or keep the rows of one")
+    return [one for one in enumerate(lines, 1) if one[1].strip() and one not in steps]
 
 
 def _separator(line: str) -> str | None:
@@ -187,33 +190,27 @@ def _refuse_semicolons(path: Path, number: int, line: str) -> None:
         raise InputError(f"{problem}; allowed: commas, tabs or blanks between numbers with points")
 
 
-def _header(
-    path: Path, numbered: list[tuple[int, str]], begin: int, separator: str | None, count: int
-) -> tuple[str, ...]:
-    """Column names from the line before the first numbers, which may be a comment; empty if it holds no names."""
-    before = [(number, line) for number, line in numbered if number < begin]
-    if not before:
-        return ()
-    number, line = before[-1]
+def _header(path: Path, number: int, line: str, separator: str | None, count: int) -> list[str]:
+    """Column names from the line above the first numbers, which may be a comment; empty if it holds no names."""
     text = line.strip()
-    names = tuple(_cells(text.lstrip("#"), separator))
+    names = _cells(text.lstrip("#"), separator)
     if len(names) == count and text[0] not in ";*":
         return names
     if text.startswith(_COMMENTED):
-        return ()
+        return []
     hint = ", or are its commas decimal commas" if separator == "," and count == 2 * len(names) else ""
     raise InputError(f"'{path}', line {number}: the header names {len(names)} columns, and the rows have {count}: is "
                      f"a name missing{hint}?")  # fmt: skip
 
 
 def _numbers(
-    path: Path, rows: list[tuple[int, str]], separator: str | None, count: int, label: int | None, words: dict[str, int]
-) -> tuple[FloatArray, dict[int, str]]:
-    """Numbers (n_row, count), the words of the column `label` as their numbers among `words`, and faults by column."""
-    faults: dict[int, str] = {}
+    path: Path, rows: list[tuple[int, str]], separator: str | None, count: int, label: int | None
+) -> tuple[FloatArray, dict[int, str], tuple[str, ...]]:
+    """Numbers (n_row, count), faults by column, and the words of the column `label`, which has their places."""
+    faults, words = dict[int, str](), dict[str, int]()
     with suppress(ValueError):
         if label is None:
-            return np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None), faults
+            return np.loadtxt((line for _, line in rows), delimiter=separator, ndmin=2, comments=None), {}, ()
     # NumPy reads neither SPICE's scales nor quoted cells, and its message does not help: read the rows one by one.
     table = np.full((len(rows), count), np.nan)
     for (number, line), found in zip(rows, table, strict=True):
@@ -227,7 +224,7 @@ def _numbers(
             except ValueError as error:
                 reason = str(error) if cell else f"the cell in column {column} is empty; allowed: numbers"
                 faults.setdefault(column, f"'{path}', line {number}: {reason}")
-    return table, faults
+    return table, faults, tuple(words)
 
 
 def _number(cell: str) -> float:
@@ -449,8 +446,9 @@ def checked_file(path: str | Path, most: int) -> Path:
         else:
             path.open("rb").close()
             size = path.stat().st_size
-            too_large = f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB" if size > most else ""
-            fault = too_large if size else "is empty"
+            fault = "is empty" if not size else ""
+            if size > most:
+                fault = f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB"
     except (OSError, ValueError) as error:
         fault = f"cannot be read: {getattr(error, 'strerror', None) or error}"
     if fault:

@@ -1,4 +1,4 @@
-"""Waveforms of straight pieces: PWL, square, triangle, sawtooth, pulses; the chirp and the exponential pulse.
+"""Waveforms of straight pieces: PWL, square, triangle, sawtooth, pulses; and stretches that are used once or repeated.
 
 The base class of straight pieces is `Ramps`, of which a subclass only lists its knots.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.waveform import TAU, Waveform, check_range, require, terms_of
+from fingerspice.waveforms.waveform import Waveform, as_waveform, check_range, require, terms_of
 
 # A waveform with at most this many knots is not divided into windows, however close together its knots are.
 FEW_KNOTS = 1000
@@ -192,26 +192,21 @@ class PWL(Ramps):
     def __post_init__(self) -> None:
         t = real_numbers("PWL times", self.times, "numbers in s")
         v = real_numbers("PWL values", self.values, "numbers in V")
-        object.__setattr__(self, "times", tuple(t.tolist()))
-        object.__setattr__(self, "values", tuple(v.tolist()))
+        self._declare(times=tuple(t.tolist()), values=tuple(v.tolist()))
         alike = t.ndim == 1 <= t.size and t.shape == v.shape
         require(alike, "PWL", f"{t.size} times and {v.size} values", "as many of each, in a row")
         for name, array in (("time", t), ("value", v)):
-            bad = np.flatnonzero(~np.isfinite(array))
-            if bad.size:
+            if (bad := np.flatnonzero(~np.isfinite(array))).size:
                 raise InputError(f"PWL {name} number {bad[0] + 1} is {array[bad[0]]}; allowed: finite numbers")
         check_range("PWL time", t, "s")
         check_range("PWL value", v, "V")
-        back = t[1:] < t[:-1]
-        if np.any(back):
-            i = int(np.argmax(back))
-            raise InputError(f"PWL times decrease: {t[i + 1]:g} s follows {t[i]:g} s; allowed: not decreasing")
-        thrice = t[2:] == t[:-2]
-        if np.any(thrice):
-            i = int(np.argmax(thrice))
-            raise InputError(f"PWL time {t[i]:g} s stands three times; two equal times are a jump")
+        if (back := np.flatnonzero(t[1:] < t[:-1])).size:
+            before, after = t[back[0] : back[0] + 2]
+            raise InputError(f"PWL times decrease: {after:g} s follows {before:g} s; allowed: not decreasing")
+        if (thrice := np.flatnonzero(t[2:] == t[:-2])).size:
+            raise InputError(f"PWL time {t[thrice[0]]:g} s stands three times; two equal times are a jump")
         if self.repeat is not None:
-            object.__setattr__(self, "repeat", real_number("PWL repeat", self.repeat, "a number in s"))
+            self._declare(repeat=real_number("PWL repeat", self.repeat, "a number in s"))
             own = t.size > 1 and self.repeat in t[:-1] and self.repeat < t[-1]
             require(own, "PWL repeat time", f"{self.repeat:g} s", "one of the PWL's own times before the last")
             self._declare(period=self.times[-1] - self.repeat, settled=max(0.0, self.times[-1]), _first=self.repeat)
@@ -388,91 +383,140 @@ class Pulse(Ramps):
         return np.array(t), np.array(v)
 
 
-@dataclass(frozen=True)
-class Chirp(Waveform):
-    """offset + amplitude sin(phi(t)), whose frequency rises linearly from f0 to f1 over `duration` and then stays.
+# A time within this relative distance of a breakpoint differs from it only by rounding, and is replaced by it.
+_ROUNDING_OF_TIMES = 8e-16
 
-    Parameters
-    ----------
-    amplitude : float
-        V.
-    f0, f1 : float
-        Hz, positive: at t = 0, and from `duration` on.
-    duration : float
-        s.
-    offset : float
-        V.
-    phase_deg : float
-        Degrees, at t = 0.
-    """
 
-    amplitude: float
-    f0: float
-    f1: float
-    duration: float
-    offset: float = 0.0
-    phase_deg: float = 0.0
-    units: ClassVar[dict[str, str]] = {
-        "amplitude": "V", "f0": "Hz", "f1": "Hz", "duration": "s", "offset": "V", "phase_deg": "deg"
-    }  # fmt: skip
+class _Stretches(Waveform):
+    """The first stretch of another waveform, once or again and again; 0 V elsewhere."""
+
+    waveform: Waveform
+    _stretch: float  # Length of the stretch, s
 
     def __post_init__(self) -> None:
+        wave = as_waveform(self.waveform)
+        self._declare(waveform=wave, _quick=wave.shortest_time())
         super().__post_init__()
-        require(self.f0 > 0.0 and self.f1 > 0.0, "chirp frequencies", f"{self.f0:g}, {self.f1:g} Hz", "> 0")
-        require(self.duration > 0.0, "chirp duration", f"{self.duration:g} s", "> 0")
-        self._declare(_breaks=(0.0, self.duration), _quick=1.0 / max(self.f0, self.f1))
 
-    def _phase(self, t: FloatArray) -> FloatArray:
-        sweep = np.clip(t, 0.0, self.duration)
-        turns = (self.f0 + 0.5 * (self.f1 - self.f0) / self.duration * sweep) * sweep
-        turns = turns + self.f1 * np.maximum(t - self.duration, 0.0) + self.f0 * np.minimum(t, 0.0)
-        return np.asarray(TAU * (turns - np.floor(turns)) + math.radians(self.phase_deg))
+    def _begin(self, t: FloatArray) -> FloatArray:
+        """Start (s) of the stretch in which, or next to which, each time is."""
+        raise NotImplementedError
 
-    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
-        return np.asarray(self.offset + self.amplitude * np.sin(self._phase(real_numbers("t", t, "times in s"))))
+    @cached_property
+    def _marks(self) -> FloatArray:
+        """Breakpoints of the other waveform within the stretch, and both ends of the stretch, s."""
+        inner = self.waveform.breakpoints(0.0, self._stretch)
+        inner = inner[(inner > 0.0) & (inner < self._stretch * (1.0 - _ROUNDING_OF_TIMES))]
+        return np.concatenate([[0.0], inner, [self._stretch]])
 
-    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
-        rate = (self.f1 - self.f0) / self.duration
-        middle = 0.5 * (start + stop)
-        rises = np.where((middle >= 0.0) & (middle < self.duration), TAU * rate, 0.0)
-        omega = TAU * (self.f0 + rate * np.clip(start, 0.0, self.duration))
-        wave = self.amplitude, 0.0, 0.0, omega, self._phase(start) - 0.5 * math.pi, rises
-        return terms_of(start.size, (self.offset,), wave)
-
-
-@dataclass(frozen=True)
-class Exp(Waveform):
-    """SPICE's EXP: from `td1` on towards v2 with time constant `tau1`, and from `td2` on back to v1 with `tau2`.
-
-    Voltages in V, times in s; the time constants are positive and td2 >= td1.
-    """
-
-    v1: float
-    v2: float
-    td1: float
-    tau1: float
-    td2: float
-    tau2: float
-    units: ClassVar[dict[str, str]] = {"v1": "V", "v2": "V", "td1": "s", "tau1": "s", "td2": "s", "tau2": "s"}
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(self.tau1 > 0.0 and self.tau2 > 0.0, "EXP time constants", f"{self.tau1:g}, {self.tau2:g} s", "> 0")
-        require(self.td2 >= self.td1, "EXP td2", f"{self.td2:g} s", f">= td1 = {self.td1:g} s")
-        breaks = tuple(sorted({self.td1, self.td2}))
-        self._declare(course=(self.td1, math.inf), _breaks=breaks, _quick=min(self.tau1, self.tau2))
+    def _inner(self, t: FloatArray, begin: FloatArray) -> FloatArray:
+        """Times (s) since the stretch began; a time that differs from a breakpoint only by rounding is set to it."""
+        tau = np.asarray(t - begin, float)
+        marks = self._marks
+        right = np.clip(np.searchsorted(marks, tau), 1, marks.size - 1)
+        near = np.where(tau - marks[right - 1] < marks[right] - tau, marks[right - 1], marks[right])
+        return np.where(np.abs(tau - near) <= _ROUNDING_OF_TIMES * np.abs(t), near, tau)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         t = real_numbers("t", t, "times in s")
-        rise = -np.expm1(-np.maximum(t - self.td1, 0.0) / self.tau1)
-        fall = -np.expm1(-np.maximum(t - self.td2, 0.0) / self.tau2)
-        return np.asarray(self.v1 + (self.v2 - self.v1) * (rise - fall))
+        tau = self._inner(t, self._begin(t))
+        first, last = (0.0, self._stretch) if side == "right" else (self._stretch, 0.0)
+        if self.period is not None:
+            # By rounding, the start of a period may count as the end of the period before, or an end as a start.
+            tau = np.where(tau == last, first, tau)
+        on = (tau >= 0.0) & (tau <= self._stretch) & (tau != last)
+        return np.where(on, self.waveform.value(np.where(on, tau, 0.0), side), 0.0)
 
-    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
-        step = self.v2 - self.v1
-        first = 0.5 * (start + stop) >= self.td1
-        second = 0.5 * (start + stop) >= self.td2
-        level = self.v1 + step * (first.astype(float) - second.astype(float))
-        rise = np.where(first, -step * np.exp(-np.maximum(start - self.td1, 0.0) / self.tau1), 0.0)
-        fall = np.where(second, step * np.exp(-np.maximum(start - self.td2, 0.0) / self.tau2), 0.0)
-        return terms_of(start.size, (level,), (rise, 0.0, -1.0 / self.tau1), (fall, 0.0, -1.0 / self.tau2))
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
+        middle = 0.5 * (start + stop)
+        begin = self._begin(middle)
+        on = (middle >= begin) & (middle - begin < self._stretch)
+        block = self.waveform.terms(*(self._inner(t[on], begin[on]) for t in (start, stop)))
+        if block is None:
+            return None
+        out = np.zeros((start.size, *block.shape[1:]))
+        out[on] = block
+        return out
+
+    @property
+    def precision(self) -> float:  # type: ignore[override]
+        return self.waveform.precision
+
+    def cancelling(self, t0: float, t1: float) -> float:
+        return self.waveform.cancelling(0.0, self._stretch)
+
+
+@dataclass(frozen=True)
+class Burst(_Stretches):
+    """The first `duration` of a waveform, beginning at `delay`; 0 V before and after.
+
+    Parameters
+    ----------
+    waveform : Waveform
+        Its time 0 is the beginning of the burst. A number or a function of time (s) is accepted, too.
+    duration : float
+        s, positive.
+    delay : float
+        s, not negative.
+    """
+
+    waveform: Waveform
+    duration: float
+    delay: float = 0.0
+    units: ClassVar[dict[str, str]] = {"duration": "s", "delay": "s"}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.duration > 0.0, "burst duration", f"{self.duration:g} s", "> 0")
+        require(self.delay >= 0.0, "burst delay", f"{self.delay:g} s", ">= 0")
+        self._declare(_stretch=self.duration, course=(self.delay, self.delay + self.duration))
+
+    def _begin(self, t: FloatArray) -> FloatArray:
+        return np.full(t.shape, self.delay)
+
+    def _edges(self, t0: float, t1: float) -> FloatArray:
+        return np.asarray(self.delay + self._marks)
+
+    def breakpoint_rate(self) -> float:
+        return self.waveform.breakpoint_rate()
+
+
+@dataclass(frozen=True)
+class Repeat(_Stretches):
+    """The first `period` of a waveform, repeated for ever.
+
+    The fundamental is the tone of the waveform, if a whole number of its cycles fits `period`, and else 1/period.
+
+    Parameters
+    ----------
+    waveform : Waveform
+        Used from its time 0 to `period`. A number or a function of time (s) is accepted, too.
+    period : float
+        s, positive.
+    """
+
+    waveform: Waveform
+    period: float = field()
+    units: ClassVar[dict[str, str]] = {"period": "s"}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.period > 0.0, "repeat period", f"{self.period:g} s", "> 0")
+        self._declare(_stretch=self.period)
+
+    def _begin(self, t: FloatArray) -> FloatArray:
+        return np.floor(t / self.period) * self.period
+
+    def _edges(self, t0: float, t1: float) -> FloatArray:
+        marks = self._marks[:-1]
+        low, high = math.floor(t0 / self.period) - 1.0, math.ceil(t1 / self.period) + 1.0
+        return np.asarray((runs_through(low, high, marks.size, t0, t1)[:, None] * self.period + marks).ravel())
+
+    def breakpoint_rate(self) -> float:
+        return self._marks.size / self.period
+
+    def tone(self) -> float | None:
+        inside = self.waveform.waveform if isinstance(self.waveform, Burst) else self.waveform
+        tone = inside.tone()
+        turns = 0.0 if tone is None else tone * self.period
+        return tone if round(turns) >= 1 and abs(turns - round(turns)) < 1e-9 * turns else 1.0 / self.period

@@ -13,10 +13,9 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, read_only, real_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
-from fingerspice.waveforms.combinations import Product, Sum
 from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, check_count, read_table, wav_layout
 from fingerspice.waveforms.periodic import FEW_KNOTS, PWL, Ramps
-from fingerspice.waveforms.waveform import DC, RANGES, Waveform, check_range, require
+from fingerspice.waveforms.waveform import DC, RANGES, Product, Sum, Waveform, check_range, require
 
 # Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
 # to 0.46 of the rate.
@@ -59,9 +58,7 @@ class Samples(Ramps):
         require(self.rate > 0.0, "sample rate", f"{self.rate:g} Hz", "> 0")
 
     @classmethod
-    def from_wav(
-        cls, path: str | Path, gain: float, channel: int | None = None, *, at_once: bool = True
-    ) -> Samples:  # fmt: skip
+    def from_wav(cls, path: str | Path, gain: float, channel: int | None = None, *, at_once: bool = True) -> Samples:
         """One channel of a WAV file of integers (8 to 64 bits) or floats, at any rate.
 
         Parameters

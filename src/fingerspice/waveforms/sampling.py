@@ -3,8 +3,6 @@
 Between its breakpoints a function is represented by Chebyshev series, which are refined until they reproduce the
 function at points that are not interpolation nodes. Where refining does not help there is a jump that was not
 declared: its time is located and becomes an edge of a segment, with a warning.
-
-Fit of a function by Chebyshev series, refined until they reproduce it at points that are not their nodes.
 """
 
 from __future__ import annotations
@@ -225,21 +223,15 @@ def source_table(
             step = 0.1 * waveform.shortest_time()
         else:
             return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
-    pieces = Refiner(waveform, tol, step, shortest, scale)
+    pieces = Refiner(waveform, tol, step, [float(t0)], shortest, scale)
     for a, b in itertools.pairwise(edges):
         if not pieces.cover(float(a), float(b)):
             break
     if terms is None:
         pieces.warn()
-    m = len(pieces.series)
-    return SourceTable(
-        np.array(pieces.edges) if m else np.array([t0]),
-        np.zeros((m, 1, 6)),
-        np.array(pieces.series).reshape(m, POINTS),
-        pieces.scale,
-        pieces.not_finite,
-        pieces.rough,
-    )
+    found, series = np.array(pieces.edges), np.array(pieces.series).reshape(-1, POINTS)
+    nothing = np.zeros((len(series), 1, 6))
+    return SourceTable(found, nothing, series, pieces.scale, pieces.not_finite, pieces.rough)
 
 
 POINTS = 20
@@ -271,9 +263,8 @@ class _Interval(NamedTuple):
     lo: float
     hi: float
     depth: int = 0  # Number of halvings that led to it
-    # misfit, largest: Misfit (V) before the last halving, and the largest misfit before any of the halvings
-    misfit: float = math.inf
-    largest: float = 0.0
+    misfit: float = math.inf  # V, before the last halving
+    largest: float = 0.0  # V, the largest misfit before any of the halvings
     idle: int = 0  # Number of halvings in a row that did not reduce the misfit
 
     def halves(self, misfit: float = math.inf, largest: float = 0.0, idle: int = 0) -> list[_Interval]:
@@ -293,11 +284,10 @@ class Refiner:
     waveform: Waveform
     tol: float  # Allowed error of a series, relative to `scale`
     step: float  # Output step, s
+    edges: list[float]  # Ends of the series' intervals, s: at first the start of them all
     shortest: float = math.inf  # Length (s) of the shortest event of the waveform that its samples have to meet
-    # scale, steepest: Largest |U| (V) and |dU/dt| (V/s) seen
-    scale: float = 0.0
-    steepest: float = 0.0
-    edges: list[float] = field(default_factory=list)  # Ends of the series' intervals, s
+    scale: float = 0.0  # Largest |U| (V) seen
+    steepest: float = 0.0  # Largest |dU/dt| (V/s) seen
     series: list[FloatArray] = field(default_factory=list)  # (POINTS,): Chebyshev coefficients on each interval
     # Times (s) at which neighbouring series differ, and the difference (V)
     jumps: list[tuple[float, float]] = field(default_factory=list)
@@ -308,14 +298,11 @@ class Refiner:
     short: list[tuple[float, float]] = field(default_factory=list)
     not_finite: float | None = None  # Time (s) of the first NaN or inf
     rough: float = 0.0  # Largest misfit (V) taken for round-off of the function's values
-    # allowed, deep: Largest allowed and present number of intervals that were halved more than `_DEEP` times
-    allowed: int = _MOST_DEEP
-    deep: int = 0
+    deep: int = 0  # Number of intervals that were halved more than `_DEEP` times
+    allowed: int = field(default_factory=lambda: _MOST_DEEP)  # Most of them
 
     def cover(self, a: float, b: float) -> bool:
         """Add series for [a, b] (s); False if the waveform has a NaN or inf inside."""
-        if not self.edges:
-            self.edges.append(a)
         # The ends of a window are breakpoints, where the waveform may jump: series use interior points only.
         longest = min(_LONGEST * self.step, 2.0 * self.waveform.shortest_time())
         count = max(1, math.ceil((b - a) / longest))

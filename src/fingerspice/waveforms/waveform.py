@@ -1,4 +1,4 @@
-"""Source waveforms: values on either side of a jump, breakpoints, the fundamental, and terms for compiled code.
+"""Waveforms: values on either side of a jump, breakpoints, the fundamental, terms for compiled code; sums, products.
 
 Between two breakpoints every library waveform is a short sum of terms
 
@@ -13,8 +13,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property, reduce
 from typing import Any, ClassVar
 
 import numpy as np
@@ -33,25 +34,17 @@ _SPREAD = np.append((np.arange(512) + np.modf(np.arange(512) * 0.618033988749894
 #: Distance of neighbouring doubles, relative to their size.
 DOUBLE = 2.0**-52
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
+#: Most cycles of a part in a common period, and the largest relative rounding error of a ratio of two periods.
+MOST_CYCLES, _ROUNDING = 10**6, 2e-15
 
 
 @dataclass(frozen=True)
 class Fundamental:
-    """Fundamental U_0 sin(2 pi f t + phase) of a waveform.
+    """Fundamental amplitude sin(2 pi frequency t + phase) of a waveform."""
 
-    Attributes
-    ----------
-    frequency : float
-        Hz.
-    amplitude : float
-        V, not negative.
-    phase : float
-        rad.
-    """
-
-    frequency: float
-    amplitude: float
-    phase: float
+    frequency: float  # Hz
+    amplitude: float  # V, not negative
+    phase: float  # rad
 
 
 class Waveform:
@@ -62,24 +55,15 @@ class Waveform:
     numbers, under the names of the attributes below, when they are made.
     """
 
-    units: ClassVar[dict[str, str]] = {}
-    """Unit of each numeric field."""
-
-    period: float | None = None
-    """Period in s after any delay, or None."""
-
+    units: ClassVar[dict[str, str]] = {}  #: Unit of each numeric field
+    period: float | None = None  #: Period in s after any delay, or None
+    settled: float = 0.0  #: Time (s) from which the waveform is periodic
+    #: Distance of neighbouring numbers of the kind that the values are computed in, relative to their size
     precision: float = DOUBLE
-    """Distance of neighbouring numbers of the kind that the values are computed in, relative to their size."""
-
-    settled: float = 0.0
-    """Time (s) from which the waveform is periodic."""
-
+    #: Times (s) before the first and after the second of which the waveform is constant
     course: tuple[float, float] = (-math.inf, math.inf)
-    """Times (s) before the first and after the second of which the waveform is constant."""
-
+    #: Whether each half period after `settled` is the negative of the half period before it
     half_wave: bool = False
-    """Whether each half period after `settled` is the negative of the half period before it."""
-
     # Times (s, ascending) at which the waveform is not smooth, and the shortest time scale (s) between them.
     _breaks: tuple[float, ...] = ()
     _quick: float = math.inf
@@ -88,8 +72,8 @@ class Waveform:
 
     def __post_init__(self) -> None:
         """Make doubles of the fields that have a unit, and refuse what is no number of it."""
-        for name in (field.name for field in fields(self) if field.name in self.units):  # type: ignore[arg-type]
-            what, unit = f"{type(self).__name__} {name}", self.units[name]
+        for name, unit in self.units.items():
+            what = f"{type(self).__name__} {name}"
             value = real_number(what, getattr(self, name), f"a number of {unit}" if unit else "a number")
             if not (math.isfinite(value) or (value == math.inf and name in self._endless)):
                 raise InputError(f"{what} is {value}; allowed: a finite number")
@@ -162,7 +146,8 @@ class Waveform:
         frequency = self.tone()
         if frequency is None:
             return None
-        start, stop = self.settled, self.settled + (self.period or 1.0 / frequency)
+        length = self.period or 1.0 / frequency
+        start, stop = self.settled, self.settled + length
         inner = self.breakpoints(start, stop)
         edges = np.unique(np.concatenate([[start], inner[(inner > start) & (inner < stop)], [stop]]))
         panel = min(0.5 / frequency, self.shortest_time())
@@ -174,7 +159,7 @@ class Waveform:
             t = 0.5 * (cuts[1:] + cuts[:-1])[:, None] + half * _GAUSS_X
             total += complex(np.sum(half * _GAUSS_W * self.value(t) * np.exp(-1j * TAU * frequency * t)))
         # The phase refers to a sine: U ~ Im(P exp(i Omega t)).
-        p = 2j * total / (self.period or 1.0 / frequency)
+        p = 2j * total / length
         if abs(p) <= 1e-12 * self.peak(start, stop):
             return None
         return Fundamental(frequency, abs(p), math.atan2(p.imag, p.real))
@@ -194,8 +179,8 @@ class Waveform:
             about = t[np.argsort(amplitude)[-8:], None] + quick * np.linspace(-0.5, 0.5, 65)
             size = np.append(size, np.abs(self.value(np.clip(about, t0, t1))))
         breakpoints = self.breakpoints(t0, t1)
-        values = [size, *(np.abs(self.value(breakpoints, side)) for side in ("right", "left") if breakpoints.size)]
-        return float(np.concatenate(values).max())
+        at_breakpoints = [np.abs(self.value(breakpoints, side)).max(initial=0.0) for side in ("right", "left")]
+        return float(np.max([size.max(), *at_breakpoints]))
 
     def cancelling(self, t0: float, t1: float) -> float:
         """Sum of the peaks (V) over [t0, t1] of parts that may cancel in U; 0 for a waveform of one part.
@@ -205,16 +190,16 @@ class Waveform:
         return 0.0
 
     def __add__(self, other: Waveform | float) -> Waveform:
-        return _combined("Sum", self, other)
+        return Sum((self, as_waveform(other)))
 
     def __radd__(self, other: float) -> Waveform:
-        return _combined("Sum", other, self)
+        return Sum((as_waveform(other), self))
 
     def __mul__(self, other: Waveform | float) -> Waveform:
-        return _combined("Product", self, other)
+        return Product((self, as_waveform(other)))
 
     def __rmul__(self, other: float) -> Waveform:
-        return _combined("Product", other, self)
+        return Product((as_waveform(other), self))
 
     def __neg__(self) -> Waveform:
         return -1.0 * self
@@ -224,14 +209,6 @@ class Waveform:
 
     def __rsub__(self, other: float) -> Waveform:
         return other + -self
-
-
-def _combined(kind: str, first: Waveform | float, second: Waveform | float) -> Waveform:
-    # Imported here because `combinations` imports this module.
-    from fingerspice.waveforms import combinations
-
-    combination: Waveform = getattr(combinations, kind)((as_waveform(first), as_waveform(second)))
-    return combination
 
 
 def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
@@ -362,3 +339,234 @@ class Sine(Waveform):
         phase = math.radians(self.phase_deg) - TAU * self.frequency * self.delay
         phase += math.pi if self.amplitude < 0.0 else 0.0
         return Fundamental(self.frequency, abs(self.amplitude), math.remainder(phase, TAU))
+
+
+@dataclass(frozen=True)
+class Chirp(Waveform):
+    """offset + amplitude sin(phi(t)), whose frequency rises linearly from f0 to f1 over `duration` and then stays.
+
+    Parameters
+    ----------
+    amplitude : float
+        V.
+    f0, f1 : float
+        Hz, positive: at t = 0, and from `duration` on.
+    duration : float
+        s.
+    offset : float
+        V.
+    phase_deg : float
+        Degrees, at t = 0.
+    """
+
+    amplitude: float
+    f0: float
+    f1: float
+    duration: float
+    offset: float = 0.0
+    phase_deg: float = 0.0
+    units: ClassVar[dict[str, str]] = {
+        "amplitude": "V", "f0": "Hz", "f1": "Hz", "duration": "s", "offset": "V", "phase_deg": "deg"
+    }  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.f0 > 0.0 and self.f1 > 0.0, "chirp frequencies", f"{self.f0:g}, {self.f1:g} Hz", "> 0")
+        require(self.duration > 0.0, "chirp duration", f"{self.duration:g} s", "> 0")
+        self._declare(_breaks=(0.0, self.duration), _quick=1.0 / max(self.f0, self.f1))
+
+    def _phase(self, t: FloatArray) -> FloatArray:
+        sweep = np.clip(t, 0.0, self.duration)
+        turns = (self.f0 + 0.5 * (self.f1 - self.f0) / self.duration * sweep) * sweep
+        turns = turns + self.f1 * np.maximum(t - self.duration, 0.0) + self.f0 * np.minimum(t, 0.0)
+        return np.asarray(TAU * (turns - np.floor(turns)) + math.radians(self.phase_deg))
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        return np.asarray(self.offset + self.amplitude * np.sin(self._phase(real_numbers("t", t, "times in s"))))
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+        rate = (self.f1 - self.f0) / self.duration
+        middle = 0.5 * (start + stop)
+        rises = np.where((middle >= 0.0) & (middle < self.duration), TAU * rate, 0.0)
+        omega = TAU * (self.f0 + rate * np.clip(start, 0.0, self.duration))
+        wave = self.amplitude, 0.0, 0.0, omega, self._phase(start) - 0.5 * math.pi, rises
+        return terms_of(start.size, (self.offset,), wave)
+
+
+@dataclass(frozen=True)
+class Exp(Waveform):
+    """SPICE's EXP: from `td1` on towards v2 with time constant `tau1`, and from `td2` on back to v1 with `tau2`.
+
+    Voltages in V, times in s; the time constants are positive and td2 >= td1.
+    """
+
+    v1: float
+    v2: float
+    td1: float
+    tau1: float
+    td2: float
+    tau2: float
+    units: ClassVar[dict[str, str]] = {"v1": "V", "v2": "V", "td1": "s", "tau1": "s", "td2": "s", "tau2": "s"}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.tau1 > 0.0 and self.tau2 > 0.0, "EXP time constants", f"{self.tau1:g}, {self.tau2:g} s", "> 0")
+        require(self.td2 >= self.td1, "EXP td2", f"{self.td2:g} s", f">= td1 = {self.td1:g} s")
+        breaks = tuple(sorted({self.td1, self.td2}))
+        self._declare(course=(self.td1, math.inf), _breaks=breaks, _quick=min(self.tau1, self.tau2))
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        t = real_numbers("t", t, "times in s")
+        rise = -np.expm1(-np.maximum(t - self.td1, 0.0) / self.tau1)
+        fall = -np.expm1(-np.maximum(t - self.td2, 0.0) / self.tau2)
+        return np.asarray(self.v1 + (self.v2 - self.v1) * (rise - fall))
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+        step = self.v2 - self.v1
+        first = 0.5 * (start + stop) >= self.td1
+        second = 0.5 * (start + stop) >= self.td2
+        level = self.v1 + step * (first.astype(float) - second.astype(float))
+        rise = np.where(first, -step * np.exp(-np.maximum(start - self.td1, 0.0) / self.tau1), 0.0)
+        fall = np.where(second, step * np.exp(-np.maximum(start - self.td2, 0.0) / self.tau2), 0.0)
+        return terms_of(start.size, (level,), (rise, 0.0, -1.0 / self.tau1), (fall, 0.0, -1.0 / self.tau2))
+
+
+class _Combination(Waveform):
+    """A sum or product of parts."""
+
+    parts: tuple[Waveform, ...]
+    _joined: ClassVar[Callable[..., Any]]  # Sum or product of numbers or arrays
+    _joined_terms: ClassVar[Callable[..., Any]]  # Terms (m, k, 6) of the sum or product of two parts, from theirs
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rate = sum(1.0 / part.shortest_time() for part in self.parts)
+        settled = max(part.settled for part in self.parts)
+        self._declare(period=_common_period(self.parts), settled=settled, _quick=1.0 / rate if rate else math.inf)
+
+    def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
+        return np.asarray(self._joined(part.value(t, side) for part in self.parts))
+
+    def cancelling(self, t0: float, t1: float) -> float:
+        return float(self._joined(max(part.peak(t0, t1), part.cancelling(t0, t1)) for part in self.parts))
+
+    def terms(self, start: FloatArray, stop: FloatArray) -> FloatArray | None:
+        blocks = [part.terms(start, stop) for part in self.parts]
+        return None if any(block is None for block in blocks) else reduce(self._joined_terms, blocks)
+
+    def breakpoints(self, t0: float, t1: float) -> FloatArray:
+        return np.unique(np.concatenate([part.breakpoints(t0, t1) for part in self.parts]))
+
+    def breakpoint_rate(self) -> float:
+        return sum(part.breakpoint_rate() for part in self.parts)
+
+    @property
+    def precision(self) -> float:  # type: ignore[override]
+        return max(part.precision for part in self.parts)
+
+    @property
+    def course(self) -> tuple[float, float]:  # type: ignore[override]
+        first, last = zip(*(part.course for part in self.parts), strict=True)
+        return min(first), max(last)
+
+    def _tones(self) -> list[float]:
+        return [tone for part in self.parts if (tone := part.tone()) is not None]
+
+
+def _common_period(parts: tuple[Waveform, ...]) -> float | None:
+    """Least common period of waveforms (s); None unless it has at most `MOST_CYCLES` cycles of each."""
+    total: float | None = None
+    for period in (part.period for part in parts if not isinstance(part, DC)):
+        if period is None:
+            return None
+        ratio = 1.0 if total is None else total / period
+        fraction = Fraction(ratio).limit_denominator(MOST_CYCLES)
+        if fraction.numerator > MOST_CYCLES or abs(float(fraction) - ratio) > _ROUNDING * ratio:
+            return None
+        total = period if total is None else total * fraction.denominator
+    return total
+
+
+@dataclass(frozen=True)
+class Sum(_Combination):
+    """Sum of waveforms; its fundamental is the lowest tone of its parts, if all other tones are harmonics of it."""
+
+    parts: tuple[Waveform, ...]
+    _joined = staticmethod(sum)
+    _joined_terms = staticmethod(lambda a, b: np.concatenate([a, b], axis=1))
+
+    def tone(self) -> float | None:
+        tones = self._tones()
+        if self.period is None or len(tones) < sum(not isinstance(part, DC) for part in self.parts):
+            return None
+        lowest = min(tones)
+        return lowest if all(abs(t / lowest - round(t / lowest)) < 1e-9 for t in tones) else None
+
+
+class _OfFactors(_Combination):
+    _joined = staticmethod(math.prod)
+
+    @staticmethod
+    def _joined_terms(a: FloatArray, b: FloatArray) -> FloatArray:
+        """By cos x cos y = (cos(x + y) + cos(x - y)) / 2."""
+        a = a[:, np.any(a[:, :, 0] != 0.0, axis=0)]
+        b = b[:, np.any(b[:, :, 0] != 0.0, axis=0)]
+        columns = []
+        for x, y in itertools.product(a.swapaxes(0, 1), b.swapaxes(0, 1)):
+            base = x + y
+            base[:, 0] = x[:, 0] * y[:, 0]
+            if np.any(x[:, 3:] != 0.0) and np.any(y[:, 3:] != 0.0):
+                base[:, 0] *= 0.5
+                other = base.copy()
+                other[:, 3:] = x[:, 3:] - y[:, 3:]
+                columns.append(other)
+            columns.append(base)
+        return np.stack(columns, axis=1) if columns else np.zeros((a.shape[0], 1, 6))
+
+    def tone(self) -> float | None:
+        tones = self._tones()
+        return max(tones) if tones and self.period is not None else None
+
+
+@dataclass(frozen=True)
+class Product(_OfFactors):
+    """Product of waveforms; its fundamental is the highest tone of its factors, which is the carrier's."""
+
+    parts: tuple[Waveform, ...]
+
+
+@dataclass(frozen=True)
+class AM(_OfFactors):
+    """Amplitude-modulated carrier: amplitude (1 + depth sin(2 pi f_m t + phase)) / (1 + depth) sin(2 pi f_c t).
+
+    Parameters
+    ----------
+    amplitude : float
+        Largest value of the envelope, V.
+    carrier, modulation : float
+        Hz, positive.
+    depth : float
+        From 0 (the carrier alone) to 1 (the envelope falls to zero).
+    phase_deg : float
+        Phase of the envelope, degrees.
+    """
+
+    amplitude: float
+    carrier: float
+    modulation: float
+    depth: float = 1.0
+    phase_deg: float = 0.0
+    units: ClassVar[dict[str, str]] = {
+        "amplitude": "V", "carrier": "Hz", "modulation": "Hz", "depth": "", "phase_deg": "deg"
+    }  # fmt: skip
+
+    def __post_init__(self) -> None:
+        Waveform.__post_init__(self)
+        require(0.0 <= self.depth <= 1.0, "AM depth", f"{self.depth:g}", "0 to 1")
+        super().__post_init__()
+
+    @cached_property
+    def parts(self) -> tuple[Waveform, ...]:  # type: ignore[override]
+        share = self.amplitude / (1.0 + self.depth)
+        envelope = Sine(share * self.depth, self.modulation, offset=share, phase_deg=self.phase_deg)
+        return (envelope, Sine(1.0, self.carrier))

@@ -27,10 +27,9 @@ from fingerspice.physics.contact import universal_curve_array
 from fingerspice.physics.materials import EPS0
 from fingerspice.results.solution import MEANS
 from fingerspice.solve.simulation import rtol_given
-from fingerspice.waveforms.combinations import AM, Sum
 from fingerspice.waveforms.periodic import Pulse, Square
 from fingerspice.waveforms.samples import Samples, as_samples
-from fingerspice.waveforms.waveform import DC, Sine, require
+from fingerspice.waveforms.waveform import AM, DC, Sine, Sum, require
 
 #: Signals whose figures a batch has, and the kinds of figures.
 SIGNALS_OF_BATCH = ("f_el", "f_t", "friction", "u_gap", "area")

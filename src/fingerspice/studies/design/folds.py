@@ -22,8 +22,7 @@ from fingerspice.solve.closed_form import meets_fold
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.runs import Progress
 from fingerspice.solve.simulation import run_problem
-from fingerspice.waveforms.combinations import Product
-from fingerspice.waveforms.waveform import as_waveform, require
+from fingerspice.waveforms.waveform import Product, as_waveform, require
 
 if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
