@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.solve.foreign import SCIPY_METHODS, TORCH_METHODS
+from fingerspice.solve.nodal import SCIPY_METHODS, TORCH_METHODS
 from scenes import deck, table1
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"

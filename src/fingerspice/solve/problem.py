@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 
@@ -104,10 +104,7 @@ class Problem:
     @cached_property
     def inner(self) -> StackState:
         """The start of a stack in the form of its own equations."""
-        state, inner = self.scene.prepared.get("inner", (None, None))
-        if state is not self.initial:
-            _, inner = self.scene.prepared["inner"] = self.initial, to_stack(self.scene, self.initial)
-        return cast("StackState", inner)
+        return to_stack(self.scene, self.initial)
 
     def done(self, t: float) -> float:
         """Fraction of the run that is done at time t, s."""
@@ -141,8 +138,7 @@ def prepare(
 ) -> Problem:
     """Prepare a run, or refuse it; times of `t_eval` that pass an end of the run by rounding are set to it, in place.
 
-    `rtol` decides whether a dispersive skin's data may be taken at one frequency. A run from the periodic state is
-    prepared from the uncharged start.
+    For `rtol` see `scene_of`. A run from the periodic state is prepared from the uncharged start.
     """
     t_stop = None if t_stop is None else real_number("t_stop", t_stop, "a number in s")
     if isinstance(start, Solution) and start.stored is not None:
@@ -200,14 +196,9 @@ def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
 
 def check_outputs(circuit: Circuit, count: float) -> None:
     """Refuse a number of output times for whose signals memory is too small."""
-
-    def columns() -> int:
-        devices = [element.device for element in circuit.elements]
-        layers = sum(element.spec.is_layer for element in circuit.elements)
-        nodes = len({node for element in circuit.elements for node in element.nodes})
-        return layers + nodes + 7 * devices.count("GAP") + 3 * (devices.count("V") + devices.count("I")) + 1
-
-    signals = circuit.remember("columns", columns)
+    of_device = {"GAP": 7, "V": 3, "I": 3}
+    signals = sum(of_device.get(element.device, 0) + element.spec.is_layer for element in circuit.elements)
+    signals += len({node for element in circuit.elements for node in element.nodes}) + 1
     size = 8.0 * signals * count
     require(
         size <= MOST_BYTES,

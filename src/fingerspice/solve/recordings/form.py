@@ -57,8 +57,7 @@ from fingerspice.solve.one_area import as_recorded, on_branch, system_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK, Scene
 from fingerspice.solve.starting import StackState, from_stack
-from fingerspice.waveforms.samples import Samples, as_samples
-from fingerspice.waveforms.waveform import DC
+from fingerspice.waveforms.samples import Samples
 
 # Number of lanes, each with a piece of a recording.
 PIECES = 64
@@ -470,20 +469,6 @@ LEAST_MODES = 4
 _TYPICAL = 0.5
 
 
-def recording_of(problem: Problem) -> tuple[int, Samples] | None:
-    """Number and samples of the one source of a network that is a recording, if all others are at 0."""
-    found = None
-    for i, wave in enumerate(problem.waveforms):
-        samples = as_samples(wave)
-        if samples is not None:
-            if found is not None:
-                return None
-            found = i, samples
-        elif not (isinstance(wave, DC) and wave.level == 0.0):
-            return None
-    return found
-
-
 def is_followed(scene: Scene, circuit: Circuit) -> bool:
     """Whether a scene is a network with one area that moves, at once and under the local law, of cells in series."""
     net = scene.net
@@ -545,14 +530,19 @@ class NetworkForm(LaneForm):
         return out.T if self.flows else np.concatenate([out, held]).T
 
 
-def finger(problem: Problem, rtol: float) -> NetworkForm | None:
-    """The network prepared for recordings, or None where this form does not apply or no polynomial is good enough."""
-    found, scene = recording_of(problem), problem.scene
-    if found is None or not is_followed(scene, problem.circuit):
+def finger(problem: Problem, rtol: float, source: int, wave: Samples) -> NetworkForm | None:
+    """The network prepared for a recording as its source of that number.
+
+    None where this form does not apply or no polynomial is good enough.
+    """
+    scene = problem.scene
+    if not is_followed(scene, problem.circuit):
         return None
-    source, wave = found
-    share = _largest_share(Reduced(scene, source, scene.area0, False), wave.rate, problem.t_stop)
-    (moving,) = np.flatnonzero(scene.net.gap >= 0)
+    # The gap's largest share of a sine of the source, over the frequencies that a recording may have.
+    one, lowest = Reduced(scene, source, scene.area0, False), min(1.0 / problem.t_stop, 0.4 * wave.rate)
+    omega = 2.0 * np.pi * np.geomspace(lowest, 0.5 * wave.rate, _FREQUENCIES)
+    response = one.k + (one.shape * one.gain / (1j * omega[:, None] + one.rates)).sum(axis=1)
+    share, moving = float(np.abs(response).max()), one.moving
     # The peak of a current is not known to the scene; that of a voltage has been looked up in the file already.
     typical = _TYPICAL * min(scene.u_top, share * (scene.u_peak or wave.peak(0.0, problem.t_stop)))
     area0 = scene.area0.copy()
@@ -578,10 +568,3 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
         lanes, active, 2, False, rows, nodes, one.rates.size - one.absorbed.size, float(contact.stress(1.0)), share,
         scene.u_top, missed, missed_bend, float(problem.network.capacitance(area0).sum()), one,
     )  # fmt: skip
-
-
-def _largest_share(one: Reduced, rate: float, stop: float) -> float:
-    """The gap's largest share of a sine of the source, over the frequencies that a recording may have."""
-    omega = 2.0 * np.pi * np.geomspace(min(1.0 / stop, 0.4 * rate), 0.5 * rate, _FREQUENCIES)
-    response = one.k + (one.shape * one.gain / (1j * omega[:, None] + one.rates)).sum(axis=1)
-    return float(np.abs(response).max())
