@@ -88,10 +88,7 @@ class _Answer(NamedTuple):
 def _answer(
     problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray
 ) -> tuple[_Answer, _Answer, float]:  # fmt: skip
-    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s.
-
-    Without modes it is that of the sources alone, and not their integrals.
-    """
+    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s."""
     t_out, left = problem.t_out, problem.left
     n, n_s, size = v0.size, len(problem.waveforms), t_out.size
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
@@ -128,10 +125,7 @@ def _answer(
 
 
 def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, _Answer] | None:
-    """Live voltages (n_t, n), V, and the response at the end, where the outputs are a recorded source's own samples.
-
-    A recursion serves for these, from the first one on; None for other outputs.
-    """
+    """Live voltages (n_t, n), V, and the response at the end, by a recursion; None for outputs at other times."""
     wave, t_out = problem.waveform, problem.t_out
     if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.count:
         return None
@@ -292,11 +286,9 @@ def lead_to_fold(problem: Problem, run: Run) -> Run | None:
 
 
 def meets_fold(problem: Problem, rtol: float) -> bool:
-    """Whether a problem reaches a fold, or a jump of its source goes past one.
+    """Whether a problem reaches a fold, or a jump of its source goes past one; another failure is a `SolveError`.
 
     A run that stops near a fold and does not reach it counts as a run without a fold: its later course is not examined.
-
-    A run that fails for another reason than a fold is a `SolveError`.
     """
     run = solve_marching(problem, rtol)
     if run.status is Status.SUCCESS:

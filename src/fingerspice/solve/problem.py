@@ -145,8 +145,22 @@ def prepare(
         raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
-    stop = _end(circuit, t_start, t_stop, t_eval)
-    tran, wave = circuit.tran, scene.waveform
+    tran, wave, stop = circuit.tran, scene.waveform, t_stop
+    if stop is None:
+        if tran is not None:
+            stop = t_start + tran.stop
+        elif t_eval is not None and t_eval.size:
+            stop = float(t_eval[-1])
+        else:
+            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+    require(math.isfinite(stop) and stop > t_start, "t_stop", f"{stop:g} s", f"more than {t_start:g} s")
+    if t_eval is not None:
+        require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
+        require(bool(np.all(t_eval[1:] >= t_eval[:-1])), "t_eval", "not in order", "ascending times")
+        to_ends(t_eval, t_start, stop)
+        first, last = float(t_eval[0]), float(t_eval[-1])
+        allowed = f"times from {t_start:g} s to t_stop = {stop:g} s{time_slip(first, last, stop)}"
+        require(first >= t_start and last <= stop, "t_eval", f"{first:g} s to {last:g} s", allowed)
     end = kept_with(wave.kept, ("end", stop), 1, lambda: on_breakpoint(wave, stop))
     return Problem(
         circuit, scene, t_start, end, t_start + (tran.start if tran else 0.0),
@@ -154,26 +168,6 @@ def prepare(
         initial_state(circuit, scene, "uncharged" if start == "periodic" else start), charge,
         start if isinstance(start, str) else "given", t_stop is None and tran is not None,
     )  # fmt: skip
-
-
-def _end(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None) -> float:
-    """End of the run, s, with its output times checked against it."""
-    if t_stop is None:
-        if circuit.tran is not None:
-            t_stop = t_start + circuit.tran.stop
-        elif t_eval is not None and t_eval.size:
-            t_stop = float(t_eval[-1])
-        else:
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
-    require(math.isfinite(t_stop) and t_stop > t_start, "t_stop", f"{t_stop:g} s", f"more than {t_start:g} s")
-    if t_eval is not None:
-        require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
-        require(bool(np.all(t_eval[1:] >= t_eval[:-1])), "t_eval", "not in order", "ascending times")
-        to_ends(t_eval, t_start, t_stop)
-        first, last = float(t_eval[0]), float(t_eval[-1])
-        allowed = f"times from {t_start:g} s to t_stop = {t_stop:g} s{time_slip(first, last, t_stop)}"
-        require(first >= t_start and last <= t_stop, "t_eval", f"{first:g} s to {last:g} s", allowed)
-    return t_stop
 
 
 def to_ends(t: FloatArray, t_start: float, t_stop: float) -> None:
@@ -245,10 +239,7 @@ def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[
 
 
 def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
-    """Times TSTART:TSTEP:TSTOP (s) and whether each is left-hand; unless `jumps` is "none", two more at each jump.
-
-    A jump at t = 0 has no left-hand output.
-    """
+    """Times TSTART:TSTEP:TSTOP (s), unless `jumps` is "none" with two at each later jump, and which are left-hand."""
     step, first = problem.step, problem.first
     count = int(np.floor((problem.t_stop - first) / step * (1.0 + 1e-12) + 1e-9))
     grid = np.asarray(first + step * np.arange(count + 1), float)
@@ -306,7 +297,17 @@ class Tables:
     def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
         self.problem, self.no_chirps = problem, no_chirps
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
-        self.edges = _windows(problem)
+        check_length(problem.waveform, problem.t_start, problem.t_stop)
+        span = problem.t_stop - problem.t_start
+        rate = max(
+            problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
+            1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
+            # A function is sampled at the output step.
+            1.0 / (4096.0 * problem.step) if problem.scene.is_sampled else 0.0,
+        )
+        count = max(1, int(np.ceil(span * rate)))
+        # Limits (s) of the windows: short ones bound memory and the phases' round-off.
+        self.edges = [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
         # An iteration skips windows that end by this time (s), except the last window.
         self.done = -np.inf
         # Largest interpolation error (V) of a table that a finer table would not reduce.
@@ -369,20 +370,6 @@ def shortest_event(problem: Problem) -> float:
     if any(wave.kept.get("one by one") for wave in problem.waveforms):
         return met
     return min(met, (problem.t_stop - problem.t_start) / LOOKS)
-
-
-def _windows(problem: Problem) -> list[float]:
-    """Limits (s) of the windows for the sources' tables: short windows bound memory and the phases' round-off."""
-    check_length(problem.waveform, problem.t_start, problem.t_stop)
-    span = problem.t_stop - problem.t_start
-    rate = max(
-        problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
-        1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
-        # A function is sampled at the output step.
-        1.0 / (4096.0 * problem.step) if problem.scene.is_sampled else 0.0,
-    )
-    count = max(1, int(np.ceil(span * rate)))
-    return [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
 
 
 def joined(tables: list[SourceTable]) -> Sources:

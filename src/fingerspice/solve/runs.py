@@ -96,10 +96,7 @@ class Run:
 
 
 def excess_of(gaps: FloatArray, rounding: float) -> float:
-    """Largest ratio of a stated error to its peak, over the voltages and forces of all gaps; for `gaps` see `Run`.
-
-    A gap whose peak is within `rounding` (V) is at 0 V and not judged.
-    """
+    """Largest ratio of a stated error to its peak, see `Run.gaps`; a gap within `rounding` (V) of 0 V is not judged."""
     worst = 0.0
     for u_peak, f_peak, u_error, f_error in gaps.tolist():
         if u_peak > rounding:
@@ -156,10 +153,7 @@ class Integration(ABC):
         raise NotImplementedError
 
     def finish(self, sources: Sources, after: Sources | None) -> None:
-        """Write the right-hand outputs at the end of the run, which `after` (the sources there) may begin with a jump.
-
-        Nothing is written if that jump goes past a fold.
-        """
+        """Write the right-hand outputs at the end of the run; `after`, the sources there, may begin with a jump."""
         if after is not None:
             values = values_at(after, self.problem.t_stop)
             if np.any(values != self.s_before) and not self.jump(values):

@@ -203,10 +203,7 @@ class Scene:
 def scene_of(
     circuit: Circuit, charge_law: str | None, area: str | float, t_stop: float | None, rtol: float = 0.0
 ) -> Scene:
-    """The circuit's scene under a charge law and area mode, made on first use.
-
-    `rtol` decides whether a dispersive skin's data may be taken at one frequency.
-    """
+    """The circuit's scene, made on first use; `rtol` decides whether a dispersive skin may be held at one frequency."""
     law = charge_law or circuit.charge_law or "local"
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     stop = t_stop or (circuit.tran.stop if circuit.tran else 1.0)
@@ -236,19 +233,13 @@ def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
     areas = stack.contact.area(np.linspace(0.0, _largest_voltage(stack.waveform, stop), 65))
     area = stack.area_given or float(np.median(areas))
     change = 0.0 if stack.area_given else float(np.ptp(areas)) / area
-    if COUPLING * change > allowed:
-        # This part of the error alone is too large, so the expensive part need not be computed.
+    # Where this part of the error alone is too large, the expensive part need not be computed.
+    fundamental = None if COUPLING * change > allowed else stack.waveform.fundamental
+    if fundamental is None:
         return None
-
-    def make() -> Freezing | None:
-        fundamental = stack.waveform.fundamental
-        if fundamental is None:
-            return None
-        f = fundamental.frequency
-        return Freezing(f, freezing_error(circuit, f, area, change, stop))
-
-    found: Freezing | None = circuit.remember(("freezing", stop), make)
-    return found if found is not None and found.error <= allowed else None
+    f = fundamental.frequency
+    error = circuit.remember(("freezing", stop), lambda: freezing_error(circuit, f, area, change, stop))
+    return Freezing(f, error) if error <= allowed else None
 
 
 def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> float:

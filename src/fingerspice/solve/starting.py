@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -37,7 +37,7 @@ from fingerspice.circuit.network import Network, build_network
 from fingerspice.circuit.statespace import Stack
 from fingerspice.engine.network import Net
 from fingerspice.engine.one_area.model import Model, choose_branch, gap_voltage
-from fingerspice.physics.contact import Contact, inverse_area
+from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
 from fingerspice.solve.scenes import Scene, kept_with
@@ -162,11 +162,18 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
     if stack is not None and scene.model is not None and not initial:
         order = list(stack.state_order)
         return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.area0, s
-    contacts = [c if gap >= 0 else None for c, gap in zip(network.contacts, net.gap, strict=True)]
     # The reduced network of a series loop has no nodes, so the operating point needs the unreduced network.
     whole = network if stack is None else build_network(replace(circuit, work="gap"))
-    u, area, held = operating_point(circuit, whole, scene.area0, contacts, initial)
-    u = u if stack is None else _cells_of(network, whole, u)
+    u, area, held = operating_point(scene, circuit, whole, initial)
+    if stack is not None:
+        of: dict[str, list[float]] = {}
+        for cell, one in zip(whole.cells, u.tolist(), strict=True):
+            of.setdefault(cell.element.name, []).append(one)
+        for layer in network.layers:
+            if sum(cell.element is layer for cell in network.cells) == 1:
+                # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
+                of[layer.name] = [sum(of[layer.name])]
+        u = np.array([of[cell.element.name].pop(0) for cell in network.cells])
     if net.mobile:
         for i in np.flatnonzero(held & (net.slow < 0)):
             # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.
@@ -176,18 +183,6 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
             u[net.place == i] *= area[i] / rest
             u[gap] = own
     return u, area, s
-
-
-def _cells_of(network: Network, whole: Network, u: FloatArray) -> FloatArray:
-    """Voltages (V) of a loop's cells from the cell voltages of the same circuit built as a network."""
-    of: dict[str, list[float]] = {}
-    for cell, one in zip(whole.cells, u.tolist(), strict=True):
-        of.setdefault(cell.element.name, []).append(one)
-    for layer in network.layers:
-        if sum(cell.element is layer for cell in network.cells) == 1:
-            # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
-            of[layer.name] = [sum(of[layer.name])]
-    return np.array([of[cell.element.name].pop(0) for cell in network.cells])
 
 
 def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) -> State:
@@ -300,23 +295,19 @@ def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Elemen
 
 
 def operating_point(
-    circuit: Circuit,
-    network: Network,
-    area0: FloatArray,
-    contacts: Sequence[Contact | None],
-    initial: Mapping[str, float],
+    scene: Scene, circuit: Circuit, network: Network, initial: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Voltages of all cells (V) and areas (m^2) at the DC operating point, and which areas ``.ic`` holds.
 
-    The sources have their values at 0-, and the nodes in `initial` are held. An area without one of the `contacts` is
-    fixed at `area0` (m^2).
+    The sources have their values at 0-, and the nodes in `initial` are held.
     """
+    contacts = [c if gap >= 0 else None for c, gap in zip(scene.network.contacts, scene.net.gap, strict=True)]
     conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in network.areas}
     held = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
     if held:
         network = build_network(replace(circuit, work="gap"), held)
     s = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
-    area = area0.copy()
+    area = scene.area0.copy()
     fixed = np.array([contact is None for contact in contacts], bool)
     asked = np.array([a.node in initial for a in network.areas], bool) & ~fixed
     area[asked] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, asked, strict=True) if mark]
@@ -400,10 +391,7 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> tuple[Fl
 
 
 def _along(net: Net, off: FloatArray, s: FloatArray, slow: FloatArray) -> FloatArray:
-    """Live voltages (V) and delivered charges (C) at the end of the homotopy to u = P x + Q s.
-
-    Along it the residual of Kirchhoff's law falls from `off` (n_cell,) V linearly to 0.
-    """
+    """Live voltages (V) and charges (C) where Kirchhoff's residual `off` (n_cell,), V, has fallen to 0 linearly."""
     n, follows = net.k.shape[0], np.flatnonzero((net.gap >= 0) & (net.slow < 0))
     y = np.zeros(n + net.q.shape[1])
     if not np.any(off):
@@ -429,10 +417,7 @@ def _along(net: Net, off: FloatArray, s: FloatArray, slow: FloatArray) -> FloatA
 def _rate(
     net: Net, off: FloatArray, s: FloatArray, slow: FloatArray, follows: IntArray, theta: float, y: FloatArray
 ) -> FloatArray:
-    """Derivative of (x, charges) by the homotopy's parameter `theta` in [0, 1]; NaN past a fold.
-
-    `follows` are the areas that change during the homotopy: those that follow their gaps without delay.
-    """
+    """Derivative of (x, charges) by the homotopy's `theta` in [0, 1], NaN past a fold; `follows` have no delay."""
     u = net.p @ y[: net.k.shape[0]] + net.q @ s + (1.0 - theta) * off
     area, slope = net.area0.copy(), np.zeros(net.area0.size)
     delayed = net.slow >= 0

@@ -27,7 +27,7 @@ from fingerspice.solve.recordings.form import PIECES, LaneForm, finger, rounded_
 from fingerspice.solve.scenes import kept_with
 from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.samples import MOST_PER_POINT, Samples, as_samples
-from fingerspice.waveforms.waveform import DC, Waveform
+from fingerspice.waveforms.waveform import DC
 
 # A window over its piece, and the fewest samples in one.
 WINDOW, FEWEST = 1.0 / 16.0, 32
@@ -292,10 +292,7 @@ class Block:
         return _Window(z, off, self.x[index], self.xi[index], took)
 
     def _windows(self, width: int) -> list[IntArray]:
-        """Where windows begin in each piece, -1 for none: where the source moves most, and at the start of a run.
-
-        With N as a drive, errors are large where |xi| is, too.
-        """
+        """Where windows begin in each piece, -1 for none: at large moves of the source, under N at large |xi|, too."""
         moves, whole = _scratch("moves", PIECES * self.count), self.count - self.count % width
         np.abs(np.subtract(self.x[1:], self.x[:-1], out=moves), out=moves)
         most = moves.reshape(PIECES, self.count)[:, :whole].reshape(PIECES, -1, width).max(axis=-1)
@@ -375,12 +372,8 @@ def driving(problem: Problem) -> tuple[int, Samples | PWL] | None:
     wave = problem.waveform
     if problem.scene.stack is not None and isinstance(wave, PWL) and wave.repeat is None and as_samples(wave) is None:
         return None if _points(problem, wave) is None else (0, wave)
-    known = [(i, as_samples(wave)) for i, wave in enumerate(problem.waveforms) if not _is_off(wave)]
-    return (known[0][0], known[0][1]) if len(known) == 1 and known[0][1] is not None else None
-
-
-def _is_off(wave: Waveform) -> bool:
-    return isinstance(wave, DC) and wave.level == 0.0
+    on = [(i, as_samples(w)) for i, w in enumerate(problem.waveforms) if not (isinstance(w, DC) and w.level == 0.0)]
+    return (on[0][0], on[0][1]) if len(on) == 1 and on[0][1] is not None else None
 
 
 # Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, peak and thread.
@@ -403,10 +396,7 @@ def ready(problem: Problem, rtol: float) -> LaneForm | None:
 
 
 def _points(problem: Problem, wave: PWL) -> FloatArray | None:
-    """Times (s) of the points within a run, with its start and end, and with more on long lines; None if not dense.
-
-    They are kept with the waveform, for the last run that asked.
-    """
+    """Times (s) of a run's points and ends, and more on long lines, kept for the last run; None if not dense."""
     key = problem.t_start, problem.t_stop
     found: tuple[tuple[float, float], FloatArray | None] | None = wave.kept.get("points")
     if found is None or found[0] != key:

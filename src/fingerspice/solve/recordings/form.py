@@ -390,10 +390,7 @@ def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, Flo
 
 
 class Reduced:
-    """A network with one moving area, in modes w at reference areas `area0`; behind them the charges, if wanted.
-
-    Only source number `source` is not 0.
-    """
+    """A network with one moving area and one `source` that is not 0, in modes w at `area0`; behind them the charges."""
 
     def __init__(self, scene: Scene, source: int, area0: FloatArray, charge: bool) -> None:
         net, network = scene.net, scene.network
@@ -492,23 +489,19 @@ class NetworkForm(LaneForm):
 
     reduced: Reduced
 
-    def _bend_at(self, u: float) -> float:
-        """N at a gap voltage u (V), from xi by Newton's method."""
-        xi, c = float(u), self.lanes
+    def start(self, problem: Problem) -> tuple[FloatArray, float]:
+        start, reduced, active, c = problem.initial, self.reduced, self.active, self.lanes
+        n = reduced.absorbed.size
+        x, s, net = start.y[:n], start.s_before, reduced.scene.net
+        u = xi = float(net.p[reduced.gap] @ x + net.q[reduced.gap] @ s)
+        # Newton's method from the gap voltage to xi.
         for _ in range(50):
-            at = np.array(xi)
-            e = 1.0 / float(self.inverse_area(at)) - 1.0 / c.q0
-            step = (xi - c.kappa * float(self.bend(at)) - u) * (1.0 + c.kappa * e)
+            e = 1.0 / float(self.inverse_area(np.array(xi))) - 1.0 / c.q0
+            step = (xi - c.kappa * float(self.bend(np.array(xi))) - u) * (1.0 + c.kappa * e)
             xi -= step
             if abs(step) <= 1e-15 * abs(xi):
                 break
-        return float(self.bend(np.array(xi)))
-
-    def start(self, problem: Problem) -> tuple[FloatArray, float]:
-        start, reduced, active = problem.initial, self.reduced, self.active
-        n = reduced.absorbed.size
-        x, s, net = start.y[:n], start.s_before, reduced.scene.net
-        bend = self._bend_at(float(net.p[reduced.gap] @ x + net.q[reduced.gap] @ s))
+        bend = float(self.bend(np.array(xi)))
         z = np.zeros(self.lanes.rates.size)
         z[:n] = reduced.modes.inverse @ (x + reduced.modes.follow @ s) - reduced.absorbed * bend
         held = self.rows.columns @ z + self.rows.bends * bend + self.rows.k * s[reduced.source]
@@ -531,10 +524,7 @@ class NetworkForm(LaneForm):
 
 
 def finger(problem: Problem, rtol: float, source: int, wave: Samples) -> NetworkForm | None:
-    """The network prepared for a recording as its source of that number.
-
-    None where this form does not apply or no polynomial is good enough.
-    """
+    """The network under a recording as its source of that number; None where no form or no polynomial serves."""
     scene = problem.scene
     if not is_followed(scene, problem.circuit):
         return None

@@ -18,7 +18,6 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.circuit.network import Network
 from fingerspice.engine.lanes.loops import flow, show
 from fingerspice.results.outcome import Plan, State, Status
-from fingerspice.results.record import Record
 from fingerspice.solve.problem import Problem, at_breakpoints
 from fingerspice.solve.recordings.block import OF_FORCE, Block, Judged, Piece, driving, pieces_of, ready, spacing_of
 from fingerspice.solve.recordings.form import PIECES, LaneForm
@@ -137,10 +136,7 @@ class LaneMarch:
         return True
 
     def _climb(self, block: Block, starts_at: float, share: float) -> tuple[Judged | None, float]:
-        """Solve a block, with ever more steps a sample until its error is met; its errors and their excess.
-
-        That is above 1 where the error is not met.
-        """
+        """Solve a block, with ever more steps until its error is met; the errors, and their excess, else above 1."""
         form, seen = self.form, None
         while True:
             parts, excess = PARTS[self.level], math.inf
@@ -156,7 +152,13 @@ class LaneMarch:
                     raise LostError
                 peak = max(peak, self.peak)
                 seen = block.judge(parts, peak, self.alike, self.chance)
-                excess = self._excess(seen, peak, share)
+                gaps, _, _ = self._stated(np.maximum(seen.errors, self.errors), peak)
+                # Errors are related to a share of the largest gap voltage to expect at least.
+                least = max(self.least, share * self.expected)
+                gaps[0, :2] = np.maximum(gaps[0, :2], [least, float(form.force(np.array(least)))])
+                excess = excess_of(gaps, self.problem.rounding) / self.rtol
+                if self.share < 1.0:
+                    excess = max(excess, SAFETY * seen.alone / (self.share * self.rtol * max(peak, self.least)))
             if excess <= 1.0:
                 return seen, excess
             self.refused += parts * block.n
@@ -164,19 +166,6 @@ class LaneMarch:
                 return seen, excess
             finer = math.ceil(math.log(excess) / math.log(FINER[form.bent])) if excess < math.inf else 1
             self.level = min(self.level + max(1, finer), len(PARTS) - 1)
-
-    def _excess(self, seen: Judged, peak: float, share: float) -> float:
-        """Excess of the stated over the allowed error, with a block's.
-
-        It is related to a `share` of the largest gap voltage to expect at least.
-        """
-        gaps, _, _ = self._stated(np.maximum(seen.errors, self.errors), peak)
-        least = max(self.least, share * self.expected)
-        gaps[0, :2] = np.maximum(gaps[0, :2], [least, float(self.form.force(np.array(least)))])
-        excess = excess_of(gaps, self.problem.rounding) / self.rtol
-        if self.share < 1.0:
-            excess = max(excess, SAFETY * seen.alone / (self.share * self.rtol * max(peak, self.least)))
-        return excess
 
     def _write(self, piece: Piece, block: Block, parts: int, t_out: FloatArray, out: FloatArray) -> None:
         """Write the outputs before the end of a block."""
@@ -209,10 +198,7 @@ class LaneMarch:
     def _show(
         self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, xi: FloatArray, out: FloatArray
     ) -> None:  # fmt: skip
-        """Write the next outputs into columns of `out`: from the source, its slope (V/s), states as in `Block`, and xi.
-
-        The latter has the shape (n,).
-        """
+        """Write the next outputs into columns of `out`: from source, slope (V/s), states as in `Block`, and xi (n,)."""
         form, n, shown, start = self.form, xi.size, self.form.rows, self.outputs
         count, charges, self.outputs = n if first.size == 1 else int(first[1]), len(shown.k) - form.flows, start + n
         show(form.shown, x, first, count, start, n, kept, out)
@@ -460,7 +446,13 @@ class ByWindows:
             run.gaps = np.maximum(run.gaps, self.gaps)
         self.last, self.gaps, self.state = run, run.gaps, run.state
         self.written += run.t.size
-        return t[: run.t.size], _as_shown(run.record(problem), whole)
+        record = run.record(problem)
+        shown, n = whole.scene.shown.network, record.network.k.shape[0]
+        if len(shown.cells) == len(record.network.cells):
+            return t[: run.t.size], record.rows
+        # In the form of exponential steps, whichever method has computed them.
+        place = [shown.layers.index(shown.cells[i].element) for i in shown.live]
+        return t[: run.t.size], np.column_stack([record.u_layer[:, place], record.rows[:, n:]])
 
     def run(self) -> Run:
         assert self.last is not None
@@ -479,12 +471,3 @@ def within(network: Network, t0: float, t1: float) -> Network:
         replace(e, waveform=e.waveform.part(t0, t1)) if isinstance(e.waveform, Samples) else e for e in network.sources
     ]
     return replace(network, sources=tuple(cut))
-
-
-def _as_shown(record: Record, problem: Problem) -> FloatArray:
-    """Rows in the form of exponential steps (see `Scene.shown`), whichever method has computed them."""
-    shown, n = problem.scene.shown.network, record.network.k.shape[0]
-    if len(shown.cells) == len(record.network.cells):
-        return record.rows
-    place = [shown.layers.index(shown.cells[i].element) for i in shown.live]
-    return np.column_stack([record.u_layer[:, place], record.rows[:, n:]])
