@@ -9,7 +9,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -320,23 +320,17 @@ class Tables:
         # rises out of next to nothing would be followed there beyond its own digits.
         peaks = [wave.kept.get("peak", (None, 0.0))[1] for wave in problem.waveforms]
         self.scales = [peak if np.isfinite(peak) else 0.0 for peak in peaks]
-        self.kept: dict[Any, list[SourceTable]] | None = {} if problem.scene.is_sampled else None
-        if self.kept is None and len(self.edges) <= 1 + KEPT_WINDOWS:
-            self.kept = problem.waveform.kept.setdefault("tables", {})
-            if len(self.kept) > MOST_KEPT:
-                self.kept.clear()
+        kept: dict[Any, Any] | None = problem.waveform.kept if len(self.edges) <= 1 + KEPT_WINDOWS else None
+        self.kept = {} if problem.scene.is_sampled else kept
 
     def __iter__(self) -> Iterator[list[SourceTable]]:
         for w0, w1 in itertools.pairwise(self.edges):
             if w1 <= self.done and w1 < self.edges[-1]:
                 continue
             # With `no_chirps`, chirps are approximated by series, so that these tables depend on the tolerance.
-            key = (w0, w1, self.tol if self.no_chirps else None)
-            tables = self.kept.get(key) if self.kept is not None else None
-            if tables is None:
-                tables = [self._table(wave, w0, w1, i) for i, wave in enumerate(self.problem.waveforms)]
-                if self.kept is not None:
-                    self.kept[key] = tables
+            key, make = ("tables", w0, w1, self.tol if self.no_chirps else None), partial(self._tables, w0, w1)
+            most = max(MOST_KEPT, len(self.edges))
+            tables = make() if self.kept is None else kept_with(self.kept, key, most, make)
             self.scales = [max(scale, table.scale) for scale, table in zip(self.scales, tables, strict=True)]
             self.rough = max(self.rough, *(table.rough for table in tables))
             self.not_finite = min((t.not_finite for t in tables if t.not_finite is not None), default=None)
@@ -344,16 +338,17 @@ class Tables:
             if self.not_finite is not None:
                 return
 
-    def _table(self, wave: Waveform, w0: float, w1: float, place: int) -> SourceTable:
-        problem = self.problem
-        table = source_table(
-            wave, w0, w1, self.tol, problem.step, no_chirps=self.no_chirps, scale=self.scales[place],
-            shortest=shortest_event(problem),
-        )  # fmt: skip
-        if problem.scene.is_sampled and is_sampled(wave):
-            off = table.unseen(wave, problem.t_out, self.tol)
-            self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
-        return table
+    def _tables(self, w0: float, w1: float) -> list[SourceTable]:
+        problem, shortest, tables = self.problem, shortest_event(self.problem), []
+        for place, (wave, scale) in enumerate(zip(problem.waveforms, self.scales, strict=True)):
+            table = source_table(
+                wave, w0, w1, self.tol, problem.step, no_chirps=self.no_chirps, scale=scale, shortest=shortest
+            )
+            if is_sampled(wave):
+                off = table.unseen(wave, problem.t_out, self.tol)
+                self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
+            tables.append(table)
+        return tables
 
     def peak(self) -> float:
         """Largest source voltage (V) of the run; of users' functions also between the samples that a scene knows."""
