@@ -318,13 +318,11 @@ def test_a_run_goes_on_from_where_the_source_stopped_being_finite(tier: str, at:
         return 3.0 + np.sin(2e3 * np.asarray(t))
 
     circuit = table1() if tier == "coupled" else deck("V1 in 0 1", *CIRCUITS[tier])
-    name = "Vdrive" if tier == "coupled" else "V1"
-    given = {"charge_law": law, "rtol": 1e-11}
-    first = fs.simulate(circuit, sources={name: broken}, t_stop=0.012, throw=False, **given)
+    given = {"charge_law": law, "rtol": 1e-11, "t_stop": 0.012}
+    first = fs.simulate(circuit, sources=broken, throw=False, **given)
     assert first.status is fs.Status.SOURCE_NOT_FINITE
     t = np.linspace(at + 1e-6, 0.012, 37)
-    later = fs.simulate(circuit, sources={name: whole}, start=first, t_eval=t, t_stop=0.012, **given)
-    want = fs.simulate(circuit, sources={name: whole}, t_eval=t, t_stop=0.012, **given)
+    later, want = (fs.simulate(circuit, sources=whole, t_eval=t, start=start, **given) for start in (first, "deck"))
     assert np.abs(later.u_layer - want.u_layer).max() <= 1e-9 * 4.0
     assert np.abs(later.q_source - want.q_source).max() <= 1e-9 * np.abs(want.q_source).max()
 
@@ -332,8 +330,7 @@ def test_a_run_goes_on_from_where_the_source_stopped_being_finite(tier: str, at:
 @pytest.mark.parametrize("tier", [*CIRCUITS, "coupled"])
 def test_a_source_that_is_never_finite_leaves_the_state_as_it_was(tier: str) -> None:
     circuit = table1() if tier == "coupled" else deck("V1 in 0 1", *CIRCUITS[tier])
-    source = {"Vdrive" if tier == "coupled" else "V1": lambda t: np.full(np.shape(t), np.nan)}
-    solution = fs.simulate(circuit, sources=source, t_stop=0.012, throw=False)
+    solution = fs.simulate(circuit, sources=lambda t: np.full(np.shape(t), np.nan), t_stop=0.012, throw=False)
     assert solution.status is fs.Status.SOURCE_NOT_FINITE
     assert solution.t.size == 0
     assert solution.state.t == 0.0
