@@ -245,7 +245,19 @@ def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
     grid = np.asarray(first + step * np.arange(count + 1), float)
     if grid.size and abs(grid[-1] - problem.t_stop) <= 1e-9 * step:
         grid[-1] = problem.t_stop
-    at = np.empty(0) if jumps == "none" else _jumps(problem)
+    found = [np.empty(0)]
+    for wave in () if jumps == "none" else problem.waveforms:
+        edges = wave.breakpoints(problem.t_start, problem.t_stop + same_time(problem.t_stop))
+        edges = edges[(edges > problem.t_start + same_time(problem.t_start)) & (edges >= first)]
+        if edges.size:
+            # At a jump both limits differ by more than the source changes beside it, within the resolution of time: a
+            # steep but continuous flank is none.
+            right, before = wave.value(edges), wave.value(edges, "left")
+            late = _RESOLVED * same_time(1.0) * np.abs(edges)
+            moved = np.abs(wave.value(edges + late) - right) + np.abs(before - wave.value(edges - late, "left"))
+            edges = edges[np.abs(right - before) > moved + 1e-12 * np.maximum(np.abs(right), np.abs(before))]
+            found.append(np.where(edges > problem.t_stop - same_time(problem.t_stop), problem.t_stop, edges))
+    at = np.unique(np.concatenate(found))
     if at.size:
         near = np.clip(np.searchsorted(at, grid), 1, max(at.size - 1, 1))
         distance = np.minimum(np.abs(grid - at[near - 1]), np.abs(grid - at[np.minimum(near, at.size - 1)]))
@@ -257,26 +269,6 @@ def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
     t, left = t[order], left[order]
     t.flags.writeable = left.flags.writeable = False
     return t, left
-
-
-def _jumps(problem: Problem) -> FloatArray:
-    """Times (s, ascending) of the jumps of any source in the run, after its start.
-
-    A jump is an edge at which both limits differ by more than the source changes beside it, within the resolution of
-    time, so that a steep but continuous flank is no jump.
-    """
-    stop, found = problem.t_stop, [np.empty(0)]
-    rounding = same_time(stop)
-    for wave in problem.waveforms:
-        edges = wave.breakpoints(problem.t_start, stop + rounding)
-        edges = edges[(edges > problem.t_start + same_time(problem.t_start)) & (edges >= problem.first)]
-        if edges.size:
-            right, left = wave.value(edges), wave.value(edges, "left")
-            late = _RESOLVED * same_time(1.0) * np.abs(edges)
-            moved = np.abs(wave.value(edges + late) - right) + np.abs(left - wave.value(edges - late, "left"))
-            edges = edges[np.abs(right - left) > moved + 1e-12 * np.maximum(np.abs(right), np.abs(left))]
-            found.append(np.where(edges > stop - rounding, stop, edges))
-    return np.unique(np.concatenate(found))
 
 
 PERIODS_PER_WINDOW = 4096.0

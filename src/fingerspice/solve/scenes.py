@@ -23,7 +23,7 @@ from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import fixed_area_curve
 from fingerspice.waveforms.combinations import Sum
 from fingerspice.waveforms.sampling import is_sampled
-from fingerspice.waveforms.waveform import Fundamental, Waveform, require
+from fingerspice.waveforms.waveform import Waveform, require
 
 # Error allowed for taking a dispersive skin's data at one frequency, relative to the error asked for.
 FREEZING_SHARE = 0.3
@@ -93,11 +93,6 @@ class Scene:
     def waveform(self) -> Waveform:
         """All sources at once, for their common period, breakpoints and shortest time."""
         return self.waveforms[0] if len(self.waveforms) == 1 else Sum(self.waveforms)
-
-    @cached_property
-    def fundamental(self) -> Fundamental | None:
-        """Fundamental of the source, if there is only one."""
-        return self.waveform.fundamental if len(self.waveforms) == 1 else None
 
     @cached_property
     def is_sampled(self) -> bool:

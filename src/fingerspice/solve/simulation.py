@@ -260,7 +260,7 @@ def solution_of(
         circuit=problem.circuit,
         state=run.state,
         fold_margin_min=run.margin,
-        fundamental=scene.fundamental,
+        fundamental=scene.waveform.fundamental if len(scene.waveforms) == 1 else None,
         period=scene.waveform.period,
         warnings=tuple(run_warnings(problem, run, record)),
         first=max(problem.first, problem.t_start),

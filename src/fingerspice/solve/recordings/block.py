@@ -398,10 +398,11 @@ def ready(problem: Problem, rtol: float) -> LaneForm | None:
 def _points(problem: Problem, wave: PWL) -> FloatArray | None:
     """Times (s) of a run's points and ends, and more on long lines, kept for the last run; None if not dense."""
     key = problem.t_start, problem.t_stop
-    found: tuple[tuple[float, float], FloatArray | None] | None = wave.kept.get("points")
-    if found is None or found[0] != key:
-        found = wave.kept["points"] = key, _dense(wave.knots[0], *key)
-    return found[1]
+    found: FloatArray | None
+    of, found = wave.kept.get("points", (None, None))
+    if of != key:
+        _, found = wave.kept["points"] = key, _dense(wave.knots[0], *key)
+    return found
 
 
 def _dense(t: FloatArray, t0: float, t1: float) -> FloatArray | None:
