@@ -78,7 +78,7 @@ LENT = {
     "circuit.circuit.Circuit.explore": "explorer.server",
     "results.solution.Solution.plot": "plots.traces",
     "results.solution.Solution.explore": "explorer.server",
-    "results.solution.Solution.sample_gradient": "solve.adjoint",
+    "results.solution.Solution.sample_gradient": "solve.derivatives",
     "results.spectrum.Spectrum.plot": "plots.traces",
     "results.spectrum.PhasorSolution.plot": "plots.traces",
 }

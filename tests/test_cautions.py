@@ -99,7 +99,8 @@ def test_a_recording_on_a_skin_of_one_frequency_is_warned_about_with_its_error(
     one, every = fs.parse_netlist(text), fs.parse_netlist(text.replace(f"SKIN d=350u f={f}", "SKIN_DISPERSIVE d=350u"))
     with pytest.warns(fs.FingerspiceWarning, match="has no fundamental") as caught:
         held = fs.simulate(one, sources=wave, rtol=1e-4)
-    right = fs.simulate(every, sources=wave, rtol=1e-4)
+    # By a method that is compiled for all numbers of modes.
+    right = fs.simulate(every, sources=wave, rtol=1e-4, method="exponential")
     pattern = r"the mean force is about (\S+) % too (large|small); SKIN_DISPERSIVE d=350u"
     ((size, side),) = re.findall(pattern, str(caught[0].message))
     said = float(size) / 100.0 * (1.0 if side == "large" else -1.0)

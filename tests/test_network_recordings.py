@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +14,8 @@ from network_reference import Floating
 from scenes import COAT, GAP, assignments, cases, deck
 
 RATE = 48e3
+pytestmark = pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
 CIRCUITS = Path(__file__).parents[1] / "circuits"
-
-
-@pytest.fixture(autouse=True)
-def _without_warnings() -> Iterator[None]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fs.FingerspiceWarning)
-        yield
 
 
 def recording(count: int, high: float = 4000.0, volts: float = 150.0) -> fs.Samples:

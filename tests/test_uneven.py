@@ -53,7 +53,10 @@ def compared(circuit: fs.Circuit, wave: fs.PWL, t: np.ndarray, *rtols: float, **
 @pytest.mark.parametrize("seed", range(cases(4, 1)))
 def test_points_at_uneven_times_run_one_step_each_with_the_error_stated(skin: str, seed: int, law: str) -> None:
     circuit, (t, v) = circuit_of(skin), points(seed)
-    for run in compared(circuit, fs.PWL(t, v), t, 1e-3, 1e-5, 1e-7, charge_law=law):
+    # For each law and number of nodes code is compiled anew: with many modes, as of this skin, it takes long.
+    few = (1e-3, 1e-5) if law == "local" else (1e-7,)
+    rtols = (1e-3, 1e-5, 1e-7) if skin == "SKIN" or cases(1, 0) else few
+    for run in compared(circuit, fs.PWL(t, v), t, *rtols, charge_law=law):
         assert run.method == "relaxation"
         assert run.stats["steps"] >= t.size - 1
 

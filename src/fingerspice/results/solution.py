@@ -406,7 +406,7 @@ class Solution(Sealed, Shown, Signalled, Figured):
         SolveError
             If the run cannot be followed sample by sample.
         """
-        from fingerspice.solve.adjoint import sample_gradient
+        from fingerspice.solve.derivatives import sample_gradient
 
         return sample_gradient(self, of)
 

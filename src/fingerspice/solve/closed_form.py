@@ -54,9 +54,9 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     v0 = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before)
     tables = Tables(problem, 1e-13, no_chirps=True)
     z_end = start.y[n:]
-    if _is_sample_by_sample(problem):
-        rows, last = _at_samples(problem, modes, v0)
-        end = problem.t_stop
+    sampled = _at_samples(problem, modes, v0)
+    if sampled is not None:
+        rows, last, end = *sampled, problem.t_stop
     else:
         answer, last, end = _answer(problem, tables, modes, v0)
         rows = answer.x(modes)
@@ -88,10 +88,7 @@ class _Answer(NamedTuple):
 def _answer(
     problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray
 ) -> tuple[_Answer, _Answer, float]:  # fmt: skip
-    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s.
-
-    Without modes it is that of the sources alone, and not their integrals.
-    """
+    """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s."""
     t_out, left = problem.t_out, problem.left
     n, n_s, size = v0.size, len(problem.waveforms), t_out.size
     states = [np.append(v0 if j == 0 else np.zeros(n), 0.0) for j in range(n_s)]
@@ -127,20 +124,15 @@ def _answer(
     return out, last, end
 
 
-def _is_sample_by_sample(problem: Problem) -> bool:
-    """Whether the outputs are a recorded source's own sample times from the first one on: then a recursion serves."""
+def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, _Answer] | None:
+    """Live voltages (n_t, n), V, and the response at the end, by a recursion; None for outputs at other times."""
     wave, t_out = problem.waveform, problem.t_out
     if problem.charge or not isinstance(wave, Samples) or not 1 < t_out.size <= wave.count:
-        return False
+        return None
     if wave.start != problem.t_start or t_out[-1] < problem.t_stop * (1.0 - 1e-12):
-        return False
-    return bool(on_grid(t_out, wave.start, 1.0 / wave.rate, same_time(problem.t_stop)))
-
-
-def _at_samples(problem: Problem, modes: Modes, v0: FloatArray) -> tuple[FloatArray, _Answer]:
-    """Live voltages at the samples of a recorded source (n_t, n), V, and the response at the last sample."""
-    wave = problem.waveform
-    assert isinstance(wave, Samples)
+        return None
+    if not on_grid(t_out, wave.start, 1.0 / wave.rate, same_time(problem.t_stop)):
+        return None
     count = round((problem.t_stop - wave.start) * wave.rate) + 1
     u, rates, gains = wave.values[:count], modes.rates, np.ascontiguousarray(modes.gains[:, 0])
     live, end = linear.first_order_hold(u, 1.0 / wave.rate, rates, gains, -modes.follow[:, 0], modes.shape, v0)
@@ -294,11 +286,9 @@ def lead_to_fold(problem: Problem, run: Run) -> Run | None:
 
 
 def meets_fold(problem: Problem, rtol: float) -> bool:
-    """Whether a problem reaches a fold, or a jump of its source goes past one.
+    """Whether a problem reaches a fold, or a jump of its source goes past one; another failure is a `SolveError`.
 
     A run that stops near a fold and does not reach it counts as a run without a fold: its later course is not examined.
-
-    A run that fails for another reason than a fold is a `SolveError`.
     """
     run = solve_marching(problem, rtol)
     if run.status is Status.SUCCESS:
@@ -338,69 +328,50 @@ class _Path(NamedTuple):
         return rows
 
 
-def _start(problem: Problem, state: StackState) -> tuple[Segment, float, float]:
-    """Start of a path: segment of the source, sign of the area's branch, and gap voltage (V).
-
-    The voltage is NaN where the start is at the fold or past it, as after a jump of the source.
-    """
+def _ahead(problem: Problem, run: Run, state: StackState, rtol: float) -> tuple[bool, _Path | None]:
+    """Whether a run that stopped in this state reaches a fold, and the path to it where it is not there already."""
     model, u = model_of(problem.scene), state.u_gap
     windows = list(Tables(problem, FINEST_RTOL))
     window = next((one for one in windows if one[0].edges[-1] > state.t), windows[-1])
     segment, since = segment_of(joined(window), state.t, "right")
+    u_source, slope = source(segment, since)
     if since == 0.0:
-        u_source, _ = source(segment, 0.0)
         u = float(ramp(model, model.k_gap * u_source, dot(model.gap, state.y), u))
     sign = math.copysign(1.0, u)
     if u != 0.0 and not math.isnan(u):
-        u_source, slope = source(segment, since)
         margin, _ = voltage_by_time(model, u_source, slope, state.y, sign, u, np.empty(state.y.size))
         u = u if margin > 0.0 else math.nan
-    return segment, sign, u
-
-
-def _ahead(problem: Problem, run: Run, state: StackState, rtol: float) -> tuple[bool, _Path | None]:
-    """Whether a run that stopped in this state reaches a fold, and the path to it where it is not there already."""
-    begun = _start(problem, state)
-    if run.margin <= 0.0 or math.isnan(begun[-1]):
+    # At the fold or past it, as after a jump of the source.
+    if run.margin <= 0.0 or math.isnan(u):
         return True, None
+    if u == 0.0:
+        return False, None
     tries = (rtol, LOOSER_RTOL, LOOSEST_RTOL) if run.margin < NEAR else (rtol, LOOSER_RTOL)
     for tried in sorted({max(rtol, x) for x in tries}):
         try:
-            path = _path(problem, state, begun, tried)
+            path = _path(problem, state, segment, sign, u, tried)
         except _LostError:
             continue
         return path is not None, path
     return False, None
 
 
-def _jacobian(slope: Callable[[float, FloatArray], FloatArray], s: float, z: FloatArray) -> FloatArray:
-    """Derivative of a slope by plain differences: scipy enlarges its own without limit for what nothing depends on."""
-    here, columns = slope(s, z), []
-    for i in range(z.size):
-        moved = z.copy()
-        moved[i] += 1e-7 * abs(z[i]) + 1e-13
-        columns.append((slope(s, moved) - here) / (moved[i] - z[i]))
-    return np.array(columns).T
-
-
-def _path(problem: Problem, state: StackState, begun: tuple[Segment, float, float], rtol: float) -> _Path | None:
+def _path(
+    problem: Problem, state: StackState, segment: Segment, sign: float, u: float, rtol: float
+) -> _Path | None:  # fmt: skip
+    """The path from a state with the gap voltage u (V) on the branch `sign` to a fold; None where it meets none."""
     t, y, model, n = state.t, state.y, model_of(problem.scene), state.y.size
-    segment, sign, u = begun
-    if u == 0.0:
-        return None
     pace = model.tau if math.isfinite(model.tau) else segment.length
     scale = np.concatenate([
         np.full(n - 1, max(np.abs(y[:-1]).max(), abs(u))), [model.area0 / model.s * abs(u), pace, abs(u)]
     ])  # fmt: skip
-    dy = np.empty(n)
+    dy, left = np.empty(n), MOST_EVALUATIONS
 
     def at(z: FloatArray) -> tuple[float, float]:
         here = z * scale
         u_here, du_here = source(segment, t - segment.start + here[n])
         margin, speed = voltage_by_time(model, u_here, du_here, here[:n], sign, here[n + 1], dy)
         return float(margin), float(speed)
-
-    left = MOST_EVALUATIONS
 
     def slope(_: float, z: FloatArray) -> FloatArray:
         nonlocal left
@@ -410,6 +381,11 @@ def _path(problem: Problem, state: StackState, begun: tuple[Segment, float, floa
         margin, speed = at(z)
         along: FloatArray = np.concatenate([dy * margin, [margin, speed]]) * pace / scale
         return along
+
+    def jacobian(s: float, z: FloatArray) -> FloatArray:
+        # By plain differences: scipy enlarges its own without limit for what nothing depends on.
+        here, steps = slope(s, z), np.diag(1e-7 * np.abs(z) + 1e-13)
+        return np.array([(slope(s, z + step) - here) / ((z + step)[i] - z[i]) for i, step in enumerate(steps)]).T
 
     from scipy.integrate import solve_ivp
 
@@ -426,7 +402,7 @@ def _path(problem: Problem, state: StackState, begun: tuple[Segment, float, floa
     # Near the fold the mode that folds may be the stiffest of all: an explicit method would need too many steps.
     found = solve_ivp(
         slope, (0.0, LONGEST), begin, "Radau",
-        rtol=rtol, atol=rtol, jac=partial(_jacobian, slope), events=events, dense_output=True,
+        rtol=rtol, atol=rtol, jac=jacobian, events=events, dense_output=True,
     )  # fmt: skip
     if found.status < 1:
         raise _LostError

@@ -1,15 +1,17 @@
-"""Choice of the lightest model whose error is below that asked for, with reasons; warnings about a run's limits."""
+"""What a call asks for: its problem, the lightest model that meets its error, and warnings about a run's limits."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import format_si
+from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import circuit_warnings, course_warnings, spectrum_warning
 from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.topology import driving
@@ -17,12 +19,13 @@ from fingerspice.engine.one_area.model import Model
 from fingerspice.physics.contact import inverse_area, inverse_area_range
 from fingerspice.results.outcome import Plan, Status
 from fingerspice.results.record import Record
-from fingerspice.solve.problem import Problem, shortest_event
+from fingerspice.solve.periodic import close_period
+from fingerspice.solve.problem import Problem, prepare, shortest_event, to_ends
 from fingerspice.solve.runs import Run
 from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.stepping import FEWEST_PERIODS
 from fingerspice.waveforms.sampling import Function
-from fingerspice.waveforms.waveform import DOUBLE
+from fingerspice.waveforms.waveform import DOUBLE, require
 
 # Number of plans cached with a scene.
 MOST_PLANS = 16
@@ -39,6 +42,18 @@ NEAR_FOLD = 0.2
 # Shortest event (s) in a user's function that may be missed without a warning, half a period of 10 kHz: drives of a
 # screen have few that are shorter.
 _EVENT = 0.5 / 10e3
+
+
+def asked(circuit: Circuit, *, rtol: float, t_eval: FloatArray | None = None, **how: Any) -> Problem:
+    """The problem that a call of `simulate` asks for, with arguments as `check_arguments` leaves them."""
+    problem = prepare(circuit, t_eval=t_eval, rtol=rtol, **how)
+    if problem.start == "periodic":
+        problem, _ = close_period(problem, 0.5 * rtol)
+        if t_eval is not None:
+            to_ends(t_eval, problem.t_start, problem.t_stop)
+            allowed = f"from {problem.t_start:g} s on, where the source has settled and its periodic state exists"
+            require(t_eval[0] >= problem.t_start, "the first of t_eval", f"{t_eval[0]:g} s", allowed)
+    return problem
 
 
 def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "auto") -> Plan:

@@ -9,8 +9,8 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, Literal, cast
+from functools import cached_property, partial
+from typing import Any, Literal
 
 import numpy as np
 
@@ -104,10 +104,7 @@ class Problem:
     @cached_property
     def inner(self) -> StackState:
         """The start of a stack in the form of its own equations."""
-        state, inner = self.scene.prepared.get("inner", (None, None))
-        if state is not self.initial:
-            _, inner = self.scene.prepared["inner"] = self.initial, to_stack(self.scene, self.initial)
-        return cast("StackState", inner)
+        return to_stack(self.scene, self.initial)
 
     def done(self, t: float) -> float:
         """Fraction of the run that is done at time t, s."""
@@ -141,16 +138,29 @@ def prepare(
 ) -> Problem:
     """Prepare a run, or refuse it; times of `t_eval` that pass an end of the run by rounding are set to it, in place.
 
-    `rtol` decides whether a dispersive skin's data may be taken at one frequency. A run from the periodic state is
-    prepared from the uncharged start.
+    For `rtol` see `scene_of`. A run from the periodic state is prepared from the uncharged start.
     """
     t_stop = None if t_stop is None else real_number("t_stop", t_stop, "a number in s")
     if isinstance(start, Solution) and start.stored is not None:
         raise InputError("start is a solution read from a file, which a run cannot go on from; allowed: one just made")
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
-    stop = _end(circuit, t_start, t_stop, t_eval)
-    tran, wave = circuit.tran, scene.waveform
+    tran, wave, stop = circuit.tran, scene.waveform, t_stop
+    if stop is None:
+        if tran is not None:
+            stop = t_start + tran.stop
+        elif t_eval is not None and t_eval.size:
+            stop = float(t_eval[-1])
+        else:
+            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+    require(math.isfinite(stop) and stop > t_start, "t_stop", f"{stop:g} s", f"more than {t_start:g} s")
+    if t_eval is not None:
+        require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
+        require(bool(np.all(t_eval[1:] >= t_eval[:-1])), "t_eval", "not in order", "ascending times")
+        to_ends(t_eval, t_start, stop)
+        first, last = float(t_eval[0]), float(t_eval[-1])
+        allowed = f"times from {t_start:g} s to t_stop = {stop:g} s{time_slip(first, last, stop)}"
+        require(first >= t_start and last <= stop, "t_eval", f"{first:g} s to {last:g} s", allowed)
     end = kept_with(wave.kept, ("end", stop), 1, lambda: on_breakpoint(wave, stop))
     return Problem(
         circuit, scene, t_start, end, t_start + (tran.start if tran else 0.0),
@@ -158,26 +168,6 @@ def prepare(
         initial_state(circuit, scene, "uncharged" if start == "periodic" else start), charge,
         start if isinstance(start, str) else "given", t_stop is None and tran is not None,
     )  # fmt: skip
-
-
-def _end(circuit: Circuit, t_start: float, t_stop: float | None, t_eval: FloatArray | None) -> float:
-    """End of the run, s, with its output times checked against it."""
-    if t_stop is None:
-        if circuit.tran is not None:
-            t_stop = t_start + circuit.tran.stop
-        elif t_eval is not None and t_eval.size:
-            t_stop = float(t_eval[-1])
-        else:
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
-    require(math.isfinite(t_stop) and t_stop > t_start, "t_stop", f"{t_stop:g} s", f"more than {t_start:g} s")
-    if t_eval is not None:
-        require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
-        require(bool(np.all(t_eval[1:] >= t_eval[:-1])), "t_eval", "not in order", "ascending times")
-        to_ends(t_eval, t_start, t_stop)
-        first, last = float(t_eval[0]), float(t_eval[-1])
-        allowed = f"times from {t_start:g} s to t_stop = {t_stop:g} s{time_slip(first, last, t_stop)}"
-        require(first >= t_start and last <= t_stop, "t_eval", f"{first:g} s to {last:g} s", allowed)
-    return t_stop
 
 
 def to_ends(t: FloatArray, t_start: float, t_stop: float) -> None:
@@ -200,14 +190,9 @@ def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
 
 def check_outputs(circuit: Circuit, count: float) -> None:
     """Refuse a number of output times for whose signals memory is too small."""
-
-    def columns() -> int:
-        devices = [element.device for element in circuit.elements]
-        layers = sum(element.spec.is_layer for element in circuit.elements)
-        nodes = len({node for element in circuit.elements for node in element.nodes})
-        return layers + nodes + 7 * devices.count("GAP") + 3 * (devices.count("V") + devices.count("I")) + 1
-
-    signals = circuit.remember("columns", columns)
+    of_device = {"GAP": 7, "V": 3, "I": 3}
+    signals = sum(of_device.get(element.device, 0) + element.spec.is_layer for element in circuit.elements)
+    signals += len({node for element in circuit.elements for node in element.nodes}) + 1
     size = 8.0 * signals * count
     require(
         size <= MOST_BYTES,
@@ -254,16 +239,25 @@ def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[
 
 
 def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
-    """Times TSTART:TSTEP:TSTOP (s) and whether each is left-hand; unless `jumps` is "none", two more at each jump.
-
-    A jump at t = 0 has no left-hand output.
-    """
+    """Times TSTART:TSTEP:TSTOP (s), unless `jumps` is "none" with two at each later jump, and which are left-hand."""
     step, first = problem.step, problem.first
     count = int(np.floor((problem.t_stop - first) / step * (1.0 + 1e-12) + 1e-9))
     grid = np.asarray(first + step * np.arange(count + 1), float)
     if grid.size and abs(grid[-1] - problem.t_stop) <= 1e-9 * step:
         grid[-1] = problem.t_stop
-    at = np.empty(0) if jumps == "none" else _jumps(problem)
+    found = [np.empty(0)]
+    for wave in () if jumps == "none" else problem.waveforms:
+        edges = wave.breakpoints(problem.t_start, problem.t_stop + same_time(problem.t_stop))
+        edges = edges[(edges > problem.t_start + same_time(problem.t_start)) & (edges >= first)]
+        if edges.size:
+            # At a jump both limits differ by more than the source changes beside it, within the resolution of time: a
+            # steep but continuous flank is none.
+            right, before = wave.value(edges), wave.value(edges, "left")
+            late = _RESOLVED * same_time(1.0) * np.abs(edges)
+            moved = np.abs(wave.value(edges + late) - right) + np.abs(before - wave.value(edges - late, "left"))
+            edges = edges[np.abs(right - before) > moved + 1e-12 * np.maximum(np.abs(right), np.abs(before))]
+            found.append(np.where(edges > problem.t_stop - same_time(problem.t_stop), problem.t_stop, edges))
+    at = np.unique(np.concatenate(found))
     if at.size:
         near = np.clip(np.searchsorted(at, grid), 1, max(at.size - 1, 1))
         distance = np.minimum(np.abs(grid - at[near - 1]), np.abs(grid - at[np.minimum(near, at.size - 1)]))
@@ -275,26 +269,6 @@ def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
     t, left = t[order], left[order]
     t.flags.writeable = left.flags.writeable = False
     return t, left
-
-
-def _jumps(problem: Problem) -> FloatArray:
-    """Times (s, ascending) of the jumps of any source in the run, after its start.
-
-    A jump is an edge at which both limits differ by more than the source changes beside it, within the resolution of
-    time, so that a steep but continuous flank is no jump.
-    """
-    stop, found = problem.t_stop, [np.empty(0)]
-    rounding = same_time(stop)
-    for wave in problem.waveforms:
-        edges = wave.breakpoints(problem.t_start, stop + rounding)
-        edges = edges[(edges > problem.t_start + same_time(problem.t_start)) & (edges >= problem.first)]
-        if edges.size:
-            right, left = wave.value(edges), wave.value(edges, "left")
-            late = _RESOLVED * same_time(1.0) * np.abs(edges)
-            moved = np.abs(wave.value(edges + late) - right) + np.abs(left - wave.value(edges - late, "left"))
-            edges = edges[np.abs(right - left) > moved + 1e-12 * np.maximum(np.abs(right), np.abs(left))]
-            found.append(np.where(edges > stop - rounding, stop, edges))
-    return np.unique(np.concatenate(found))
 
 
 PERIODS_PER_WINDOW = 4096.0
@@ -315,7 +289,17 @@ class Tables:
     def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
         self.problem, self.no_chirps = problem, no_chirps
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
-        self.edges = _windows(problem)
+        check_length(problem.waveform, problem.t_start, problem.t_stop)
+        span = problem.t_stop - problem.t_start
+        rate = max(
+            problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
+            1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
+            # A function is sampled at the output step.
+            1.0 / (4096.0 * problem.step) if problem.scene.is_sampled else 0.0,
+        )
+        count = max(1, int(np.ceil(span * rate)))
+        # Limits (s) of the windows: short ones bound memory and the phases' round-off.
+        self.edges = [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
         # An iteration skips windows that end by this time (s), except the last window.
         self.done = -np.inf
         # Largest interpolation error (V) of a table that a finer table would not reduce.
@@ -328,23 +312,17 @@ class Tables:
         # rises out of next to nothing would be followed there beyond its own digits.
         peaks = [wave.kept.get("peak", (None, 0.0))[1] for wave in problem.waveforms]
         self.scales = [peak if np.isfinite(peak) else 0.0 for peak in peaks]
-        self.kept: dict[Any, list[SourceTable]] | None = {} if problem.scene.is_sampled else None
-        if self.kept is None and len(self.edges) <= 1 + KEPT_WINDOWS:
-            self.kept = problem.waveform.kept.setdefault("tables", {})
-            if len(self.kept) > MOST_KEPT:
-                self.kept.clear()
+        kept: dict[Any, Any] | None = problem.waveform.kept if len(self.edges) <= 1 + KEPT_WINDOWS else None
+        self.kept = {} if problem.scene.is_sampled else kept
 
     def __iter__(self) -> Iterator[list[SourceTable]]:
         for w0, w1 in itertools.pairwise(self.edges):
             if w1 <= self.done and w1 < self.edges[-1]:
                 continue
             # With `no_chirps`, chirps are approximated by series, so that these tables depend on the tolerance.
-            key = (w0, w1, self.tol if self.no_chirps else None)
-            tables = self.kept.get(key) if self.kept is not None else None
-            if tables is None:
-                tables = [self._table(wave, w0, w1, i) for i, wave in enumerate(self.problem.waveforms)]
-                if self.kept is not None:
-                    self.kept[key] = tables
+            key, make = ("tables", w0, w1, self.tol if self.no_chirps else None), partial(self._tables, w0, w1)
+            most = max(MOST_KEPT, len(self.edges))
+            tables = make() if self.kept is None else kept_with(self.kept, key, most, make)
             self.scales = [max(scale, table.scale) for scale, table in zip(self.scales, tables, strict=True)]
             self.rough = max(self.rough, *(table.rough for table in tables))
             self.not_finite = min((t.not_finite for t in tables if t.not_finite is not None), default=None)
@@ -352,16 +330,17 @@ class Tables:
             if self.not_finite is not None:
                 return
 
-    def _table(self, wave: Waveform, w0: float, w1: float, place: int) -> SourceTable:
-        problem = self.problem
-        table = source_table(
-            wave, w0, w1, self.tol, problem.step, no_chirps=self.no_chirps, scale=self.scales[place],
-            shortest=shortest_event(problem),
-        )  # fmt: skip
-        if problem.scene.is_sampled and is_sampled(wave):
-            off = table.unseen(wave, problem.t_out, self.tol)
-            self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
-        return table
+    def _tables(self, w0: float, w1: float) -> list[SourceTable]:
+        problem, shortest, tables = self.problem, shortest_event(self.problem), []
+        for place, (wave, scale) in enumerate(zip(problem.waveforms, self.scales, strict=True)):
+            table = source_table(
+                wave, w0, w1, self.tol, problem.step, no_chirps=self.no_chirps, scale=scale, shortest=shortest
+            )
+            if is_sampled(wave):
+                off = table.unseen(wave, problem.t_out, self.tol)
+                self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
+            tables.append(table)
+        return tables
 
     def peak(self) -> float:
         """Largest source voltage (V) of the run; of users' functions also between the samples that a scene knows."""
@@ -378,20 +357,6 @@ def shortest_event(problem: Problem) -> float:
     if any(wave.kept.get("one by one") for wave in problem.waveforms):
         return met
     return min(met, (problem.t_stop - problem.t_start) / LOOKS)
-
-
-def _windows(problem: Problem) -> list[float]:
-    """Limits (s) of the windows for the sources' tables: short windows bound memory and the phases' round-off."""
-    check_length(problem.waveform, problem.t_start, problem.t_stop)
-    span = problem.t_stop - problem.t_start
-    rate = max(
-        problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
-        1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
-        # A function is sampled at the output step.
-        1.0 / (4096.0 * problem.step) if problem.scene.is_sampled else 0.0,
-    )
-    count = max(1, int(np.ceil(span * rate)))
-    return [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]
 
 
 def joined(tables: list[SourceTable]) -> Sources:

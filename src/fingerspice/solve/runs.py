@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -97,10 +96,7 @@ class Run:
 
 
 def excess_of(gaps: FloatArray, rounding: float) -> float:
-    """Largest ratio of a stated error to its peak, over the voltages and forces of all gaps; for `gaps` see `Run`.
-
-    A gap whose peak is within `rounding` (V) is at 0 V and not judged.
-    """
+    """Largest ratio of a stated error to its peak, see `Run.gaps`; a gap within `rounding` (V) of 0 V is not judged."""
     worst = 0.0
     for u_peak, f_peak, u_error, f_error in gaps.tolist():
         if u_peak > rounding:
@@ -110,12 +106,11 @@ def excess_of(gaps: FloatArray, rounding: float) -> float:
 
 def closed_form(problem: Problem, again: Callable[[Problem], Run], error: float = 0.0) -> ClosedForm:
     """The run between its outputs, by a method that computes it `again` with any outputs; see `ClosedForm`."""
-    look = partial(_look, problem, again)
+
+    def look(t: FloatArray, left: BoolArray) -> Record:
+        return again(problem.at(t, left)).record(problem)
+
     return ClosedForm(look, problem.waveform, problem.t_start, error, problem.rounding)
-
-
-def _look(problem: Problem, again: Callable[[Problem], Run], t: FloatArray, left: BoolArray) -> Record:
-    return again(problem.at(t, left)).record(problem)
 
 
 class Integration(ABC):
@@ -123,6 +118,7 @@ class Integration(ABC):
 
     counters: IntArray  # With the indices of `engine.collocation.readout`
     rows: FloatArray  # (n_out, width): Outputs as in `Record`, of networks, whose steps have the same state
+    detail = ""  # Message of a method about its failure
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self.net = problem, problem.scene.net
@@ -157,10 +153,7 @@ class Integration(ABC):
         raise NotImplementedError
 
     def finish(self, sources: Sources, after: Sources | None) -> None:
-        """Write the right-hand outputs at the end of the run, which `after` (the sources there) may begin with a jump.
-
-        Nothing is written if that jump goes past a fold.
-        """
+        """Write the right-hand outputs at the end of the run; `after`, the sources there, may begin with a jump."""
         if after is not None:
             values = values_at(after, self.problem.t_stop)
             if np.any(values != self.s_before) and not self.jump(values):
@@ -212,7 +205,8 @@ def integrate(one: Integration, tables: Tables, progress: Progress | None = None
     stats = {name: int(one.counters[i]) for name, i in (("steps", ACCEPTED), ("rejected", REJECTED), ("zeros", ZEROS))}
     return Run(
         t_out[: len(rows)], left[: len(rows)], rows, status, int(one.counters[NFEV]), stats, state,
-        t_failed=t_failed, tried=one.tried, unseen=tables.unseen, rough=tables.rough, here=here,
+        t_failed=t_failed, tried=one.tried, unseen=tables.unseen, rough=tables.rough, detail=one.detail,
+        here=here,
     )  # fmt: skip
 
 
@@ -248,9 +242,8 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         element = _not_finite_at(problem, run.t_failed)
     elif status is Status.SOURCE_UNSEEN and run.unseen is not None:
         _, off, place = run.unseen
-        source = problem.network.sources[place]
-        element = ", ".join(_written(problem, place))
-        cause += f" (by {off:.3g} {'A' if source.device == 'I' else 'V'})"
+        element, device = ", ".join(_written(problem, place)), problem.network.sources[place].device
+        cause += f" (by {off:.3g} {'A' if device == 'I' else 'V'})"
     elif status is Status.FOLD and run.t.size and record.fingers:
         if run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size:
             cause += " (the source jumps past the fold at this time)"

@@ -22,7 +22,7 @@ from fingerspice.engine.one_area.system import build_system
 from fingerspice.numerics.modes import modes
 from fingerspice.physics.contact import fixed_area_curve
 from fingerspice.waveforms.sampling import is_sampled
-from fingerspice.waveforms.waveform import Fundamental, Sum, Waveform, require
+from fingerspice.waveforms.waveform import Sum, Waveform, require
 
 # Error allowed for taking a dispersive skin's data at one frequency, relative to the error asked for.
 FREEZING_SHARE = 0.3
@@ -92,11 +92,6 @@ class Scene:
     def waveform(self) -> Waveform:
         """All sources at once, for their common period, breakpoints and shortest time."""
         return self.waveforms[0] if len(self.waveforms) == 1 else Sum(self.waveforms)
-
-    @cached_property
-    def fundamental(self) -> Fundamental | None:
-        """Fundamental of the source, if there is only one."""
-        return self.waveform.fundamental if len(self.waveforms) == 1 else None
 
     @cached_property
     def is_sampled(self) -> bool:
@@ -202,10 +197,7 @@ class Scene:
 def scene_of(
     circuit: Circuit, charge_law: str | None, area: str | float, t_stop: float | None, rtol: float = 0.0
 ) -> Scene:
-    """The circuit's scene under a charge law and area mode, made on first use.
-
-    `rtol` decides whether a dispersive skin's data may be taken at one frequency.
-    """
+    """The circuit's scene, made on first use; `rtol` decides whether a dispersive skin may be held at one frequency."""
     law = charge_law or circuit.charge_law or "local"
     require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
     stop = t_stop or (circuit.tran.stop if circuit.tran else 1.0)
@@ -235,19 +227,13 @@ def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
     areas = stack.contact.area(np.linspace(0.0, _largest_voltage(stack.waveform, stop), 65))
     area = stack.area_given or float(np.median(areas))
     change = 0.0 if stack.area_given else float(np.ptp(areas)) / area
-    if COUPLING * change > allowed:
-        # This part of the error alone is too large, so the expensive part need not be computed.
+    # Where this part of the error alone is too large, the expensive part need not be computed.
+    fundamental = None if COUPLING * change > allowed else stack.waveform.fundamental
+    if fundamental is None:
         return None
-
-    def make() -> Freezing | None:
-        fundamental = stack.waveform.fundamental
-        if fundamental is None:
-            return None
-        f = fundamental.frequency
-        return Freezing(f, freezing_error(circuit, f, area, change, stop))
-
-    found: Freezing | None = circuit.remember(("freezing", stop), make)
-    return found if found is not None and found.error <= allowed else None
+    f = fundamental.frequency
+    error = circuit.remember(("freezing", stop), lambda: freezing_error(circuit, f, area, change, stop))
+    return Freezing(f, error) if error <= allowed else None
 
 
 def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> float:

@@ -19,14 +19,13 @@ from fingerspice.circuit.describe import Parameters, Sources, area_given, circui
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
-from fingerspice.solve.closed_form import solve_algebraic, solve_linear
+from fingerspice.solve.closed_form import lead_to_fold, run_to_fold, solve_algebraic, solve_linear
+from fingerspice.solve.derivatives import check_request, sensitivities_of
 from fingerspice.solve.marching import solve as solve_exponential
-from fingerspice.solve.nodal import solve_coupled
-from fingerspice.solve.periodic import close_period
-from fingerspice.solve.planning import make_plan, run_warnings
-from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare, to_ends
+from fingerspice.solve.nodal import solve_coupled, solve_foreign
+from fingerspice.solve.planning import asked, make_plan, run_warnings
+from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare
 from fingerspice.solve.runs import ROUGH, Progress, Run, run_failure
-from fingerspice.solve.sensitivities import check_request, sensitivities_of
 from fingerspice.waveforms.waveform import DOUBLE, require
 
 RTOL_RANGE = (1e-13, 0.1)
@@ -136,18 +135,6 @@ def simulate(
         if text not in solution.circuit.warnings:
             warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return solution
-
-
-def asked(circuit: Circuit, *, rtol: float, t_eval: FloatArray | None = None, **how: Any) -> Problem:
-    """The problem that a call of `simulate` asks for, with arguments as `check_arguments` leaves them."""
-    problem = prepare(circuit, t_eval=t_eval, rtol=rtol, **how)
-    if problem.start == "periodic":
-        problem, _ = close_period(problem, 0.5 * rtol)
-        if t_eval is not None:
-            to_ends(t_eval, problem.t_start, problem.t_stop)
-            allowed = f"from {problem.t_start:g} s on, where the source has settled and its periodic state exists"
-            require(t_eval[0] >= problem.t_start, "the first of t_eval", f"{t_eval[0]:g} s", allowed)
-    return problem
 
 
 def rtol_given(rtol: object, least: float = RTOL_RANGE[0]) -> float:
@@ -273,7 +260,7 @@ def solution_of(
         circuit=problem.circuit,
         state=run.state,
         fold_margin_min=run.margin,
-        fundamental=scene.fundamental,
+        fundamental=scene.waveform.fundamental if len(scene.waveforms) == 1 else None,
         period=scene.waveform.period,
         warnings=tuple(run_warnings(problem, run, record)),
         first=max(problem.first, problem.t_start),
@@ -286,8 +273,6 @@ def solution_of(
 def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | None) -> tuple[Run, str]:
     """A run of the coupled tier, and the name of its method."""
     if ":" in method:
-        from fingerspice.solve.foreign import solve_foreign
-
         return solve_foreign(problem, method, rtol, progress), method
     if method == "auto":
         from fingerspice.solve.recordings.run import solve as solve_recording
@@ -301,8 +286,6 @@ def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | No
         if run.status not in (BEYOND_STACKS if is_stack else BEYOND_NETWORKS) or (is_stack and method == "exponential"):
             return run, "exponential"
         if is_stack and run.status is Status.FOLD:
-            from fingerspice.solve.closed_form import run_to_fold
-
             folded = run_to_fold(problem)
             if folded is not None:
                 return folded, "exponential"
@@ -311,8 +294,6 @@ def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | No
     # The implicit method is the last resort: its step length does not depend on fast modes.
     run = solve_coupled(problem, rtol, progress, reason)
     if is_stack and run.status is Status.FOLD:
-        from fingerspice.solve.closed_form import lead_to_fold
-
         run = lead_to_fold(problem, run) or run
     return run, "radau"
 

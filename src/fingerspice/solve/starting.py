@@ -1,13 +1,11 @@
-"""The initial state of a run, from the deck's ``uic`` and ``.ic``, the operating point, or an earlier solution; and the
-form that a state has in a stack's own equations.
+"""The initial state of a run, and the form that a state has in a stack's own equations.
 
 The live voltages along the loop are k U + v. The stack's own state x is v under `local`, and v A / A_0 under `mobile`
 (see `engine.one_area.model`). The charge delivered by the source is z under `local`, and z + A U / S - offset under
 `mobile`.
 
-Start of a circuit: the capacitors' voltages at t = 0 by the deck, made consistent with Kirchhoff's voltage law.
-
-The rules are those of SPICE, compared with ngspice 39:
+A run starts from an earlier solution, or from the capacitors' voltages at t = 0 by the deck, made consistent with
+Kirchhoff's voltage law. The rules are those of SPICE, compared with ngspice 39:
 
 - With ``uic`` each capacitor has the voltage of its ``IC=``, else the difference of its nodes' ``.ic``, else 0 V.
 - Without ``uic`` the start is the DC operating point with the nodes of ``.ic`` held, which are then released; ``IC=``
@@ -24,7 +22,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -39,7 +37,7 @@ from fingerspice.circuit.network import Network, build_network
 from fingerspice.circuit.statespace import Stack
 from fingerspice.engine.network import Net
 from fingerspice.engine.one_area.model import Model, choose_branch, gap_voltage
-from fingerspice.physics.contact import Contact, inverse_area
+from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
 from fingerspice.solve.scenes import Scene, kept_with
@@ -96,20 +94,8 @@ def from_stack(scene: Scene, state: StackState) -> State:
     return State(state.t, y, np.array([state.u_before]), np.array([sign]), scene.charge_law)
 
 
-def _unreachable(scene: Scene, state: StackState, largest: float) -> bool:
-    """Whether the source, raised from 0 V, cannot reach a state's gap voltage; `largest`: largest cell voltage, V."""
-    model, k_u = model_of(scene), model_of(scene).k_gap * state.u_before
-    sign = choose_branch(model, state.u_before, state.y)
-    found = float(gap_voltage(model, k_u, float(model.gap @ state.y[:-1]), sign, k_u))
-    # Behind an insulating coating, a gap voltage of 0 V is a difference of other voltages: allow for their round-off.
-    return not abs(found - state.u_gap) <= 1e-9 * abs(state.u_gap) + 1e-13 * largest
-
-
 def as_marched(scene: Scene, rows: FloatArray, by_layer: bool = True) -> FloatArray:
-    """Rows in the form of the compiled loop from rows of `write_row`: voltages along the loop, z and the current.
-
-    The voltages are those of the recorded layers (`Scene.shown`), or without `by_layer` those of all cells.
-    """
+    """Voltages of the layers (`Scene.shown`) or all cells along the loop, z and current from rows of `write_row`."""
     model, stack = model_of(scene), scene.stack
     x = rows[:, 5:-1] * (model.area0 * rows[:, 2:3]) if model.mobile else rows[:, 5:-1]
     live = rows[:, :1] * model.k[:-1] + x
@@ -155,7 +141,12 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
         # An area is NaN if it follows its voltage without delay, or if it starts in equilibrium with it.
         u, area = np.zeros(len(network.cells)), np.full(len(network.areas), np.nan)
         if asked and (circuit.initial or any(cell.element.initial is not None for cell in network.cells)):
-            u = start_voltages([c.element for c in network.cells], scene.net.c, circuit.initial)
+            total: dict[str, float] = {}
+            for cell in network.cells:
+                total[cell.element.name] = total.get(cell.element.name, 0.0) + 1.0 / cell.c
+            # The slabs of a dispersive layer share its voltage in proportion to their elastances, as in a jump.
+            started = [(c, start_voltage(c.element, circuit.initial)) for c in network.cells]
+            u = np.array([voltage / (c.c * total[c.element.name]) for c, voltage in started])
             for i, one in enumerate(network.areas):
                 if scene.net.slow[i] >= 0:
                     area[i] = 1e-6 * circuit.initial.get(one.node, math.nan)
@@ -171,11 +162,18 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
     if stack is not None and scene.model is not None and not initial:
         order = list(stack.state_order)
         return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.area0, s
-    contacts = [c if gap >= 0 else None for c, gap in zip(network.contacts, net.gap, strict=True)]
     # The reduced network of a series loop has no nodes, so the operating point needs the unreduced network.
     whole = network if stack is None else build_network(replace(circuit, work="gap"))
-    u, area, held = operating_point(circuit, whole, scene.area0, contacts, initial)
-    u = u if stack is None else _cells_of(network, whole, u)
+    u, area, held = operating_point(scene, circuit, whole, initial)
+    if stack is not None:
+        of: dict[str, list[float]] = {}
+        for cell, one in zip(whole.cells, u.tolist(), strict=True):
+            of.setdefault(cell.element.name, []).append(one)
+        for layer in network.layers:
+            if sum(cell.element is layer for cell in network.cells) == 1:
+                # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
+                of[layer.name] = [sum(of[layer.name])]
+        u = np.array([of[cell.element.name].pop(0) for cell in network.cells])
     if net.mobile:
         for i in np.flatnonzero(held & (net.slow < 0)):
             # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.
@@ -185,18 +183,6 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
             u[net.place == i] *= area[i] / rest
             u[gap] = own
     return u, area, s
-
-
-def _cells_of(network: Network, whole: Network, u: FloatArray) -> FloatArray:
-    """Voltages (V) of a loop's cells from the cell voltages of the same circuit built as a network."""
-    of: dict[str, list[float]] = {}
-    for cell, one in zip(whole.cells, u.tolist(), strict=True):
-        of.setdefault(cell.element.name, []).append(one)
-    for layer in network.layers:
-        if sum(cell.element is layer for cell in network.cells) == 1:
-            # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
-            of[layer.name] = [sum(of[layer.name])]
-    return np.array([of[cell.element.name].pop(0) for cell in network.cells])
 
 
 def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) -> State:
@@ -226,17 +212,20 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
         _, slow, _ = settle(net, u, slow, after)
     sign = np.zeros(len(network.areas))
     state = State(0.0, np.concatenate([x, slow, charge]), before, sign, scene.charge_law)
-    has_gap = scene.model is not None and network.gaps[0] is not None
-    if has_gap and np.any(u) and _unreachable(scene, to_stack(scene, state), float(np.abs(u).max())):
-        raise InputError(f"the start has {u[scene.measured[0]]:.4g} V across the gap, {PAST_FOLD}")
+    model = scene.model
+    if model is not None and network.gaps[0] is not None and np.any(u):
+        # Raised from 0 V, the source has to reach the state's gap voltage.
+        _, x, u_before, u_gap, _ = to_stack(scene, state)
+        k_u, branch = model.k_gap * u_before, choose_branch(model, u_before, x)
+        found = float(gap_voltage(model, k_u, float(model.gap @ x[:-1]), branch, k_u))
+        # Behind an insulating coating, a gap voltage of 0 V is a difference of other voltages, with their round-off.
+        if not abs(found - u_gap) <= 1e-9 * abs(u_gap) + 1e-13 * float(np.abs(u).max()):
+            raise InputError(f"the start has {u[scene.measured[0]]:.4g} V across the gap, {PAST_FOLD}")
     return state
 
 
 def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
-    """Cell voltages (V) along the loop (n_cell,) at the DC operating point, with the area coupled.
-
-    Where two or more layers do not leak, the node between them has no DC voltage: such a start is refused.
-    """
+    """Cell voltages (V) along the loop (n_cell,) at the DC operating point; refused where some node has none."""
     insulating = stack.layers_of(stack.g_total + stack.g_area == 0.0)
     if len(insulating) > 1:
         raise InputError(
@@ -282,17 +271,6 @@ def start_voltage(element: Element, initial: Mapping[str, float]) -> float:
     return initial.get(element.nodes[0], 0.0) - initial.get(element.nodes[1], 0.0)
 
 
-def start_voltages(elements: Sequence[Element], c: FloatArray, initial: Mapping[str, float]) -> FloatArray:
-    """Start voltage of every cell (n_cell,), V, from the cells' elements and capacitances.
-
-    The slabs of a dispersive layer share its voltage in proportion to their elastances, as in a jump.
-    """
-    total: dict[str, float] = {}
-    for element, one in zip(elements, c, strict=True):
-        total[element.name] = total.get(element.name, 0.0) + 1.0 / one
-    return np.array([start_voltage(e, initial) / (one * total[e.name]) for e, one in zip(elements, c, strict=True)])
-
-
 def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Element, ...]:
     """Voltage sources that hold the nodes of ``.ic`` (V) while the operating point is found."""
     tied: dict[str, dict[str, float]] = {}
@@ -317,26 +295,19 @@ def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Elemen
 
 
 def operating_point(
-    circuit: Circuit,
-    network: Network,
-    area0: FloatArray,
-    contacts: Sequence[Contact | None],
-    initial: Mapping[str, float],
+    scene: Scene, circuit: Circuit, network: Network, initial: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Voltages of all cells (V) and areas (m^2) at the DC operating point, and which areas ``.ic`` holds.
 
-    The sources have their values at 0-, and the nodes in `initial` are held. Areas follow their gaps by `contacts`; an
-    area without contact is fixed at `area0` (m^2).
-
-    A node without a path for direct current is refused, and areas that find no operating point.
+    The sources have their values at 0-, and the nodes in `initial` are held.
     """
+    contacts = [c if gap >= 0 else None for c, gap in zip(scene.network.contacts, scene.net.gap, strict=True)]
     conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in network.areas}
     held = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
     if held:
         network = build_network(replace(circuit, work="gap"), held)
-    waves = [e.waveform for e in network.sources]
-    s = np.array([float(w.value(0.0, "left")) for w in waves if w is not None])
-    area = area0.copy()
+    s = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
+    area = scene.area0.copy()
     fixed = np.array([contact is None for contact in contacts], bool)
     asked = np.array([a.node in initial for a in network.areas], bool) & ~fixed
     area[asked] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, asked, strict=True) if mark]
@@ -380,10 +351,7 @@ def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
 
 
 def at_own_area(u: float, area: float, curve: FloatArray) -> float:
-    """The gap voltage (V) on its own area that has the same charge as `u` (V) on `area` (m^2), under ``mobile``.
-
-    Where no voltage has that charge, the start is past the fold and refused.
-    """
+    """The gap voltage (V) on its own area that has the same charge as `u` (V) on `area` (m^2), under ``mobile``."""
 
     def charge(v: float) -> float:
         return v / inverse_area(v, curve)[0]
@@ -406,8 +374,6 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> tuple[Fl
 
     These are what the cells' start voltages u (n_cell,) V come to by Kirchhoff's law, with the sources at `s` (n_s,).
     Areas that are NaN in `slow` are set to their equilibrium at the consistent voltages.
-
-    A start from which this leads past a fold is refused.
     """
     n, free = net.k.shape[0], np.isnan(slow)
     area = np.where(free, 1.0, slow)
@@ -425,10 +391,7 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> tuple[Fl
 
 
 def _along(net: Net, off: FloatArray, s: FloatArray, slow: FloatArray) -> FloatArray:
-    """Live voltages (V) and delivered charges (C) at the end of the homotopy to u = P x + Q s.
-
-    Along it the residual of Kirchhoff's law falls from `off` (n_cell,) V linearly to 0.
-    """
+    """Live voltages (V) and charges (C) where Kirchhoff's residual `off` (n_cell,), V, has fallen to 0 linearly."""
     n, follows = net.k.shape[0], np.flatnonzero((net.gap >= 0) & (net.slow < 0))
     y = np.zeros(n + net.q.shape[1])
     if not np.any(off):
@@ -454,10 +417,7 @@ def _along(net: Net, off: FloatArray, s: FloatArray, slow: FloatArray) -> FloatA
 def _rate(
     net: Net, off: FloatArray, s: FloatArray, slow: FloatArray, follows: IntArray, theta: float, y: FloatArray
 ) -> FloatArray:
-    """Derivative of (x, charges) by the homotopy's parameter `theta` in [0, 1]; NaN past a fold.
-
-    `follows` are the areas that change during the homotopy: those that follow their gaps without delay.
-    """
+    """Derivative of (x, charges) by the homotopy's `theta` in [0, 1], NaN past a fold; `follows` have no delay."""
     u = net.p @ y[: net.k.shape[0]] + net.q @ s + (1.0 - theta) * off
     area, slope = net.area0.copy(), np.zeros(net.area0.size)
     delayed = net.slow >= 0

@@ -19,10 +19,10 @@ from fingerspice.circuit.describe import Parameters, Sources, overridden
 from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
-from fingerspice.solve.planning import make_plan
+from fingerspice.solve.planning import asked, make_plan
 from fingerspice.solve.problem import Problem, check_length, check_outputs
 from fingerspice.solve.recordings.run import BySamples, ByWindows, Mark, Outputs, outputs_of, within
-from fingerspice.solve.simulation import asked, check_arguments, solution_of
+from fingerspice.solve.simulation import check_arguments, solution_of
 from fingerspice.waveforms.waveform import require
 
 # Default length of a chunk, s.

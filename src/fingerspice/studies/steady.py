@@ -30,9 +30,9 @@ from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.solution import Sensitivity, Solution
 from fingerspice.results.spectrum import PhasorSolution
 from fingerspice.results.summary import Figured, Figures
+from fingerspice.solve.derivatives import check_request, period_of, sensitivities_of
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
-from fingerspice.solve.sensitivities import check_request, period_of, sensitivities_of
 from fingerspice.solve.simulation import rtol_given, run_problem
 from fingerspice.waveforms.waveform import Fundamental, require
 

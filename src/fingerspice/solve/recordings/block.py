@@ -1,13 +1,11 @@
-"""A block of a recording in lanes: its pieces followed from starts that are corrected, and windows of them judged.
+"""Which runs are followed in lanes, and in which pieces; and a block of such a piece, followed and judged.
 
-All pieces are followed at once (`engine.lanes.loops`). Their starts are first those of the circuit with its area held;
-after each sweep they are corrected by what the modes decay by in a piece, until xi no longer changes.
+All pieces of a block are followed at once (`engine.lanes.loops`). Their starts are first those of the circuit with its
+area held; after each sweep they are corrected by what the modes decay by in a piece, until xi no longer changes.
 
 A window of each piece, where the source moves most, is followed by steps half as long. The difference is the error of
 the window; a piece adds as much more as it is longer, and hands it on to the pieces after it, as the modes decay: once
 as if all errors were alike, and once as if they came by chance.
-
-Pieces of a run whose source is a recording, or a PWL with dense points at uneven times.
 """
 
 from __future__ import annotations
@@ -16,7 +14,8 @@ import itertools
 import math
 import threading
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,9 +23,11 @@ from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.engine.lanes.loops import MORE, lead, show, span
 from fingerspice.engine.lanes.rows import along, rows_of
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.form import PIECES, LaneForm, recording_of
+from fingerspice.solve.recordings.form import PIECES, LaneForm, finger, rounded_peak, stack
+from fingerspice.solve.scenes import kept_with
 from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.samples import MOST_PER_POINT, Samples, as_samples
+from fingerspice.waveforms.waveform import DC
 
 # A window over its piece, and the fewest samples in one.
 WINDOW, FEWEST = 1.0 / 16.0, 32
@@ -293,10 +294,7 @@ class Block:
         return _Window(z, off, self.x[index], self.xi[index], took)
 
     def _windows(self, width: int) -> list[IntArray]:
-        """Where windows begin in each piece, -1 for none: where the source moves most, and at the start of a run.
-
-        With N as a drive, errors are large where |xi| is, too.
-        """
+        """Where windows begin in each piece, -1 for none: at large moves of the source, under N at large |xi|, too."""
         moves, whole = _scratch("moves", PIECES * self.count), self.count - self.count % width
         np.abs(np.subtract(self.x[1:], self.x[:-1], out=moves), out=moves)
         most = moves.reshape(PIECES, self.count)[:, :whole].reshape(PIECES, -1, width).max(axis=-1)
@@ -343,8 +341,7 @@ class Piece:
     # start, spacing: Time of the first sample and distance of the samples, s
     start: float
     spacing: float
-    # first, last: Numbers of the first and the last sample; both 0 for a single step between two times that are no
-    # samples
+    # first, last: Numbers of the first and the last sample; both 0 for one step between two times that are no samples
     first: int = 0
     last: int = 0
     # Whether its steps grow from its start on: where a run of a network starts, the source may jump, after which fast
@@ -369,31 +366,45 @@ class Piece:
         return wave.between(self.first, self.last + 1)
 
 
-def driving(problem: Problem) -> Samples | PWL | None:
-    """The recording that drives a stack, or one source of a network whose other sources are at 0; else None.
+def driving(problem: Problem) -> tuple[int, Samples | PWL] | None:
+    """Number and waveform of the one source that is a recording, where all others are at 0; else None.
 
     For a stack it may also be a PWL with many points, without jump in the run.
     """
-    if problem.scene.stack is not None:
-        wave = problem.waveform
-        samples = as_samples(wave)
-        if samples is None and isinstance(wave, PWL) and wave.repeat is None:
-            return None if _points(problem, wave) is None else wave
-        return samples
-    found = recording_of(problem)
-    return None if found is None else found[1]
+    wave = problem.waveform
+    if problem.scene.stack is not None and isinstance(wave, PWL) and wave.repeat is None and as_samples(wave) is None:
+        return None if _points(problem, wave) is None else (0, wave)
+    on = [(i, as_samples(w)) for i, w in enumerate(problem.waveforms) if not (isinstance(w, DC) and w.level == 0.0)]
+    return (on[0][0], on[0][1]) if len(on) == 1 and on[0][1] is not None else None
+
+
+# Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, peak and thread.
+MOST_FORMS = 16
+
+
+def ready(problem: Problem, rtol: float) -> LaneForm | None:
+    """The scene under a recording (`driving`) prepared for a decade of errors; None where lanes do not apply to it.
+
+    It is cached with the scene, or with a stack for all sources of about its peak.
+    """
+    scene, decade, found = problem.scene, float(10.0 ** np.floor(np.log10(rtol))), driving(problem)
+    key: tuple[Any, ...] = "followed", decade, problem.charge, threading.get_ident()
+    if scene.stack is not None:
+        key = *key, scene.charge_law, rounded_peak(scene.u_peak)
+        return kept_with(scene.stack.kept, key, MOST_FORMS, lambda: stack(problem, decade))
+    source, wave = found or (0, None)
+    assert isinstance(wave, Samples)
+    return kept_with(scene.prepared, key, MOST_FORMS, partial(finger, problem, decade, source, wave))
 
 
 def _points(problem: Problem, wave: PWL) -> FloatArray | None:
-    """Times (s) of the points within a run, with its start and end, and with more on long lines; None if not dense.
-
-    They are kept with the waveform, for the last run that asked.
-    """
+    """Times (s) of a run's points and ends, and more on long lines, kept for the last run; None if not dense."""
     key = problem.t_start, problem.t_stop
-    found: tuple[tuple[float, float], FloatArray | None] | None = wave.kept.get("points")
-    if found is None or found[0] != key:
-        found = wave.kept["points"] = key, _dense(wave.knots[0], *key)
-    return found[1]
+    found: FloatArray | None
+    of, found = wave.kept.get("points", (None, None))
+    if of != key:
+        _, found = wave.kept["points"] = key, _dense(wave.knots[0], *key)
+    return found
 
 
 def _dense(t: FloatArray, t0: float, t1: float) -> FloatArray | None:
@@ -419,9 +430,10 @@ def spacing_of(wave: Samples | PWL) -> float:
 
 def pieces_of(problem: Problem) -> list[Piece] | None:
     """The pieces of a run with a moving area that is driven by a recording of enough samples; else None."""
-    wave = driving(problem) if problem.scene.coupled else None
-    if wave is None:
+    found = driving(problem) if problem.scene.coupled else None
+    if found is None:
         return None
+    _, wave = found
     if isinstance(wave, PWL):
         points, spacing = _points(problem, wave), spacing_of(wave)
         assert points is not None

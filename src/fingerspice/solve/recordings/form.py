@@ -57,8 +57,7 @@ from fingerspice.solve.one_area import as_recorded, on_branch, system_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK, Scene
 from fingerspice.solve.starting import StackState, from_stack
-from fingerspice.waveforms.samples import Samples, as_samples
-from fingerspice.waveforms.waveform import DC
+from fingerspice.waveforms.samples import Samples
 
 # Number of lanes, each with a piece of a recording.
 PIECES = 64
@@ -391,10 +390,7 @@ def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, Flo
 
 
 class Reduced:
-    """A network with one moving area, in modes w at reference areas `area0`; behind them the charges, if wanted.
-
-    Only source number `source` is not 0.
-    """
+    """A network with one moving area and one `source` that is not 0, in modes w at `area0`; behind them the charges."""
 
     def __init__(self, scene: Scene, source: int, area0: FloatArray, charge: bool) -> None:
         net, network = scene.net, scene.network
@@ -470,20 +466,6 @@ LEAST_MODES = 4
 _TYPICAL = 0.5
 
 
-def recording_of(problem: Problem) -> tuple[int, Samples] | None:
-    """Number and samples of the one source of a network that is a recording, if all others are at 0."""
-    found = None
-    for i, wave in enumerate(problem.waveforms):
-        samples = as_samples(wave)
-        if samples is not None:
-            if found is not None:
-                return None
-            found = i, samples
-        elif not (isinstance(wave, DC) and wave.level == 0.0):
-            return None
-    return found
-
-
 def is_followed(scene: Scene, circuit: Circuit) -> bool:
     """Whether a scene is a network with one area that moves, at once and under the local law, of cells in series."""
     net = scene.net
@@ -507,23 +489,19 @@ class NetworkForm(LaneForm):
 
     reduced: Reduced
 
-    def _bend_at(self, u: float) -> float:
-        """N at a gap voltage u (V), from xi by Newton's method."""
-        xi, c = float(u), self.lanes
+    def start(self, problem: Problem) -> tuple[FloatArray, float]:
+        start, reduced, active, c = problem.initial, self.reduced, self.active, self.lanes
+        n = reduced.absorbed.size
+        x, s, net = start.y[:n], start.s_before, reduced.scene.net
+        u = xi = float(net.p[reduced.gap] @ x + net.q[reduced.gap] @ s)
+        # Newton's method from the gap voltage to xi.
         for _ in range(50):
-            at = np.array(xi)
-            e = 1.0 / float(self.inverse_area(at)) - 1.0 / c.q0
-            step = (xi - c.kappa * float(self.bend(at)) - u) * (1.0 + c.kappa * e)
+            e = 1.0 / float(self.inverse_area(np.array(xi))) - 1.0 / c.q0
+            step = (xi - c.kappa * float(self.bend(np.array(xi))) - u) * (1.0 + c.kappa * e)
             xi -= step
             if abs(step) <= 1e-15 * abs(xi):
                 break
-        return float(self.bend(np.array(xi)))
-
-    def start(self, problem: Problem) -> tuple[FloatArray, float]:
-        start, reduced, active = problem.initial, self.reduced, self.active
-        n = reduced.absorbed.size
-        x, s, net = start.y[:n], start.s_before, reduced.scene.net
-        bend = self._bend_at(float(net.p[reduced.gap] @ x + net.q[reduced.gap] @ s))
+        bend = float(self.bend(np.array(xi)))
         z = np.zeros(self.lanes.rates.size)
         z[:n] = reduced.modes.inverse @ (x + reduced.modes.follow @ s) - reduced.absorbed * bend
         held = self.rows.columns @ z + self.rows.bends * bend + self.rows.k * s[reduced.source]
@@ -545,14 +523,16 @@ class NetworkForm(LaneForm):
         return out.T if self.flows else np.concatenate([out, held]).T
 
 
-def finger(problem: Problem, rtol: float) -> NetworkForm | None:
-    """The network prepared for recordings, or None where this form does not apply or no polynomial is good enough."""
-    found, scene = recording_of(problem), problem.scene
-    if found is None or not is_followed(scene, problem.circuit):
+def finger(problem: Problem, rtol: float, source: int, wave: Samples) -> NetworkForm | None:
+    """The network under a recording as its source of that number; None where no form or no polynomial serves."""
+    scene = problem.scene
+    if not is_followed(scene, problem.circuit):
         return None
-    source, wave = found
-    share = _largest_share(Reduced(scene, source, scene.area0, False), wave.rate, problem.t_stop)
-    (moving,) = np.flatnonzero(scene.net.gap >= 0)
+    # The gap's largest share of a sine of the source, over the frequencies that a recording may have.
+    one, lowest = Reduced(scene, source, scene.area0, False), min(1.0 / problem.t_stop, 0.4 * wave.rate)
+    omega = 2.0 * np.pi * np.geomspace(lowest, 0.5 * wave.rate, _FREQUENCIES)
+    response = one.k + (one.shape * one.gain / (1j * omega[:, None] + one.rates)).sum(axis=1)
+    share, moving = float(np.abs(response).max()), one.moving
     # The peak of a current is not known to the scene; that of a voltage has been looked up in the file already.
     typical = _TYPICAL * min(scene.u_top, share * (scene.u_peak or wave.peak(0.0, problem.t_stop)))
     area0 = scene.area0.copy()
@@ -578,10 +558,3 @@ def finger(problem: Problem, rtol: float) -> NetworkForm | None:
         lanes, active, 2, False, rows, nodes, one.rates.size - one.absorbed.size, float(contact.stress(1.0)), share,
         scene.u_top, missed, missed_bend, float(problem.network.capacitance(area0).sum()), one,
     )  # fmt: skip
-
-
-def _largest_share(one: Reduced, rate: float, stop: float) -> float:
-    """The gap's largest share of a sine of the source, over the frequencies that a recording may have."""
-    omega = 2.0 * np.pi * np.geomspace(min(1.0 / stop, 0.4 * rate), 0.5 * rate, _FREQUENCIES)
-    response = one.k + (one.shape * one.gain / (1j * omega[:, None] + one.rates)).sum(axis=1)
-    return float(np.abs(response).max())

@@ -9,10 +9,7 @@ long the run is, and whether all outputs are held in one array or streamed in ch
 from __future__ import annotations
 
 import math
-import threading
 from dataclasses import dataclass, replace
-from enum import Enum
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,12 +18,10 @@ from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.circuit.network import Network
 from fingerspice.engine.lanes.loops import flow, show
 from fingerspice.results.outcome import Plan, State, Status
-from fingerspice.results.record import Record
 from fingerspice.solve.problem import Problem, at_breakpoints
-from fingerspice.solve.recordings.block import OF_FORCE, Block, Judged, Piece, driving, pieces_of, spacing_of
-from fingerspice.solve.recordings.form import PIECES, LaneForm, finger, rounded_peak, stack
+from fingerspice.solve.recordings.block import OF_FORCE, Block, Judged, Piece, driving, pieces_of, ready, spacing_of
+from fingerspice.solve.recordings.form import PIECES, LaneForm
 from fingerspice.solve.runs import Progress, Run, closed_form, excess_of
-from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.simulation import integrated, own_rtol, state_error
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.sampling import on_breakpoint, on_grid
@@ -60,10 +55,8 @@ LEAST_PEAK = 1e-3
 LEAST_AT_START = 0.1
 
 
-class Outcome(Enum):
-    """Outcome of a piece: its error is met, or not met, or this method cannot integrate it (LOST)."""
-
-    MET, NOT_MET, LOST = range(3)
+class LostError(Exception):
+    """A piece cannot be followed in lanes, however short their steps are."""
 
 
 class LaneMarch:
@@ -78,8 +71,9 @@ class LaneMarch:
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
         # The error allowed is reduced to a `share` where errors of earlier pieces add up.
         self.problem, self.form, self.rtol, self.share = problem, form, rtol, share
-        wave = driving(problem)
-        assert wave is not None
+        found = driving(problem)
+        assert found is not None
+        _, wave = found
         # Time reached (s), and largest |U| of the source so far, V.
         self.wave, self.usual, self.t, self.loudest = wave, spacing_of(wave), problem.t_start, 0.0
         # Of a source of current the scene knows no peak.
@@ -105,20 +99,29 @@ class LaneMarch:
         self.outputs = 0
         return np.empty((self.form.rows.k.size + self.form.flows, t_out.size))
 
-    def follow(self, piece: Piece, t_out: FloatArray, out: FloatArray) -> Outcome:
-        """Integrate a piece, and write the outputs before its end as rows of `out`."""
+    def follow(self, piece: Piece, t_out: FloatArray, out: FloatArray) -> bool:
+        """Integrate a piece, and write the outputs before its end as rows of `out`; False where its error is not met.
+
+        Of a piece that grows, all steps lie on one line of the source, and become longer from a part of the shortest
+        time constant on.
+        """
         values = piece.values(self.wave)
         self.loudest = max(self.loudest, float(values.max()), -float(values.min()))
         if piece.grows:
-            piece, values = self._growing(piece, values)
+            span = piece.stop - piece.start
+            shortest = min(EARLY / float(self.form.lanes.rates.max()), span / (PIECES * GROWN))
+            share = np.append(0.0, np.geomspace(shortest / span, 1.0, PIECES * GROWN))
+            share[-1] = 1.0
+            piece = replace(piece, times=piece.start + share * span)
+            values = values[0] + share * (values[-1] - values[0])
         h = np.array([piece.spacing]) if piece.times is None else np.diff(piece.times)
         starts_at = self.form.after(self.z, float(values[0]))
         tries = self.steps == 0 and self.rtol < AT_ONCE[self.form.bent] and values.size > 4 * FIRST
         for size in (FIRST, values.size - 1)[0 if tries else 1 :]:
             block = Block(self.form, values[: size + 1], h[:size], self.steps == 0)
-            outcome, seen, excess = self._climb(block, starts_at, LEAST_AT_START if piece.grows else LEAST_PEAK)
-            if outcome is not Outcome.MET:
-                return outcome
+            seen, excess = self._climb(block, starts_at, LEAST_AT_START if piece.grows else LEAST_PEAK)
+            if not excess <= 1.0:
+                return False
         assert seen is not None
         parts, self.peak = PARTS[self.level], max(float(block.peaks.max()), self.peak)
         self.errors = np.maximum(seen.errors, self.errors)
@@ -130,10 +133,10 @@ class LaneMarch:
             self.level = 0
         elif excess < COARSER and self.level > 0:
             self.level -= 1
-        return Outcome.MET
+        return True
 
-    def _climb(self, block: Block, starts_at: float, share: float) -> tuple[Outcome, Judged | None, float]:
-        """Solve a block, with ever more steps a sample until its error is met; its errors and their excess."""
+    def _climb(self, block: Block, starts_at: float, share: float) -> tuple[Judged | None, float]:
+        """Solve a block, with ever more steps until its error is met; the errors, and their excess, else above 1."""
         form, seen = self.form, None
         while True:
             parts, excess = PARTS[self.level], math.inf
@@ -146,39 +149,23 @@ class LaneMarch:
                 # Under `mobile` the run stays on the branch on which it starts.
                 near = not form.mobile or abs(block.xi[0] - starts_at) <= 0.01 * peak
                 if not (near and block.on_one_branch and form.gap(np.array(peak)) <= form.u_top):
-                    return Outcome.LOST, seen, excess
+                    raise LostError
                 peak = max(peak, self.peak)
                 seen = block.judge(parts, peak, self.alike, self.chance)
-                excess = self._excess(seen, peak, share)
+                gaps, _, _ = self._stated(np.maximum(seen.errors, self.errors), peak)
+                # Errors are related to a share of the largest gap voltage to expect at least.
+                least = max(self.least, share * self.expected)
+                gaps[0, :2] = np.maximum(gaps[0, :2], [least, float(form.force(np.array(least)))])
+                excess = excess_of(gaps, self.problem.rounding) / self.rtol
+                if self.share < 1.0:
+                    excess = max(excess, SAFETY * seen.alone / (self.share * self.rtol * max(peak, self.least)))
             if excess <= 1.0:
-                return Outcome.MET, seen, excess
+                return seen, excess
             self.refused += parts * block.n
             if self.level + 1 == len(PARTS):
-                return Outcome.NOT_MET, seen, excess
+                return seen, excess
             finer = math.ceil(math.log(excess) / math.log(FINER[form.bent])) if excess < math.inf else 1
             self.level = min(self.level + max(1, finer), len(PARTS) - 1)
-
-    def _growing(self, piece: Piece, values: FloatArray) -> tuple[Piece, FloatArray]:
-        """A piece on one line of the source, with steps that grow from a part of the shortest time constant on."""
-        span = piece.stop - piece.start
-        shortest = min(EARLY / float(self.form.lanes.rates.max()), span / (PIECES * GROWN))
-        share = np.append(0.0, np.geomspace(shortest / span, 1.0, PIECES * GROWN))
-        share[-1] = 1.0
-        line = values[0] + share * (values[-1] - values[0])
-        return replace(piece, times=piece.start + share * span), line
-
-    def _excess(self, seen: Judged, peak: float, share: float) -> float:
-        """Excess of the stated over the allowed error, with a block's.
-
-        It is related to a `share` of the largest gap voltage to expect at least.
-        """
-        gaps, _, _ = self._stated(np.maximum(seen.errors, self.errors), peak)
-        least = max(self.least, share * self.expected)
-        gaps[0, :2] = np.maximum(gaps[0, :2], [least, float(self.form.force(np.array(least)))])
-        excess = excess_of(gaps, self.problem.rounding) / self.rtol
-        if self.share < 1.0:
-            excess = max(excess, SAFETY * seen.alone / (self.share * self.rtol * max(peak, self.least)))
-        return excess
 
     def _write(self, piece: Piece, block: Block, parts: int, t_out: FloatArray, out: FloatArray) -> None:
         """Write the outputs before the end of a block."""
@@ -211,10 +198,7 @@ class LaneMarch:
     def _show(
         self, x: FloatArray, slope: FloatArray, first: IntArray, kept: FloatArray, xi: FloatArray, out: FloatArray
     ) -> None:  # fmt: skip
-        """Write the next outputs into columns of `out`: from the source, its slope (V/s), states as in `Block`, and xi.
-
-        The latter has the shape (n,).
-        """
+        """Write the next outputs into columns of `out`: from source, slope (V/s), states as in `Block`, and xi (n,)."""
         form, n, shown, start = self.form, xi.size, self.form.rows, self.outputs
         count, charges, self.outputs = n if first.size == 1 else int(first[1]), len(shown.k) - form.flows, start + n
         show(form.shown, x, first, count, start, n, kept, out)
@@ -278,22 +262,6 @@ class LaneMarch:
 # Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
 # and add up, a later piece cannot make up for errors of the earlier ones.
 BEGINNINGS = (1.0, 0.03)
-# Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, peak and thread.
-MOST_FORMS = 16
-
-
-def ready(problem: Problem, rtol: float) -> LaneForm | None:
-    """The scene prepared for this method and a decade of errors; None where it does not apply.
-
-    It is cached with the scene, or with a stack for all sources of about its peak.
-    """
-    scene, decade = problem.scene, float(10.0 ** np.floor(np.log10(rtol)))
-    key: tuple[Any, ...] = "followed", decade, problem.charge, threading.get_ident()
-    if scene.stack is not None:
-        key = *key, scene.charge_law, rounded_peak(scene.u_peak)
-    kept, make = (scene.prepared, finger) if scene.stack is None else (scene.stack.kept, stack)
-    one: LaneForm | None = kept_with(kept, key, MOST_FORMS, partial(make, problem, decade))
-    return one
 
 
 def _prepared(problem: Problem, rtol: float) -> tuple[list[Piece], LaneForm] | None:
@@ -305,40 +273,38 @@ def _prepared(problem: Problem, rtol: float) -> tuple[list[Piece], LaneForm] | N
 
 def solve(problem: Problem, rtol: float, progress: Progress | None = None) -> Run | None:
     """A run sample by sample; None where this method does not apply (no recording) or does not meet the error."""
-    found = _prepared(problem, rtol)
+    found, refused, t_out = _prepared(problem, rtol), 0, problem.t_out
     if found is None:
         return None
     pieces, one = found
-    refused, t_out, left = 0, problem.t_out, problem.left
+
+    def again(other: Problem) -> Run:
+        run = solve(other, rtol)
+        assert run is not None
+        return run
+
     for share in BEGINNINGS:
         march = LaneMarch(problem, one, rtol, share)
         out = march.outputs_at(t_out)
         for piece in pieces:
-            outcome = march.follow(piece, t_out, out)
-            if outcome is not Outcome.MET:
+            try:
+                met = march.follow(piece, t_out, out)
+            except LostError:
+                return None
+            if not met:
+                refused += march.refused
                 break
             if progress is not None:
-                progress((march.t - problem.t_start) / (problem.t_stop - problem.t_start))
-        if outcome is Outcome.LOST:
-            return None
-        if outcome is Outcome.NOT_MET:
-            refused += march.refused
-            continue
-        march.finish(t_out, out)
-        run = march.run(t_out, left, one.recorded(problem, out))
-        run.stats["rejected"] += refused
-        # Else the peaks stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
-        if run.excess(problem.rounding) <= rtol:
-            run.continuous = closed_form(replace(problem, charge=False), partial(_again, rtol=rtol), rtol)
-            return run
+                progress(problem.done(march.t))
+        else:
+            march.finish(t_out, out)
+            run = march.run(t_out, problem.left, one.recorded(problem, out))
+            run.stats["rejected"] += refused
+            # Else the peaks stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
+            if run.excess(problem.rounding) <= rtol:
+                run.continuous = closed_form(replace(problem, charge=False), again, rtol)
+                return run
     return None
-
-
-def _again(problem: Problem, rtol: float) -> Run:
-    """The same run with other outputs."""
-    run = solve(problem, rtol)
-    assert run is not None
-    return run
 
 
 # Number of outputs in a window of a run that is not integrated sample by sample.
@@ -421,7 +387,10 @@ class BySamples:
         t = o.times(self.written, end)
         run_at = t if o.rated else at_breakpoints(_between(self.problem, piece.start, piece.stop), t)
         out = march.outputs_at(run_at)
-        if march.follow(piece, run_at, out) is not Outcome.MET:
+        try:
+            if not march.follow(piece, run_at, out):
+                return None
+        except LostError:
             return None
         if last:
             march.finish(run_at, out)
@@ -477,7 +446,13 @@ class ByWindows:
             run.gaps = np.maximum(run.gaps, self.gaps)
         self.last, self.gaps, self.state = run, run.gaps, run.state
         self.written += run.t.size
-        return t[: run.t.size], _as_shown(run.record(problem), whole)
+        record = run.record(problem)
+        shown, n = whole.scene.shown.network, record.network.k.shape[0]
+        if len(shown.cells) == len(record.network.cells):
+            return t[: run.t.size], record.rows
+        # In the form of exponential steps, whichever method has computed them.
+        place = [shown.layers.index(shown.cells[i].element) for i in shown.live]
+        return t[: run.t.size], np.column_stack([record.u_layer[:, place], record.rows[:, n:]])
 
     def run(self) -> Run:
         assert self.last is not None
@@ -496,12 +471,3 @@ def within(network: Network, t0: float, t1: float) -> Network:
         replace(e, waveform=e.waveform.part(t0, t1)) if isinstance(e.waveform, Samples) else e for e in network.sources
     ]
     return replace(network, sources=tuple(cut))
-
-
-def _as_shown(record: Record, problem: Problem) -> FloatArray:
-    """Rows in the form of exponential steps (see `Scene.shown`), whichever method has computed them."""
-    shown, n = problem.scene.shown.network, record.network.k.shape[0]
-    if len(shown.cells) == len(record.network.cells):
-        return record.rows
-    place = [shown.layers.index(shown.cells[i].element) for i in shown.live]
-    return np.column_stack([record.u_layer[:, place], record.rows[:, n:]])

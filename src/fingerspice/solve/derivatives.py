@@ -1,15 +1,19 @@
-"""Derivatives of a number that follows from a run by every sample of its source.
+"""Derivatives of runs: of signals by parameters, and of a number by every sample of the source.
 
-The run is followed in lanes (`solve.recordings.block`), by so many steps in each interval between samples. What an
-interval leads to is differentiated by what it starts from and by the source at its ends (`engine.lanes.loops`); back
-from the end of the run, these derivatives are multiplied.
+By parameters they are fourth-order differences of runs with a much smaller error than the run's own. At an `rtol` of
+1e-10 the gap voltages of networks are differentiated to 1e-9 of their peaks, for a change of a parameter by all of
+itself, and all signals to 2e-9 (tests/test_sensitivity.py).
+
+For those by samples the run is followed in lanes (`solve.recordings.block`), by so many steps in each interval between
+samples. What an interval leads to is differentiated by what it starts from and by the source at its ends
+(`engine.lanes.loops`); back from the end of the run, these derivatives are multiplied.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,17 +21,153 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.loop import network_of
 from fingerspice.engine.lanes.loops import AREAS, GAP, MORE, SQUARES, lead, sum_back
 from fingerspice.numerics.modes import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes
 from fingerspice.results.outcome import Failure, SolveError, Status
-from fingerspice.results.solution import MEANS, SIGNALS, SampleGradient, Solution
+from fingerspice.results.solution import MEANS, SIGNALS, SampleGradient, Sensitivity, Solution
+from fingerspice.solve.planning import asked
 from fingerspice.solve.problem import Problem
-from fingerspice.solve.recordings.block import Block, driving
-from fingerspice.solve.recordings.run import ready
-from fingerspice.solve.simulation import asked
+from fingerspice.solve.recordings.block import Block, driving, ready
 from fingerspice.waveforms.samples import Samples, as_samples
 from fingerspice.waveforms.waveform import DC, Sum, Waveform
+
+# Error asked of the runs that are compared, over the run's own, and the least one; and what may be left of it where
+# rounding is in the way, over the run's own.
+_SHARE, _FINEST, _KNOWN = 1e-3, 3e-13, 1e-2
+# Step relative to a parameter, at which what the runs' errors and the difference's truncation do are about the same;
+# and shares of it for outputs at which the gap voltage changes its sign in a step.
+_STEP, _CLOSER = 5e-4, (0.03, 1e-3)
+
+# The same run of another circuit, with another `rtol`.
+Runner = Callable[[Circuit, float], Solution]
+
+
+class _Parameter:
+    """A parameter by which a run is differentiated; refused if it is unknown, or not covered."""
+
+    def __init__(self, problem: Problem, path: str) -> None:
+        self.circuit, known = problem.circuit, {name.lower(): name for name in problem.circuit.parameters}
+        if path.lower() not in known:
+            # Refused with the nearest name.
+            self.circuit.varied({path: 1.0})
+        self.path = known[path.lower()]
+        parameter = self.circuit.parameters[self.path]
+        self.value, self.unit, self.step = parameter.value, parameter.unit, _STEP
+        if not (math.isfinite(self.value) and self.value != 0.0):
+            raise InputError(
+                f"sensitivities names {self.path}, which is {self.value:g}; allowed: parameters whose value is finite "
+                "and not 0, as steps are relative to it"
+            )
+        element, span = self.path.rpartition(".")[0], (problem.t_start, problem.t_stop)
+        own = self.circuit[element].waveform
+        if own is None:
+            return
+        # A phase is a frequency times all the time since the start.
+        self.step /= max(1.0, 2.0 * math.pi * problem.t_stop / own.shortest_time())
+        for wave in (circuit[element].waveform for circuit in self.circuits()):
+            if wave is None or not np.array_equal(wave.breakpoints(*span), own.breakpoints(*span)):
+                raise InputError(
+                    f"sensitivities names {self.path}, which moves the edges of its source; allowed: parameters "
+                    "that leave them where they are, such as an amplitude, or the frequency of a sine"
+                )
+
+    def circuits(self, share: float = 1.0) -> list[Circuit]:
+        """Circuits around its value, with a `share` of the step."""
+        return [self.circuit.varied({self.path: self.value * (1.0 + share * self.step * at)}) for at in AT]
+
+    def by(self, values: Sequence[FloatArray | float], share: float = 1.0) -> FloatArray:
+        """Derivative of what has these values for the circuits."""
+        return derivative(values, share * self.step * self.value)
+
+    def longer(self) -> float:
+        """Relative change of the sources' common period, per unit of the parameter; NaN where there is none near it."""
+        own, *periods = (period_of(circuit) or math.nan for circuit in (self.circuit, *self.circuits()))
+        if not max(abs(period / own - 1.0) for period in periods) <= 0.01:
+            return math.nan
+        return float(self.by(periods)) / own if set(periods) != {own} else 0.0
+
+    def runs(self, share: float, run: Runner, solution: Solution) -> list[Solution]:
+        """The runs of `circuits`, whose errors are small enough, and whose outputs are at one time."""
+        found = [run(circuit, max(_SHARE * solution.rtol, _FINEST)) for circuit in self.circuits(share)]
+        for other in found:
+            largest = float(np.abs(_gaps(other)).max())
+            known = other.status is Status.ERROR_NOT_MET and other.error.u_gap <= _KNOWN * solution.rtol * largest
+            if other.failure is not None and not known:
+                raise SolveError(other.failure, solution)
+            if not np.array_equal(other.t, solution.t):
+                raise InputError(
+                    f"sensitivities names {self.path}, which moves the times at which the run has outputs; allowed: "
+                    "other parameters, or given t_eval"
+                )
+        return found
+
+
+def _gaps(run: Solution) -> FloatArray:
+    """Gap voltages, V, shape (n_t, n_gap)."""
+    assert run.u_gap is not None
+    return run.u_gap.reshape(run.t.size, -1)
+
+
+def period_of(circuit: Circuit) -> float | None:
+    """Common period of a circuit's sources, s."""
+    waves = network_of(circuit).waveforms
+    return (waves[0] if len(waves) == 1 else Sum(waves)).period
+
+
+def check_request(problem: Problem, paths: Sequence[str], method: str, start: str) -> str:
+    """Refuse a run that has no sensitivities; the method of the runs that are compared."""
+    if isinstance(paths, str) or not all(isinstance(path, str) for path in paths):
+        raise InputError(f"sensitivities is {paths!r}; allowed: a sequence of paths such as ('Xgap.d',)")
+    for what, refused in (
+        ("the circuit has no GAP", not problem.network.fingers),
+        ("the run goes on from another one", start == "given"),
+        (f"the method is {method!r}", method not in ("auto", "exponential")),
+    ):
+        if refused:
+            raise InputError(
+                f"sensitivities are asked for, and {what}; allowed: a circuit with a GAP, one of the other starts, and "
+                "the methods 'auto' and 'exponential'"
+            )
+    # A recording, or a PWL with many points, is otherwise followed point by point, to no error as small as needed here.
+    return method if driving(problem) is None else "exponential"
+
+
+def sensitivities_of(
+    problem: Problem, solution: Solution, paths: Sequence[str], run: Runner, over_period: bool = False
+) -> dict[str, Sensitivity]:
+    """Derivatives of a run's signals and means; `over_period`: of means over a period, which a parameter may change.
+
+    A run with a parameter near its value that fails is a `SolveError`.
+    """
+    found = {}
+    for one in [_Parameter(problem, path) for path in paths]:
+        longer = one.longer() if problem.begun is not None else 0.0
+        if math.isnan(longer):
+            raise InputError(
+                f"sensitivities of a periodic state name {one.path}, near whose value the source has no such period; "
+                "allowed: other parameters, or a run from another start"
+            )
+        runs = one.runs(1.0, run, solution)
+        by: dict[str, Any] = {name: one.by([getattr(other, name) for other in runs]) for name in (*SIGNALS, *MEANS)}
+        for share in _CLOSER:
+            # The area has a kink where the gap voltage is 0.
+            signs = np.sign([_gaps(other) for other in runs])
+            turned = np.any(signs != signs[0], axis=(0, 2))
+            if not turned.any():
+                break
+            runs = one.runs(share, run, solution)
+            for name in SIGNALS:
+                by[name][turned] = one.by([getattr(other, name)[turned] for other in runs], share)
+        for name in MEANS if over_period else ():
+            # The mean over a period that grows takes up what the signal is at its end.
+            at_end = getattr(solution, name.removesuffix("_mean"))[-1]
+            by[name] = by[name] + longer * (at_end - getattr(solution, name))
+        found[one.path] = Sensitivity(one.path, one.unit, one.value, **by)
+    return found
+
 
 # Steps of an interval: of the first two numbers, or below this `rtol` of the second and third, and twice as many while
 # these differ; and the error wanted, relative to the largest derivative, over `rtol`.
@@ -37,7 +177,8 @@ _APART = 1e-5
 # Intervals whose derivatives are held at once.
 _AT_ONCE = 1 << 13
 # Change of starts that is left, over the largest voltage; errors of the polynomials, over that asked for.
-_CLOSED, _SHARE = 1e-14, 1e-2
+_CLOSED, _OF_AREA = 1e-14, 1e-2
+_ASKED = "derivatives by samples are asked for, and "
 
 
 def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
@@ -50,12 +191,11 @@ def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
         if name not in by:
             raise InputError(f"unknown signal {name!r}; allowed: {allowed}")
         value = real_numbers(name, given, "numbers, derivatives by the signal")
-        shape = () if name in MEANS else run.t.shape
-        if value.shape != shape or not np.isfinite(value).all():
+        shape, finite = () if name in MEANS else run.t.shape, bool(np.isfinite(value).all())
+        if value.shape != shape or not finite:
             raise InputError(
-                f"{name} has the shape {value.shape}"
-                + ("" if np.isfinite(value).all() else " and numbers that are not finite")
-                + f"; allowed: the shape {shape}, finite: the derivative of a number by that signal"
+                f"{name} has the shape {value.shape}{'' if finite else ' and numbers that are not finite'}; allowed: "
+                f"the shape {shape}, finite: the derivative of a number by that signal"
             )
         by[name] = value
     ((_, contact),) = run.record.fingers
@@ -69,18 +209,16 @@ def _source_of(problem: Problem) -> tuple[str, float, Samples]:
     """Name, sign along the loop and samples of the only source that is a recording, beside constant ones."""
     scene, stack = problem.scene, problem.scene.stack
     if len(problem.network.fingers) != 1 or not scene.coupled:
-        raise InputError(
-            "derivatives by samples are asked for, and the circuit has no single GAP whose area is coupled; allowed: "
-            "one"
-        )
+        raise InputError(f"{_ASKED}the circuit has no single GAP whose area is coupled; allowed: one")
     sources = [(e, 1.0) for e in problem.network.sources] if stack is None else stack.sources
     waves = [(e.name, float(sign), None if e.waveform is None else as_samples(e.waveform)) for e, sign in sources]
     known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
-    if len(known) != 1 or not isinstance(driving(problem), Samples):
+    _, wave = driving(problem) or (0, None)
+    if len(known) != 1 or not isinstance(wave, Samples):
         others = "sources of 0" if stack is None else "constant ones"
         raise InputError(
-            f"derivatives by samples are asked for, and of the circuit's {len(waves)} sources {len(known)} are "
-            f"recordings; allowed: one, such as fs.Samples, or a PWL on an even grid, beside {others}"
+            f"{_ASKED}of the circuit's {len(waves)} sources {len(known)} are recordings; allowed: one, such as "
+            f"fs.Samples, or a PWL on an even grid, beside {others}"
         )
     return known[0]
 
@@ -93,11 +231,11 @@ class _Intervals:
         problem, rtol = self.problem, run.rtol
         # Of the source: its name, its sign along the loop, and its samples.
         self.name, self.sign, wave = _source_of(problem)
-        form = ready(problem, max(_SHARE * rtol, 1e-13)) or ready(problem, rtol)
+        form = ready(problem, max(_OF_AREA * rtol, 1e-13)) or ready(problem, rtol)
         if form is None:
             raise InputError(
-                "derivatives by samples are asked for, and this circuit is not followed sample by sample "
-                "(docs/recordings.md); allowed: a circuit that is"
+                f"{_ASKED}this circuit is not followed sample by sample (docs/recordings.md); allowed: a circuit that "
+                "is"
             )
         self.wave, self.form, self.first, self.m = wave, form, 0 if rtol >= _COARSE else 1, form.lanes.rates.size
         t0, t1 = problem.t_start, problem.t_stop
@@ -110,9 +248,6 @@ class _Intervals:
         self.x, h = np.ascontiguousarray(problem.waveform.value(self.t)), np.diff(self.t)
         # Lengths of the intervals (n,), or their common one (1,), s
         self.h = h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
-        # Sign of the gap voltage along the loop.
-        stack = problem.scene.stack
-        self.turn = 1.0 if stack is None or stack.gap is None else float(stack.sign[stack.gap])
 
     def follow(self) -> None:
         """Find the modes at the starts of all intervals (m, n), and the distances of their differences (m + 1,)."""
@@ -168,14 +303,15 @@ class _Intervals:
 
     def outputs(self, by: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
         """Derivatives of a number by modes (2, m, n) and source (2, n + 1) at all times, by the outputs after each."""
-        n, m, t, x, run = self.x.size - 1, self.m, self.t, self.x, self.run
+        n, m, t, x, run, stack = self.x.size - 1, self.m, self.t, self.x, self.run, self.problem.scene.stack
         ((_, contact),) = run.record.fingers
         assert run.u_gap is not None
         # By the gap voltage along the loop.
-        u = self.turn * run.u_gap
+        turn = 1.0 if stack is None or stack.gap is None else float(stack.sign[stack.gap])
+        u = turn * run.u_gap
         q, dq = inverse_areas_with_slopes(u, contact.curve(self.problem.scene.u_top))
         dq = dq * np.sign(u)
-        by_u = self.turn * by["u_gap"] - by["area"] * dq / q**2
+        by_u = turn * by["u_gap"] - by["area"] * dq / q**2
         by_u = by_u + by["f_el"] * contact.stress(1.0) * u * (2.0 - u * dq / q) / q
         of_modes, of_source = np.zeros((2, m, n)), np.zeros((2, n + 1))
         place = np.clip(np.searchsorted(t, run.t, "right") - 1, 0, n - 1)
@@ -241,11 +377,11 @@ def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradien
     """See `Solution.sample_gradient`."""
     if run.stored is not None or run.start == "given":
         raise InputError(
-            "derivatives by samples are asked for, and the run goes on from another one or was read from a file; "
-            "allowed: a run just made from its circuit's own start"
+            f"{_ASKED}the run goes on from another one or was read from a file; allowed: a run just made from its "
+            "circuit's own start"
         )
     if run.failure is not None:
-        raise InputError("derivatives by samples are asked for, and the run failed; allowed: a run to its end")
+        raise InputError(f"{_ASKED}the run failed; allowed: a run to its end")
     one = _Intervals(run)
     coarse, fine = one.swept(_weights(run, of))
     largest = float(np.abs(fine).max())
