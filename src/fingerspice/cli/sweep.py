@@ -8,12 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from fingerspice.base.errors import InputError
-from fingerspice.cli import terminal
-from fingerspice.cli.options import read_circuit
-from fingerspice.cli.result_files import Results
+from fingerspice.cli.options import Job, Results
 from fingerspice.cli.terminal import Answering
 
 #: Keys of the file, and the arguments of `batch` among them.
@@ -32,24 +30,18 @@ _LARGEST = 1 << 20
 
 
 def sweep(
-    file: Annotated[Path, typer.Argument(metavar="SWEEP.toml", help="Deck, parameters and outputs.")],
-    out: terminal.Out = None,
-    name: terminal.Name = None,
-    overwrite: terminal.Overwrite = False,
-    as_json: terminal.AsJson = False,
-    no_plot: terminal.NoPlot = False,
+    job: Job,
+    file: Annotated[Path, Argument(metavar="SWEEP.toml", help="Deck, parameters and outputs.")],
     store: Annotated[
         Path | None,
-        typer.Option(
-            metavar="OUT.zarr", help="Write piece by piece to a Zarr store, which a second call goes on with."
-        ),
+        Option(metavar="OUT.zarr", help="Write piece by piece to a Zarr store, which a second call goes on with."),
     ] = None,
-    workers: Annotated[int | None, typer.Option(metavar="N", help="With --store: in N processes.")] = None,
+    workers: Annotated[int | None, Option(metavar="N", help="With --store: in N processes.")] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="With --store: by the workers of a Dask scheduler.")
+        str | None, Option(metavar="ADDRESS", help="With --store: by the workers of a Dask scheduler.")
     ] = None,
     shard: Annotated[
-        str | None, typer.Option(metavar="I/M", help="With --store: the I-th of M parts, from 1/M to M/M.")
+        str | None, Option(metavar="I/M", help="With --store: the I-th of M parts, from 1/M to M/M.")
     ] = None,
 ) -> None:
     """Run a grid or a random population of parameters: table, NetCDF, picture, and what the variance comes from.
@@ -58,74 +50,64 @@ def sweep(
 
       fingerspice sweep circuits/population.toml
     """
-    with Answering("sweep", as_json) as answer:
-        from fingerspice.plots.populations import plot_sweep
-        from fingerspice.studies.sweep import populations
+    from fingerspice.plots.populations import plot_sweep
+    from fingerspice.studies.sweep import populations
 
-        asked, deck = _read(file)
-        circuit = read_circuit(deck, None, None)
-        parameters = {path: _parameter(path, one) for path, one in asked["parameters"].items()}
-        options = {key: asked[key] for key in ("n", "seed", *_OPTIONS) if key in asked}
-        answer.update(**terminal.of_circuit(circuit, None))
-        if store is not None:
-            if asked.get("indices"):
-                raise InputError(f"{file}: indices = true and --store are both given; allowed: one of them")
-            if (part := re.fullmatch("([0-9]+)/([0-9]+)", "1/1" if shard is None else shard)) is None:
-                raise InputError(f"--shard is {shard!r}; allowed: two whole numbers such as 1/8")
-            part_of = int(part[1]), int(part[2])
-            options |= {"store": store, "workers": workers, "scheduler": scheduler, "shard": part_of}
-        else:
-            for option, given in (("workers", workers), ("scheduler", scheduler), ("shard", shard)):
-                if given is not None:
-                    raise InputError(f"--{option} is given without --store; allowed: --store OUT.zarr, too")
-            results = Results(deck, circuit, out, name or file.stem, overwrite, None)
-            own = {"deck": circuit.text}
-            results.will_write(".nc", lambda path: _written(found, indices, own | results.about, path))
-            results.will_draw(".png", lambda: plot_sweep(found, output, indices), unless=no_plot)
-        found = populations.sweep(circuit, parameters, **options)
-        about = found.attrs
-        known = {"sets": about.get("sets", []), "n": about.get("n"), "seed": about.get("seed")}
-        answer.update(scenes=int(found.status.size), **known)
-        if store is not None:
-            _give_stored(answer, found, store)
-            return
-        output = str(next(iter(found.data_vars)))
-        indices = populations.sobol(circuit, parameters, **options) if asked.get("indices") else None
-        said = [_told(answer, found)]
-        if indices is not None:
-            shares = populations.ranking(indices, output)
-            answer.update(shares=shares)
-            said.append(_shared(shares, output))
-        answer.give(lambda: "\n\n".join(said), results.ready())
+    asked, job.deck = _read(file)
+    job.name = job.name or file.stem
+    circuit = job.read()
+    parameters = {path: _parameter(path, one) for path, one in asked["parameters"].items()}
+    options = {key: asked[key] for key in ("n", "seed", *_OPTIONS) if key in asked}
+    if store is None:
+        for option, given in (("workers", workers), ("scheduler", scheduler), ("shard", shard)):
+            if given is not None:
+                raise InputError(f"--{option} is given without --store; allowed: --store OUT.zarr, too")
+        results = Results(job, circuit)
+        own = {"deck": circuit.text}
+        results.will_write(".nc", lambda path: _written(found, indices, own | results.about, path))
+        results.will_draw(".png", lambda: plot_sweep(found, output, indices))
+    else:
+        if asked.get("indices"):
+            raise InputError(f"{file}: indices = true and --store are both given; allowed: one of them")
+        if (part := re.fullmatch("([0-9]+)/([0-9]+)", "1/1" if shard is None else shard)) is None:
+            raise InputError(f"--shard is {shard!r}; allowed: two whole numbers such as 1/8")
+        part_of = int(part[1]), int(part[2])
+        options |= {"store": store, "workers": workers, "scheduler": scheduler, "shard": part_of}
+    found = populations.sweep(circuit, parameters, **options)
+    answer, about = job.answer, found.attrs
+    known = {"sets": about.get("sets", []), "n": about.get("n"), "seed": about.get("seed")}
+    answer.update(scenes=int(found.status.size), **known)
+    if store is not None:
+        answer.data["files"].append(str(store))
+        answer.update(store={key: about[key] for key in ("chunks", "chunks_found", "chunks_missing", "seconds")})
+        whole = not about["chunks_missing"] and found.status.size <= populations.MOST_SCENES
+        said = [_told(answer, found)] if whole else []
+        said.append(f"{about['chunks']:,} pieces ({about['chunks_found']:,} were there already) in {store}")
+        if about["chunks_missing"]:
+            said.append(f"{about['chunks_missing']:,} pieces of other parts are missing")
+        answer.give(lambda: "\n".join([*said, *about["failures"][:_MOST_TOLD]]))
+        return
+    output = str(next(iter(found.data_vars)))
+    indices = populations.sobol(circuit, parameters, **options) if asked.get("indices") else None
+    said = [_told(answer, found)]
+    if indices is not None:
+        shares = populations.ranking(indices, output)
+        answer.update(shares=shares)
+        said.append(_shared(shares, output))
+    answer.give(lambda: "\n\n".join(said), results.ready())
 
 
 def _told(answer: Answering, found: Any) -> str:
     """Fill the answer with the percentiles of a whole sweep, which this text has."""
-    from fingerspice.studies.sweep import populations
+    from fingerspice.studies.sweep.populations import summary
 
-    rows = populations.summary(found)
+    rows = summary(found)
     answer.update(figures=rows, failed=int((found.status >= 2).sum()))
-    head = f"{'output':<24}{'unit':<8}{'5 %':>12}{'median':>12}{'95 %':>12}{'mean':>12}"
-    lines = [
-        f"{row['output']:<24}{row['unit']:<8}"
-        + "".join(f"{row[key]:>12.4g}" for key in ("p5", "median", "p95", "mean"))
-        for row in rows
-    ]
-    return "\n".join([head, *lines])
-
-
-def _give_stored(answer: Answering, found: Any, store: Path) -> None:
-    """Fill the answer with what a call has done for a store, and percentiles of a store that is whole."""
-    from fingerspice.studies.sweep.populations import MOST_SCENES
-
-    about = found.attrs
-    answer.data["files"].append(str(store))
-    answer.update(store={key: about[key] for key in ("chunks", "chunks_found", "chunks_missing", "seconds")})
-    said = [_told(answer, found)] if not about["chunks_missing"] and found.status.size <= MOST_SCENES else []
-    said.append(f"{about['chunks']:,} pieces ({about['chunks_found']:,} were there already) in {store}")
-    if about["chunks_missing"]:
-        said.append(f"{about['chunks_missing']:,} pieces of other parts are missing")
-    answer.give(lambda: "\n".join([*said, *about["failures"][:_MOST_TOLD]]))
+    lines = [f"{'output':<24}{'unit':<8}{'5 %':>12}{'median':>12}{'95 %':>12}{'mean':>12}"]
+    for row in rows:
+        figures = [f"{row[key]:>12.4g}" for key in ("p5", "median", "p95", "mean")]
+        lines.append(f"{row['output']:<24}{row['unit']:<8}{''.join(figures)}")
+    return "\n".join(lines)
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Path]:
@@ -166,24 +148,23 @@ def _parameter(path: str, one: Any) -> Any:
     if not isinstance(one, Mapping) or len(one) != 1 or next(iter(one)) not in _KINDS:
         raise InputError(f"{path} is {one!r}; allowed: {allowed}")
     kind, numbers = next(iter(one.items()))
-    if not isinstance(numbers, list) or not all(isinstance(x, int | float) for x in numbers) or not numbers:
-        raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {_KINDS[kind]}")
-    if kind == "values":
+    allowed = _KINDS[kind]
+    good = isinstance(numbers, list) and len(numbers) > 0 and all(isinstance(x, int | float) for x in numbers)
+    if good and kind == "values":
         return np.array(numbers, float)
-    if len(numbers) != _KINDS[kind].count(",") + 1:
-        raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {_KINDS[kind]}")
-    if kind in ("linear", "log"):
-        first, last, count = numbers
-        if not (count == int(count) and 1 <= count <= 100_000) or (kind == "log" and min(first, last) <= 0.0):
-            raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {_KINDS[kind]}, a whole count, for log above 0")
-        return (np.linspace if kind == "linear" else np.geomspace)(first, last, int(count))
-    a, b = map(float, numbers)
-    in_order = a < b if kind.endswith("uniform") else b > 0.0
-    if not in_order or (kind.startswith("log") and a <= 0.0):
-        raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {_KINDS[kind]}, ascending or above 0")
-    if kind.startswith("log"):
-        return stats.loguniform(a, b) if kind == "loguniform" else stats.lognorm(b, scale=a)
-    return stats.uniform(a, b - a) if kind == "uniform" else stats.norm(a, b)
+    if good and len(numbers) == allowed.count(",") + 1 == 3:
+        allowed += ", a whole count, for log above 0"
+        first, last, count = map(float, numbers)
+        if count.is_integer() and 1 <= count <= 100_000 and (kind == "linear" or min(first, last) > 0.0):
+            return (np.linspace if kind == "linear" else np.geomspace)(first, last, int(count))
+    elif good and len(numbers) == allowed.count(",") + 1:
+        allowed += ", ascending or above 0"
+        a, b = map(float, numbers)
+        if (a < b if kind.endswith("uniform") else b > 0.0) and (a > 0.0 or not kind.startswith("log")):
+            if kind.startswith("log"):
+                return stats.loguniform(a, b) if kind == "loguniform" else stats.lognorm(b, scale=a)
+            return stats.uniform(a, b - a) if kind == "uniform" else stats.norm(a, b)
+    raise InputError(f"{path}: {kind} is {numbers!r}; allowed: {allowed}")
 
 
 def _shared(rows: list[dict[str, Any]], output: str) -> str:
