@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -26,7 +27,7 @@ import fingerspice as fs
 from commands import Command, tree
 from fingerspice.studies.sweep import chunks
 from fingerspice.studies.sweep.populations import Draws, make_plan
-from processes import forked, no_room_here, start
+from processes import forked, no_room_here
 from scenes import cases
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
@@ -195,8 +196,6 @@ def _given_up_at_once() -> Iterator[None]:
 class Deadly:
     """A distribution whose draws end every process but the one that started the sweep."""
 
-    home = os.getpid()
-
     def __init__(self) -> None:
         self.pid = os.getpid()
 
@@ -244,36 +243,28 @@ from fingerspice.studies.sweep import chunks
 if __name__ == "__main__":
     chunks.CHUNK = 64
     circuit = fs.read_netlist(here.CIRCUITS / "fingerpad.cir")
-    fs.sweep(circuit, here.PARAMETERS, store=sys.argv[1], workers=2, **here.HOW)
+    fs.sweep(circuit, here.PARAMETERS, store=sys.argv[1], workers=1, **here.HOW)
 """
 
 
-@pytest.fixture
-def script(tmp_path: Path) -> list[str]:
-    (tmp_path / "script.py").write_text(SCRIPT)
-    return [sys.executable, str(tmp_path / "script.py")]
-
-
-def _environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
-
-
 def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, script: list[str]
+    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
 ) -> None:
     path, enough = tmp_path / "s.zarr", 3 * CHUNKS // 4
+    (tmp_path / "script.py").write_text(SCRIPT)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     for kill in range(KILLS):
         wanted = marks(path) + enough // KILLS
-        # With workers at every other time, by a program of its own: these end by themselves.
-        process = (
-            start(tmp_path, str(path), entry=script, env=_environment()) if kill % 2
+        # With a worker at every other time, by a program of its own: the worker ends by itself.
+        process: Any = (
+            subprocess.Popen([sys.executable, tmp_path / "script.py", path], env=environment) if kill % 2
             else forked(lambda: fs.sweep(circuit, PARAMETERS, store=path, **HOW))
         )  # fmt: skip
         while marks(path) < wanted:
             assert process.poll() is None if kill % 2 else process.is_alive()
             time.sleep(0.002)
         process.kill()
-        process.communicate() if kill % 2 else process.join()
+        process.wait() if kill % 2 else process.join()
     assert enough // KILLS * KILLS <= marks(path) < CHUNKS
     fs.sweep(circuit, PARAMETERS, store=path, **HOW)
     assert tree(path) == whole

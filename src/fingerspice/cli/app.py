@@ -1,7 +1,7 @@
 """The command line. Exit codes: 0 for success, 1 for a failed solve, 2 for bad input or a full disk.
 
 The commands on a circuit are `run`, `ac`, `plan`, `compare`, and those around it `export`, `sets`, `check`, `figures`
-and `explore`; those for studies and sweeps have files of their own.
+and `explore`; those for studies are in `cli/studies.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from fingerspice.base.arrays import positive_row
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
 from fingerspice.cli import studies, terminal
-from fingerspice.cli import sweep as sweeps
 from fingerspice.cli.options import FOLDER, Job, Results, add_command, area_from_text, check_output, with_times
 from fingerspice.cli.terminal import answer_usage, complain, is_input, listen, said_of, say
 from fingerspice.results.outcome import SolveError
@@ -458,7 +457,7 @@ _COMMANDS: dict[Callable[..., Callable[[], None] | None], str] = {
     studies.design: f"table {_FILES} carrier limit slew rate charge_law changes {_END}",
     studies.fit: f"table deck free groups out name overwrite average skin profile charge_law changes {_END}",
     studies.fit_contact: f"tables deck free finger out name overwrite profile changes {_END}",
-    sweeps.sweep: f"file out name overwrite {_END} store workers scheduler shard",
+    studies.sweep: f"file out name overwrite {_END} store workers scheduler shard",
     export: "deck output charge_law changes source stop as_json",
     figures: "out only gallery as_json",
     explore: "deck changes finger coating drive port no_browser static as_json",

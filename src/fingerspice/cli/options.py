@@ -219,25 +219,23 @@ def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple
     from fingerspice.circuit.circuit import Tran
 
     tran, t_stop = circuit.tran, time_from_text("--stop", stop)
-    t_start = time_from_text("--start", start) if start[:1] in "+-.0123456789" and start else None
-    if t_start is not None:
-        start = "deck"
-    if t_stop is None and (t_start is None or tran is None):
+    t_start = time_from_text("--start", start) if start and start[0] in "+-.0123456789" else None
+    start = start if t_start is None else "deck"
+    if tran is None and t_stop is not None:
+        tran = Tran((t_stop - (t_start or 0.0)) / 1000.0, t_stop, uic=True)
+    elif tran is None or (t_stop is None and t_start is None):
         return circuit, start
-    first = t_start if t_start is not None else tran.start if tran is not None else 0.0
-    last = t_stop if t_stop is not None or tran is None else tran.stop
-    assert last is not None
+    first, last = tran.start if t_start is None else t_start, tran.stop if t_stop is None else t_stop
     if last <= 0.0:
         raise InputError(f"--stop {last:g} s; allowed: more than 0 s")
     if t_start is not None and not 0.0 <= first < last:
         raise InputError(f"--start {first:g} s; allowed: from 0 s to less than the end, {last:g} s")
-    step = tran.step if tran is not None else (last - first) / 1000.0
-    if last < first + step * (1.0 - 1e-12):
+    if last < first + tran.step * (1.0 - 1e-12):
+        least = first + tran.step
         raise InputError(
-            f"--stop {last:g} s is before the second output; allowed: TSTART + TSTEP = {first + step:g} s or more"
+            f"--stop {last:g} s is before the second output; allowed: TSTART + TSTEP = {least:g} s or more"
         )
-    old = Tran(step, last, uic=True) if tran is None else tran
-    return dataclasses.replace(circuit, tran=dataclasses.replace(old, stop=last, start=first)), start
+    return dataclasses.replace(circuit, tran=dataclasses.replace(tran, stop=last, start=first)), start
 
 
 def time_from_text(option: str, text: str | None) -> float | None:

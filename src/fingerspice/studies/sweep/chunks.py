@@ -77,7 +77,7 @@ class Work:
     options: Mapping[str, Any]  # Of `batch`
     path: Path
     block: tuple[int, ...]  # Scenes of a chunk along each dimension
-    outputs: dict[str, Array]  # With ``error`` and ``status``
+    outputs: dict[str, Array]  # With ``error`` and, as the last, ``status``
     drawn: dict[str, Array]  # The drawn parameters, along ``scene``
     draws: Draws | None
     programs: str
@@ -99,7 +99,7 @@ class Work:
         """Arrays of a chunk, and its place in each, ``status`` last; the first place of a grid has the draws."""
         at = dict(zip(self.plan.dims, self._place(index), strict=True))
         first = not any(at[name] for name in self.plan.grid)
-        for name, one in [*(self.drawn.items() if first else ()), *sorted(self.outputs.items(), key=_is_status)]:
+        for name, one in ((self.drawn if first else {}) | self.outputs).items():
             yield name, one, tuple(at.get(dim, 0) for dim in one.dims)
 
     def is_done(self, index: int) -> bool:
@@ -218,10 +218,6 @@ class Work:
             raise InputError(f"cannot write {self.path}: {error.strerror or error}; {_GOES_ON}") from None
 
 
-def _is_status(item: tuple[str, Array]) -> bool:
-    return item[0] == STATUS
-
-
 def _identity_at(path: Path) -> dict[str, Any]:
     """What the store that is at a path holds about its sweep; refuses what is no store of a sweep."""
     try:
@@ -258,9 +254,10 @@ def make_work(plan: Plan, options: Mapping[str, Any], path: Path) -> tuple[Work,
         )
         for name, one in first.data_vars.items()
     }  # fmt: skip
-    flags = dict(outputs[STATUS].attributes)
+    status = outputs.pop(STATUS)
+    flags = dict(status.attributes)
     flags |= {"flag_values": [*flags["flag_values"], MISSING], "flag_meanings": f"{flags['flag_meanings']} missing"}
-    outputs[STATUS] = replace(outputs[STATUS], kind="i1", fill=MISSING, attributes=flags)
+    outputs[STATUS] = replace(status, kind="i1", fill=MISSING, attributes=flags)
     drawn = {
         name: Array(path / name, ("scene",), plan.sizes[-1:], block[-1:], {"units": plan.units[name]})
         for name in plan.drawn
