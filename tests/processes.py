@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import multiprocessing
 import os
 import resource
 import shutil
@@ -10,8 +11,11 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -59,3 +63,24 @@ def no_room(size: int) -> Callable[[], None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
     return limit
+
+
+@contextmanager
+def no_room_here(size: int) -> Iterator[None]:
+    """As `no_room`, for this process, where Python ignores the signal, and for a while."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def forked(run: Callable[[], object]) -> BaseProcess:
+    """A process of its own that runs a function, with all that this one has loaded; it can be killed at any time."""
+    process = multiprocessing.get_context("fork").Process(target=run)
+    with warnings.catch_warnings():
+        # From Python 3.12 on of threads, none of which the function needs.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        process.start()
+    return process

@@ -34,15 +34,6 @@ MAX_COMPILED_BODY, MAX_COMPILED_PARAMETERS = 100, 12
 # Each parameter is an option of the command line or a keyword that users may leave out.
 MANY_PARAMETERS = {
     "cli.app.run",
-    "cli.app.ac",
-    "cli.app.plan",
-    "cli.app.compare",
-    "cli.tools.explore",
-    "cli.studies.limits",
-    "cli.studies.design",
-    "cli.studies.fit",
-    "cli.sweep.sweep",
-    "cli.studies.fit_contact",
     "studies.design.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",

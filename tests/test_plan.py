@@ -258,6 +258,9 @@ def test_a_heavier_model_may_always_be_asked_for(tier: str) -> None:
     assert fs.simulate(table1(), tier="coupled", area="frozen", t_stop=1e-3).method == "exponential"
 
 
+UNKNOWN = "allowed: auto, algebraic, linear, coupled"
+
+
 @pytest.mark.parametrize(
     ("circuit", "tier", "options", "message"),
     [
@@ -268,9 +271,10 @@ def test_a_heavier_model_may_always_be_asked_for(tier: str) -> None:
         (table1(), "linear", {"charge": False, "charge_law": "mobile"}, "the mobile law needs the one that follows"),
         (dry(), "linear", {"charge_law": "mobile"}, "the mobile law"),
         (table1(extra="Rbeside drive 0 1meg"), "linear", {}, "not for this network; allowed: auto or coupled"),
+        *((table1(), tier, {}, UNKNOWN) for tier in ("exact", "Linear", "", "dispersive")),
     ],
 )
-def test_a_lighter_model_that_cannot_describe_the_circuit_is_refused(circuit, tier, options, message) -> None:
+def test_an_unknown_model_and_one_that_cannot_describe_the_circuit_are_refused(circuit, tier, options, message) -> None:
     with pytest.raises(fs.InputError, match=message):
         fs.simulate(circuit, tier=tier, t_stop=1e-3, **options)
     with pytest.raises(fs.InputError, match=message):
@@ -290,12 +294,6 @@ def test_a_lighter_model_that_errs_more_than_asked_says_so() -> None:
     with pytest.raises(fs.SolveError, match="the error estimate stayed above the error asked for"):
         fs.simulate(table1(), rtol=1e-3, **given)
     assert fs.simulate(table1("SIN(0 1 100)"), rtol=0.1, **given).success
-
-
-@pytest.mark.parametrize("tier", ["exact", "Linear", "", "dispersive"])
-def test_an_unknown_model_is_refused_with_what_is_allowed(tier: str) -> None:
-    with pytest.raises(fs.InputError, match="allowed: auto, algebraic, linear, coupled"):
-        fs.simulate(table1(), tier=tier)
 
 
 def test_a_method_steps_whatever_the_model_could_have_been() -> None:

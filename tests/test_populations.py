@@ -202,6 +202,7 @@ def test_the_command_writes_scenes_indices_and_a_picture(tmp_path: Path, command
         (("lognormal = [3.5e-6, 0.1]", "lognormal = [3.5e-6]"), "median"),
         (("lognormal", "gaussian"), "allowed: a number, or one of"),
         (("uniform = [3e-4, 4e-4]", "uniform = [4e-4, 3e-4]"), "ascending"),
+        (("uniform = [3e-4, 4e-4]", "linear = [3e-4, 4e-4, inf]"), "a whole count"),
         (("n = 32", "n = 33"), "power of two"),
         (("n = 32", "n = "), "cannot be read as TOML"),
         (('"Xgap.d"', '"Xgap.q"'), "Xgap"),

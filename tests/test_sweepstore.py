@@ -9,11 +9,13 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +25,14 @@ from scipy import stats
 
 import fingerspice as fs
 from commands import Command, tree
-from fingerspice.studies.sweep import chunks, workers
-from fingerspice.studies.sweep.plan import make_plan
-from processes import ended, no_room, start
+from fingerspice.studies.sweep import chunks
+from fingerspice.studies.sweep.populations import Draws, make_plan
+from processes import forked, no_room_here
 from scenes import cases
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 # How often a whole program, and a worker, is killed; each takes seconds to start.
-KILLS, KILLS_OF_WORKERS = cases(20, 2), cases(20, 2)
+KILLS, KILLS_OF_WORKERS = cases(20, 2), cases(20, 1)
 CHUNK = chunks.CHUNK
 PARAMETERS: dict[str, Any] = {
     "source.frequency": [100.0, 1000.0, 5000.0],
@@ -110,9 +112,9 @@ def killing(pids: Callable[[], list[int]], store: Path, most: int) -> Iterator[l
 
 def test_draws_in_parts_are_those_of_the_whole(circuit: fs.Circuit) -> None:
     plan = make_plan(circuit, PARAMETERS, 1 << 14, 5, 1 << 30)
-    draws = plan.draws()
+    draws = plan.quantiles(stats.qmc.Sobol(2, scramble=True, bits=30, rng=5).random(plan.n))
     for count in (1 << 9, 1 << 14):
-        parts = [plan.sequence(count).part(i) for i in range(plan.n // count)]
+        parts = [Draws(plan, count).part(i) for i in range(plan.n // count)]
         for name, values in draws.items():
             np.testing.assert_array_equal(np.concatenate([part[name] for part in parts]), values)
 
@@ -194,8 +196,6 @@ def _given_up_at_once() -> Iterator[None]:
 class Deadly:
     """A distribution whose draws end every process but the one that started the sweep."""
 
-    home = os.getpid()
-
     def __init__(self) -> None:
         self.pid = os.getpid()
 
@@ -209,7 +209,7 @@ class Deadly:
 def test_chunks_that_always_cost_their_worker_end_the_sweep(
     circuit: fs.Circuit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workers, "MOST_LOST", 1)
+    monkeypatch.setattr(chunks, "MOST_LOST", 1)
     with pytest.raises(fs.InputError, match=r"one chunk after another were lost, 1 times.* what is written stays"):
         fs.sweep(circuit, {"Xgap.d": Deadly()}, store=tmp_path / "s.zarr", workers=1, **{**HOW, "n": 64})
 
@@ -243,38 +243,30 @@ from fingerspice.studies.sweep import chunks
 if __name__ == "__main__":
     chunks.CHUNK = 64
     circuit = fs.read_netlist(here.CIRCUITS / "fingerpad.cir")
-    asked = {"store": sys.argv[1], "shard": (int(sys.argv[2]), int(sys.argv[3]))}
-    fs.sweep(circuit, here.PARAMETERS, **asked, **({"workers": 2} if len(sys.argv) > 4 else {}), **here.HOW)
+    fs.sweep(circuit, here.PARAMETERS, store=sys.argv[1], workers=1, **here.HOW)
 """
 
 
-@pytest.fixture
-def script(tmp_path: Path) -> list[str]:
-    (tmp_path / "script.py").write_text(SCRIPT)
-    return [sys.executable, str(tmp_path / "script.py")]
-
-
-def _environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
-
-
 def test_a_sweep_killed_again_and_again_comes_to_the_same_bytes(
-    whole: dict[str, bytes | None], tmp_path: Path, script: list[str]
+    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
 ) -> None:
     path, enough = tmp_path / "s.zarr", 3 * CHUNKS // 4
+    (tmp_path / "script.py").write_text(SCRIPT)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     for kill in range(KILLS):
-        # With workers at every other time: these end by themselves.
-        more = ["workers"] if kill % 2 else []
-        process = start(tmp_path, str(path), "1", "1", *more, entry=script, env=_environment())
         wanted = marks(path) + enough // KILLS
-        while marks(path) < wanted and process.poll() is None:
+        # With a worker at every other time, by a program of its own: the worker ends by itself.
+        process: Any = (
+            subprocess.Popen([sys.executable, tmp_path / "script.py", path], env=environment) if kill % 2
+            else forked(lambda: fs.sweep(circuit, PARAMETERS, store=path, **HOW))
+        )  # fmt: skip
+        while marks(path) < wanted:
+            assert process.poll() is None if kill % 2 else process.is_alive()
             time.sleep(0.002)
-        assert process.poll() is None
         process.kill()
-        process.communicate()
+        process.wait() if kill % 2 else process.join()
     assert enough // KILLS * KILLS <= marks(path) < CHUNKS
-    code, said, _ = ended(start(tmp_path, str(path), "1", "1", entry=script, env=_environment()))
-    assert (code, said) == (0, [])
+    fs.sweep(circuit, PARAMETERS, store=path, **HOW)
     assert tree(path) == whole
 
 
@@ -284,12 +276,14 @@ def test_a_shard_without_chunks_does_nothing(circuit: fs.Circuit, tmp_path: Path
 
 
 def test_shards_by_separate_processes_make_the_whole(
-    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, script: list[str]
+    circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
 ) -> None:
     path = tmp_path / "s.zarr"
     # At once: whichever comes first creates the store.
-    shards = [start(tmp_path, str(path), str(i), "3", entry=script, env=_environment()) for i in (1, 2)]
-    assert [ended(one)[:2] for one in shards] == [(0, []), (0, [])]
+    shards = [forked(partial(fs.sweep, circuit, PARAMETERS, store=path, shard=(i, 3), **HOW)) for i in (1, 2)]
+    for one in shards:
+        one.join(120)
+        assert one.exitcode == 0
     assert marks(path) == 2 * CHUNKS // 3
     last = fs.sweep(circuit, PARAMETERS, store=path, shard=(2, 3), **HOW)
     assert {last.attrs[key] for key in ("chunks", "chunks_found", "chunks_missing")} == {CHUNKS // 3}
@@ -534,13 +528,15 @@ def test_bad_commands_are_refused_in_one_sentence(
 def test_a_full_disk_ends_in_one_sentence_and_the_sweep_goes_on_from_there(
     file: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(file.parent)
     words = ("sweep", str(file), "--store", "o.zarr")
-    code, said, _ = ended(start(file.parent, *words, preexec_fn=no_room(2500), env=_environment()))
-    assert code == 2
-    assert len(said) == 1
-    assert "cannot write" in said[0]
-    assert "goes on from there" in said[0]
     monkeypatch.setattr(chunks, "CHUNK", CHUNK)
+    with no_room_here(2500):
+        refused = command(*words)
+    assert refused.code == 2
+    (line,) = [line for line in refused.lines if not line.startswith("fingerspice: warning")]
+    assert "cannot write" in line
+    assert "goes on from there" in line
     again = command(*words)
     assert again.code == 0
     assert all(line.startswith("fingerspice: warning") for line in again.lines)

@@ -1,17 +1,33 @@
-"""Interpretation of the command line's options, and checks before a run; no function here writes a file."""
+"""One call of a command: its options and the circuit that they ask for, and the files of its results.
+
+Options that commands share are here. Files are named after the deck and never replace results of another circuit; all
+that can be checked before a run is.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import html
+import inspect
+import json
 import os
+import re
 import tempfile
 import warnings
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer import Argument, Option
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, printable
+from fingerspice.base.files import write_aside
 from fingerspice.base.units import parse_number
-from fingerspice.cli.terminal import complain
+from fingerspice.cli.terminal import Answering, Write, complain
 
 if TYPE_CHECKING:
     from fingerspice.circuit.circuit import Circuit
@@ -21,43 +37,114 @@ if TYPE_CHECKING:
 LARGEST_AREA = 0.01
 #: Largest number of characters of a source's numbers that are stored with the results.
 LONGEST_SOURCE = 1000
+#: Folder of the results unless another one is named.
+FOLDER = Path("out")
+#: First bytes of the tables that the commands write.
+_HEADS = (
+    b"t [s],u_source", b"frequency [Hz],gain [1],", b"parameter,value [SI],unit,", b"time (s),drive (V)",
+    b"time (s),wanted force (N),",
+)  # fmt: skip
 
 
-def read_circuit(deck: Path, changes: list[str] | None, sources: list[str] | None, **sets: list[str] | None) -> Circuit:
-    """The deck's circuit with the named sets of ``--set`` and of options by kind, ``--set`` values, and ``--source``.
+def _named(kind: str, example: str) -> Any:
+    said = f"Apply a named set of this kind: {example} (list: fingerspice sets)."
+    return Option(f"--{kind}", metavar="[ELEMENT=]NAME", help=said)
 
-    What comes later in this order has the last word. Gives the reader's warnings, without those about replaced values,
-    and warnings about directives without effect.
+
+_SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
+
+
+@dataclass
+class Job:
+    """One call of a command: the options that commands share, with the defaults of those that it does not take."""
+
+    answer: Answering
+    deck: Annotated[Path, Argument(metavar="DECK", help="Netlist file (.cir), - for standard input.")]
+    out: Annotated[Path | None, Option(metavar="FOLDER", help="Folder of the files; out by default.")] = None
+    name: Annotated[str | None, Option(metavar="NAME", help="Name of the files; that of the deck by default.")] = None
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace results of other circuits, and other files.")] = (
+        False
+    )
+    rtol: Annotated[float, Option(help="Largest error of gap voltage and force, relative to their peaks.")] = 1e-8
+    charge_law: Annotated[str | None, Option(help="local or mobile; the included library's by default.")] = None
+    changes: Annotated[
+        list[str] | None,
+        Option(
+            "--set", metavar="PATH=VALUE|NAME",
+            help="Change a value: Xgap.d=3u; or apply a named set: moist. Repeatable.",
+        ),
+    ] = None  # fmt: skip
+    finger: Annotated[list[str] | None, _named("finger", "moist, or Xlight=dry for one of several")] = None
+    coating: Annotated[list[str] | None, _named("coating", "3M")] = None
+    drive: Annotated[list[str] | None, _named("drive", "Fig4-5kHz")] = None
+    source: Annotated[list[str] | None, Option(metavar="[NAME=]SPEC", help=f"Replace a source: {_SPECS}.")] = None
+    stop: Annotated[str | None, Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")] = None
+    as_json: Annotated[bool, Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")] = False
+    no_plot: Annotated[bool, Option("--no-plot", help="Write no picture.")] = False
+
+    def read(self) -> Circuit:
+        """The circuit that the options ask for, of which the answer tells.
+
+        It is the deck's with the named sets of ``--set`` and of options by kind, ``--set`` values, and ``--source``:
+        what comes later in this order has the last word. Gives the reader's warnings, without those about replaced
+        values, and warnings about directives without effect.
+        """
+        from fingerspice.circuit.circuit import CHARGE_LAWS
+        from fingerspice.circuit.describe import directive_warnings
+        from fingerspice.netlist.netlist import read_netlist
+        from fingerspice.waveforms.waveform import require
+
+        with warnings.catch_warnings(record=True) as noticed:
+            warnings.simplefilter("always", FingerspiceWarning)
+            circuit = read_netlist(self.deck)
+        given, changes = circuit.warnings, self.changes or []
+        # A path has a dot, and the name of a set none.
+        named = [change for change in changes if change and not set("=.") & set(change)]
+        sets = {"set": named, "finger": self.finger, "coating": self.coating, "drive": self.drive}
+        try:
+            for option, texts in sets.items():
+                for text in texts or ():
+                    circuit = _with_set(circuit, option, text)
+            circuit = _with_values(circuit, changes, named)
+            circuit = _with_sources(circuit, self.source or [])
+            given = circuit.warnings
+        finally:
+            # If a change is refused, show all warnings of the deck, since any of them may explain the refusal.
+            for warning in noticed:
+                if str(warning.message) in map(printable, given):
+                    warnings.warn(str(warning.message), FingerspiceWarning, stacklevel=2)
+        # `simulate` gives these warnings itself, but commands that do not call it with this circuit would not.
+        for text in directive_warnings(circuit):
+            warnings.warn(text, FingerspiceWarning, stacklevel=2)
+        others = [name.removeprefix(".options ") for name in circuit.unused if name.startswith(".options ")]
+        if others:
+            complain(f"note: .options {', '.join(others)}: of no effect here, where --rtol alone sets the error")
+        law = self.charge_law or circuit.charge_law or "local"
+        require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
+        known = {"title": circuit.title, "overrides": dict(circuit.overrides), "sets": list(circuit.sets)}
+        self.answer.update(**known, charge_law=law)
+        return circuit
+
+
+def add_command(app: typer.Typer, options: str, function: Callable[..., Callable[[], None] | None]) -> None:
+    """Make a function of a `Job` and of options of its own a command, whose help has all options in this order.
+
+    What the function returns, if anything, is called after its answer has been printed.
     """
-    from fingerspice.circuit.describe import directive_warnings
-    from fingerspice.netlist.netlist import read_netlist
+    name = function.__name__.replace("_", "-")
+    own = inspect.signature(function, eval_str=True).parameters
+    known = {**inspect.signature(Job, eval_str=True).parameters, **own}
 
-    with warnings.catch_warnings(record=True) as noticed:
-        warnings.simplefilter("always", FingerspiceWarning)
-        circuit = read_netlist(deck)
-    given = circuit.warnings
-    # A path has a dot, and the name of a set none.
-    named = [change for change in changes or () if change and not set("=.") & set(change)]
-    try:
-        for option, text in [
-            (option, text) for option, texts in {"set": named, **sets}.items() for text in texts or ()
-        ]:
-            circuit = _with_set(circuit, option, text)
-        circuit = _with_values(circuit, changes or [], named)
-        circuit = _with_sources(circuit, sources or [])
-        given = circuit.warnings
-    finally:
-        # If a change is refused, show all warnings of the deck, since any of them may explain the refusal.
-        for warning in noticed:
-            if str(warning.message) in map(printable, given):
-                warnings.warn(str(warning.message), FingerspiceWarning, stacklevel=2)
-    # `simulate` gives these warnings itself, but commands that do not call it with this circuit would not.
-    for text in directive_warnings(circuit):
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    others = [name.removeprefix(".options ") for name in circuit.unused if name.startswith(".options ")]
-    if others:
-        complain(f"note: .options {', '.join(others)}: of no effect here, where --rtol alone sets the error")
-    return circuit
+    def call(**given: Any) -> None:
+        with Answering(name, **given) as answer:
+            mine = {key: given.pop(key) for key in own if key in given}
+            then = function(Job(answer, **{"deck": Path(), **given}), **mine)
+        if then is not None:
+            then()
+
+    taken = [known[key].replace(kind=inspect.Parameter.KEYWORD_ONLY) for key in options.split()]
+    call.__doc__, call.__signature__ = function.__doc__, inspect.Signature(taken)  # type: ignore[attr-defined]
+    app.command(name)(call)
 
 
 def _with_set(circuit: Circuit, option: str, text: str) -> Circuit:
@@ -132,25 +219,23 @@ def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple
     from fingerspice.circuit.circuit import Tran
 
     tran, t_stop = circuit.tran, time_from_text("--stop", stop)
-    t_start = time_from_text("--start", start) if start[:1] in "+-.0123456789" and start else None
-    if t_start is not None:
-        start = "deck"
-    if t_stop is None and (t_start is None or tran is None):
+    t_start = time_from_text("--start", start) if start and start[0] in "+-.0123456789" else None
+    start = start if t_start is None else "deck"
+    if tran is None and t_stop is not None:
+        tran = Tran((t_stop - (t_start or 0.0)) / 1000.0, t_stop, uic=True)
+    elif tran is None or (t_stop is None and t_start is None):
         return circuit, start
-    first = t_start if t_start is not None else tran.start if tran is not None else 0.0
-    last = t_stop if t_stop is not None or tran is None else tran.stop
-    assert last is not None
+    first, last = tran.start if t_start is None else t_start, tran.stop if t_stop is None else t_stop
     if last <= 0.0:
         raise InputError(f"--stop {last:g} s; allowed: more than 0 s")
     if t_start is not None and not 0.0 <= first < last:
         raise InputError(f"--start {first:g} s; allowed: from 0 s to less than the end, {last:g} s")
-    step = tran.step if tran is not None else (last - first) / 1000.0
-    if last < first + step * (1.0 - 1e-12):
+    if last < first + tran.step * (1.0 - 1e-12):
+        least = first + tran.step
         raise InputError(
-            f"--stop {last:g} s is before the second output; allowed: TSTART + TSTEP = {first + step:g} s or more"
+            f"--stop {last:g} s is before the second output; allowed: TSTART + TSTEP = {least:g} s or more"
         )
-    old = Tran(step, last, uic=True) if tran is None else tran
-    return dataclasses.replace(circuit, tran=dataclasses.replace(old, stop=last, start=first)), start
+    return dataclasses.replace(circuit, tran=dataclasses.replace(tran, stop=last, start=first)), start
 
 
 def time_from_text(option: str, text: str | None) -> float | None:
@@ -199,3 +284,148 @@ def check_output(file: Path, deck: Path | None = None) -> None:
             raise InputError(f"cannot write {file}: it is the deck itself; allowed: another name or folder")
     except OSError as error:
         raise InputError(f"cannot write {file}: {error.strerror}; {allowed}") from None
+
+
+class Results:
+    """The files of a job's results for its circuit, with all changes.
+
+    They go into the job's folder (`FOLDER` by default) under its name (that of the deck) with their endings; with
+    `overwrite` they may replace files of other or unknown circuits.
+    """
+
+    def __init__(self, job: Job, circuit: Circuit) -> None:
+        name = job.name
+        if name is not None and (name in ("", ".", "..") or Path(name).name != name or not name.isprintable()):
+            raise InputError(
+                f"--name is {name!r}; allowed: a file's name without folder and end; --out names the folder"
+            )
+        self.job, self.circuit, self.folder = job, circuit, job.out or FOLDER
+        self.name = name or (circuit.path or job.deck).stem
+        self._names: list[str] = []
+        self._noted = False
+        self._own = {
+            "program": "fingerspice", "title": circuit.title, "file": str(circuit.path or ""),
+            "deck_sha256": _hash(circuit.text), "overrides": json.dumps(dict(circuit.overrides)),
+            "charge_law": job.charge_law or circuit.charge_law or "local",
+        }  # fmt: skip
+        self._writes: list[Write] = []
+
+    @property
+    def about(self) -> dict[str, str]:
+        """Texts kept in a picture: the circuit, and the files that were made with the picture."""
+        return {**self._own, "files": json.dumps(self._names)}
+
+    def will_write(self, end: str, write: Callable[[Path], Path | None]) -> None:
+        """Let `ready` have the function that writes the file with this ending.
+
+        Refused is a file that cannot be written, or must not be replaced.
+        """
+        file = self.folder / f"{self.name}{end}"
+        check_output(file, self.job.deck)
+        self._names.append(file.name)
+        if file.is_file() and not self.job.overwrite:
+            self._check(file)
+        self._writes.append(lambda: write(file))
+
+    def will_draw(self, end: str, draw: Callable[[], Any]) -> None:
+        """As `will_write`, of the picture that a function draws, if it draws one, unless the job wants none."""
+
+        def write(file: Path) -> Path | None:
+            from fingerspice.plots.drawing import save
+
+            picture = draw()
+            return None if picture is None else save(picture, file, about=self.about)
+
+        if not self.job.no_plot:
+            self.will_write(end, write)
+
+    def ready(self) -> list[Write]:
+        """The functions that write the files, for which there is a folder now."""
+        if self._writes:
+            self.open()
+        return self._writes
+
+    def open(self) -> None:
+        """When the default folder is created, put a .gitignore into it, to keep results out of version control."""
+        if self.job.out is None and not self.folder.exists():
+            # Ignore an error: writing the results will then fail as well, with a message.
+            with suppress(InputError):
+                write_aside(self.folder / ".gitignore", lambda path: path.write_text("*\n"))
+
+    def _check(self, file: Path) -> None:
+        held = _held(file)
+        ways = "allowed: --name NAME, another --out, or --overwrite"
+        if held is None and _is_table(file):
+            complain(f"note: {file} is replaced; a table alone does not say which circuit it is of")
+            return
+        if held is None:
+            raise InputError(f"{file} is there already, and nothing says which circuit it is of; {ways}")
+        same_deck = held["deck_sha256"] == self._own["deck_sha256"]
+        if json.loads(held["overrides"]) != dict(self.circuit.overrides):
+            said, own = _of(held), _of(self._own)
+        elif held["charge_law"] != self._own["charge_law"]:
+            said, own = (f"under the {x['charge_law']} law" for x in (held, self._own))
+        elif not same_deck and (held.get("file", "") != self._own["file"] or not held.get("file")):
+            said, own = f"of the deck {held.get('file') or 'of another text'}", f"of {self.job.deck}"
+        else:
+            if not same_deck and not self._noted:
+                self._noted = True
+                complain(
+                    f"note: the results in {self.folder} are of an earlier text of {self.job.deck} and are replaced"
+                )
+            return
+        raise InputError(f"{file} holds a result {said}, and this one is {own}; {ways}")
+
+
+def _of(held: Mapping[str, str]) -> str:
+    changed = json.loads(held["overrides"])
+    if not changed:
+        return "of the deck as it is"
+    said = [f"{path}={value if len(value) <= 40 else value[:36] + ' ...'}" for path, value in changed.items()]
+    return f"with {', '.join(said[:8])}"
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "replace")).hexdigest()
+
+
+def _held(file: Path) -> dict[str, str] | None:
+    """Attributes of a file that name its deck, changes and charge law; None if it has none."""
+    try:
+        found = _attributes(file)
+        known = all(isinstance(found.get(key), str) for key in ("deck_sha256", "overrides", "charge_law"))
+        return found if known and isinstance(json.loads(found["overrides"]), dict) else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, SyntaxError):
+        # The file was not written by this package.
+        return None
+
+
+def _attributes(file: Path) -> dict[str, Any]:
+    """Texts kept in a file; of a table, those in the picture of the same name, if it lists the table's file."""
+    if file.suffix == ".nc":
+        import h5netcdf
+
+        with h5netcdf.File(file, "r") as data:
+            attributes = {str(key): str(value) for key, value in data.attrs.items()}
+        return {**attributes, "deck_sha256": _hash(attributes["deck"])}
+    if file.suffix == ".svg":
+        # A schematic has them as its description.
+        found = re.search(r"<dc:description>(.*?)</dc:description>", file.read_text(encoding="utf-8"), re.DOTALL)
+        return {} if found is None else dict(json.loads(html.unescape(found[1])))
+    from PIL import Image
+
+    picture = file.with_suffix(".png")
+    if not picture.is_file():
+        # `design` writes NAME_drive.wav, NAME_drive.csv and NAME_friction.csv with the picture NAME_design.png.
+        picture = file.with_name(f"{file.stem.rpartition('_')[0]}_design.png")
+    with Image.open(picture) as image:
+        image.load()
+        text: dict[str, Any] = dict(getattr(image, "text", {}))
+    return text if file.name in json.loads(text.get("files", "[]")) else {}
+
+
+def _is_table(file: Path) -> bool:
+    """Whether a file begins like the tables that the commands write; a WAV file, whether such a table is beside it."""
+    with suppress(OSError), (file.with_suffix(".csv") if file.suffix == ".wav" else file).open("rb") as stream:
+        return stream.read(100).startswith(_HEADS)
+    return False

@@ -16,24 +16,22 @@ from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from fingerspice import __version__
 from fingerspice.base.announcing import paced
+from fingerspice.base.compiled import STAMP
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.files import UNFINISHED, settle_on_disk, write_aside, write_durably
-from fingerspice.cli.options import check_output, time_from_text
-from fingerspice.cli.result_files import Results
-from fingerspice.cli.terminal import Answering
-from fingerspice.results.record import variables
+from fingerspice.base.files import settle_on_disk, write_aside, write_durably
+from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.describe import digests
+from fingerspice.cli.options import Results, check_output, time_from_text
+from fingerspice.results.record import SIGNALS, variables
 from fingerspice.results.runfile import CHECKSUM, SIGNATURE, Array, attributes_of, create, signature, tidy, zarr_library
-
-if TYPE_CHECKING:
-    from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.solution import Solution
-    from fingerspice.solve.streaming import Stream
+from fingerspice.results.solution import Solution
+from fingerspice.solve.streaming import Stream, stream
 
 #: Attributes of the group: identity of the run, number of finished chunks, state to continue from, results so far, and
 #: the number of columns of each array, 0 for one without.
@@ -81,10 +79,10 @@ class Store:
             return
         self._hold(self.path)
         try:
-            attributes = attributes_of(self.path)
-            whole = all(isinstance(attributes[key], dict) for key in (RUN, MARK, SO_FAR, COLUMNS))
-            sound = attributes.get(SIGNATURE, "") in ("", signature(attributes))
-            whole = whole and sound and isinstance(attributes[DONE], int) and attributes[DONE] >= 0
+            held = attributes_of(self.path)
+            whole = all(isinstance(held[key], dict) for key in (RUN, MARK, SO_FAR, COLUMNS))
+            whole = whole and held.get(SIGNATURE, "") in ("", signature(held))
+            whole = whole and isinstance(held[DONE], int) and held[DONE] >= 0
         except (OSError, ValueError, KeyError, TypeError):
             whole = False
         if not whole:
@@ -94,17 +92,18 @@ class Store:
             return
         self.there = True
         for key, own in self.run.items():
-            held = attributes[RUN].get(key)
-            if held != own:
-                said = "" if len(f"{held}{own}") > 80 else f" ({held}, and this one {own})"
+            other = held[RUN].get(key)
+            if other != own:
+                said = "" if len(f"{other}{own}") > 80 else f" ({other}, and this one {own})"
                 what = f"{'other' if key == 'signals' else 'another'} {key.replace('_', ' ')}{said}"
                 ways = "allowed: --name NAME, another --out, or --overwrite"
                 raise InputError(f"{self.path} holds a run of {what}; {ways}")
-        self.done, self.mark, self.so_far = attributes[DONE], attributes[MARK], attributes[SO_FAR]
+        self.done, self.mark, self.so_far = held[DONE], held[MARK], held[SO_FAR]
         written: set[Path] = set()
-        for name, columns in attributes[COLUMNS].items():
+        for name, columns in held[COLUMNS].items():
             array = self._array(name, columns)
-            for place in ((chunk, *(0,) * bool(columns)) for chunk in range(self.done)):
+            for chunk in range(self.done):
+                place = _place(chunk, array)
                 if fault := array.fault(place):
                     raise InputError(f"{self.path} is damaged: {array.file(place)} {fault}; allowed: --overwrite")
                 written.add(array.file(place))
@@ -136,9 +135,13 @@ class Store:
         }  # fmt: skip
         try:
             if not self.there:
-                self._create({**about, RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, COLUMNS: columns}, arrays)
+                blank = {RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, COLUMNS: columns}
+                # The store is locked before it has its name.
+                if not create(self.path, {**about, **blank}, arrays, {}, self._hold):
+                    raise self._busy()
+                self.there = True
             for name, one in arrays.items():
-                place = (chunk, *(0,) * bool(columns[name]))
+                place = _place(chunk, one)
                 one.put(place, data[name][1])
                 settle_on_disk(one.file(place).parent)
             head = json.loads((self.path / "zarr.json").read_text())
@@ -151,21 +154,6 @@ class Store:
                 "written, and the same command goes on from there"
             ) from None
         self.done = chunk + 1
-
-    def _create(self, attributes: dict[str, Any], arrays: Mapping[str, Array]) -> None:
-        """Create the store, which is locked before it has its name; refused if another process was faster."""
-        aside = self.path.with_name(f"{UNFINISHED}{os.urandom(6).hex()}")
-        try:
-            create(aside, attributes, arrays, {}, os.urandom(6).hex())
-            self._hold(aside)
-            if self.path.exists():
-                raise self._busy()
-            # It fails where another process has just done the same.
-            aside.rename(self.path)
-            settle_on_disk(self.path.parent)
-            self.there = True
-        finally:
-            shutil.rmtree(aside, ignore_errors=True)
 
     def to_netcdf(self, path: Path) -> Path:
         """Write the whole run as NetCDF, piece by piece."""
@@ -201,32 +189,34 @@ class Store:
         return write_aside(path, write)
 
 
-def run_streamed(
-    answer: Answering, results: Results, circuit: Circuit, how: dict[str, Any], *, chunk: str | None,
-    signals: str | None, netcdf: bool,
-) -> None:  # fmt: skip
-    """Run a circuit, write its chunks to a store, and fill the answer; what a failed run has written stays."""
-    from fingerspice.solve.streaming import stream
+def _place(chunk: int, array: Array) -> tuple[int, ...]:
+    return (chunk, *(0,) * (len(array.shape) - 1))
 
-    path = results.folder / f"{results.name}.zarr"
+
+def run_streamed(
+    results: Results, how: dict[str, Any], *, chunk: str | None, signals: str | None, netcdf: bool
+) -> None:
+    """Run a circuit, write its chunks to a store, and fill the answer; what a failed run has written stays."""
+    circuit, answer, path = results.circuit, results.job.answer, results.folder / f"{results.name}.zarr"
     # The store is a folder, so check that a file can be written next to it.
-    check_output(path.with_suffix(".zarr.part"), results.deck)
+    check_output(path.with_suffix(".zarr.part"), results.job.deck)
     names = _names(signals, circuit)
     charge = any(name in ("q_source", "i_source") for name in names)
     run = stream(circuit, chunk=time_from_text("--chunk", chunk), charge=charge, **how)
     if netcdf:
         results.will_write(".nc", lambda file: store.to_netcdf(file))
-    store = Store(path, _identity(run, circuit, how, names), run.outputs.total, run.count)
+    total, span = run.outputs.total, run.problem.t_stop - run.problem.t_start
+    store = Store(path, _identity(run, circuit, how, names), total, run.count)
     with store.lock:
-        store.open(results.overwrite)
+        store.open(results.job.overwrite)
         if store.done and store.done < store.chunks:
             run.go_to(store.mark, store.done * store.count)
         results.open()
-        begun, first, total = time.perf_counter(), store.done, run.outputs.total
+        begun, first = time.perf_counter(), store.done
         answer.data["files"].append(str(path))
         if first < store.chunks:
             _fill(run, store, names, results)
-        took, span = time.perf_counter() - begun, run.problem.t_stop - run.problem.t_start
+        took = time.perf_counter() - begun
         said = [f"{total:,} outputs of {span:g} s in {store.chunks:,} piece{'s' if store.chunks > 1 else ''}: {path}"]
         if first < store.chunks:
             said.append(f"{(store.chunks - first) / store.chunks * span / took:,.3g} times real time")
@@ -241,8 +231,6 @@ def run_streamed(
 
 def _names(signals: str | None, circuit: Circuit) -> list[str]:
     """Keys of the signals that are written, of those that the circuit has."""
-    from fingerspice.results.record import SIGNALS
-
     has = {"gap": circuit.by_device("GAP"), "layer": [e for e in circuit.elements if e.spec.is_layer]}
     allowed = [name for name, signal in SIGNALS.items() if has.get(signal.of, True)]
     if signals is None:
@@ -255,9 +243,6 @@ def _names(signals: str | None, circuit: Circuit) -> list[str]:
 
 def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[str]) -> dict[str, Any]:
     """All inputs that determine the bytes of a store, by which a later call recognises its own store."""
-    from fingerspice.base.compiled import STAMP
-    from fingerspice.circuit.describe import digests
-
     elements, sources = digests(circuit)
     o, scene = run.outputs, run.problem.scene
     return {
@@ -271,16 +256,14 @@ def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[st
 def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None:
     """Compute and write all missing chunks; a chunk is written while the next one is computed."""
     about = {key: text for key, text in results.about.items() if key != "files"}
-    known: set[str] = set()
     writing: Future[None] | None = None
     start, span = run.problem.t_start, run.problem.t_stop - run.problem.t_start
     first = float(run.outputs.times(run.done, run.done + 1)[0])
     with ThreadPoolExecutor(1) as writer, paced("simulating", (first - start) / span) as show:
         for number, solution in enumerate(run, store.done):
             for text in solution.warnings:
-                if text not in known:
-                    known.add(text)
-                    warnings.warn(text, FingerspiceWarning, stacklevel=2)
+                # One that comes again is not told again.
+                warnings.warn(text, FingerspiceWarning, stacklevel=2)
             if writing is not None:
                 writing.result()
             writing = writer.submit(store.write, number, solution, names, about, run.mark())

@@ -1,7 +1,6 @@
 """What the command line says: on the terminal, without control characters of a deck and tracebacks, and with `--json`.
 
-The answers of `--json` have the same keys for every outcome (docs/json.md). Arguments that commands share are here,
-too.
+The answers of `--json` have the same keys for every outcome (docs/json.md).
 """
 
 from __future__ import annotations
@@ -12,20 +11,15 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from fingerspice import __version__
-from fingerspice.base.announcing import paced
 from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.results.outcome import SolveError
 
 if TYPE_CHECKING:
-    from fingerspice.circuit.circuit import Circuit
     from fingerspice.results.solution import Solution
 
 
@@ -56,6 +50,8 @@ OWN = {
         "check": "chunks",
     }.items()
 }
+#: Keys that are options, too.
+AS_ASKED = ("charge_law", "method", "rtol", "area", "skin")
 #: Figures of a signal; a figure that a signal lacks is null.
 FIGURES = ("min", "max", "peak", "mean", "rms", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
 
@@ -65,17 +61,6 @@ def blank(command: str | None) -> Answer:
     keys = (*COMMON, *OWN.get(command or "", ()))
     empty = {"success": False, "warnings": [], "files": [], "overrides": {}, "sets": []}
     return {**dict.fromkeys(keys), **empty, "version": __version__, "command": command}
-
-
-def of_circuit(circuit: Circuit, charge_law: str | None) -> Answer:
-    """The part of an answer that describes the circuit; an unknown charge law is refused."""
-    from fingerspice.circuit.circuit import CHARGE_LAWS
-    from fingerspice.waveforms.waveform import require
-
-    law = charge_law or circuit.charge_law or "local"
-    require(law in CHARGE_LAWS, "charge_law", repr(law), " or ".join(map(repr, CHARGE_LAWS)))
-    known = {"title": circuit.title, "overrides": dict(circuit.overrides), "sets": list(circuit.sets)}
-    return {**known, "charge_law": law}
 
 
 def of_run(solution: Solution) -> Answer:
@@ -96,57 +81,9 @@ def of_run(solution: Solution) -> Answer:
     }  # fmt: skip
 
 
-Deck = Annotated[Path, typer.Argument(metavar="DECK", help="Netlist file (.cir), - for standard input.")]
-Out = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the files; out by default.")]
-Name = Annotated[
-    str | None, typer.Option("--name", metavar="NAME", help="Name of the files; that of the deck by default.")
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of other circuits, and other files.")]
-Rtol = Annotated[float, typer.Option(help="Largest error of gap voltage and force, relative to their peaks.")]
-ChargeLaw = Annotated[str | None, typer.Option(help="local or mobile; the included library's by default.")]
-Set = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set", metavar="PATH=VALUE|NAME", help="Change a value: Xgap.d=3u; or apply a named set: moist. Repeatable."
-    ),
-]
-
-
-def _named(kind: str, example: str) -> Any:
-    said = f"Apply a named set of this kind: {example} (list: fingerspice sets)."
-    return typer.Option(f"--{kind}", metavar="[ELEMENT=]NAME", help=said)
-
-
-Finger = Annotated[list[str] | None, _named("finger", "moist, or Xlight=dry for one of several")]
-Coating = Annotated[list[str] | None, _named("coating", "3M")]
-Drive = Annotated[list[str] | None, _named("drive", "Fig4-5kHz")]
-_SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
-Source = Annotated[
-    list[str] | None,
-    typer.Option("--source", metavar="[NAME=]SPEC", help=f"Replace a source: {_SPECS}."),
-]
-Stop = Annotated[str | None, typer.Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")]
-NoPlot = Annotated[bool, typer.Option("--no-plot", help="Write no picture.")]
-Schematic = Annotated[
-    bool, typer.Option("--schematic", help="Draw the circuit, too: small in the picture, and NAME_schematic.svg.")
-]
-Streamed = Annotated[
-    bool,
-    typer.Option("--stream", help="Write a long run piece by piece to a Zarr store, which a second call goes on with."),
-]
-Chunk = Annotated[
-    str | None, typer.Option(metavar="TIME", help="With --stream: length of a piece of the store, s; 10 by default.")
-]
-Signals = Annotated[
-    str | None, typer.Option(metavar="NAME,...", help="With --stream: what is written; u_gap,f_el by default.")
-]
-NetCdf = Annotated[bool, typer.Option("--netcdf", help="With --stream: write the whole as NetCDF, too, at the end.")]
-
-
 #: Largest number of characters of a printed line; the middle of a longer line is left out.
 LONGEST_LINE = 2000
-Write = Callable[[], Path]
+Write = Callable[[], Path | None]
 
 
 def say(text: str = "", end: str = "\n") -> None:
@@ -216,12 +153,12 @@ class Answering:
     """The answer of one command, collected while it runs and printed at its end as text or JSON.
 
     It is used as a context. Each warning becomes one line on stderr and a part of the answer. If JSON is wanted, it is
-    printed even when the command ends with an error. `known` are values of keys that are known at the start.
+    printed even when the command ends with an error. Of the options given it has some as they are, until more is known.
     """
 
-    def __init__(self, command: str, as_json: bool, **known: Any) -> None:
-        self.as_json = as_json
-        self.data = {**blank(command), **known}
+    def __init__(self, command: str, as_json: bool, **given: Any) -> None:
+        self.as_json, self.data = as_json, blank(command)
+        self.data |= {key: given[key] for key in AS_ASKED if key in given and key in self.data}
         self._warnings = warnings.catch_warnings()
 
     def __enter__(self) -> Answering:
@@ -256,14 +193,14 @@ class Answering:
     def give(self, text: Callable[[], str], writes: Sequence[Write] = ()) -> None:
         """Write files, then print the result as text unless JSON is wanted.
 
-        Each of `writes` writes a file and returns its path. If one cannot be written, the text is still printed before
-        the error is raised.
+        Each of `writes` writes a file and returns its path, or None for no file. If one cannot be written, the text is
+        still printed before the error is raised.
         """
         files: list[str] = self.data["files"]
         failed = None
         try:
             for write in writes:
-                files.append(str(write()))
+                files += [str(file)] if (file := write()) is not None else []
         except InputError as error:
             failed = error
         said = [*filter(None, [text()]), *(f"wrote {file}" for file in files)]
@@ -279,10 +216,3 @@ def answer_usage(message: str) -> None:
     if "--json" in words:
         command = next((word for word in words if word in OWN), None)
         say_json({**blank(command), "status": "BAD_INPUT", "message": message})
-
-
-@contextmanager
-def progress(what: str = "simulating") -> Iterator[Callable[[float], None] | None]:
-    """A progress bar on a terminal, which appears after one second."""
-    with paced(what) as show:
-        yield show if sys.stderr.isatty() else None

@@ -105,10 +105,8 @@ class Array:
             values = whole
         content = np.ascontiguousarray(values, self.kind).tobytes()
         temporary = self.path / f"{UNFINISHED}{os.urandom(6).hex()}"
-        with temporary.open("wb") as stream:
-            stream.write(content + _checksum(content))
-            stream.flush()
-            os.fsync(stream.fileno())
+        temporary.write_bytes(content + _checksum(content))
+        settle_on_disk(temporary)
         file = self.file(place)
         file.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -120,13 +118,13 @@ class Array:
 
 
 def create(
-    path: Path, attributes: dict[str, Any], arrays: Mapping[str, Array], known: Mapping[str, NDArray[Any]], suffix: str
-) -> None:
-    """Create a store without values, but for those `known` as one chunk each, under a temporary name, and rename it."""
+    path: Path, attributes: dict[str, Any], arrays: Mapping[str, Array], known: Mapping[str, NDArray[Any]],
+    hold: Callable[[Path], None] = lambda _: None,  # Is given the store before it has its name
+) -> bool:  # fmt: skip
+    """Create a store without values but those `known`, one chunk each; False if another process was faster."""
     zarr = zarr_library()
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f"{UNFINISHED}{suffix}")
-    shutil.rmtree(aside, ignore_errors=True)
+    aside = path.with_name(f"{UNFINISHED}{os.urandom(6).hex()}")
     try:
         group = zarr.create_group(aside, zarr_format=3, attributes=attributes)
         for name, one in arrays.items():
@@ -136,13 +134,15 @@ def create(
             )  # fmt: skip
         for name, values in known.items():
             replace(arrays[name], path=aside / name).put((0,) * values.ndim, values)
+        hold(aside)
         try:
             aside.rename(path)
         except OSError:
-            # Another process was faster.
-            if not path.is_dir():
-                raise
+            if path.is_dir():
+                return False
+            raise
         settle_on_disk(path.parent)
+        return True
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 

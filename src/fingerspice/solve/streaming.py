@@ -62,8 +62,7 @@ class Stream:
         if self.done == self.outputs.total:
             raise StopIteration
         wanted = min(self.count, self.outputs.total - self.done)
-        while sum(t.size for _, t, _ in self._ready) < wanted and not self._source.over:
-            self._advance()
+        self._reach(self.done + wanted)
         solution = self._solution(*self._take(wanted))
         if solution.failure is not None:
             self.done = self.outputs.total
@@ -82,27 +81,27 @@ class Stream:
             self._source = self._stepped()
         self._source.go_to(mark)
         self.done = done
-        while self._source.written <= done and not self._source.over:
-            self._advance()
+        self._reach(done + 1)
         self._take(done - (self._ready[0][0]["written"] if self._ready else done))
 
     def _stepped(self) -> ByWindows:
         """The method for a recording that the one for recordings fails on."""
         return ByWindows(self.problem, self.outputs, self.plan, self.rtol, "exponential")
 
-    def _advance(self) -> None:
-        """Integrate the next piece."""
-        mark = self._source.mark()
-        found = self._source.advance()
-        if found is None:
-            # Integrate this piece, and the rest, by exponential steps.
-            assert isinstance(self._source, BySamples)
-            self._source.go_to(mark)
-            other = self._stepped()
-            other.written, other.state = mark["written"], self._source.march.state
-            self._source = other
-            mark, found = other.mark(), other.advance()
-        self._ready.append((mark, *found))
+    def _reach(self, written: int) -> None:
+        """Integrate pieces until so many outputs are there, or the run ends."""
+        while self._source.written < written and not self._source.over:
+            mark = self._source.mark()
+            found = self._source.advance()
+            if found is None:
+                # Integrate this piece, and the rest, by exponential steps.
+                assert isinstance(self._source, BySamples)
+                self._source.go_to(mark)
+                other = self._stepped()
+                other.written, other.state = mark["written"], self._source.march.state
+                self._source = other
+                mark, found = other.mark(), other.advance()
+            self._ready.append((mark, *found))
 
     def _take(self, count: int) -> tuple[FloatArray, FloatArray]:
         """Take the next `count` outputs, or all if there are fewer: times (s) and rows."""

@@ -1,34 +1,42 @@
-"""A sweep divided into chunks by itself alone, the Zarr store that any number of processes fill, and running a chunk.
+"""A sweep into a Zarr store, in chunks that any number of processes run, here or by the workers of a Dask scheduler.
 
-A chunk is a block of scenes, one file of every array. The file of ``status`` is written last, when the others have
-reached the disk, and so marks the chunk as done.
+The sweep alone divides itself into chunks. A chunk is a block of scenes, one file of every array. The file of
+``status`` is written last, when the others have reached the disk, and so marks the chunk as done.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import os
+import time
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from inspect import signature
+from multiprocessing import parent_process
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice import __version__
+from fingerspice.base.announcing import paced
+from fingerspice.base.arrays import keep_freed_memory, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import digests, scenes_warnings
-from fingerspice.results.runfile import CHECKSUM, Array, attributes_of, create
-from fingerspice.studies.batch.batch import batch
+from fingerspice.results.runfile import CHECKSUM, Array, attributes_of, create, tidy
+from fingerspice.studies.batch.batch import MESSAGES, batch
 from fingerspice.studies.batch.form import LOCKSTEP, REFUSED, STATUS_NAMES, checked_scenes
-from fingerspice.studies.sweep.plan import Plan, Sequence
+from fingerspice.studies.sweep.populations import Draws, Plan
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -42,7 +50,16 @@ STATUS, MISSING = "status", len(STATUS_NAMES)
 RUN, NAMES = "sweep", "names"
 # Quantiles by which a distribution is recognised.
 _PROBES = np.linspace(0.015625, 0.984375, 63)
-_FREE = nullcontext()
+# Chunks that a process has at once: it computes one while another one is waiting for the disk.
+AT_ONCE = 2
+_FREE, _WRITING = nullcontext(), Lock()
+# How often the scheduler may give up one chunk, and chunks one after another: each time it has lost several workers.
+TRIES, MOST_LOST = 2, 20
+# Chunks that a scheduler is given at once, and how long it may take to answer, s.
+AHEAD, PATIENCE = 4096, 5.0
+_GOES_ON = "what is written stays, and the same command goes on from there"
+# What is known of a chunk that has been run: the number of its scenes, and why some of them have no result.
+Ran = tuple[int, list[str]]
 
 
 def programs() -> str:
@@ -52,25 +69,17 @@ def programs() -> str:
     return f"fingerspice {__version__}, NumPy {np.__version__}, SciPy {scipy.__version__}"
 
 
-def identity_at(path: Path) -> dict[str, Any]:
-    """What the store that is at a path holds about its sweep; refuses what is no store of a sweep."""
-    try:
-        return dict(json.loads(attributes_of(path)[RUN]))
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path} is there already and is no store of a sweep; allowed: another path") from None
-
-
 @dataclass(frozen=True)
 class Work:
     """A sweep with its store, and all that it takes to run any chunk of it."""
 
-    circuit: Circuit
     plan: Plan
     options: Mapping[str, Any]  # Of `batch`
     path: Path
     block: tuple[int, ...]  # Scenes of a chunk along each dimension
-    outputs: dict[str, Array]  # With ``error`` and ``status``
-    draws: Sequence | None
+    outputs: dict[str, Array]  # With ``error`` and, as the last, ``status``
+    drawn: dict[str, Array]  # The drawn parameters, along ``scene``
+    draws: Draws | None
     programs: str
 
     @property
@@ -86,21 +95,12 @@ class Work:
         """Number of a chunk along each dimension: chunks one after another have the same draws at other places."""
         return tuple(int(i) for i in np.unravel_index(index, self._grid, "F" if self.plan.drawn else "C"))
 
-    def _drawn(self) -> dict[str, Array]:
-        """The arrays of drawn parameters, along ``scene``."""
-        sizes, block, units = self.plan.sizes[-1:], self.block[-1:], self.plan.units
-        return {
-            name: Array(self.path / name, ("scene",), sizes, block, {"units": units[name]}) for name in self.plan.drawn
-        }
-
     def _pieces(self, index: int) -> Iterator[tuple[str, Array, tuple[int, ...]]]:
         """Arrays of a chunk, and its place in each, ``status`` last; the first place of a grid has the draws."""
-        place = self._place(index)
-        if not any(place[:-1]):
-            yield from ((name, one, place[-1:]) for name, one in self._drawn().items())
-        for name in sorted(self.outputs, key=STATUS.__eq__):
-            one = self.outputs[name]
-            yield name, one, place + (0,) * (len(one.shape) - len(place))
+        at = dict(zip(self.plan.dims, self._place(index), strict=True))
+        first = not any(at[name] for name in self.plan.grid)
+        for name, one in ((self.drawn if first else {}) | self.outputs).items():
+            yield name, one, tuple(at.get(dim, 0) for dim in one.dims)
 
     def is_done(self, index: int) -> bool:
         """Whether a chunk has been written as a whole, and has not changed since."""
@@ -117,15 +117,15 @@ class Work:
         """
         own = json.loads(json.dumps({**self._identity(), "kind of checksum": CHECKSUM}, default=float))
         if not os.path.lexists(self.path):
-            plan, arrays = self.plan, self.outputs | self._drawn()
+            plan, arrays = self.plan, self.outputs | self.drawn
             for name, values in plan.grid.items():
                 of = {NAMES: list(plan.names[name])} if name in plan.names else {"units": plan.units[name]}
                 arrays[name] = Array(self.path / name, (name,), values.shape, values.shape, of, fill=0.0)
             try:
-                create(self.path, {**about, RUN: json.dumps(own)}, arrays, plan.grid, os.urandom(6).hex())
+                create(self.path, {**about, RUN: json.dumps(own)}, arrays, plan.grid)
             except OSError as error:
                 raise InputError(f"cannot write {self.path}: {error.strerror or error}") from None
-        held = identity_at(self.path)
+        held = _identity_at(self.path)
         if differ := [key for key in {**own, **held} if held.get(key) != own.get(key)]:
             key, told = differ[0], [str(one.get(differ[0])) for one in (held, own)]
             said = "" if max(map(len, told)) > 40 else f" ({told[0]}, and this one {told[1]})"
@@ -136,7 +136,7 @@ class Work:
 
     def _identity(self) -> dict[str, Any]:
         """All inputs that determine the bytes of the store, by which a later call recognises it."""
-        circuit, plan = self.circuit, self.plan
+        plan, circuit = self.plan, self.plan.circuit
         values: dict[str, Any] = {}
         for name, one in (plan.grid | plan.fixed).items():
             values[name] = hashlib.sha256(one.tobytes()).hexdigest() if one.size > 8 else one.tolist()
@@ -165,17 +165,17 @@ class Work:
 
         found: Dataset = xarray.open_zarr(self.path, chunks=None, consolidated=False, zarr_format=3)
         del found.attrs[RUN]
-        found = found.set_coords(list(self.plan.drawn))
+        found = found.set_coords(list(self.drawn))
         named = {str(name): one.attrs[NAMES] for name, one in found.coords.items() if NAMES in one.attrs}
         return found.assign_coords(named)[list(self.outputs)]
 
     def run_chunk(
         self, index: int, computing: AbstractContextManager[Any] = _FREE, writing: AbstractContextManager[Any] = _FREE
-    ) -> tuple[int, list[str]]:
+    ) -> Ran:
         """Run the scenes of a chunk and write them, which marks the chunk as done.
 
         Scenes are run within `computing`: a lock, where several chunks of a process are to be computed one after
-        another; and written within `writing`. Gives their number, and why some of them have no result.
+        another; and written within `writing`.
         """
         if not (self.path / "zarr.json").is_file():
             raise InputError(f"{self.path} is not there on a worker; allowed: a folder that all machines share")
@@ -208,25 +208,30 @@ class Work:
         """The batch of a chunk's scenes, and the values that are drawn."""
         draws = {} if self.draws is None else self.draws.part(self._place(index)[-1])
         grid = {name: values[one] for (name, values), one in zip(self.plan.grid.items(), part, strict=False)}
-        return batch(self.circuit, self.plan.spread(grid, draws), **self.options), {**draws}
+        return batch(self.plan.circuit, self.plan.spread(grid, draws), **self.options), {**draws}
 
     def _write(self, index: int, values: Mapping[str, NDArray[Any]]) -> None:
         try:
             for name, one, place in self._pieces(index):
                 one.put(place, np.asarray(values[name]))
         except OSError as error:
-            raise InputError(
-                f"cannot write {self.path}: {error.strerror or error}; what is written stays, and the same command "
-                "goes on from there"
-            ) from None
+            raise InputError(f"cannot write {self.path}: {error.strerror or error}; {_GOES_ON}") from None
 
 
-def make_work(circuit: Circuit, plan: Plan, options: Mapping[str, Any], path: Path) -> tuple[Work, dict[str, Any]]:
+def _identity_at(path: Path) -> dict[str, Any]:
+    """What the store that is at a path holds about its sweep; refuses what is no store of a sweep."""
+    try:
+        return dict(json.loads(attributes_of(path)[RUN]))
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path} is there already and is no store of a sweep; allowed: another path") from None
+
+
+def make_work(plan: Plan, options: Mapping[str, Any], path: Path) -> tuple[Work, dict[str, Any]]:
     """The sweep as chunks, and the attributes of its store; its first scene is run to see what outputs there are."""
-    _check_values(circuit, plan)
+    _check_values(plan)
+    circuit, skin = plan.circuit, options.get("skin", "own")
     middle = plan.quantiles(np.full((1, len(plan.drawn)), 0.5))
     ends = plan.spread({name: values[[0, -1]] for name, values in plan.grid.items()}, middle)
-    skin = options.get("skin", "own")
     for text in scenes_warnings(circuit, options.get("t_stop"), checked_scenes(circuit, ends), skin):
         warnings.warn(text, FingerspiceWarning, stacklevel=4)
     with warnings.catch_warnings():
@@ -249,18 +254,22 @@ def make_work(circuit: Circuit, plan: Plan, options: Mapping[str, Any], path: Pa
         )
         for name, one in first.data_vars.items()
     }  # fmt: skip
-    flags = dict(outputs[STATUS].attributes)
+    status = outputs.pop(STATUS)
+    flags = dict(status.attributes)
     flags |= {"flag_values": [*flags["flag_values"], MISSING], "flag_meanings": f"{flags['flag_meanings']} missing"}
-    outputs[STATUS] = replace(outputs[STATUS], kind="i1", fill=MISSING, attributes=flags)
-    draws = plan.sequence(block[-1]) if plan.drawn else None
-    work = Work(circuit, plan, options, path, block, outputs, draws, programs())
+    outputs[STATUS] = replace(status, kind="i1", fill=MISSING, attributes=flags)
+    drawn = {
+        name: Array(path / name, ("scene",), plan.sizes[-1:], block[-1:], {"units": plan.units[name]})
+        for name in plan.drawn
+    }
+    work = Work(plan, options, path, block, outputs, drawn, Draws(plan, block[-1]) if drawn else None, programs())
     require(work.chunks <= MOST_CHUNKS, "the sweep", f"{math.prod(plan.sizes):,} scenes", f"at most {MOST_CHUNKS:,} "
             f"chunks of {math.prod(block):,}")  # fmt: skip
     about = {key: value for key, value in first.attrs.items() if key not in ("n_ordinary", "ordinary", "failures")}
-    return work, about | plan.about(circuit)
+    return work, about | plan.about
 
 
-def _check_values(circuit: Circuit, plan: Plan) -> None:
+def _check_values(plan: Plan) -> None:
     """Refuse what a parameter does not accept: values of the grid, and quantiles beyond which there are draws."""
     ends = plan.quantiles(np.repeat([[1.0 / plan.n], [1.0 - 1.0 / plan.n]], len(plan.drawn), axis=1))
     for name, values in (plan.grid | plan.fixed | ends).items():
@@ -268,7 +277,153 @@ def _check_values(circuit: Circuit, plan: Plan) -> None:
             # Sets of parameters that do not differ.
             continue
         try:
-            checked_scenes(circuit, paths)
+            checked_scenes(plan.circuit, paths)
         except InputError as error:
             kind = "the distribution of" if name in plan.drawn else "the values of"
             raise InputError(f"{kind} {name}: {error}") from None
+
+
+def stored(
+    plan: Plan, options: Mapping[str, Any], path: Path, workers: int | None, scheduler: str | None,
+    shard: tuple[int, int],
+) -> Dataset:  # fmt: skip
+    """Run the missing chunks of a sweep, or of a shard of it, and return what the store has."""
+    if workers is not None:
+        whole_number("workers", workers, 1)
+        if scheduler is not None:
+            raise InputError("workers and scheduler are both given; allowed: one of them")
+    good = len(shard) == 2 and all(isinstance(x, int) for x in shard) and 1 <= shard[0] <= shard[1]
+    require(good, "shard", shard, "two whole numbers (i, m), with i from 1 to m")
+    if os.path.lexists(path):
+        _identity_at(path)
+    work, about = make_work(plan, options, path)
+    here = workers is None and scheduler is None
+    if not here:
+        work = replace(work, options={"threads": 1, **options})
+    with nullcontext() if here else _client(workers and min(workers, work.chunks), scheduler) as client:
+        work.open(about)
+        begun, mine = time.perf_counter(), range(shard[0] - 1, work.chunks, shard[1])
+        missing = [index for index in mine if not work.is_done(index)]
+        answers = _here(work, missing) if here or not missing else _by_scheduler(work, missing, client)
+        failures: list[str] = []
+        scenes, there, whole = 0, len(mine) - len(missing), max(len(mine), 1)
+        with paced("sweeping", there / whole) as show:
+            for number, (count, told) in enumerate(answers, there + 1):
+                failures, scenes = failures + told, scenes + count
+                show(number / whole, lambda s, count=scenes: f"{count / s:,.3g} scenes/s,")
+        lacking = work.chunks - work.marked()
+        if not lacking:
+            tidy(work.path)
+        took = time.perf_counter() - begun
+    found = work.dataset()
+    found.attrs |= {"chunks": len(mine), "chunks_found": there, "chunks_missing": lacking, "seconds": took}
+    found.attrs["failures"] = failures[:MESSAGES]
+    return found
+
+
+def _here(work: Work, missing: Sequence[int]) -> Iterator[Ran]:
+    """Chunks by this process."""
+    # A batch changes the filters for a while, and two of them at once for good.
+    with warnings.catch_warnings(), ThreadPoolExecutor(AT_ONCE) as pool:
+        warnings.simplefilter("ignore", FingerspiceWarning)
+        yield from pool.map(partial(work.run_chunk, computing=Lock()), missing)
+
+
+@contextmanager
+def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
+    """A client of so many `workers` on this machine, or of those of a scheduler."""
+    try:
+        import distributed
+    except ImportError:
+        raise InputError(
+            f"{'scheduler' if workers is None else 'workers'} takes the package distributed, which is not installed; "
+            "allowed: pip install 'fingerspice[cluster]'"
+        ) from None
+    with ExitStack() as held:
+        try:
+            if workers is not None:
+                scheduler = held.enter_context(
+                    distributed.LocalCluster(
+                        n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0",
+                        silence_logs=logging.CRITICAL,
+                    )
+                ).scheduler_address  # fmt: skip
+            client = held.enter_context(distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False))
+        except (OSError, ValueError, ImportError, RuntimeError) as error:
+            raise InputError(
+                f"no scheduler answers at {scheduler} ({type(error).__name__}); allowed: the address that "
+                "`dask scheduler` tells, such as tcp://10.0.0.1:8786"
+                if workers is None
+                else f"the workers did not start ({type(error).__name__}); in a script, allowed: workers under "
+                "if __name__ == '__main__'"
+            ) from None
+        yield client
+
+
+def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[Ran]:
+    """Chunks by the workers of a Dask scheduler, which gives the chunks of a lost worker to others."""
+    from distributed import KilledWorker, TimeoutError, as_completed
+
+    # Held by the scheduler, not by a worker, with which it could be lost.
+    held = client.submit(lambda: work, pure=False)
+    todo, lost = deque(missing), Counter[int | None]()
+    running: dict[Any, int] = {}
+    given_up: dict[int, Exception] = {}
+    waiting = as_completed(loop=client.loop)
+    while todo or running:
+        # A chunk that workers were lost with is run alone, so that it alone is blamed.
+        while todo and len(running) < (1 if lost.keys() & {todo[0], *running.values()} else AHEAD):
+            index = todo.popleft()
+            future = client.submit(_run_and_write_aside, held, index, pure=False)
+            running[future] = index
+            waiting.add(future)
+        future = next(waiting)
+        index = running.pop(future)
+        try:
+            answer = future.result(timeout=PATIENCE)
+        except InputError:
+            raise
+        except (KilledWorker, TimeoutError) as error:
+            # The scheduler gives a chunk up that several workers were lost with; and an answer that is lost with its
+            # worker does not come before the chunk has been run again.
+            lost.update((None, index) if isinstance(error, KilledWorker) else (None,))
+            if lost[None] == MOST_LOST:
+                raise _lost("one chunk after another", MOST_LOST, error) from None
+            given_up[index] = error
+            if lost[index] < TRIES:
+                todo.append(index)
+        except Exception as error:
+            raise InputError(
+                f"the sweep at the scheduler ended with {type(error).__name__}: {error}; {_GOES_ON}"
+            ) from None
+        else:
+            lost[None], _ = 0, given_up.pop(index, None)
+            yield answer
+    for index, reason in given_up.items():
+        raise _lost(f"chunk {index} of the sweep", TRIES, reason)
+
+
+def _lost(chunk: str, count: int, reason: Exception) -> InputError:
+    return InputError(
+        f"the workers of {chunk} were lost, {count} times: {reason}; allowed: fewer workers, if the memory is too "
+        f"small for these; {_GOES_ON}"
+    )
+
+
+def _run_and_write_aside(work: Work, index: int) -> Ran:
+    """A task of Dask: its worker computes the next chunk while this one is written."""
+    keep_freed_memory()
+    if parent_process() is not None:
+        # A process of Dask's own, whose terminal may be the user's, who has been warned before the first chunk.
+        warnings.simplefilter("ignore", FingerspiceWarning)
+    return work.run_chunk(index, writing=_aside())
+
+
+@contextmanager
+def _aside() -> Iterator[None]:
+    """What a task does in here takes no thread of its worker; one task at a time, so that chunks cannot pile up."""
+    from distributed import secede
+
+    with _WRITING:
+        secede()
+        yield

@@ -3,33 +3,239 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray, real_number
+from fingerspice.base.arrays import FloatArray, real_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.describe import require_circuit
+from fingerspice.sets.parameters import KINDS
+from fingerspice.sets.parameters import parameters as known_sets
 from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.form import REFUSED
-from fingerspice.studies.sweep.plan import BITS, Plan, make_plan, with_sets
-from fingerspice.studies.sweep.workers import stored
-from fingerspice.waveforms.waveform import require
+from fingerspice.studies.batch.form import REFUSED, own_path
+from fingerspice.waveforms.waveform import Waveform, require
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
+# Bits of a Sobol point, and so the largest number of draws of all.
+BITS = 30
 # Largest number of scenes of a sweep, whose figures are kept in memory (some 100 bytes each), of a population, and of a
 # population in a store.
 MOST_SCENES, MOST_SAMPLES, MOST_STORED_SAMPLES = 1 << 26, 1 << 20, 1 << BITS
 # Quantiles of one parameter at which its influence is shown, all others being at their medians.
 QUANTILES = (0.05, 0.5, 0.95)
+# Quantiles are taken no nearer to 0 and 1 than this, so that a distribution without bounds gives finite values.
+_EDGE = 1e-12
 # Resamples of the population for the intervals of the indices. (scipy's own cannot be given a seed.)
 RESAMPLES = 499
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Parameters of a circuit that make a grid, those that are drawn (`n` draws by `seed`), those that are one number.
+
+    Names are paths, or several paths with commas, whose numbers are factors. A kind of named sets, such as ``finger``,
+    is a name as well, whose numbers count the sets.
+    """
+
+    circuit: Circuit  # With the values that named sets give to every scene
+    n: int
+    seed: int
+    grid: dict[str, FloatArray] = field(default_factory=dict)
+    drawn: dict[str, Any] = field(default_factory=dict)
+    fixed: dict[str, FloatArray] = field(default_factory=dict)
+    # The paths of each name, with the value that its numbers are factors of, or with the values of the sets, (n_set,).
+    own: dict[str, Mapping[str, float | FloatArray]] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+    names: dict[str, tuple[str, ...]] = field(default_factory=dict)  # Of the sets that a name counts
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Dimensions of the sweep."""
+        return (*self.grid, *(("scene",) if self.drawn else ()))
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of scenes along each dimension."""
+        return (*(values.size for values in self.grid.values()), *((self.n,) if self.drawn else ()))
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Attributes of the sweep: its draws, and the named sets in it."""
+        sets = {"sets": list(self.circuit.sets)} if self.circuit.sets else {}
+        return ({"n": self.n, "seed": self.seed} if self.drawn else {}) | sets
+
+    @property
+    def coordinates(self) -> dict[str, Any]:
+        """Of each dimension of the grid its numbers, or the names of its sets, for a Dataset."""
+        return {
+            name: (name, list(self.names[name])) if name in self.names
+            else (name, values, {"units": self.units[name]})
+            for name, values in self.grid.items()
+        }  # fmt: skip
+
+    def paths(self, values: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+        """Values of each path of these names."""
+        found = {}
+        for name, numbers in values.items():
+            for path, of in self.own[name].items():
+                x = np.asarray(numbers, float)
+                found[path] = np.take(of, x.astype(int)) if name in self.names else np.asarray(of * x)
+        return found
+
+    def spread(self, grid: Mapping[str, FloatArray], draws: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Values of each path in all scenes of a part of the grid with a part of the draws, shape (n_scene,)."""
+        count = next(iter(draws.values())).size if draws else 1
+        mesh = np.meshgrid(*grid.values(), indexing="ij")
+        places = mesh[0].size if mesh else 1
+        flat = {path: np.repeat(values.ravel(), count) for path, values in zip(grid, mesh, strict=True)}
+        return self.paths(self.fixed | flat | {path: np.tile(values, places) for path, values in draws.items()})
+
+    def quantiles(self, points: FloatArray) -> dict[str, FloatArray]:
+        """Values of the drawn parameters at points of the unit cube, shape (n_point, n_drawn)."""
+        points = np.clip(points, _EDGE, 1.0 - _EDGE)
+        return {path: np.asarray(law.ppf(points[:, i]), float) for i, (path, law) in enumerate(self.drawn.items())}
+
+
+class Draws:
+    """The draws of a plan in parts of `count` (a power of two, at most `n`), each of which costs the same.
+
+    The bits of a Sobol point are a linear function of those of its index: point i + j, of two indices without a common
+    bit, is the sum (exclusive or) of points i, j and 0.
+    """
+
+    def __init__(self, plan: Plan, count: int) -> None:
+        self.plan, self.count = plan, count
+        # Sums of point 0 and the points `count`, 2 `count`, ..., (n_drawn,) each.
+        self._steps: list[NDArray[np.int64]] = []
+        engine, at = self._engine(), count
+        first = _bits(engine.random(1))[0] if at < plan.n else 0
+        while at < plan.n:
+            engine.fast_forward(at - engine.num_generated)
+            self._steps.append(_bits(engine.random(1))[0] ^ first)
+            at *= 2
+
+    def _engine(self) -> Any:
+        """The sequence of points of the unit cube, from its beginning."""
+        from scipy.stats import qmc
+
+        return qmc.Sobol(len(self.plan.drawn), scramble=True, bits=BITS, rng=self.plan.seed)
+
+    @cached_property
+    def _first(self) -> NDArray[np.int64]:
+        """Bits of the first part, shape (count, n_drawn): a process that is sent the draws makes them once."""
+        return _bits(self._engine().random(self.count))
+
+    # Two chunks may run at once, and those after them mostly have the same draws.
+    @lru_cache(2)  # noqa: B019
+    def part(self, number: int) -> dict[str, FloatArray]:
+        """Values of the drawn parameters in the part with this number, shape (count,) each."""
+        bits = self._first
+        for i, step in enumerate(self._steps):
+            if number >> i & 1:
+                bits = bits ^ step
+        return self.plan.quantiles(np.asarray(bits * 2.0**-BITS, float))
+
+
+def _bits(points: FloatArray) -> NDArray[np.int64]:
+    return np.asarray(points * 2.0**BITS, np.int64)
+
+
+def make_plan(circuit: Circuit, asked: Mapping[str, Any], n: int, seed: int, most: int) -> Plan:
+    """The plan of what `sweep` is asked for as its `parameters`, with `most` draws or fewer."""
+    require_circuit(circuit)
+    if not isinstance(asked, Mapping) or not asked:
+        raise InputError(f"parameters is {asked!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
+    n, seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
+    power = most.bit_length() - 1
+    require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
+    tables: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for kind in (kind for kind in KINDS if kind in asked):
+        if isinstance(asked[kind], str):
+            circuit = _applied(circuit, kind, asked[kind])[0]
+        else:
+            circuit, tables[kind] = _together(circuit, kind, asked[kind])
+    rest = [name for name in asked if name in tables or name not in KINDS]
+    if not rest:
+        raise InputError(
+            f"parameters is {dict(asked)!r}, and nothing varies; allowed: a list of sets, an array or a distribution "
+            "beside it"
+        )
+    plan, taken = Plan(circuit, n, seed), Counter[str]()
+    for given in rest:
+        if given in tables:
+            sets = tables[given]
+            paths = list(next(iter(sets.values())))
+            plan.names[given], plan.grid[given] = tuple(sets), np.arange(len(sets), dtype=float)
+            plan.own[given] = {path: np.array([one[path] for one in sets.values()], float) for path in paths}
+        else:
+            paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
+            _place(plan, paths, asked[given])
+        taken.update(paths)
+        if twice := [path for path, count in taken.items() if count > 1]:
+            raise InputError(f"{twice[0]} is given twice, where sets that differ in it count; allowed: once")
+    return plan
+
+
+def _place(plan: Plan, paths: list[str], value: Any) -> None:
+    """Enter what is asked for under some paths in a plan."""
+    path, alone, known = ",".join(paths), len(paths) == 1, plan.circuit.parameters
+    plan.own[path] = {one: 1.0 if alone else known[one].value for one in paths}
+    plan.units[path] = known[path].unit if alone else "1"
+    if hasattr(value, "ppf"):
+        plan.drawn[path] = value
+        return
+    allowed = "a number, an array of numbers, or a frozen distribution of scipy.stats such as norm(3.5e-6, 0.3e-6)"
+    array = real_numbers(path, value, allowed)
+    require(array.ndim < 2 and array.size > 0, path, f"of shape {array.shape}", "numbers in one row")
+    (plan.grid if array.ndim else plan.fixed)[path] = array
+
+
+def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, dict[str, Mapping[str, Any]]]:
+    """The circuit with the values in which several sets agree, and by set and path those in which they differ."""
+    given = list(names) if isinstance(names, list | tuple | np.ndarray) else []
+    if not given or not all(isinstance(name, str) for name in given):
+        raise InputError(f"{kind} is {names!r}; allowed: the name of a set of parameters, or a list of names")
+    found = dict(_applied(circuit, kind, name)[1:] for name in given)
+    if len(found) < len(given):
+        raise InputError(f"{kind} is {given!r}, where a set is named twice; allowed: each once")
+    if any(isinstance(value, Waveform) for one in found.values() for value in one.values()):
+        raise InputError(
+            f"{kind} is {given!r}, whose sets replace the source; allowed: one of them by itself, with arrays of "
+            "numbers such as source.frequency beside it"
+        )
+    own = circuit.parameters
+    whole = {
+        path: [float(one.get(path, own[path].value)) for one in found.values()]
+        for path in dict.fromkeys(path for one in found.values() for path in one)
+    }
+    same = {path: each[0] for path, each in whole.items() if len({*each}) == 1}
+    differ = {path: each for path, each in whole.items() if path not in same}
+    sets: dict[str, Mapping[str, Any]] = {
+        name: {path: each[i] for path, each in differ.items()} for i, name in enumerate(found)
+    }
+    return circuit.replace(same) if same else circuit, sets
+
+
+def _applied(circuit: Circuit, kind: str, entry: str) -> tuple[Circuit, str, Mapping[str, Any]]:
+    """The circuit with a set, the set's name as the sweep shows it, and the values that it gives by path."""
+    to, _, name = (part.strip() for part in entry.rpartition("="))
+    try:
+        one = known_sets(name, kind)
+        changed = one.apply(circuit, to or None)
+    except InputError as error:
+        raise InputError(f"{kind} {entry!r}: {error.message}") from None
+    return changed, f"{to}={one.name}" if to else one.name, changed.sets[one.name]
 
 
 def sweep(
@@ -89,10 +295,11 @@ def sweep(
         As `batch`, for an `n` that is no power of two, and for too many scenes. With `store`, if the folder is there
         and is no store of this sweep, or the scheduler does not answer.
     """
-    circuit, parameters = with_sets(circuit, parameters)
     if store is not None:
+        from fingerspice.studies.sweep.chunks import stored
+
         plan = make_plan(circuit, parameters, n, seed, MOST_STORED_SAMPLES)
-        return stored(circuit, plan, options, Path(store), workers, scheduler, shard)
+        return stored(plan, options, Path(store), workers, scheduler, shard)
     if workers is not None or scheduler is not None or tuple(shard) != (1, 1):
         raise InputError(
             "workers, scheduler or shard is given without store; allowed: a folder such as 'out/sweep.zarr'"
@@ -102,8 +309,8 @@ def sweep(
     plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
     total = math.prod(plan.sizes)
     require(total <= MOST_SCENES, "the sweep", f"{total:,} scenes", f"at most {MOST_SCENES:,}, or a store")
-    draws = plan.draws()
-    found = batch(circuit, plan.spread(plan.grid, draws), **options)
+    draws = Draws(plan, n).part(0) if plan.drawn else {}
+    found = batch(plan.circuit, plan.spread(plan.grid, draws), **options)
     data = {
         name: ((*plan.dims, *one.dims[1:]), one.values.reshape((*plan.sizes, *one.shape[1:])), one.attrs)
         for name, one in found.data_vars.items()
@@ -111,7 +318,7 @@ def sweep(
     coords: dict[str, Any] = plan.coordinates
     coords |= {name: ("scene", values, {"units": plan.units[name]}) for name, values in draws.items()}
     coords |= {name: one for name, one in found.coords.items() if name == "turn"}
-    return Dataset(data, coords, found.attrs | plan.about(circuit))
+    return Dataset(data, coords, found.attrs | plan.about)
 
 
 def sobol(
@@ -149,7 +356,6 @@ def sobol(
     InputError
         As `sweep`; if nothing is drawn; and if a scene has no result, because indices need all of them.
     """
-    circuit, parameters = with_sets(circuit, parameters)
     plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
     require(bool(plan.drawn), "parameters", "all numbers", "one distribution or more, such as scipy.stats.norm(...)")
     confidence = real_number("confidence", confidence, "a number between 0 and 1")
@@ -161,7 +367,7 @@ def sobol(
 
     # Every place of the grid: each of its parameters with one value, shape (1,).
     places = [dict(zip(plan.grid, np.reshape(values, (-1, 1)), strict=True)) for values in product(*plan.grid.values())]
-    rows = [_indices(circuit, plan, place, outputs, confidence, options) for place in places]
+    rows = [_indices(plan, place, outputs, confidence, options) for place in places]
     data: dict[str, Any] = {}
     for i, output in enumerate(outputs):
         for kind in rows[0]:
@@ -175,14 +381,13 @@ def sobol(
 
 
 def _indices(
-    circuit: Circuit, plan: Plan, place: dict[str, FloatArray], outputs: tuple[str, ...], confidence: float,
-    options: Mapping[str, Any],
-) -> dict[str, FloatArray]:  # fmt: skip
+    plan: Plan, place: dict[str, FloatArray], outputs: tuple[str, ...], confidence: float, options: Mapping[str, Any]
+) -> dict[str, FloatArray]:
     """Indices (n_output, d), their intervals, and mean and standard deviation of the outputs, at one place."""
     from scipy.stats import qmc
 
     def figures(x: FloatArray) -> FloatArray:
-        found = batch(circuit, plan.spread(place, dict(zip(plan.drawn, x, strict=True))), **options)
+        found = batch(plan.circuit, plan.spread(place, dict(zip(plan.drawn, x, strict=True))), **options)
         if lost := int(np.count_nonzero(found.status >= REFUSED)):
             why = f" ({found.attrs['failures'][0]})" if len(found.attrs["failures"]) else ""
             raise InputError(
