@@ -43,7 +43,7 @@ MANY_PARAMETERS = {
     "cli.studies.fit",
     "cli.sweep.sweep",
     "cli.studies.fit_contact",
-    "studies.design.inverse.inverse_drive",
+    "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
     "studies.batch.batch.batch",

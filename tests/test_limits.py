@@ -11,7 +11,7 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 from conftest import Command
-from fingerspice.studies.design.folds import fold_voltage
+from fingerspice.studies.limits import fold_voltage
 from scenes import deck, table1
 
 

@@ -52,7 +52,7 @@ def design(
 
       fingerspice design wanted.csv circuits/fingerpad_5khz.cir --carrier 5k --limit 200
     """
-    from fingerspice.studies.design.inverse import inverse_drive, read_wanted
+    from fingerspice.studies.inverse import inverse_drive, read_wanted
 
     with Answering("design", as_json, charge_law=charge_law) as answer:
         circuit = read_circuit(deck, changes, None)
@@ -94,7 +94,7 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.studies.design.folds import fold_limits, grid_of
+    from fingerspice.studies.limits import fold_limits, grid_of
 
     law = None if capability else "mobile"
     with Answering("limits", as_json, charge_law=law) as answer:
@@ -111,7 +111,7 @@ def limits(
         results.will_draw(f"{end}.png", lambda: found.plot(), unless=no_plot)
         found: Any
         if capability:
-            from fingerspice.studies.design.inverse import capability as friction_map
+            from fingerspice.studies.limits import capability as friction_map
 
             if largest is None:
                 # The peak of the deck's own sources.
