@@ -17,7 +17,7 @@ from random_decks import deck as random_deck
 from scenes import cases, deck, table1
 
 LAWS = ["local", "mobile"]
-SEEDS = range(50)
+SEEDS = range(cases(50, 20))
 DECKS = sorted(Path(CIRCUITS).glob("*.cir"))
 # Exported as a hundred thousand points and more, among which ngspice searches at every step: their beginnings, s.
 BEGINNINGS = {"burst": 2.5e-3, "chirp": 4e-3, **({"texture_recording": 0.05} if cases(0, 1) else {})}
