@@ -256,22 +256,13 @@ class _Search:
 
 @dataclass(frozen=True)
 class FoldSweep:
-    """Voltage at which the law folds against one parameter.
-
-    Attributes
-    ----------
-    name, unit : str
-    own : float
-        The deck's value.
-    values, voltages : ndarray, shape (n,)
-        The parameter, and the source's peak voltage at the fold (V); NaN if there is no fold up to `HIGHEST`.
-    """
+    """Voltage at which the law folds against one parameter."""
 
     name: str
     unit: str
-    own: float
-    values: FloatArray
-    voltages: FloatArray
+    own: float  # The deck's value
+    values: FloatArray  # (n,): of the parameter
+    voltages: FloatArray  # (n,): the source's peak at the fold, V; NaN if there is no fold up to `HIGHEST`
 
     @property
     def rows(self) -> list[tuple[float, float | None]]:
@@ -400,12 +391,12 @@ def fold_limits(
         own, voltages, guess = float(circuit.parameters[paths[0]].value), np.zeros(points), peak
         for i, x in enumerate(factors):
             told((1 + i + points * len(sweeps)) / (1 + points * len(varied)))
-            changed = circuit.varied(dict.fromkeys(paths, own * x))
-            voltages[i] = fold_voltage(changed, peak, t_stop / x if name == "frequency" else t_stop, guess)
+            voltages[i] = around
+            if abs(x - 1.0) > 1e-12:
+                changed = circuit.varied(dict.fromkeys(paths, own * x))
+                voltages[i] = fold_voltage(changed, peak, t_stop / x if name == "frequency" else t_stop, guess)
             # The next search starts at this voltage.
             guess = voltages[i] if math.isfinite(voltages[i]) else HIGHEST
-        # The fold at the deck's own value is known: the bisection of the sweep may end 1e-3 beside it.
-        voltages[np.abs(factors - 1.0) <= 1e-12] = around
         sweeps.append(FoldSweep(name, unit, own, own * factors, voltages))
     told(1.0)
     return FoldLimits(circuit, peak, around, tuple(sweeps))
