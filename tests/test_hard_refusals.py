@@ -95,7 +95,7 @@ def test_the_local_law_has_no_fold_in_the_same_scene(case: str) -> None:
 def test_a_fold_is_not_believed_while_a_finer_run_meets_it_elsewhere(gap: float, rtol: float) -> None:
     # Steps as coarse as these errors ask for end a hundred-thousandth to a ten-thousandth of the time too late.
     params = dataclasses.replace(ref.TABLE1, d_a=gap)
-    fold = ref.transient(SINE, [], law="mobile", freq=100.0, params=params, tol=1e-12).fold
+    fold = ref.transient(SINE, [], law="mobile", freq=100.0, params=params, tol=1e-9).fold
     circuit = table1().replace({"Xgap.d": gap})
     kept = fs.simulate(circuit, charge_law="mobile", method="radau", rtol=rtol, throw=False)
     assert kept.status is fs.Status.FOLD

@@ -28,7 +28,7 @@ def test_the_fold_is_that_of_a_run_which_starts_as_the_deck_s_does(start: str) -
     how = {"uncharged": "uncharged", "operating point": "dc", "given": [-12.0, 21.0, -9.0]}[start]
     for x, folds in ((0.998, False), (1.002, True)):
         segments = ref.sine_segments(x * found, 100.0, 4e-3, phase=0.5 * math.pi)
-        run = ref.transient(segments, [], law="mobile", freq=100.0, params=params, start=how, tol=1e-11)
+        run = ref.transient(segments, [], law="mobile", freq=100.0, params=params, start=how, tol=1e-9)
         assert (run.fold is not None) == folds
 
 

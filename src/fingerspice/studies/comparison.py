@@ -296,27 +296,25 @@ def large_signal(
     skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     found = []
     for place, (size, phase, drive) in enumerate(drives):
-        gains: list[list[complex]] = []
-        areas: list[float] = []
-        forces: list[float] = []
+        rows = []
         for number, x in enumerate(f.tolist(), place * f.size + 1):
             changed = circuit.varied({**dict.fromkeys(skins, x), source.name: Sine(size, x)})
             s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution
             # The output starts at a multiple of the period, so that phases from its start are phases relative to the
             # source.
             period, end = s.t - s.t[0], "" if len(s.gaps) == 1 else f":{scene.layers[scene.gap]}"
-            gains.append([weigh_outputs(period, u).phasor(x) * sign / size for u in s.u_layer.T])
-            for means, key in ((areas, "area"), (forces, "f_el")):
-                means.append(weigh_outputs(period, s.by_name(key)[key + end]).mean())
+            means = [weigh_outputs(period, s.record.one(key + end)).mean() for key in ("area", "f_el")]
+            rows.append([*means, *(weigh_outputs(period, u).phasor(x) * sign / size for u in s.u_layer.T)])
             if progress is not None:
                 progress(number / (f.size * len(drives)))
-        gain = np.array(gains, np.complex128)
+        table = np.array(rows, np.complex128)
+        (areas, forces), gain = table[:, :2].real.T.copy(), table[:, 2:].copy()
         u_gap = gain[:, scene.gap] * size * np.exp(1j * phase)
-        largest = max(forces), float(scene.contact.stress(np.abs(u_gap)).max()), max(areas)
+        largest = forces.max(), scene.contact.stress(np.abs(u_gap)).max(), areas.max()
         found.append(
             PhasorSolution(
-                f, gain[:, scene.gap], gain, u_gap, np.array(areas), np.array(forces), size, s.layers, phase, drive,
-                notes, (*warned, *beyond_fingers("", *largest)), circuit,
+                f, gain[:, scene.gap], gain, u_gap, areas, forces, size, s.layers, phase, drive, notes,
+                (*warned, *beyond_fingers("", *map(float, largest))), circuit,
             )
         )  # fmt: skip
     return tuple(found)

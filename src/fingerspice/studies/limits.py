@@ -100,15 +100,15 @@ class Capability(Shown):
         return {name: np.asarray(getattr(self, name)).tolist() for name in (*names, "largest_mean")}
 
     def _page(self) -> Page:
-        rows = [
-            (format_si(f, "Hz"), format_si(a, "N"), format_si(m, "N"))
-            for f, a, m in zip(*(x.tolist() for x in (self.frequency, self.largest, self.best_mean)), strict=True)
-        ]
+        columns = (self.frequency, "Hz"), (self.largest, "N"), (self.best_mean, "N")
+        rows = list(zip(*([format_si(x, unit) for x in values.tolist()] for values, unit in columns), strict=True))
         said = (
-            f"up to {format_si(self.limit, 'V')} {on_carrier(self.carrier)} the friction's mean is from "
-            f"{format_si(self.smallest_mean, 'N')} to {format_si(self.largest_mean, 'N')}"
+            f"up to {format_si(self.limit, 'V')} {on_carrier(self.carrier)} the friction's mean is from {self._range()}"
         )
         return Page([heading(self.circuit), said, "", Table(("modulation", "largest amplitude", "at mean"), rows)])
+
+    def _range(self) -> str:
+        return f"{format_si(self.smallest_mean, 'N')} to {format_si(self.largest_mean, 'N')}"
 
     def plot(self) -> Picture:
         """Picture with a map of the amplitude over frequency and mean, and the largest amplitude over frequency."""
@@ -128,11 +128,8 @@ class Capability(Shown):
             ax.set_xscale("log")
             dress(ax, label, "Modulation frequency [Hz]")
         wave = "unipolar drive" if self.carrier is None else f"carrier {format_si(self.carrier, 'Hz')}"
-        caption(
-            figure,
-            f"{heading(self.circuit)} · at most {format_si(self.limit, 'V')}, {wave} · mean friction "
-            f"{format_si(self.smallest_mean, 'N')} to {format_si(self.largest_mean, 'N')}",
-        )
+        drive = f"at most {format_si(self.limit, 'V')}, {wave}"
+        caption(figure, f"{heading(self.circuit)} · {drive} · mean friction {self._range()}")
         return figure
 
     def to_csv(self, path: str | Path) -> Path:
@@ -217,12 +214,13 @@ class _Search:
 
     def __init__(self, finger: Finger, limit: float, carrier: float | None, most: float) -> None:
         self.finger, self.limit, self.carrier, self.ratio = finger, limit, carrier, 1.0
-        self.voltages = finger.voltages(most, _PER_CARRIER * (carrier or 0.0), carrier)
+        self.rate = _PER_CARRIER * carrier if carrier is not None else _LEAST_RATE
+        self.voltages = finger.voltages(most, self.rate, carrier)
         self.inverter = finger.inverter(10.0 * limit)
 
     def wanted(self, mean: float, frequency: float, amplitude: float) -> Samples:
         """A mean force (N) with a modulation (Hz, N), sampled at the rate of the drive."""
-        rate = max(_PER_PERIOD * frequency, _LEAST_RATE) if self.carrier is None else _PER_CARRIER * self.carrier
+        rate = max(_PER_PERIOD * frequency, self.rate) if self.carrier is None else self.rate
         t = np.arange(math.ceil(max(_PERIODS / frequency, _LASTS) * rate)) / rate
         return Samples(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0), rate)
 
