@@ -47,7 +47,6 @@ def deviation(circuit: fs.Circuit, law: str | None = None) -> tuple[float, float
     That of the gap voltage (of node voltages without a GAP) over its peak; and that of a node's voltage over the
     largest of all, or of an area over 35 mm^2.
     """
-    assert circuit.tran is not None
     layers = [e for e in circuit.elements if e.spec.is_layer]
     areas = {e.node_names[2]: e for e in layers}
     named = {name: node for e in circuit.elements for node, name in zip(e.nodes[:2], e.node_names[:2], strict=True)}

@@ -122,7 +122,6 @@ def test_another_period_by_another_method_changes_no_more_than_the_defect_says(
     circuit = table1().replace({"Vdrive": waveform})
     state = fs.steady_state(circuit, charge_law=law, rtol=rtol)
     solution = state.solution
-    assert waveform.period is not None
     stop = solution.state.t + waveform.period
     given = {"charge_law": law, "start": solution, "t_stop": stop, "rtol": 1e-12}
     t = solution.t[1:-1] + waveform.period
@@ -266,7 +265,6 @@ def test_the_multipliers_are_the_eigenvalues_of_the_map_of_one_period(law: str) 
 def test_a_run_started_from_the_periodic_state_is_it(name: str, law: str) -> None:
     waveform, _ = SCENES[name]
     circuit = table1().replace({"Vdrive": waveform})
-    assert waveform.period is not None
     period = waveform.period
     state = fs.steady_state(circuit, charge_law=law, rtol=1e-10)
     # Off the jumps: three times twenty outputs.
@@ -410,7 +408,6 @@ NOT_ALIKE = {
 
 @pytest.mark.parametrize("waveform", [*ALIKE.values(), *NOT_ALIKE.values()], ids=[*ALIKE, *NOT_ALIKE])
 def test_half_waves_are_what_their_values_say(waveform: fs.Waveform) -> None:
-    assert waveform.period is not None
     t = waveform.settled + waveform.period * (3.0 + np.linspace(0.0, 0.5, 4001)[1:-1])
     alike = np.abs(waveform.value(t + 0.5 * waveform.period) + waveform.value(t)).max() <= 1e-9
     assert waveform.half_wave == alike

@@ -74,12 +74,9 @@ def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[t
         notes = (f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})",)
     swept = bool(circuit.by_device("SKIN_DISPERSIVE")) or (bool(skins) and skin != "own")
     low, high = float(f.min()), float(f.max())
-    beyond = []
+    ends = ("down to", low, SKIN_BAND[0] / low, "below"), ("up to", high, high / SKIN_BAND[1], "above")
     # The tolerance of 1e-6 allows for rounding of a sweep's end.
-    if low < SKIN_BAND[0] * (1.0 - 1e-6):
-        beyond.append(f"down to {low:g} Hz, {math.log10(SKIN_BAND[0] / low):.2g} decades below")
-    if high > SKIN_BAND[1] * (1.0 + 1e-6):
-        beyond.append(f"up to {high:g} Hz, {math.log10(high / SKIN_BAND[1]):.2g} decades above")
+    beyond = [f"{to} {x:g} Hz, {math.log10(by):.2g} decades {side}" for to, x, by, side in ends if by > 1.0 + 1e-6]
     if not swept or not beyond:
         return notes, ()
     return notes, (
