@@ -34,7 +34,7 @@ MAX_COMPILED_BODY, MAX_COMPILED_PARAMETERS = 100, 12
 # Each parameter is an option of the command line or a keyword that users may leave out.
 MANY_PARAMETERS = {
     "cli.app.run",
-    "studies.design.inverse.inverse_drive",
+    "studies.inverse.inverse_drive",
     "solve.simulation.simulate",
     "solve.simulation.plan",
     "studies.batch.batch.batch",

@@ -12,16 +12,8 @@ from scipy.integrate import solve_ivp
 
 import fingerspice as fs
 from commands import Command
-from fingerspice.studies.feel import (
-    DIFFERENCE_DB,
-    FINGERPAD,
-    GRAVITY,
-    WEBER_FRICTION,
-    SkinMechanics,
-    Threshold,
-    android_threshold,
-    feel,
-)  # fmt: skip
+from fingerspice import studies
+from fingerspice.studies.feel import FINGERPAD, GRAVITY, SkinMechanics, Threshold, android_threshold, feel
 from scenes import deck, table1
 
 ROOT = Path(__file__).parents[1]
@@ -57,7 +49,7 @@ def test_the_skin_moves_as_its_equation_of_motion_says(frequency: float) -> None
 
 
 def test_skin_and_thresholds_are_those_of_their_sources() -> None:
-    assert (DIFFERENCE_DB, WEBER_FRICTION) == (1.21, 0.11)
+    assert (studies.feel.DIFFERENCE_DB, studies.feel.WEBER_FRICTION) == (1.21, 0.11)
     # The fingerpad is a spring at low and a mass at high frequencies.
     assert (FINGERPAD.mass, FINGERPAD.damping, FINGERPAD.stiffness) == (1e-4, 1.0, 1e3)
     low, high = np.abs(FINGERPAD.displacement(np.array([0.1]))), np.abs(FINGERPAD.acceleration(np.array([1e6])))
@@ -90,7 +82,6 @@ def test_the_level_of_a_sines_friction_is_that_of_the_formula(frozen: fs.Solutio
     omega = 2.0 * math.pi * 200.0
     size = omega**2 * force / abs(1e3 - 1e-4 * omega**2 + 1j * omega)
     place = found.strongest
-    assert place is not None
     assert found.frequency[place] == pytest.approx(200.0)
     assert found.force[place] == pytest.approx(force, rel=1e-7)
     assert found.displacement[place] == pytest.approx(size / omega**2, rel=1e-7)
@@ -105,7 +96,6 @@ def test_the_level_of_a_sines_friction_is_that_of_the_formula(frozen: fs.Solutio
 def test_a_level_follows_drive_threshold_and_skin_in_decibels(frozen: fs.Solution) -> None:
     half = fs.simulate(table1("SIN(0 100 100)"), area="frozen", start="periodic", t_stop=0.01)
     level = feel(frozen, threshold=FLAT).highest
-    assert level is not None
     # Force goes with the square of the voltage: 20 log10(4).
     assert feel(half, threshold=FLAT).highest == pytest.approx(level - 40.0 * math.log10(2.0), abs=1e-6)
     higher = Threshold("higher", FLAT.frequency, FLAT.level + 6.0)
@@ -116,13 +106,10 @@ def test_a_level_follows_drive_threshold_and_skin_in_decibels(frozen: fs.Solutio
 
 def test_what_is_weak_or_too_fast_is_not_felt() -> None:
     weak = feel(fs.simulate(table1("SIN(0 2 100)"), start="periodic", t_stop=0.01))
-    assert not weak.felt
-    assert weak.steps is None
-    assert not weak.change_felt
+    assert (weak.felt, weak.steps, weak.change_felt) == (False, None, False)
     assert "below the threshold" in weak.verdict()
     fast = feel(fs.simulate(table1("SIN(0 200 5k)", f=5e3), start="periodic", t_stop=2e-4))
-    assert not fast.felt
-    assert fast.highest is None
+    assert (fast.felt, fast.highest) == (False, None)
     assert "no part of the friction" in fast.verdict()
 
 
@@ -137,7 +124,6 @@ def test_friction_beyond_the_table_is_felt_not_felt_or_not_known(frequency: floa
     assert possible.felt is (amplitude == 150.0)
     assert found.felt is (None if possible.felt and frequency > 200.0 else possible.felt)
     if frequency > 200.0:
-        assert found.unjudged is not None
         assert found.unjudged.level == pytest.approx(possible.highest, abs=1e-9)
         assert f"at {2 * frequency:g} Hz, outside the threshold's frequencies" in found.verdict()
         assert found.change_felt is found.felt
@@ -149,7 +135,6 @@ def test_friction_below_the_table_is_compared_by_its_displacement() -> None:
     line = int(found.force.argmax())
     # 10 m/s^2 at 50 Hz.
     level = 20.0 * math.log10(found.displacement[line] * (2.0 * math.pi * 50.0) ** 2 / 10.0)
-    assert found.unjudged is not None
     assert (found.unjudged.frequency, found.unjudged.level) == pytest.approx((40.0, level))
     assert (found.felt, level < 0.0) == (False, True)
     assert "too weak to be felt" in found.verdict()
@@ -161,7 +146,6 @@ def test_a_run_too_short_to_resolve_its_friction_has_no_verdict(amplitude: float
     run = fs.simulate(table1(), sources=chirp, t_stop=0.05, t_eval=np.arange(0.0, 0.05, 1e-4), rtol=1e-5)
     found = feel(run)
     assert found.felt is felt
-    assert found.unjudged is not None
     assert found.unjudged.slower
     # The friction varies at 80 to 120 Hz, below all bands: its rms about the mean is that of the outputs.
     assert found.unjudged.force == pytest.approx(math.sqrt(2.0) * float(np.std(run.f_t)), rel=0.2)
@@ -175,9 +159,6 @@ def test_below_60_hz_squares_are_felt_at_lower_voltages_than_sines_by_their_fast
     circuit = table1(skin={"f": frequency})
     waves = fs.Sine(20.0, frequency), fs.Square(20.0, frequency)
     sine, square = (feel(fs.steady_state(circuit, sources=wave, rtol=1e-5).solution) for wave in waves)
-    assert sine.highest is not None
-    assert square.highest is not None
-    assert square.strongest is not None
     more = square.highest - sine.highest
     if frequency < 60.0:
         assert more > 6.0
@@ -195,7 +176,6 @@ def test_a_source_without_a_period_is_felt_in_third_octaves() -> None:
     tone = feel(fs.simulate(table1("SIN(0 200 80)"), area="frozen", start="periodic", t_stop=0.0125))
     assert (found.kind, tone.kind) == ("bands", "lines")
     place = found.strongest
-    assert place is not None
     assert found.frequency[place] == pytest.approx(1e3 * 2.0 ** (-8 / 3))
     # The band holds all of the tone, whose frequency is not its middle.
     assert found.force[place] == pytest.approx(tone.force.max(), rel=1e-3)
@@ -204,25 +184,17 @@ def test_a_source_without_a_period_is_felt_in_third_octaves() -> None:
 
 
 def test_a_period_with_too_many_lines_is_felt_in_third_octaves() -> None:
-    slow = fs.AM(200, 100, 0.25)
-    circuit = table1(skin={"f": 100.0})
-    solution = fs.simulate(circuit, sources={"Vdrive": slow}, t_stop=8.0, t_eval=np.arange(0.0, 8.0, 5e-4), rtol=1e-5)
-    found = feel(solution)
-    assert found.kind == "bands"
-    assert found.felt
-    place = found.strongest
-    assert place is not None
-    assert found.frequency[place] == pytest.approx(198.4, abs=0.1)
+    t = np.arange(0.0, 8.0, 5e-4)
+    found = feel(fs.simulate(table1(), sources=fs.AM(200, 100, 0.25), t_stop=8.0, t_eval=t, rtol=1e-5))
+    assert (found.kind, found.felt) == ("bands", True)
+    assert found.frequency[found.strongest] == pytest.approx(198.4, abs=0.1)
 
 
 def test_bands_add_up_to_the_variance_of_noise() -> None:
-    values = 60.0 * np.random.default_rng(3).standard_normal(8000)
-    source = fs.Samples(values, rate=2000.0)
-    solution = fs.simulate(
-        table1(), sources={"Vdrive": source}, area="frozen", t_stop=3.9, t_eval=np.arange(0.0, 3.9, 1e-4), rtol=1e-5
-    )
+    source = fs.Samples(60.0 * np.random.default_rng(3).standard_normal(8000), rate=2000.0)
+    t = np.arange(0.0, 3.9, 1e-4)
+    solution = fs.simulate(table1(), sources=source, area="frozen", t_stop=3.9, t_eval=t, rtol=1e-5)
     found, spectrum = feel(solution), solution.spectrum()
-    assert spectrum.density is not None
     low, high = found.frequency[0] / 2.0 ** (1 / 6), found.frequency[-1] * 2.0 ** (1 / 6)
     inside = (spectrum.frequency >= low) & (spectrum.frequency < high)
     expected = spectrum.density[inside].sum() * spectrum.resolution
@@ -286,8 +258,7 @@ def test_run_says_what_is_felt_and_draws_it(command: Command) -> None:
     assert (finger["felt"], finger["kind"], finger["strongest"]) == (True, "lines", 200.0)
     assert finger["lines"][1].keys() == {"frequency", "force", "displacement", "acceleration", "level_db"}
     document = (ROOT / "docs" / "json.md").read_text()
-    for key in (*finger, *finger["lines"][0]):
-        assert f"`{key}`" in document
+    assert all(f"`{key}`" in document for key in (*finger, *finger["lines"][0]))
     assert json.loads(command("run", "pad.cir", "--json", "--no-plot", "--out", "out").out)["feel"] is None
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import fingerspice as fs
 from commands import run_here
-from fingerspice.studies.design.folds import fold_voltage
+from fingerspice.studies.limits import fold_voltage
 from network_reference import Floating
 from scenes import deck, finger, table1
 

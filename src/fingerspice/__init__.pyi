@@ -28,12 +28,6 @@ if TYPE_CHECKING:
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.comparison import large_signal as large_signal
-    from fingerspice.studies.design.drive import InverseDrive as InverseDrive
-    from fingerspice.studies.design.folds import FoldLimits as FoldLimits
-    from fingerspice.studies.design.folds import fold_limits as fold_limits
-    from fingerspice.studies.design.inverse import Capability as Capability
-    from fingerspice.studies.design.inverse import capability as capability
-    from fingerspice.studies.design.inverse import inverse_drive as inverse_drive
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
@@ -44,6 +38,12 @@ if TYPE_CHECKING:
     from fingerspice.studies.fit.materialfit import ColeCole as ColeCole
     from fingerspice.studies.fit.materialfit import MaterialFit as MaterialFit
     from fingerspice.studies.fit.materialfit import fit_material as fit_material
+    from fingerspice.studies.inverse import InverseDrive as InverseDrive
+    from fingerspice.studies.inverse import inverse_drive as inverse_drive
+    from fingerspice.studies.limits import Capability as Capability
+    from fingerspice.studies.limits import FoldLimits as FoldLimits
+    from fingerspice.studies.limits import capability as capability
+    from fingerspice.studies.limits import fold_limits as fold_limits
     from fingerspice.studies.steady import SteadyState as SteadyState
     from fingerspice.studies.steady import phasor as phasor
     from fingerspice.studies.steady import steady_state as steady_state

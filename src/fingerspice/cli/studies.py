@@ -63,7 +63,7 @@ def design(
 
       fingerspice design wanted.csv circuits/fingerpad_5khz.cir --carrier 5k --limit 200
     """
-    from fingerspice.studies.design.inverse import inverse_drive, read_wanted
+    from fingerspice.studies.inverse import inverse_drive, read_wanted
 
     circuit = job.read()
     given = {"carrier": carrier, "limit": limit, "slew": slew, "rate": rate}
@@ -96,7 +96,7 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.studies.design.folds import fold_limits, grid_of
+    from fingerspice.studies.limits import fold_limits, grid_of
 
     job.charge_law = None if capability else "mobile"
     job.answer.update(charge_law=job.charge_law)
@@ -112,7 +112,7 @@ def limits(
     results.will_draw(f"{end}.png", lambda: found.plot())
     found: Any
     if capability:
-        from fingerspice.studies.design.inverse import capability as friction_map
+        from fingerspice.studies.limits import capability as friction_map
 
         if largest is None:
             # The peak of the deck's own sources.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray, positive_row
+from fingerspice.base.arrays import positive_row
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
@@ -23,7 +23,6 @@ from fingerspice.plots import drawing, traces
 from fingerspice.results.solution import Solution
 from fingerspice.results.spectrum import PhasorSolution
 from fingerspice.results.steps import weigh_outputs
-from fingerspice.results.summary import Value
 from fingerspice.solve.runs import Progress
 from fingerspice.studies.steady import phasor, steady_state, sweep_drive, sweep_notes
 from fingerspice.waveforms.waveform import Sine
@@ -91,8 +90,7 @@ class Comparison(Shown):
         for i, gap in enumerate(self.gaps):
             reference, mean, coupled = (f.of_gap(i)["f_el_mean"] for f in (self.phasor, self.mean, self.coupled))
             # Round before formatting, and add 0.0, so that -0.00 is not printed.
-            total = round(100.0 * (coupled / reference - 1.0), 2) + 0.0
-            waveform = round(100.0 * (mean / reference - 1.0), 2) + 0.0
+            total, waveform = (round(100.0 * (x / reference - 1.0), 2) + 0.0 for x in (coupled, mean))
             said.append(
                 f"mean force{f' of {gap}' if len(self.gaps) > 1 else ''}: {total:+.2f} % against the phasor; "
                 f"{total - waveform:+.2f} % of that is the ripple of the area, {waveform:+.2f} % is the waveform's "
@@ -106,19 +104,18 @@ class Comparison(Shown):
         # The table has four rows for each GAP.
         more = 0.53 * (len(self.gaps) - 1)
         figure, axes = drawing.new_figure(3, height=5.6 + 1.67 * more, height_ratios=[1.3, 1.3, 0.75 + more])
-        solution, p = self.solution, self.phasor
-        runs = [traces.Drawn(solution, "")]
+        solution, runs = self.solution, [traces.Drawn(self.solution, "")]
         start, stop = float(solution.t[0]), float(solution.t[-1])
-        source_phase = solution.fundamental.phase if solution.fundamental else 0.0
-        turns = 2.0 * np.pi * self.frequency * solution.t + source_phase
-        waves = [np.sin(turns + np.radians(p.of_gap(i)["phase_deg"])) for i in range(len(self.gaps))]
-        voltages = [p.of_gap(i)["amplitude"] * wave for i, wave in enumerate(waves)]
-        forces = [2.0 * p.of_gap(i)["f_el_mean"] * wave**2 for i, wave in enumerate(waves)]
-        for ax, keys, curves in zip(axes, (["u_source", "u_gap"], ["f_el"]), (voltages, forces), strict=False):
+        turns = 2.0 * np.pi * self.frequency * solution.t
+        turns += solution.fundamental.phase if solution.fundamental else 0.0
+        t = traces.time_unit(runs)[0] * solution.t
+        style: dict[str, Any] = {"color": drawing.BLACK, "linestyle": drawing.DASHES[3], "linewidth": 1.5}
+        for ax, keys in zip(axes, (["u_source", "u_gap"], ["f_el"]), strict=False):
             drawn, factor, unit = traces.draw_panel(ax, runs, keys, start, stop)
-            t = traces.time_unit(runs)[0] * solution.t
-            style: dict[str, Any] = {"color": drawing.BLACK, "linestyle": drawing.DASHES[3], "linewidth": 1.5}
-            for trace, curve in zip(drawn[-len(curves) :], curves, strict=True):
+            for i, trace in enumerate(drawn[-len(self.gaps) :]):
+                p = self.phasor.of_gap(i)
+                wave = np.sin(turns + np.radians(p["phase_deg"]))
+                curve = 2.0 * p["f_el_mean"] * wave**2 if keys == ["f_el"] else p["amplitude"] * wave
                 ax.plot(t, factor * curve, label=f"{trace.label}, phasor", **style)
             traces.finish_panel(ax, keys, drawn, factor, unit)
         traces.time_axis(axes[:2], runs, start, stop)
@@ -129,8 +126,7 @@ class Comparison(Shown):
 
     def _draw_table(self, ax: Axes) -> None:
         split = "transient,\nmean area", "transient,\ncoupled", "coupled −\nphasor", "of it, ripple\nof the area"
-        head = ["", "phasor", *split]
-        cells = []
+        cells = [["", "phasor", *split]]
         for label, unit, numbers in self._labelled(3):
             texts = [*(f"{x:.5g}" for x in numbers[:3]), *(f"{x:+.2g}" for x in numbers[3:])]
             marks = unit.replace("deg", "°").replace("^2", "²")
@@ -139,12 +135,11 @@ class Comparison(Shown):
         # Names of GAPs need more room.
         first, size = (0.36, drawing.FONT - 0.5) if len(self.gaps) == 1 else (0.42, drawing.SMALL)
         widths = [first, *[0.2 * (1.0 - first)] * 5]
-        table = ax.table([head, *cells], cellLoc="right", loc="center", edges="horizontal", colWidths=widths)
+        table = ax.table(cells, cellLoc="right", loc="center", edges="horizontal", colWidths=widths)
         table.auto_set_font_size(False)
         table.set_fontsize(size)
         for (row, column), cell in table.get_celld().items():
-            cell.set_edgecolor("#BBBBBB")
-            cell.set_linewidth(0.6)
+            cell.set(edgecolor="#BBBBBB", linewidth=0.6)
             if row == 0:
                 cell.set_height(1.7 * cell.get_height())
             if column == 0:
@@ -177,11 +172,8 @@ class Comparison(Shown):
     def to_dict(self) -> dict[str, Any]:
         """The figures as plain data, in SI units."""
         parts = {"phasor": self.phasor, "transient_mean_area": self.mean, "transient_coupled": self.coupled}
-        return {
-            "frequency": self.frequency,
-            "gaps": list(self.gaps),
-            **{key: {name: np.asarray(x).tolist() for name, x in vars(part).items()} for key, part in parts.items()},
-        }
+        plain = {key: {name: np.asarray(x).tolist() for name, x in vars(part).items()} for key, part in parts.items()}
+        return {"frequency": self.frequency, "gaps": list(self.gaps), **plain}
 
 
 def compare(
@@ -220,22 +212,22 @@ def compare(
     if fundamental is None:
         raise InputError("compare needs a source with a fundamental: a periodic one; this source has none")
     phasors = {name: phasor(circuit, finger=name) for name in names}
-    coupled = steady_state(circuit, charge_law=charge_law, rtol=rtol, points=2000).solution
-    mean = steady_state(circuit, charge_law=charge_law, area="mean", rtol=rtol, points=2000).solution
+    coupled, mean = (
+        steady_state(circuit, charge_law=charge_law, area=area, rtol=rtol, points=2000).solution
+        for area in ("coupled", "mean")
+    )
     found = [phasors[name] for name in coupled.gaps]
     figures = [(abs(p.u_gap[0]), np.degrees(np.angle(p.gain[0])), p.f_el_mean[0], p.area[0]) for p in found]
-    every = []
+    ways: list[Any] = [np.array(figures).T]
     for one in (mean, coupled):
         lead = np.asarray(one.u_gap_phase_deg, float) - np.degrees(fundamental.phase)
-        lead, area = (lead + 180.0) % 360.0 - 180.0, one._figures.value("area", "mean_periodic")
-        every.append(_together(one.u_gap_amplitude, lead, one.f_el_mean_periodic, area))
-    return Comparison(_together(*np.array(figures).T), every[0], every[1], fundamental.frequency, coupled)
-
-
-def _together(*values: Value | FloatArray) -> Figures:
-    """Figures as arrays over the GAPs, or as numbers if there is one GAP."""
-    arrays = [np.atleast_1d(np.asarray(value, float)) for value in values]
-    return Figures(*(float(x[0]) if x.size == 1 else x for x in arrays))
+        area = one._figures.value("area", "mean_periodic")
+        every = one.u_gap_amplitude, (lead + 180.0) % 360.0 - 180.0, one.f_el_mean_periodic, area
+        ways.append(np.array(every, float).reshape(len(every), -1))
+    if len(found) == 1:
+        ways = [way[:, 0].tolist() for way in ways]
+    of_phasor, of_mean, of_coupled = (Figures(*way) for way in ways)
+    return Comparison(of_phasor, of_mean, of_coupled, fundamental.frequency, coupled)
 
 
 # Number of outputs in a period; cubics through them interpolate a sine with an error of 1e-9 of its amplitude.
@@ -300,27 +292,25 @@ def large_signal(
     skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     found = []
     for place, (size, phase, drive) in enumerate(drives):
-        gains: list[list[complex]] = []
-        areas: list[float] = []
-        forces: list[float] = []
+        rows = []
         for number, x in enumerate(f.tolist(), place * f.size + 1):
             changed = circuit.varied({**dict.fromkeys(skins, x), source.name: Sine(size, x)})
             s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution
             # The output starts at a multiple of the period, so that phases from its start are phases relative to the
             # source.
             period, end = s.t - s.t[0], "" if len(s.gaps) == 1 else f":{scene.layers[scene.gap]}"
-            gains.append([weigh_outputs(period, u).phasor(x) * sign / size for u in s.u_layer.T])
-            for means, key in ((areas, "area"), (forces, "f_el")):
-                means.append(weigh_outputs(period, s.by_name(key)[key + end]).mean())
+            means = [weigh_outputs(period, s.record.one(key + end)).mean() for key in ("area", "f_el")]
+            rows.append([*means, *(weigh_outputs(period, u).phasor(x) * sign / size for u in s.u_layer.T)])
             if progress is not None:
                 progress(number / (f.size * len(drives)))
-        gain = np.array(gains, np.complex128)
+        table = np.array(rows, np.complex128)
+        (areas, forces), gain = table[:, :2].real.T.copy(), table[:, 2:].copy()
         u_gap = gain[:, scene.gap] * size * np.exp(1j * phase)
-        largest = max(forces), float(scene.contact.stress(np.abs(u_gap)).max()), max(areas)
+        largest = forces.max(), scene.contact.stress(np.abs(u_gap)).max(), areas.max()
         found.append(
             PhasorSolution(
-                f, gain[:, scene.gap], gain, u_gap, np.array(areas), np.array(forces), size, s.layers, phase, drive,
-                notes, (*warned, *beyond_fingers("", *largest)), circuit,
+                f, gain[:, scene.gap], gain, u_gap, areas, forces, size, s.layers, phase, drive, notes,
+                (*warned, *beyond_fingers("", *map(float, largest))), circuit,
             )
         )  # fmt: skip
     return tuple(found)

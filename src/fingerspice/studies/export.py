@@ -201,10 +201,7 @@ def _source_text(w: Waveform, name: str, circuit: Circuit) -> str:
         jumps = empty and w.value(0.0) != 0.0 and w.breakpoint_rate() * stop < _FEW_POINTS
         if not jumps and (numbers := _pulse_numbers(w, stop + abs(w.delay), edge)):
             return _call("PULSE", numbers)
-    if isinstance(w, PWL | Samples) and w.period is None:
-        t, v = _own_points(w, name, circuit)
-    else:
-        t, v = _sampled(w, name, circuit)
+    t, v = _points(w, name, circuit)
     if empty:
         # All voltages start at 0, so let the source start at 0 V and jump: otherwise ngspice often fails at its first
         # step.
@@ -223,19 +220,41 @@ def _pulse_numbers(p: Pulse, span: float, edge: float) -> tuple[float, ...] | No
     return p.v1, p.v2, p.delay, rise, fall, width, period
 
 
-def _own_points(waveform: PWL | Samples, name: str, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
-    """The waveform's own points from 0 s to the first one after the end of the run; all if the end is not known."""
-    v = np.asarray(waveform.values)
-    at = waveform.times if isinstance(waveform, PWL) else waveform.start + np.arange(v.size) / waveform.rate
-    t = np.asarray(at)
-    if circuit.tran is not None:
-        count = int(np.searchsorted(t, circuit.tran.stop, side="right")) + 1
-        t, v = t[:count], v[:count]
-    if t[0] < 0.0:
-        at_0 = [waveform.value(0.0, "left").item(), waveform.value(0.0).item()]
-        t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append(at_0, v[t > 0.0])
-    _refuse_many(t.size, name)
-    return t, v
+def _points(w: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
+    """Points (s, V) of a waveform over the run: its own, or left and right values at breakpoints and dense points.
+
+    Own points go from 0 s to the first one after the end of the run, or to the last one if the end is not known.
+    """
+    tran = circuit.tran
+    if isinstance(w, PWL | Samples) and w.period is None:
+        v = np.asarray(w.values)
+        t = np.asarray(w.times if isinstance(w, PWL) else w.start + np.arange(v.size) / w.rate)
+        if tran is not None:
+            count = int(np.searchsorted(t, tran.stop, side="right")) + 1
+            t, v = t[:count], v[:count]
+        if t[0] < 0.0:
+            at_0 = [w.value(0.0, "left").item(), w.value(0.0).item()]
+            t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append(at_0, v[t > 0.0])
+        _refuse_many(t.size, name)
+        return t, v
+    if tran is None:
+        raise InputError(f"{name}: exporting this source as PWL needs a .tran line to know how far")
+    stop, spacing = tran.stop, w.shortest_time() / _POINTS_PER_TIME_SCALE
+    if not math.isfinite(spacing) and w.terms(np.array([0.0]), np.array([stop])) is None:
+        spacing = tran.step / 4.0
+    count = math.ceil(stop / spacing) if math.isfinite(spacing) else 1
+    # Test with the rate, an upper bound, before the breakpoints are listed: there may be too many to list.
+    most = count + 2.0 * w.breakpoint_rate() * stop
+    breaks = w.breakpoints(0.0, stop) if most <= 10 * _MAX_POINTS else np.empty(0)
+    _refuse_many(count + 2 * breaks.size if most <= 10 * _MAX_POINTS else most, name)
+    if tran.uic:
+        # The left value at t = 0 only matters for an operating point, which a run with uic does not have.
+        breaks = breaks[breaks > 0.0]
+    smooth = np.linspace(0.0, stop, count + 1)
+    # At one time the left value comes first, and the right one last.
+    t = np.concatenate([breaks, smooth, breaks])
+    order = np.argsort(t, kind="stable")
+    return t[order], np.concatenate([w.value(breaks, "left"), w.value(smooth), w.value(breaks)])[order]
 
 
 def _refuse_many(points: float, name: str) -> None:
@@ -244,34 +263,6 @@ def _refuse_many(points: float, name: str) -> None:
             f"{name}: the source would take {points:.0f} PWL points; allowed: at most {_MAX_POINTS}; shorten the run "
             "(--stop, or .tran)"
         )
-
-
-def _sampled(waveform: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
-    """Points (s, V) of a waveform over the run: left and right values at breakpoints, and dense points between them."""
-    if circuit.tran is None:
-        raise InputError(f"{name}: exporting this source as PWL needs a .tran line to know how far")
-    stop = circuit.tran.stop
-    spacing = waveform.shortest_time() / _POINTS_PER_TIME_SCALE
-    terms = waveform.terms(np.array([0.0]), np.array([stop]))
-    if not math.isfinite(spacing) and terms is None:
-        spacing = circuit.tran.step / 4.0
-    count = 1 if not math.isfinite(spacing) else math.ceil(stop / spacing)
-    points = count + 2.0 * waveform.breakpoint_rate() * stop
-    breaks = np.empty(0)
-    # Test with the rate, an upper bound, before the breakpoints are listed: there may be too many to list.
-    if points <= 10 * _MAX_POINTS:
-        breaks = waveform.breakpoints(0.0, stop)
-        points = count + 2 * breaks.size
-    _refuse_many(points, name)
-    if circuit.tran.uic:
-        # The left value at t = 0 only matters for an operating point, which a run with uic does not have.
-        breaks = breaks[breaks > 0.0]
-    smooth = np.linspace(0.0, stop, count + 1)
-    t = np.concatenate([smooth, breaks, breaks])
-    v = np.concatenate([waveform.value(smooth), waveform.value(breaks, "left"), waveform.value(breaks)])
-    rank = np.concatenate([np.full(smooth.size, 1), np.zeros(breaks.size), np.full(breaks.size, 2)])
-    order = np.lexsort((rank, t))
-    return t[order], v[order]
 
 
 def _pwl_text(t: np.ndarray, v: np.ndarray, edge: float) -> str:

@@ -182,13 +182,8 @@ def android_threshold() -> Threshold:
     path = Path(__file__).with_name("least_perceptible_acceleration.csv")
     # The first row has the names of the columns.
     frequency, level = np.genfromtxt(path, delimiter=",", encoding="utf-8", unpack=True)[:, 1:]
-    return Threshold(
-        "Android's least perceptible acceleration",
-        frequency,
-        level,
-        reference=GRAVITY,
-        source="Android Open Source Project, Apache-2.0: of a device held in the hand, not of a bare, sliding finger",
-    )
+    source = "Android Open Source Project, Apache-2.0: of a device held in the hand, not of a bare, sliding finger"
+    return Threshold("Android's least perceptible acceleration", frequency, level, GRAVITY, source)
 
 
 #: Upper edge of a third-octave band, relative to its middle (one band's middle is 1 kHz); fewest bins in a band.
@@ -198,6 +193,8 @@ _NOTHING = 1e-9
 #: Largest number of rows in a report, and of lines whose level is written in the picture.
 _SHOWN, _NAMED = 10, 6
 _MARKERS = "osD^vP"
+#: Units of the columns of lines or bands, beside the level.
+_UNITS = {"frequency": "Hz", "force": "N", "displacement": "m", "acceleration": "m/s^2"}
 #: In the picture the vertical axis reaches down to the threshold, but spans at most the factor _DEPTH. The frequency
 #: axis ends at _BEYOND times the threshold's highest frequency.
 _DEPTH, _BEYOND = 1e7, 5.0
@@ -259,10 +256,6 @@ class Feel(Sealed, Shown):
     threshold: Threshold
 
     @property
-    def _columns(self) -> tuple[FloatArray, ...]:
-        return self.frequency, self.force, self.displacement, self.acceleration, self.level
-
-    @property
     def strongest(self) -> int | None:
         """Index of the line or band with the highest level; None if none is within the threshold's frequencies."""
         return int(np.nanargmax(self.level)) if np.isfinite(self.level).any() else None
@@ -275,7 +268,7 @@ class Feel(Sealed, Shown):
     @property
     def felt(self) -> bool | None:
         """Whether some line or band reaches the threshold; None if none does, but what it cannot judge may be felt."""
-        return self._or_unknown(self.highest is not None and self.highest >= 0.0)
+        return self._or_unknown(bool(np.any(self.level >= 0.0)))
 
     @property
     def change_felt(self) -> bool | None:
@@ -289,13 +282,12 @@ class Feel(Sealed, Shown):
     @property
     def steps(self) -> float | None:
         """The highest level in difference thresholds of 1.21 dB (`feel.DIFFERENCE_DB`); None if not felt."""
-        return self.highest / DIFFERENCE_DB if self.highest is not None and self.felt else None
+        return self.highest / DIFFERENCE_DB if self.felt and self.highest is not None else None
 
     def to_dict(self) -> dict[str, Any]:
         """The keys of ``--json``; lines outside the threshold's frequencies are left out."""
-        rows = zip(*(x[np.isfinite(self.level)] for x in self._columns), strict=True)
-        keys = ("frequency", "force", "displacement", "acceleration", "level_db")
         place = self.strongest
+        columns = {**{name: getattr(self, name) for name in _UNITS}, "level_db": self.level}
         return {
             "element": self.signal.partition(":")[2] or None,
             "felt": self.felt,
@@ -308,7 +300,7 @@ class Feel(Sealed, Shown):
             "friction_change_felt": self.change_felt,
             "mechanics": dict(vars(self.mechanics)),
             "threshold": {"name": self.threshold.name, "source": self.threshold.source},
-            "lines": [dict(zip(keys, map(float, row), strict=True)) for row in rows],
+            "lines": [{k: float(x[i]) for k, x in columns.items()} for i in np.flatnonzero(np.isfinite(self.level))],
         }  # fmt: skip
 
     def _page(self) -> Page:
@@ -317,20 +309,16 @@ class Feel(Sealed, Shown):
         judged = np.flatnonzero(np.isfinite(self.level))
         if judged.size:
             shown = np.sort(judged[np.argsort(self.level[judged])[::-1][:_SHOWN]])
-            units = ("Hz", "N", "m", "m/s^2")
-            rows = [
-                (*(format_si(float(x[i]), unit) for x, unit in zip(self._columns, units, strict=False)),
-                 f"{self.level[i]:+.1f} dB")
-                for i in shown
-            ]  # fmt: skip
+            texts = [[format_si(float(x), unit) for x in getattr(self, k)[shown]] for k, unit in _UNITS.items()]
+            rows = list(zip(*texts, [f"{x:+.1f} dB" for x in self.level[shown]], strict=True))
             blocks += ["", Table((what, "friction", "skin moves", "accelerates", "above threshold"), rows), ""]
-        blocks.append(
-            f"friction changes by {100.0 * self.change:.3g} % within these frequencies; "
-            f"{100.0 * WEBER_FRICTION:g} % are noticed as a transient reduction"
-        )
-        blocks.append(f"threshold: {self.threshold.name} ({self.threshold.source})")
-        blocks.append(f"skin: {self.mechanics.name}: {self.mechanics.said}")
-        return Page(blocks)
+        change = f"friction changes by {100.0 * self.change:.3g} % within these frequencies"
+        return Page([
+            *blocks,
+            f"{change}; {100.0 * WEBER_FRICTION:g} % are noticed as a transient reduction",
+            f"threshold: {self.threshold.name} ({self.threshold.source})",
+            f"skin: {self.mechanics.name}: {self.mechanics.said}",
+        ])  # fmt: skip
 
     def verdict(self) -> str:
         """A sentence: whether it is felt, at which frequency most, the level, and friction that cannot be judged."""
@@ -366,8 +354,8 @@ class Feel(Sealed, Shown):
         f = np.geomspace(ends[0], high, 400)
         curve = table.acceleration(f)
         drawn = [(one.frequency >= ends[0]) & (one.frequency <= ends[1]) for one in fingers]
-        highest = max(drawing.peak_of(one.acceleration[some]) for one, some in zip(fingers, drawn, strict=True))
-        top = 3.0 * max(float(curve.max()), highest)
+        peaks = [drawing.peak_of(one.acceleration[some]) for one, some in zip(fingers, drawn, strict=True)]
+        top = 3.0 * max(float(curve.max()), *peaks)
         bottom = max(top / _DEPTH, 0.3 * float(curve.min()))
         ax.fill_between(f, bottom, curve, color=drawing.GREY, alpha=0.15, linewidth=0.0)
         ax.plot(f, curve, color=drawing.BLACK, linewidth=1.4, label=table.name)

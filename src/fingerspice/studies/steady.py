@@ -73,12 +73,9 @@ def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[t
         notes = (f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})",)
     swept = bool(circuit.by_device("SKIN_DISPERSIVE")) or (bool(skins) and skin != "own")
     low, high = float(f.min()), float(f.max())
-    beyond = []
+    ends = ("down to", low, SKIN_BAND[0] / low, "below"), ("up to", high, high / SKIN_BAND[1], "above")
     # The tolerance of 1e-6 allows for rounding of a sweep's end.
-    if low < SKIN_BAND[0] * (1.0 - 1e-6):
-        beyond.append(f"down to {low:g} Hz, {math.log10(SKIN_BAND[0] / low):.2g} decades below")
-    if high > SKIN_BAND[1] * (1.0 + 1e-6):
-        beyond.append(f"up to {high:g} Hz, {math.log10(high / SKIN_BAND[1]):.2g} decades above")
+    beyond = [f"{to} {x:g} Hz, {math.log10(by):.2g} decades {side}" for to, x, by, side in ends if by > 1.0 + 1e-6]
     if not swept or not beyond:
         return notes, ()
     return notes, (
@@ -140,7 +137,10 @@ def phasor(
         a frequency or the area is not positive, or a result is not finite.
     """
     require(skin in ("swept", "own"), "skin", repr(skin), "'swept' or 'own'")
-    area = area if isinstance(area, str) else area_given(area)
+    if isinstance(area, str):
+        require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
+    else:
+        area = area_given(area)
     circuit = overridden(circuit, sources, parameters)
     held = circuit if skin == "swept" else with_skin_held(circuit)
     scene = None if finger is None and not circuit.by_device("GAP") else linear_scene(held, finger)
@@ -153,8 +153,6 @@ def phasor(
     f = positive_row("frequency", asked, "Hz")
     driving = tuple((e, 1.0) for e in network.sources) if scene is None else scene.sources
     amplitude, phase, drive = sweep_drive(driving, fundamental, frequency is not None)
-    if isinstance(area, str):
-        require(area in ("mean", "frozen"), "area", repr(area), "'mean', 'frozen' or a number in m^2")
     if scene is None and math.isnan(amplitude):
         raise InputError("no source has an amplitude; allowed: AC on a source, such as V1 in 0 AC 1, or one sine")
     if scene is not None and area == "mean" and math.isnan(amplitude) and not scene.fixed:
@@ -163,27 +161,25 @@ def phasor(
             "'frozen' or an area in m^2"
         )
     notes, warned = sweep_notes(circuit, f, skin)
+    v, none = None, np.full(f.size, math.nan)
     with np.errstate(all="ignore"):
-        u = amplitude * np.exp(1j * phase)
         if scene is None:
             # Node voltages at the areas that the circuit gives; as in ngspice, the AC of every source counts.
-            s = [u] if alone else [0.0 if e.ac is None else e.ac.phasor for e in network.sources]
+            own = [amplitude * np.exp(1j * phase)]
+            s = own if alone else [0.0 if e.ac is None else e.ac.phasor for e in network.sources]
             at = areas_at_rest(network) if isinstance(area, str) else np.full(len(network.areas), area)
             areas = np.tile(at, (f.size, 1))
             v = np.array([network.node_phasors(float(x), at, np.array(s, complex)) for x in f])
-            gain = u_gap = np.full(f.size, math.nan + 0j)
-            layers, size, force = np.zeros((f.size, 0), complex), gain.real, gain.real
+            layers, gain, u_gap, size, force = np.zeros((f.size, 0), complex), none + 0j, none + 0j, none, none
             results: tuple[NDArray[np.inexact], ...] = (v,)
         else:
-            areas, v = np.array([scene.areas(float(x), area, amplitude) for x in f]), None
+            areas = np.array([scene.areas(float(x), area, amplitude) for x in f])
             layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
             gain, size = layers[:, scene.gap], areas[:, scene.finger].copy()
             u_gap = gain * amplitude * np.exp(1j * phase)
             stress = scene.contact.stress(np.abs(u_gap))
-            # At a constant area the mean force over a period of a sine is half its peak.
-            force = 0.5 * stress * size
-            results = (layers, size, *((u_gap, force) if math.isfinite(amplitude) else ()))
-            notes = (*notes, scene.note) if scene.note else notes
+            force = 0.5 * stress * size  # At a constant area the mean over a period of a sine is half the peak
+            results = (layers, size, u_gap, force)[: 4 if math.isfinite(amplitude) else 2]
         impedance = np.array([network.impedance(float(x), a) for x, a in zip(f, areas, strict=True)]) if alone else None
     finite = np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
     if not finite.all():
@@ -192,6 +188,7 @@ def phasor(
             "the 10 Hz to 100 kHz of the skin's data, and values nearer to Table 1's"
         )
     if scene is not None:
+        notes = (*notes, *filter(None, [scene.note]))
         warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
     for text in warned:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)

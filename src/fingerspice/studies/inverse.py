@@ -1,7 +1,4 @@
-"""The drive that produces a wanted electroadhesive force or friction, checked by forward runs.
-
-Capability of a screen: the mean and the modulation of the friction that a largest source voltage allows.
-"""
+"""The drive that produces a wanted electroadhesive force or friction, checked and corrected by forward runs."""
 
 from __future__ import annotations
 
@@ -9,24 +6,23 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray, positive_number, positive_row, real_number, real_numbers, whole_number
+from fingerspice.base.arrays import FloatArray, positive_number, real_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.files import write_csv
+from fingerspice.base.files import write_aside, write_csv
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import heading, require_circuit
-from fingerspice.plots.drawing import BLUE, caption, dress, engineering, new_figure
-from fingerspice.solve.runs import Progress
+from fingerspice.circuit.describe import head_lines, heading, require_circuit
+from fingerspice.plots import drawing
+from fingerspice.results.record import Sealed
 from fingerspice.solve.simulation import simulate
-from fingerspice.studies.design.drive import Finger, InverseDrive, Inverter, Voltages, force_curve, the_finger
+from fingerspice.studies.finger import Finger
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_columns
 from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.samples import Samples
@@ -34,7 +30,6 @@ from fingerspice.waveforms.waveform import Waveform, as_waveform, require
 
 if TYPE_CHECKING:
     from fingerspice.plots.picture import Picture
-
 
 #: Types that may be given as a wanted force.
 Wanted = ArrayLike | Waveform | Callable[[float], float]
@@ -47,6 +42,187 @@ MOST_SAMPLES = 5_000_000
 RTOL, CLOSE, CORRECTIONS, STALLED = 1e-6, 1e-5, 25, 0.7
 # Largest voltage of a drive without a warning where no limit is given, V: usual amplifiers end below it.
 HUGE = 1000.0
+# Full scale of a WAV file's integers.
+_FULL = 2.0**31
+
+
+def on_carrier(carrier: float | None) -> str:
+    """The carrier of a drive (Hz) in words."""
+    return "without a carrier" if carrier is None else f"on a carrier of {format_si(carrier, 'Hz')}"
+
+
+@dataclass(frozen=True, repr=False)
+class InverseDrive(Sealed, Shown):
+    """A drive, the force and friction wanted from it, and those that a forward run gives.
+
+    Attributes
+    ----------
+    circuit : Circuit
+        The circuit with the drive as its source.
+    drive : Samples
+        Voltage of the source, V.
+    times : ndarray, shape (n,)
+        Times at which wanted and reached values are compared, s: the samples, or the middles of the carrier's periods.
+    wanted, force : ndarray, shape (n,)
+        Wanted electroadhesive force, and that of the forward run, N; with a carrier the means over its periods.
+    wanted_friction, friction : ndarray, shape (n,)
+        Wanted friction F_T = mu (F_N + F_el), and that of the forward run, N.
+    kind : str
+        The quantity asked for, ``"force"`` or ``"friction"``.
+    carrier : float or None
+        Frequency of the carrier, Hz.
+    limit, slew : float
+        Largest voltage (V) and slew rate (V/s) of the source; inf for no limit.
+    lead : float
+        Time in which the drive rises to the first wanted value, s; it is left out of the comparison.
+    at_limit : float
+        Fraction of the samples at which a limit holds the drive.
+    corrections : int
+        Number of forward runs after the first.
+    """
+
+    circuit: Circuit
+    drive: Samples
+    times: FloatArray
+    wanted: FloatArray
+    force: FloatArray
+    wanted_friction: FloatArray
+    friction: FloatArray
+    kind: str
+    carrier: float | None
+    limit: float
+    slew: float
+    lead: float
+    at_limit: float
+    corrections: int
+
+    @property
+    def _asked(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The quantity asked for, as wanted and as reached, and the difference, N."""
+        wanted, reached = self.wanted_friction, self.friction
+        if self.kind == "force":
+            wanted, reached = self.wanted, self.force
+        return wanted, reached, reached - wanted
+
+    @property
+    def worst(self) -> float:
+        """Largest difference between reached and wanted force or friction, N."""
+        return float(np.abs(self._asked[2]).max())
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the difference between reached and wanted force or friction, N."""
+        return float(np.sqrt(np.mean(self._asked[2] ** 2)))
+
+    @property
+    def worst_share(self) -> float:
+        """`worst` relative to the largest wanted value."""
+        return self.worst / (float(self._asked[0].max()) or math.inf)
+
+    @property
+    def rms_share(self) -> float:
+        """`rms` relative to the largest wanted value."""
+        return self.rms / (float(self._asked[0].max()) or math.inf)
+
+    @property
+    def peak(self) -> float:
+        """Largest voltage of the drive, V."""
+        return float(np.abs(self.drive.values).max())
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures as plain data, in SI units."""
+        names = ("carrier", "limit", "slew", "lead", "peak", "at_limit", "worst", "rms", "worst_share", "rms_share")
+        wanted, reached, _ = self._asked
+        return {
+            "kind": self.kind, "rate": self.drive.rate, "samples": self.drive.values.size,
+            **{name: getattr(self, name) for name in names}, "largest_wanted": float(wanted.max()),
+            "largest_reached": float(reached.max()), "corrections": self.corrections,
+        }  # fmt: skip
+
+    def _page(self) -> Page:
+        wanted, reached, _ = self._asked
+        rows = [
+            ("peak of the drive", format_si(self.peak, "V")),
+            ("samples", f"{self.drive.values.size:,} at {format_si(self.drive.rate, 'Hz')}"),
+            (f"largest {self.kind} wanted", format_si(float(wanted.max()), "N")),
+            (f"largest {self.kind} reached", format_si(float(reached.max()), "N")),
+            ("worst miss", f"{format_si(self.worst, 'N')}, {100.0 * self.worst_share:.2g} %"),
+            ("rms miss", f"{format_si(self.rms, 'N')}, {100.0 * self.rms_share:.2g} %"),
+            ("time at a limit", f"{100.0 * self.at_limit:.3g} %"),
+        ]
+        if self.lead > 0.0:
+            rows.append(("rise before it", format_si(self.lead, "s")))
+        said = f"drive for a wanted {self.kind}, {on_carrier(self.carrier)}: {self._verdict()}"
+        return Page([*head_lines(self.circuit), said, "", Table(("", ""), rows)])
+
+    def _verdict(self) -> str:
+        if self.at_limit == 0.0:
+            return f"met to {100.0 * self.worst_share:.2g} % of its largest value"
+        limits = [format_si(x, unit) for x, unit in ((self.limit, "V"), (self.slew, "V/s")) if math.isfinite(x)]
+        worst, rms = format_si(self.worst, "N"), format_si(self.rms, "N")
+        return f"the limits ({', '.join(limits)}) cost {worst} at worst, {rms} rms"
+
+    def plot(self) -> Picture:
+        """Picture of the wanted and the reached quantity, their difference, and the drive, against time."""
+        figure, (top, middle, bottom) = drawing.new_figure(3, height=5.2, sharex=True, height_ratios=(3, 1.4, 2))
+        (wanted, reached, miss), volts = self._asked, self.drive.values
+        at = np.arange(volts.size) / self.drive.rate
+        scale, unit = drawing.engineering(float(at[-1]), "s")
+        force, newton = drawing.engineering(float(wanted.max(initial=0.0)) or 1.0, "N")
+        small, milli = drawing.engineering(max(self.worst, 1e-12), "N")
+        dashes, t = (0, (4, 1.5)), scale * self.times
+        top.plot(*drawing.thin(t, force * wanted), color=drawing.BLACK, linewidth=2.2, label="wanted")
+        top.plot(*drawing.thin(t, force * reached), color=drawing.ORANGE, linewidth=1.2, ls=dashes, label="reached")
+        middle.plot(*drawing.thin(t, small * miss), color=drawing.VERMILION, linewidth=1.0)
+        bottom.plot(*drawing.thin(scale * at, volts), color=drawing.BLUE, linewidth=0.9)
+        drawing.dress(top, f"{self.kind.capitalize()} [{newton}]")
+        drawing.legend_above(top, 2)
+        drawing.dress(middle, f"Miss [{milli}]")
+        drawing.dress(bottom, "Drive [V]", f"Time [{unit}]")
+        limit = ""
+        if math.isfinite(self.limit):
+            limit = "; dashed: limit"
+            for level in {math.copysign(self.limit, side) for side in (volts.min(), volts.max())}:
+                bottom.axhline(level, color=drawing.GREY, linewidth=0.9, linestyle="--")
+        mean = "" if self.carrier is None else f" · means over periods of the carrier, {format_si(self.carrier, 'Hz')}"
+        drawing.caption(figure, f"{heading(self.circuit)} · {self._verdict()}{mean}{limit}")
+        return figure
+
+    def to_wav(self, path: str | Path, gain: float | None = None) -> Path:
+        """Write the drive as a WAV file of 32-bit integers.
+
+        Parameters
+        ----------
+        path : str or Path
+        gain : float, optional
+            V at full scale; the drive's own peak by default. ``WAV(path gain=...)`` reads it back.
+
+        Raises
+        ------
+        InputError
+            If the rate is not a whole number of Hz, the gain is below the peak, or the path cannot be written.
+        """
+        from scipy.io import wavfile
+
+        rate, peak = self.drive.rate, self.peak
+        if abs(rate - round(rate)) > 1e-9 * rate or not 1.0 <= rate < 2**32:
+            raise InputError(f"a WAV file has a whole number of samples a second, and the drive has {rate:g}; allowed: "
+                             "rate= a whole number of Hz")  # fmt: skip
+        full = (peak or 1.0) if gain is None else gain
+        require(full >= peak, "gain", f"{full:g} V at full scale", f"the drive's peak, {peak:.6g} V, or more")
+        data = np.clip(np.rint(_FULL / full * self.drive.values), -_FULL, _FULL - 1.0).astype("<i4")
+        return write_aside(Path(path), lambda target: wavfile.write(target, round(rate), data))
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write the drive as CSV: time (s) and voltage (V)."""
+        t = np.arange(self.drive.values.size) / self.drive.rate
+        return write_csv(path, ("time (s)", "drive (V)"), zip(t, self.drive.values, strict=True))
+
+    def friction_to_csv(self, path: str | Path) -> Path:
+        """Write wanted and predicted force and friction as CSV."""
+        names = ("time (s)", "wanted force (N)", "force (N)", "wanted friction (N)", "friction (N)")
+        columns = self.times, self.wanted, self.force, self.wanted_friction, self.friction
+        return write_csv(path, names, zip(*columns, strict=True))
 
 
 def _wave_of(given: Wanted, what: str, rate: float | None, duration: float | None) -> tuple[Waveform, float]:
@@ -188,7 +364,7 @@ def inverse_drive(
             ("rate", rate, "Hz"), ("carrier", carrier, "Hz"), ("limit", limit, "V"), ("slew", slew, "V/s")
         )
     )  # fmt: skip
-    finger = the_finger(circuit, charge_law)
+    finger = Finger(circuit, charge_law)
     wave, end = _wave_of(wanted, kind, rate, duration)
     if carrier is not None:
         if rate is not None and rate < FEWEST * carrier:
@@ -226,53 +402,55 @@ class Task:
         self.finger, self.kind, self.rate, self.carrier, self.lead = finger, kind, rate, carrier, round(lead * rate)
         # With a carrier the force is also evaluated midway between samples, as Simpson's rule for its mean needs it.
         self.fine = 1 if carrier is None else 2
-        count = math.floor(end * rate * (1.0 + 1e-12)) + 1
-        t = np.arange(self.fine * (count - 1) + 1) / (self.fine * rate)
-        contact, friction, force = finger.contact, kind == "friction", wave.value(t)
-        if friction:
+        t = np.arange(self.fine * math.floor(end * rate * (1.0 + 1e-12)) + 1) / (self.fine * rate)
+        contact, force, least, scale, rest = finger.contact, wave.value(t), "0 N", 1.0, 0.0
+        if kind == "friction":
             if contact.mu == 0.0:
                 raise InputError(
                     "the GAP has mu=0, so that no voltage makes friction; allowed: mu > 0, or a wanted force"
                 )
             # F_el = F_T / mu - F_N (Eq. 1 with full slip).
             force = force / contact.mu - contact.f_n
+            scale, rest = contact.mu, contact.f_n
+            least = f"{contact.mu * contact.f_n:g} N, the friction without a voltage"
         bad = np.flatnonzero(~(force >= -1e-12 * max(1.0, float(np.abs(force).max()))))
         if bad.size:
-            value, least = float(force[bad[0]]), "0 N"
-            if friction:
-                value = contact.mu * (value + contact.f_n)
-                least = f"{contact.mu * contact.f_n:g} N, the friction without a voltage"
             raise InputError(
-                f"{kind}: {value:g} N at {t[bad[0]]:g} s is reached by no voltage, which only attracts; allowed: "
-                f"from {least}"
+                f"{kind}: {scale * (float(force[bad[0]]) + rest):g} N at {t[bad[0]]:g} s is reached by no voltage, "
+                f"which only attracts; allowed: from {least}"
             )
         # Negative round-off becomes 0.
         self.wanted = np.maximum(force, 0.0)
-        voltages = force_curve(finger, None if carrier is None else rate / carrier, float(self.wanted.max()))
-        self.target = voltages(self.wanted[:: self.fine], rate, carrier, self.lead)
+        self.target = finger.voltages(float(self.wanted.max()), rate, carrier)(self.wanted[:: self.fine], self.lead)
 
     def solve(self, limit: float = math.inf, slew: float = math.inf, close: float = CLOSE) -> InverseDrive:
         """The drive within limits (V, V/s), corrected by the errors of the gap voltage until they are `close`."""
-        finger, target, contact = self.finger, self.target, self.finger.contact
+        finger, target, contact, fine = self.finger, self.target, self.finger.contact, self.fine
         peak = float(np.abs(target).max())
         inverter = finger.inverter(peak)
-        best, least, done = None, math.inf, -1
-        wish, levelled = target.copy(), self.carrier is None
-        while best is None or done < CORRECTIONS:
+        t = np.arange(fine * (target.size - 1) + 1) / (fine * self.rate)
+        wish, least, levelled = target.copy(), math.inf, self.carrier is None
+        for done in range(CORRECTIONS + 1):
             values, held = inverter(wish, 1.0 / self.rate, limit, slew)
             drive = Samples(values, self.rate)
             circuit = finger.circuit.varied({finger.source.name: drive})
-            u, force = self._forward(circuit, close * RTOL / CLOSE)
-            miss = np.where(held, 0.0, target - finger.sign * u)
+            with warnings.catch_warnings():
+                # The reader has given the deck's warnings, and those of an uncorrected drive do not concern the user.
+                warnings.simplefilter("ignore", FingerspiceWarning)
+                run = simulate(
+                    circuit, t_stop=float(t[-1]), t_eval=t, charge_law=finger.law, rtol=close * RTOL / CLOSE,
+                    start="uncharged", charge=False,
+                )  # fmt: skip
+            force = run.record.one("f_el")
+            miss = np.where(held, 0.0, target - finger.sign * run.record.one("u_gap")[::fine])
             size = float(np.abs(miss[self.lead :]).max()) / max(peak, 1e-300)
-            done += 1
             stalled = size > STALLED * least
             if size < least:
                 best, least = (circuit, drive, held, force, done), size
-            if (size <= close or stalled) and levelled:
-                break
             wish = wish + miss
             if size <= close or stalled:
+                if levelled:
+                    break
                 # The gap voltage is linear between samples, not a sine, which changes the mean force: now that the
                 # force is known, scale the envelope once, so that the mean of each period becomes the wanted one.
                 times, wanted, reached = self._compared(force)
@@ -281,28 +459,12 @@ class Task:
                 at = (np.arange(target.size) - self.lead) / self.rate
                 factor, levelled, least = np.where(held, 1.0, np.interp(at, times, factor)), True, math.inf
                 target, wish = target * factor, wish * factor
-        assert best is not None
         circuit, drive, held, force, done = best
         lead, (times, wanted, reached) = self.lead / self.rate, self._compared(force)
         return InverseDrive(
             circuit, drive, lead + times, wanted, reached, contact.mu * (contact.f_n + wanted),
             contact.mu * (contact.f_n + reached), self.kind, self.carrier, limit, slew, lead, float(held.mean()), done,
         )  # fmt: skip
-
-    def _forward(self, circuit: Circuit, rtol: float) -> tuple[FloatArray, FloatArray]:
-        """Gap voltage at the samples (V), and force at the fine times (N), that the circuit with a drive has."""
-        t = np.arange(self.fine * (self.target.size - 1) + 1) / (self.fine * self.rate)
-        with warnings.catch_warnings():
-            # The reader has given the deck's warnings, and warnings about an uncorrected drive do not concern the user.
-            warnings.simplefilter("ignore", FingerspiceWarning)
-            run = simulate(
-                circuit, t_stop=float(t[-1]), t_eval=t, charge_law=self.finger.law, rtol=rtol, start="uncharged",
-                charge=False,
-            )  # fmt: skip
-        u, force = run.u_gap, run.f_el
-        assert u is not None
-        assert force is not None
-        return u[:: self.fine], force
 
     def _compared(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Times after the lead (s), and the wanted and the reached force there (N), from the force at the fine times.
@@ -322,227 +484,3 @@ class Task:
             return np.asarray(np.diff(at_edges) / np.diff(edges))
 
         return 0.5 * (edges[1:] + edges[:-1]), means(self.wanted), means(reached)
-
-
-# Samples per period of the modulation and of the carrier, and the lowest sample rate, Hz.
-_PER_PERIOD, _PER_CARRIER, _LEAST_RATE = 64, 32, 8000.0
-# Duration of a force: this many periods of the modulation, and at least this many seconds.
-_PERIODS, _LASTS = 3.0, 0.05
-# Relative accuracy of the amplitudes of a stack, and of the voltage of another network, whose drives are corrected this
-# many times at most.
-_EXACT = 1e-3
-_MOST = 8
-
-
-@dataclass(frozen=True, repr=False)
-class Capability(Shown):
-    """Largest amplitudes of the friction that a voltage allows.
-
-    The friction is mean + amplitude sin(2 pi f t), produced by the inverse drive from an uncharged circuit for 3
-    periods, and at least 50 ms, with ``|U| <= limit`` all the time; the amplitude is at most the mean less the friction
-    at 0 V. In a network other than a series stack the force first rises for 2 ms, as in `inverse_drive`.
-
-    Attributes
-    ----------
-    circuit : Circuit
-    limit : float
-        V.
-    carrier : float or None
-        Frequency of the carrier, Hz.
-    frequency : ndarray, shape (n_f,)
-        Frequency of the modulation, Hz.
-    mean : ndarray, shape (n_m,)
-        Mean friction, N.
-    amplitude : ndarray, shape (n_m, n_f)
-        Largest amplitude of the friction, N.
-    smallest_mean, largest_mean : float
-        Smallest and largest constant friction, N.
-    """
-
-    circuit: Circuit
-    limit: float
-    carrier: float | None
-    frequency: FloatArray
-    mean: FloatArray
-    amplitude: FloatArray
-    smallest_mean: float
-    largest_mean: float
-
-    @property
-    def largest(self) -> FloatArray:
-        """Largest amplitude at each frequency, over all means, N, shape (n_f,)."""
-        return np.asarray(self.amplitude.max(axis=0))
-
-    @property
-    def best_mean(self) -> FloatArray:
-        """Mean friction at which the amplitude is largest, N, shape (n_f,)."""
-        return np.asarray(self.mean[self.amplitude.argmax(axis=0)])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data, SI units."""
-        names = ("limit", "carrier", "frequency", "mean", "amplitude", "largest", "best_mean", "smallest_mean")
-        return {name: np.asarray(getattr(self, name)).tolist() for name in (*names, "largest_mean")}
-
-    def _page(self) -> Page:
-        wave = "without a carrier" if self.carrier is None else f"on a carrier of {format_si(self.carrier, 'Hz')}"
-        rows = [
-            (format_si(f, "Hz"), format_si(a, "N"), format_si(m, "N"))
-            for f, a, m in zip(*(x.tolist() for x in (self.frequency, self.largest, self.best_mean)), strict=True)
-        ]
-        said = (
-            f"up to {format_si(self.limit, 'V')} {wave} the friction's mean is from "
-            f"{format_si(self.smallest_mean, 'N')} to {format_si(self.largest_mean, 'N')}"
-        )
-        return Page([heading(self.circuit), said, "", Table(("modulation", "largest amplitude", "at mean"), rows)])
-
-    def plot(self) -> Picture:
-        """Picture with a map of the amplitude over frequency and mean, and the largest amplitude over frequency."""
-        figure, (left, right) = new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))
-        factor, unit = engineering(self.largest_mean, "N")
-        f, amplitude = self.frequency, factor * self.amplitude
-        if f.size == 1:
-            # A map needs two frequencies: a single one is drawn as a band around it, with room for the axis to be read.
-            f, amplitude = np.append(0.1 * f, 10.0 * f), np.repeat(amplitude, 2, axis=1)
-        mesh = left.contourf(f, factor * self.mean, amplitude, levels=12, cmap="viridis")
-        bar = figure.colorbar(mesh, ax=left, pad=0.02)
-        bar.set_label(f"Largest amplitude [{unit}]", fontsize=8)
-        bar.ax.tick_params(labelsize=8)
-        right.plot(self.frequency, factor * self.largest, color=BLUE, marker="o", markersize=3)
-        right.set_ylim(bottom=0.0)
-        for ax, label in ((left, f"Mean friction [{unit}]"), (right, f"Largest amplitude, best mean [{unit}]")):
-            ax.set_xscale("log")
-            dress(ax, label, "Modulation frequency [Hz]")
-        wave = "unipolar drive" if self.carrier is None else f"carrier {format_si(self.carrier, 'Hz')}"
-        caption(
-            figure,
-            f"{heading(self.circuit)} · at most {format_si(self.limit, 'V')}, {wave} · mean friction "
-            f"{format_si(self.smallest_mean, 'N')} to {format_si(self.largest_mean, 'N')}",
-        )
-        return figure
-
-    def to_csv(self, path: str | Path) -> Path:
-        """Write the map as CSV: one row for each frequency and mean."""
-        mean, f = np.meshgrid(self.mean, self.frequency, indexing="ij")
-        header = "frequency (Hz)", "mean friction (N)", "largest amplitude (N)"
-        return write_csv(path, header, zip(f.ravel(), mean.ravel(), self.amplitude.ravel(), strict=True))
-
-
-def capability(
-    circuit: Circuit,
-    limit: float,
-    *,
-    carrier: float | None = None,
-    frequency: ArrayLike | None = None,
-    means: int = 13,
-    charge_law: str | None = None,
-    progress: Progress | None = None,
-) -> Capability:
-    """Map the friction that a screen can produce with a source of at most `limit` (V).
-
-    Parameters
-    ----------
-    circuit : Circuit
-        A circuit with one GAP and one V source. A series stack takes seconds, and another network up to minutes,
-        because its drives are corrected by forward runs.
-    limit : float
-        Largest voltage of the source, V.
-    carrier : float, optional
-        Hz; without it the drive is unipolar.
-    frequency : array_like, optional
-        Frequencies of the modulation, Hz; by default 13 from 5 Hz to 1 kHz, or to an eighth of a carrier below 8 kHz.
-    means : int
-        Number of mean frictions, from the smallest to the largest, 3 or more.
-    charge_law : str, optional
-        As in `simulate`.
-    progress : callable, optional
-        Called with the fraction done.
-
-    Raises
-    ------
-    InputError
-        If the circuit is not such a one, if its source does not drive the gap, or if a number is out of range.
-    SolveError
-        If a forward run fails.
-    """
-    require_circuit(circuit)
-    limit, means = positive_number("limit", limit, "V"), whole_number("means", means, 3, 1000)
-    carrier = None if carrier is None else positive_number("carrier", carrier, "Hz")
-    top = 1000.0 if carrier is None else min(1000.0, carrier / 8.0)
-    own = np.geomspace(min(5.0, 0.1 * top), top, 13)
-    f = positive_row("frequency", own if frequency is None else frequency, "Hz")
-    if carrier is not None and f.max() > carrier / 4.0:
-        raise InputError(
-            f"frequency reaches {f.max():g} Hz; allowed: at most a quarter of the carrier's {carrier:g} Hz"
-        )
-    finger = the_finger(circuit, charge_law)
-    contact = finger.contact
-    if contact.mu == 0.0:
-        raise InputError(f"{finger.gap.name} has mu=0 and no friction; allowed: mu > 0")
-    # The charges in the layers can raise the gap voltage above the source voltage, but not to ten times the limit.
-    area = float(contact.area(10.0 * limit)) if finger.area is None else finger.area
-    most = 0.4 * float(contact.stress(10.0 * limit)) * area
-    voltages = force_curve(finger, None if carrier is None else float(_PER_CARRIER), most)
-    search = _Search(finger, voltages, finger.inverter(10.0 * limit), limit, carrier)
-    largest = search.largest(lambda x: search.wanted(x, 1.0 / _LASTS, 0.0), most)
-    force = np.linspace(0.0, largest, means)
-    amplitude = np.zeros((means, f.size))
-    for i, mean in enumerate(force[1:-1].tolist(), 1):
-        amplitude[i] = [search.largest(partial(search.wanted, mean, x), mean) for x in f.tolist()]
-        if progress is not None:
-            progress(i / (means - 2))
-    friction = contact.mu * (contact.f_n + force)
-    return Capability(
-        circuit, limit, carrier, f, friction, contact.mu * amplitude, float(friction[0]), float(friction[-1])
-    )
-
-
-@dataclass
-class _Search:
-    """Search for the largest forces whose inverse drive stays within the voltage limit.
-
-    For a series stack the inverter's drive is exact. For another network it is that of the linear response, whose peak
-    is off by `ratio`: this changes little from a force to the next, so that few drives have to be corrected by forward
-    runs.
-    """
-
-    finger: Finger
-    voltages: Voltages
-    inverter: Inverter
-    limit: float  # V
-    carrier: float | None  # Hz
-    ratio: float = 1.0
-
-    def wanted(self, mean: float, frequency: float, amplitude: float) -> Samples:
-        """A mean force (N) with a modulation (Hz, N), sampled at the rate of the drive."""
-        rate = max(_PER_PERIOD * frequency, _LEAST_RATE) if self.carrier is None else _PER_CARRIER * self.carrier
-        t = np.arange(math.ceil(max(_PERIODS / frequency, _LASTS) * rate)) / rate
-        return Samples(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0), rate)
-
-    def largest(self, wanted: Callable[[float], Samples], most: float) -> float:
-        """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit.
-
-        By bisection, to `_EXACT` times itself or 1e-3 `_EXACT` times `most`.
-        """
-        for _ in range(_MOST):
-            found, high = 0.0, most
-            if self.ratio * self._peak(wanted(most)) <= self.limit:
-                found = most
-            while high - found > _EXACT * max(found, 1e-3 * most):
-                middle = 0.5 * (found + high)
-                within = self.ratio * self._peak(wanted(middle)) <= self.limit
-                found, high = (middle, high) if within else (found, middle)
-            if self.finger.network.stack is not None or found == 0.0:
-                break
-            force = wanted(found)
-            end = (force.values.size - 1) / force.rate
-            task = Task(self.finger, "force", force, end, force.rate, self.carrier, self.finger.lead)
-            peak = task.solve(close=0.3 * _EXACT).peak
-            before, self.ratio = self.ratio, peak / self._peak(force)
-            if abs(self.ratio / before - 1.0) < 0.5 * _EXACT or (found == most and peak <= self.limit):
-                break
-        return found
-
-    def _peak(self, force: Samples) -> float:
-        """Largest voltage (V) of the inverter's drive for a force."""
-        u = self.voltages(force.values, force.rate, self.carrier, round(self.finger.lead * force.rate))
-        return float(np.abs(self.inverter(u, 1.0 / force.rate, math.inf, math.inf)[0]).max())
