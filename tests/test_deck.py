@@ -12,7 +12,8 @@ import pytest
 from fingerspice.base.errors import InputError, Where
 from fingerspice.netlist import reader
 from fingerspice.netlist.deck import parse_deck, read_deck
-from fingerspice.netlist.reader import Call, Deck, Number, Statement, Token
+from fingerspice.netlist.expressions import Call, Number, Token
+from fingerspice.netlist.reader import Deck, Statement
 
 PAPER = """Fingerpad on a 3M-coated touchscreen, Table 1
 .include fingerspice.lib

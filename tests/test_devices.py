@@ -13,7 +13,7 @@ import fingerspice as fs
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.devices import DEVICES, DeviceSpec, ParameterSpec, Usual, layer_devices
 from fingerspice.circuit.statespace import layer_constants
-from fingerspice.netlist.lexer import LIBRARIES, library_text
+from fingerspice.netlist.reader import LIBRARIES, library_text
 from fingerspice.physics.materials import EPS0
 from ngspice_tools import run_ngspice
 

@@ -18,8 +18,8 @@ from fingerspice.base.errors import LONGEST_MESSAGE, FingerspiceWarning, InputEr
 from fingerspice.circuit import topology
 from fingerspice.netlist import reader
 from fingerspice.netlist.deck import LONGEST_TITLE, MAX_DEPTH, parse_deck
-from fingerspice.netlist.expressions import nearest
-from fingerspice.netlist.reader import Number
+from fingerspice.netlist.expressions import Number
+from fingerspice.netlist.lexer import nearest
 
 MANY = 20_000
 

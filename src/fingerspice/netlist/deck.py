@@ -1,32 +1,31 @@
 """A netlist file as a flat list of evaluated statements: expands subcircuit calls, renames nodes, evaluates values.
 
-A statement has a name, nodes and values; `elements` and `sources` give it a meaning. The steps are those of `lexer`
-(from text to words), `reader` (lines by kind, included files), `scope` (parameters and values) and `Flattener`
+A statement has a name, nodes and values; `netlist` and `sources` give it a meaning. The steps are those of `lexer`
+(from text to words), `reader` (lines by kind, included files), `expressions` (parameters and values) and `Flattener`
 (subcircuit calls). Every error has its place in the file.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
-from fingerspice.netlist.expressions import nearest, stray_word, with_comma
-from fingerspice.netlist.lexer import MAX_BYTES, MAX_NAME, Group, Lexeme, Line, group, lex, read_stream, read_text
+from fingerspice.netlist.expressions import Bare, Number, Scope, Value
+from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
 from fingerspice.netlist.reader import (
     DIRECTIVES,
-    Bare,
+    MAX_BYTES,
     Deck,
     Directive,
-    Number,
     Reader,
-    Scope,
     Statement,
     Subcircuit,
-    Value,
+    read_stream,
+    read_text,
 )
 
 #: Largest number of characters of a title that are shown; the middle of a longer title is left out.
@@ -35,7 +34,6 @@ LONGEST_TITLE = 200
 MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
-
 
 _ELSEWHERE = {
     "A": "an XSPICE model",
@@ -89,7 +87,9 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
         reader.warn(problem, Where(deck.file, 1))
     try:
         reader.read_deck(lines)
-        Flattener(deck).run(reader.root)
+        scope = Scope(reader.root.params)
+        deck.params = scope.solve()
+        Flattener(deck).expand(_Instance(reader.root, scope))
     except InputError as error:
         raise with_comma(error, deck.warnings) from None
     for defined in reader.root.inner.values():
@@ -97,6 +97,13 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
         if defined.where.file == deck.file and not (defined.called or defined.skipped):
             reader.warn(f"subcircuit '{defined.name}' is never called, and its body was not read", defined.where)
     return deck
+
+
+def with_comma(error: InputError, warnings: Iterable[str]) -> InputError:
+    """The error, with the warning about a decimal comma in the same line, if there is one."""
+    place = f"{error.where.file}:{error.where.line}:" if error.where else "none"
+    found = [text.partition(": ")[2] for text in warnings if text.startswith(place) and "decimal comma" in text]
+    return InputError("; note ".join([error.message, *found]), error.where) if found else error
 
 
 @dataclass(slots=True)
@@ -143,13 +150,7 @@ class Flattener:
         self._names: dict[str, Where] = {}
         self._expanded = self._expanded_text = 0
 
-    def run(self, root: Subcircuit) -> None:
-        """Evaluate the deck's parameters and add its statements."""
-        scope = Scope(root.params)
-        self.deck.params = scope.solve()
-        self._expand(_Instance(root, scope))
-
-    def _expand(self, instance: _Instance) -> None:
+    def expand(self, instance: _Instance) -> None:
         """Add the statements and directives of a call; an `.ic` line gets the canonical names of its nodes."""
         for line in instance.definition.elements:
             self._element(line, instance)
@@ -162,10 +163,10 @@ class Flattener:
                 if flat in params:
                     raise InputError(f".ic gives node {flat[2:-1]!r} twice", value.key)
                 params[flat] = value
-            self.deck.directives.append(Directive(name, args, params, line.place, line.text[line.start :]))
+            self.deck.directives.append(Directive(name, args, params, line.where(), line.text))
 
     def _element(self, line: Line, instance: _Instance) -> None:
-        lexemes = lex(line) or [Lexeme("", ",", line.start, line)]  # a line of commas has none
+        lexemes = lex(line) or [Lexeme("", ",", 0, line)]  # a line of commas has none
         first = lexemes[0]
         where, letter = first.where, first.text[:1].upper()
         if first.kind != "word" or not (letter.isascii() and letter.isalpha()):
@@ -196,9 +197,10 @@ class Flattener:
     def _call(self, name: str, lexemes: list[Lexeme], instance: _Instance) -> None:
         """An X line: a native device becomes a statement, and a subcircuit is expanded."""
         words, scope = group(lexemes[1:], plain=len(lexemes)), instance.scope
-        if words.stray is not None:
-            stray = words.stray
-            hint = stray_word(stray.text, stray.line.text[: stray.position])
+        if (stray := words.stray) is not None:
+            number = stray.line.text[: stray.position].rpartition("=")[2].strip()
+            apart = NUMBER.fullmatch(number) and is_unit(stray.text)
+            hint = f"; a unit joins its number, {number}{stray.text}" if apart else ""
             problem = f"'{stray.text}' follows the parameters: nodes and the device's name come first{hint}"
             raise InputError(problem, stray.where)
         plain = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
@@ -240,22 +242,26 @@ class Flattener:
                 raise InputError(f"subcircuit '{called.name}' has no parameter '{word.text}'{hint}", word.where)
             inner.preset(parameter, scope.number(value))
         _refuse_captured(called.name, inner.solve(), words, scope)
-        self._expand(_Instance(called, inner, outside, f"{name}.", ports, (*instance.calls, called)))
+        self.expand(_Instance(called, inner, outside, f"{name}.", ports, (*instance.calls, called)))
 
     def _count(self, called: Subcircuit, instance: _Instance, where: Where) -> None:
         """Count what a call expands to; refuse circles, and what is too deep or too much."""
-        if any(called is outer for outer in instance.calls):
-            start = next(i for i, outer in enumerate(instance.calls) if outer is called)
-            path = " -> ".join(sub.name for sub in (*instance.calls[start:], called))
-            raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
-        if len(instance.calls) >= MAX_DEPTH:
-            raise InputError(f"subcircuits call each other more than {MAX_DEPTH} deep", where)
+        names = [sub.name for sub in (*instance.calls, called)]
+        for start, outer in enumerate(instance.calls):
+            if outer is called:
+                path = " -> ".join(names[start:])
+                raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
         self._expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
-        if self._expanded > MAX_EXPANDED:
-            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
         self._expanded_text += called.characters
-        if self._expanded_text > MAX_EXPANDED_TEXT:
-            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
+        problem = ""
+        if len(instance.calls) >= MAX_DEPTH:
+            problem = f"subcircuits call each other more than {MAX_DEPTH} deep"
+        elif self._expanded > MAX_EXPANDED:
+            problem = f"the subcircuits expand to more than {MAX_EXPANDED:,} lines"
+        elif self._expanded_text > MAX_EXPANDED_TEXT:
+            problem = f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text"
+        if problem:
+            raise InputError(problem, where)
 
 
 def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import InputError
-from fingerspice.netlist.lexer import read_text
+from fingerspice.netlist.reader import read_text
 from fingerspice.physics.materials import EPS0
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_columns
 
