@@ -13,7 +13,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.base.units import spice_text
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import in_force, remembering
-from fingerspice.circuit.topology import driving_sources
+from fingerspice.circuit.statespace import driving_sources
 from fingerspice.explorer.request import Asked, quiet, read_source, text_of, value_text
 from fingerspice.sets.parameters import parameters
 from fingerspice.waveforms.waveform import Waveform

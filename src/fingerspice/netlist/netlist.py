@@ -15,7 +15,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.units import exponent_and_scale, format_si
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Circuit, Element, Tran
 from fingerspice.circuit.devices import DEVICES, REST_AREA, ParameterSpec, mega_note, unit_trap, unusual
-from fingerspice.circuit.loop import checked
+from fingerspice.circuit.network import checked
 from fingerspice.netlist.deck import parse_deck, read_deck, with_comma
 from fingerspice.netlist.expressions import Call, Number, Token, Value
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest

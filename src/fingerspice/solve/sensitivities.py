@@ -15,7 +15,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.network import network_of
 from fingerspice.numerics.modes import AT, derivative
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.results.sensitivity import MEANS, SIGNALS, Sensitivity

@@ -15,8 +15,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.devices import MEASURED as USUAL
 from fingerspice.circuit.devices import MEASURING
-from fingerspice.circuit.statespace import build_stack, is_stack
-from fingerspice.circuit.topology import driving_sources
+from fingerspice.circuit.statespace import build_stack, driving_sources, is_stack
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.batch.batch import batch
 from fingerspice.studies.batch.form import REFUSED, in_lockstep_by
