@@ -8,7 +8,7 @@ A statement has a name, nodes and values; `netlist` and `sources` give it a mean
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -112,7 +112,8 @@ class _Instance:
 
     definition: Subcircuit
     scope: Scope
-    outside: _Instance | None = None  # the instance in which the definition stands
+    # The instances around the definition, innermost first, whose subcircuits an X line may call, too
+    around: tuple[_Instance, ...] = ()
     prefix: str = ""  # as written, ends in a dot
     ports: dict[str, tuple[str, str]] = field(default_factory=dict)
     calls: tuple[Subcircuit, ...] = ()  # definitions being expanded, outermost first
@@ -130,13 +131,6 @@ class _Instance:
             if word.kind != "word":
                 raise InputError(f"{word.written} stands where a node's name belongs", word.where)
         return [self.node(word.text) for word in words]
-
-    def around(self) -> Iterator[_Instance]:
-        """This instance, and those around it, whose subcircuits an X line may call, too."""
-        instance: _Instance | None = self
-        while instance is not None:
-            yield instance
-            instance = instance.outside
 
 
 class Flattener:
@@ -210,8 +204,10 @@ class Flattener:
         if device.kind != "word":
             raise InputError(f"{device.written} stands where a device's name belongs", device.where)
         native, key = device.text.upper(), device.text.lower()
-        outside = next((around for around in instance.around() if key in around.definition.inner), None)
-        called = None if outside is None else outside.definition.inner[key]
+        around = (instance, *instance.around)
+        while around and key not in around[0].definition.inner:
+            around = around[1:]
+        called = around[0].definition.inner[key] if around else None
         if native in layer_devices():
             called, shown, wanted = None, native, DEVICES[native].nodes
         elif called is not None:
@@ -242,7 +238,7 @@ class Flattener:
                 raise InputError(f"subcircuit '{called.name}' has no parameter '{word.text}'{hint}", word.where)
             inner.preset(parameter, scope.number(value))
         _refuse_captured(called.name, inner.solve(), words, scope)
-        self.expand(_Instance(called, inner, outside, f"{name}.", ports, (*instance.calls, called)))
+        self.expand(_Instance(called, inner, around, f"{name}.", ports, (*instance.calls, called)))
 
     def _count(self, called: Subcircuit, instance: _Instance, where: Where) -> None:
         """Count what a call expands to; refuse circles, and what is too deep or too much."""
@@ -279,10 +275,8 @@ def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: S
 def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
     """The message that the last word of an X line is not a device, with a hint."""
     last = words[-1]
-    visible = [
-        *layer_devices(),
-        *(sub.name for around in instance.around() for sub in around.definition.inner.values()),
-    ]
+    inner = [one.definition.inner for one in (instance, *instance.around)]
+    visible = [*layer_devices(), *(sub.name for subs in inner for sub in subs.values())]
     known = {name.lower() for name in visible}
     for word in words[2:-1]:
         # A device's name after two words or more is probably the device, and the words after it lack their `key=`.

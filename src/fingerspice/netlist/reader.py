@@ -302,14 +302,6 @@ class Deck:
         return [directive for directive in self.directives if directive.name == name]
 
 
-class DirectiveLine(NamedTuple):
-    """A line that begins with a dot."""
-
-    name: str  # In lower case, with its dot
-    line: Line
-    rest: int  # Position of the arguments
-
-
 @dataclass(slots=True)
 class Subcircuit:
     """The definition of a subcircuit, or, without a name, the deck itself."""
@@ -320,7 +312,8 @@ class Subcircuit:
     defaults: list[Assignment] = field(default_factory=list)
     elements: list[Line] = field(default_factory=list)
     params: list[Assignment] = field(default_factory=list)
-    directives: list[DirectiveLine] = field(default_factory=list)  # those with values; only .ic in a subcircuit
+    # Those with values, in a subcircuit only .ic: name in lower case with its dot, and the position of the arguments
+    directives: list[tuple[str, Line, int]] = field(default_factory=list)
     inner: dict[str, Subcircuit] = field(default_factory=dict)
     skipped: bool = False  # has a native device's name, or is inside such a definition: its body is not read
     called: bool = False
@@ -387,30 +380,29 @@ class Reader:
             word = word.partition("(")[0].partition("=")[0]
             # In the body of a definition that is not read, only what gives it its end counts.
             if not here.skipped or word in (".subckt", ".ends", ".control"):
-                self._direct(DirectiveLine(".param" if word == ".params" else word, line, len(word)))
+                self._direct(".param" if word == ".params" else word, line, len(word))
         elif not here.skipped:
             here.elements.append(line)
             here.characters += len(line.text)
 
-    def _direct(self, read: DirectiveLine) -> None:
-        """Do what a directive asks for."""
-        here, line, place = self._open[-1], read.line, read.line.where()
-        name, text = read.name, read.line.text[read.rest :]
+    def _direct(self, name: str, line: Line, rest: int) -> None:
+        """Do what a directive asks for, whose arguments begin at a position of its line."""
+        here, place, text = self._open[-1], line.where(), line.text[rest:]
         match name:
             case ".tran" | ".ac" | ".option" | ".options" | ".ic":
                 if here is not self.root and name != ".ic":
                     opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
                     raise InputError(f"{name} does not belong inside {opened}?", place)
                 if name in (".tran", ".ac"):
-                    for first in here.directives:
-                        if first.name == name:
-                            raise InputError(f"{name} is given twice, first at {first.line.where()}", place)
-                here.directives.append(read._replace(name=".options") if name == ".option" else read)
+                    for other, first, _ in here.directives:
+                        if other == name:
+                            raise InputError(f"{name} is given twice, first at {first.where()}", place)
+                here.directives.append((".options" if name == ".option" else name, line, rest))
             case ".param":
-                here.params += definitions(line, read.rest)
+                here.params += definitions(line, rest)
                 here.characters += len(line.text)
             case ".subckt":
-                self._open.append(self._subcircuit(read))
+                self._open.append(self._subcircuit(line, rest))
             case ".ends":
                 if len(self._open) == 1:
                     raise InputError(".ends without a .subckt before it", place)
@@ -418,7 +410,7 @@ class Reader:
                 if text.strip() and closed and text.strip().lower() != closed.lower():
                     raise InputError(f".ends {text.strip()} closes .subckt {closed}: the names differ", place)
             case ".include" | ".inc" | ".lib":
-                self._include(read)
+                self._include(name, line, rest)
             case ".control":
                 self._control = line
                 self.deck.unused[name] = None
@@ -437,12 +429,11 @@ class Reader:
                 hint = f": {ELSEWHERE[name]}" if name in ELSEWHERE else hint
                 raise InputError(f"{name} is not supported{hint}", place)
 
-    def _subcircuit(self, read: DirectiveLine) -> Subcircuit:
-        """The subcircuit whose definition begins with a line."""
-        around, line = self._open[-1], read.line
+    def _subcircuit(self, line: Line, rest: int) -> Subcircuit:
+        around = self._open[-1]
         if around.skipped:
             return Subcircuit("", line.where(), skipped=True)
-        words = group(lex(line, read.rest), plain=len(line.text))
+        words = group(lex(line, rest), plain=len(line.text))
         names = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
         if not names or any(word.kind != "word" for word in names):
             raise InputError("write .subckt NAME node node ... key=value ...", line.where())
@@ -470,10 +461,9 @@ class Reader:
             raise InputError(f"subcircuit '{name}' is defined twice, first at {first.where}", defined.where)
         return defined
 
-    def _include(self, read: DirectiveLine) -> None:
-        raw = read.line.text[read.rest :]
-        where = read.line.where(read.rest + len(raw) - len(raw.lstrip()))
-        name = raw.strip()
+    def _include(self, directive: str, line: Line, rest: int) -> None:
+        raw = line.text[rest:]
+        name, where = raw.strip(), line.where(rest + len(raw) - len(raw.lstrip()))
         words = name.split()
         if name[:1] in ("'", '"') and name:
             inner, closed, after = name[1:].partition(name[0])
@@ -481,10 +471,10 @@ class Reader:
                 raise InputError(f"{name[0]} is never closed", where)
             name, words = inner, [inner, *after.split()]
         if not name.strip():
-            raise InputError(f"{read.name} needs a file name", read.line.where())
+            raise InputError(f"{directive} needs a file name", line.where())
         if len(words) > 1:
             problem = "one file name is allowed; put a name with blanks in quotes"
-            if read.name == ".lib":
+            if directive == ".lib":
                 problem = "sections of a library are not supported: put the section into a file and .include it"
             raise InputError(problem, where)
         folder = self._reading[-1].parent if self._reading else self._folder
@@ -510,6 +500,6 @@ class Reader:
             raise InputError(f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
         self._reading.append(path)
         shown = str(Path(self.deck.file).parent / path.relative_to(self._folder))
-        for line in logical_lines(self.split(text, where), shown):
-            self._take(line)
+        for inner in logical_lines(self.split(text, where), shown):
+            self._take(inner)
         self._reading.pop()
