@@ -20,8 +20,9 @@ from fingerspice.netlist import reader
 from fingerspice.netlist.deck import LONGEST_TITLE, MAX_DEPTH, parse_deck
 from fingerspice.netlist.expressions import Number
 from fingerspice.netlist.lexer import nearest
+from scenes import cases
 
-MANY = 20_000
+MANY = cases(20_000, 8_000)
 
 
 def lines(of: Callable[[int], str], count: int = MANY) -> str:

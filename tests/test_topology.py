@@ -41,6 +41,12 @@ REFUSALS = {
     "area node as a conductor": ([V, "Xcoat n0 area area LAYER d=1u eps_r=3.9", GAP], "is floating"),
     "antiparallel sources": ([V, "Vsecond 0 n0 5", COAT, GAP], "Vdrive and Vsecond are voltage sources in parallel"),
     "source loop": ([V, "Vb n0 n5 5", "Vc n5 0 5", COAT, GAP], "Vc closes a loop of voltage sources"),
+    "current source into nothing": (
+        ["Idrive 0 drive 1m", "Ia drive 0 2m"],
+        "Idrive is a current source without a path: node 'drive' is reached through current sources only",
+    ),
+    "area node under a resistor": ([V, COAT, GAP, "Rx area 0 1k"], "Rx and Xgap both drive the area node 'area'"),
+    "dangling resistor": ([V, COAT, GAP, "R2 n0 Loose 1k"], "node 'Loose' is floating: only R2 touches it"),
     "no source in the loop": ([COAT.replace("n0", "0"), SLAB, AREA], "the circuit has no source"),
 }
 

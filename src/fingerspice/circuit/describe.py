@@ -355,6 +355,11 @@ def scenes_warnings(
         yield from course_warnings(circuit, 0.0, stop, t_stop is None)
     if skin != "own":
         return
+
+    def span(f: FloatArray) -> str:
+        low, high = float(f.min()), float(f.max())
+        return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+
     own = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     on = driving_sources(circuit) if own else []
     clocks = [f"{e.name}.{name}" for e in on for name in ("frequency", "carrier")]
@@ -367,14 +372,9 @@ def scenes_warnings(
             f = scenes.get(path, np.array(circuit.parameters[path].value))
             if np.any(np.abs(f / at - 1.0) > _SAME):
                 yield (
-                    f"{path.removesuffix('.f')} {_TAKES} {_span(f)}, the source's fundamental is {_span(at)}; with "
+                    f"{path.removesuffix('.f')} {_TAKES} {span(f)}, the source's fundamental is {span(at)}; with "
                     "skin 'follow' they are taken at the fundamental"
                 )
-
-
-def _span(f: FloatArray) -> str:
-    low, high = float(f.min()), float(f.max())
-    return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
 
 
 def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:

@@ -353,11 +353,11 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
     """The network of a circuit; with `skin_at`, dispersive skins of a stack have their data at that frequency (Hz)."""
 
     def make() -> Network:
-        stack = build_stack(circuit, skin_at) if is_stack(circuit) else None
-        if stack is None:
+        if not is_stack(circuit):
             network = shared(circuit, "network", lambda: build_network(circuit))
             now = {e.name: e for e in circuit.elements}
             return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
+        stack = build_stack(circuit, skin_at)
         network = shared(circuit, ("loop network", skin_at), lambda: loop_network(stack))
         return replace(network, sources=(_source(stack),), stack=stack)
 
@@ -508,13 +508,12 @@ def with_skin_held(circuit: Circuit) -> Circuit:
 
 def mean_areas(network: Network) -> FloatArray:
     """Areas of a coupled phasor at its source's fundamental, m^2, shape (n_area,); refused if there is none."""
-    several = len(network.sources) > 1
-    fundamental = None if several else network.waveforms[0].fundamental
-    if fundamental is not None:
-        return coupled_areas(network, fundamental.frequency, fundamental.amplitude)
-    what = "at the source's fundamental, and this source has none"
-    if several:
+    if len(network.sources) > 1:
         what = "of one source at its fundamental, and this circuit has several sources"
+    elif fundamental := network.waveforms[0].fundamental:
+        return coupled_areas(network, fundamental.frequency, fundamental.amplitude)
+    else:
+        what = "at the source's fundamental, and this source has none"
     raise InputError(f"area='mean' is the area of the phasor {what}; allowed: 'coupled', 'frozen' or an area in m^2")
 
 

@@ -104,8 +104,7 @@ def shared(circuit: Circuit, key: Any, make: Callable[[], T]) -> T:
 def loop_of(circuit: Circuit) -> tuple[tuple[Hop, ...], Area] | None:
     """The hops and the area of a circuit that is one series loop of sources and layers, from ground back to ground.
 
-    None for any other circuit, and for an area that follows with delay. All circuits that `Circuit.replace` derives
-    from one another share the way round the loop.
+    None for any other circuit, and for an area that follows with delay. Related circuits share the way round the loop.
     """
 
     def make() -> tuple[tuple[Hop, ...], Area] | None:
@@ -452,10 +451,7 @@ def contact_of(gap: Element) -> Contact:
 
 
 def is_stack(circuit: Circuit) -> bool:
-    """Whether a circuit is one series loop of sources and layers, with one area that follows the voltage without delay.
-
-    A circuit that `topology.find_branches` refuses is refused.
-    """
+    """Whether a circuit is a stack (see `loop_of`); one that `find_branches` refuses is refused."""
     return loop_of(circuit) is not None
 
 
@@ -467,6 +463,20 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
     series stack is refused.
     """
 
+    def build(hops: tuple[Hop, ...], area: Area) -> Stack:
+        along = [hop for hop in hops if hop.element.spec.is_layer]
+        layers = tuple(hop.element for hop in along)
+        parts = [layer_constants(e, skin_at) for e in layers]
+        cells = tuple(len(part) for part in parts)
+        c, g_total, g_area = np.concatenate(parts).T
+        contact = None if area.gap is None else contact_of(area.gap)
+        if contact is not None and circuit.work == "total":
+            d = np.repeat([e.values["d"] for e in layers], cells)
+            contact = contact.with_total_voltage_held(d, c * d / EPS0)
+        sign = np.repeat([hop.sign for hop in along], cells)
+        gap = None if area.gap is None else sum(cells[: layers.index(area.gap)])
+        return Stack(layers, cells, sign, c, g_total, g_area, gap, contact, area.given, hops)
+
     def make() -> Stack:
         loop = loop_of(circuit)
         if loop is None:
@@ -474,22 +484,6 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
                 "this needs a series chain of LAYER, SLAB, SKIN and GAP driven by V sources, and the circuit is "
                 "another network; allowed for any network: simulate (run), plan, phasor (ac) and export"
             )
-        hops, area = loop
-        found = shared(circuit, ("stack", skin_at, circuit.work), lambda: _build(hops, area, skin_at, circuit.work))
-        return replace(found, hops=hops)
+        return replace(shared(circuit, ("stack", skin_at, circuit.work), lambda: build(*loop)), hops=loop[0])
 
     return circuit.remember(("stack", skin_at), make)
-
-
-def _build(hops: tuple[Hop, ...], area: Area, skin_at: float | None, work: str) -> Stack:
-    layers = tuple(hop.element for hop in hops if hop.element.spec.is_layer)
-    parts = [layer_constants(e, skin_at) for e in layers]
-    cells = tuple(len(part) for part in parts)
-    c, g_total, g_area = np.concatenate(parts).T
-    contact = None if area.gap is None else contact_of(area.gap)
-    if contact is not None and work == "total":
-        d = np.repeat([e.values["d"] for e in layers], cells)
-        contact = contact.with_total_voltage_held(d, c * d / EPS0)
-    sign = np.repeat([hop.sign for hop in hops if hop.element.spec.is_layer], cells)
-    gap = None if area.gap is None else sum(cells[: layers.index(area.gap)])
-    return Stack(layers, cells, sign, c, g_total, g_area, gap, contact, area.given, hops)
