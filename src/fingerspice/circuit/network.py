@@ -92,7 +92,7 @@ class Network:
     resistor_factor_s: FloatArray
     node_names: tuple[str, ...]
     nodes: FloatArray  # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources
-    # The series stack if this is its network (see `loop`): modes and phasors are then computed from the stack, to full
+    # The series stack if this is its network (see `loop_network`): modes and phasors are then computed from it, to full
     # relative precision
     stack: Stack | None = None
     # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
@@ -213,9 +213,9 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
 
     across = rows([cell.nodes for cell in cells])
     conductance = np.array([1.0 / e.values["value"] for e in resistors])
-    over_resistors, over_currents = rows([e.nodes for e in resistors]), rows([e.nodes for e in currents])
-    from_e, from_i, into_e, into_i, factor = _eliminate(over_resistors, over_currents, conductance, n_e)
-    delivered, together = _source_currents(into_e, into_i, factor, n_v)
+    from_e, from_i, into_e, into_i, factor, delivered, together = _currents(
+        rows([e.nodes for e in resistors]), rows([e.nodes for e in currents]), conductance, n_v, n_e
+    )
     s, x, order = slice(0, n_v), slice(n_v, n_e), [*range(n_v, n_e), *range(n_v)]
     through = np.zeros((n_v + n_i, len(cells)))
     through[:n_v] = across[:, s].T + together @ across[:, x].T
@@ -259,41 +259,31 @@ def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
     ]
 
 
-def _eliminate(
-    over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_e: int
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+def _currents(
+    over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_v: int, n_e: int
+) -> tuple[FloatArray, ...]:
     """Eliminate the voltages of the tree's resistors: given its other voltages e = (s, x), they minimise the power.
 
     `over_resistors` (n_resistor, n_e + n_r) and `over_currents` (n_i, n_e + n_r) are the voltages of all resistors and
-    current sources by those of the tree's branches, its own resistors last; `conductance` (n_resistor,) is in S.
+    current sources by those of the tree's branches: n_v voltage sources, capacitors, resistors; `conductance` is in S.
 
     Returned are the voltages of the tree's resistors by e (n_r, n_e) and by the currents of the current sources
-    (n_r, n_i); the currents into the cuts of the tree's sources and capacitors by both, (n_e, n_e) and (n_e, n_i); and
-    the square roots of the power in each resistor by e (n_resistor, n_e), a factor f of these currents f^T f.
+    (n_r, n_i); the currents into the cuts of the tree's sources and capacitors by both, (n_e, n_e) and (n_e, n_i); the
+    square roots of the power in each resistor by e (n_resistor, n_e), a factor f of these currents f^T f; the current
+    of each source (A) by x, s and the currents of the current sources (n_v + n_i, n_e + n_i); and the shares of the
+    capacitors' cuts (n_v, n) that are added to those of the voltage sources.
+
+    The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
+    capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
     """
     weight, (over_e, over_r) = np.sqrt(conductance)[:, None], np.hsplit(over_resistors, [n_e])
     orthogonal, upper = np.linalg.qr(weight * over_r)
     from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_e))
     from_i = -np.linalg.solve(upper, np.linalg.solve(upper.T, over_currents[:, n_e:].T))
     by_e, by_i = over_e + over_r @ from_e, over_r @ from_i
+    into_e = by_e.T @ (conductance[:, None] * by_e)
     into_i = over_e.T @ (conductance[:, None] * by_i) + over_currents[:, :n_e].T
-    return from_e, from_i, by_e.T @ (conductance[:, None] * by_e), into_i, weight * by_e
-
-
-def _source_currents(
-    into_e: FloatArray, into_i: FloatArray, factor: FloatArray, n_v: int
-) -> tuple[FloatArray, FloatArray]:
-    """What the sources deliver to resistors, and the cuts of capacitors that are added to their own.
-
-    The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
-    capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
-
-    The first is (n_v + n_i, n + n_v + n_i), the current of each source (A) by the voltages of the capacitors and of the
-    n_v voltage sources and the currents of the others; the second (n_v, n), shares of the capacitors' cuts.
-    """
-    n_e, n_i = into_i.shape
-    # The order of the result's columns: capacitors, voltage sources.
-    order = [*range(n_v, n_e), *range(n_v)]
+    factor, n_i, order = weight * by_e, len(over_currents), [*range(n_v, n_e), *range(n_v)]
     together: FloatArray = np.zeros((n_v, n_e - n_v))
     if factor.size:
         together = np.asarray(-np.linalg.lstsq(factor[:, n_v:], factor[:, :n_v], rcond=None)[0].T, float)
@@ -302,7 +292,7 @@ def _source_currents(
     size = np.linalg.norm(factor, axis=0)
     rounding = np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.outer(size[:n_v], size[order])
     delivered[:n_v, :n_e][rounding] = 0.0
-    return delivered, together
+    return from_e, from_i, into_e, into_i, factor, delivered, together
 
 
 class Modes(NamedTuple):
