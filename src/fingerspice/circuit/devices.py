@@ -142,7 +142,7 @@ def _cells(c: ArrayLike, g_total: ArrayLike, g_area: ArrayLike) -> FloatArray:
 def _layer_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
     """Of a layer that leaks by a resistance r, or by its resistivity rho."""
     g_total, g_area = (1.0 / v["r"], 0.0) if "r" in v else (0.0, 1.0 / (v["rho"] * v["d"]))
-    return _cells([EPS0 * v["eps_r"] / v["d"]], [g_total], [g_area])
+    return _cells(np.array([EPS0 * v["eps_r"] / v["d"]]), np.array([g_total]), np.array([g_area]))
 
 
 def _skin_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:

@@ -500,6 +500,6 @@ class Reader:
             raise InputError(f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
         self._reading.append(path)
         shown = str(Path(self.deck.file).parent / path.relative_to(self._folder))
-        for inner in logical_lines(self.split(text, where), shown):
-            self._take(inner)
+        for included in logical_lines(self.split(text, where), shown):
+            self._take(included)
         self._reading.pop()
