@@ -142,31 +142,6 @@ def test_a_source_is_replaced_by_a_waveform_a_number_or_a_function() -> None:
     assert duty["Vdrive"].waveform == fs.Square(200.0, 50.0, duty=0.3)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"Xgap.dd": 1e-6}, "unknown parameter 'Xgap.dd'; nearest: 'Xgap.d'"),
-        ({"Xgp.d": 1e-6}, "unknown parameter 'Xgp.d'; nearest: 'Xgap.d'"),
-        ({"Vdrive.amplitud": 1.0}, "nearest: 'Vdrive.amplitude'"),
-        ({"Vdrive.duty": 0.3}, "unknown parameter 'Vdrive.duty'"),
-        ({"Xgap": 1.0}, "unknown parameter 'Xgap'"),
-        ({"Xgap.d": 0.0}, "Xgap d is 0 m; allowed: more than 0"),
-        ({"Xgap.d": -3e-6}, "Xgap d is -3e-06 m; allowed: more than 0"),
-        ({"Xgap.d": math.nan}, "Xgap d is nan m; allowed: more than 0"),
-        ({"Xgap.d": math.inf}, "Xgap d is inf m; allowed: more than 0"),
-        ({"Xcoat.r": 0.0}, "Xcoat r is 0 ohm; allowed: more than 0 or inf"),
-        ({"Xgap.mu": -0.1}, "Xgap mu is -0.1; allowed: 0 or more"),
-        ({"Xgap.n_exp": 0.4}, "0 < m_exp < n_exp"),
-        ({"Xgap.mu": 3.0}, "Xgap has no contact"),
-        ({"Vdrive.frequency": 0.0}, "sine frequency is 0 Hz"),
-    ],
-)
-def test_a_bad_replacement_is_refused_with_what_is_allowed(changes: dict, message: str) -> None:
-    with pytest.raises(fs.InputError) as caught:
-        table1().replace(changes)
-    assert message in str(caught.value)
-
-
 def test_an_element_is_found_in_any_case_and_an_unknown_one_has_its_nearest_named() -> None:
     assert table1()["XGAP"].name == "Xgap"
     with pytest.raises(fs.InputError, match="unknown element 'Xgop'; nearest: 'Xgap'"):
