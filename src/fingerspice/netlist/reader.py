@@ -177,9 +177,7 @@ def _similar_file(path: Path, shown: str, root: Path | None) -> str:
         return ""
     # Use the beginning of `shown`, because `path` may be relative to another folder.
     written = PurePath(shown.replace("\\", "/")).parts[: -len(below)]
-    found = _nearest_path(folder, below)
-    if found is None and len(below) > 1:
-        found = _nearest_path(folder, below[-1:])
+    found = _nearest_path(folder, below) or _nearest_path(folder, below[-1:])
     # A library of native devices is built in and need not exist in the folder: propose it, too.
     names = [*([found[-1]] if found else []), *(LIBRARIES.values() if root is not None else ())]
     name = closest(path.name, names)
