@@ -225,25 +225,16 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     written = {node: name for el in branches for node, name in zip(el.nodes, el.node_names, strict=True)}
     shown = [i for i, name in enumerate(names) if name in written and name != "0"]
     return Network(
-        sources=(*voltages, *currents),
-        n_voltage=n_v,
-        cells=tuple(cells),
-        layers=tuple(e for e in branches if e.spec.is_layer),
-        live=tuple(i for i, taken in enumerate(live) if taken),
-        areas=areas,
-        contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
+        sources=(*voltages, *currents), n_voltage=n_v, cells=tuple(cells),
+        layers=tuple(e for e in branches if e.spec.is_layer), live=tuple(i for i, taken in enumerate(live) if taken),
+        areas=areas, contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
         gaps=tuple(next((i for i, c in enumerate(cells) if c.element is a.gap), None) for a in areas),
-        p=np.ascontiguousarray(across[:, x]),
-        q=np.hstack([across[:, s], np.zeros((len(cells), n_i))]),
-        k=into_e[x, x],
-        b=np.hstack([into_e[x, s], into_i[x]]),
-        through=through,
-        delivered=delivered,
-        resistor_factor=factor[:, x],
-        resistor_factor_s=np.hstack([factor[:, s], np.zeros((len(resistors), n_i))]),
+        p=np.ascontiguousarray(across[:, x]), q=np.hstack([across[:, s], np.zeros((len(cells), n_i))]),
+        k=into_e[x, x], b=np.hstack([into_e[x, s], into_i[x]]), through=through, delivered=delivered,
+        resistor_factor=factor[:, x], resistor_factor_s=np.hstack([factor[:, s], np.zeros((len(resistors), n_i))]),
         node_names=tuple(written[names[i]] for i in shown),
         nodes=np.hstack([whole[shown][:, order], (at_node[:, n_e:] @ from_i)[shown]]),
-    )
+    )  # fmt: skip
 
 
 def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
@@ -392,30 +383,19 @@ def loop_network(stack: Stack) -> Network:
             row[n] += 1.0
         rows.append(row.copy())
     gap = None if stack.gap_layer is None else stack.layers[stack.gap_layer]
+    cells = [
+        Cell(stack.layers[i], ("1", "0"), c, g_total, g_area, 0)
+        for i, (c, g_total, g_area) in zip(of_layer, constants, strict=True)
+    ]
     return Network(
-        sources=(_source(stack),),
-        n_voltage=1,
-        cells=tuple(
-            Cell(stack.layers[i], ("1", "0"), c, g_total, g_area, 0)
-            for i, (c, g_total, g_area) in zip(of_layer, constants, strict=True)
-        ),
-        layers=stack.layers,
-        live=tuple(range(n)),
-        areas=(Area(stack.layers[0].nodes[2], gap, stack.area_given),),
-        contacts=(stack.contact,),
+        sources=(_source(stack),), n_voltage=1, cells=tuple(cells), layers=stack.layers, live=tuple(range(n)),
+        areas=(Area(stack.layers[0].nodes[2], gap, stack.area_given),), contacts=(stack.contact,),
         gaps=(None if stack.gap is None else order.index(stack.gap),),
-        p=across[:, :n].copy(),
-        q=across[:, n : n + 1].copy(),
-        k=np.zeros((n, n)),
-        b=np.zeros((n, 1)),
-        through=(sign * slowest)[None],
-        delivered=np.zeros((1, n + 1)),
-        resistor_factor=np.zeros((0, n)),
-        resistor_factor_s=np.zeros((0, 1)),
-        node_names=tuple(hop.node for hop in stack.hops[:-1]),
-        nodes=np.array(rows).reshape(-1, row.size),
-        stack=stack,
-    )
+        p=across[:, :n].copy(), q=across[:, n : n + 1].copy(), k=np.zeros((n, n)), b=np.zeros((n, 1)),
+        through=(sign * slowest)[None], delivered=np.zeros((1, n + 1)),
+        resistor_factor=np.zeros((0, n)), resistor_factor_s=np.zeros((0, 1)),
+        node_names=tuple(hop.node for hop in stack.hops[:-1]), nodes=np.array(rows).reshape(-1, row.size), stack=stack,
+    )  # fmt: skip
 
 
 # Linear response
@@ -467,22 +447,17 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     if finger is None and len(gaps) > 1:
         raise InputError(f"this circuit has several GAPs; allowed: finger= one of {', '.join(gaps.values())}")
     name = next(iter(gaps.values())) if finger is None else gaps[finger.lower()]
-    # Every GAP drives an area: `topology` refuses two on one.
+    # Every GAP drives an area: `find_branches` refuses two on one.
     place = next(i for i, area in enumerate(network.areas) if area.gap is not None and area.gap.name == name)
     contact, area, stack = network.contacts[place], network.areas[place], network.stack
     assert contact is not None
     assert area.gap is not None
     return LinearScene(
-        network,
-        contact,
-        gap=network.layers.index(area.gap),
-        finger=place,
-        note=f"of several GAPs, {name}" if len(gaps) > 1 else "",
-        fixed=area.given is not None,
-        fundamental=network.waveforms[0].fundamental,
+        network, contact, network.layers.index(area.gap), finger=place, fixed=area.given is not None,
+        note=f"of several GAPs, {name}" if len(gaps) > 1 else "", fundamental=network.waveforms[0].fundamental,
         sources=tuple((e, 1.0) for e in network.sources) if stack is None else stack.sources,
         layers=tuple(e.name for e in network.layers),
-    )
+    )  # fmt: skip
 
 
 def with_skin_held(circuit: Circuit) -> Circuit:

@@ -36,6 +36,18 @@ MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 
 _ELSEWHERE = {
+    "A": "an XSPICE model", "D": "a diode", "K": "a coupled inductor", "L": "an inductor",
+    "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
+    **dict.fromkeys("EFGH", "a controlled source"), **dict.fromkeys("JMQZ", "a transistor"),
+    **dict.fromkeys("OTUY", "a transmission line"), **dict.fromkeys("SW", "a switch"),
+}  # fmt: skip
+_TITLE = 200
+#: Limits of subcircuit calls: total number of expanded lines and characters, and nesting.
+MAX_EXPANDED = 100_000
+MAX_EXPANDED_TEXT = 4 * 2**20
+MAX_DEPTH = 32
+
+_ELSEWHERE = {
     "A": "an XSPICE model",
     "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
     "D": "a diode",

@@ -55,22 +55,11 @@ _AS_IN_MATH = "sqrt exp log10 sin cos tan asin acos atan sinh cosh tanh asinh ac
 #: From a name to the function, and its number of arguments.
 FUNCTIONS: Mapping[str, tuple[Callable[..., float], int]] = {
     **{name: (getattr(math, name), 1) for name in _AS_IN_MATH.split()},
-    "ln": (math.log, 1),
-    "log": (math.log, 1),
-    "arctan": (math.atan, 1),
-    "abs": (abs, 1),
-    "sqr": (lambda x: x * x, 1),
-    "sgn": (lambda x: (x > 0.0) - (x < 0.0), 1),
-    "int": (math.trunc, 1),
-    "nint": (round, 1),
-    "min": (min, 2),
-    "max": (max, 2),
-    "pow": (math.pow, 2),
-    "pwr": (_pwr, 2),
-    "atan2": (math.atan2, 2),
-    "hypot": (math.hypot, 2),
+    "ln": (math.log, 1), "log": (math.log, 1), "arctan": (math.atan, 1), "abs": (abs, 1), "sqr": (lambda x: x * x, 1),
+    "sgn": (lambda x: (x > 0.0) - (x < 0.0), 1), "int": (math.trunc, 1), "nint": (round, 1), "min": (min, 2),
+    "max": (max, 2), "pow": (math.pow, 2), "pwr": (_pwr, 2), "atan2": (math.atan2, 2), "hypot": (math.hypot, 2),
     "ternary_fcn": (lambda condition, yes, no: yes if condition else no, 3),
-}
+}  # fmt: skip
 #: Names of functions in ngspice 39, where a parameter of such a name is not read: `{max + 1}` is 1.
 RESERVED = frozenset((*FUNCTIONS, "agauss", "aunif", "gauss", "limit", "unif"))
 
