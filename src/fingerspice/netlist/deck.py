@@ -41,23 +41,6 @@ _ELSEWHERE = {
     **dict.fromkeys("EFGH", "a controlled source"), **dict.fromkeys("JMQZ", "a transistor"),
     **dict.fromkeys("OTUY", "a transmission line"), **dict.fromkeys("SW", "a switch"),
 }  # fmt: skip
-_TITLE = 200
-#: Limits of subcircuit calls: total number of expanded lines and characters, and nesting.
-MAX_EXPANDED = 100_000
-MAX_EXPANDED_TEXT = 4 * 2**20
-MAX_DEPTH = 32
-
-_ELSEWHERE = {
-    "A": "an XSPICE model",
-    "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
-    "D": "a diode",
-    "K": "a coupled inductor",
-    "L": "an inductor",
-    **dict.fromkeys("EFGH", "a controlled source"),
-    **dict.fromkeys("JMQZ", "a transistor"),
-    **dict.fromkeys("OTUY", "a transmission line"),
-    **dict.fromkeys("SW", "a switch"),
-}
 _TITLE = re.compile(r"^\.title\s+", re.IGNORECASE)
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
 #: Titles that are probably the netlist's first statement.
