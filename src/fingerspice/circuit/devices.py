@@ -19,12 +19,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.base.units import (
-    format_si,
-    spice_text,
-    suggest_mega,
-    unit_read_as_scale,
-)
+from fingerspice.base.units import format_si, spice_text, suggest_mega, unit_read_as_scale
 from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, skin_permittivity, skin_resistivity
 
 if TYPE_CHECKING:

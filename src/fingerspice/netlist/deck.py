@@ -16,17 +16,7 @@ from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.expressions import Bare, Number, Scope, Value
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
-from fingerspice.netlist.reader import (
-    DIRECTIVES,
-    MAX_BYTES,
-    Deck,
-    Directive,
-    Reader,
-    Statement,
-    Subcircuit,
-    read_stream,
-    read_text,
-)
+from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, Deck, Directive, Reader, Statement, Subcircuit, text_of
 
 #: Largest number of characters of a title that are shown; the middle of a longer title is left out.
 LONGEST_TITLE = 200
@@ -56,10 +46,7 @@ def read_deck(path: str | Path) -> Deck:
 
     Standard input (``-``), a device or a pipe is a deck called ``stdin`` in the working directory.
     """
-    streamed = read_stream(Path(path))
-    if streamed is not None:
-        return parse_deck(streamed, Path("stdin"))
-    return parse_deck(read_text(Path(path), str(path)), Path(path))
+    return parse_deck(*text_of(Path(path)))
 
 
 def parse_deck(text: str, path: Path | None = None) -> Deck:

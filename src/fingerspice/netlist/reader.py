@@ -79,13 +79,13 @@ def _reason(error: Exception) -> str:
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
-def read_stream(path: Path) -> str | None:
-    """Text of a deck from standard input (``-``), a device, or a pipe such as bash's ``<(...)``; None for a file."""
+def text_of(path: Path) -> tuple[str, Path]:
+    """Text and path of a deck; standard input (``-``), a device or a pipe such as ``<(...)`` has the path ``stdin``."""
     stream = str(path) in ("-", "/dev/stdin") or path.is_relative_to("/dev/fd")
     with suppress(OSError):
         stream = stream or path.is_fifo() or path.is_char_device()
     if not stream:
-        return None
+        return read_text(path, str(path)), path
     try:
         with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as source:
             data = source.read(MAX_BYTES + 1)
@@ -93,7 +93,7 @@ def read_stream(path: Path) -> str | None:
         raise InputError(f"'{path}' cannot be read: {_reason(error)}") from None
     if len(data) > MAX_BYTES:
         raise InputError(f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
-    return _decoded(data, str(path), None)
+    return _decoded(data, str(path), None), Path("stdin")
 
 
 def _decoded(data: bytes, shown: str, where: Where | None) -> str:
