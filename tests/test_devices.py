@@ -12,8 +12,7 @@ import pytest
 import fingerspice as fs
 from fingerspice.base.units import parse_number
 from fingerspice.circuit.devices import DEVICES, DeviceSpec, ParameterSpec, Usual, layer_devices
-from fingerspice.circuit.statespace import layer_constants
-from fingerspice.netlist.lexer import LIBRARIES, library_text
+from fingerspice.netlist.reader import LIBRARIES, library_text
 from fingerspice.physics.materials import EPS0
 from ngspice_tools import run_ngspice
 
@@ -57,18 +56,6 @@ def test_a_layer_has_its_body_in_the_library_with_the_same_nodes_parameters_and_
         if default is not None:
             there = math.inf if defaults[key] == "inf" else parse_number(defaults[key])
             assert there == default, f"{file}: the default of {name} {key} differs from its entry"
-
-
-@every_layer
-def test_a_layer_has_cells_of_positive_numbers(name: str) -> None:
-    circuit = fs.parse_netlist(f"t\nV1 p 0 DC 5\n{line_of(name)}\n" + ("" if name == "GAP" else "Va area 0 35\n"))
-    element = circuit["X1"]
-    cells = layer_constants(element)
-    assert cells.shape == (len(cells), 3)
-    assert np.all(np.isfinite(cells))
-    assert np.all(cells[:, 0] > 0.0)
-    assert np.all(cells[:, 1:] >= 0.0)
-    assert layer_constants(element, 1e3).shape == (1, 3)
 
 
 @pytest.mark.parametrize("law", LIBRARIES)

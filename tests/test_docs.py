@@ -15,8 +15,7 @@ import fingerspice as fs
 from fingerspice.base.units import SCALES, parse_number, spice_text
 from fingerspice.circuit.devices import DEVICES, ParameterSpec
 from fingerspice.circuit.devices import SOURCES as USUAL_OF_SOURCES
-from fingerspice.netlist.expressions import ELSEWHERE
-from fingerspice.netlist.reader import DIRECTIVES
+from fingerspice.netlist.reader import DIRECTIVES, ELSEWHERE
 from fingerspice.netlist.sources import SOURCES
 from ngspice_tools import CIRCUITS, run_ngspice
 

@@ -15,8 +15,8 @@ import fingerspice as fs
 from commands import Command
 from deck_edits import DECK, edited
 from fingerspice.circuit.circuit import Tran
-from fingerspice.netlist.expressions import ELSEWHERE, decimal_comma
-from fingerspice.netlist.lexer import LIBRARIES, library_text
+from fingerspice.netlist.lexer import decimal_comma
+from fingerspice.netlist.reader import ELSEWHERE, LIBRARIES, library_text
 from ngspice_tools import call_ngspice, run_ngspice, with_max_step
 
 TRAN = ".tran 10u 50m uic"

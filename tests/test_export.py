@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fingerspice as fs
-from fingerspice.netlist.lexer import LIBRARIES, library_text
+from fingerspice.netlist.reader import LIBRARIES, library_text
 from ngspice_tools import CIRCUITS, call_ngspice, run_ngspice
 from random_decks import NETWORKS, SOURCES
 from random_decks import deck as random_deck

@@ -1,16 +1,11 @@
-"""Kills, interrupts, full disks and closed pipes: files are complete or absent, exit codes are right, reruns work.
-
-`python tests/test_faults.py --kills 200` kills more often, at times spread over the whole command.
-"""
+"""Kills, interrupts, full disks and closed pipes: files are complete or absent, exit codes are right, reruns work."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from pathlib import Path
@@ -129,9 +124,17 @@ def strike(folder: Path, name: str, number: int, delay: float, right: dict[str, 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
 def test_at_any_moment_a_signal_leaves_whole_files_or_none(folder: Path, right: dict[str, bytes], number: int) -> None:
-    moments = [0.1, 0.6] if number == signal.SIGINT else [0.6, 0.1]
-    for delay in moments[: cases(2, 1)]:
-        strike(folder, "run", number, delay, right)
+    first = 0.1 if number == signal.SIGINT else 0.6
+    strike(folder, "run", number, first, right)
+    # Under stress every command, at moments spread over the first seconds by the golden ratio.
+    for i, name in enumerate(COMMANDS if cases(1, 0) else ()):
+        (folder / name).mkdir()
+        whole = undisturbed(name, folder / name)
+        for k in range(10):
+            strike(folder / name, name, number, 3.0 * ((10 * i + k) * 0.6180339887 % 1.0), whole)
+            for left in (folder / name / "out").glob(".fingerspice-*"):
+                left.unlink()
+        rerun(name, folder / name, whole)
 
 
 @pytest.mark.parametrize(
@@ -351,36 +354,3 @@ def test_a_link_is_followed_a_pipe_is_written_as_it_stands_and_a_file_gets_the_u
     finally:
         os.umask(before)
     assert path.stat().st_mode & 0o777 == 0o600
-
-
-def main() -> None:
-    """Strike the commands in turn with the signals in turn, at moments spread over the time they take."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--kills", type=int, default=200)
-    count = parser.parse_args().kills
-    seen: dict[tuple[str, int], int] = {}
-    with tempfile.TemporaryDirectory() as scratch:
-        root = Path(scratch)
-        right, took = {}, {}
-        for name in COMMANDS:
-            (root / name).mkdir()
-            right[name] = undisturbed(name, root / name)
-            begin = time.perf_counter()
-            rerun(name, root / name, right[name])
-            took[name] = time.perf_counter() - begin
-        for i in range(count):
-            name = list(COMMANDS)[i % len(COMMANDS)]
-            number = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)[i // len(COMMANDS) % 3]
-            # By the golden ratio: every part of the time is struck.
-            code = strike(root / name, name, number, took[name] * (i * 0.6180339887 % 1.0), right[name])
-            seen[number.name, code] = seen.get((number.name, code), 0) + 1
-            for left in (root / name / "out").glob(".fingerspice-*"):
-                left.unlink()
-        for name in COMMANDS:
-            rerun(name, root / name, right[name])
-    print(f"{count} strikes, every file whole or absent, every rerun the same")
-    print("\n".join(f"{name:8} exit {code:4}: {times}" for (name, code), times in sorted(seen.items())))
-
-
-if __name__ == "__main__":
-    main()

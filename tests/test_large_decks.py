@@ -15,13 +15,14 @@ import fingerspice as fs
 import fuzz
 from deck_edits import evaluate
 from fingerspice.base.errors import LONGEST_MESSAGE, FingerspiceWarning, InputError, Where
-from fingerspice.circuit import topology
+from fingerspice.circuit import statespace
 from fingerspice.netlist import reader
 from fingerspice.netlist.deck import LONGEST_TITLE, MAX_DEPTH, parse_deck
-from fingerspice.netlist.expressions import nearest
-from fingerspice.netlist.reader import Number
+from fingerspice.netlist.expressions import Number
+from fingerspice.netlist.lexer import nearest
+from scenes import cases
 
-MANY = 20_000
+MANY = cases(20_000, 8_000)
 
 
 def lines(of: Callable[[int], str], count: int = MANY) -> str:
@@ -181,14 +182,14 @@ def test_circuits_too_large_for_dense_matrices_are_refused(text: str) -> None:
 
 def test_slabs_of_a_dispersive_skin_count_as_elements(monkeypatch: pytest.MonkeyPatch) -> None:
     deck = "Va area 0 35\nV1 d 0 1\nX1 d m area SKIN_DISPERSIVE d=1u\nX2 m 0 area LAYER d=1u eps_r=1\n"
-    monkeypatch.setattr(topology, "MAX_ELEMENTS", 9)
+    monkeypatch.setattr(statespace, "MAX_ELEMENTS", 9)
     assert len(fs.parse_netlist(f"t\n{deck}").elements) == 4
-    monkeypatch.setattr(topology, "MAX_ELEMENTS", 8)
+    monkeypatch.setattr(statespace, "MAX_ELEMENTS", 8)
     assert "9 elements, a SKIN_DISPERSIVE counted as its 6 slabs; allowed: at most 8" in refusal(deck)
 
 
 def test_the_largest_circuits_find_conflicts_and_start_values(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(topology, "MAX_ELEMENTS", 10**9)
+    monkeypatch.setattr(statespace, "MAX_ELEMENTS", 10**9)
     star = lines(lambda i: f"V{i} n0 n{i + 1} 1", 5_000)
     assert refusal(f"{star}Vx n5000 n1 1\nR1 n5000 0 1\nR2 n1 0 1\n").startswith("node 'n2' is floating")
     ring = lines(lambda i: f"V{i} n0 n{i + 1} 1\nR{i} n{i + 1} 0 1", 5_000)

@@ -428,28 +428,6 @@ def test_phasors_of_a_network_are_its_periodic_state(name: str) -> None:
     assert abs(got - p.u_gap[0]) <= 1e-6 * abs(p.u_gap[0])
 
 
-REFUSALS = {
-    "current source into nothing": (
-        ["Idrive 0 drive 1m", "Ia drive 0 2m"],
-        "Idrive is a current source without a path: node 'drive' is reached through current sources only",
-    ),
-    "dangling resistor": (["V1 a 0 1", "R1 a 0 1k", "R2 a Loose 1k"], "node 'Loose' is floating: only R2 touches it"),
-    "island": (["V1 a 0 1", "R1 a 0 1k", "R2 x y 1k", "C1 x y 1n"], "is floating: nothing connects it to ground"),
-    "area node as a conductor": (
-        ["V1 a 0 1", *finger("a", "0"), "Rx area 0 1k"],
-        "Rx and Xgap both drive the area node 'area'",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", REFUSALS)
-def test_what_no_network_is_gets_one_sentence(case: str) -> None:
-    lines, message = REFUSALS[case]
-    with pytest.raises(fs.InputError) as caught:
-        deck(*lines)
-    assert message in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("request_", "message"),
     [

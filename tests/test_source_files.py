@@ -18,7 +18,7 @@ from scipy.io import wavfile
 import fingerspice as fs
 from commands import QUICK, Command
 from deck_edits import edited
-from fingerspice.netlist import lexer
+from fingerspice.netlist import reader
 from fingerspice.waveforms import files
 from scenes import cases, table1_deck
 
@@ -611,7 +611,7 @@ def test_files_that_a_deck_may_not_or_cannot_read_are_refused_with_its_line(text
 
 
 def test_all_files_of_a_deck_together_have_a_limit(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lexer, "MAX_SOURCE_BYTES", 1000)
+    monkeypatch.setattr(reader, "MAX_SOURCE_BYTES", 1000)
     twice = "Vother other 0 WAVEFILE(mono.wav 1)\nRother other 0 1k"
     source("WAVEFILE(mono.wav 150)")
     said = "decks/pad.cir:8:25: the sources' files are larger than"

@@ -13,9 +13,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
+from fingerspice.base.arrays import real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.pages import Page, Shown
-from fingerspice.circuit.devices import DEVICES, DeviceSpec, check, concerns, unusual_of_changed, value_of
+from fingerspice.base.units import parse_number, suspicious_mega
+from fingerspice.circuit.devices import DEVICES, DeviceSpec, check, concerns, mega_note, unit_trap, unusual_of_changed
 from fingerspice.waveforms.waveform import Waveform, as_waveform
 
 CHARGE_LAWS = ("local", "mobile")
@@ -327,14 +329,28 @@ class Circuit(Shown):
 
 def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:
     """An element with a new value, and a warning about the value's notation, or None."""
-    known, own = element.parameters, parameter in element.values
+    known, note = element.parameters, None
     if parameter not in known:
         raise InputError(_unknown("parameter", path, [f"{element.name}.{name}" for name in known]))
-    value, note = value_of(path, given, element.spec.parameter(parameter) if own else None, known[parameter].unit)
-    if own:
-        return dataclasses.replace(element, values=MappingProxyType({**element.values, parameter: value})), note
+    spec = element.spec.parameter(parameter) if parameter in element.values else None
+    if not isinstance(given, str):
+        value = real_number(path, given, f"a number {known[parameter].unit}".rstrip() + ", or text such as '3.5u'")
+    elif (text := given.strip()).lower() in ("inf", "none"):
+        value = math.inf
+    else:
+        try:
+            value = parse_number(text)
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from None
+        if spec is not None and (trap := unit_trap(spec, text)):
+            raise InputError(f"{path} {trap}")
+        if spec is not None and suspicious_mega(text):
+            note = mega_note(text, value, spec)
+    told = f"{path}: {note}" if note else None
+    if spec is not None:
+        return dataclasses.replace(element, values=MappingProxyType({**element.values, parameter: value})), told
     waveform = dataclasses.replace(element.waveform, **{parameter: value})  # type: ignore[type-var]
-    return dataclasses.replace(element, waveform=waveform), note
+    return dataclasses.replace(element, waveform=waveform), told
 
 
 def _unknown(kind: str, given: str, known: list[str]) -> str:

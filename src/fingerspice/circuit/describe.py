@@ -14,20 +14,18 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray, IntArray, real_number
+from fingerspice.base.arrays import FloatArray, real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import shown, unusual_of_changed
-from fingerspice.circuit.loop import areas_at_rest, network_of, with_skin_held
-from fingerspice.circuit.statespace import build_stack
-from fingerspice.circuit.topology import driving, driving_sources, shared
+from fingerspice.circuit.network import network_of, with_skin_held
+from fingerspice.circuit.statespace import build_stack, driving, driving_sources, shared
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.physics.phasor import layer_gains
 from fingerspice.waveforms.periodic import PWL, Burst, Repeat
@@ -356,6 +354,11 @@ def scenes_warnings(
         yield from course_warnings(circuit, 0.0, stop, t_stop is None)
     if skin != "own":
         return
+
+    def span(f: FloatArray) -> str:
+        low, high = float(f.min()), float(f.max())
+        return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+
     own = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     on = driving_sources(circuit) if own else []
     clocks = [f"{e.name}.{name}" for e in on for name in ("frequency", "carrier")]
@@ -368,14 +371,9 @@ def scenes_warnings(
             f = scenes.get(path, np.array(circuit.parameters[path].value))
             if np.any(np.abs(f / at - 1.0) > _SAME):
                 yield (
-                    f"{path.removesuffix('.f')} {_TAKES} {_span(f)}, the source's fundamental is {_span(at)}; with "
+                    f"{path.removesuffix('.f')} {_TAKES} {span(f)}, the source's fundamental is {span(at)}; with "
                     "skin 'follow' they are taken at the fundamental"
                 )
-
-
-def _span(f: FloatArray) -> str:
-    low, high = float(f.min()), float(f.max())
-    return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
 
 
 def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
@@ -418,12 +416,6 @@ def _samples(waveform: Waveform, t0: float, t1: float, count: int) -> FloatArray
     return np.asarray(waveform.value(t0 + (np.arange(count) + 0.5) * ((t1 - t0) / count)))
 
 
-@lru_cache(maxsize=4)
-def _window(count: int) -> FloatArray:
-    """Hann's window, cached because its cosines cost as much as the Fourier transform."""
-    return np.hanning(count)
-
-
 def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatArray, FloatArray]:
     """Frequencies (Hz) up to about twice `highest` (Hz), and the source's energy at each, in arbitrary units.
 
@@ -431,22 +423,22 @@ def _energies(waveform: Waveform, t_stop: float, highest: float) -> tuple[FloatA
     window, because the ends of the run would count as jumps. For a run of too many samples the spectra of several
     pieces spread over the run are added. A source with values that are not finite has energy 0.
     """
-    periodic = waveform.period is not None
-    t0 = waveform.settled if periodic else 0.0
-    span = waveform.period if waveform.period is not None else t_stop
-    rate, pieces = 4.0 * highest, 1
-    if not periodic and span * rate > _MOST_SAMPLES:
+    t0, span, rate, pieces = 0.0, t_stop, 4.0 * highest, 1
+    if (periodic := waveform.period) is not None:
+        t0, span = waveform.settled, periodic
+    elif span * rate > _MOST_SAMPLES:
         own = max(2.0 * waveform.breakpoint_rate(), 16.0 / waveform.shortest_time())
         rate = min(rate, own or rate)
         pieces = 1 if span * rate <= _MOST_SAMPLES else _PIECES
     count = _enough(span, rate) // pieces
     length = span if pieces == 1 else count / rate
+    window = 1.0 if periodic is not None else np.hanning(count)
     total: FloatArray = np.zeros(1)
     for start in np.linspace(t0, t0 + span - length, pieces).tolist():
         u = _samples(waveform, start, start + length, count)
         if not np.all(np.isfinite(u)):
             return np.zeros(1), np.zeros(1)
-        total = total + np.abs(np.fft.rfft(u if periodic else u * _window(u.size))) ** 2
+        total = total + np.abs(np.fft.rfft(u * window)) ** 2
     total[1:] *= 2.0
     return np.arange(total.size) / length, total
 
@@ -462,9 +454,9 @@ def _recorded(wave: Waveform, t_stop: float) -> tuple[FloatArray, FloatArray] | 
         # A power of two, as the Fourier transform of a number with a large prime factor takes many times as long.
         count = min(2 ** int(math.log2(last)), 2 ** math.ceil(math.log2(_LEAST * wave.rate)), _MOST_SAMPLES)
         starts = np.unique(np.linspace(0, last - count, min(_PIECES, math.ceil(last / count))).astype(int))
-        total = np.zeros(count // 2 + 1)
+        total, window = np.zeros(count // 2 + 1), np.hanning(count)
         for i in starts.tolist():
-            lines = np.fft.rfft(wave.between(i, i + count) * _window(count))
+            lines = np.fft.rfft(wave.between(i, i + count) * window)
             total += lines.real**2 + lines.imag**2
         total[1:] *= 2.0
         frequencies = np.arange(total.size) * (wave.rate / count)
@@ -499,33 +491,6 @@ def is_near(waveform: Waveform, t_stop: float, frequency: float) -> bool:
     return sum(energy_outside(waveform, t_stop, (0.95 * frequency, 1.05 * frequency))) < NOTABLE
 
 
-@lru_cache(maxsize=4)
-def _places(step: float, count: int) -> tuple[IntArray, FloatArray, IntArray]:
-    """Where the lines at 0, `step`, ... (Hz), `count` of them, lie in the grid of gains, which is even in log f.
-
-    Cached, because the logarithms cost as much as the Fourier transform: the number of the grid's frequency below each
-    line that is not empty of lines, how far each line is above its own, and the first line of each.
-    """
-    f = np.clip(step * np.arange(count), *SKIN_BAND)
-    place = np.log(f / SKIN_BAND[0]) * ((_GRID - 1) / math.log(SKIN_BAND[1] / SKIN_BAND[0]))
-    below = np.minimum(place.astype(int), _GRID - 2)
-    cells, first = np.unique(below, return_index=True)
-    return cells, place - below, first
-
-
-def _squared_gains(circuit: Circuit) -> tuple[FloatArray, FloatArray] | None:
-    """Squared gains from the one source to each gap (_GRID, n_gap), with the skin's own data at each frequency and with
-    those held at one; None if they cannot be computed."""
-    networks = network_of(circuit), network_of(with_skin_held(circuit))
-    gaps = [gap for gap in networks[0].gaps if gap is not None]
-    grid, areas = np.geomspace(*SKIN_BAND, _GRID), areas_at_rest(networks[0])
-    try:
-        own, held = (np.abs(n.phasors(grid, areas, np.ones(1, complex))[:, gaps]) ** 2 for n in networks)
-    except np.linalg.LinAlgError:
-        return None
-    return own, held
-
-
 def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | None:
     """Relative error of the mean force due to SKIN's data held at one frequency, for a circuit with one source.
 
@@ -533,16 +498,24 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     at rest and the source's spectrum over the run to `t_stop` (s); of several fingers the largest error counts. Outside
     the band of the skin's data the response at the band's ends is used. None if the response cannot be computed.
     """
-    squares = shared(circuit, "squared gains", lambda: _squared_gains(circuit))
+    grid = np.geomspace(*SKIN_BAND, _GRID)
+
+    def squared_gains() -> list[FloatArray] | None:
+        """Of each gap (n_gap, _GRID), with the skin's own data at each frequency and with those held at one."""
+        networks = network_of(circuit), network_of(with_skin_held(circuit))
+        gaps, areas = [gap for gap in networks[0].gaps if gap is not None], networks[0].areas_at_rest
+        try:
+            return [np.abs(n.phasors(grid, areas, np.ones(1, complex)).T[gaps]) ** 2 for n in networks]
+        except np.linalg.LinAlgError:
+            return None
+
+    squares = shared(circuit, "squared gains", squared_gains)
     f, energy = _recorded(waveform, t_stop) or _energies(waveform, t_stop, SKIN_BAND[1])
     if squares is None or f.size < 2:
         return None
-    # Each line is divided between its two neighbours in the grid by linear weights in log f.
-    cells, above, first = _places(float(f[1]), energy.size)
-    near, high = np.zeros(_GRID), np.add.reduceat(energy * above, first)
-    near[cells] = np.add.reduceat(energy, first) - high
-    near[cells + 1] += high
-    right, held = (near @ square for square in squares)
+    # Gains between those of the grid are interpolated in log f, beyond its ends they are those of the ends.
+    place, known = np.log(np.maximum(f, SKIN_BAND[0])), np.log(grid)
+    right, held = (np.array([energy @ np.interp(place, known, row) for row in square]) for square in squares)
     if not (right.size and np.all(right > 0.0) and np.all(np.isfinite(held / right))):
         return None
     errors = held / right - 1.0

@@ -17,16 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray, real_number
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.base.units import (
-    format_si,
-    parse_number,
-    spice_text,
-    suggest_mega,
-    suspicious_mega,
-    unit_read_as_scale,
-)
+from fingerspice.base.units import format_si, spice_text, suggest_mega, unit_read_as_scale
 from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, skin_permittivity, skin_resistivity
 
 if TYPE_CHECKING:
@@ -142,15 +135,13 @@ def _cells(c: ArrayLike, g_total: ArrayLike, g_area: ArrayLike) -> FloatArray:
 
 
 def _layer_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
-    return _cells(np.array([EPS0 * v["eps_r"] / v["d"]]), np.array([1.0 / v["r"]]), 0.0)
-
-
-def _slab_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
-    return _cells(np.array([EPS0 * v["eps_r"] / v["d"]]), 0.0, np.array([1.0 / (v["rho"] * v["d"])]))
+    """Of a layer that leaks by a resistance r, or by its resistivity rho."""
+    g_total, g_area = (1.0 / v["r"], 0.0) if "r" in v else (0.0, 1.0 / (v["rho"] * v["d"]))
+    return _cells(np.array([EPS0 * v["eps_r"] / v["d"]]), np.array([g_total]), np.array([g_area]))
 
 
 def _skin_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
-    return _slab_cells({"d": v["d"], "eps_r": skin_permittivity(v["f"]), "rho": skin_resistivity(v["f"])}, at)
+    return _layer_cells({"d": v["d"], "eps_r": skin_permittivity(v["f"]), "rho": skin_resistivity(v["f"])}, at)
 
 
 def _dispersive_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
@@ -225,7 +216,7 @@ _R = _P("r", "ohm", math.inf, _LEAK, "leak resistance", first=True, may_be_infin
 _E_MAX = _P("e_max", "V/m", math.inf, _STRENGTH, "dielectric strength", may_be_infinite=True)
 _DEVICES = (
     DeviceSpec("LAYER", _LAYER_NODES, (_THICKNESS, _EPS[0], _R, _E_MAX), _layer_cells, "layer"),
-    DeviceSpec("SLAB", _LAYER_NODES, (_THICKNESS, _EPS[1], _RESISTIVITY, _E_MAX), _slab_cells, "layer"),
+    DeviceSpec("SLAB", _LAYER_NODES, (_THICKNESS, _EPS[1], _RESISTIVITY, _E_MAX), _layer_cells, "layer"),
     DeviceSpec("SKIN", _LAYER_NODES, (_SKIN_THICKNESS, _TAKEN_AT), _skin_cells, "skin"),
     DeviceSpec("SKIN_DISPERSIVE", _LAYER_NODES, (_SKIN_THICKNESS,), _dispersive_cells, "skin, dispersive"),
     DeviceSpec(
@@ -303,28 +294,6 @@ def mega_note(text: str, value: float, spec: ParameterSpec) -> str | None:
     if spec.unit not in ("ohm", "ohm m"):
         return None
     return f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for megohm write {suggest_mega(text)}"
-
-
-def value_of(path: str, given: Any, spec: ParameterSpec | None, unit: str) -> tuple[float, str | None]:
-    """A parameter's new value, given as a number or as text, and a warning about how it is written, or None.
-
-    `path` names it in messages, and `spec` is None for a parameter of a waveform.
-    """
-    if not isinstance(given, str):
-        return real_number(path, given, f"a number {unit}".rstrip() + ", or text such as '3.5u'"), None
-    text = given.strip()
-    if text.lower() in ("inf", "none"):
-        return math.inf, None
-    try:
-        value = parse_number(text)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
-    if spec is None:
-        return value, None
-    if trap := unit_trap(spec, text):
-        raise InputError(f"{path} {trap}")
-    note = mega_note(text, value, spec) if suspicious_mega(text) else None
-    return value, f"{path}: {note}" if note else None
 
 
 def unusual(element: Element) -> Iterator[tuple[str, str]]:

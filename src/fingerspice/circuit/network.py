@@ -11,10 +11,12 @@ The same law on the cuts of the voltage sources gives the currents that these de
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,17 +24,29 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
-from fingerspice.circuit.statespace import Stack, contact_of, layer_constants, skin_admittance
-from fingerspice.circuit.topology import Area, Tree, find_branches
+from fingerspice.circuit.devices import check
+from fingerspice.circuit.statespace import (
+    Area,
+    Stack,
+    Tree,
+    build_stack,
+    contact_of,
+    find_branches,
+    is_stack,
+    layer_constants,
+    shared,
+    skin_admittance,
+)
 from fingerspice.physics.contact import Contact
-from fingerspice.waveforms.waveform import Waveform
+from fingerspice.physics.materials import skin_permittivity, skin_resistivity
+from fingerspice.physics.phasor import coupled_area, layer_gains
+from fingerspice.waveforms.waveform import Fundamental, Waveform
 
 # A current of a source that is this small, relative to what it is the difference of, is rounding.
 _ROUNDING = 1e-13
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """A capacitor with its parallel leak: a C, a layer, or one of the slabs of a dispersive layer.
 
     The capacitance is `c` times the area, and the leak is `g_area` times the area plus `g_total`; a cell without an
@@ -78,7 +92,7 @@ class Network:
     resistor_factor_s: FloatArray
     node_names: tuple[str, ...]
     nodes: FloatArray  # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources
-    # The series stack if this is its network (see `loop`): modes and phasors are then computed from the stack, to full
+    # The series stack if this is its network (see `loop_network`): modes and phasors are then computed from it, to full
     # relative precision
     stack: Stack | None = None
     # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
@@ -103,6 +117,12 @@ class Network:
         """Matrix of 0 and 1 from cells to layers, shape (n_layer, n_cell)."""
         rows = [[float(cell.element is layer) for cell in self.cells] for layer in self.layers]
         return np.array(rows).reshape(len(self.layers), len(self.cells))
+
+    @property
+    def areas_at_rest(self) -> FloatArray:
+        """Areas at 0 V, or as the deck gives them, m^2, shape (n_area,)."""
+        pairs = zip(self.areas, self.contacts, strict=True)
+        return np.array([float(c.area(0.0)) if c is not None and a.given is None else a.given for a, c in pairs])
 
     @property
     def fingers(self) -> tuple[int, ...]:
@@ -193,9 +213,9 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
 
     across = rows([cell.nodes for cell in cells])
     conductance = np.array([1.0 / e.values["value"] for e in resistors])
-    over_resistors, over_currents = rows([e.nodes for e in resistors]), rows([e.nodes for e in currents])
-    from_e, from_i, into_e, into_i, factor = _eliminate(over_resistors, over_currents, conductance, n_e)
-    delivered, together = _source_currents(into_e, into_i, factor, n_v)
+    from_e, from_i, into_e, into_i, factor, delivered, together = _currents(
+        rows([e.nodes for e in resistors]), rows([e.nodes for e in currents]), conductance, n_v, n_e
+    )
     s, x, order = slice(0, n_v), slice(n_v, n_e), [*range(n_v, n_e), *range(n_v)]
     through = np.zeros((n_v + n_i, len(cells)))
     through[:n_v] = across[:, s].T + together @ across[:, x].T
@@ -205,25 +225,16 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     written = {node: name for el in branches for node, name in zip(el.nodes, el.node_names, strict=True)}
     shown = [i for i, name in enumerate(names) if name in written and name != "0"]
     return Network(
-        sources=(*voltages, *currents),
-        n_voltage=n_v,
-        cells=tuple(cells),
-        layers=tuple(e for e in branches if e.spec.is_layer),
-        live=tuple(i for i, taken in enumerate(live) if taken),
-        areas=areas,
-        contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
+        sources=(*voltages, *currents), n_voltage=n_v, cells=tuple(cells),
+        layers=tuple(e for e in branches if e.spec.is_layer), live=tuple(i for i, taken in enumerate(live) if taken),
+        areas=areas, contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
         gaps=tuple(next((i for i, c in enumerate(cells) if c.element is a.gap), None) for a in areas),
-        p=np.ascontiguousarray(across[:, x]),
-        q=np.hstack([across[:, s], np.zeros((len(cells), n_i))]),
-        k=into_e[x, x],
-        b=np.hstack([into_e[x, s], into_i[x]]),
-        through=through,
-        delivered=delivered,
-        resistor_factor=factor[:, x],
-        resistor_factor_s=np.hstack([factor[:, s], np.zeros((len(resistors), n_i))]),
+        p=np.ascontiguousarray(across[:, x]), q=np.hstack([across[:, s], np.zeros((len(cells), n_i))]),
+        k=into_e[x, x], b=np.hstack([into_e[x, s], into_i[x]]), through=through, delivered=delivered,
+        resistor_factor=factor[:, x], resistor_factor_s=np.hstack([factor[:, s], np.zeros((len(resistors), n_i))]),
         node_names=tuple(written[names[i]] for i in shown),
         nodes=np.hstack([whole[shown][:, order], (at_node[:, n_e:] @ from_i)[shown]]),
-    )
+    )  # fmt: skip
 
 
 def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
@@ -239,41 +250,31 @@ def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
     ]
 
 
-def _eliminate(
-    over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_e: int
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+def _currents(
+    over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_v: int, n_e: int
+) -> tuple[FloatArray, ...]:
     """Eliminate the voltages of the tree's resistors: given its other voltages e = (s, x), they minimise the power.
 
     `over_resistors` (n_resistor, n_e + n_r) and `over_currents` (n_i, n_e + n_r) are the voltages of all resistors and
-    current sources by those of the tree's branches, its own resistors last; `conductance` (n_resistor,) is in S.
+    current sources by those of the tree's branches: n_v voltage sources, capacitors, resistors; `conductance` is in S.
 
     Returned are the voltages of the tree's resistors by e (n_r, n_e) and by the currents of the current sources
-    (n_r, n_i); the currents into the cuts of the tree's sources and capacitors by both, (n_e, n_e) and (n_e, n_i); and
-    the square roots of the power in each resistor by e (n_resistor, n_e), a factor f of these currents f^T f.
+    (n_r, n_i); the currents into the cuts of the tree's sources and capacitors by both, (n_e, n_e) and (n_e, n_i); the
+    square roots of the power in each resistor by e (n_resistor, n_e), a factor f of these currents f^T f; the current
+    of each source (A) by x, s and the currents of the current sources (n_v + n_i, n_e + n_i); and the shares of the
+    capacitors' cuts (n_v, n) that are added to those of the voltage sources.
+
+    The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
+    capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
     """
     weight, (over_e, over_r) = np.sqrt(conductance)[:, None], np.hsplit(over_resistors, [n_e])
     orthogonal, upper = np.linalg.qr(weight * over_r)
     from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_e))
     from_i = -np.linalg.solve(upper, np.linalg.solve(upper.T, over_currents[:, n_e:].T))
     by_e, by_i = over_e + over_r @ from_e, over_r @ from_i
+    into_e = by_e.T @ (conductance[:, None] * by_e)
     into_i = over_e.T @ (conductance[:, None] * by_i) + over_currents[:, :n_e].T
-    return from_e, from_i, by_e.T @ (conductance[:, None] * by_e), into_i, weight * by_e
-
-
-def _source_currents(
-    into_e: FloatArray, into_i: FloatArray, factor: FloatArray, n_v: int
-) -> tuple[FloatArray, FloatArray]:
-    """What the sources deliver to resistors, and the cuts of capacitors that are added to their own.
-
-    The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
-    capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
-
-    The first is (n_v + n_i, n + n_v + n_i), the current of each source (A) by the voltages of the capacitors and of the
-    n_v voltage sources and the currents of the others; the second (n_v, n), shares of the capacitors' cuts.
-    """
-    n_e, n_i = into_i.shape
-    # The order of the result's columns: capacitors, voltage sources.
-    order = [*range(n_v, n_e), *range(n_v)]
+    factor, n_i, order = weight * by_e, len(over_currents), [*range(n_v, n_e), *range(n_v)]
     together: FloatArray = np.zeros((n_v, n_e - n_v))
     if factor.size:
         together = np.asarray(-np.linalg.lstsq(factor[:, n_v:], factor[:, :n_v], rcond=None)[0].T, float)
@@ -282,11 +283,10 @@ def _source_currents(
     size = np.linalg.norm(factor, axis=0)
     rounding = np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.outer(size[:n_v], size[order])
     delivered[:n_v, :n_e][rounding] = 0.0
-    return delivered, together
+    return from_e, from_i, into_e, into_i, factor, delivered, together
 
 
-@dataclass(frozen=True)
-class Modes:
+class Modes(NamedTuple):
     """Modes v of a network with fixed areas: x = shape v - follow s, with v_k' = -rates_k v_k + gains_k s."""
 
     rates: FloatArray  # (n,): 1/s; zero for a charge that no conductance drains
@@ -325,3 +325,184 @@ def network_modes(network: Network, area: FloatArray) -> Modes:
     shape = np.linalg.solve(lower.T, turned.T)
     gains = rates[:, None] * moved - pushed
     return Modes(*(np.asarray(x, float) for x in (rates, gains, shape, inverse, shape @ moved, take)))
+
+
+# Networks of circuits
+
+
+def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
+    """The network of a circuit; with `skin_at`, dispersive skins of a stack have their data at that frequency (Hz)."""
+
+    def make() -> Network:
+        if not is_stack(circuit):
+            network = shared(circuit, "network", lambda: build_network(circuit))
+            now = {e.name: e for e in circuit.elements}
+            return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
+        stack = build_stack(circuit, skin_at)
+        network = shared(circuit, ("loop network", skin_at), lambda: loop_network(stack))
+        return replace(network, sources=(_source(stack),), stack=stack)
+
+    return circuit.remember(("network", skin_at), make)
+
+
+def checked(circuit: Circuit) -> Circuit:
+    """The circuit, refused if a value is not allowed or it has no solution."""
+    check(circuit)
+    network_of(circuit)
+    return circuit
+
+
+def _source(stack: Stack) -> Element:
+    """The voltage around a stack's loop."""
+    return Element("loop", "V", ("1", "0"), ("1", "0"), MappingProxyType({}), stack.waveform)
+
+
+def loop_network(stack: Stack) -> Network:
+    """The network of a stack, its cells in the order of `Stack.state_order`, with voltages from p to n."""
+    order, n = list(stack.state_order), stack.c.size - 1
+    of_layer, sign = stack.layer_of[order], stack.sign[order]
+    constants = np.stack([stack.c, stack.g_total, stack.g_area], axis=1)[order].tolist()
+    area = stack.area_given if stack.contact is None or stack.area_given else stack.contact.area_at_rest
+    assert area is not None
+    # The delivered charge is computed at the cell that leaks most slowly, where cancellation costs fewest digits.
+    slowest = np.array(order) == np.argmin(stack.leak_rates(area))
+    # Cell voltages follow from the states and the loop's voltage, node voltages also from each of several sources.
+    several = len(stack.sources) if len(stack.sources) > 1 else 0
+    across = np.zeros((n + 1, n + 1 + several))
+    across[:n, :n] = np.eye(n)
+    across[n, :n], across[n, n] = -sign[n] * sign[:n], sign[n]
+    rows, row, layer, source = list[FloatArray](), np.zeros(across.shape[1]), 0, n + 1
+    for hop in stack.hops[:-1]:
+        if hop.element.device != "V":
+            row = row - hop.sign * across[of_layer == layer].sum(axis=0)
+            layer += 1
+        elif several:
+            row[source] -= hop.sign
+            source += 1
+        else:
+            row[n] += 1.0
+        rows.append(row.copy())
+    gap = None if stack.gap_layer is None else stack.layers[stack.gap_layer]
+    cells = [
+        Cell(stack.layers[i], ("1", "0"), c, g_total, g_area, 0)
+        for i, (c, g_total, g_area) in zip(of_layer, constants, strict=True)
+    ]
+    return Network(
+        sources=(_source(stack),), n_voltage=1, cells=tuple(cells), layers=stack.layers, live=tuple(range(n)),
+        areas=(Area(stack.layers[0].nodes[2], gap, stack.area_given),), contacts=(stack.contact,),
+        gaps=(None if stack.gap is None else order.index(stack.gap),),
+        p=across[:, :n].copy(), q=across[:, n : n + 1].copy(), k=np.zeros((n, n)), b=np.zeros((n, 1)),
+        through=(sign * slowest)[None], delivered=np.zeros((1, n + 1)),
+        resistor_factor=np.zeros((0, n)), resistor_factor_s=np.zeros((0, 1)),
+        node_names=tuple(hop.node for hop in stack.hops[:-1]), nodes=np.array(rows).reshape(-1, row.size), stack=stack,
+    )  # fmt: skip
+
+
+# Linear response
+
+
+@dataclass(frozen=True)
+class LinearScene:
+    """The data of a circuit that the phasors of one of its contacts depend on."""
+
+    network: Network
+    contact: Contact
+    gap: int  # Index of the GAP among the layers
+    finger: int  # Index of the GAP's area
+    note: str  # Text that names the GAP if there are several; empty for one GAP
+    fixed: bool  # Whether the deck fixes the contact's area
+    fundamental: Fundamental | None  # Of the source
+    sources: tuple[tuple[Element, float], ...]  # Each with its sign along the loop of a stack; 1 in other networks
+    layers: tuple[str, ...]
+
+    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
+        """Areas at one frequency (Hz), m^2, shape (n_area,)."""
+        if not isinstance(area, str):
+            return np.full(len(self.network.areas), area)
+        return self.network.areas_at_rest if area == "frozen" else coupled_areas(self.network, f, amplitude)
+
+    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
+        """Ratio of each layer's voltage (from p to n) to the source's, shape (n_layer,)."""
+        network, stack = self.network, self.network.stack
+        if stack is None:
+            return np.asarray(network.grouping @ network.phasors(f, areas, np.ones(1, complex)))
+        return np.asarray(layer_gains(stack.admittance(f, areas))[0] * stack.sign[stack.first_cell])
+
+
+def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
+    """The linear scene of a circuit's GAP, which has to be named if there are several.
+
+    Refused are names of no GAP, and networks with several sources, which have no common amplitude and frequency.
+    """
+    gaps = {e.name.lower(): e.name for e in circuit.by_device("GAP")}
+    if finger is not None and finger.lower() not in gaps:
+        known = ", ".join(gaps.values()) or "none: this circuit has no GAP"
+        raise InputError(f"finger is {finger!r}; allowed: the name of a GAP, {known}")
+    network = network_of(circuit)
+    if not gaps:
+        raise InputError("a phasor solution needs a GAP; this circuit has none")
+    if len(network.sources) != 1:
+        names = ", ".join(e.name for e in network.sources)
+        raise InputError(f"a phasor solution needs one source, whose amplitude it takes; this circuit has {names}")
+    if finger is None and len(gaps) > 1:
+        raise InputError(f"this circuit has several GAPs; allowed: finger= one of {', '.join(gaps.values())}")
+    name = next(iter(gaps.values())) if finger is None else gaps[finger.lower()]
+    # Every GAP drives an area: `find_branches` refuses two on one.
+    place = next(i for i, area in enumerate(network.areas) if area.gap is not None and area.gap.name == name)
+    contact, area, stack = network.contacts[place], network.areas[place], network.stack
+    assert contact is not None
+    assert area.gap is not None
+    return LinearScene(
+        network, contact, network.layers.index(area.gap), finger=place, fixed=area.given is not None,
+        note=f"of several GAPs, {name}" if len(gaps) > 1 else "", fundamental=network.waveforms[0].fundamental,
+        sources=tuple((e, 1.0) for e in network.sources) if stack is None else stack.sources,
+        layers=tuple(e.name for e in network.layers),
+    )  # fmt: skip
+
+
+def with_skin_held(circuit: Circuit) -> Circuit:
+    """The circuit with each SKIN replaced by a SLAB that has the skin's data at the SKIN's own frequency."""
+
+    held: dict[str, Element] = {}
+    for skin in circuit.by_device("SKIN"):
+        d, f = skin.values["d"], skin.values["f"]
+        values = {"d": d, "eps_r": float(skin_permittivity(f)), "rho": float(skin_resistivity(f)), "e_max": math.inf}
+        held[skin.name] = replace(skin, device="SLAB", values=MappingProxyType(values))
+    return replace(circuit, elements=tuple(held.get(e.name, e) for e in circuit.elements))
+
+
+def mean_areas(network: Network) -> FloatArray:
+    """Areas of a coupled phasor at its source's fundamental, m^2, shape (n_area,); refused if there is none."""
+    if len(network.sources) > 1:
+        what = "of one source at its fundamental, and this circuit has several sources"
+    elif fundamental := network.waveforms[0].fundamental:
+        return coupled_areas(network, fundamental.frequency, fundamental.amplitude)
+    else:
+        what = "at the source's fundamental, and this source has none"
+    raise InputError(f"area='mean' is the area of the phasor {what}; allowed: 'coupled', 'frozen' or an area in m^2")
+
+
+def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
+    """Areas under one source's amplitude (V or A) at one frequency (Hz), each at its gap's rms voltage."""
+    area = network.areas_at_rest
+    if all(a.given is not None for a in network.areas):
+        return area
+    stack, finger = network.stack, network.contacts[0]
+    if stack is not None and finger is not None:
+
+        def gain(area: float) -> float:
+            return float(np.abs(layer_gains(stack.admittance(f, area))[0, stack.gap_layer]))
+
+        return np.array([coupled_area(lambda u: float(finger.area(u)), gain, amplitude)])
+    s = np.array([complex(amplitude)])
+    for attempt in range(500):
+        u, new = np.abs(network.phasors(f, area, s)), area.copy()
+        for i, (contact, gap) in enumerate(zip(network.contacts, network.gaps, strict=True)):
+            if network.areas[i].given is None and contact is not None and gap is not None:
+                new[i] = float(contact.area(float(u[gap]) / math.sqrt(2.0)))
+        # NaN and inf cannot converge: return them, for the caller to refuse.
+        if np.all(np.abs(new - area) <= 4e-16 * area) or not np.all(np.isfinite(new)):
+            return new
+        # The fixed-point iteration may oscillate between two values: after 50 iterations, damp it by taking the mean.
+        area = new if attempt < 50 else 0.5 * (area + new)
+    raise InputError("the phasor's areas do not settle; allowed: area='frozen' or an area in m^2")

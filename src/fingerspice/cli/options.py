@@ -176,7 +176,7 @@ def _with_values(circuit: Circuit, changes: list[str], named: list[str]) -> Circ
 def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
     """The circuit with every ``--source``; the source's name may be left out if the circuit has only one."""
     from fingerspice.circuit.describe import overridden
-    from fingerspice.circuit.topology import driving_sources
+    from fingerspice.circuit.statespace import driving_sources
     from fingerspice.netlist.netlist import source_from_text
     from fingerspice.waveforms.periodic import MOST_SHOWN, PWL
     from fingerspice.waveforms.samples import Samples

@@ -24,8 +24,8 @@ from fingerspice.base.units import parse_number, spice_text
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
 from fingerspice.circuit.describe import MEANINGS_OF_WAVEFORMS
 from fingerspice.circuit.devices import ParameterSpec
-from fingerspice.circuit.loop import network_of
-from fingerspice.circuit.topology import SLABS, count_of, driving_sources
+from fingerspice.circuit.network import network_of
+from fingerspice.circuit.statespace import SLABS, count_of, driving_sources
 from fingerspice.netlist.netlist import parse_netlist, source_from_text
 from fingerspice.results.solution import Solution
 from fingerspice.waveforms.periodic import PWL, Sawtooth, Square, Triangle

@@ -20,7 +20,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si, spice_text
 from fingerspice.circuit.circuit import Circuit, Element, Tran
 from fingerspice.circuit.describe import in_force, remembering
-from fingerspice.circuit.topology import driving_sources
+from fingerspice.circuit.statespace import driving_sources
 from fingerspice.explorer.request import WAVEFORMS, Asked, quiet, read_source, sliders, text_of, value_text
 from fingerspice.netlist.netlist import read_netlist
 from fingerspice.plots.drawing import save

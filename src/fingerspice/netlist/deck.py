@@ -1,33 +1,22 @@
 """A netlist file as a flat list of evaluated statements: expands subcircuit calls, renames nodes, evaluates values.
 
-A statement has a name, nodes and values; `elements` and `sources` give it a meaning. The steps are those of `lexer`
-(from text to words), `reader` (lines by kind, included files), `scope` (parameters and values) and `Flattener`
+A statement has a name, nodes and values; `netlist` and `sources` give it a meaning. The steps are those of `lexer`
+(from text to words), `reader` (lines by kind, included files), `expressions` (parameters and values) and `Flattener`
 (subcircuit calls). Every error has its place in the file.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
-from fingerspice.netlist.expressions import nearest, stray_word, with_comma
-from fingerspice.netlist.lexer import MAX_BYTES, MAX_NAME, Group, Lexeme, Line, group, lex, read_stream, read_text
-from fingerspice.netlist.reader import (
-    DIRECTIVES,
-    Bare,
-    Deck,
-    Directive,
-    Number,
-    Reader,
-    Scope,
-    Statement,
-    Subcircuit,
-    Value,
-)
+from fingerspice.netlist.expressions import Bare, Number, Scope, Value
+from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
+from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, Deck, Directive, Reader, Statement, Subcircuit, text_of
 
 #: Largest number of characters of a title that are shown; the middle of a longer title is left out.
 LONGEST_TITLE = 200
@@ -36,18 +25,12 @@ MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
 MAX_DEPTH = 32
 
-
 _ELSEWHERE = {
-    "A": "an XSPICE model",
+    "A": "an XSPICE model", "D": "a diode", "K": "a coupled inductor", "L": "an inductor",
     "B": "a behavioural source (a function of time is given in Python, sources={'V1': f})",
-    "D": "a diode",
-    "K": "a coupled inductor",
-    "L": "an inductor",
-    **dict.fromkeys("EFGH", "a controlled source"),
-    **dict.fromkeys("JMQZ", "a transistor"),
-    **dict.fromkeys("OTUY", "a transmission line"),
-    **dict.fromkeys("SW", "a switch"),
-}
+    **dict.fromkeys("EFGH", "a controlled source"), **dict.fromkeys("JMQZ", "a transistor"),
+    **dict.fromkeys("OTUY", "a transmission line"), **dict.fromkeys("SW", "a switch"),
+}  # fmt: skip
 _TITLE = re.compile(r"^\.title\s+", re.IGNORECASE)
 _VALUE = r"(?:\{|'|[-+.\d]|(?:dc|ac|sine?|pulse|exp|pwl|square|chirp|burst|wavefile|table)\b)"
 #: Titles that are probably the netlist's first statement.
@@ -63,10 +46,7 @@ def read_deck(path: str | Path) -> Deck:
 
     Standard input (``-``), a device or a pipe is a deck called ``stdin`` in the working directory.
     """
-    streamed = read_stream(Path(path))
-    if streamed is not None:
-        return parse_deck(streamed, Path("stdin"))
-    return parse_deck(read_text(Path(path), str(path)), Path(path))
+    return parse_deck(*text_of(Path(path)))
 
 
 def parse_deck(text: str, path: Path | None = None) -> Deck:
@@ -89,7 +69,9 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
         reader.warn(problem, Where(deck.file, 1))
     try:
         reader.read_deck(lines)
-        Flattener(deck).run(reader.root)
+        scope = Scope(reader.root.params)
+        deck.params = scope.solve()
+        Flattener(deck).expand(_Instance(reader.root, scope))
     except InputError as error:
         raise with_comma(error, deck.warnings) from None
     for defined in reader.root.inner.values():
@@ -99,13 +81,21 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
     return deck
 
 
+def with_comma(error: InputError, warnings: Iterable[str]) -> InputError:
+    """The error, with the warning about a decimal comma in the same line, if there is one."""
+    place = f"{error.where.file}:{error.where.line}:" if error.where else "none"
+    found = [text.partition(": ")[2] for text in warnings if text.startswith(place) and "decimal comma" in text]
+    return InputError("; note ".join([error.message, *found]), error.where) if found else error
+
+
 @dataclass(slots=True)
 class _Instance:
     """A subcircuit call that is being expanded, or the deck itself."""
 
     definition: Subcircuit
     scope: Scope
-    outside: _Instance | None = None  # the instance in which the definition stands
+    # The instances around the definition, innermost first, whose subcircuits an X line may call, too
+    around: tuple[_Instance, ...] = ()
     prefix: str = ""  # as written, ends in a dot
     ports: dict[str, tuple[str, str]] = field(default_factory=dict)
     calls: tuple[Subcircuit, ...] = ()  # definitions being expanded, outermost first
@@ -124,13 +114,6 @@ class _Instance:
                 raise InputError(f"{word.written} stands where a node's name belongs", word.where)
         return [self.node(word.text) for word in words]
 
-    def around(self) -> Iterator[_Instance]:
-        """This instance, and those around it, whose subcircuits an X line may call, too."""
-        instance: _Instance | None = self
-        while instance is not None:
-            yield instance
-            instance = instance.outside
-
 
 class Flattener:
     """Turns the lines of a deck into statements and directives.
@@ -143,13 +126,7 @@ class Flattener:
         self._names: dict[str, Where] = {}
         self._expanded = self._expanded_text = 0
 
-    def run(self, root: Subcircuit) -> None:
-        """Evaluate the deck's parameters and add its statements."""
-        scope = Scope(root.params)
-        self.deck.params = scope.solve()
-        self._expand(_Instance(root, scope))
-
-    def _expand(self, instance: _Instance) -> None:
+    def expand(self, instance: _Instance) -> None:
         """Add the statements and directives of a call; an `.ic` line gets the canonical names of its nodes."""
         for line in instance.definition.elements:
             self._element(line, instance)
@@ -162,10 +139,10 @@ class Flattener:
                 if flat in params:
                     raise InputError(f".ic gives node {flat[2:-1]!r} twice", value.key)
                 params[flat] = value
-            self.deck.directives.append(Directive(name, args, params, line.place, line.text[line.start :]))
+            self.deck.directives.append(Directive(name, args, params, line.where(), line.text))
 
     def _element(self, line: Line, instance: _Instance) -> None:
-        lexemes = lex(line) or [Lexeme("", ",", line.start, line)]  # a line of commas has none
+        lexemes = lex(line) or [Lexeme("", ",", 0, line)]  # a line of commas has none
         first = lexemes[0]
         where, letter = first.where, first.text[:1].upper()
         if first.kind != "word" or not (letter.isascii() and letter.isalpha()):
@@ -196,9 +173,10 @@ class Flattener:
     def _call(self, name: str, lexemes: list[Lexeme], instance: _Instance) -> None:
         """An X line: a native device becomes a statement, and a subcircuit is expanded."""
         words, scope = group(lexemes[1:], plain=len(lexemes)), instance.scope
-        if words.stray is not None:
-            stray = words.stray
-            hint = stray_word(stray.text, stray.line.text[: stray.position])
+        if (stray := words.stray) is not None:
+            number = stray.line.text[: stray.position].rpartition("=")[2].strip()
+            apart = NUMBER.fullmatch(number) and is_unit(stray.text)
+            hint = f"; a unit joins its number, {number}{stray.text}" if apart else ""
             problem = f"'{stray.text}' follows the parameters: nodes and the device's name come first{hint}"
             raise InputError(problem, stray.where)
         plain = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
@@ -208,8 +186,10 @@ class Flattener:
         if device.kind != "word":
             raise InputError(f"{device.written} stands where a device's name belongs", device.where)
         native, key = device.text.upper(), device.text.lower()
-        outside = next((around for around in instance.around() if key in around.definition.inner), None)
-        called = None if outside is None else outside.definition.inner[key]
+        around = (instance, *instance.around)
+        while around and key not in around[0].definition.inner:
+            around = around[1:]
+        called = around[0].definition.inner[key] if around else None
         if native in layer_devices():
             called, shown, wanted = None, native, DEVICES[native].nodes
         elif called is not None:
@@ -240,22 +220,26 @@ class Flattener:
                 raise InputError(f"subcircuit '{called.name}' has no parameter '{word.text}'{hint}", word.where)
             inner.preset(parameter, scope.number(value))
         _refuse_captured(called.name, inner.solve(), words, scope)
-        self._expand(_Instance(called, inner, outside, f"{name}.", ports, (*instance.calls, called)))
+        self.expand(_Instance(called, inner, around, f"{name}.", ports, (*instance.calls, called)))
 
     def _count(self, called: Subcircuit, instance: _Instance, where: Where) -> None:
         """Count what a call expands to; refuse circles, and what is too deep or too much."""
-        if any(called is outer for outer in instance.calls):
-            start = next(i for i, outer in enumerate(instance.calls) if outer is called)
-            path = " -> ".join(sub.name for sub in (*instance.calls[start:], called))
-            raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
-        if len(instance.calls) >= MAX_DEPTH:
-            raise InputError(f"subcircuits call each other more than {MAX_DEPTH} deep", where)
+        names = [sub.name for sub in (*instance.calls, called)]
+        for start, outer in enumerate(instance.calls):
+            if outer is called:
+                path = " -> ".join(names[start:])
+                raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
         self._expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
-        if self._expanded > MAX_EXPANDED:
-            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
         self._expanded_text += called.characters
-        if self._expanded_text > MAX_EXPANDED_TEXT:
-            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
+        problem = ""
+        if len(instance.calls) >= MAX_DEPTH:
+            problem = f"subcircuits call each other more than {MAX_DEPTH} deep"
+        elif self._expanded > MAX_EXPANDED:
+            problem = f"the subcircuits expand to more than {MAX_EXPANDED:,} lines"
+        elif self._expanded_text > MAX_EXPANDED_TEXT:
+            problem = f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text"
+        if problem:
+            raise InputError(problem, where)
 
 
 def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:
@@ -273,10 +257,8 @@ def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: S
 def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:
     """The message that the last word of an X line is not a device, with a hint."""
     last = words[-1]
-    visible = [
-        *layer_devices(),
-        *(sub.name for around in instance.around() for sub in around.definition.inner.values()),
-    ]
+    inner = [one.definition.inner for one in (instance, *instance.around)]
+    visible = [*layer_devices(), *(sub.name for subs in inner for sub in subs.values())]
     known = {name.lower() for name in visible}
     for word in words[2:-1]:
         # A device's name after two words or more is probably the device, and the words after it lack their `key=`.

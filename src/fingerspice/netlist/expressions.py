@@ -1,6 +1,4 @@
-"""Arithmetic of netlists such as `{2*d + 1u}`: compiled once, and evaluated with the values of parameters.
-
-Common slips, and directives of other simulators, have a sentence each about what to write instead.
+"""Values of a netlist's words: numbers, keywords, and arithmetic such as `{2*d + 1u}` of parameters.
 
 From loose to tight an expression has `a ? b : c`, `||`, `&&`, comparisons, `+ -`, `* /`, signs, and `^` or `**`.
 Functions have the same meaning as in ngspice's `.param`; `log` is the natural logarithm. An expression that ngspice and
@@ -10,120 +8,17 @@ mathematics read differently (`2^3^2`, a negative base) is refused. ngspice 39 d
 
 from __future__ import annotations
 
-import difflib
-import itertools
 import math
 import operator
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import ChainMap
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number, spice_text, suspicious_mega
-
-#: Directives that only other simulators know, each with the alternative here.
-ELSEWHERE = {
-    ".step": "give one value a run by --set PATH=VALUE, or loop over circuit.replace({path: value}) in Python",
-    ".four": "mean, peaks and amplitude are in the summary of a run, and any harmonic in the data that it writes",
-    ".temp": "nothing depends on temperature; give the values at the one that is meant",
-    ".model": "there are no models; write the device's parameters on its own line",
-    ".global": "give the node to each .subckt as one of its nodes",
-    ".func": "write the expression where it is used, {a*b}, or into .param",
-    ".op": "a .tran without uic starts from the operating point, fs.simulate(circuit, start='dc') too",
-    ".dc": "run once per value by --set, such as --set Vdrive.level=5",
-    ".noise": "there is no noise analysis",
-    ".wave": "run writes every signal as NetCDF, or as CSV with --csv",
-    ".csparam": "write .param",
-    ".endl": "put the section of the library into a file and .include it",
-    ".width": "leave it out",
-    **dict.fromkeys((".tf", ".pz", ".net"), "gains against frequency are given by fingerspice ac"),
-    **dict.fromkeys((".sens", ".data", ".alter"), "run once per value by --set"),
-    **dict.fromkeys((".if", ".elseif", ".else", ".endif"), "write the case that is meant"),
-    **dict.fromkeys(
-        (".savebias", ".loadbias"), "a run goes on from another in Python, fs.simulate(circuit, start=solution)"
-    ),
-}
-
-_LISTS = re.compile(r"\{[^{}]*\}|'[^']*'|\"[^\"]*\"")
-_CALL = re.compile(r"\(([^()]*)\)")
-_COMMA = re.compile(r"(?<![\w.,])([+-]?[0-9]+),([0-9]+[a-zµμ]*)(?![\w.,])", re.IGNORECASE)
-_ASSIGNED = re.compile(rf"=\s*{_COMMA.pattern}", re.IGNORECASE)
-_NUMBER = re.compile(r"[+-]?\.?[0-9][\w.+-]*")
-_GREEK_MU = re.compile(r"(?<![\w.])([0-9.]+(?:e[+-]?[0-9]+)?)μ", re.IGNORECASE)
-_UNIT = re.compile(r"(?:[tgkmunpfµμ]|meg|mil)?(?:m|v|a|s|n|f|hz|ohm|ω)?", re.IGNORECASE)
-
-
-def decimal_comma(text: str) -> str | None:
-    """A warning about a comma that is probably meant as a decimal point; None if there is none.
-
-    Commas separate numbers, as in ``SIN(0,200,100)``. A comma is doubtful if blanks separate the other numbers, as in
-    ``SIN(0 200 0,1)``, and in ``d=3,5u``.
-    """
-    bare = _LISTS.sub("x", text)
-    for found in (_ASSIGNED.search(bare), *_among_blanks(bare)):
-        if found:
-            whole, part = found[1], found[2]
-            return (
-                f"{whole},{part} is two numbers, {whole} and {part}, for a comma separates; if it is a decimal comma "
-                f"write {whole}.{part}"
-            )
-    return None
-
-
-def greek_mu(text: str) -> str | None:
-    """A warning about a number with the Greek letter for micro, which ngspice does not read; None if there is none."""
-    found = _GREEK_MU.search(text)
-    return f"{found[0]} is {found[1]}u here and {found[1]} in ngspice 39: write {found[1]}u" if found else None
-
-
-def _among_blanks(bare: str) -> Iterator[re.Match[str] | None]:
-    outside = _CALL.sub(" ", bare)
-    # An element's name and nodes are left out: they may be numbers, and commas may separate them.
-    words = outside.split()[1 if outside.lstrip().startswith(".") else 3 :]
-    for chunks in ([c for c in words if "=" not in c], *(m[1].split() for m in _CALL.finditer(bare))):
-        matches = [_COMMA.fullmatch(chunk) for chunk in chunks]
-        others = [c for c, m in zip(chunks, matches, strict=True) if m is None]
-        if all(_NUMBER.fullmatch(c) or c.isalpha() for c in others) and (others or len(chunks) == len(words) == 1):
-            yield from matches
-
-
-def is_unit(word: str) -> bool:
-    """Whether a word may be a scale, a unit, or both."""
-    return _UNIT.fullmatch(word) is not None and word != ""
-
-
-def stray_word(word: str, before: str) -> str:
-    """A hint if a word after ``key=value`` is a unit, separated from its number by a blank; else an empty text."""
-    number = before.rpartition("=")[2].strip()
-    return f"; a unit joins its number, {number}{word}" if _NUMBER.fullmatch(number) and is_unit(word) else ""
-
-
-def with_comma(error: InputError, warnings: Iterable[str]) -> InputError:
-    """The error, with the warning about a decimal comma in the same line, if there is one."""
-    place = f"{error.where.file}:{error.where.line}:" if error.where else "none"
-    found = [text.partition(": ")[2] for text in warnings if text.startswith(place) and "decimal comma" in text]
-    return InputError("; note ".join([error.message, *found]), error.where) if found else error
-
-
-#: Largest number and length of the known words that are compared: a comparison takes the product of the two lengths.
-MAX_KNOWN, MAX_COMPARED = 1000, 60
-
-
-def closest(word: str, known: Iterable[str]) -> str | None:
-    """The known word whose spelling is nearest to `word`, regardless of case; None if none is similar."""
-    if len(word) > MAX_COMPARED:
-        return None
-    lower = {name.lower(): name for name in itertools.islice(known, MAX_KNOWN) if len(name) <= MAX_COMPARED}
-    close = difflib.get_close_matches(word.lower(), lower, n=1)
-    return lower[close[0]] if close else None
-
-
-def nearest(word: str, known: Iterable[str]) -> str:
-    """The clause ``; did you mean 'x'?`` with the closest known word, or an empty text."""
-    found = closest(word, known)
-    return f"; did you mean '{found}'?" if found is not None else ""
-
+from fingerspice.netlist.lexer import Assignment, Group, Lexeme, Line, nearest
 
 #: Limits: characters of an expression, nested brackets, `?` in an expression, and signs in a row.
 MAX_LENGTH, MAX_DEPTH, MAX_QUESTIONS, MAX_SIGNS = 2000, 25, 25, 3
@@ -137,8 +32,7 @@ class Problem(Exception):
     """An error in an expression, with the position of the character at fault."""
 
     def __init__(self, message: str, position: int = 0) -> None:
-        self.message = message
-        self.position = position
+        self.message, self.position = message, position
 
 
 def _power(base: float, exponent: float) -> float:
@@ -161,22 +55,11 @@ _AS_IN_MATH = "sqrt exp log10 sin cos tan asin acos atan sinh cosh tanh asinh ac
 #: From a name to the function, and its number of arguments.
 FUNCTIONS: Mapping[str, tuple[Callable[..., float], int]] = {
     **{name: (getattr(math, name), 1) for name in _AS_IN_MATH.split()},
-    "ln": (math.log, 1),
-    "log": (math.log, 1),
-    "arctan": (math.atan, 1),
-    "abs": (abs, 1),
-    "sqr": (lambda x: x * x, 1),
-    "sgn": (lambda x: (x > 0.0) - (x < 0.0), 1),
-    "int": (math.trunc, 1),
-    "nint": (round, 1),
-    "min": (min, 2),
-    "max": (max, 2),
-    "pow": (math.pow, 2),
-    "pwr": (_pwr, 2),
-    "atan2": (math.atan2, 2),
-    "hypot": (math.hypot, 2),
+    "ln": (math.log, 1), "log": (math.log, 1), "arctan": (math.atan, 1), "abs": (abs, 1), "sqr": (lambda x: x * x, 1),
+    "sgn": (lambda x: (x > 0.0) - (x < 0.0), 1), "int": (math.trunc, 1), "nint": (round, 1), "min": (min, 2),
+    "max": (max, 2), "pow": (math.pow, 2), "pwr": (_pwr, 2), "atan2": (math.atan2, 2), "hypot": (math.hypot, 2),
     "ternary_fcn": (lambda condition, yes, no: yes if condition else no, 3),
-}
+}  # fmt: skip
 #: Names of functions in ngspice 39, where a parameter of such a name is not read: `{max + 1}` is 1.
 RESERVED = frozenset((*FUNCTIONS, "agauss", "aunif", "gauss", "limit", "unif"))
 
@@ -214,25 +97,6 @@ class _Piece(NamedTuple):
     position: int
 
 
-def _pieces(text: str) -> list[_Piece]:
-    """Numbers, names, operators, and at last the end."""
-    pieces: list[_Piece] = []
-    position = questions = 0
-    while position < len(text):
-        match = _LEX.match(text, position)
-        if match is None:
-            hint = ": a comparison is ==" if text[position] == "=" else ""
-            raise Problem(f"{text[position]!r} does not belong in arithmetic{hint}", position)
-        kind, found = match.lastgroup or "", match.group()
-        questions += found == "?"
-        if questions > MAX_QUESTIONS:
-            raise Problem(f"more than {MAX_QUESTIONS} '?' in one expression", position)
-        if kind != "space":
-            pieces.append(_Piece(kind, found, position))
-        position = match.end()
-    return [*pieces, _Piece("end", "", len(text))]
-
-
 class Expression:
     """A compiled expression; `Problem` is raised for a text that is not arithmetic.
 
@@ -244,14 +108,27 @@ class Expression:
             raise Problem(f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
         self.text = text
         self.names: dict[str, int] = {}  # In lower case, constants included, and the position of each one's first use
-        self._pieces = _pieces(text)
-        self._at = 0
+        self.mega: tuple[str, int] | None = None  # The first number written with a capital M, and its position
+        self._pieces: list[_Piece] = []
+        self._at = position = questions = 0
         self._brackets: list[tuple[_Piece, bool]] = []  # open, each with whether it encloses a function's arguments
+        while position < len(text):
+            match = _LEX.match(text, position)
+            if match is None:
+                hint = ": a comparison is ==" if text[position] == "=" else ""
+                raise Problem(f"{text[position]!r} does not belong in arithmetic{hint}", position)
+            kind, found = match.lastgroup or "", match.group()
+            questions += found == "?"
+            if questions > MAX_QUESTIONS:
+                raise Problem(f"more than {MAX_QUESTIONS} '?' in one expression", position)
+            if kind != "space":
+                self._pieces.append(_Piece(kind, found, position))
+            if kind == "number" and self.mega is None and suspicious_mega(found):
+                self.mega = found, position
+            position = match.end()
+        self._pieces.append(_Piece("end", "", len(text)))
         self._term = self._condition()
         self._refuse_going_on()
-        numbers = [piece for piece in self._pieces if piece.kind == "number"]
-        # The first number written with a capital M, and its position
-        self.mega = next(((text, position) for _, text, position in numbers if suspicious_mega(text)), None)
         self._pieces.clear()
 
     def evaluate(self, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
@@ -351,8 +228,7 @@ class Expression:
 
     def _value(self) -> Term:
         """A number, a name, or what is in brackets."""
-        piece = self._pieces[self._at]
-        kind, text, position = piece
+        kind, text, position = piece = self._pieces[self._at]
         if text == "(":
             return self._in_brackets(False)[0]
         if kind == "op":
@@ -435,3 +311,214 @@ def compile_expression(text: str, place: Callable[[int], Where]) -> Expression:
         return compiled(text)
     except Problem as problem:
         raise InputError(problem.message, place(problem.position)) from None
+
+
+# Words
+
+_NUMERIC = re.compile(r"[+-]|\.?[0-9]")
+_FILE_NAME = re.compile(r".*[/\\].*|.*\.[A-Za-z]\w*")
+_PLAIN_NUMBER = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?[A-Za-z]*")
+_OF_TIME = re.compile(r"(?<![A-Za-z])(?:t|time)(?![A-Za-z])", re.IGNORECASE)
+_OPERATOR = re.compile(r"[-+*/^]")
+_PAIR = re.compile(r"[({]|[)}]|'[^']*'|(?<![\w.])([A-Za-z_]\w*)\s*=(?!=)|[<>!=]=|=")
+
+#: Kinds of text that are evaluated without braces: nothing, a parameter's name, or also arithmetic. As in ngspice,
+#: `R1 a b rho` and `X1 a b sub w=2*rho` are allowed, but not `R1 a b 2*rho`.
+Bare: TypeAlias = Literal["nothing", "name", "arithmetic"]
+
+
+class Token(NamedTuple):
+    """A word that is not a number, such as a keyword, a file name, `inf`, or what was in double quotes."""
+
+    text: str
+    where: Where
+    key: Where | None = None  # Place of the key of a `key=value` pair
+
+
+class Number(NamedTuple):
+    """A number, or an expression's value."""
+
+    value: float  # The value in SI units
+    text: str  # As written, braces included
+    where: Where  # The place of its first character
+    # The number with a capital M from which the value was computed: M is milli, and perhaps meant as mega
+    mega: Token | None = None
+    key: Where | None = None  # Place of the key of a `key=value` pair
+
+
+Value: TypeAlias = Number | Token
+
+
+class Call(NamedTuple):
+    """A word with arguments in brackets: `SIN(0 200 100)` or `SIN (0 200 100)`."""
+
+    text: str  # The word
+    args: tuple[Value, ...]
+    params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
+    where: Where
+
+
+Word: TypeAlias = Number | Token | Call
+
+
+class Scope:
+    """The parameters of the deck or of one subcircuit call, which also sees those of its callers (`parent`).
+
+    As in ngspice, a name that a subcircuit does not define is looked up in its caller, then in that caller's caller,
+    and at last in the deck; the place of the subcircuit's definition does not matter.
+    """
+
+    def __init__(self, definitions: Iterable[Assignment], parent: Scope | None = None) -> None:
+        self.values: dict[str, float] = {}
+        self._visible: ChainMap[str, float] = ChainMap(self.values, *(parent._visible.maps if parent else ()))
+        # As in `Number`
+        self._mega: ChainMap[str, Token | None] = ChainMap({}, *(parent._mega.maps if parent else ()))
+        self._definitions: dict[str, Assignment] = {}
+        for definition in definitions:
+            key, name = definition.key, definition.key.text.lower()
+            if name in RESERVED:
+                problem = f"parameter '{key.text}' has the name of a function of ngspice; allowed: another name"
+                raise InputError(problem, key.where)
+            first = self._definitions.setdefault(name, definition)
+            if first is not definition:
+                raise InputError(f"parameter '{key.text}' is defined twice, first at {first.key.where}", key.where)
+
+    def preset(self, name: str, number: Number) -> None:
+        """Set a parameter to its value in the call, instead of its default."""
+        self.values[name], self._mega[name] = number.value, number.mega
+
+    def solve(self) -> dict[str, float]:
+        """The parameters' values; each definition, in any order, is evaluated after those of the parameters in it."""
+        known: dict[str, Expression] = {}
+        for root in self._definitions:
+            stack = [root]
+            while stack:
+                name = stack[-1]
+                if name in self.values:
+                    stack.pop()
+                    continue
+                text = self._definitions[name].value
+                if name not in known:
+                    known[name] = compile_expression(text.text, text.place)
+                waiting = [n for n in known[name].names if n in self._definitions and n not in self.values]
+                if not waiting:
+                    self.preset(name, self.number(text))
+                elif any(n in known for n in waiting):
+                    raise self._circle(known, name)  # a compiled definition without a value is on the stack: a circle
+                stack.extend(waiting)
+        return self.values
+
+    def _circle(self, known: dict[str, Expression], start: str) -> InputError:
+        """The error that names the parameters of a circle; following undefined names from `start` leads into it."""
+        order, name = dict[str, None](), start
+        while name not in order:
+            order[name] = None
+            name = next(n for n in known[name].names if n in known and n not in self.values)
+        path = list(order)
+        path = [*path[path.index(name) :], name]
+        shown = [self._definitions[name].key.text for name in path]
+        if len(shown) > 12:
+            shown[6:-5] = ["..."]
+        problem = f"parameters refer to each other in a circle: {' -> '.join(shown)}"
+        return InputError(problem, self._definitions[path[0]].key.where)
+
+    def number(self, lexeme: Lexeme) -> Number:
+        """Value of a lexeme that must be arithmetic, with or without braces."""
+        if lexeme.kind == "string":
+            raise InputError(f"a number is needed, not the text {lexeme.written}", lexeme.where)
+        expression = compile_expression(lexeme.text, lexeme.place)
+        mega = Token(expression.mega[0], lexeme.place(expression.mega[1])) if expression.mega else None
+        for name in expression.names:
+            mega = mega or self._mega.get(name)
+        return Number(expression.evaluate(self._visible, lexeme.place), lexeme.written, lexeme.where, mega)
+
+    def references(self, lexeme: Lexeme) -> dict[str, float]:
+        """Values in this scope of the parameters in a lexeme; empty if the lexeme is not arithmetic."""
+        return {name: self._visible[name] for name in _names_in(lexeme.text) or () if name in self._visible}
+
+    def value(self, lexeme: Lexeme, bare: Bare = "nothing") -> Value:
+        """Number or token of a word, string or expression; `bare` is what is evaluated without braces."""
+        text, where, known = lexeme.text, lexeme.where, lexeme.text.lower() in self._visible
+        if lexeme.kind == "string":
+            return Token(text, where)
+        plain, signs = _PLAIN_NUMBER.fullmatch(text), _OPERATOR.search(text)
+        if lexeme.kind == "expression" or (bare == "arithmetic" and plain):
+            return self.number(lexeme)
+        if bare != "nothing" and not known and signs and not plain:
+            # Arithmetic of numbers and known parameters only
+            names = _names_in(text)
+            if names is not None and all(name in self._visible or name in CONSTANTS for name in names):
+                if bare == "name":
+                    raise InputError(f"arithmetic goes in braces: {{{text}}}", where)
+                known = True
+        if bare != "nothing" and known:
+            return self.number(lexeme)
+        if _NUMERIC.match(text) is None:
+            return Token(text, where)
+        try:
+            return Number(parse_number(text), text, where, Token(text, where) if suspicious_mega(text) else None)
+        except ValueError as error:
+            if _FILE_NAME.fullmatch(text):
+                return Token(text, where)
+            hint = f"; arithmetic goes in braces: {{{text}}}" if signs else ""
+            if _OF_TIME.search(text):
+                hint = "; a function of time is SIN(VO VA FREQ), PULSE or PWL, or given in Python, sources={'V1': f}"
+            raise InputError(f"{error}{hint}", where) from None
+
+    def pairs(self, group: Group, bare: Bare = "nothing") -> dict[str, Value]:
+        """Values of `key=value` pairs, each with the place of its key."""
+        return {name: self.value(value, bare)._replace(key=key.where) for name, (key, value) in group.params.items()}
+
+    def words(self, words: list[Lexeme | Group], bare: Bare = "nothing") -> tuple[Word, ...]:
+        """Values of the words that belong to no pair; a group is a call, which has no calls in it."""
+        out: list[Word] = []
+        for word in words:
+            if isinstance(word, Lexeme):
+                out.append(self.value(word, bare))
+            elif word.name is not None:
+                args = tuple(self.value(arg) for arg in word.words if isinstance(arg, Lexeme))
+                out.append(Call(word.name.text, args, self.pairs(word), word.name.where))
+        return tuple(out)
+
+
+def _names_in(text: str) -> Mapping[str, int] | None:
+    """The names in an expression; None if it is not arithmetic."""
+    try:
+        return compiled(text).names
+    except Problem:
+        return None
+
+
+def definitions(line: Line, start: int) -> list[Assignment]:
+    """Definitions on a `.param` line; right sides may be arithmetic without braces, and with blanks."""
+    keys: list[tuple[Lexeme, int]] = []  # the name, and the position after its `=`
+    depth = 0
+    for match in _PAIR.finditer(line.text, start):
+        found = match.group()
+        depth = max(0, depth + {"(": 1, "{": 1, ")": -1, "}": -1}.get(found, 0))
+        if match[1] is not None and depth == 0:
+            keys.append((Lexeme("word", match[1], match.start(), line), match.end()))
+        elif found == "=" and depth == 0:
+            problem = "the name before '=' is missing: write .param name=value (functions are not supported)"
+            raise InputError(problem, line.where(match.start()))
+    ends = [*(key.position for key, _ in keys), len(line.text)]
+    before = line.text[start : ends[0]].strip(" \t,")
+    if before or not keys:
+        given = f"'{before}'" if before else "nothing"
+        raise InputError(f".param is followed by {given}: write .param name=value", line.where(start))
+    out = []
+    for (key, begin), end in zip(keys, ends[1:], strict=True):
+        raw = line.text[begin:end]
+        text = raw.strip(" \t,")
+        if not text:
+            raise InputError(f"missing value of '{key.text}'", key.where)
+        value = Lexeme("word", text, begin + len(raw) - len(raw.lstrip(" \t,")), line)
+        if text[0] in "{'":
+            closing = "}" if text[0] == "{" else "'"
+            if len(text) < 2 or text[-1] != closing:
+                known = closing in text[1:]
+                problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
+                raise InputError(problem, value.where)
+            value = value._replace(kind="expression", text=text[1:-1])
+        out.append(Assignment(key, value))
+    return out

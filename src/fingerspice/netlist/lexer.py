@@ -1,208 +1,77 @@
-"""The text of a netlist's files, divided into logical lines, lexemes and groups, each with its line and column.
+"""Text of a netlist divided into logical lines, lexemes and groups, each with its line and column; hints about slips.
 
-Files may be in the netlist's folder; the libraries of native devices are those shipped. Nothing here depends on the
-meaning of a word: the callers distinguish names, values and directives.
+Nothing here depends on the meaning of a word: the callers distinguish names, values and directives.
 """
 
 from __future__ import annotations
 
-import codecs
+import difflib
+import itertools
 import re
-import sys
 from bisect import bisect_right
-from collections.abc import Iterator
-from contextlib import nullcontext, suppress
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from encodings import cp1252
-from functools import cache
-from itertools import chain
-from pathlib import Path, PurePath
 from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
-from fingerspice.netlist.expressions import closest, nearest
 
-#: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
-LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
+# Hints
 
-#: Largest size of a file, and of all the files that a deck's sources name, bytes.
-MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30
-
-
-@cache
-def library_text(law: str) -> str:
-    """Text of a charge law's library, from the installed package or the source tree."""
-    name = LIBRARIES[law]
-    package = Path(__file__).resolve().parents[1]
-    for folder in (package / "lib", package.parents[1] / "circuits"):
-        path = folder / name
-        if path.is_file():
-            return path.read_text(encoding="utf-8")
-    raise InputError(f"{name} is missing from this installation; reinstall fingerspice")
+_LISTS = re.compile(r"\{[^{}]*\}|'[^']*'|\"[^\"]*\"")
+_CALL = re.compile(r"\(([^()]*)\)")
+_COMMA = re.compile(r"(?<![\w.,])([+-]?[0-9]+),([0-9]+[a-zµμ]*)(?![\w.,])", re.IGNORECASE)
+_ASSIGNED = re.compile(rf"=\s*{_COMMA.pattern}", re.IGNORECASE)
+NUMBER = re.compile(r"[+-]?\.?[0-9][\w.+-]*")
+_UNIT = re.compile(r"(?:[tgkmunpfµμ]|meg|mil)?(?:m|v|a|s|n|f|hz|ohm|ω)?", re.IGNORECASE)
+#: Largest number and length of the known words that are compared: a comparison takes the product of the two lengths.
+MAX_KNOWN, MAX_COMPARED = 1000, 60
 
 
-def read_text(path: Path, shown: str, where: Where | None = None, root: Path | None = None) -> str:
-    """Text of a netlist or table in UTF-8, Latin-1, or UTF-16 with a mark.
+def decimal_comma(text: str) -> str | None:
+    """A warning about a comma that is probably meant as a decimal point; None if there is none.
 
-    `shown` is the path as the user wrote it at the place `where`; files outside the folder `root` are not proposed.
+    Commas separate numbers, as in ``SIN(0,200,100)``. A comma is doubtful if blanks separate the other numbers, as in
+    ``SIN(0 200 0,1)``, and in ``d=3,5u``.
     """
-    try:
-        if path.is_dir():
-            problem = "is a folder, not a file"
-        elif not path.exists():
-            problem = f"does not exist{_similar_file(path, shown, root)}"
-        elif not path.is_file():
-            problem = "is not an ordinary file"
-        elif path.stat().st_size > MAX_BYTES:
-            problem = f"is larger than {MAX_BYTES >> 20} MiB"
-        else:
-            return _decoded(path.read_bytes(), shown, where)
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        problem = f"cannot be read: {_reason(error)}"
-    raise InputError(f"'{shown}' {problem}", where)
+    bare = _LISTS.sub("x", text)
+    found, outside = [_ASSIGNED.search(bare)], _CALL.sub(" ", bare)
+    # An element's name and nodes are left out: they may be numbers, and commas may separate them.
+    words = outside.split()[1 if outside.lstrip().startswith(".") else 3 :]
+    for chunks in ([c for c in words if "=" not in c], *(m[1].split() for m in _CALL.finditer(bare))):
+        matches = [_COMMA.fullmatch(chunk) for chunk in chunks]
+        others = [c for c, m in zip(chunks, matches, strict=True) if m is None]
+        if all(NUMBER.fullmatch(c) or c.isalpha() for c in others) and (others or len(chunks) == len(words) == 1):
+            found += matches
+    for match in filter(None, found):
+        whole, part = match[1], match[2]
+        return (
+            f"{whole},{part} is two numbers, {whole} and {part}, for a comma separates; if it is a decimal comma "
+            f"write {whole}.{part}"
+        )
+    return None
 
 
-def _reason(error: Exception) -> str:
-    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+def is_unit(word: str) -> bool:
+    """Whether a word may be a scale, a unit, or both."""
+    return _UNIT.fullmatch(word) is not None and word != ""
 
 
-def read_stream(path: Path) -> str | None:
-    """Text of a deck from standard input (``-``), a device, or a pipe such as bash's ``<(...)``; None for a file."""
-    stream = str(path) in ("-", "/dev/stdin") or path.is_relative_to("/dev/fd")
-    with suppress(OSError):
-        stream = stream or path.is_fifo() or path.is_char_device()
-    if not stream:
+def closest(word: str, known: Iterable[str]) -> str | None:
+    """The known word whose spelling is nearest to `word`, regardless of case; None if none is similar."""
+    if len(word) > MAX_COMPARED:
         return None
-    try:
-        with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as source:
-            data = source.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"'{path}' cannot be read: {_reason(error)}") from None
-    if len(data) > MAX_BYTES:
-        raise InputError(f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
-    return _decoded(data, str(path), None)
+    lower = {name.lower(): name for name in itertools.islice(known, MAX_KNOWN) if len(name) <= MAX_COMPARED}
+    close = difflib.get_close_matches(word.lower(), lower, n=1)
+    return lower[close[0]] if close else None
 
 
-def _decoded(data: bytes, shown: str, where: Where | None) -> str:
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        # LTspice writes UTF-16 if a name has letters that Latin-1 lacks.
-        return data.decode("utf-16", "replace")
-    if b"\0" in data:
-        raise InputError(f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        broken = error.start
-    try:
-        # LTspice writes its micro sign in the Latin-1 of Windows.
-        return cp1252.Codec().decode(data)[0]
-    except UnicodeDecodeError:
-        number = data[:broken].count(b"\n") + 1
-        problem = f"'{shown}' is neither UTF-8 nor Latin-1 text (byte 0x{data[broken]:02x} in line {number})"
-        raise InputError(f"{problem}: save it as UTF-8", where) from None
+def nearest(word: str, known: Iterable[str]) -> str:
+    """The clause ``; did you mean 'x'?`` with the closest known word, or an empty text."""
+    found = closest(word, known)
+    return f"; did you mean '{found}'?" if found is not None else ""
 
 
-@dataclass
-class SourceFiles:
-    """Finds the recordings and tables of sources: a deck's in its folder or below, a user's own anywhere."""
-
-    folder: Path | None = None  # Folder of the deck; None for a deck given as text
-    # Whether any file may be read, relative to the working directory: for sources given by the user, not by a deck
-    anywhere: bool = False
-    size: int = 0  # Total size of the files named so far, bytes; a file counts each time that it is named
-
-    def find(self, name: str, where: Where) -> Path:
-        """Path of a file named at the place `where`; one outside the folder is refused, and too much in all."""
-        try:
-            if self.anywhere:
-                path = Path(name).expanduser()
-            elif self.folder is None:
-                raise InputError(f"'{name}' cannot be read: a netlist given as text has no folder to look in", where)
-            else:
-                # The line may stand in an included file, whose name begins with the deck's folder as the user wrote it.
-                folder, root = Path(where.file).parent, self.folder.resolve()
-                path = inside(root, folder, name, where)
-                if not path.exists():
-                    raise InputError(f"'{name}' does not exist{_similar_file(path, name, root)}", where)
-                path = folder / name.replace("\\", "/")
-            self.size += path.stat().st_size if path.is_file() else 0
-        except (OSError, RuntimeError) as error:  # a name that is too long, or the folder of an unknown user
-            raise InputError(f"'{name}' cannot be read: {_reason(error)}", where) from None
-        if self.size > MAX_SOURCE_BYTES:
-            raise InputError(f"the sources' files are larger than {MAX_SOURCE_BYTES >> 20:,} MiB in all", where)
-        return path
-
-
-def library_changed(root: Path, folder: Path, name: str) -> bool:
-    """Whether the netlist's folder has a library of that name that differs from this version's."""
-    try:
-        path = (folder / name.replace("\\", "/")).resolve()
-        if not path.is_relative_to(root) or not path.is_file():
-            return False
-        own = library_text(next(law for law, file in LIBRARIES.items() if file == path.name.lower()))
-        # A file of more than four bytes per character cannot be equal, and need not be read.
-        if path.stat().st_size > 4 * len(own):
-            return True
-        text = read_text(path, name)
-        read, shipped = ([line.rstrip() for line in split_lines(x.rstrip())] for x in (text, own))
-        return read != shipped
-    except (OSError, ValueError, RuntimeError):
-        # A file that cannot be read is not this version's library.
-        return True
-
-
-def _similar_file(path: Path, shown: str, root: Path | None) -> str:
-    """The clause ``; did you mean 'folder/file'?`` for a missing file, or an empty text.
-
-    The search goes through the file's folder or, if that is missing, the folder with the nearest name, and then through
-    the parent folder. The proposal is written relative to the same folder as the missing file's name.
-    """
-    folder, below = path.parent, [path.name]
-    while not folder.is_dir() and folder != folder.parent:
-        folder, below = folder.parent, [folder.name, *below]
-    if root is not None and not folder.is_relative_to(root):
-        return ""
-    # Use the beginning of `shown`, because `path` may be relative to another folder.
-    written = PurePath(shown.replace("\\", "/")).parts[: -len(below)]
-    found = _nearest_path(folder, below)
-    if found is None and len(below) > 1:
-        found = _nearest_path(folder, below[-1:])
-    # A library of native devices is built in and need not exist in the folder: propose it, too.
-    names = [*([found[-1]] if found else []), *(LIBRARIES.values() if root is not None else ())]
-    name = closest(path.name, names)
-    if found is not None and name in (found[-1], None):
-        return f"; did you mean '{PurePath(*written, *found).as_posix()}'?"
-    return nearest(path.name, names)
-
-
-def _nearest_path(folder: Path, parts: list[str]) -> list[str] | None:
-    """A file below a folder, found by the nearest name for each part of its path; None if there is none."""
-    found: list[str] = []
-    for number, part in enumerate(parts, 1):
-        try:
-            entries = [e.name for e in folder.joinpath(*found).iterdir() if e.is_dir() == (number < len(parts))]
-        except OSError:
-            return None
-        name = part if part in entries else closest(part, sorted(entries))
-        if name is None:
-            return None
-        found.append(name)
-    return found
-
-
-def inside(root: Path, folder: Path, name: str, where: Where) -> Path:
-    """Resolved path of an included file; one outside the netlist's folder is refused."""
-    try:
-        path = (folder / name.replace("\\", "/")).resolve()
-        allowed = path.is_relative_to(root)
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: a circle of links
-        raise InputError(f"'{name}' is not a usable file name", where) from None
-    if not allowed:
-        raise InputError(f"'{name}' lies outside the netlist's folder, where nothing is read", where)
-    return path
-
+# Lines
 
 #: As in ngspice a `;`, a `//` after a blank, or a `$` between blanks starts a comment, except in double quotes.
 _COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)//|(?<!\S)\$(?!\S))')
@@ -220,24 +89,14 @@ class Line(NamedTuple):
     """A logical line: a physical line without its comment, joined by one space with the `+` lines that continue it."""
 
     file: str  # The file's name as shown to the user
-    text: str
+    text: str  # From the first character that is not blank
     # Of each physical line: the position of its text, its number, and what a position in it lacks to its column
     parts: tuple[tuple[int, int, int], ...]
 
-    def where(self, position: int) -> Where:
+    def where(self, position: int = 0) -> Where:
         """Place of one character of the text."""
         _, number, shift = self.parts[bisect_right(self.parts, position, key=lambda part: part[0]) - 1]
         return Where(self.file, number, position + shift)
-
-    @property
-    def start(self) -> int:
-        """Position of the first character that is not blank."""
-        return len(self.text) - len(self.text.lstrip())
-
-    @property
-    def place(self) -> Where:
-        """Place of the first character that is not blank."""
-        return self.where(self.start)
 
 
 class Lexeme(NamedTuple):
@@ -291,7 +150,7 @@ def split_lines(text: str) -> list[str]:
 def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]:
     """Logical lines, without comments and blank lines; `first` is the number of the first physical line."""
     texts, parts, length = list[str](), list[tuple[int, int, int]](), 0
-    for number, raw in enumerate(chain(lines, ("after the last line",)), first):
+    for number, raw in enumerate(itertools.chain(lines, ("after the last line",)), first):
         comment = None
         if ";" in raw or "$" in raw or "//" in raw:
             comment = next((match.start() for match in _COMMENT.finditer(raw) if match[1]), None)
@@ -299,18 +158,17 @@ def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]
         bare = text.lstrip()
         if not bare or bare[0] == "*":
             continue
-        column = 1
+        column = 1 + len(text) - len(bare)
         if bare[0] == "+":
-            column += len(text) - len(bare) + 1
             if not texts:
-                raise InputError("'+' continues the line before, but there is none", Where(file, number, column - 1))
-            text = bare[1:]
+                raise InputError("'+' continues the line before, but there is none", Where(file, number, column))
+            column, bare = column + 1, bare[1:]
         elif texts:
             yield Line(file, " ".join(texts), tuple(parts))
             texts, parts, length = [], [], 0
-        texts.append(text)
+        texts.append(bare)
         parts.append((length, number, column - length))
-        length += len(text) + 1
+        length += len(bare) + 1
 
 
 def lex(line: Line, start: int = 0) -> list[Lexeme]:
@@ -334,15 +192,12 @@ def lex(line: Line, start: int = 0) -> list[Lexeme]:
             position = brace.end()
             continue
         mark, string, quoted, word = match.groups()
-        if mark:
-            lexemes.append(Lexeme(mark, mark, position, line))
+        if word and word[0] == "$":
+            raise InputError(f"'{word}': a comment after '$' needs a blank between them", line.where(position))
+        if mark or word:
+            lexemes.append(Lexeme(mark or "word", mark or word, position, line))
         elif string or quoted:
-            kind, inner = ("string", string) if string else ("expression", quoted)
-            lexemes.append(Lexeme(kind, inner[1:-1], position, line))
-        elif word:
-            if word[0] == "$":
-                raise InputError(f"'{word}': a comment after '$' needs a blank between them", line.where(position))
-            lexemes.append(Lexeme("word", word, position, line))
+            lexemes.append(Lexeme("string" if string else "expression", (string or quoted)[1:-1], position, line))
         position = match.end()
     return lexemes
 
@@ -422,18 +277,18 @@ def _probe(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int] | None:
 
 def _assign(inside: Group, key: Lexeme, following: list[Lexeme]) -> None:
     """Enter the pair `key = value`, given up to two of the lexemes after its `=`."""
-    name = key.text.lower()
-    if key.kind not in ("word", "probe") or (key.kind == "word" and not _KEY.fullmatch(key.text)):
-        problem = f"{key.written} cannot be a parameter's name: letters, digits and _ are allowed"
-        raise InputError(problem, key.where)
-    if name in inside.params:
-        first = inside.params[name].key.where
-        raise InputError(f"'{key.text}' is given twice, first at {first}", key.where)
+    name, where, problem = key.text.lower(), key.where, ""
     value = following[0] if following else None
     after = following[1].kind if len(following) > 1 else ""
-    if value is not None and (value.kind == "(" or (after == "(" and value.kind == "word")):
+    if key.kind not in ("word", "probe") or (key.kind == "word" and not _KEY.fullmatch(key.text)):
+        problem = f"{key.written} cannot be a parameter's name: letters, digits and _ are allowed"
+    elif name in inside.params:
+        problem = f"'{key.text}' is given twice, first at {inside.params[name].key.where}"
+    elif value is not None and (value.kind == "(" or (after == "(" and value.kind == "word")):
         problem = f"the value of '{key.text}' holds brackets: arithmetic goes in braces, as in {{(a + b)*2}}"
-        raise InputError(problem, value.where)
-    if value is None or value.kind in (")", "=") or (after == "=" and value.kind == "word"):
-        raise InputError(f"missing value of '{key.text}'", key.where)
+        where = value.where
+    elif value is None or value.kind in (")", "=") or (after == "=" and value.kind == "word"):
+        problem = f"missing value of '{key.text}'"
+    if problem or value is None:
+        raise InputError(problem, where)
     inside.params[name] = Assignment(key, value)

@@ -1,24 +1,49 @@
-"""Reading of a netlist, from a file or a text, into a `Circuit`."""
+"""Reading of a netlist, from a file or a text, into a `Circuit`: what its statements and directives mean."""
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
 
-from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import AcSweep, Circuit, Element, Tran
-from fingerspice.circuit.devices import REST_AREA, unusual
-from fingerspice.circuit.loop import checked
-from fingerspice.netlist.deck import parse_deck, read_deck
-from fingerspice.netlist.elements import read_ac, read_elements, read_initial, read_options, read_tran, source_of
-from fingerspice.netlist.expressions import decimal_comma, with_comma
-from fingerspice.netlist.lexer import SourceFiles
-from fingerspice.netlist.reader import MAX_WARNINGS, Deck
-from fingerspice.netlist.sources import Context
-from fingerspice.waveforms.waveform import DC, Waveform
+from fingerspice.base.errors import FingerspiceWarning, InputError, Where
+from fingerspice.base.units import exponent_and_scale, format_si
+from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Circuit, Element, Tran
+from fingerspice.circuit.devices import DEVICES, REST_AREA, ParameterSpec, mega_note, unit_trap, unusual
+from fingerspice.circuit.network import checked
+from fingerspice.netlist.deck import parse_deck, read_deck, with_comma
+from fingerspice.netlist.expressions import Call, Number, Token, Value
+from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
+from fingerspice.netlist.reader import MAX_WARNINGS, Deck, Directive, SourceFiles, Statement
+from fingerspice.netlist.sources import Context, Source, read_source
+from fingerspice.waveforms.waveform import DC, Waveform, check_range
+
+#: The parameter that gives the number of equal parts in parallel.
+_COPIES = "m"
+#: Number of outputs of a run whose .tran has no TSTEP.
+LTSPICE_OUTPUTS = 10_000
+_LTSPICE_START = {
+    "startup": "sources are not ramped up here; allowed: a source that rises by itself, such as PWL(0 0 20u 5)",
+    "steady": "no run stops by itself here; allowed: fs.steady_state(circuit), which finds the periodic state",
+    "nodiscard": "outputs begin at TSTART here; allowed: TSTART left out",
+    "step": "loads are not stepped here; allowed: a source with steps, PULSE or PWL",
+}
+_NGSPICE_OPTIONS = frozenset(
+    """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5 itl6 keepopinfo
+    klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter numdgt opts
+    pivrel pivtol ramptime reltol rshunt savecurrents seed seedinfo sparse srcsteps temp tnom trtol trytocompact
+    vntol warn xmu""".split()  # noqa: SIM905
+)
+_LTSPICE_OPTIONS = frozenset(
+    """baudrate cshunt delay fastaccess flagloads gfloat gshunt measdgt meascplxfmt minclockguide mindeltagmin nomarch
+    noopiter plotabstol plotreltol plotvntol plotwinsize ptranmax ptrantau srcstepmethod sstol thev_induc
+    topologycheck""".split()  # noqa: SIM905
+)
 
 
 def read_netlist(path: str | Path) -> Circuit:
@@ -88,33 +113,22 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     ac = next(map(read_ac, deck.named(".ac")), None)
     if len(laws) > 1:
         raise InputError("both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
-    circuit = Circuit(
-        title=deck.title,
-        elements=elements,
-        tran=tran,
-        ac=ac,
-        initial=initial,
-        charge_law=next(iter(laws), None),
-        work=work,
-        warnings=tuple(notes),
-        unused=(*deck.unused, *unused, *unused_starts),
-        text=deck.text,
-        path=deck.path,
-    )
-    return checked(circuit)
+    law, said, effectless = next(iter(laws), None), tuple(notes), (*deck.unused, *unused, *unused_starts)
+    return checked(Circuit(deck.title, elements, tran, ac, initial, law, work, said, effectless, deck.text, deck.path))
 
 
 def _unusual(
     deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initial: Mapping[str, float]
 ) -> Iterator[str]:
-    """Warnings about unusual areas given by sources or start values, and outputs too far apart for a source."""
+    """Warnings about unusual areas given by start values or sources, and outputs too far apart for a source."""
     nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
-    for node in (node for node in initial if node in nodes):
-        if text := REST_AREA.warning(f".ic v({node})", initial[node], "mm^2"):
-            yield text
-    for e in (e for e in elements if e.device == "V" and e.nodes[0] in nodes):
-        if isinstance(e.waveform, DC) and (text := REST_AREA.warning(f"{e.name}, an area,", e.waveform.level, "mm^2")):
-            yield f"{e.where}: {text}"
+    areas = [("", f".ic v({node})", value) for node, value in initial.items() if node in nodes]
+    for e in elements:
+        if e.device == "V" and e.nodes[0] in nodes and isinstance(e.waveform, DC):
+            areas.append((f"{e.where}: ", f"{e.name}, an area,", e.waveform.level))
+    for place, what, area in areas:
+        if text := REST_AREA.warning(what, area, "mm^2"):
+            yield f"{place}{text}"
     for e in elements if tran is not None else ():
         period = e.waveform.period if e.waveform is not None else None
         # A source whose frequency is unusual has a warning already.
@@ -160,3 +174,297 @@ def sweep_from_text(text: str) -> AcSweep:
         return read_ac(sweeps[0])
     except InputError as error:
         raise InputError(f"{text!r}: {error.message}") from None
+
+
+# Elements
+
+
+def read_elements(statement: Statement, context: Context, notes: list[str]) -> list[Element]:
+    """The element of a statement, and the elements for LTspice's ``Rser``, ``Rpar`` and ``Cpar``.
+
+    Warnings are added to `notes`.
+    """
+    name, device, nodes, names, _, params, where = statement
+    beside = {key: params[key] for key in DEVICES[device].beside if key in params}
+    own = statement._replace(params={k: v for k, v in params.items() if k not in beside})
+    read: dict[str, Any] = {}
+    values: dict[str, float] = {}
+    if device in "VI":
+        read["waveform"], read["ac"], differences = source_of(own, context)
+        notes.extend(differences)
+    elif device in "RC":
+        values, read["initial"] = _read_passive(own, notes)
+    else:
+        values = _device_values(own, notes)
+    element = Element(name, device, nodes, names, MappingProxyType(values), where=where, **read)
+    for parameter, text in unusual(element):
+        named = params.get(parameter)
+        given = statement.body[0] if parameter == "value" and statement.body else named
+        # One warning per number is enough.
+        if not (isinstance(given, Number) and _doubts(given, element.spec.parameter(parameter))):
+            notes.append(f"{where if given is None else given.where}: {text}")
+    out = [element]
+    for key, part in beside.items():
+        if isinstance(part, Number) and part.value == 0.0 and key != "rpar":
+            continue
+        written, kind = f"{name}.{key.capitalize()}", key[0].upper()
+        value = MappingProxyType({"value": _value(written, DEVICES[kind].parameter("value"), part, notes)})
+        ends, ends_written = nodes, names
+        if key == "rser":
+            inner = written.lower()
+            ends, ends_written = (nodes[0], inner), (names[0], written)
+            out[0] = replace(element, nodes=(inner, nodes[1]), node_names=(written, names[1]))
+        out.append(Element(written, kind, ends, ends_written, value, where=where))
+    return out
+
+
+def source_of(statement: Statement, context: Context) -> Source:
+    """The source that a V or I element's statement describes."""
+    name, body, params = statement.name, list(statement.body), statement.params
+    last = body[-1] if body else None
+    if "wavefile" in params and not any(isinstance(word, Call) for word in body):
+        # LTspice's `wavefile=path [chan=n]`: 1 V at full scale, and the first channel if none is chosen.
+        path = params["wavefile"]
+        where = path.key or path.where
+        for key, value in params.items():
+            if key not in ("wavefile", "chan"):
+                raise InputError(f"{name} takes no parameter {key!r} beside wavefile=; allowed: chan=", value.key)
+        channel = params.get("chan", Number(0.0, "0", where))
+        body.append(Call("wavefile", (path, Number(1.0, "1", where), channel), {}, where))
+    elif params:
+        # ngspice takes PWL(...) r=10m as well as PWL(... r=10m), and the brackets of PWL(file=...) may be left out.
+        inner = last.params if isinstance(last, Call) else {}
+        if not isinstance(last, Call | Token) or last.text.lower() != "pwl" or set(inner) & set(params):
+            key = next(iter(params))
+            takes = ", ".join(p.capitalize() for p in DEVICES[statement.device].beside)
+            hint = f"; allowed: {takes}, besides its value" if takes else ""
+            raise InputError(f"{name} takes no parameter {key!r}{hint}", params[key].key)
+        body[-1] = Call(last.text, last.args if isinstance(last, Call) else (), {**inner, **params}, last.where)
+    return read_source(name, body, context, statement.where)
+
+
+def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
+    name, device, params = statement.name, statement.device, statement.params
+    if statement.nodes[2] == "0":
+        raise InputError(f"{name} has ground as its area; allowed: the area node of a GAP", statement.where)
+    known = {p.name: p for p in DEVICES[device].parameters}
+    for key, given in params.items():
+        if key not in known:
+            # On an X line m=... is ngspice's number of copies.
+            hint = "; the exponent is m_exp" if key == _COPIES and "m_exp" in known else nearest(key, known)
+            problem = f"{name}: {device} has no parameter {key!r}{hint}; allowed: {', '.join(known)}"
+            raise InputError(problem, given.key)
+    values = {}
+    for key, spec in known.items():
+        if key in params:
+            values[key] = _value(name, spec, params[key], notes)
+        elif spec.default is not None:
+            values[key] = spec.default
+        else:
+            unit = f" ({spec.unit})" if spec.unit else ""
+            raise InputError(f"{name}: {device} needs {key}{unit}, missing here", statement.where)
+    return values
+
+
+def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, float], float | None]:
+    """Value of an R or C, and the start voltage (V) of a C."""
+    name, device, params = statement.name, statement.device, statement.params
+    kind, spec = DEVICES[device], DEVICES[device].parameter("value")
+    own = (*kind.aliases, _COPIES, *(("ic",) if device == "C" else ()), *kind.data)
+    for key, part in params.items():
+        if key not in own and not (key == "lser" and isinstance(part, Number) and part.value == 0.0):
+            shown = ", ".join(f"{k}=" for k in (*own, *kind.beside))
+            reason = ", there are no inductors here" if key == "lser" else ""
+            raise InputError(f"{name} takes no parameter {key!r}{reason}; allowed: {shown}", part.key)
+    given = [*statement.body, *(params[key] for key in kind.aliases if key in params)]
+    if len(given) != 1:
+        raise InputError(f"{name} needs one value in {spec.unit}, {len(given)} are given", statement.where)
+    word = given[0]
+    if not isinstance(word, Number):
+        raise InputError(f"{name} value is {word.text!r}; allowed: a number {spec.unit}", word.where)
+    value = _value(name, spec, word, notes)
+    copies = params.get(_COPIES)
+    if copies is not None:
+        if not isinstance(copies, Number) or not 1e-6 <= copies.value <= 1e6:
+            raise InputError(f"{name} m is {copies.text!r}; allowed: a number of parts side by side", copies.where)
+        value = value / copies.value if device == "R" else value * copies.value
+    initial = params.get("ic")
+    if isinstance(initial, Token):
+        raise InputError(f"{name} IC is {initial.text!r}; allowed: a number V", initial.where)
+    return {"value": value}, None if initial is None else start_volts(f"{name} IC", initial)
+
+
+def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> float:
+    """Value of one parameter; refuses or warns about units that SPICE reads as scale factors."""
+    unit = f" {spec.unit}" if spec.unit else ""
+    if isinstance(given, Token):
+        if spec.may_be_infinite and given.text.lower() in ("inf", "none"):
+            return math.inf
+        allowed = f"a number{unit}, or the name of a .param"
+        raise InputError(f"{name} {spec.name} is {given.text!r}; allowed: {allowed}", given.where)
+    trap = unit_trap(spec, given.text)
+    if trap:
+        raise InputError(f"{name} {spec.name} {trap}", given.where)
+    notes.extend(f"{place}: {name} {spec.name}: {doubt}" for place, doubt in _doubts(given, spec))
+    if not spec.accepts(given.value):
+        plain = f"{given.value:g}{unit}"
+        written = plain if given.text == f"{given.value:g}" else f"{given.text} ({plain})"
+        raise InputError(f"{name} {spec.name} is {written}; allowed: {spec.allowed()}", given.where)
+    return given.value
+
+
+def _doubts(given: Number, spec: ParameterSpec) -> list[tuple[Where, str]]:
+    """Warnings about the notation of a number, each with the place that it is about."""
+    found = []
+    if given.mega is not None and (note := mega_note(given.mega.text, given.value, spec)):
+        found.append((given.mega.where, note))
+    if exponent_and_scale(given.text):
+        found.append((given.where, f"{given.text} is {given.value:g}: exponent and scale both count"))
+    return found
+
+
+# Directives
+
+
+def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]:
+    """The numbers and the other words of a directive's line."""
+    for arg in directive.args:
+        if isinstance(arg, Call):
+            raise InputError(f"{directive.name}: {arg.text!r} is not understood; allowed: {usage}", arg.where)
+    for key, value in directive.params.items():
+        raise InputError(f"{directive.name} takes no {key!r}; allowed: {usage}", value.key)
+    numbers = [arg for arg in directive.args if isinstance(arg, Number)]
+    return numbers, [arg.text.lower() for arg in directive.args if isinstance(arg, Token)]
+
+
+def read_tran(directive: Directive, notes: list[str]) -> Tran:
+    """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``, and LTspice's ``.tran TSTOP`` and ``.tran 0 TSTOP [TSTART [TMAX]]``.
+
+    If no TSTEP is given, a warning with the TSTEP that is used is added to `notes`.
+    """
+    usage = ".tran TSTEP TSTOP [TSTART [TMAX]] [uic]"
+    numbers, words = _numbers(directive, usage)
+    for word in words:
+        if word in _LTSPICE_START:
+            raise InputError(f".tran {word}: {_LTSPICE_START[word]}", directive.where)
+    if any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4:
+        apart = "; a unit joins its number, such as 20m" if any(is_unit(w) for w in words) else ""
+        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}{apart}", directive.where)
+    step, stop, start, longest = [None, numbers[0], None, None] if len(numbers) == 1 else [*numbers, None, None][:4]
+    assert stop is not None
+    _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")
+    for what, number in (("TSTOP", stop), ("TMAX", longest)):
+        _require(number is None or 1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 s")
+    if step is None or step.value == 0.0:
+        step = longest
+    if step is None:
+        every = stop.value / LTSPICE_OUTPUTS
+        step = Number(every, f"{every:g}", directive.where)
+        notes.append(
+            f"{directive.where}: {directive.text.strip()!r} has no TSTEP, which LTspice does not need: "
+            f"{LTSPICE_OUTPUTS:,} outputs, one every {every:g} s"
+        )
+    _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
+    _require(1e-30 <= step.value <= 1e30, "TSTEP", step, "1e-30 to 1e30 s")
+    _require(step.value <= stop.value, "TSTEP", step, f"at most TSTOP = {stop.text} (the output step comes first)")
+    begin = start.value if start else 0.0
+    _require(0.0 <= begin < stop.value, "TSTART", start, f"0 to TSTOP = {stop.text}")
+    _require((stop.value - begin) / step.value <= 1e8, "TSTEP", step, "at most 1e8 output steps in a run")
+    return Tran(step.value, stop.value, begin, longest.value if longest else None, "uic" in words)
+
+
+def _require(condition: bool, what: str, given: Number | None, allowed: str) -> None:
+    if not condition:
+        assert given is not None
+        raise InputError(f"{what} is {given.text}; allowed: {allowed}", given.where)
+
+
+def read_ac(directive: Directive) -> AcSweep:
+    """``.ac DEC|OCT|LIN N FSTART FSTOP``."""
+    usage = ".ac DEC|OCT|LIN N FSTART FSTOP"
+    numbers, words = _numbers(directive, usage)
+    if len(words) != 1 or words[0] not in ("dec", "oct", "lin") or len(numbers) != 3:
+        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}", directive.where)
+    n, low, high = numbers
+    _require(n.value >= 1 and n.value == int(n.value) and n.value <= 1e6, "N", n, "a whole number, 1 to 1e6")
+    _require(low.value > 0.0, "FSTART", low, "more than 0 Hz")
+    _require(high.value >= low.value, "FSTOP", high, f"at least FSTART = {low.text}")
+    for what, number in (("FSTART", low), ("FSTOP", high)):
+        _require(1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 Hz")
+    scale: Literal["dec", "oct", "lin"] = words[0]  # type: ignore[assignment]
+    spans = 1.0 if scale == "lin" else math.log(high.value / low.value, 10.0 if scale == "dec" else 2.0)
+    _require(n.value * spans <= 1e6, "N", n, f"at most 1e6 frequencies in a sweep, here {n.value * spans:.3g}")
+    return AcSweep(scale, int(n.value), low.value, high.value)
+
+
+def read_initial(
+    directives: list[Directive], elements: tuple[Element, ...], uic: bool
+) -> tuple[dict[str, float], tuple[str, ...]]:
+    """``.ic v(node)=value``: start values by canonical node, in V, or in mm^2 of an area node, and what has no effect.
+
+    Without effect are with ``uic`` those where no layer or capacitor without ``IC=`` is, else every ``IC=``.
+    """
+    usage = "allowed: .ic v(node)=value"
+    nodes = {node: None for e in elements for node in e.nodes}  # an ordered set
+    layers = [e for e in elements if e.spec.is_layer]
+    area_nodes = {e.nodes[2] for e in layers}
+    out: dict[str, float] = {}
+    for directive in directives:
+        if directive.args:
+            raise InputError(f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
+        for key, value in directive.params.items():
+            place = value.key
+            if not (key.startswith("v(") and key.endswith(")")):
+                raise InputError(f".ic {key!r} is not understood; {usage}", place)
+            if not isinstance(value, Number):
+                raise InputError(f".ic {key} is {value.text!r}; allowed: a number V", place)
+            node = key[2:-1]
+            if node not in nodes:
+                raise InputError(f".ic names node {node!r}, which is not in the circuit{nearest(node, nodes)}", place)
+            if node in out:
+                raise InputError(f".ic gives node {node!r} twice", place)
+            if node == "0" and value.value != 0.0:
+                raise InputError(f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
+            if node in area_nodes and not 1e-30 <= value.value <= 1e30:
+                raise InputError(f".ic {key} is {value.text} mm^2; allowed: more than 0, from 1e-30 to 1e30", place)
+            out[node] = value.value if node in area_nodes else start_volts(f".ic {key}", value)
+    gaps = [e for e in layers if e.device == "GAP" and e.values["a_fix"] == 0.0]
+    started = [*layers, *(e for e in elements if e.device == "C" and e.initial is None)]
+    used = {node for e in started for node in e.nodes[:2]} if uic else set(out)
+    used = used - area_nodes | {e.nodes[2] for e in gaps if not uic or e.values["tau"] > 0.0}
+    without = [f".ic v({node})" for node in out if node not in used]
+    return out, (*without, *(f"IC= of {e.name}" for e in elements if e.initial is not None and not uic))
+
+
+def start_volts(what: str, number: Number) -> float:
+    """A start voltage (V), which must be within the range allowed for sources."""
+    try:
+        check_range(what, number.value, "V")
+    except InputError as error:
+        raise InputError(error.message, number.where) from None
+    return number.value
+
+
+def read_options(directives: list[Directive]) -> tuple[str, tuple[str, ...]]:
+    """The reading of Eq. 7 that ``work`` selects, and the names of ngspice's and LTspice's options, without effect."""
+    work, unused = None, []
+    for directive in directives:
+        names = [(key, value.text.lower(), value.key) for key, value in directive.params.items()]
+        for arg in directive.args:
+            if not isinstance(arg, Token):
+                raise InputError(f".options {arg.text!r} is not understood; allowed: .options name=value", arg.where)
+            names.append((arg.text.lower(), "", arg.where))
+        for key, text, place in names:
+            if key == "work":
+                if text not in WORK_READINGS:
+                    raise InputError(f".options work is {text!r}; allowed: {' or '.join(WORK_READINGS)}", place)
+                if work not in (None, text):
+                    raise InputError(f".options work is given twice, first {work}, then {text}", place)
+                work = text
+            elif key in _NGSPICE_OPTIONS or key in _LTSPICE_OPTIONS:
+                unused.append(f".options {key}")
+            else:
+                hint = nearest(key, [*_NGSPICE_OPTIONS, "work"])
+                known = f"work={'|'.join(WORK_READINGS)}, and those of ngspice and LTspice, which have no effect here"
+                raise InputError(f"unknown option {key!r}{hint}; allowed: {known}", place)
+    return work or "gap", tuple(dict.fromkeys(unused))

@@ -1,96 +1,254 @@
-"""A netlist's words, and their evaluation: numbers, keywords, and expressions of parameters.
+"""Files of a netlist, and its lines sorted into elements, parameters, subcircuits and directives.
 
-Reader of netlist files: sorts lines into elements, parameters, subcircuits and directives.
-
-Included files must be in the netlist's own folder.
+Files may be in the netlist's own folder; the libraries of native devices are those shipped.
 """
 
 from __future__ import annotations
 
+import codecs
 import re
-from collections import ChainMap
-from collections.abc import Iterable, Mapping
+import sys
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
+from encodings import cp1252
+from functools import cache
 from itertools import islice
-from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias
+from pathlib import Path, PurePath
+from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
-from fingerspice.base.units import parse_number, suspicious_mega
 from fingerspice.circuit.devices import layer_devices
-from fingerspice.netlist.expressions import (
-    CONSTANTS,
-    ELSEWHERE,
-    RESERVED,
-    Expression,
-    Problem,
-    compile_expression,
-    compiled,
-    decimal_comma,
-    greek_mu,
-    nearest,
-)
+from fingerspice.netlist.expressions import Value, Word, definitions
 from fingerspice.netlist.lexer import (
-    LIBRARIES,
-    MAX_BYTES,
     SPLIT,
     Assignment,
-    Group,
     Lexeme,
     Line,
+    closest,
+    decimal_comma,
     group,
-    inside,
     lex,
-    library_changed,
     logical_lines,
-    read_text,
+    nearest,
     split_lines,
 )
 
-_NUMERIC = re.compile(r"[+-]|\.?[0-9]")
-_FILE_NAME = re.compile(r".*[/\\].*|.*\.[A-Za-z]\w*")
-_PLAIN_NUMBER = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?[A-Za-z]*")
-_OF_TIME = re.compile(r"(?<![A-Za-z])(?:t|time)(?![A-Za-z])", re.IGNORECASE)
-_OPERATOR = re.compile(r"[-+*/^]")
-_PAIR = re.compile(r"[({]|[)}]|'[^']*'|(?<![\w.])([A-Za-z_]\w*)\s*=(?!=)|[<>!=]=|=")
+#: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
+LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
 
-#: Kinds of text that are evaluated without braces: nothing, a parameter's name, or also arithmetic. As in ngspice,
-#: `R1 a b rho` and `X1 a b sub w=2*rho` are allowed, but not `R1 a b 2*rho`.
-Bare: TypeAlias = Literal["nothing", "name", "arithmetic"]
+#: Largest size of a file, and of all the files that a deck's sources name, bytes.
+MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30
 
 
-class Token(NamedTuple):
-    """A word that is not a number, such as a keyword, a file name, `inf`, or what was in double quotes."""
-
-    text: str
-    where: Where
-    key: Where | None = None  # Place of the key of a `key=value` pair
-
-
-class Number(NamedTuple):
-    """A number, or an expression's value."""
-
-    value: float  # The value in SI units
-    text: str  # As written, braces included
-    where: Where  # The place of its first character
-    # The number with a capital M from which the value was computed: M is milli, and perhaps meant as mega
-    mega: Token | None = None
-    key: Where | None = None  # Place of the key of a `key=value` pair
+@cache
+def library_text(law: str) -> str:
+    """Text of a charge law's library, from the installed package or the source tree."""
+    name = LIBRARIES[law]
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "lib", package.parents[1] / "circuits"):
+        path = folder / name
+        if path.is_file():
+            return path.read_text(encoding="utf-8")
+    raise InputError(f"{name} is missing from this installation; reinstall fingerspice")
 
 
-Value: TypeAlias = Number | Token
+def read_text(path: Path, shown: str, where: Where | None = None, root: Path | None = None) -> str:
+    """Text of a netlist or table in UTF-8, Latin-1, or UTF-16 with a mark.
+
+    `shown` is the path as the user wrote it at the place `where`; files outside the folder `root` are not proposed.
+    """
+    try:
+        if path.is_dir():
+            problem = "is a folder, not a file"
+        elif not path.exists():
+            problem = f"does not exist{_similar_file(path, shown, root)}"
+        elif not path.is_file():
+            problem = "is not an ordinary file"
+        elif path.stat().st_size > MAX_BYTES:
+            problem = f"is larger than {MAX_BYTES >> 20} MiB"
+        else:
+            return _decoded(path.read_bytes(), shown, where)
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        problem = f"cannot be read: {_reason(error)}"
+    raise InputError(f"'{shown}' {problem}", where)
 
 
-class Call(NamedTuple):
-    """A word with arguments in brackets: `SIN(0 200 100)` or `SIN (0 200 100)`."""
-
-    text: str  # The word
-    args: tuple[Value, ...]
-    params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
-    where: Where
+def _reason(error: Exception) -> str:
+    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
-Word: TypeAlias = Number | Token | Call
+def text_of(path: Path) -> tuple[str, Path]:
+    """Text and path of a deck; standard input (``-``), a device or a pipe such as ``<(...)`` has the path ``stdin``."""
+    stream = str(path) in ("-", "/dev/stdin") or path.is_relative_to("/dev/fd")
+    with suppress(OSError):
+        stream = stream or path.is_fifo() or path.is_char_device()
+    if not stream:
+        return read_text(path, str(path)), path
+    try:
+        with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as source:
+            data = source.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"'{path}' cannot be read: {_reason(error)}") from None
+    if len(data) > MAX_BYTES:
+        raise InputError(f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
+    return _decoded(data, str(path), None), Path("stdin")
+
+
+def _decoded(data: bytes, shown: str, where: Where | None) -> str:
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        # LTspice writes UTF-16 if a name has letters that Latin-1 lacks.
+        return data.decode("utf-16", "replace")
+    if b"\0" in data:
+        raise InputError(f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        broken = error.start
+    try:
+        # LTspice writes its micro sign in the Latin-1 of Windows.
+        return cp1252.Codec().decode(data)[0]
+    except UnicodeDecodeError:
+        number = data[:broken].count(b"\n") + 1
+        problem = f"'{shown}' is neither UTF-8 nor Latin-1 text (byte 0x{data[broken]:02x} in line {number})"
+        raise InputError(f"{problem}: save it as UTF-8", where) from None
+
+
+@dataclass
+class SourceFiles:
+    """Finds the recordings and tables of sources: a deck's in its folder or below, a user's own anywhere."""
+
+    folder: Path | None = None  # Folder of the deck; None for a deck given as text
+    # Whether any file may be read, relative to the working directory: for sources given by the user, not by a deck
+    anywhere: bool = False
+    size: int = 0  # Total size of the files named so far, bytes; a file counts each time that it is named
+
+    def find(self, name: str, where: Where) -> Path:
+        """Path of a file named at the place `where`; one outside the folder is refused, and too much in all."""
+        try:
+            if self.anywhere:
+                path = Path(name).expanduser()
+            elif self.folder is None:
+                raise InputError(f"'{name}' cannot be read: a netlist given as text has no folder to look in", where)
+            else:
+                # The line may stand in an included file, whose name begins with the deck's folder as the user wrote it.
+                folder, root = Path(where.file).parent, self.folder.resolve()
+                path = inside(root, folder, name, where)
+                if not path.exists():
+                    raise InputError(f"'{name}' does not exist{_similar_file(path, name, root)}", where)
+                path = folder / name.replace("\\", "/")
+            self.size += path.stat().st_size if path.is_file() else 0
+        except (OSError, RuntimeError) as error:  # a name that is too long, or the folder of an unknown user
+            raise InputError(f"'{name}' cannot be read: {_reason(error)}", where) from None
+        if self.size > MAX_SOURCE_BYTES:
+            raise InputError(f"the sources' files are larger than {MAX_SOURCE_BYTES >> 20:,} MiB in all", where)
+        return path
+
+
+def library_changed(root: Path, folder: Path, name: str) -> bool:
+    """Whether the netlist's folder has a library of that name that differs from this version's."""
+    try:
+        path = (folder / name.replace("\\", "/")).resolve()
+        if not path.is_relative_to(root) or not path.is_file():
+            return False
+        own = library_text(next(law for law, file in LIBRARIES.items() if file == path.name.lower()))
+        # A file of more than four bytes per character cannot be equal, and need not be read.
+        if path.stat().st_size > 4 * len(own):
+            return True
+        text = read_text(path, name)
+        read, shipped = ([line.rstrip() for line in split_lines(x.rstrip())] for x in (text, own))
+        return read != shipped
+    except (OSError, ValueError, RuntimeError):
+        # A file that cannot be read is not this version's library.
+        return True
+
+
+def _similar_file(path: Path, shown: str, root: Path | None) -> str:
+    """The clause ``; did you mean 'folder/file'?`` for a missing file, or an empty text.
+
+    The search goes through the file's folder or, if that is missing, the folder with the nearest name, and then through
+    the parent folder. The proposal is written relative to the same folder as the missing file's name.
+    """
+    folder, below = path.parent, [path.name]
+    while not folder.is_dir() and folder != folder.parent:
+        folder, below = folder.parent, [folder.name, *below]
+    if root is not None and not folder.is_relative_to(root):
+        return ""
+    # Use the beginning of `shown`, because `path` may be relative to another folder.
+    written = PurePath(shown.replace("\\", "/")).parts[: -len(below)]
+    found = _nearest_path(folder, below) or _nearest_path(folder, below[-1:])
+    # A library of native devices is built in and need not exist in the folder: propose it, too.
+    names = [*([found[-1]] if found else []), *(LIBRARIES.values() if root is not None else ())]
+    name = closest(path.name, names)
+    if found is not None and name in (found[-1], None):
+        return f"; did you mean '{PurePath(*written, *found).as_posix()}'?"
+    return nearest(path.name, names)
+
+
+def _nearest_path(folder: Path, parts: list[str]) -> list[str] | None:
+    """A file below a folder, found by the nearest name for each part of its path; None if there is none."""
+    found: list[str] = []
+    for number, part in enumerate(parts, 1):
+        try:
+            entries = [e.name for e in folder.joinpath(*found).iterdir() if e.is_dir() == (number < len(parts))]
+        except OSError:
+            return None
+        name = part if part in entries else closest(part, sorted(entries))
+        if name is None:
+            return None
+        found.append(name)
+    return found
+
+
+def inside(root: Path, folder: Path, name: str, where: Where) -> Path:
+    """Resolved path of an included file; one outside the netlist's folder is refused."""
+    try:
+        path = (folder / name.replace("\\", "/")).resolve()
+        allowed = path.is_relative_to(root)
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: a circle of links
+        raise InputError(f"'{name}' is not a usable file name", where) from None
+    if not allowed:
+        raise InputError(f"'{name}' lies outside the netlist's folder, where nothing is read", where)
+    return path
+
+
+# Lines
+
+_GREEK_MU = re.compile(r"(?<![\w.])([0-9.]+(?:e[+-]?[0-9]+)?)μ", re.IGNORECASE)
+#: Directives that only other simulators know, each with the alternative here.
+ELSEWHERE = {
+    ".step": "give one value a run by --set PATH=VALUE, or loop over circuit.replace({path: value}) in Python",
+    ".four": "mean, peaks and amplitude are in the summary of a run, and any harmonic in the data that it writes",
+    ".temp": "nothing depends on temperature; give the values at the one that is meant",
+    ".model": "there are no models; write the device's parameters on its own line",
+    ".global": "give the node to each .subckt as one of its nodes",
+    ".func": "write the expression where it is used, {a*b}, or into .param",
+    ".op": "a .tran without uic starts from the operating point, fs.simulate(circuit, start='dc') too",
+    ".dc": "run once per value by --set, such as --set Vdrive.level=5",
+    ".noise": "there is no noise analysis",
+    ".wave": "run writes every signal as NetCDF, or as CSV with --csv",
+    ".csparam": "write .param",
+    ".endl": "put the section of the library into a file and .include it",
+    ".width": "leave it out",
+    **dict.fromkeys((".tf", ".pz", ".net"), "gains against frequency are given by fingerspice ac"),
+    **dict.fromkeys((".sens", ".data", ".alter"), "run once per value by --set"),
+    **dict.fromkeys((".if", ".elseif", ".else", ".endif"), "write the case that is meant"),
+    **dict.fromkeys(
+        (".savebias", ".loadbias"), "a run goes on from another in Python, fs.simulate(circuit, start=solution)"
+    ),
+}
+#: Limits of a netlist with its included files: a word takes up to 500 bytes of memory, and a line 200.
+MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000
+#: Largest number of warnings that are shown.
+MAX_WARNINGS = 100
+MAX_INCLUDES = 1000
+MAX_INCLUDE_DEPTH = 32
+
+_USED = tuple(".tran .ac .options .ic .param .subckt .ends .include .inc .lib .control .end".split())  # noqa: SIM905
+_UNUSED = (".print", ".plot", ".save", ".probe", ".meas", ".measure", ".title")
+#: Every directive that may stand in a deck; `Reader._direct` says what is done with it.
+DIRECTIVES = (*_USED, ".option", *_UNUSED, ".nodeset", ".backanno", ".endc")
 
 
 class Directive(NamedTuple):
@@ -115,187 +273,6 @@ class Statement(NamedTuple):
     body: tuple[Word, ...]  # The words after the nodes; empty for an X
     params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
     where: Where  # Place of the name
-
-
-class Scope:
-    """The parameters of the deck or of one subcircuit call, which also sees those of its callers (`parent`).
-
-    As in ngspice, a name that a subcircuit does not define is looked up in its caller, then in that caller's caller,
-    and at last in the deck; the place of the subcircuit's definition does not matter.
-    """
-
-    def __init__(self, definitions: Iterable[Assignment], parent: Scope | None = None) -> None:
-        self.values: dict[str, float] = {}
-        self._visible: ChainMap[str, float] = ChainMap(self.values, *(parent._visible.maps if parent else ()))
-        # As in `Number`
-        self._mega: ChainMap[str, Token | None] = ChainMap({}, *(parent._mega.maps if parent else ()))
-        self._definitions: dict[str, Assignment] = {}
-        for definition in definitions:
-            key, name = definition.key, definition.key.text.lower()
-            if name in RESERVED:
-                problem = f"parameter '{key.text}' has the name of a function of ngspice; allowed: another name"
-                raise InputError(problem, key.where)
-            first = self._definitions.setdefault(name, definition)
-            if first is not definition:
-                raise InputError(f"parameter '{key.text}' is defined twice, first at {first.key.where}", key.where)
-
-    def preset(self, name: str, number: Number) -> None:
-        """Set a parameter to its value in the call, instead of its default."""
-        self.values[name] = number.value
-        self._mega[name] = number.mega
-
-    def solve(self) -> dict[str, float]:
-        """The parameters' values; each definition, in any order, is evaluated after those of the parameters in it."""
-        known: dict[str, Expression] = {}
-        for root in self._definitions:
-            stack = [root]
-            while stack:
-                name = stack[-1]
-                if name in self.values:
-                    stack.pop()
-                    continue
-                text = self._definitions[name].value
-                if name not in known:
-                    known[name] = compile_expression(text.text, text.place)
-                waiting = [n for n in known[name].names if n in self._definitions and n not in self.values]
-                if not waiting:
-                    self.preset(name, self.number(text))
-                elif any(n in known for n in waiting):
-                    raise self._circle(known, name)  # a compiled definition without a value is on the stack: a circle
-                stack.extend(waiting)
-        return self.values
-
-    def _circle(self, known: dict[str, Expression], start: str) -> InputError:
-        """The error that names the parameters of a circle; following undefined names from `start` leads into it."""
-        order, name = dict[str, None](), start
-        while name not in order:
-            order[name] = None
-            name = next(n for n in known[name].names if n in known and n not in self.values)
-        path = list(order)
-        path = [*path[path.index(name) :], name]
-        shown = [self._definitions[name].key.text for name in path]
-        if len(shown) > 12:
-            shown[6:-5] = ["..."]
-        problem = f"parameters refer to each other in a circle: {' -> '.join(shown)}"
-        return InputError(problem, self._definitions[path[0]].key.where)
-
-    def number(self, lexeme: Lexeme) -> Number:
-        """Value of a lexeme that must be arithmetic, with or without braces."""
-        if lexeme.kind == "string":
-            raise InputError(f"a number is needed, not the text {lexeme.written}", lexeme.where)
-        expression = compile_expression(lexeme.text, lexeme.place)
-        mega = Token(expression.mega[0], lexeme.place(expression.mega[1])) if expression.mega else None
-        for name in expression.names:
-            mega = mega or self._mega.get(name)
-        return Number(expression.evaluate(self._visible, lexeme.place), lexeme.written, lexeme.where, mega)
-
-    def references(self, lexeme: Lexeme) -> dict[str, float]:
-        """Values in this scope of the parameters in a lexeme; empty if the lexeme is not arithmetic."""
-        return {name: self._visible[name] for name in _names_in(lexeme.text) or () if name in self._visible}
-
-    def value(self, lexeme: Lexeme, bare: Bare = "nothing") -> Value:
-        """Number or token of a word, string or expression; `bare` is what is evaluated without braces."""
-        text, where = lexeme.text, lexeme.where
-        if lexeme.kind == "string":
-            return Token(text, where)
-        if lexeme.kind == "expression" or (bare == "arithmetic" and _PLAIN_NUMBER.fullmatch(text)):
-            return self.number(lexeme)
-        if bare != "nothing" and self._is_arithmetic(text):
-            if bare == "name" and text.lower() not in self._visible:
-                raise InputError(f"arithmetic goes in braces: {{{text}}}", where)
-            return self.number(lexeme)
-        if _NUMERIC.match(text) is None:
-            return Token(text, where)
-        try:
-            mega = Token(text, where) if suspicious_mega(text) else None
-            return Number(parse_number(text), text, where, mega)
-        except ValueError as error:
-            if _FILE_NAME.fullmatch(text):
-                return Token(text, where)
-            hint = f"; arithmetic goes in braces: {{{text}}}" if _OPERATOR.search(text) else ""
-            if _OF_TIME.search(text):
-                hint = "; a function of time is SIN(VO VA FREQ), PULSE or PWL, or given in Python, sources={'V1': f}"
-            raise InputError(f"{error}{hint}", where) from None
-
-    def _is_arithmetic(self, text: str) -> bool:
-        """Whether a word without braces is arithmetic of numbers and known parameters only."""
-        if text.lower() in self._visible:
-            return True
-        if _OPERATOR.search(text) is None or _PLAIN_NUMBER.fullmatch(text):
-            return False
-        names = _names_in(text)
-        return names is not None and all(name in self._visible or name in CONSTANTS for name in names)
-
-    def pairs(self, group: Group, bare: Bare = "nothing") -> dict[str, Value]:
-        """Values of `key=value` pairs, each with the place of its key."""
-        return {name: self.value(value, bare)._replace(key=key.where) for name, (key, value) in group.params.items()}
-
-    def words(self, words: list[Lexeme | Group], bare: Bare = "nothing") -> tuple[Word, ...]:
-        """Values of the words that belong to no pair; a group is a call, which has no calls in it."""
-        out: list[Word] = []
-        for word in words:
-            if isinstance(word, Lexeme):
-                out.append(self.value(word, bare))
-            elif word.name is not None:
-                args = tuple(self.value(arg) for arg in word.words if isinstance(arg, Lexeme))
-                out.append(Call(word.name.text, args, self.pairs(word), word.name.where))
-        return tuple(out)
-
-
-def _names_in(text: str) -> Mapping[str, int] | None:
-    """The names in an expression; None if it is not arithmetic."""
-    try:
-        return compiled(text).names
-    except Problem:
-        return None
-
-
-def definitions(line: Line, start: int) -> list[Assignment]:
-    """Definitions on a `.param` line; right sides may be arithmetic without braces, and with blanks."""
-    keys: list[tuple[Lexeme, int]] = []  # the name, and the position after its `=`
-    depth = 0
-    for match in _PAIR.finditer(line.text, start):
-        found = match.group()
-        depth = max(0, depth + {"(": 1, "{": 1, ")": -1, "}": -1}.get(found, 0))
-        if match[1] is not None and depth == 0:
-            keys.append((Lexeme("word", match[1], match.start(), line), match.end()))
-        elif found == "=" and depth == 0:
-            problem = "the name before '=' is missing: write .param name=value (functions are not supported)"
-            raise InputError(problem, line.where(match.start()))
-    ends = [*(key.position for key, _ in keys), len(line.text)]
-    before = line.text[start : ends[0]].strip(" \t,")
-    if before or not keys:
-        given = f"'{before}'" if before else "nothing"
-        raise InputError(f".param is followed by {given}: write .param name=value", line.where(start))
-    out = []
-    for (key, begin), end in zip(keys, ends[1:], strict=True):
-        raw = line.text[begin:end]
-        text = raw.strip(" \t,")
-        if not text:
-            raise InputError(f"missing value of '{key.text}'", key.where)
-        value = Lexeme("word", text, begin + len(raw) - len(raw.lstrip(" \t,")), line)
-        if text[0] in "{'":
-            closing = "}" if text[0] == "{" else "'"
-            if len(text) < 2 or text[-1] != closing:
-                known = closing in text[1:]
-                problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
-                raise InputError(problem, value.where)
-            value = value._replace(kind="expression", text=text[1:-1])
-        out.append(Assignment(key, value))
-    return out
-
-
-#: Limits of a netlist with its included files: a word takes up to 500 bytes of memory, and a line 200.
-MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000
-#: Largest number of warnings that are shown.
-MAX_WARNINGS = 100
-MAX_INCLUDES = 1000
-MAX_INCLUDE_DEPTH = 32
-
-_USED = tuple(".tran .ac .options .ic .param .subckt .ends .include .inc .lib .control .end".split())  # noqa: SIM905
-_UNUSED = (".print", ".plot", ".save", ".probe", ".meas", ".measure", ".title")
-#: Every directive that may stand in a deck; `Reader._direct` says what is done with it.
-DIRECTIVES = (*_USED, ".option", *_UNUSED, ".nodeset", ".backanno", ".endc")
 
 
 @dataclass
@@ -323,14 +300,6 @@ class Deck:
         return [directive for directive in self.directives if directive.name == name]
 
 
-class DirectiveLine(NamedTuple):
-    """A line that begins with a dot."""
-
-    name: str  # In lower case, with its dot
-    line: Line
-    rest: int  # Position of the arguments
-
-
 @dataclass(slots=True)
 class Subcircuit:
     """The definition of a subcircuit, or, without a name, the deck itself."""
@@ -341,7 +310,8 @@ class Subcircuit:
     defaults: list[Assignment] = field(default_factory=list)
     elements: list[Line] = field(default_factory=list)
     params: list[Assignment] = field(default_factory=list)
-    directives: list[DirectiveLine] = field(default_factory=list)  # those with values; only .ic in a subcircuit
+    # Those with values, in a subcircuit only .ic: name in lower case with its dot, and the position of the arguments
+    directives: list[tuple[str, Line, int]] = field(default_factory=list)
     inner: dict[str, Subcircuit] = field(default_factory=dict)
     skipped: bool = False  # has a native device's name, or is inside such a definition: its body is not read
     called: bool = False
@@ -373,11 +343,11 @@ class Reader:
         """Read the deck's own lines after the title."""
         for line in logical_lines(lines, self.deck.file, first=2):
             if self._ended:
-                self.warn("text after .end is not read", line.place)
+                self.warn("text after .end is not read", line.where())
                 break
             self._take(line)
         if self._control is not None:
-            raise InputError(".control without its .endc", self._control.place)
+            raise InputError(".control without its .endc", self._control.where())
         if len(self._open) > 1:
             raise InputError(f".subckt {self._open[-1].name} without its .ends", self._open[-1].where)
 
@@ -391,8 +361,7 @@ class Reader:
 
     def _take(self, line: Line) -> None:
         """Enter one line in its list."""
-        start, here = line.start, self._open[-1]
-        word = line.text[start:].split(None, 1)[0].lower()
+        here, word = self._open[-1], line.text.split(None, 1)[0].lower()
         if self._control is not None:
             if word == ".endc":
                 self._control = None
@@ -400,40 +369,38 @@ class Reader:
         self._words += len(line.parts) + sum(1 for _ in islice(SPLIT.finditer(line.text), MAX_WORDS))
         if self._words > MAX_WORDS:
             problem = f"the netlist has more than {MAX_WORDS:,} words and brackets; allowed: no more"
-            raise InputError(f"{problem}, samples go in by Python: fs.Samples(values, rate)", line.place)
-        for sign, slip in (",", decimal_comma), ("μ", greek_mu):
-            note = slip(line.text) if sign in line.text and not here.skipped else None
-            if note:
-                self.warn(note, line.place)
+            raise InputError(f"{problem}, samples go in by Python: fs.Samples(values, rate)", line.where())
+        if not here.skipped and "," in line.text and (note := decimal_comma(line.text)):
+            self.warn(note, line.where())
+        if not here.skipped and "μ" in line.text and (found := _GREEK_MU.search(line.text)):
+            self.warn(f"{found[0]} is {found[1]}u here and {found[1]} in ngspice 39: write {found[1]}u", line.where())
         if word[0] == ".":
             word = word.partition("(")[0].partition("=")[0]
             # In the body of a definition that is not read, only what gives it its end counts.
             if not here.skipped or word in (".subckt", ".ends", ".control"):
-                name = ".param" if word == ".params" else word
-                self._direct(DirectiveLine(name, line, start + len(word)))
+                self._direct(".param" if word == ".params" else word, line, len(word))
         elif not here.skipped:
             here.elements.append(line)
             here.characters += len(line.text)
 
-    def _direct(self, read: DirectiveLine) -> None:
-        """Do what a directive asks for."""
-        here, line, place = self._open[-1], read.line, read.line.place
-        name, text = read.name, read.line.text[read.rest :]
+    def _direct(self, name: str, line: Line, rest: int) -> None:
+        """Do what a directive asks for, whose arguments begin at a position of its line."""
+        here, place, text = self._open[-1], line.where(), line.text[rest:]
         match name:
             case ".tran" | ".ac" | ".option" | ".options" | ".ic":
                 if here is not self.root and name != ".ic":
                     opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
                     raise InputError(f"{name} does not belong inside {opened}?", place)
                 if name in (".tran", ".ac"):
-                    for first in here.directives:
-                        if first.name == name:
-                            raise InputError(f"{name} is given twice, first at {first.line.place}", place)
-                here.directives.append(read._replace(name=".options") if name == ".option" else read)
+                    for other, first, _ in here.directives:
+                        if other == name:
+                            raise InputError(f"{name} is given twice, first at {first.where()}", place)
+                here.directives.append((".options" if name == ".option" else name, line, rest))
             case ".param":
-                here.params += definitions(line, read.rest)
+                here.params += definitions(line, rest)
                 here.characters += len(line.text)
             case ".subckt":
-                self._open.append(self._subcircuit(read))
+                self._open.append(self._subcircuit(line, rest))
             case ".ends":
                 if len(self._open) == 1:
                     raise InputError(".ends without a .subckt before it", place)
@@ -441,7 +408,7 @@ class Reader:
                 if text.strip() and closed and text.strip().lower() != closed.lower():
                     raise InputError(f".ends {text.strip()} closes .subckt {closed}: the names differ", place)
             case ".include" | ".inc" | ".lib":
-                self._include(read)
+                self._include(name, line, rest)
             case ".control":
                 self._control = line
                 self.deck.unused[name] = None
@@ -460,19 +427,18 @@ class Reader:
                 hint = f": {ELSEWHERE[name]}" if name in ELSEWHERE else hint
                 raise InputError(f"{name} is not supported{hint}", place)
 
-    def _subcircuit(self, read: DirectiveLine) -> Subcircuit:
-        """The subcircuit whose definition begins with a line."""
-        around, line = self._open[-1], read.line
+    def _subcircuit(self, line: Line, rest: int) -> Subcircuit:
+        around = self._open[-1]
         if around.skipped:
-            return Subcircuit("", line.place, skipped=True)
-        words = group(lex(line, read.rest), plain=len(line.text))
+            return Subcircuit("", line.where(), skipped=True)
+        words = group(lex(line, rest), plain=len(line.text))
         names = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
         if not names or any(word.kind != "word" for word in names):
-            raise InputError("write .subckt NAME node node ... key=value ...", line.place)
+            raise InputError("write .subckt NAME node node ... key=value ...", line.where())
         name = names[0].text
         if name.upper() in layer_devices():
             self.warn(f"{name.upper()} is a native device: its .subckt is not read", names[0].where)
-            return Subcircuit(name, line.place, skipped=True)
+            return Subcircuit(name, line.where(), skipped=True)
         if words.stray is not None:
             raise InputError(f"'{words.stray.text}' follows the parameters: nodes come first", words.stray.where)
         ports: dict[str, None] = {}  # an ordered set
@@ -487,16 +453,15 @@ class Reader:
         for _, value in defaults:
             if value.kind == "string":
                 raise InputError("a number is needed, not a text", value.where)
-        defined = Subcircuit(name, line.place, tuple(ports), defaults, characters=len(line.text))
+        defined = Subcircuit(name, line.where(), tuple(ports), defaults, characters=len(line.text))
         first = around.inner.setdefault(name.lower(), defined)
         if first is not defined:
             raise InputError(f"subcircuit '{name}' is defined twice, first at {first.where}", defined.where)
         return defined
 
-    def _include(self, read: DirectiveLine) -> None:
-        raw = read.line.text[read.rest :]
-        where = read.line.where(read.rest + len(raw) - len(raw.lstrip()))
-        name = raw.strip()
+    def _include(self, directive: str, line: Line, rest: int) -> None:
+        raw = line.text[rest:]
+        name, where = raw.strip(), line.where(rest + len(raw) - len(raw.lstrip()))
         words = name.split()
         if name[:1] in ("'", '"') and name:
             inner, closed, after = name[1:].partition(name[0])
@@ -504,10 +469,10 @@ class Reader:
                 raise InputError(f"{name[0]} is never closed", where)
             name, words = inner, [inner, *after.split()]
         if not name.strip():
-            raise InputError(f"{read.name} needs a file name", read.line.place)
+            raise InputError(f"{directive} needs a file name", line.where())
         if len(words) > 1:
             problem = "one file name is allowed; put a name with blanks in quotes"
-            if read.name == ".lib":
+            if directive == ".lib":
                 problem = "sections of a library are not supported: put the section into a file and .include it"
             raise InputError(problem, where)
         folder = self._reading[-1].parent if self._reading else self._folder
@@ -533,6 +498,6 @@ class Reader:
             raise InputError(f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
         self._reading.append(path)
         shown = str(Path(self.deck.file).parent / path.relative_to(self._folder))
-        for line in logical_lines(self.split(text, where), shown):
-            self._take(line)
+        for included in logical_lines(self.split(text, where), shown):
+            self._take(included)
         self._reading.pop()

@@ -10,9 +10,9 @@ from typing import NamedTuple, NoReturn
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import SmallSignal, Tran
-from fingerspice.netlist.expressions import is_unit, nearest
-from fingerspice.netlist.lexer import SourceFiles
-from fingerspice.netlist.reader import Call, Number, Token, Word
+from fingerspice.netlist.expressions import Call, Number, Token, Word
+from fingerspice.netlist.lexer import is_unit, nearest
+from fingerspice.netlist.reader import SourceFiles
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.periodic import PWL, Burst, Pulse, Repeat, Sawtooth, Square, Triangle
 from fingerspice.waveforms.samples import Samples

@@ -31,7 +31,7 @@ from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.files import UNFINISHED, settle_on_disk
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran
-from fingerspice.circuit.loop import checked
+from fingerspice.circuit.network import checked
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.physics.contact import Contact
 from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, State, Status

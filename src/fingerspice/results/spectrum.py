@@ -21,7 +21,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import NOTABLE, energy_outside, heading
-from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.network import network_of
 from fingerspice.results.record import Sealed, signal_of
 from fingerspice.waveforms.waveform import require
 

@@ -19,7 +19,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import in_force, remembering, require_circuit
-from fingerspice.circuit.topology import driving_sources
+from fingerspice.circuit.statespace import driving_sources
 from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import AM, Sine, Waveform
 

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.loop import network_of
+from fingerspice.circuit.network import network_of
 from fingerspice.engine.lanes.loops import AREAS, GAP, MORE, SQUARES, lead, sum_back
 from fingerspice.numerics.modes import AT, STEP, derivative
 from fingerspice.physics.contact import inverse_areas_with_slopes

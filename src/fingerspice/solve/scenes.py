@@ -13,8 +13,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import COUPLING, freezing_error
-from fingerspice.circuit.loop import areas_at_rest, loop_network, mean_areas, network_of
-from fingerspice.circuit.network import Modes, Network, network_modes
+from fingerspice.circuit.network import Modes, Network, loop_network, mean_areas, network_modes, network_of
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.engine.network import Net
 from fingerspice.engine.one_area.model import Model
@@ -263,7 +262,7 @@ def _fixed_areas(network: Network, area: str | float) -> tuple[tuple[float | Non
         return tuple(given), area
     if area == "mean":
         return tuple(map(float, mean_areas(network))), area
-    return tuple(map(float, areas_at_rest(network))), area
+    return tuple(map(float, network.areas_at_rest)), area
 
 
 def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:

@@ -18,7 +18,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import Parameters, Sources, head_lines, overridden, require_circuit
 from fingerspice.circuit.devices import beyond_fingers
-from fingerspice.circuit.loop import linear_scene
+from fingerspice.circuit.network import linear_scene
 from fingerspice.plots import drawing, traces
 from fingerspice.results.solution import Solution
 from fingerspice.results.spectrum import PhasorSolution

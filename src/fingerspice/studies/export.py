@@ -13,9 +13,9 @@ import numpy as np
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import require_circuit
-from fingerspice.circuit.loop import network_of
-from fingerspice.circuit.topology import find_branches
-from fingerspice.netlist.lexer import LIBRARIES, library_text
+from fingerspice.circuit.network import network_of
+from fingerspice.circuit.statespace import find_branches
+from fingerspice.netlist.reader import LIBRARIES, library_text
 from fingerspice.physics.contact import Contact
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged

@@ -14,9 +14,8 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
-from fingerspice.circuit.loop import areas_at_rest, network_of
-from fingerspice.circuit.network import Network
-from fingerspice.circuit.topology import find_branches
+from fingerspice.circuit.network import Network, network_of
+from fingerspice.circuit.statespace import find_branches
 from fingerspice.engine.inverse import drive_stack, hold
 from fingerspice.physics.contact import fixed_area_curve
 from fingerspice.waveforms.waveform import require
@@ -160,7 +159,7 @@ def _linear_inverse(net: Network) -> Callable[[FloatArray, float], FloatArray]:
     """
     from scipy.fft import irfft, next_fast_len, rfft
 
-    areas = areas_at_rest(net)
+    areas = net.areas_at_rest
     leak, c = net.leak(areas), net.capacitance(areas)
     gap = next(g for g in net.gaps if g is not None)
 

@@ -23,8 +23,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element
 from fingerspice.circuit.describe import Parameters, Sources, area_given, overridden
 from fingerspice.circuit.devices import beyond_fingers
-from fingerspice.circuit.loop import areas_at_rest, linear_scene, with_skin_held
-from fingerspice.circuit.network import build_network
+from fingerspice.circuit.network import build_network, linear_scene, with_skin_held
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.solution import Sensitivity, Solution
@@ -167,7 +166,7 @@ def phasor(
             # Node voltages at the areas that the circuit gives; as in ngspice, the AC of every source counts.
             own = [amplitude * np.exp(1j * phase)]
             s = own if alone else [0.0 if e.ac is None else e.ac.phasor for e in network.sources]
-            at = areas_at_rest(network) if isinstance(area, str) else np.full(len(network.areas), area)
+            at = network.areas_at_rest if isinstance(area, str) else np.full(len(network.areas), area)
             areas = np.tile(at, (f.size, 1))
             v = np.array([network.node_phasors(float(x), at, np.array(s, complex)) for x in f])
             layers, gain, u_gap, size, force = np.zeros((f.size, 0), complex), none + 0j, none + 0j, none, none

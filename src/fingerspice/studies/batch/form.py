@@ -19,8 +19,7 @@ from fingerspice.base.arrays import FloatArray, IntArray, positive_number, real_
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import Value
-from fingerspice.circuit.statespace import Stack, build_stack, is_stack
-from fingerspice.circuit.topology import driving_sources
+from fingerspice.circuit.statespace import Stack, build_stack, driving_sources, is_stack
 from fingerspice.engine.lockstep.scenes import CELL_ROWS, LARGEST_X, N_OTHERS
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import universal_curve_array

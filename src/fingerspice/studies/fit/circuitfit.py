@@ -21,8 +21,8 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import meaning_of, require_circuit, scenes_warnings
-from fingerspice.circuit.loop import network_of
-from fingerspice.circuit.topology import driving_sources
+from fingerspice.circuit.network import network_of
+from fingerspice.circuit.statespace import driving_sources
 from fingerspice.results.record import SIGNALS
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import batch

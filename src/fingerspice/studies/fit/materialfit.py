@@ -18,7 +18,7 @@ from fingerspice.base.arrays import ComplexArray, FloatArray, positive_number, r
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
-from fingerspice.netlist.lexer import read_text
+from fingerspice.netlist.reader import read_text
 from fingerspice.physics.materials import EPS0, Ladder
 from fingerspice.waveforms.waveform import require
 

@@ -16,7 +16,7 @@ from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.devices import MEASURED as USUAL
 from fingerspice.circuit.devices import MEASURING
-from fingerspice.circuit.topology import driving_sources
+from fingerspice.circuit.statespace import driving_sources
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_columns
 
 #: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
