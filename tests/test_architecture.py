@@ -55,7 +55,7 @@ MANY_PARAMETERS = {
 }
 # Functions over the limits, with their lines and parameters: no other may be, and these may only shrink.
 LARGER = {
-    "engine.lockstep.card.thread_kernel.kernel": (28, 17),
+    "engine.lockstep.card.thread_kernel.kernel": (13, 9),
 }
 
 # From the bottom up: a part imports its own files and the parts above it in this list, nothing below.

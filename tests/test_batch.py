@@ -378,8 +378,7 @@ def test_an_exponential_adams_step_is_exact_for_a_cubic(y: float) -> None:
     h, lanes = 2e-3, 8
     marks = marks_of(1, 1, 1, 1, 1, lanes)
     still, moving = np.empty(9 * lanes), np.empty((1, 3, 9 * lanes))
-    rates = np.full((1, lanes), y / h)
-    weigh(np.full(lanes, h), rates, np.full((1, lanes), 2.0), (still, moving), np.empty((11, lanes)), marks)
+    weigh(np.full(lanes, h), np.full(lanes, y / h), np.full(lanes, 2.0), (still, moving), np.empty((11, lanes)), marks)
     decay, drive, *_, end, now, old, older = moving[0, 2].reshape(9, lanes)[:, 3]
     assert decay == pytest.approx(np.exp(-y), rel=1e-13, abs=1e-15)
 

@@ -117,12 +117,11 @@ def test_the_kernel_compiles_for_a_card(modes: int, pieces: int, monkeypatch: py
     asked = type("Card", (), {"compute_capability": (9, 0)})
     monkeypatch.setattr(sys.modules["numba.cuda.dispatcher"], "get_current_device", lambda: asked)
     kinds = cuda.types
-    whole, real, ints = kinds.int64, kinds.float64, kinds.int64[::1]
-    row, table = real[::1], real[:, ::1]
-    given = (table, ints, whole, ints, row, row, table, row, table, table, whole, whole, whole, kinds.boolean)
-    kernel = thread_kernel((modes, 1 if pieces else 2, 2, 9, 1), 3 * (modes + 1) + 8, pieces)
-    text, result = cuda.compile(kernel, kinds.void(*given, real, real, real[:, :, ::1]), cc=(9, 0), output="ptx",
-                                device=False, abi="numba")  # fmt: skip
+    whole, real = kinds.int64, kinds.float64
+    table = real[:, ::1]
+    given = (table, table, table, whole, whole, whole, kinds.boolean, real, real[:, :, ::1])
+    kernel = thread_kernel((modes, 1 if pieces else 2, 2, 9, 1), pieces)
+    text, result = cuda.compile(kernel, kinds.void(*given), cc=(9, 0), output="ptx", device=False, abi="numba")
     assert result == kinds.void
     assert ".target sm_90" in text
     # Fused multiply-add in double precision.

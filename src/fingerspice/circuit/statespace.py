@@ -11,6 +11,7 @@ sum v_x = 0 fixes the neutral gauge of the leaked charges. So N layers have N - 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -155,15 +156,19 @@ def layer_constants(layer: Element, skin_at: float | None = None) -> FloatArray:
     return layer.remember(("cells", skin_at), lambda: cells(layer.values, skin_at))
 
 
+def contact_with(v: Mapping[str, Any]) -> Contact:
+    """The contact with a GAP's values, or arrays of them; here, and nowhere else, the paper's mm are converted to m."""
+    alpha, beta, c2 = v["alpha"] * 1e-6, v["beta"] * 1e-6 * 1e3 ** v["n_exp"], v["c2"] * 1e-12
+    return Contact(v["d"], v["eps_r"], v["fn"], v["mu"], alpha, v["m_exp"], beta, v["n_exp"], c2)
+
+
 def contact_of(gap: Element) -> Contact:
-    """The contact of a GAP; here, and nowhere else, the paper's mm are converted to m."""
+    """The contact of a GAP."""
 
     def make() -> Contact:
-        v = gap.values
         # A product may overflow, or a logarithm be taken of one that underflows.
         with suppress(ArithmeticError, ValueError):
-            alpha, beta, c2 = v["alpha"] * 1e-6, v["beta"] * 1e-6 * 1e3 ** v["n_exp"], v["c2"] * 1e-12
-            contact = Contact(v["d"], v["eps_r"], v["fn"], v["mu"], alpha, v["m_exp"], beta, v["n_exp"], c2)
+            contact = contact_with(gap.values)
             if np.all(np.isfinite(contact.packed)):
                 return contact
         raise InputError(

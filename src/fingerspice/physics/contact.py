@@ -11,8 +11,9 @@ All functions take and return SI units.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +27,8 @@ N_PACKED = 8
 """Length of the parameter vector that the compiled functions take."""
 # Terms that a curve may have, and its error, relative.
 _SIZES, _ERROR = (16, 24, 32, 48), 2e-15
+# Largest X in the series of the universal curve that many contacts share, its terms and error.
+_MOST_X, _SHARED_SIZES, _SHARED_ERROR = 1.3, (16, 20, 24, 28), 1e-13
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ class Contact:
     @property
     def area_unloaded(self) -> float:
         """Ridge area without voltage and friction, alpha F_N^m (Eq. 5), m^2."""
-        return float(self.alpha * self.f_n**self.m)
+        area: float = self.alpha * self.f_n**self.m
+        return area
 
     @property
     def exists(self) -> bool:
@@ -81,22 +85,23 @@ class Contact:
 
     @cached_property
     def packed(self) -> FloatArray:
-        """Parameters as the compiled functions take them, shape (8,), SI."""
+        """Parameters as the compiled functions take them, shape (8,), SI; (8, n) where fields have n values each."""
+        many = any(np.ndim(getattr(self, field.name)) for field in fields(self))
+        of: Any = np if many else math
         p = 0.5 * (1.0 + 1.0 / self.m - 1.0 / self.n)
         area = self.area_unloaded
         # Eq. 4 divided by F_N; w = sigma d k = eps0 eps_r k u^2 / (2 d), so X is proportional to |u|.
         log_x2 = (
-            math.log(EPS0 * self.eps_r * self.work_ratio / self.d)
-            + math.log(self.n**2 / (self.n - self.m))
-            + math.log(self.beta) / self.n
-            - math.log(self.alpha) / self.m
-            + 2.0 * p * math.log(area)
-            - 2.0 * math.log(self.f_n)
+            of.log(EPS0 * self.eps_r * self.work_ratio / self.d)
+            + of.log(self.n**2 / (self.n - self.m))
+            + of.log(self.beta) / self.n
+            - of.log(self.alpha) / self.m
+            + 2.0 * p * of.log(area)
+            - 2.0 * of.log(self.f_n)
         )
         stress = 0.5 * EPS0 * self.eps_r / self.d**2
-        return np.array(
-            [math.exp(0.5 * log_x2), area, 1.0 / self.m, p, stress, self.f_n, self.mu, self.c2 * self.mu**2]
-        )
+        rows = [of.exp(0.5 * log_x2), area, 1.0 / self.m, p, stress, self.f_n, self.mu, self.c2 * self.mu**2]
+        return np.stack(np.broadcast_arrays(*rows)) if many else np.array(rows)
 
     def area(self, u_gap: ArrayLike) -> FloatArray:
         """Ridge contact area in full slip, A_R (Eqs. 1 to 4), m^2, at gap voltage `u_gap` (V)."""
@@ -272,6 +277,36 @@ def areas(u: FloatArray, curve: FloatArray) -> FloatArray:
     """A_R (m^2) at gap voltages |u| (V), shape (n,), from a `Contact.curve`."""
     q = inverse_areas(u, curve)
     return np.divide(1.0, q, out=q)
+
+
+def inverse_areas_of_many(u: FloatArray, contacts: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """1/A_R (1/m^2) of n contacts with the same exponents, packed (8, n), each at k gap voltages (V), u (k, n).
+
+    And the voltages up to which it holds, (n,). None if no series reaches the universal curve of these exponents.
+    """
+    series = _shared_series(float(contacts[2, 0]), float(contacts[3, 0]))
+    if series is None:
+        return None
+    area, out = np.empty(u.size), np.empty_like(u)
+    chebyshev.evaluate_array(series, read_only((contacts[0] * u).ravel()), 0.0, 2.0 / _MOST_X, area)
+    _slide(u, area.reshape(u.shape), contacts, out)
+    return out, _MOST_X / contacts[0]
+
+
+@lru_cache(maxsize=32)
+def _shared_series(inv_m: float, p: float) -> FloatArray | None:
+    return chebyshev.fit(lambda x: universal_curve_array(x, inv_m, p), 0.0, _MOST_X, _SHARED_ERROR, _SHARED_SIZES)
+
+
+@jit_rows
+def _slide(u: FloatArray, curve: FloatArray, contacts: FloatArray, out: FloatArray) -> None:
+    """1/A_R as in `ridge_area`, from the values of the universal curve."""
+    a0, stress, f_n, loss = contacts[1], contacts[4], contacts[5], contacts[7]
+    for j in range(u.shape[0]):
+        for i in range(u.shape[1]):
+            a, sigma = a0[i] * curve[j, i], stress[i] * u[j, i] * u[j, i]
+            root = math.sqrt(a * a + 4.0 * loss[i] * sigma * a * (f_n[i] + sigma * a))
+            out[j, i] = (a + 2.0 * loss[i] * f_n[i] * sigma + root) / (2.0 * (a * a - loss[i] * f_n[i] * f_n[i]))
 
 
 @jit

@@ -1,377 +1,179 @@
-"""Constants of scenes for `step`: modes, response to the source, area polynomials, weights of the steps."""
+"""Constants of scenes in lockstep: modes, responses to the source and polynomials of the area, a column for each scene.
+
+Sums are taken row by row, so that no scene's rounding depends on how many there are.
+"""
 
 from __future__ import annotations
 
 import math
-from itertools import islice
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial.chebyshev import cheb2poly
 from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray, aligned
+from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.lockstep import step as lockstep
-from fingerspice.engine.lockstep.step import Marks, area_row, n_state
+from fingerspice.engine.lockstep.step import SHAPE, area_row
+from fingerspice.numerics import chebyshev
 from fingerspice.numerics.modes import write_modes
+from fingerspice.physics.contact import N_PACKED, inverse_areas_of_many
 
 # A mode's rate nearer than this (relative) to the rate of a cell, a pole of the characteristic equation, has too few
 # correct digits in the difference of both.
 NEAR_POLE = 1e-5
-
-
-@jit_rows
-def find_rates(
-    k: FloatArray, moved: FloatArray, r: FloatArray, inverse: FloatArray, rates: FloatArray, near: FloatArray,
-    marks: Marks,
-) -> None:  # fmt: skip
-    """Rates of the cells, into `r`, and of the modes of two or three cells; `inverse` is 1/A.
-
-    On entry `r` holds the leakage rates by area. `near` is 1 where a mode's rate is too near to that of a cell, and for
-    more cells, whose modes need an iteration.
-    """
-    m_all, lanes = len(marks[0]), len(marks[5])
-    cells = m_all + 1
-    for i in range(lanes):
-        for j in range(cells):
-            r[j * lanes + i] += inverse[i] * moved[j * lanes + i]
-        unclear = 0.0 if m_all <= 2 else 1.0
-        if m_all == 1:
-            rates[0, i] = k[i] * r[lanes + i] + k[lanes + i] * r[i]
-        if m_all == 2:
-            r0, r1, r2 = r[i], r[lanes + i], r[2 * lanes + i]
-            k0, k1, k2 = k[i], k[lanes + i], k[2 * lanes + i]
-            middle = 0.5 * (k0 * (r1 + r2) + k1 * (r0 + r2) + k2 * (r0 + r1))
-            product = k0 * r1 * r2 + k1 * r0 * r2 + k2 * r0 * r1
-            faster = middle + math.sqrt(max(middle * middle - product, 0.0))
-            rates[0, i], rates[1, i] = product / faster, faster
-        if m_all <= 2:
-            for m in range(m_all):
-                for j in range(cells):
-                    rate = r[j * lanes + i]
-                    apart = abs(rate - rates[m, i]) > NEAR_POLE * max(rate, rates[m, i])
-                    unclear = unclear if apart else 1.0
-        near[i] = unclear
-
-
-@jit_rows
-def _shapes(
-    k: FloatArray, r: FloatArray, rates: FloatArray, gain: FloatArray, feed: FloatArray, shape: FloatArray,
-    marks: Marks,
-) -> None:  # fmt: skip
-    """Modes of all lanes with such rates; `feed` and `shape` have a row for every mode of every cell."""
-    m_all, lanes = len(marks[0]), len(marks[5])
-    for i in range(lanes):
-        for m in range(m_all):
-            norm = 0.0
-            for j in range(m_all + 1):
-                inverse = 1.0 / (r[j * lanes + i] - rates[m, i])
-                norm += k[j * lanes + i] * inverse * inverse
-                shape[(j * m_all + m) * lanes + i] = k[j * lanes + i] * inverse
-                feed[(j * m_all + m) * lanes + i] = inverse
-            gain[m * lanes + i] = -1.0 / norm
-            for j in range(m_all + 1):
-                feed[(j * m_all + m) * lanes + i] *= -1.0 / norm
-
-
-@jit
-def find_modes(rates: FloatArray, scratch: Any, marks: Marks) -> None:
-    """Modes of all lanes: in closed form, and by iteration where this would lose digits or there is none."""
-    k, _, r, near, gain, feed, shape, _, own, found, forms, floats, whole = scratch
-    m_all, lanes = len(marks[0]), len(marks[5])
-    if m_all <= 2:
-        _shapes(k, r, rates, gain, feed, shape, marks)
-    for i in range(lanes):
-        if near[i] > 0.0:
-            for j in range(m_all + 1):
-                own[0, j], own[1, j] = r[j * lanes + i], k[j * lanes + i]
-            write_modes(own[0], own[1], (found[0], found[1], forms[0], forms[1]), floats, whole)
-            for m in range(m_all):
-                rates[m, i], gain[m * lanes + i] = found[0, m], found[1, m]
-                for j in range(m_all + 1):
-                    feed[(j * m_all + m) * lanes + i] = forms[0, j, m]
-                    shape[(j * m_all + m) * lanes + i] = forms[1, j, m]
-
-
-@jit_rows
-def link(
-    gap: int, leaks: NDArray[np.int64], moved: FloatArray, feed: FloatArray, shape: FloatArray, c: FloatArray,
-    marks: Marks,
-) -> None:  # fmt: skip
-    """Constants by which the modes have to do with gap and leaks."""
-    m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
-    of_z = lockstep.SHAPE + m_all + w_all + l_all * w_all
-    of_leak = of_z + l_all * m_all
-    for i in range(lanes):
-        for m in range(m_all):
-            c[(lockstep.SHAPE + m) * lanes + i] = shape[(gap * m_all + m) * lanes + i]
-            for n in range(l_all):
-                c[(of_z + n * m_all + m) * lanes + i] = shape[(leaks[n] * m_all + m) * lanes + i]
-                c[(of_leak + m * l_all + n) * lanes + i] = (
-                    feed[(leaks[n] * m_all + m) * lanes + i] * moved[leaks[n] * lanes + i]
-                )
-
-
-# A table of scenes has three rows for every cell: capacitance (F/m^2), total leakage (S), leakage per area (S/m^2).
 CELL_ROWS = 3
-# Its further rows.
-XI, REST, STRESS, LOAD, LOSS, OMEGA, N_OTHERS = 0, 1, 2, 3, 4, 5, 6
-"""X of Eq. 4 at 1 V, A0 at 0 V (m^2), stress at 1 V (Pa), load (N), c2 mu^2; the source's angular frequency (rad/s).
-After them come the amplitudes (V) of the sine and of the cosine in each of its tones; a square's or recording's is the
-first of both."""
-LARGEST_X = 1.3
-"""Largest X that the series of the universal curve covers."""
-Scenes = tuple[
-    FloatArray,  # (n_row, n_scene): Table, `CELL_ROWS` for all cells, `N_OTHERS` rows, and two for every tone
-    NDArray[np.int64],  # (n,): Which of them are integrated
-    tuple[int, NDArray[np.int64]],  # The gap among the cells, and those whose leak has a total resistance
-    # Polynomial coefficients of the universal curve over X, highest power first; Chebyshev points; and the matrix from
-    # values at these points to polynomial coefficients (d + 1, d + 1), highest power first
-    tuple[FloatArray, FloatArray, FloatArray],
-]
-"""Scenes of a table, and what they have in common."""
+"""Rows of a table of scenes for every cell: capacitance (F/m^2), total leakage (S), leakage per area (S/m^2).
+
+Then come the contact's constants, as `physics.contact` packs them, the source's angular frequency (rad/s), and the
+amplitudes (V) of the sine and of the cosine in each of its tones; a square's or recording's is the first of both."""
+
+# Rows of a scene's constants, from the last one back: the relative size of the last coefficient of the area's
+# polynomial, infinite where the contact's own series does not reach so far; the largest gap voltage that it covers (V);
+# the source's angular frequency (rad/s); the slope of 1/A by |u| at 0 V. Before them, of every mode: voltage at the
+# start (V), rate (1/s), and drive of a source of constant pieces or straight lines.
+TAIL, TOP, OMEGA, SLOPE, N_LAST = 1, 2, 3, 4, 4
+START, RATES, DRIVE, N_OF_MODES = 0, 1, 2, 3
 
 
-@jit_rows
-def _divide(
-    t: FloatArray, gap: int, jumping: bool, covered: float, k: FloatArray, moved: FloatArray, own: FloatArray,
-    top: FloatArray, marks: Marks,
-) -> None:  # fmt: skip
-    """Shares of the cells in a voltage step, their leakage rates by total resistance and by area, and the largest u.
+def constants_of(
+    table: FloatArray, places: tuple[int, int, IntArray], tones: FloatArray | None, covered: float, degree: int
+) -> FloatArray | None:
+    """What `march.march` takes of scenes of a table, a column each; None without a series of the area.
 
-    That is an estimate of the largest gap voltage with the area at rest, times `covered`. The gap's share of the source
-    is between the capacitive and the resistive divider's; the jump of a square adds the difference of both, which is
-    left of the half period before.
+    `places` are the number of cells, the gap among them, and those whose leak has a total resistance; `tones` the
+    frequencies of the source's tones, in its own, or None for one of constant pieces or straight lines; `covered` is
+    the largest gap voltage that the area's polynomial covers, as a ratio to its estimate.
     """
-    cells, tones, lanes = len(marks[0]) + 1, (len(marks[1]) + 1) // 2, len(marks[5])
-    others, turned = CELL_ROWS * cells, 1.0 if jumping else 0.0
-    for i in range(lanes):
-        elastance, resistance, area = 0.0, 0.0, t[(others + REST) * lanes + i]
-        for j in range(cells):
-            inverse = 1.0 / t[j * lanes + i]
-            total, per_area = t[(cells + j) * lanes + i], t[(2 * cells + j) * lanes + i]
-            moved[j * lanes + i] = total * inverse
-            own[j * lanes + i] = per_area * inverse
-            k[j * lanes + i] = inverse
-            elastance += inverse
-            resistance += 1.0 / (total + area * per_area + 1e-300)
-        for j in range(cells):
-            k[j * lanes + i] /= elastance
-        amplitude = 0.0
-        for tone in range(tones):
-            along, across = (
-                t[(others + N_OTHERS + 2 * tone) * lanes + i],
-                t[(others + N_OTHERS + 2 * tone + 1) * lanes + i],
-            )
-            amplitude += math.sqrt(along * along + across * across)
-        at_once = 1.0 / (t[gap * lanes + i] * elastance)
-        leak = t[(cells + gap) * lanes + i] + area * t[(2 * cells + gap) * lanes + i]
-        at_last = 1.0 / ((leak + 1e-300) * resistance)
-        share = max(at_once, at_last) + turned * abs(at_once - at_last)
-        top[i] = covered * (amplitude * share) + 1e-12
-
-
-@jit_rows
-def _inverse_areas(
-    at: float, top: FloatArray, b: FloatArray, series: FloatArray, y: FloatArray, out: FloatArray, marks: Marks
-) -> None:  # fmt: skip
-    """1/A at the voltages top (1 + at) / 2 of every lane, by the universal curve and the closed form of Eqs. 1 and 3.
-
-    `b` holds the table's further rows (X, A0, stress, ...) for the lanes of the block; `y` (lanes,) is scratch.
-    """
-    lanes, half = len(marks[5]), 0.5 * (1.0 + at)
-    for i in range(lanes):
-        y[i] = series[0]
-    for d in range(1, series.size):
-        for i in range(lanes):
-            x = b[XI * lanes + i] * (half * top[i]) * (2.0 / LARGEST_X) - 1.0
-            y[i] = y[i] * x + series[d]
-    for i in range(lanes):
-        u, a = half * top[i], b[REST * lanes + i] * y[i]
-        load, loss = b[LOAD * lanes + i], b[LOSS * lanes + i]
-        sigma = b[STRESS * lanes + i] * u * u
-        root = math.sqrt(a * a + 4.0 * loss * sigma * a * (load + sigma * a))
-        out[i] = (a + 2.0 * loss * load * sigma + root) / (2.0 * (a * a - loss * load * load))
-
-
-@jit_rows
-def _polynomials(matrix: FloatArray, values: FloatArray, area: int, c: FloatArray, marks: Marks) -> None:
-    """Coefficients of 1/A of every lane, from row `area` of the constants on, from its values at Chebyshev's points."""
-    count, lanes = len(marks[3]), len(marks[5])
-    for d in range(count):
-        for i in range(lanes):
-            total = matrix[d, 0] * values[i]
-            for j in range(1, count):
-                total += matrix[d, j] * values[j * lanes + i]
-            c[(area + d) * lanes + i] = total
-
-
-@jit_rows
-def _respond(
-    t: FloatArray, tones: FloatArray, k: FloatArray, gain: FloatArray, rates: FloatArray, start: FloatArray,
-    c: FloatArray, gap: int, leaks: NDArray[np.int64], marks: Marks,
-) -> None:  # fmt: skip
-    """Response to the tones, in the constants of the block, and the modes at the start, which are the rest beside it.
-
-    A tone's response in a mode is gain (rate - i omega) / (rate^2 + omega^2) of it.
-    """
-    m_all, w_all, l_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[5])
-    others, of_u = CELL_ROWS * (m_all + 1), lockstep.SHAPE + m_all
-    of_w = of_u + w_all
-    of_z = of_w + l_all * w_all
-    for i in range(lanes):
-        for m in range(m_all):
-            start[m * lanes + i] = 0.0
-        for tone in range(w_all // 2):
-            row = others + N_OTHERS + 2 * tone
-            sine, cosine = t[row * lanes + i], t[(row + 1) * lanes + i]
-            omega = tones[tone] * t[(others + OMEGA) * lanes + i]
-            u_sine, u_cosine = k[gap * lanes + i] * sine, k[gap * lanes + i] * cosine
-            for n in range(l_all):
-                c[(of_w + n * w_all + 2 * tone) * lanes + i] = k[leaks[n] * lanes + i] * sine
-                c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] = k[leaks[n] * lanes + i] * cosine
-            for m in range(m_all):
-                rate = rates[m, i]
-                size = gain[m * lanes + i] / (rate * rate + omega * omega)
-                along, across = size * (rate * sine + omega * cosine), size * (rate * cosine - omega * sine)
-                start[m * lanes + i] -= across
-                u_sine += c[(lockstep.SHAPE + m) * lanes + i] * along
-                u_cosine += c[(lockstep.SHAPE + m) * lanes + i] * across
-                for n in range(l_all):
-                    c[(of_w + n * w_all + 2 * tone) * lanes + i] += c[(of_z + n * m_all + m) * lanes + i] * along
-                    c[(of_w + n * w_all + 2 * tone + 1) * lanes + i] += c[(of_z + n * m_all + m) * lanes + i] * across
-            c[(of_u + 2 * tone) * lanes + i] = u_sine
-            c[(of_u + 2 * tone + 1) * lanes + i] = u_cosine
-
-
-@jit_rows
-def _drive(
-    t: FloatArray, k: FloatArray, gain: FloatArray, start: FloatArray, drive: FloatArray, c: FloatArray, gap: int,
-    leaks: NDArray[np.int64], marks: Marks,
-) -> None:  # fmt: skip
-    """Constants of a source of constant pieces or straight lines: the cells' voltages at once, and the modes' drive."""
-    m_all, l_all, lanes = len(marks[0]), len(marks[2]), len(marks[5])
-    of_u, row = lockstep.SHAPE + m_all, CELL_ROWS * (m_all + 1) + N_OTHERS
-    for i in range(lanes):
-        amplitude = t[row * lanes + i]
-        c[of_u * lanes + i] = k[gap * lanes + i] * amplitude
-        for n in range(l_all):
-            c[(of_u + 1 + n) * lanes + i] = k[leaks[n] * lanes + i] * amplitude
-        for m in range(m_all):
-            start[m * lanes + i] = 0.0
-            drive[m, i] = gain[m * lanes + i] * amplitude
-
-
-@jit
-def put_result(
-    i: int, s: FloatArray, parts: FloatArray, closing: float, lengths: tuple[int, int, int], found: Any, first: int,
-    out: FloatArray, marks: Marks,
-) -> None:  # fmt: skip
-    """Write lane i's column of `out`, which `march.march` describes; `parts` are the sums over parts of the run.
-
-    `lengths` are how often the last part stands for others beside itself; steps of the run; and steps of a part, or of
-    the run, of which each part then has its share.
-    """
-    own, count, lanes = lockstep.N_STATE * len(marks[0]), len(marks[4]), len(marks[5])
-    ahead, steps, of_part = lengths
-    at, peak = first + i, s[(own + lockstep.PEAK) * lanes + i]
-    if at >= out.shape[1]:
-        return
-    for j in range(count):
-        total = s[(own + lockstep.VALUE + count + j) * lanes + i]
-        if ahead > 0:
-            total += ahead * parts[j * lanes + i]
-        out[j, at] = total / steps
-        for k in range(j, out.shape[0] - 3 - count, count):
-            out[count + k, at] = parts[k * lanes + i] / of_part
-    out[-3, at], out[-2, at] = peak, closing
-    out[-1, at] = found[6][i] if peak <= found[5][i] else math.inf
-
-
-def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int, ...], ...], ...]:
-    """Shapes of a block's arrays, for a table with so many rows and half periods of so many pieces (4 without jumps).
-
-    They are in three groups: what `fill_block` finds, its scratch, and what `march.march_block` steps with.
-    """
-    m, w, k, d, count, lanes = (len(mark) for mark in marks)
-    lane, modes, cells, both = (lanes,), (m * lanes,), ((m + 1) * lanes,), ((m + 1) * m * lanes,)
-    weights = lockstep.N_WEIGHTS * m * lanes
-    found = (
-        ((area_row(m, w, k) + d) * lanes,),  # Constants, as `step` takes them
-        modes,  # Modes at the start, V
-        (m, lanes), (m, lanes),  # Rates (1/s), and drive of a source of constant pieces
-        (rows * lanes,),  # Columns of the table
-        # Largest gap voltage that the area's polynomial covers (V), and the relative size of its last coefficient;
-        # infinite where the universal curve does not reach so far
-        lane, lane,
-    )  # fmt: skip
-    # Of the cells, their share, rate by total resistance and rate; of a lane, whether a rate is near, and others; the
-    # modes' gain, feed and shape; values of the area; and for `write_modes` of one lane, rates and shares of the cells,
-    # rates and gains of the modes, their feeds and shapes, and its scratch.
-    scratch = (
-        cells, cells, cells, lane, modes, both, both, (d * lanes,), (2, m + 1), (2, m), (2, m + 1, m), (2, m + 1),
-    )  # fmt: skip
-    stepping = (
-        (weights,), (pieces, 3, weights),  # Weights, as `step.run` takes them
-        (n_state(m, k, count) * lanes,),  # State
-        (count * lanes,),  # Sums over the last period
-        modes,  # Modes at the start of the last period
-        # In the search for the periodic state, the derivative of the start by what a period leaves open, with the area
-        # held. In a run from rest, an upper bound of the modes' time constants, in periods.
-        modes,
-        # What the periodic state is off, relative to the peak gap voltage; or half of what the mean force is off
-        # because the last period stands for those after it, relative to that force, and infinite while it does not
-        lane,
-        # Length of the shortest step, s; in a run from rest, then the number of half periods after which it has settled
-        lane,
-        (11, lanes),  # Scratch of `step.weigh`
-    )  # fmt: skip
-    return found, scratch, stepping
-
-
-def new_block(rows: int, pieces: int, marks: Marks) -> tuple[Any, Any, Any]:
-    """Arrays for blocks of scenes; `pieces` is 0 without jumps."""
-    shapes = block_shapes(rows, pieces or 4, marks)
-    arrays = iter(aligned(shape for group in shapes for shape in group))
-    found, scratch, stepping = (tuple(islice(arrays, len(group))) for group in shapes)
-    return found, (*scratch, np.empty((2, len(marks[0]) + 1), np.int64)), stepping
-
-
-@jit
-def fill_block(
-    scenes: Scenes, first: int, source: tuple[FloatArray, bool, float], found: Any, scratch: Any, marks: Marks
-) -> None:
-    """Find the constants of the scenes from number `first` on.
-
-    `source` has the frequencies of the tones, in that of the source; whether it is of constant pieces, or of straight
-    lines; and the largest gap voltage that the area's polynomial covers, as a ratio to its estimate.
-    """
-    m_all, w_all, l_all, d_all, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[3]) - 1, len(marks[5])
-    area = area_row(m_all, w_all, l_all)
-    table, pending, (gap, leaks), curves = scenes
-    c, start, rates, drive, t, top, tails = found
-    k, moved, r, near, gain, feed, shape, values, _, _, _, _, _ = scratch
-    for i in range(lanes):
-        scene = pending[min(first + i, pending.size - 1)]
-        for row in range(table.shape[0]):
-            t[row * lanes + i] = table[row, scene]
-    _divide(t, gap, source[1], source[2], k, moved, r, top, marks)
-    b = t[CELL_ROWS * (m_all + 1) * lanes :]
-    for j in range(d_all + 1):
-        _inverse_areas(curves[1][j], top, b, curves[0], near, values[j * lanes : (j + 1) * lanes], marks)
-    _polynomials(curves[2], values, area, c, marks)
-    for i in range(lanes):
-        c[lockstep.SCALE * lanes + i] = 2.0 / top[i]
+    cells, gap, leaks = places
+    c, total, per_area = table[: CELL_ROWS * cells].reshape(CELL_ROWS, cells, -1)
+    contacts, omega = table[CELL_ROWS * cells :][:N_PACKED], table[CELL_ROWS * cells + N_PACKED]
+    waves = table[CELL_ROWS * cells + N_PACKED + 1 :]
+    with np.errstate(all="ignore"):
+        k = 1.0 / c
+        k /= sum(k)
+        # The gap's share of the source is between the capacitive and the resistive divider's, with the area at rest; a
+        # jump adds the difference of both, which is left of what was before.
+        leak = total + contacts[1] * per_area + 1e-300
+        at_last = 1.0 / (leak[gap] * sum(1.0 / leak))
+        share = np.maximum(k[gap], at_last)
+        if tones is None:
+            share += abs(k[gap] - at_last)
+        amplitude = sum(np.sqrt(waves[::2] ** 2 + waves[1::2] ** 2))
+        top = covered * (amplitude * share) + 1e-12
+        nodes, to_powers = _polynomials(degree)
+        found = inverse_areas_of_many(np.multiply.outer(0.5 * (1.0 + nodes), top), contacts)
+        if found is None:
+            return None
+        area = np.empty((degree + 2, top.size))
+        _combine(to_powers, found[0], area)
+        slope, area = 2.0 / top * area[0], area[1:]
         # The coefficients of the two highest powers are 2^(d - 1) and 2^(d - 2) times those of Chebyshev's series.
         # These fall to about a third from one to the next; the last one alone may be small by chance.
-        tail = max(abs(c[area * lanes + i]), 2.0 / 3.0 * abs(c[(area + 1) * lanes + i])) / 2.0 ** (d_all - 1)
-        covered = b[XI * lanes + i] * top[i] <= LARGEST_X
-        tails[i] = tail / c[(area + d_all) * lanes + i] if covered else math.inf
-    find_rates(k, moved, r, c[(area + d_all) * lanes : (area + d_all + 1) * lanes], rates, near, marks)
-    find_modes(rates, scratch, marks)
-    link(gap, leaks, moved, feed, shape, c, marks)
-    if source[1]:
-        _drive(t, k, gain, start, drive, c, gap, leaks, marks)
-    else:
-        drive[:] = 0.0
-        _respond(t, source[0], k, gain, rates, start, c, gap, leaks, marks)
+        tail = np.maximum(abs(area[0]), 2.0 / 3.0 * abs(area[1])) / 2.0 ** (degree - 1) / area[-1]
+        tail = np.where(top <= found[1], tail, np.inf)
+    first = area_row(cells - 1, len(waves) if tones is not None else 1, leaks.size)
+    out = np.empty((first + degree + 1 + N_OF_MODES * (cells - 1) + N_LAST, top.size))
+    out[0], out[first : first + degree + 1], out[-N_LAST:] = 2.0 / top, area, (slope, omega, top, tail)
+    _fill(table, k, np.array([gap, *leaks]), np.empty(0) if tones is None else tones, first + degree, out)
+    return out
+
+
+@lru_cache(maxsize=32)
+def _polynomials(degree: int) -> tuple[FloatArray, FloatArray]:
+    """Chebyshev points; and the matrix from values there to the slope at -1 and the powers, the highest first."""
+    at = np.eye(degree + 1)
+    to_powers = np.zeros((degree + 1, degree + 1))
+    for k in range(degree + 1):
+        to_powers[: k + 1, k] = cheb2poly(at[k, : k + 1])
+    powers, series = to_powers[::-1], chebyshev.coefficients(at)
+    slopes = np.array([(-1.0) ** (k + 1) * k * k for k in range(degree + 1)])
+    return chebyshev.nodes(degree + 1, -1.0, 1.0), np.vstack([slopes @ series, powers @ series])
+
+
+@jit_rows
+def _combine(matrix: FloatArray, values: FloatArray, out: FloatArray) -> None:
+    """Rows of `out` as combinations of those of `values`."""
+    for d in range(matrix.shape[0]):
+        for i in range(values.shape[1]):
+            out[d, i] = matrix[d, 0] * values[0, i]
+        for j in range(1, values.shape[0]):
+            by = matrix[d, j]
+            for i in range(values.shape[1]):
+                out[d, i] += by * values[j, i]
+
+
+@jit
+def _modes(
+    r: FloatArray, k: FloatArray, found: tuple[FloatArray, FloatArray, FloatArray, FloatArray], floats: FloatArray,
+    whole: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """As `write_modes`: in closed form, or by its iteration where this would lose digits or there is none."""
+    rates, gain, feed, shape = found
+    near = r.size > 3
+    if r.size == 2:
+        rates[0] = k[0] * r[1] + k[1] * r[0]
+    if r.size == 3:
+        middle = 0.5 * (k[0] * (r[1] + r[2]) + k[1] * (r[0] + r[2]) + k[2] * (r[0] + r[1]))
+        product = k[0] * r[1] * r[2] + k[1] * r[0] * r[2] + k[2] * r[0] * r[1]
+        rates[1] = middle + math.sqrt(max(middle * middle - product, 0.0))
+        rates[0] = product / rates[1]
+    for m in range(0 if near else rates.size):
+        norm = 0.0
+        for j in range(r.size):
+            apart = r[j] - rates[m]
+            near = near or not abs(apart) > NEAR_POLE * max(r[j], rates[m])
+            feed[j, m] = 1.0 / apart
+            shape[j, m] = k[j] * feed[j, m]
+            norm += shape[j, m] * feed[j, m]
+        gain[m] = -1.0 / norm
+        for j in range(r.size):
+            feed[j, m] *= gain[m]
+    if near:
+        write_modes(r, k, found, floats, whole)
+
+
+@jit
+def _fill(
+    table: FloatArray, k: FloatArray, cells_seen: IntArray, tones: FloatArray, held: int, out: FloatArray
+) -> None:  # fmt: skip
+    """Constants of modes and waves, scene by scene, from the shares k of the cells.
+
+    `cells_seen` are the gap's and those of the leaks; `held` is the row of 1/A in the middle of the voltages.
+    """
+    cells, gap, leaks = k.shape[0], cells_seen[0], cells_seen[1:]
+    modes, n_leak, n_wave, others = cells - 1, leaks.size, max(2 * tones.size, 1), CELL_ROWS * cells + N_PACKED
+    by_wave = SHAPE + modes
+    by_mode = by_wave + (1 + n_leak) * n_wave
+    by_leak, start = by_mode + n_leak * modes, held + 1
+    r, share, moved, rates, gain = np.empty(cells), np.empty(cells), np.empty(cells), np.empty(modes), np.empty(modes)
+    feed, shape = np.empty((cells, modes)), np.empty((cells, modes))
+    floats, whole = np.empty((2, cells)), np.empty((2, cells), np.int64)
+    for i in range(table.shape[1]):
+        for j in range(cells):
+            inverse = 1.0 / table[j, i]
+            share[j], moved[j] = k[j, i], table[cells + j, i] * inverse
+            r[j] = out[held, i] * moved[j] + table[2 * cells + j, i] * inverse
+        _modes(r, share, (rates, gain, feed, shape), floats, whole)
+        for m in range(modes):
+            out[SHAPE + m, i], out[start + m, i], out[start + modes + m, i] = shape[gap, m], 0.0, rates[m]
+            out[start + 2 * modes + m, i] = gain[m] * table[others + 1, i] if tones.size == 0 else 0.0
+            for x in range(n_leak):
+                out[by_mode + x * modes + m, i] = shape[leaks[x], m]
+                out[by_leak + m * n_leak + x, i] = feed[leaks[x], m] * moved[leaks[x]]
+        for x in range(1 + n_leak):
+            for w in range(n_wave):
+                out[by_wave + x * n_wave + w, i] = share[cells_seen[x]] * table[others + 1 + w, i]
+        for tone in range(tones.size):
+            sine, cosine = table[others + 1 + 2 * tone, i], table[others + 2 + 2 * tone, i]
+            turning = tones[tone] * table[others, i]
+            for m in range(modes):
+                # A tone's response in a mode is gain (rate - i omega) / (rate^2 + omega^2) of it. The mode starts at
+                # the rest beside it.
+                size = gain[m] / (rates[m] * rates[m] + turning * turning)
+                along, across = size * (rates[m] * sine + turning * cosine), size * (rates[m] * cosine - turning * sine)
+                out[start + m, i] -= across
+                for x in range(1 + n_leak):
+                    row = by_wave + x * n_wave + 2 * tone
+                    out[row, i] += shape[cells_seen[x], m] * along
+                    out[row + 1, i] += shape[cells_seen[x], m] * across

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_rows
+from fingerspice.base.compiled import borrow, jit, jit_rows, jit_within_rows
 
 
 @jit
@@ -83,7 +83,7 @@ def _shortest(rates: FloatArray, h: FloatArray, moments: FloatArray, marks: Mark
 
 
 @jit_rows
-def _double(moments: FloatArray, longer: FloatArray, marks: Marks) -> None:
+def double(moments: FloatArray, longer: FloatArray, marks: Marks) -> None:
     """Moments over twice the length of a step, shape (5, lanes): exp(-y), then those of `moment_integrals`."""
     for i in range(len(marks[5])):
         e, m0, m1, m2, m3 = moments[0, i], moments[1, i], moments[2, i], moments[3, i], moments[4, i]
@@ -94,21 +94,43 @@ def _double(moments: FloatArray, longer: FloatArray, marks: Marks) -> None:
         longer[4, i] = 0.0625 * (e * m3 + m0 + 3.0 * (m1 + m2) + m3)
 
 
+@jit
+def moments_over(rates: FloatArray, h: FloatArray, moments: FloatArray, other: FloatArray, marks: Marks) -> None:
+    """Moments of a mode of every lane over steps of length h (lanes,), s, as of `double`; `other` is overwritten."""
+    _shortest(rates, h, moments, marks)
+    for _ in range(_DOUBLED // 2):
+        double(moments, other, marks)
+        double(other, moments, marks)
+    for i in range(len(marks[5])):
+        y = rates[i] * h[i]
+        if y > _MOST:
+            moments[1, i], moments[2, i], moments[3, i], moments[4, i] = moment_integrals(y)
+            moments[0, i] = 1.0 - y * moments[1, i]
+
+
 @jit_rows
-def _weigh_rows(
-    powers: FloatArray, h: FloatArray, drive: FloatArray, moments: FloatArray, g: FloatArray, mode: int, marks: Marks
+def weigh_rows(
+    powers: FloatArray, by: FloatArray, moments: FloatArray, g: FloatArray, first: int, mode: int, marks: Marks
 ) -> None:  # fmt: skip
-    """Weights of a step of length h (lanes,) for one mode, from its moments and the polynomials of its kind, (7, 4)."""
+    """Weights of one mode from row `first` on: integrals of polynomials, given by powers (n, 4), times `by`."""
+    n_modes, lanes = len(marks[0]), len(marks[5])
+    for row in range(powers.shape[0]):
+        p0, p1, p2, p3 = powers[row, 0], powers[row, 1], powers[row, 2], powers[row, 3]
+        at = ((first + row) * n_modes + mode) * lanes
+        for i in range(lanes):
+            total = p0 * moments[1, i] + p1 * moments[2, i] + p2 * moments[3, i] + p3 * moments[4, i]
+            g[at + i] = by[i] * total
+
+
+@jit_rows
+def _weigh_linear(
+    drive: FloatArray, h: FloatArray, moments: FloatArray, g: FloatArray, mode: int, marks: Marks
+) -> None:
+    """Weights of one mode itself, and of a constant source."""
     n_modes, lanes = len(marks[0]), len(marks[5])
     for i in range(lanes):
         g[(DECAY * n_modes + mode) * lanes + i] = moments[0, i]
         g[(DRIVE * n_modes + mode) * lanes + i] = drive[i] * h[i] * moments[1, i]
-    for row in range(7):
-        p0, p1, p2, p3 = powers[row, 0], powers[row, 1], powers[row, 2], powers[row, 3]
-        at = ((PREDICT + row) * n_modes + mode) * lanes
-        for i in range(lanes):
-            total = p0 * moments[1, i] + p1 * moments[2, i] + p2 * moments[3, i] + p3 * moments[4, i]
-            g[at + i] = h[i] * total
 
 
 @jit
@@ -117,7 +139,7 @@ def weigh(
 ) -> None:  # fmt: skip
     """Weights of every lane for a step of length 0 and for the pieces, the first of steps of length `shortest` (s).
 
-    `rates` and `drive` have shape (n_mode, lanes); `scratch` (11, lanes) is overwritten.
+    `rates` and `drive` have every mode's (n_mode * lanes,); `scratch` (11, lanes) is overwritten.
     """
     m_all, lanes = len(marks[0]), len(marks[5])
     still, moving = g
@@ -126,21 +148,15 @@ def weigh(
     h = scratch[10]
     for m in range(m_all):
         now, longer = scratch[:5], scratch[5:10]
+        moments_over(rates[m * lanes : (m + 1) * lanes], shortest, now, longer, marks)
         for i in range(lanes):
             h[i] = shortest[i]
-        _shortest(rates[m], shortest, now, marks)
-        for _ in range(_DOUBLED):
-            _double(now, longer, marks)
-            now, longer = longer, now
-        for i in range(lanes):
-            y = rates[m, i] * h[i]
-            if y > _MOST:
-                now[1, i], now[2, i], now[3, i], now[4, i] = moment_integrals(y)
-                now[0, i] = 1.0 - y * now[1, i]
         for piece in range(moving.shape[0]):
             for step in range(3):
-                _weigh_rows(_POLYNOMIALS[_KINDS[min(piece, 1), step]], h, drive[m], now, moving[piece, step], m, marks)
-            _double(now, longer, marks)
+                _weigh_linear(drive[m * lanes : (m + 1) * lanes], h, now, moving[piece, step], m, marks)
+                powers = _POLYNOMIALS[_KINDS[min(piece, 1), step]]
+                weigh_rows(powers, h, now, moving[piece, step], PREDICT, m, marks)
+            double(now, longer, marks)
             now, longer = longer, now
             for i in range(lanes):
                 h[i] *= 2.0
@@ -166,8 +182,7 @@ shape (pieces, 3, n)."""
 SCALE, SHAPE = 0, 1
 # Rows of the weights, each for every mode: decay, drive; predictor's weights of the nonlinear term at this step and the
 # two before; corrector's weights at the next step, this one and the two before.
-DECAY, DRIVE, PREDICT, PREDICT_OLD, PREDICT_OLDER = 0, 1, 2, 3, 4
-CORRECT, CORRECT_NOW, CORRECT_OLD, CORRECT_OLDER, N_WEIGHTS = 5, 6, 7, 8, 9
+DECAY, DRIVE, PREDICT, CORRECT, CORRECT_NOW, N_WEIGHTS = 0, 1, 2, 5, 6, 9
 # Rows of the state for every mode: z, the nonlinear term now, one and two steps before, and two scratch rows of a step.
 Z, RATE, OLD, OLDER, KEPT, GUESS, N_STATE = 0, 1, 2, 3, 4, 5, 6
 # Rows of the state after those: gap voltage, its peak, then the integrands' latest values and their weighted sums, and
@@ -194,6 +209,40 @@ def n_state(m: int, k: int, moments: int) -> int:
     return N_STATE * m + VALUE + 2 * moments + k
 
 
+@jit_within_rows
+def rows_of(marks: Marks, own: int) -> tuple[int, int, int, int, int, int, int]:
+    """Rows of the constants: u by waves, leaks by waves and by modes, modes by leaks; of the state, behind `own` rows
+    for every mode: integrands, their sums, and the leaks' terms."""
+    m_all, w_all, l_all, count = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[4])
+    of_u = SHAPE + m_all
+    of_w = of_u + w_all
+    of_z = of_w + l_all * w_all
+    value = own * m_all + VALUE
+    return of_u, of_w, of_z, of_z + l_all * m_all, value, value + count, value + 2 * count
+
+
+@jit_within_rows
+def plus(
+    total: float, a: FloatArray, at: int, b: FloatArray, of: int, how: tuple[int, int], lanes: int, i: int
+) -> float:  # fmt: skip
+    """The total and the products of some rows of a, from row `at` on, and b; `how`: number and distance of rows."""
+    for j in range(how[0]):
+        total += a[(at + j * how[1]) * lanes + i] * b[(of + j * how[1]) * lanes + i]
+    return total
+
+
+@jit_within_rows
+def area_change(u: float, c: FloatArray, marks: Marks, i: int) -> float:
+    """1/A, less its value in the middle of the voltages, which the linear part of the equations has."""
+    d_all, lanes = len(marks[3]) - 1, len(marks[5])
+    area = area_row(len(marks[0]), len(marks[1]), len(marks[2]))
+    v: float = abs(u) * c[SCALE * lanes + i] - 1.0
+    q: float = c[area * lanes + i]
+    for d in range(1, d_all):
+        q = q * v + c[(area + d) * lanes + i]
+    return q * v
+
+
 @jit_rows
 def _step(
     c: FloatArray, g: FloatArray, s: FloatArray, source: FloatArray, before: float, weight: float, marks: Marks,
@@ -202,53 +251,36 @@ def _step(
 
     `source` holds the waves at the end of the step, and `before` the first of them at its start.
     """
-    modes, waves, leaks, powers, moments, scenes = marks
-    m_all, w_all, l_all, d_all, count = len(modes), len(waves), len(leaks), len(powers) - 1, len(moments)
-    lanes = len(scenes)
-    of_u = SHAPE + m_all
-    of_w = of_u + w_all
-    of_z = of_w + l_all * w_all
-    of_leak = of_z + l_all * m_all
-    area = of_leak + m_all * l_all
-    own = N_STATE * m_all
-    value, total = own + VALUE, own + VALUE + count
-    current = total + count
+    m_all, w_all, l_all, count, lanes = len(marks[0]), len(marks[1]), len(marks[2]), len(marks[4]), len(marks[5])
+    c, g, s = borrow(c), borrow(g), borrow(s)
+    own, held = N_STATE * m_all, area_row(m_all, w_all, l_all) + len(marks[3]) - 1
+    of_u, of_w, of_z, of_leak, value, total, current = rows_of(marks, N_STATE)
     for i in range(lanes):
-        wave = c[of_u * lanes + i] * source[0]
-        for w in range(1, w_all):
+        wave = 0.0
+        for w in range(w_all):
             wave += c[(of_u + w) * lanes + i] * source[w]
         u = wave
         for m in range(m_all):
             kept = g[(DECAY * m_all + m) * lanes + i] * s[(Z * m_all + m) * lanes + i]
             kept += g[(DRIVE * m_all + m) * lanes + i] * before
-            guess = kept + g[(PREDICT * m_all + m) * lanes + i] * s[(RATE * m_all + m) * lanes + i]
-            guess += g[(PREDICT_OLD * m_all + m) * lanes + i] * s[(OLD * m_all + m) * lanes + i]
-            guess += g[(PREDICT_OLDER * m_all + m) * lanes + i] * s[(OLDER * m_all + m) * lanes + i]
             s[(KEPT * m_all + m) * lanes + i] = kept
+            # By the nonlinear term at this step and the two before
+            guess = plus(kept, g, PREDICT * m_all + m, s, RATE * m_all + m, (3, m_all), lanes, i)
             s[(GUESS * m_all + m) * lanes + i] = guess
             u += c[(SHAPE + m) * lanes + i] * guess
-        v = abs(u) * c[SCALE * lanes + i] - 1.0
-        q = c[area * lanes + i]
-        for d in range(1, d_all):
-            q = q * v + c[(area + d) * lanes + i]
-        q *= v
+        q = area_change(u, c, marks, i)
         for k in range(l_all):
-            change = c[(of_w + k * w_all) * lanes + i] * source[0]
-            for w in range(1, w_all):
+            change = 0.0
+            for w in range(w_all):
                 change += c[(of_w + k * w_all + w) * lanes + i] * source[w]
-            for m in range(m_all):
-                change += c[(of_z + k * m_all + m) * lanes + i] * s[(GUESS * m_all + m) * lanes + i]
+            change = plus(change, c, of_z + k * m_all, s, GUESS * m_all, (m_all, 1), lanes, i)
             s[(current + k) * lanes + i] = q * change
         u = wave
         for m in range(m_all):
-            rate = c[(of_leak + m * l_all) * lanes + i] * s[current * lanes + i]
-            for k in range(1, l_all):
-                rate += c[(of_leak + m * l_all + k) * lanes + i] * s[(current + k) * lanes + i]
+            rate = plus(0.0, c, of_leak + m * l_all, s, current, (l_all, 1), lanes, i)
             now, old = s[(RATE * m_all + m) * lanes + i], s[(OLD * m_all + m) * lanes + i]
             z = s[(KEPT * m_all + m) * lanes + i] + g[(CORRECT * m_all + m) * lanes + i] * rate
-            z += g[(CORRECT_NOW * m_all + m) * lanes + i] * now
-            z += g[(CORRECT_OLD * m_all + m) * lanes + i] * old
-            z += g[(CORRECT_OLDER * m_all + m) * lanes + i] * s[(OLDER * m_all + m) * lanes + i]
+            z = plus(z, g, CORRECT_NOW * m_all + m, s, RATE * m_all + m, (3, m_all), lanes, i)
             s[(Z * m_all + m) * lanes + i] = z
             s[(OLDER * m_all + m) * lanes + i] = old
             s[(OLD * m_all + m) * lanes + i] = now
@@ -256,8 +288,7 @@ def _step(
             u += c[(SHAPE + m) * lanes + i] * z
         s[(own + GAP) * lanes + i] = u
         s[(own + PEAK) * lanes + i] = max(s[(own + PEAK) * lanes + i], abs(u))
-        a = 1.0 / (q + c[(area + d_all) * lanes + i])
-        force = u * u * a
+        force = u * u * (1.0 / (q + c[held * lanes + i]))
         s[value * lanes + i] = force
         s[total * lanes + i] += weight * force
         if count > 1:

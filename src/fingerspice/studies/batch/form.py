@@ -8,23 +8,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import chebyshev as powers
 from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.base.arrays import FloatArray, IntArray, positive_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import Value
-from fingerspice.circuit.statespace import Stack, build_stack, is_stack
+from fingerspice.circuit.statespace import Stack, build_stack, contact_with, is_stack
 from fingerspice.circuit.topology import driving_sources
-from fingerspice.engine.lockstep.scenes import CELL_ROWS, LARGEST_X, N_OTHERS
-from fingerspice.numerics import chebyshev
-from fingerspice.physics.contact import universal_curve_array
-from fingerspice.physics.materials import EPS0
+from fingerspice.engine.lockstep.scenes import CELL_ROWS
+from fingerspice.physics.contact import N_PACKED
 from fingerspice.results.sensitivity import MEANS
 from fingerspice.solve.simulation import rtol_given
 from fingerspice.waveforms.combinations import AM, Sum
@@ -261,7 +258,6 @@ def _turns(circuit: Circuit, path: str) -> bool:
     return own is not None and other is not None and own.tone() != other.tone()
 
 
-Curves = tuple[FloatArray, FloatArray, FloatArray]
 # Parameters that must be equal in all scenes of a lockstep, because the form of the equations depends on them.
 _FORM = ("m_exp", "n_exp", "a_fix", "tau")
 # Most layers and most tones of a lockstep: code is compiled for each number of cells and of tones.
@@ -269,8 +265,6 @@ _MOST_LAYERS, _MOST_TONES = 4, 4
 _LAYERS = ("LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP")
 # Largest ratio of a tone's frequency to that of the whole source.
 _MOST_PERIODS = 2000
-# Numbers of points tried for the universal curve's Chebyshev series, and the relative error allowed.
-_CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
 # Smallest rtol at which derivatives are taken in lockstep: below it their kinks would take too many steps.
 _LEAST_RTOL_OF_SLOPES = 5e-7
 _Figure = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
@@ -318,11 +312,12 @@ class LockstepForm:
         return self.stack.c.size
 
     @cached_property
-    def places(self) -> tuple[int, IntArray]:
-        """Index of the gap among the cells, and those of the cells whose leak has a total resistance."""
+    def places(self) -> tuple[int, int, IntArray]:
+        """Number of cells, index of the gap among them, and those of the cells whose leak has a total resistance."""
         assert self.stack.gap is not None
-        of_cells = [self.stack.layers[self.stack.layer_of[i]].device for i in range(self.cells)]
-        return self.stack.gap, np.array([i for i, device in enumerate(of_cells) if device in ("LAYER", "GAP")])
+        of_cells = [self.stack.layers[i].device for i in self.stack.layer_of]
+        leaks = np.array([i for i, device in enumerate(of_cells) if device in ("LAYER", "GAP")])
+        return self.cells, self.stack.gap, leaks
 
 
 def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str:
@@ -462,8 +457,9 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
         return {**element.values, **given}
 
     n = next(iter(scenes.values())).size
-    out = np.empty((CELL_ROWS * form.cells + N_OTHERS + 2 * len(form.multiples), n))
-    of_cells, cell = out[: CELL_ROWS * form.cells].reshape(CELL_ROWS, form.cells, n), 0
+    others = CELL_ROWS * form.cells
+    out = np.empty((others + N_PACKED + 1 + 2 * len(form.multiples), n))
+    of_cells, cell = out[:others].reshape(CELL_ROWS, form.cells, n), 0
     for layer, count in zip(form.stack.layers, form.stack.cells, strict=True):
         assert layer.spec.cells is not None
         cells = layer.spec.cells(values(layer), None)
@@ -472,50 +468,16 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
     first = form.sources[0][0]
     period = first.waveform.period if first.waveform is not None else None
     frequency = form.frequency or values(first).get("frequency", 1.0 / (period or math.nan))
-    rows = [*_contact_rows(values(form.gap)), 2.0 * np.pi * np.asarray(frequency)]
+    rows = [*contact_with(values(form.gap)).packed, 2.0 * np.pi * np.asarray(frequency)]
     for element, sign in form.sources:
         recorded = None if form.recording is None else [(peak_of(form.recording), 0.0)]
         for amplitude, phase in recorded or _tones_of(element.waveform, values(element)):
             rows += [sign * amplitude * np.cos(phase), sign * amplitude * np.sin(phase)]
     for i, row in enumerate(rows):
-        out[CELL_ROWS * form.cells + i] = row
+        out[others + i] = row
     return out
 
 
 def peak_of(recording: Samples) -> float:
     """Largest sample, V; 1 V if all are 0."""
     return float(np.abs(recording.values).max()) or 1.0
-
-
-def _contact_rows(v: Mapping[str, Value]) -> tuple[Value, ...]:
-    """As `Contact.packed`, for arrays of values: X at 1 V, A0, stress at 1 V, load, c2 mu^2."""
-    m, n, f_n, d = v["m_exp"], v["n_exp"], np.asarray(v["fn"]), v["d"]
-    p = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
-    alpha, beta = np.asarray(v["alpha"]) * 1e-6, np.asarray(v["beta"]) * 1e-6 * 1e3**n
-    area = alpha * f_n**m
-    per_volt = EPS0 * v["eps_r"] / d
-    xi = np.sqrt(per_volt * (n * n / (n - m)) * beta ** (1.0 / n) * alpha ** (-1.0 / m)) * area**p / f_n
-    return xi, area, 0.5 * per_volt / d, f_n, v["c2"] * 1e-12 * np.asarray(v["mu"]) ** 2
-
-
-@lru_cache(maxsize=32)
-def curves_of(m: float, n: float, degree: int) -> Curves | None:
-    """Power series of the universal curve of two exponents, Chebyshev nodes and matrix of a degree, as for `march`.
-
-    None if no series of the allowed sizes reaches the error allowed.
-    """
-    p = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
-
-    def curve(x: FloatArray) -> FloatArray:
-        return universal_curve_array(x, 1.0 / m, p)
-
-    series = chebyshev.fit(curve, 0.0, LARGEST_X, _CURVE_ERROR, _CURVE_SIZES)
-    if series is None:
-        return None
-    at = chebyshev.nodes(degree + 1, -1.0, 1.0)
-    to_series = chebyshev.coefficients(np.eye(degree + 1))
-    to_powers = np.zeros((degree + 1, degree + 1))
-    for k in range(degree + 1):
-        to_powers[: k + 1, k] = powers.cheb2poly(np.eye(degree + 1)[k, : k + 1])
-    highest_first = np.ascontiguousarray((to_powers @ to_series)[::-1])
-    return np.ascontiguousarray(powers.cheb2poly(series)[::-1]), at, highest_first

@@ -13,11 +13,12 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
 from fingerspice.engine.lockstep.card import march_on_card
-from fingerspice.engine.lockstep.march import N_PORTION, march, march_samples
-from fingerspice.engine.lockstep.scenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
+from fingerspice.engine.lockstep.march import N_PORTION, march, march_samples, new_block
+from fingerspice.engine.lockstep.scenes import CELL_ROWS, constants_of
 from fingerspice.engine.lockstep.step import ALL_MOMENTS, START_TIMES, marks_of
 from fingerspice.numerics.modes import STEP
-from fingerspice.studies.batch.form import FIGURES, LOCKSTEP, Answers, LockstepForm, Task, curves_of, peak_of, table_of
+from fingerspice.physics.contact import N_PACKED
+from fingerspice.studies.batch.form import FIGURES, LOCKSTEP, Answers, LockstepForm, Task, peak_of, table_of
 
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
 # and (of the highest) under several; and initial degree of the area's polynomial, of which each takes the compiler 8 s.
@@ -106,13 +107,15 @@ class Ladder(ABC):
     def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
         """Put what is wanted of the scenes that are `good` among `pending` into the answers."""
 
+    @property
+    def contacts(self) -> FloatArray:
+        """The table's rows of the contacts, packed as in `physics.contact`."""
+        return self.table[CELL_ROWS * self.form.cells :][:N_PACKED]
+
     def figure(self, name: str, moments: FloatArray, columns: IntArray) -> FloatArray:
         """An output of some columns of the table, from their moments."""
-        others, gap = self.table[CELL_ROWS * self.form.cells :], self.form.gap
-        mu = self.scenes.get(f"{gap.name.lower()}.mu")
-        friction = np.full(columns.size, gap.values["mu"]) if mu is None else mu[columns]
-        of_moments = FIGURES[name.removesuffix("_periodic")][1]
-        return of_moments(moments, others[LOAD, columns], others[STRESS, columns], friction)
+        stress, load, friction = self.contacts[4:7, columns]
+        return FIGURES[name.removesuffix("_periodic")][1](moments, load, stress, friction)
 
     def columns(self, some: IntArray) -> IntArray:
         """Places of all copies of some scenes in the table."""
@@ -180,12 +183,13 @@ class Ladder(ABC):
     def _look(self) -> None:
         """Find what the scenes need of their steps, each of shape (n,)."""
         form, table, periodic = self.form, self.table, self.task.periodic
-        cells, others = form.cells, CELL_ROWS * form.cells
+        cells, waves = form.cells, table[CELL_ROWS * form.cells + N_PACKED + 1 :]
+        _, rest, _, _, _, load, _, loss = self.contacts
         # Whether there is contact
-        self.possible = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
+        self.possible = rest**2 > loss * load**2
         # Leakage rate of every cell with its area at rest; the largest is an upper bound of the rates of the modes.
-        leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
-        rates = leaks / (table[:cells] * table[others + OMEGA])
+        leaks = table[cells : 2 * cells] / rest + table[2 * cells : 3 * cells]
+        rates = leaks / (table[:cells] * table[CELL_ROWS * cells + N_PACKED])
         # Smallest leakage rate, in periods over 2 pi; and half a period in time constants of the fastest cell
         self.slowest, self.decays = rates.min(axis=0), np.max(rates, axis=0) * np.pi
         self.pieces = np.zeros(table.shape[1], int)  # As in `Level`
@@ -198,7 +202,7 @@ class Ladder(ABC):
         elif form.recording is not None and not periodic:
             first = 0.5 * (form.recording.between(0, 1)[0] != 0.0)
         elif not periodic:
-            sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
+            sines, cosines = waves[::2], waves[1::2]
             from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
             first = np.where(from_zero, START_TIMES[1] if self.task.rtol < _LEADING else 0.0, 1.0)
         # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
@@ -207,29 +211,28 @@ class Ladder(ABC):
     def _run(self, level: Level, columns: IntArray, before: Run | None) -> Run | None:
         """Integrate columns of the table, for half the steps, too, where `before` has no results; None: no curve."""
         task, form, halves, steps = self.task, self.form, level.halves, level.steps
-        curves = curves_of(form.gap.values["m_exp"], form.gap.values["n_exp"], level.degree)
-        if curves is None:
+        tones = None if form.jumping or form.recording is not None else np.array(form.multiples, float)
+        scenes = constants_of(self.table[:, columns], form.places, tones, level.covered, level.degree)
+        if scenes is None:
             return None
         sizes = steps // 2 if before is None else 0, steps
         waves = _waves(sizes[0], form), _waves(sizes[1], form)
         widths = [halves * n // 2 if self.task.traced else 0 for n in sizes]
         traces = np.empty((columns.size, widths[0])), np.empty((columns.size, widths[1]))
-        lengths = form.cells - 1, waves[1].shape[1], form.places[1].size, level.degree + 1, self.n_moment
-        marks, scenes = marks_of(*lengths), (self.table, columns, form.places, curves)
-        block = new_block(self.table.shape[0], level.pieces, marks)
+        lengths = form.cells - 1, waves[1].shape[1], form.places[2].size, level.degree + 1, self.n_moment
+        marks = marks_of(*lengths)
         if form.recording is not None:
             out = np.empty((2, (1 + N_PORTION) * self.n_moment + 3, columns.size))
             values = form.recording.between(0, halves + 1) / peak_of(form.recording)
-            march_samples(scenes, values, (sizes, level.covered), block, out, marks)
+            march_samples(scenes, values, sizes, out, marks)
         else:
-            source = np.array(form.multiples, float), waves
             tol = (_CLOSING if task.periodic else _SETTLED) * (task.rtol * self.closer)
-            how = halves, steps // 2, level.pieces, task.periodic, tol, level.covered
+            how = halves, steps // 2, level.pieces, task.periodic, tol
             if task.device == "cuda":
-                out = march_on_card(scenes, source, how, _MOST_PIECES if form.jumping else 0, lengths)
+                out = march_on_card(scenes, waves, how, _MOST_PIECES if form.jumping else 0, lengths)
             else:
                 out = np.empty((2, 2 * self.n_moment + 3, columns.size))
-                march(scenes, source, how, block, out, traces, marks)
+                march(scenes, waves, how, new_block(level.pieces, marks), out, traces, marks)
         if before is None:
             return Run(out[0], out[1], traces[0], traces[1])
         return Run(before.fine, out[1], before.trace, traces[1])
