@@ -307,7 +307,7 @@ def engine_charge(
     z = np.array([[step.charge(x, 0.0) for x in POINTS]])
     control, collected = np.zeros(1, readout.CONTROL)[0], np.array([[before], [0.0]])
     form = form_of(step)
-    work = blocks.new_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
+    work = blocks.new_network_work(len(places), len(places), form.c.size, form.cell.size, 1, 1)
     work.places[:], work.off[:, : len(places)] = places, missed
     many_charge.charge_error(
         form, work, H, step.lost[None, :], step.g, theta, np.ascontiguousarray(u), areas, z, collected, control

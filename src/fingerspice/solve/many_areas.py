@@ -16,10 +16,10 @@ from fingerspice.circuit.network import network_modes
 from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.exponential import new_tables
 from fingerspice.engine.collocation.loop import Looks, no_looks
-from fingerspice.engine.many_areas.form import REFERRED, Form, new_work
-from fingerspice.engine.many_areas.step import LEVEL_RATIO, ManyAreas, References
+from fingerspice.engine.many_areas.form import REFERRED, Form, new_network_work
+from fingerspice.engine.many_areas.step import ManyAreas, References
 from fingerspice.engine.network import Sources
-from fingerspice.engine.one_area.system import area_error, area_missed, area_polynomials
+from fingerspice.engine.one_area.system import LEVEL_RATIO, area_error, area_missed, area_polynomials
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.results.outcome import Status
 from fingerspice.solve.problem import Problem, ramp
@@ -209,7 +209,7 @@ class March(Stepping):
         self.references = known_references(scene, self.decade)
         self.form = self.references.form()
         cells = self.form.c.size
-        self.work = new_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
+        self.work = new_network_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
         scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
         self.look_for_period(self.form.rates, scale, repeat)
 

@@ -15,7 +15,7 @@ from fingerspice.engine.collocation.exponential import forget, new_tables
 from fingerspice.engine.collocation.step_control import end_row
 from fingerspice.engine.network import Sources, source
 from fingerspice.engine.one_area.model import Model, dot, gap_voltage, write_row_at
-from fingerspice.engine.one_area.rows import Work, new_work
+from fingerspice.engine.one_area.rows import Work, new_stack_work
 from fingerspice.engine.one_area.step import OneArea
 from fingerspice.engine.one_area.system import LEVEL_RATIO, System, area_error, area_missed, area_range, build_system
 from fingerspice.numerics.lobatto import integral_table
@@ -49,7 +49,7 @@ class _Scratch(threading.local):
         """Tables and arrays for the next call of a compiled loop: another system's run may use them after that."""
         n = system.model.gap.size
         if n not in self.by_size:
-            self.by_size[n] = new_tables(n), new_work(n)
+            self.by_size[n] = new_tables(n), new_stack_work(n)
         if self.system.get(n) is not system:
             self.system[n] = system
             forget(self.by_size[n][0])

@@ -168,7 +168,7 @@ class Work(NamedTuple):
     jump: Jump
 
 
-def new_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: int) -> Work:
+def new_network_work(n: int, modes: int, cells: int, areas: int, sources: int, columns: int) -> Work:
     """Work arrays for so many live voltages, modes, cells whose area moves, areas, sources and output columns."""
     z, whole = np.zeros, np.int64
     leaks = Leaks(z(modes), z((modes, sources)), z(cells), z(areas), z((sources, n)), z((sources, sources)))

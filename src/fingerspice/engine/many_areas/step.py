@@ -75,12 +75,13 @@ from fingerspice.engine.many_areas.form import (
     source_rows,
 )
 from fingerspice.engine.network import Sources, at_sources
+from fingerspice.engine.one_area.system import LEVEL_RATIO
 from fingerspice.numerics.lobatto import END, NODES, POINTS
 from fingerspice.numerics.modes import copy_to
 from fingerspice.physics.contact import inverse_area
 
-# Ratio of neighbouring reference areas, and the ratio of an area to its reference beyond which another one is taken.
-LEVEL_RATIO, FARTHEST = 1.28, 1.2
+# Ratio of an area to its reference beyond which another one is taken.
+FARTHEST = 1.2
 
 
 class References(NamedTuple):

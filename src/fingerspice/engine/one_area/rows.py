@@ -55,7 +55,7 @@ class Work(NamedTuple):
     spare_r: FloatArray
 
 
-def new_work(n: int) -> Work:
+def new_stack_work(n: int) -> Work:
     """Work arrays for n modes."""
     rows, flat, columns = (n, ROWS), (N_FLAT, ROWS), (n + 2, ROWS)
     shapes: tuple[Any, ...] = (
