@@ -16,7 +16,7 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 from fingerspice.numerics.lobatto import NODES
-from fingerspice.solve.one_area import Track
+from fingerspice.solve.collocation import Track
 from fingerspice.solve.problem import Tables, prepare
 from fingerspice.solve.runs import integrate
 from scenes import table1

@@ -25,7 +25,7 @@ from fingerspice.engine.one_area.model import branch_area, dot, follow, ramp, so
 from fingerspice.numerics import linear
 from fingerspice.results.outcome import Failure, SolveError, State, Status, last_tried
 from fingerspice.results.record import Record
-from fingerspice.solve.marching import solve as solve_marching
+from fingerspice.solve.collocation import solve as solve_by_steps
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, segment_of
 from fingerspice.solve.runs import PAST_FOLD, Run, closed_form, gap_signals
 from fingerspice.solve.scenes import kept_with
@@ -248,7 +248,7 @@ class _LostError(Exception):
 
 def run_to_fold(problem: Problem) -> Run | None:
     """A run under the `mobile` law up to the fold that it reaches or jumps past; None where it reaches no fold."""
-    run = solve_marching(problem, FINEST_RTOL, repeat=False)
+    run = solve_by_steps(problem, FINEST_RTOL, repeat=False)
     run.gaps[:, 2:] *= SAFETY
     jumped = run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size > 0
     if not jumped and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
@@ -290,7 +290,7 @@ def meets_fold(problem: Problem, rtol: float) -> bool:
 
     A run that stops near a fold and does not reach it counts as a run without a fold: its later course is not examined.
     """
-    run = solve_marching(problem, rtol)
+    run = solve_by_steps(problem, rtol)
     if run.status is Status.SUCCESS:
         return False
     if run.status is not Status.FOLD:

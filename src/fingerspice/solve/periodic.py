@@ -28,10 +28,8 @@ from fingerspice.engine.collocation import readout
 from fingerspice.numerics import linear
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import SolveError, State, Status
-from fingerspice.solve.many_areas import March
-from fingerspice.solve.marching import GUESS, stepping
+from fingerspice.solve.collocation import GUESS, March, Track, stepping
 from fingerspice.solve.nodal import pass_through
-from fingerspice.solve.one_area import Track
 from fingerspice.solve.problem import Problem, joined
 from fingerspice.solve.runs import period_failure
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError

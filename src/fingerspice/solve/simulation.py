@@ -20,8 +20,8 @@ from fingerspice.results.outcome import Plan, SolveError, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.closed_form import lead_to_fold, run_to_fold, solve_algebraic, solve_linear
+from fingerspice.solve.collocation import solve as solve_exponential
 from fingerspice.solve.derivatives import check_request, sensitivities_of
-from fingerspice.solve.marching import solve as solve_exponential
 from fingerspice.solve.nodal import solve_coupled, solve_foreign
 from fingerspice.solve.planning import asked, make_plan, run_warnings
 from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare

@@ -53,7 +53,7 @@ from fingerspice.engine.one_area.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
-from fingerspice.solve.one_area import as_recorded, on_branch, system_of
+from fingerspice.solve.collocation import as_recorded, on_branch, system_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK, Scene
 from fingerspice.solve.starting import StackState, from_stack

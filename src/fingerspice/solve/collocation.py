@@ -1,0 +1,520 @@
+"""Integration of stacks and networks by exponential steps, with smaller tolerances until the stated error is met.
+
+`Track` and `March` are one integration of a stack and of a network, as `engine.collocation.loop` takes it. A network
+has its modes at reference areas; a run whose areas change by much goes from one reference to another, so that the areas
+stay near those of the modes.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import Any, Literal
+
+import numpy as np
+
+from fingerspice.base.arrays import FloatArray, IntArray, views_of
+from fingerspice.circuit.network import network_modes
+from fingerspice.engine.collocation import readout
+from fingerspice.engine.collocation.exponential import Tables as StepTables
+from fingerspice.engine.collocation.exponential import forget, new_tables
+from fingerspice.engine.collocation.loop import Looks, no_looks
+from fingerspice.engine.collocation.step_control import end_row
+from fingerspice.engine.many_areas.form import REFERRED, Form, new_network_work
+from fingerspice.engine.many_areas.step import ManyAreas, References
+from fingerspice.engine.network import Sources, source
+from fingerspice.engine.one_area.model import Model, dot, gap_voltage, write_row_at
+from fingerspice.engine.one_area.rows import Work, new_stack_work
+from fingerspice.engine.one_area.step import OneArea
+from fingerspice.engine.one_area.system import (
+    LEVEL_RATIO,
+    System,
+    area_error,
+    area_missed,
+    area_polynomials,
+    area_range,
+    build_system,
+)
+from fingerspice.numerics.lobatto import integral_table
+from fingerspice.physics.contact import inverse_areas
+from fingerspice.results.outcome import State, Status
+from fingerspice.results.record import sided
+from fingerspice.solve.problem import Problem, Tables, ramp, segment_of
+from fingerspice.solve.runs import Progress, Run, integrate
+from fingerspice.solve.scenes import Scene, kept_with
+from fingerspice.solve.starting import StackState, as_marched, from_stack, from_written, model_of, row_width, to_stack
+from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
+
+# Number of modal systems cached with a scene, one for each decade of tolerances, of up to 1 MB each.
+MOST_SYSTEMS = 16
+# Stated error of the charge over the estimate. It comes from a stack whose layers all leak fast: compared with a
+# reference, the errors of gap voltage and charge were 1.5 times the estimates, because they peak between the points of
+# the estimate; and from scene 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
+CHARGE_SAFETY = 1.75
+
+
+class _Scratch(threading.local):
+    """The present thread's step tables and scratch arrays by number of modes, and the systems that the tables are of.
+
+    Fresh arrays would cost a changed circuit some 50 us of its set-up, as the memory has to be mapped anew.
+    """
+
+    def __init__(self) -> None:
+        self.by_size: dict[int, tuple[StepTables, Work]] = {}
+        self.system: dict[int, System] = {}
+
+    def of(self, system: System) -> tuple[StepTables, Work]:
+        """Tables and arrays for the next call of a compiled loop: another system's run may use them after that."""
+        n = system.model.gap.size
+        if n not in self.by_size:
+            self.by_size[n] = new_tables(n), new_stack_work(n)
+        if self.system.get(n) is not system:
+            self.system[n] = system
+            forget(self.by_size[n][0])
+        return self.by_size[n]
+
+
+SCRATCH = _Scratch()
+
+
+def _prepared(scene: Scene, rtol: float, u_top: float) -> tuple[System, float]:
+    """The modal system of a scene, made on first use, and the relative error of its area's polynomial."""
+    # The cache distinguishes tolerances by their decade, so that similar runs share a system.
+    decade = int(np.floor(np.log10(rtol)))
+
+    def make() -> tuple[System, float]:
+        system = system_of(scene, decade, u_top)
+        return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
+
+    return kept_with(scene.prepared, ("system", decade, u_top), MOST_SYSTEMS, make)
+
+
+def system_of(
+    scene: Scene, decade: int, u_top: float = 0.0, ratio: float = LEVEL_RATIO, u_peak: float = 0.0
+) -> System:  # fmt: skip
+    """The modal system of a scene for tolerances of a decade, with neighbouring reference areas in at most `ratio`.
+
+    The area curve reaches `u_top` (V) and the reference areas `u_peak` (V) if these are above 0.
+    """
+    model, (contact,) = model_of(scene), scene.network.contacts
+    assert scene.stack is not None
+    if u_top > 0.0:
+        assert contact is not None
+        model = model._replace(curve=contact.curve(u_top))
+    stress = 0.0 if contact is None else float(contact.stress(1.0))
+    u_max, n = u_peak or max(scene.u_peak, u_top), model.gap.size
+    nodes = scene.network.nodes[:, : n + 1] * np.append(scene.turn, 1.0)
+    u_range = area_range(model, u_max)
+    return build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress, ratio)
+
+
+class Track(Stepping):
+    """One integration in progress, with an error of the gap voltage of at most `tol` (V) in every step.
+
+    The area's curve reaches `top` (V) if that is above 0. The loop's state is that of `engine.one_area.model`; `state`
+    and the outputs have the form used for all circuits.
+    """
+
+    def __init__(
+        self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True, h_fixed: float = 0.0
+    ) -> None:
+        scene = problem.scene
+        self.system, self.area_error = _prepared(scene, rtol, top)
+        model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
+        self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
+        # Of the layer through which the charge is computed.
+        self.capacitance = float(model.slow[-3]) * model.area0
+        super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown, h_fixed)
+        self.error = np.zeros(n + 1)
+        self.control["branch_length"] = np.inf
+        self.control["margin"] = 1.0
+        self._start_from(problem.inner)
+        self.look_for_period(self.system.rates, np.ones(n), repeat and h_fixed == 0.0)
+
+    def _start_from(self, start: StackState) -> None:
+        self.start, self.y[:], self.control["u_before"] = start, start.y, start.u_before
+        if self.system.model.mobile and self.sign[0] != 0.0:
+            self.control["u_gap"], self.control["sign"] = start.u_gap, math.copysign(1.0, start.u_gap)
+
+    def again(self, initial: State, tol: float) -> None:
+        super().again(initial, tol)
+        self._start_from(to_stack(self.problem.scene, initial))
+
+    @property
+    def rounding(self) -> list[float]:
+        # Of the nodes, the peak is that of the gap.
+        peak, size = float(self.peaks[0, readout.PEAK_U]), self.problem.scene.u_size
+        return [4e-16 * (peak + self.system.model.k_gap * size), 4e-16 * (peak + size)]
+
+    def circuit(self, sources: Sources) -> OneArea:
+        return OneArea(self.system, *SCRATCH.of(self.system), integral_table(), sources)
+
+    def _failed(self, code: int, sources: Sources) -> Status:
+        if code == readout.OUT_OF_RANGE:
+            raise OutOfRangeError(self.system.u_top)
+        if self.t > sources.edges[0]:
+            # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
+            self.control["u_before"], _ = source(*segment_of(sources, self.t, "left"))
+        return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
+
+    def state(self) -> State:
+        c = self.control
+        found = StackState(self.t, self.y.copy(), float(c["u_before"]), float(c["u_gap"]), self.start.offset)
+        return from_stack(self.problem.scene, on_branch(self.system.model, found, float(c["sign"])))
+
+    def written(self) -> FloatArray:
+        n_out = int(self.counters[readout.OUTPUT])
+        model = self.system.model
+        wanted = self.pace.charge and model.mobile
+        u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out]) if wanted else np.empty(0)
+        return as_recorded(self.problem, model, self.out[:, :n_out].T, u)
+
+    def finish(self, sources: Sources, after: Sources | None) -> None:
+        first = int(self.counters[readout.OUTPUT])
+        row = np.empty(row_width(self.problem.scene))
+        segment, tau = segment_of(after or sources, self.problem.t_stop, "right")
+        model = self.system.model
+        # `end_row` applies a jump at the end to these copies, so that the final state remains the left-hand one.
+        end_row(model, segment, tau, self.pace.charge, self.y.copy(), self.controls.copy(), row)
+        self.out[:, first:] = as_marched(self.problem.scene, row[None, :])[0, : len(self.out), None]
+        self.counters[readout.OUTPUT] = self.t_out.size
+
+    def row(self, sources: Sources, side: Literal["left", "right"]) -> FloatArray:
+        # This model's area curve may reach higher voltages than the curve of the scene's model.
+        model, c = self.system.model, self.control
+        segment, tau = segment_of(sources, self.t, side)
+        row = np.empty(row_width(self.problem.scene))
+        u, du = source(segment, tau)
+        found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c["sign"], c["u_gap"])
+        # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
+        write_row_at(model, u, du, self.y, c["sign"], found if found == found else c["u_gap"], row)
+        return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
+
+
+def on_branch(model: Model, state: StackState, sign: float) -> StackState:
+    """The state with its gap voltage computed anew from the area equation, on the branch with this sign."""
+    if not model.mobile:
+        return state
+    x_gap = dot(model.gap, state.y)
+    found = float(gap_voltage(model, model.k_gap * state.u_before, x_gap, sign or 1.0, state.u_gap))
+    # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
+    return state if found != found else state._replace(u_gap=found)
+
+
+def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray) -> FloatArray:
+    """Convert rows of the compiled loops to rows of `Record`, in place; `mobile` needs the source u (V) for charge."""
+    shown = problem.scene.shown
+    n = int(shown.turn.size)
+    rows[:, :n] *= shown.turn
+    if problem.charge and model.mobile:
+        (cell,), network = shown.measured, shown.network
+        u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
+        rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - problem.inner.offset
+    return rows
+
+
+def scale_of(problem: Problem, peak: float) -> float:
+    """Largest gap voltage to expect under a source with this peak, V."""
+    start = problem.inner
+    share = peak * model_of(problem.scene).k_gap if np.isfinite(peak) else 0.0
+    return max(share, float(np.abs(start.y[:-1]).max(initial=0.0))) or 1.0
+
+
+# Number of sets of references cached with a scene: one for each thread and decade of tolerances.
+MOST_SETS = 16
+# Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
+MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
+# Number of references cached with the network, for runs with other sources.
+MOST_KEPT = 16
+
+
+class Known:
+    """The references of a scene that one thread has needed so far, and the step tables for them.
+
+    The first has the areas at 0 V. The scene, with which this is cached, is not an attribute: two objects that hold
+    each other are freed by garbage collection only.
+    """
+
+    def __init__(self, scene: Scene, decade: int) -> None:
+        numbers, magnified, self.shapes = _referred(scene, scene.area0)
+        n_area = scene.area0.size
+        counts = np.zeros(1, np.int64), np.zeros(n_area, np.int64)
+        self.arrays = References(np.zeros((2, n_area), np.int64), np.zeros((2, numbers.size)), *counts)
+        self.tables = new_tables(self.shapes[0][0])
+        # (n_area + 1,): Round-off of each gap's voltage, and last of the nodes' voltages, relative to the rounding of
+        # the largest voltage; the maximum over all references
+        self.magnified = np.zeros(magnified.size)
+        self.fixed = _fixed(scene, decade)  # The fields of a `Form` that are the same for all references
+        self.add(scene, (0,) * n_area)
+
+    @property
+    def count(self) -> int:
+        return int(self.arrays.used[0])
+
+    def add(self, scene: Scene, levels: tuple[int, ...]) -> None:
+        """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
+        arrays, one = self.arrays, self.count
+        if one == len(arrays.levels):
+            more = np.zeros_like(arrays.levels), np.zeros_like(arrays.numbers)
+            self.arrays = arrays = arrays._replace(
+                levels=np.vstack([arrays.levels, more[0]]), numbers=np.vstack([arrays.numbers, more[1]])
+            )
+        area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
+        arrays.numbers[one], magnified, _ = _referred(scene, area)
+        arrays.levels[one] = levels
+        arrays.used[0] += 1
+        np.maximum(self.magnified, magnified, out=self.magnified)
+
+    def form(self) -> Form:
+        """A form for the areas at 0 V, with its own copy of the numbers: compiled code overwrites them."""
+        numbers, views = views_of(self.shapes)
+        numbers[:] = self.arrays.numbers[0]
+        parts: dict[str, Any] = dict(zip(REFERRED, views, strict=True))
+        return Form(numbers=numbers, **parts, **self.fixed)
+
+
+def known_references(scene: Scene, decade: int, *, anew: bool = False) -> Known:
+    """The references of a scene for tolerances of a decade."""
+    # Each thread has its own set, because compiled code writes into the tables.
+    key = ("references", decade, threading.get_ident())
+    if anew:
+        scene.prepared.pop(key, None)
+    return kept_with(scene.prepared, key, MOST_SETS, lambda: Known(scene, decade))
+
+
+def _fed(scene: Scene) -> IntArray:
+    """Indices of the cells whose area follows a gap, sorted by area."""
+    net = scene.net
+    fed = np.flatnonzero([i >= 0 and net.gap[i] >= 0 for i in net.place])
+    return fed[np.argsort(net.place[fed], kind="stable")]
+
+
+def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
+    """The fields of a form that are the same for all references."""
+    network, net = scene.network, scene.net
+    n, n_area = net.k.shape[0], net.gap.size
+    slow, fed = net.slow >= 0, _fed(scene)
+    stress = np.zeros(n_area)
+    for i in network.fingers:
+        contact = network.contacts[i]
+        assert contact is not None
+        stress[i] = float(contact.stress(1.0))
+    powers, slopes, lo, scale = area_polynomials(net.curves, net.gap >= 0, area_error(decade))
+    return {
+        "mobile": net.mobile,
+        "c": net.c[fed],
+        "g": net.g_area[fed],
+        "home": net.place[fed],
+        "first": np.searchsorted(net.place[fed], np.arange(n_area + 1)),
+        "cell": np.array([int(np.flatnonzero(fed == i)[0]) if i >= 0 else -1 for i in net.gap], np.int64),
+        "unit": scene.area0.copy(),
+        "slow": np.where(slow, n + net.slow, -1),
+        "pace": np.where(slow, 1.0 / np.where(slow, net.tau, 1.0), 0.0),
+        "stress": stress,
+        "powers": powers,
+        "slopes": slopes,
+        "lo": lo,
+        "scale": scale,
+        "curves": net.curves,
+        "through": np.ascontiguousarray(network.through[:, fed]),
+    }
+
+
+def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
+    """The arrays in `REFERRED` for reference areas (m^2) in one row, the round-off as in `Known`, and their shapes."""
+    key = ("referred", scene.fixed, area.tobytes())
+    return kept_with(scene.network.kept, key, MOST_KEPT, lambda: _refer(scene, area))
+
+
+def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
+    network, net = scene.network, scene.net
+    modes = network_modes(network, area)
+    n, n_s = modes.gains.shape
+    slow, fed = net.slow >= 0, _fed(scene)
+    n_slow = int(np.count_nonzero(slow))
+    tap, tap_s = network.p @ modes.shape, network.q - network.p @ modes.follow
+    gap, gap_s = np.zeros((area.size, n)), np.zeros((area.size, n_s))
+    for i in network.fingers:
+        cell = network.gaps[i]
+        assert cell is not None
+        gap[i], gap_s[i] = tap[cell], tap_s[cell]
+    capacitance, leak = network.capacitance(area)[:, None], network.leak(area)[:, None]
+    node = network.nodes[:, :n] @ modes.shape
+    node_s = network.nodes[:, n : n + n_s] - network.nodes[:, :n] @ modes.follow
+    at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
+    parts = {
+        "rates": np.append(modes.rates, 1.0 / net.tau[slow]),
+        "gain": np.vstack([modes.gains, np.zeros((n_slow, n_s))]),
+        "shape": modes.shape,
+        "inverse": modes.inverse,
+        "follow": modes.follow,
+        "feed": np.vstack([-modes.take[:, fed], np.zeros((n_slow, fed.size))]),
+        "tap": tap[fed],
+        "tap_s": tap_s[fed],
+        "area0": area,
+        "gap": gap,
+        "gap_s": gap_s,
+        "node": node,
+        "node_s": node_s,
+        "size": np.linalg.norm(modes.shape, axis=0),
+        "stored": network.through @ (capacitance * tap),
+        "stored_s": network.through @ (capacitance * tap_s),
+        "lost": network.through @ (leak * tap) + at_x @ modes.shape,
+        "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
+    }
+    live = modes.rates[modes.rates > 0.0]
+    # The eigenvectors of the slowest mode contain the round-off of the fastest one.
+    spread = math.sqrt(float(live.max() / live.min())) if live.size else 0.0
+    inverse = np.abs(modes.inverse)
+    every = (np.abs(modes.shape) @ inverse).sum(axis=1).max(initial=1.0)
+    # A voltage is a sum over modes and sources: the sum of the moduli of its terms measures the cancellation.
+    of_gaps, of_nodes = (
+        (np.abs(by_mode) @ inverse).sum(axis=1) + np.abs(by_source).sum(axis=1)
+        for by_mode, by_source in ((gap, gap_s), (node, node_s))
+    )
+    own = np.append(of_gaps, of_nodes.max(initial=0.0))
+    magnified = np.asarray((every + spread) * np.minimum(own / every, 1.0))
+    numbers = np.concatenate([parts[name].ravel() for name in REFERRED])
+    return numbers, magnified, [parts[name].shape for name in REFERRED]
+
+
+# Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method. Where
+# an area strongly affects the charge of a stiff mode, the fixed-point iteration converges only with steps of the
+# mode's own time constant.
+MOST_STEPS = 100
+
+
+class March(Stepping):
+    """One integration in progress, with an error of at most `tol` times `u_scale` (V) in every step."""
+
+    def __init__(self, problem: Problem, rtol: float, tol: float, u_scale: float, repeat: bool) -> None:
+        scene, size = problem.scene, problem.initial.y.size
+        n_s, n_area = len(scene.waveforms), scene.net.gap.size
+        self.u_scale, self.decade = u_scale, int(np.floor(np.log10(rtol)))
+        self.gaps, self.largest = list(scene.network.fingers), u_scale
+        self.area_error = max((area_missed(curve, self.decade) for curve in scene.net.curves), default=0.0)
+        self.capacitance = float(problem.network.capacitance(scene.area0).sum())
+        super().__init__(problem, tol * u_scale, size - n_s, size + n_s if problem.charge else size)
+        self.control["magnified"] = 1.0
+        self.rows = self.out.T
+        self.error = np.zeros(self.n + self.n_slow)
+        self.branch = np.tile([problem.t_start, math.inf], (n_area, 1))
+        self.shortest = problem.waveform.shortest_time()
+        self.references = known_references(scene, self.decade)
+        self.form = self.references.form()
+        cells = self.form.c.size
+        self.work = new_network_work(self.n, self.n + self.n_slow, cells, n_area, n_s, self.y.size + n_s)
+        scale = np.append(np.ones(self.n), np.full(self.n_slow, u_scale))
+        self.look_for_period(self.form.rates, scale, repeat)
+
+    @property
+    def rounding(self) -> list[float]:
+        u_peak = self.peaks[:, readout.PEAK_U]
+        # Enlarged by the condition of the modes.
+        floor = 4e-16 * (self.references.magnified * (float(u_peak.max()) + self.u_scale) + u_peak)
+        return list(map(float, floor))
+
+    @property
+    def margin(self) -> float:
+        return 1.0 / float(self.control["magnified"])
+
+    def circuit(self, sources: Sources) -> ManyAreas:
+        known = self.references
+        return ManyAreas(
+            self.form, known.arrays, known.tables, self.work, integral_table(), sources, self.u_scale, self.sign,
+            self.s_before, self.branch,
+        )  # fmt: skip
+
+    def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
+        taken = int(self.counters[readout.ACCEPTED] + self.counters[readout.REJECTED])
+        more = MOST_STEPS * (4.0 + sources.edges.size + (t_end - self.t) / self.shortest)
+        self.step[0]["most"] = taken + int(more)
+        while (code := super().march(sources, t_end, looks)) == readout.REFERENCE:
+            self._add_reference()
+        return code
+
+    def _failed(self, code: int, sources: Sources) -> Status:
+        return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
+
+    def jump(self, after: FloatArray) -> bool:
+        # With sources that stay at these values.
+        return self.march(ramp(after, after, self.t), self.t, no_looks()) == readout.DONE
+
+    def _add_reference(self) -> None:
+        """Add the reference areas that the compiled loop needs next, and that it has written to `wanted`."""
+        known, at = self.references, self.work.at
+        wanted = tuple(map(int, known.arrays.wanted))
+        if known.count >= max(2, min(MOST_REFERENCES, MOST_NUMBERS // known.arrays.numbers.shape[1])):
+            # Start a new set of references with the one in use; the tables and couplings of all others are dropped.
+            levels = tuple(map(int, known.arrays.levels[at[0]]))
+            self.references = known = known_references(self.problem.scene, self.decade, anew=True)
+            if levels != (0,) * len(levels):
+                known.add(self.problem.scene, levels)
+            at[0] = known.count - 1
+            self.work.own.keys[:] = self.work.own.key[:] = -1
+        known.add(self.problem.scene, wanted)
+
+
+ATTEMPTS = 6
+# Voltage scale of a circuit whose sources give none, before any voltage has been computed, V.
+GUESS = 1.0
+
+
+def stepping(problem: Problem, rtol: float, tol: float, u_scale: float, top: float, repeat: bool) -> Track | March:
+    """An integration with an error of `tol` times `u_scale` (V) in every step, in a run that is asked for `rtol`.
+
+    A stack's area curve reaches `top` (V) if that is above 0.
+    """
+    if problem.scene.stack is None:
+        return March(problem, rtol, tol, u_scale, repeat)
+    return Track(problem, rtol, tol * u_scale, top, repeat)
+
+
+def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, repeat: bool = True) -> Run:
+    """Integrate until the stated error is within `rtol` of the peaks of every gap's voltage and force.
+
+    The tolerance of the first attempt is a guess; each further one follows from the previous attempt's stated error.
+    With `repeat`, later periods may repeat one period, once the state no longer changes from one to the next.
+    """
+    tables = Tables(problem, LOCAL_SHARE * rtol)
+    is_stack = problem.scene.stack is not None
+    met = tables.peak() if is_stack or problem.scene.is_sampled else 0.0
+    u_scale = scale_of(problem, met) if is_stack else max(problem.largest, met) or GUESS
+    tol, top, nfev, attempts, tries_out = LOCAL_SHARE * rtol, 0.0, 0, 0, True
+    # The voltages of sources that cancel are rounding errors of those of their parts.
+    finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
+    while True:
+        one = stepping(problem, rtol, max(tol, finest), u_scale, top, repeat)
+        if tries_out:
+            one.try_out(rtol)
+        try:
+            run = integrate(one, tables, progress)
+        except OutOfRangeError as error:
+            top = 1.5 * error.top
+            continue
+        run.by_layer = True
+        run.end_where_it_stopped()
+        nfev += run.nfev
+        run.nfev = nfev
+        run.stats["repeated"] = one.repeated
+        run.continuous = one.recorded()
+        one.stated(run)
+        attempts += 1
+        worst = run.excess(problem.rounding) / rtol
+        # A trial (`try_out`) that predicts too large an error stops the run early, with ERROR_NOT_MET.
+        is_whole = run.status is not Status.ERROR_NOT_MET
+        if is_whole and (run.status is not Status.SUCCESS or worst <= 1.0):
+            return run
+        peak = float(run.gaps[:, 0].max(initial=0.0))
+        # A peak smaller than its own error may still vanish with a finer tolerance, so that case is not hopeless.
+        hopeless = rtol * peak < problem.rounding and run.error.u_gap < peak
+        if hopeless or tol <= finest or attempts >= ATTEMPTS:
+            if is_whole:
+                run.status = Status.ERROR_NOT_MET
+                return run
+            tries_out = False
+            continue
+        finer = tol * min(0.3, 0.5 / worst)
+        # If edges or zeros kept the steps short, their error is below `tol`, and only a tolerance below that error
+        # shortens them. Not for a network: this could lead below the error of its areas' polynomials, made for `rtol`.
+        tol = min(finer, 0.5 / worst * run.error.u_gap / u_scale) if is_stack else finer
