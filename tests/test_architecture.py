@@ -19,12 +19,12 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along.
-ALL_LINES = 41_402
-ALL_FILES = 154
+ALL_LINES = 40_110
+ALL_FILES = 134
 PACKAGE_LINES = {
-    "base": 1_038, "circuit": 2_412, "cli": 1_914, "engine": 8_709, "explorer": 1_495, "netlist": 2_515,
-    "numerics": 1_166, "physics": 508, "plots": 1_401, "results": 2_755, "sets": 386, "solve": 6_607,
-    "studies": 7_402, "torch": 457, "waveforms": 2_466,
+    "base": 1_038, "circuit": 2_291, "cli": 1_767, "engine": 8_694, "explorer": 1_429, "netlist": 2_379,
+    "numerics": 1_166, "physics": 508, "plots": 1_320, "results": 2_706, "sets": 385, "solve": 6_374,
+    "studies": 7_089, "torch": 414, "waveforms": 2_401,
 }  # fmt: skip
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.
@@ -270,7 +270,8 @@ def functions(path: Path) -> Iterator[tuple[str, bool, int, int]]:
 
 
 def test_the_whole_grows_no_more() -> None:
-    lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
+    files = [*FILES, *PACKAGE.rglob("*.pyi")]
+    lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in files}
     assert len(lines) <= ALL_FILES
     every = sum(lines.values())
     assert every <= ALL_LINES, f"{every} lines in all; allowed: {ALL_LINES}, as something else becomes shorter"

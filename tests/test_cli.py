@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import fcntl
 import io
@@ -302,6 +303,20 @@ def test_a_store_that_another_process_writes_is_refused(command: Command, monkey
     os.close(number)
     assert command(*words).code == 0
     shutil.move("out/pad.zarr", "pad.zarr")
+    held = []
+
+    def another(folder: Path) -> None:
+        number = os.open("out/pad.zarr", os.O_RDONLY)
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held.append(folder)
+        os.close(number)
+
+    # A new store, too, is held by the process that writes it.
+    monkeypatch.setattr("fingerspice.cli.store.settle_on_disk", another)
+    assert command(*words).code == 0
+    assert held == []
+    shutil.rmtree("out/pad.zarr")
 
     def late(*given: object) -> None:
         # Another process is faster: it has created its store since this one began.

@@ -223,3 +223,11 @@ def test_what_a_layer_with_a_long_memory_keeps_of_errors_is_stated_from_block_to
     exact = run(1e-10)
     for rtol in (1e-4, 1e-6, 1e-8):
         assert_met(run(rtol), exact.u_gap, exact.f_el, rtol)
+
+
+def test_a_recording_takes_as_few_steps_a_sample_as_its_kinks_allow() -> None:
+    # Where xi crosses 0 V, the area has a kink within a step: its integral and first moment are known.
+    n = 20_000
+    samples = fs.Samples(200.0 * recording_errors.noise(5, n, 48e3, 50.0, 8e3), 48e3)
+    for rtol, parts in ((1e-4, 1), (1e-6, 1), (1e-8, 4)):
+        assert follow(samples, (n - 1) / 48e3, rtol=rtol, t_eval=[0.1]).stats["steps"] == parts * (n - 1)
