@@ -92,7 +92,7 @@ def collocation() -> Any:
     run = fs.simulate(
         finger(), rtol=1e-8, t_eval=np.linspace(first - 2e-3, first + period, 2401), t_stop=0.05, charge=False
     )
-    starts, whole, _, reach = run.continuous.steps[0][:4]  # type: ignore[union-attr]
+    starts, whole, _, reach = run.continuous.times[:4]  # type: ignore[union-attr]
     lengths = whole * reach
     inside = (starts + lengths > first + 1e-9) & (starts + lengths < first + period + 1e-9)
     starts, lengths = starts[inside], lengths[inside]

@@ -1,14 +1,9 @@
-"""One period of a circuit for the search of its periodic state: tables of the sources, and the linear circuit's state.
-
-The search solves for the modes' amplitudes at the start of the period, so this module converts between them and the
-voltages of the tree capacitors, and gives the periodic state of the circuit with its areas at 0 V as a first guess.
-
-The periodic state of any circuit, by Newton's method on the map of one period.
+"""The periodic state of any circuit, by Newton's method on the map of one period (`Search` on `Period`).
 
 The unknown z consists of the modes of the live voltages, for the areas at 0 V, and of the areas with a time constant,
-relative to their values at 0 V. The first derivative of the map is that of the linear circuit with its areas held at
-0 V. Broyden's updates improve it from period to period; finite differences, which cost a period for each slow
-mode, replace it only where these updates do not lead to convergence.
+relative to their values at 0 V. The first guess, and the first derivative of the map, are those of the linear circuit
+with its areas at 0 V. Broyden's updates improve the derivative from period to period; finite differences, which cost a
+period for each slow mode, replace it only where these updates do not lead to convergence.
 """
 
 from __future__ import annotations

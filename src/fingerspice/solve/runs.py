@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -106,11 +107,11 @@ def excess_of(gaps: FloatArray, rounding: float) -> float:
 
 def closed_form(problem: Problem, again: Callable[[Problem], Run], error: float = 0.0) -> ClosedForm:
     """The run between its outputs, by a method that computes it `again` with any outputs; see `ClosedForm`."""
+    return ClosedForm(partial(_look, problem, again), problem.waveform, problem.t_start, error, problem.rounding)
 
-    def look(t: FloatArray, left: BoolArray) -> Record:
-        return again(problem.at(t, left)).record(problem)
 
-    return ClosedForm(look, problem.waveform, problem.t_start, error, problem.rounding)
+def _look(problem: Problem, again: Callable[[Problem], Run], t: FloatArray, left: BoolArray) -> Record:
+    return again(problem.at(t, left)).record(problem)
 
 
 class Integration(ABC):
