@@ -25,7 +25,7 @@ from __future__ import annotations
 from typing import Any
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit_by_kind, jit_within_rows
+from fingerspice.base.compiled import jit_by_kind, jit_rows, jit_within_rows
 from fingerspice.engine.lanes.rows import (
     END_SLOPES,
     FADED,
@@ -326,8 +326,7 @@ _drives_at_node = jit_by_kind(
 _end = jit_by_kind(StackMarks=_end_of_stack, MobileMarks=_end_under_mobile, NetworkMarks=end_bent)(_of_kind)
 
 
-@jit_within_rows
-def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: FloatArray, a: float, b: float) -> None:
+def _step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: FloatArray, a: float, b: float) -> None:
     """Advance every lane by the part of a sample from `a` to `b`; the source goes from its last sample to `after`.
 
     `weights` are those of the part's length.
@@ -349,6 +348,12 @@ def step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Floa
     if b == 1.0:
         for i in range(lanes):
             state[2 * lanes + i] = state[lanes + i]
+
+
+# A network's step is larger: as a function of its own it is a tenth faster, as a stack's is within its loop.
+step = jit_by_kind(
+    StackMarks=jit_within_rows(_step), MobileMarks=jit_within_rows(_step), NetworkMarks=jit_rows(_step)
+)(_of_kind)  # fmt: skip
 
 
 @jit_within_rows

@@ -291,14 +291,6 @@ def _mix(
 
 
 @jit_rows
-def _take_solution(matrix: FloatArray, eta: FloatArray) -> None:
-    n = matrix.shape[0]
-    for b in range(n):
-        for i in range(ROWS):
-            eta[b, i] = matrix[b, n, i]
-
-
-@jit_rows
 def _add_rates(
     home: IntArray, answer: FloatArray, more: FloatArray, chi: FloatArray, eta: FloatArray, known: FloatArray,
     share: FloatArray, rho: FloatArray,
@@ -360,7 +352,8 @@ def answer_mobile(
         _mix(home, answer, x.cross, more, chi, mixed)
         _fill_matrix(True, home, answer, x.cross, more, eta, known, share, mixed, matrix)
         _eliminate(matrix, spare, least, False)
-        _take_solution(matrix, eta)
+        for b in range(answer.size):
+            copy_to(eta[b], matrix[b, answer.size])
     answer_alone(home, answer, more, eta, rows.rho)
     _add_rates(home, answer, more, chi, eta, known, share, rows.rho)
 
