@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -431,3 +432,10 @@ def test_a_state_found_by_half_a_period_is_that_of_the_whole_one(
     assert half.periods < whole.periods
     assert np.abs(half.solution.u_layer - whole.solution.u_layer).max() <= 2e-10 * 200.0
     np.testing.assert_allclose(half.multipliers, whole.multipliers, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("area", ["coupled", "frozen"])
+def test_a_copy_of_a_periodic_state_has_its_multipliers(area: str) -> None:
+    state = fs.steady_state(table1(), area=area, rtol=1e-7)
+    copied = pickle.loads(pickle.dumps(state))
+    np.testing.assert_array_equal(copied.multipliers, state.multipliers)

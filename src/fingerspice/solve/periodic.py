@@ -223,8 +223,7 @@ class Search:
     def __init__(self, period: Period, rtol: float) -> None:
         self.period, self.rtol, self.passes = period, rtol, 0
         self.implicit = False
-        # The integration of every pass by exponential steps.
-        self.one: Track | March | None = None
+        self.one: Track | March | None = None  # Integrates every pass by exponential steps
         # The gap voltage that a stack's area curve reaches, V; 0: that of its scene.
         self.top = 0.0
         # A conserved charge is no unknown. If half a period is used, all voltages change sign: such a charge is 0.
@@ -342,7 +341,8 @@ class Search:
                 self.implicit, tol = True, LOCAL_SHARE * self.rtol
             else:
                 break
-        start = np.append(period.voltages(self.z), self.z[period.n :])
+        # Its records are views of its arrays, which a copy of what is found would separate.
+        self.one, start = None, np.append(period.voltages(self.z), self.z[period.n :])
         return Found(start, period.parts * defect, self._map_slope, self._memory(), errors, self.passes / period.parts)
 
     def _map_slope(self) -> FloatArray:
@@ -499,11 +499,10 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
 
 def _closed_form(period: Period) -> Found:
     """The periodic state of a circuit with fixed areas."""
-    modes = period.modes
     start, end, _ = period.linear_state([])
     sign = 1.0 if period.parts == 1 else -1.0
-    defect = float(np.abs(modes.shape @ (sign * end - start)).max(initial=0.0))
+    defect = float(np.abs(period.modes.shape @ (sign * end - start)).max(initial=0.0))
     slope = np.diag(np.exp(-period.rates * period.span * period.parts))
     # The only error of the closed form is round-off, which the run adds to its stated error itself.
     none = np.zeros((len(period.problem.network.fingers), 2))
-    return Found(period.voltages(start + period.kept), period.parts * defect, lambda: slope, 1.0, none, 1)
+    return Found(period.voltages(start + period.kept), period.parts * defect, slope.copy, 1.0, none, 1)

@@ -118,6 +118,7 @@ class Stepping(Integration):
             array[:] = first
         self.y[:], self.s_before[:], self.sign[:] = initial.y, initial.s_before, initial.sign
         self.pace = self.pace._replace(tol=tol)
+        self.recorder.parts.clear()
 
     @property
     def t(self) -> float:
