@@ -1299,6 +1299,14 @@ class _Run:
         v, force = s * np.append(u[stack.gap], ua), stack.sigma_per_u2 * ua**2 * a
         step = _Step(t, h, s, source, w, v, g * ua, force, self.q_leak, self.force_integral, us[-1])
         end = _fields_at(stack, self.nodes, step, np.array([1.0]))[0][0]
+        if stack.mobile:
+            # Newton's iteration may have leapt past a fold to voltages that no motion leads to.
+            for before, after in pairwise([u, *us, end]):
+                one, other = float(before[stack.gap]), float(after[stack.gap])
+                leapt = one * other > 0.0 and abs(math.log(other / one)) > 0.1
+                between = np.geomspace(one, other, 200) if leapt else (one, other)
+                if min(stack.rise(float(x), self.stored(after), s) for x in between) <= 0.0:
+                    raise _NoStep("fold")
         return replace(step, u_end=end), us
 
     def sign(self, t: float, h: float, u: np.ndarray, source: Waveform) -> float:

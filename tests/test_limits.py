@@ -77,6 +77,17 @@ def test_the_fold_at_the_deck_s_own_point_is_looked_for_once(monkeypatch: pytest
     assert len(set(tried)) == len(tried) == 1 + 3 * 4
 
 
+@pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
+def test_where_exponential_steps_give_up_near_the_fold_implicit_ones_look_for_it() -> None:
+    circuit = table1(gap={"d": "100n"}).replace({"Vdrive.frequency": 10.0})
+    found = fold_voltage(circuit, 200.0, 0.3, 900.0)
+    for x, status in ((0.998, fs.Status.SUCCESS), (1.002, fs.Status.FOLD)):
+        run = fs.simulate(
+            circuit.replace({"Vdrive.amplitude": x * found}), charge_law="mobile", t_stop=0.3, rtol=1e-5, throw=False
+        )
+        assert run.status is status
+
+
 def test_a_map_needs_a_gap_and_a_source_and_an_end() -> None:
     two = deck("V1 a 0 SIN(0 1 100)", "C1 a 0 1n", ".tran 1u 1m uic")
     for circuit, points, said in (

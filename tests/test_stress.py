@@ -46,17 +46,19 @@ MENDED = {
     (0, 4495): "right",  # The force's peak stood between the last two nodes of a panel.
     (0, 1304): "right",  # Runs were refused for the error of a node whose fast decay no gap feels.
     (0, 1596): "refused: fold",  # The path from where the steps had met the fold went back in time.
+    (0, 3546): "right",  # The error of a mode that no leak drains, of 1e12 V, was carried by a difference of that size.
+    (0, 3553): "refused: fold",  # The reference's own: its end of a step leapt past the fold.
     # Their gap voltage is near rounding of the source's, and a fold ends them.
     **dict.fromkeys(((3, 12), (3, 68), (3, 214)), "refused: fold"),
 }
 # Others of these kinds, of which the first jumps to an area of 4.5e-13 m^2 past no fold, and in 4371 a sum of voltages
-# that turned was taken for a zero of the gap's.
+# that turned was taken for a zero of the gap's, and in 3581 a Radau run's polynomials were too coarse for its error.
 OTHERS = {
     (4, 124): "right", (0, 4371): "refused: fold", (0, 650): "right", (0, 454): "refused: fold",
     (0, 761): "refused: fold", (1, 539): "right", (1, 299): "right", (0, 3773): "refused: fold",
     (3, 178): "refused: fold", (0, 5490): "right",
     (1, 920): "refused: fold", (1, 45): "refused: fold", (21, 2759): "right", (0, 1380): "right", (0, 1731): "right",
-    (0, 1887): "right",
+    (0, 1887): "right", (0, 3581): "right",
 }  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from fingerspice.circuit.network import Modes
 from fingerspice.engine.network import Segment, at_sources, source
 from fingerspice.engine.one_area.model import branch_area, dot, follow, ramp, source_at, voltage_by_time, write_row_at
 from fingerspice.numerics import linear
-from fingerspice.results.outcome import Failure, SolveError, State, Status, last_tried
+from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import Record
 from fingerspice.solve.collocation import solve as solve_by_steps
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, segment_of
@@ -285,17 +285,14 @@ def lead_to_fold(problem: Problem, run: Run) -> Run | None:
     return run
 
 
-def meets_fold(problem: Problem, rtol: float) -> bool:
-    """Whether a problem reaches a fold, or a jump of its source goes past one; another failure is a `SolveError`.
+def meets_fold(problem: Problem, rtol: float) -> bool | None:
+    """Whether a problem reaches a fold, or a jump of its source goes past one; None where exponential steps gave up.
 
     A run that stops near a fold and does not reach it counts as a run without a fold: its later course is not examined.
     """
     run = solve_by_steps(problem, rtol)
-    if run.status is Status.SUCCESS:
-        return False
     if run.status is not Status.FOLD:
-        tried = last_tried(run.tried)
-        raise SolveError(Failure(run.status, run.status.cause, run.status.action, run.t_failed, tried=tried))
+        return False if run.status is Status.SUCCESS else None
     return _ahead(problem, run, to_stack(problem.scene, run.state), rtol)[0]
 
 

@@ -63,6 +63,8 @@ TELL_AFTER = 3.0
 # Difference of a fold's times in two successive runs at which the fold is accepted at once, over its time; and the one
 # at which it is accepted after the last attempt, over its time or the source's shortest time, if that is longer.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
+# Part of a run's stated error that its polynomials between outputs may be off by.
+_BETWEEN = 0.1
 # Limit of accepted and rejected steps: at the start, and over the whole run. A run that needs more has a cause that
 # smaller steps do not remove.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
@@ -239,7 +241,8 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
     run = run.only(~probed)
     run.end_where_it_stopped()
     run.margin = min(margin, float(run.record(problem).fold_margin[-1])) if mobile and run.t.size else margin
-    run.continuous = closed_form(problem, partial(_integrate, scheme=fine, tol=taken, u_scale=u_scale), rtol)
+    again = partial(_integrate, scheme=fine, tol=taken, u_scale=u_scale)
+    run.continuous = closed_form(problem, again, _BETWEEN * run.excess(problem.rounding))
     run.note = f"{reason}; implicit steps took over, {run.stats['steps']} of them" if reason else ""
     return run
 

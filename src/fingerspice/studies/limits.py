@@ -416,8 +416,8 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
                 raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck", charge=False,
                 rtol=RTOL,
             )  # fmt: skip
-            if problem.scene.stack is not None:
-                return meets_fold(problem, RTOL)
+            if problem.scene.stack is not None and (met := meets_fold(problem, RTOL)) is not None:
+                return met
             # Not by `simulate`, which would warn about voltages that the user did not ask for.
             run = run_problem(problem, np.array([0.0, problem.t_stop]), RTOL)
         except InputError as error:

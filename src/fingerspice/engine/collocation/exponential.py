@@ -13,7 +13,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_by_kind, jit_rows, jit_within
 from fingerspice.engine.many_areas.form import evaluate_many, probe_many
-from fingerspice.engine.one_area.rows import DQ, SOURCE, X_GAP, Q, U, Work, evaluate_one, probe_one
+from fingerspice.engine.one_area.rows import DQ, SOURCE, X_GAP, Q, U, Work, evaluate_one, largest_size, probe_one
 from fingerspice.engine.one_area.system import System
 from fingerspice.numerics.lobatto import BETWEEN, END, FIRST, MISS, NODES, ROWS, SECOND, THIRD, fill_table
 
@@ -283,12 +283,12 @@ def largest(first: float, second: float, third: float) -> float:
     return out if abs(out) > abs(third) else third
 
 
-# Shift of the modes for the difference, over the largest mode: half of the digits are left for the difference.
+# Shift of the gap voltages for a difference, over the largest of them: half of the digits are left.
 _SHIFT = 1e-7
 # Answer of the areas up to which it is neglected: the error carried changes by at most 6 times as much of itself.
 _SLIGHT = 0.01
-# Most iterations, and the relative change below which the next iteration does not matter.
-_PASSES, _ENOUGH = 6, 0.1
+# Most iterations, and the move over the shift below which the next iteration does not matter.
+_PASSES, _ENOUGH = 6, 0.3
 
 
 @jit_by_kind(OneArea=probe_one, ManyAreas=probe_many)
@@ -298,60 +298,55 @@ def _probe(circuit: Any, state: Any, w: FloatArray, pull: FloatArray) -> bool:
 
 
 @jit_rows
-def _shift(w: FloatArray, step: float, off: FloatArray, out: FloatArray) -> None:
+def _add(a: FloatArray, factor: float, b: FloatArray, out: FloatArray) -> None:
     for k in range(out.shape[0]):
         for i in range(ROWS):
-            out[k, i] = w[k, i] + step * off[k, i]
-
-
-@jit_rows
-def _difference(a: FloatArray, b: FloatArray, factor: float, out: FloatArray) -> None:
-    for k in range(out.shape[0]):
-        for i in range(ROWS):
-            out[k, i] = factor * (a[k, i] - b[k, i])
+            out[k, i] = a[k, i] + factor * b[k, i]
 
 
 @jit_within
-def carry(circuit: Any, state: Any, w: FloatArray, pull: FloatArray, answer: float) -> None:
+def carry(circuit: Any, state: Any, x: Iterates, gap: FloatArray, answer: float) -> None:
     """Carry the error of the modes from the start of a converged step to the points between and the end.
 
     With the areas held it decays with the modes. But an error of a gap voltage also changes 1/A, which forces the
     modes. This may oppose the error or amplify it: near an instability of the circuit (a layer's leakage that rises
     with the area, or an area that the stored charge drives on) errors grow thousandfold within a few steps. So the
-    nonlinear term `pull` is evaluated once more at modes shifted by the error, and the response to its change is
-    iterated a few times. `answer` is how strongly the areas answered to a change of the modes (`exponential.converge`):
-    where they hardly do, the error decays with the modes. The result is `work.carried`.
+    nonlinear term is evaluated once more at modes shifted by the error, and the response to its change is iterated as
+    the step itself was (`converge`). `answer` is how strongly the areas answered there to a change of the modes: where
+    they hardly do, the error decays with the modes. The shift is small beside the gap voltages, in which alone the
+    nonlinear term is not linear; `gap` (n_area, n) is how far a mode moves them. The result is `work.carried`.
     """
-    work, error, slot, m = circuit.work, state.error, state.step[0].slot, w.shape[0]
-    base, forced, off, shifted, other = work.spare[0], work.spare[1], work.spare[2], work.spare[3], work.spare[4]
+    work, error, slot = circuit.work, state.error, state.step[0].slot
+    base, used, off, shifted, other = work.spare[0], work.spare[1], work.spare[2], work.spare[3], work.spare[4]
     decay, phi, carried = circuit.tables.decay[slot], circuit.tables.phi[slot], work.carried
-    largest_one, size = 0.0, 0.0
-    for k in range(m):
-        largest_one = max(largest_one, abs(error[k]))
+    largest_u, reach = largest_size(x.u.ravel()), 0.0
+    for k in range(x.w.shape[0]):
+        for a in range(gap.shape[0]):
+            # A slow area is a mode behind the others, in units of its area at 0 V.
+            reach = max(reach, abs((gap[a, k] if k < gap.shape[1] else largest_u) * error[k]))
+    shift = _SHIFT * largest_u
+    answers = answer > _SLIGHT and 0.0 < shift / reach < math.inf
+    scale = shift / reach if answers else 1.0
+    for k in range(x.w.shape[0]):
         for i in range(ROWS):
-            base[k, i] = decay[k, i] * error[k]
-            off[k, i] = base[k, i]
-            size = max(size, abs(w[k, i]))
-    step = _SHIFT * size / largest_one if largest_one > 0.0 else 0.0
-    if answer > _SLIGHT and 0.0 < step < math.inf:
-        for _ in range(_PASSES):
-            before, change = 0.0, 0.0
-            _shift(w, step, off, shifted)
-            if not _probe(circuit, state, shifted, other):
-                break
-            _difference(other, pull, 1.0 / step, forced)
-            for k in range(m):
-                before = max(before, abs(off[k, END]))
-                shifted[k, 0] = off[k, END]
-            respond(forced, phi, base, off)
-            for k in range(m):
-                change = max(change, abs(off[k, END] - shifted[k, 0]))
-            if not change > _ENOUGH * before:
-                break
-    for k in range(m):
+            off[k, i] = base[k, i] = scale * decay[k, i] * error[k]
+            used[k, i] = 0.0
+    for iteration in range(_PASSES if answers else 0):
+        _add(x.w, 1.0, off, shifted)
+        if not _probe(circuit, state, shifted, other):
+            break
+        _add(other, -1.0, x.pull, shifted)
+        if iteration > 0:
+            move = mix(shifted, used, x.weight, x.pull_before, x.left_before)
+        else:
+            move = plain(shifted, used, x.weight, x.pull_before, x.left_before)
+        respond(used, phi, base, off)
+        if not move > _ENOUGH * shift:
+            break
+    for k in range(x.w.shape[0]):
         for p in range(3):
-            carried[k, p] = off[k, NODES + p]
-        carried[k, 3] = off[k, END]
+            carried[k, p] = off[k, NODES + p] / scale
+        carried[k, 3] = off[k, END] / scale
 
 
 @jit_within

@@ -418,7 +418,7 @@ def attempt_many(c: ManyAreas, pace: Pace, s: LoopState) -> int:
         return RETRY
     if form.mobile:
         step.grown = 1.0 / work.room[3].min()
-    carry(c, s, w, pull, answer)
+    carry(c, s, iterates, form.gap, answer)
     error = assess(form, work, leaks, tables, step.slot, h, s.error, step.grown)
     step.step_error = max(error, charged(form.cell, u, work.areas[blocks.AREA])) if pace.charge else error
     return GO_ON

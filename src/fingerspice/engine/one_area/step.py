@@ -256,7 +256,7 @@ def attempt_one(c: OneArea, pace: Pace, s: LoopState) -> int:
         return RETRY
     step.converged, step.step_error = int(closed), math.inf
     if closed:
-        carry(c, s, work.w, work.pull, answer)
+        carry(c, s, iterates, system.gap[level : level + 1], answer)
         step.step_error, step.grown = assess(system, c.tables, work, step.slot, level, s.error)
     return GO_ON
 
