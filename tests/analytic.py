@@ -1301,12 +1301,14 @@ class _Run:
         end = _fields_at(stack, self.nodes, step, np.array([1.0]))[0][0]
         if stack.mobile:
             # Newton's iteration may have leapt past a fold to voltages that no motion leads to.
-            for before, after in pairwise([u, *us, end]):
-                one, other = float(before[stack.gap]), float(after[stack.gap])
-                leapt = one * other > 0.0 and abs(math.log(other / one)) > 0.1
-                between = np.geomspace(one, other, 200) if leapt else (one, other)
-                if min(stack.rise(float(x), self.stored(after), s) for x in between) <= 0.0:
-                    raise _NoStep("fold")
+            states = np.array([u, *us, end])
+            one, other = states[:-1, stack.gap], states[1:, stack.gap]
+            first = np.where(one * other > 0.0, np.abs(one), np.abs(other))
+            between = np.geomspace(np.maximum(first, 1e-300), np.maximum(np.abs(other), 1e-300), 60)
+            a, da = stack.area(between.ravel())
+            kk = np.array([self.stored(x) for x in states[1:]]) * np.copysign(1.0, np.where(other == 0.0, s, other))
+            if np.any(1.0 + kk * stack.a_zero * (da / a**2).reshape(between.shape) <= 0.0):
+                raise _NoStep("fold")
         return replace(step, u_end=end), us
 
     def sign(self, t: float, h: float, u: np.ndarray, source: Waveform) -> float:
