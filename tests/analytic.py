@@ -39,7 +39,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import pairwise
+from itertools import pairwise, product
 
 import mpmath as mp
 import numpy as np
@@ -1116,16 +1116,18 @@ class Transient:
     def extremes(self, t0: float, t1: float, samples: int = 60) -> dict[str, float]:
         """Extremes over [t0, t1] of |u_a| (V) and F_el (N), one-sided values at jumps included."""
         lows: dict[str, float] = {}
-        for name in ("u_gap", "force"):
-            best_low, best_high = math.inf, -math.inf
-            for step in self.steps:
-                if step.t + step.h <= t0 or step.t >= t1:
-                    continue
+        steps = [step for step in self.steps if step.t + step.h > t0 and step.t < t1]
+        for name, sign in product(("u_gap", "force"), (1.0, -1.0)):
+            best, sampled = math.inf, []
+            for step in steps:
                 x = np.linspace(max(0.0, (t0 - step.t) / step.h), min(1.0, (t1 - step.t) / step.h), samples)
-                y = self.at_fractions(step, x, name)
-                best_low = min(best_low, _refine(lambda f, s=step, q=name: self.at_fractions(s, f, q), x, y))
-                best_high = max(best_high, -_refine(lambda f, s=step, q=name: -self.at_fractions(s, f, q), x, -y))
-            lows[f"{name}_min"], lows[f"{name}_max"] = best_low, best_high
+                sampled.append((step, x, sign * self.at_fractions(step, x, name)))
+            least = min((float(y.min()) for _, _, y in sampled), default=math.inf)
+            for step, x, y in sampled:
+                # Between two samples the signal goes no further beyond them than it goes from one to the next.
+                if y.min() - np.abs(np.diff(y)).max() <= least:
+                    best = min(best, _refine(lambda f, s=step, q=name, k=sign: k * self.at_fractions(s, f, q), x, y))
+            lows[f"{name}_{'min' if sign > 0.0 else 'max'}"] = sign * best
         return lows
 
     def at_fractions(self, step: _Step, theta: np.ndarray, name: str) -> np.ndarray:
