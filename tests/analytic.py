@@ -930,10 +930,20 @@ class _Stack:
         after[j] = ua
         return after
 
-    def rise(self, u: float, kk: float, side: float) -> float:
+    def rises(self, u: np.ndarray, kk: np.ndarray, side: float) -> np.ndarray:
         """d p / d u of the mobile equation p = u - kk A(0)/A(|u|), on the given side of 0: 0 at a fold."""
-        a, da = (float(x[0]) for x in self.area(np.array([abs(u)])))
-        return 1.0 + math.copysign(1.0, u or side) * kk * self.a_zero * da / a**2
+        a, da = self.area(np.abs(u))
+        return 1.0 + np.copysign(1.0, np.where(u == 0.0, side, u)) * kk * self.a_zero * da / a**2
+
+    def rise(self, u: float, kk: float, side: float) -> float:
+        """`rises` at one voltage."""
+        return float(self.rises(np.array([u]), np.array([kk]), side)[0])
+
+    def margin_kk(self, u: np.ndarray) -> np.ndarray:
+        """kk of `fold_margin` for layer voltages u (m, n)."""
+        j = self.gap
+        leaked = -(u * self.c) * self.area(np.abs(u[:, j]))[0][:, None]
+        return leaked @ self.b_of_w[j] / (self.c[j] * self.a_zero)
 
     def _ramped(self, p: float, kk: float, u: float) -> float:
         """Gap voltage where the source's share has gone to p along a ramp too fast for any leak.
@@ -1301,12 +1311,14 @@ class _Run:
         end = _fields_at(stack, self.nodes, step, np.array([1.0]))[0][0]
         if stack.mobile:
             # Newton's iteration may have leapt past a fold to voltages that no motion leads to.
-            for before, after in pairwise([u, *us, end]):
-                one, other = float(before[stack.gap]), float(after[stack.gap])
-                leapt = one * other > 0.0 and abs(math.log(other / one)) > 0.1
-                between = np.geomspace(one, other, 200) if leapt else (one, other)
-                if min(stack.rise(float(x), self.stored(after), s) for x in between) <= 0.0:
-                    raise _NoStep("fold")
+            before, after = np.array([u, *us]), np.array([*us, end])
+            one, other, kk = before[:, stack.gap], after[:, stack.gap], stack.margin_kk(after)
+            leapt = (one * other > 0.0) & (np.abs(one - other) > 0.1 * np.minimum(np.abs(one), np.abs(other)))
+            between = np.geomspace(one[leapt], other[leapt], 200)
+            at = np.concatenate([one, other, between.ravel()])
+            held = np.concatenate([kk, kk, np.broadcast_to(kk[leapt], between.shape).ravel()])
+            if stack.rises(at, held, s).min() <= 0.0:
+                raise _NoStep("fold")
         return replace(step, u_end=end), us
 
     def sign(self, t: float, h: float, u: np.ndarray, source: Waveform) -> float:
@@ -1392,8 +1404,7 @@ class _Run:
 
     def stored(self, u: np.ndarray) -> float:
         """kk of `fold_margin` for layer voltages u."""
-        j = self.stack.gap
-        return float((self.stack.b_of_w @ self.stack.gauge(u))[j]) / (self.stack.c[j] * self.stack.a_zero)
+        return float(self.stack.margin_kk(u[None])[0])
 
     def fold_at(self, t: float, u: np.ndarray, source: Waveform, s: float, reason: str) -> None:
         """Record the fold, which steps have come up to until they were rounding of the time."""
