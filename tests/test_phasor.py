@@ -86,23 +86,6 @@ def test_the_skin_is_evaluated_at_each_frequency_of_a_sweep_whatever_its_own_f()
         assert sweep.gain[i] == pytest.approx(phasor_gains(x, 35e-6, table1_layers(float(x)))[GAP], rel=1e-13)
 
 
-@settings(max_examples=50, derandomize=True, deadline=None)
-@given(
-    st.lists(
-        st.tuples(st.floats(-12.0, -3.0), st.floats(-12.0, -3.0)).map(lambda x: complex(10.0 ** x[0], 10.0 ** x[1])),
-        min_size=1,
-        max_size=8,
-    )
-)
-def test_layer_gains_share_the_source_in_the_ratio_of_the_impedances(y: list[complex]) -> None:
-    gains = layer_gains(y)
-    assert abs(gains.sum() - 1.0) < 1e-14
-    current = gains * np.array(y)
-    np.testing.assert_allclose(current, current[0], rtol=1e-13)
-    total = sum(1.0 / x for x in y)
-    np.testing.assert_allclose(gains, [1.0 / x / total for x in y], rtol=1e-13)
-
-
 def test_an_open_layer_takes_all_the_voltage() -> None:
     np.testing.assert_array_equal(layer_gains([1e-6, 0.0, 1e-3]), [0.0, 1.0, 0.0])
     np.testing.assert_array_equal(layer_gains([0.0, 1e-6, 0.0]), [0.5, 0.0, 0.5])
