@@ -231,7 +231,7 @@ def _universal_log(x: np.ndarray, m: float, p: float) -> np.ndarray:
         e = x * np.exp(p * log_y)
         step = (log_y / m - np.log1p(e)) / (1.0 / m - p * e / (1.0 + e))
         log_y = log_y - step
-        size = float(np.max(np.abs(step))) if step.size else 0.0
+        size = float(np.abs(step).max(initial=0.0))
         if size < 1e-16 or (size < 1e-13 and size >= last):
             return log_y
         last = size
@@ -1010,12 +1010,9 @@ class _Nodes:
 
     def _antiderivative(self, x: np.ndarray) -> np.ndarray:
         """Rows: integrals from 0 to tau(x) of the Legendre polynomials, with respect to tau."""
-        columns = []
-        for j in range(len(self.x)):
-            unit = np.zeros(j + 1)
-            unit[j] = 1.0
-            columns.append(0.5 * legendre.legval(x, legendre.legint(unit, lbnd=-1.0)))
-        return np.array(columns).T
+        p = legendre.legvander(x, len(self.x))
+        degrees = np.arange(1, len(self.x))
+        return 0.5 * np.column_stack([p[:, 0] + p[:, 1], (p[:, 2:] - p[:, :-2]) / (2 * degrees + 1)])
 
     def antiderivative(self, x: np.ndarray) -> np.ndarray:
         """Matrix (len(x), stages): integral from 0 to tau(x) of the interpolant through stage values."""

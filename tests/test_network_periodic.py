@@ -14,7 +14,7 @@ import fingerspice as fs
 from commands import run_here
 from fingerspice.studies.limits import fold_voltage
 from network_reference import Floating
-from scenes import CIRCUITS, deck, every_law, finger, floating, shipped, table1
+from scenes import CIRCUITS, cases, deck, every_law, finger, floating, shipped, table1
 
 WAVES = (fs.Sine(200.0, 5000.0), fs.Square(200.0, 5000.0), fs.Square(150.0, 5000.0, duty=0.3))
 SHIPPED = ("amplifier", "ungrounded_user", "two_fingers")
@@ -333,7 +333,7 @@ def test_a_rough_function_counts_in_both_errors_and_in_what_is_asked(name: str, 
         # Its own rounding: a part in 1e11, anew at every time.
         return 200.0 * math.sin(3e3 * t) * (1.0 + 1e-11 * table.setdefault(t, rng.uniform(-1.0, 1.0)))
 
-    given = {"sources": rough, "t_stop": 4e-4, "area": area}
+    given = {"sources": rough, "t_stop": 1e-4 * cases(4, 2), "area": area}
     met = fs.simulate(shipped(name), rtol=1e-8, **given)
     tight = fs.simulate(shipped(name), rtol=1e-13, throw=False, **given)
     assert met.success
