@@ -9,7 +9,7 @@ from scipy import integrate
 import fingerspice as fs
 from fingerspice.engine.lanes.rows import INNER, QUICK, Lanes, weigh, weighed
 from fingerspice.solve.recordings.block import LEAST_POINTS
-from scenes import cases, dispersive_deck, every_law, table1
+from scenes import LAWS, cases, dispersive_deck, table1
 
 
 def circuit_of(skin: str) -> fs.Circuit:
@@ -41,14 +41,18 @@ def compared(circuit: fs.Circuit, wave: fs.PWL, t: np.ndarray, *rtols: float, **
     return runs
 
 
-@every_law
-@pytest.mark.parametrize("skin", ["SKIN", "SKIN_DISPERSIVE"])
+# For each law, number of modes and rule of nodes, which depends on the tolerance, code is compiled anew, which takes
+# long: the suite has each law under each rule, and each skin.
+FEW = [("SKIN", "local", (1e-3, 1e-5, 1e-7)), ("SKIN", "mobile", (1e-3, 1e-5)), ("SKIN_DISPERSIVE", "mobile", (1e-7,))]
+EVERY = [(skin, law, (1e-3, 1e-5, 1e-7)) for skin in ("SKIN", "SKIN_DISPERSIVE") for law in LAWS]
+
+
+@pytest.mark.parametrize(("skin", "law", "rtols"), EVERY if cases(1, 0) else FEW)
 @pytest.mark.parametrize("seed", range(cases(4, 1)))
-def test_points_at_uneven_times_run_one_step_each_with_the_error_stated(skin: str, seed: int, law: str) -> None:
+def test_points_at_uneven_times_run_one_step_each_with_the_error_stated(
+    seed: int, skin: str, law: str, rtols: tuple[float, ...]
+) -> None:
     circuit, (t, v) = circuit_of(skin), points(seed)
-    # For each law, skin and rule of nodes code is compiled anew, which takes long: each law and skin has one rule.
-    few = (1e-3, 1e-5) if (law == "local") == (skin != "SKIN") else (1e-7,)
-    rtols = (1e-3, 1e-5, 1e-7) if (skin, law) == ("SKIN", "local") or cases(1, 0) else few
     for run in compared(circuit, fs.PWL(t, v), t, *rtols, charge_law=law):
         assert run.method == "relaxation"
         assert run.stats["steps"] >= t.size - 1
