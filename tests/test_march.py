@@ -24,7 +24,7 @@ from scenes import CIRCUITS, cases, every_law, random_finger, random_waveform, t
 
 # Fast enough that a step long against a period is short against the decays, and the gap voltage never changes sign.
 F = 20e3
-PHASES = 0.1 + 2.0 * math.pi * np.arange(0, 16, cases(1, 2)) / 16
+PHASES = 0.1 + 2.0 * math.pi * np.arange(16) / 16
 
 
 def errors_of_one_step(amplitude: float, offset: float, phase: float, h: float, law: str) -> tuple[float, float]:
