@@ -303,8 +303,8 @@ def _quadrature() -> tuple[np.ndarray, np.ndarray]:
     return 0.5 * (x + 1.0), 0.5 * w
 
 
-def area_primitive(u: float, params: Parameters = TABLE1, k: float = 1.0) -> float:
-    """Integral of A_R(|v|) dv from 0 to u, m^2 V, odd in u.
+def area_primitive(u: np.ndarray | float, params: Parameters = TABLE1, k: float = 1.0) -> np.ndarray:
+    """Integrals of A_R(|v|) dv from 0 to each u, m^2 V, odd in u.
 
     40-point Gauss on panels that double in length, the first as long as the voltage at which friction begins
     to take area away or X = 0.5, whichever is less.
@@ -313,12 +313,13 @@ def area_primitive(u: float, params: Parameters = TABLE1, k: float = 1.0) -> flo
     _, a_hertz, x_per_u, sigma_per_u2, c = _contact_constants(params, k)
     b = c / a_hertz
     first = min(0.5 / x_per_u, math.sqrt(0.5 / (b * params.force_normal + math.sqrt(c)) / sigma_per_u2))
-    edges = [0.0, first]
-    while edges[-1] < abs(u):
+    size, edges = np.abs(np.asarray(u, dtype=float)), [0.0, first]
+    while edges[-1] < size.max(initial=0.0):
         edges.append(2.0 * edges[-1])
-    edges = np.minimum(edges, abs(u))
-    nodes = edges[:-1, None] + np.diff(edges)[:, None] * x
-    return math.copysign(float(np.sum(np.diff(edges)[:, None] * w * contact(nodes, params, k)[1])), u)
+    starts = np.minimum(edges, size[..., None])
+    lengths = np.diff(starts)[..., None]
+    nodes = starts[..., :-1, None] + lengths * x
+    return np.copysign(np.sum(lengths * w * contact(nodes, params, k)[1], axis=(-2, -1)), u)
 
 
 def jkr_parameters(radius: float, e_star: float) -> tuple[float, float, float, float]:
@@ -973,12 +974,12 @@ class _Stack:
             u = ahead
         return u
 
-    def stored(self, u: float) -> float:
+    def stored(self, u: np.ndarray | float) -> np.ndarray:
         """Charge taken up by the gap capacitor between 0 and u, C: c_a int A du (local), c_a A u (mobile)."""
         if self.frozen is not None:
             return self.c[self.gap] * self.frozen * u
         if self.mobile:
-            return float(self.c[self.gap] * area(u, self.params, self.k) * u)
+            return self.c[self.gap] * area(u, self.params, self.k) * u
         return self.c[self.gap] * area_primitive(u, self.params, self.k)
 
 
@@ -1186,7 +1187,6 @@ def _sample(run: Transient, t: np.ndarray, side: str) -> Transient:
                 continue
             raise ValueError(f"output time {ti} s outside [{run.steps[0].t}, {t_end}] s")
         groups.setdefault(_place(run.steps, ti, side), []).append(i)
-    stored0 = stack.stored(run.u_before)
     for j, index in groups.items():
         step = run.steps[j]
         ti = t[index]
@@ -1198,8 +1198,9 @@ def _sample(run: Transient, t: np.ndarray, side: str) -> Transient:
                 raise RuntimeError(f"no voltages at t = {ti[0]} s, in a step that has them at its nodes") from None
             continue
         x = np.clip(2.0 * (ti - step.t) / step.h - 1.0, -1.0, 1.0)
-        leaked = step.q_leak + step.h * (nodes.antiderivative(x) @ step.leak)
-        q[index] = leaked + np.array([stack.stored(v) - stored0 for v in u[index, stack.gap]])
+        q[index] = step.q_leak + step.h * (nodes.antiderivative(x) @ step.leak)
+    known = ~np.isnan(q)
+    q[known] += stack.stored(u[known, stack.gap]) - stack.stored(run.u_before)
     force = stack.sigma_per_u2 * u[:, stack.gap] ** 2 * a
     return replace(run, t=t, u=u, area=a, force=force, q=q)
 
