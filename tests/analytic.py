@@ -231,7 +231,7 @@ def _universal_log(x: np.ndarray, m: float, p: float) -> np.ndarray:
         e = x * np.exp(p * log_y)
         step = (log_y / m - np.log1p(e)) / (1.0 / m - p * e / (1.0 + e))
         log_y = log_y - step
-        size = float(np.max(np.abs(step))) if step.size else 0.0
+        size = float(np.abs(step).max(initial=0.0))
         if size < 1e-16 or (size < 1e-13 and size >= last):
             return log_y
         last = size
@@ -303,8 +303,8 @@ def _quadrature() -> tuple[np.ndarray, np.ndarray]:
     return 0.5 * (x + 1.0), 0.5 * w
 
 
-def area_primitive(u: float, params: Parameters = TABLE1, k: float = 1.0) -> float:
-    """Integral of A_R(|v|) dv from 0 to u, m^2 V, odd in u.
+def area_primitive(u: np.ndarray | float, params: Parameters = TABLE1, k: float = 1.0) -> np.ndarray:
+    """Integrals of A_R(|v|) dv from 0 to each u, m^2 V, odd in u.
 
     40-point Gauss on panels that double in length, the first as long as the voltage at which friction begins
     to take area away or X = 0.5, whichever is less.
@@ -313,12 +313,13 @@ def area_primitive(u: float, params: Parameters = TABLE1, k: float = 1.0) -> flo
     _, a_hertz, x_per_u, sigma_per_u2, c = _contact_constants(params, k)
     b = c / a_hertz
     first = min(0.5 / x_per_u, math.sqrt(0.5 / (b * params.force_normal + math.sqrt(c)) / sigma_per_u2))
-    edges = [0.0, first]
-    while edges[-1] < abs(u):
+    size, edges = np.abs(np.asarray(u, dtype=float)), [0.0, first]
+    while edges[-1] < size.max(initial=0.0):
         edges.append(2.0 * edges[-1])
-    edges = np.minimum(edges, abs(u))
-    nodes = edges[:-1, None] + np.diff(edges)[:, None] * x
-    return math.copysign(float(np.sum(np.diff(edges)[:, None] * w * contact(nodes, params, k)[1])), u)
+    starts = np.minimum(edges, size[..., None])
+    lengths = np.diff(starts)[..., None]
+    nodes = starts[..., :-1, None] + lengths * x
+    return np.copysign(np.sum(lengths * w * contact(nodes, params, k)[1], axis=(-2, -1)), u)
 
 
 def jkr_parameters(radius: float, e_star: float) -> tuple[float, float, float, float]:
@@ -930,10 +931,20 @@ class _Stack:
         after[j] = ua
         return after
 
-    def rise(self, u: float, kk: float, side: float) -> float:
+    def rises(self, u: np.ndarray, kk: np.ndarray, side: float) -> np.ndarray:
         """d p / d u of the mobile equation p = u - kk A(0)/A(|u|), on the given side of 0: 0 at a fold."""
-        a, da = (float(x[0]) for x in self.area(np.array([abs(u)])))
-        return 1.0 + math.copysign(1.0, u or side) * kk * self.a_zero * da / a**2
+        a, da = self.area(np.abs(u))
+        return 1.0 + np.copysign(1.0, np.where(u == 0.0, side, u)) * kk * self.a_zero * da / a**2
+
+    def rise(self, u: float, kk: float, side: float) -> float:
+        """`rises` at one voltage."""
+        return float(self.rises(np.array([u]), np.array([kk]), side)[0])
+
+    def margin_kk(self, u: np.ndarray) -> np.ndarray:
+        """kk of `fold_margin` for layer voltages u (m, n)."""
+        j = self.gap
+        leaked = -(u * self.c) * self.area(np.abs(u[:, j]))[0][:, None]
+        return leaked @ self.b_of_w[j] / (self.c[j] * self.a_zero)
 
     def _ramped(self, p: float, kk: float, u: float) -> float:
         """Gap voltage where the source's share has gone to p along a ramp too fast for any leak.
@@ -963,12 +974,12 @@ class _Stack:
             u = ahead
         return u
 
-    def stored(self, u: float) -> float:
+    def stored(self, u: np.ndarray | float) -> np.ndarray:
         """Charge taken up by the gap capacitor between 0 and u, C: c_a int A du (local), c_a A u (mobile)."""
         if self.frozen is not None:
             return self.c[self.gap] * self.frozen * u
         if self.mobile:
-            return float(self.c[self.gap] * area(u, self.params, self.k) * u)
+            return self.c[self.gap] * area(u, self.params, self.k) * u
         return self.c[self.gap] * area_primitive(u, self.params, self.k)
 
 
@@ -1000,12 +1011,9 @@ class _Nodes:
 
     def _antiderivative(self, x: np.ndarray) -> np.ndarray:
         """Rows: integrals from 0 to tau(x) of the Legendre polynomials, with respect to tau."""
-        columns = []
-        for j in range(len(self.x)):
-            unit = np.zeros(j + 1)
-            unit[j] = 1.0
-            columns.append(0.5 * legendre.legval(x, legendre.legint(unit, lbnd=-1.0)))
-        return np.array(columns).T
+        p = legendre.legvander(x, len(self.x))
+        degrees = np.arange(1, len(self.x))
+        return 0.5 * np.column_stack([p[:, 0] + p[:, 1], (p[:, 2:] - p[:, :-2]) / (2 * degrees + 1)])
 
     def antiderivative(self, x: np.ndarray) -> np.ndarray:
         """Matrix (len(x), stages): integral from 0 to tau(x) of the interpolant through stage values."""
@@ -1181,7 +1189,6 @@ def _sample(run: Transient, t: np.ndarray, side: str) -> Transient:
                 continue
             raise ValueError(f"output time {ti} s outside [{run.steps[0].t}, {t_end}] s")
         groups.setdefault(_place(run.steps, ti, side), []).append(i)
-    stored0 = stack.stored(run.u_before)
     for j, index in groups.items():
         step = run.steps[j]
         ti = t[index]
@@ -1193,8 +1200,9 @@ def _sample(run: Transient, t: np.ndarray, side: str) -> Transient:
                 raise RuntimeError(f"no voltages at t = {ti[0]} s, in a step that has them at its nodes") from None
             continue
         x = np.clip(2.0 * (ti - step.t) / step.h - 1.0, -1.0, 1.0)
-        leaked = step.q_leak + step.h * (nodes.antiderivative(x) @ step.leak)
-        q[index] = leaked + np.array([stack.stored(v) - stored0 for v in u[index, stack.gap]])
+        q[index] = step.q_leak + step.h * (nodes.antiderivative(x) @ step.leak)
+    known = ~np.isnan(q)
+    q[known] += stack.stored(u[known, stack.gap]) - stack.stored(run.u_before)
     force = stack.sigma_per_u2 * u[:, stack.gap] ** 2 * a
     return replace(run, t=t, u=u, area=a, force=force, q=q)
 
@@ -1303,13 +1311,13 @@ class _Run:
         end = _fields_at(stack, self.nodes, step, np.array([1.0]))[0][0]
         if stack.mobile:
             # Newton's iteration may have leapt past a fold to voltages that no motion leads to.
-            states = np.array([u, *us, end])
-            one, other = states[:-1, stack.gap], states[1:, stack.gap]
-            first = np.where(one * other > 0.0, np.abs(one), np.abs(other))
-            between = np.geomspace(np.maximum(first, 1e-300), np.maximum(np.abs(other), 1e-300), 60)
-            a, da = stack.area(between.ravel())
-            kk = np.array([self.stored(x) for x in states[1:]]) * np.copysign(1.0, np.where(other == 0.0, s, other))
-            if np.any(1.0 + kk * stack.a_zero * (da / a**2).reshape(between.shape) <= 0.0):
+            before, after = np.array([u, *us]), np.array([*us, end])
+            one, other, kk = before[:, stack.gap], after[:, stack.gap], stack.margin_kk(after)
+            leapt = (one * other > 0.0) & (np.abs(one - other) > 0.1 * np.minimum(np.abs(one), np.abs(other)))
+            between = np.geomspace(one[leapt], other[leapt], 200)
+            at = np.concatenate([one, other, between.ravel()])
+            held = np.concatenate([kk, kk, np.broadcast_to(kk[leapt], between.shape).ravel()])
+            if stack.rises(at, held, s).min() <= 0.0:
                 raise _NoStep("fold")
         return replace(step, u_end=end), us
 
@@ -1396,8 +1404,7 @@ class _Run:
 
     def stored(self, u: np.ndarray) -> float:
         """kk of `fold_margin` for layer voltages u."""
-        j = self.stack.gap
-        return float((self.stack.b_of_w @ self.stack.gauge(u))[j]) / (self.stack.c[j] * self.stack.a_zero)
+        return float(self.stack.margin_kk(u[None])[0])
 
     def fold_at(self, t: float, u: np.ndarray, source: Waveform, s: float, reason: str) -> None:
         """Record the fold, which steps have come up to until they were rounding of the time."""

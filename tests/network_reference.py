@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
-from scipy.optimize import brentq
 
 import analytic
 
@@ -145,14 +144,19 @@ class Floating:
             if q == 0.0:
                 return y[:3] / (c * a0), a0
 
-            def missing(v: float) -> float:
-                return c[gap] * float(analytic.area(abs(v))) * v - q
-
             # The area grows by 1 % at first, then falls; these stay where it is not less than half.
-            held = q / (c[gap] * a0)
+            v = held = float(q / (c[gap] * a0))
             if not abs(held) <= 200.0:
                 return np.full(3, np.nan), math.nan
-            v = brentq(missing, 0.9 * held, 2.0 * held, xtol=1e-13, rtol=1e-15)
+            for _ in range(50):
+                _, at, slope, _ = analytic.contact(abs(v))
+                step = (at * v - a0 * held) / (at + abs(v) * slope)
+                v -= float(step)
+                # What is left is of the square of the last step.
+                if abs(step) <= 1e-9 * abs(v):
+                    break
+            else:
+                raise AssertionError("Newton's method did not converge")
             area = float(analytic.area(abs(v)))
             return y[:3] / (c * area), area
 

@@ -62,7 +62,7 @@ def draw(number: int, count: int = 600, network: bool = False) -> Recording:
     return Recording(number, kind, fs.parse_netlist("\n".join(text)), fs.Samples(values, rate, start), law)
 
 
-def judge(recording: Recording) -> list[Beside]:
+def judge(recording: Recording, rtols: tuple[float, ...] = RTOLS) -> list[Beside]:
     """Stated and true errors of all quantities at all tolerances; none where the samples were not followed."""
     samples = recording.samples
     stop = samples.start + (samples.values.size - 1.6) / samples.rate
@@ -78,7 +78,7 @@ def judge(recording: Recording) -> list[Beside]:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fs.FingerspiceWarning)
-        runs = {rtol: run(rtol, "auto") for rtol in RTOLS}
+        runs = {rtol: run(rtol, "auto") for rtol in rtols}
         if not all(one.method == "relaxation" and one.success for one in runs.values()):
             return []
         return beside(recording, runs, run(TIGHT, "exponential"))

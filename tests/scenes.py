@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import os
+import re
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
 from scipy.stats import binom
 
 import fingerspice as fs
 
+CIRCUITS = Path(__file__).parents[1] / "circuits"
+LAWS = ("local", "mobile")
+every_law = pytest.mark.parametrize("law", LAWS)
 COAT = {"d": "1u", "eps_r": 3.9, "r": "0.2meg"}
 GAP = {
     "d": "3.5u",
@@ -72,6 +79,16 @@ def table1(source: str = "SIN(0 200 100)", f: float = 100.0, **changes: Any) -> 
     return fs.parse_netlist(table1_deck(source, f, **changes))
 
 
+def dispersive_deck(source: str = "SIN(0 200 100)", **changes: Any) -> str:
+    """`table1_deck` with a dispersive skin."""
+    return re.sub(r"SKIN (d=\S+) f=\S+", r"SKIN_DISPERSIVE \1", table1_deck(source, **changes))
+
+
+def shipped(name: str) -> fs.Circuit:
+    """A deck of `circuits/`."""
+    return fs.read_netlist(CIRCUITS / f"{name}.cir")
+
+
 def deck(*lines: str) -> fs.Circuit:
     """A circuit from element lines."""
     return fs.parse_netlist("\n".join(("a deck", *lines, "")))
@@ -84,3 +101,38 @@ def finger(p: str, n: str, area: str = "area", name: str = "", f: float = 5000.0
         f"Xgap{name} top{name} skin{name} {area} GAP {assignments(GAP | gap)}",
         f"Xskin{name} skin{name} {n} {area} SKIN d=350u f={f!r}",
     ]
+
+
+def floating(source: str = "0", *more: str, **gap: object) -> fs.Circuit:
+    """Amplifier, its resistance, Table 1's finger at 5 kHz and a body's capacitance: `network_reference.Floating`."""
+    lines = (f"Vdrive amp 0 {source}", "Rout amp drive 47k", *finger("drive", "body", **gap), "Cbody body 0 150p")
+    return deck(*lines, *more, ".tran 1u 1m uic")
+
+
+def random_finger(rng: np.random.Generator) -> fs.Circuit:
+    """Table 1 with other leaks, gap, load and skin."""
+    changes = {
+        "Xgap.r": 10.0 ** rng.uniform(5.0, 9.0),
+        "Xgap.d": rng.uniform(2e-6, 8e-6),
+        "Xgap.fn": rng.uniform(0.2, 1.0),
+        "Xcoat.r": 10.0 ** rng.uniform(2.0, 9.0),
+        "Xskin.d": rng.uniform(1e-4, 5e-4),
+    }
+    return table1().replace(changes)
+
+
+def random_waveform(rng: np.random.Generator, f: float, u: float) -> fs.Waveform:
+    """One of any kind with a frequency (Hz) or times of about its period, and an amplitude of about `u` (V)."""
+    makers = (
+        lambda: fs.Sine(u, f, offset=rng.uniform(-0.3, 0.3) * u, phase_deg=rng.uniform(0.0, 360.0)),
+        lambda: fs.Square(u, f, duty=rng.uniform(0.1, 0.9), offset=rng.uniform(-0.2, 0.2) * u),
+        lambda: fs.Triangle(u, f),
+        lambda: fs.Sawtooth(u, f, phase_deg=rng.uniform(0.0, 360.0)),
+        lambda: fs.Chirp(u, 0.2 * f, 4.0 * f, 1.5 / f),
+        lambda: fs.AM(u, 6.0 * f, f, depth=rng.uniform(0.1, 1.0)),
+        lambda: fs.Exp(0.0, u, 0.2 / f, 0.3 / f, 1.0 / f, 0.1 / f),
+        lambda: fs.PWL((0.0, 0.4 / f, 0.4 / f, 1.1 / f, 1.6 / f), (0.0, u, -0.5 * u, 0.7 * u, 0.0)),
+        lambda: fs.Pulse(0.0, u, 0.1 / f, 0.05 / f, 0.0, 0.4 / f, 1.0 / f),
+        lambda: fs.Function(lambda t: u * np.sin(5.0 * f * t) * np.exp(-f * t)),
+    )
+    return makers[rng.integers(len(makers))]()

@@ -15,13 +15,11 @@ from scipy.optimize import minimize
 import analytic as ref
 import fingerspice as fs
 from commands import Command
-from scenes import cases, table1, table1_deck
+from scenes import cases, dispersive_deck, shipped, table1
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
-DISPERSIVE = table1_deck().replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
 KINDS = {
-    "stack": table1(), "dispersive": fs.parse_netlist(DISPERSIVE),
-    **{deck: fs.read_netlist(CIRCUITS / f"{deck}.cir") for deck in ("amplifier", "ungrounded_user")},
+    "stack": table1(), "dispersive": fs.parse_netlist(dispersive_deck()),
+    **{deck: shipped(deck) for deck in ("amplifier", "ungrounded_user")},
 }  # fmt: skip
 pytestmark = pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
 
@@ -139,7 +137,7 @@ BAD = [
     ({"force": [0.1] * 3, "limit": -5.0}, "limit is -5"),
     ({"force": [1e9] * 3}, "reached by no voltage"),
     ({"force": [0.1] * 3, "charge_law": "no"}, "charge_law is 'no'"),
-    *(({"circuit": fs.read_netlist(CIRCUITS / f"{deck}.cir"), "force": [0.1, 0.1]}, said) for deck, said in (
+    *(({"circuit": shipped(deck), "force": [0.1, 0.1]}, said) for deck, said in (
         ("two_fingers", "one finger"), ("current_drive", "one V"), ("fingerpad_dispersive", "one V"))),
     ({"circuit": table1(gap={"tau": 1e-3}), "force": [0.1, 0.1]}, "tau"),
     ({"circuit": table1(gap={"mu": 0}), "friction": [0.1, 0.1]}, "mu=0"),

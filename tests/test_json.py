@@ -15,8 +15,8 @@ import fingerspice as fs
 from commands import Command, Result
 from deck_edits import edited
 from fingerspice.cli.terminal import COMMON, FIGURES, OWN
+from scenes import CIRCUITS, shipped
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 DOCUMENT = (Path(__file__).parents[1] / "docs" / "json.md").read_text()
 FLAT = "t\nV1 a 0 SIN(0 10 100)\nXcoat a 0 area LAYER d=1u eps_r=2 r=1k\nVarea area 0 35\n.tran 100u 20m uic\n"
 RC = "t\nV1 a 0 SIN(0 10 100)\nR1 a b 1k\nC1 b 0 1u\n.tran 100u 20m uic\n"
@@ -108,7 +108,7 @@ def test_an_answer_says_what_was_asked_changed_and_warned_of(command: Command) -
 
 def test_the_rows_are_the_figures_of_the_summary_by_element(command: Command) -> None:
     data = answer(command("run", str(CIRCUITS / "two_fingers.cir"), "--json", "--no-plot"), "run")
-    solution = fs.simulate(fs.read_netlist(CIRCUITS / "two_fingers.cir"))
+    solution = fs.simulate(shipped("two_fingers"))
     rows = {(row["signal"], row["element"]): row for row in data["signals"]}
     assert {element for signal, element in rows if signal == "f_el"} == set(solution.gaps)
     for i, name in enumerate(solution.gaps):

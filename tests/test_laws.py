@@ -15,7 +15,7 @@ from scipy.fft import dct
 
 import analytic as ref
 import fingerspice as fs
-from scenes import deck, table1
+from scenes import deck, every_law, table1
 
 EPS0 = 8.854e-12
 SOURCES = {
@@ -30,7 +30,7 @@ def run(waveform, law="local", **options):
     return fs.simulate(table1(), sources={"Vdrive": waveform}, **options)
 
 
-@pytest.mark.parametrize("law", ["local", "mobile"])
+@every_law
 @pytest.mark.parametrize("source", SOURCES)
 def test_reversing_the_source_reverses_every_voltage_and_no_force(source, law):
     plus = run(SOURCES[source], law)
@@ -41,7 +41,7 @@ def test_reversing_the_source_reverses_every_voltage_and_no_force(source, law):
     assert np.abs(plus.q_source + minus.q_source).max() <= 1e-12 * np.abs(plus.q_source).max()
 
 
-@pytest.mark.parametrize("law", ["local", "mobile"])
+@every_law
 def test_a_later_source_gives_the_same_response_later(law):
     # An uncharged stack at 0 V stays so: the sine may as well begin 3 ms later.
     t = np.linspace(0.0, 0.017, 341)
@@ -62,14 +62,14 @@ def permuted(order):
 
 
 @pytest.mark.parametrize("order", ["gcs", "scg", "csg", "sgc", "gsc"])
-@pytest.mark.parametrize("law", ["local", "mobile"])
+@every_law
 def test_the_order_of_the_layers_does_not_matter(order, law):
     usual = fs.simulate(permuted("cgs"), charge_law=law)
     other = fs.simulate(permuted(order), charge_law=law)
     assert np.abs(usual.u_gap - other.u_gap).max() <= 2e-8 * np.abs(usual.u_gap).max()
 
 
-@pytest.mark.parametrize("law", ["local", "mobile"])
+@every_law
 def test_charge_bookkeeping_closes_to_1e_12(law):
     """The current through each layer, C u' or (C u)' plus its leak, is the source's: integrated over smooth stretches.
 

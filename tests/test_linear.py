@@ -119,8 +119,7 @@ def test_a_wave_that_decays_as_the_mode_does(p, off):
 
 
 rates_strategy = st.one_of(
-    st.sampled_from([0.0, 1.0, 1.0 + 1e-12, 1e3, 1e12, 5e-324, 1e-300]),
-    st.floats(-6.0, 15.0).map(lambda x: 10.0**x),
+    st.sampled_from([0.0, 1.0, 1.0 + 1e-12, 1e3, 1e12, 5e-324, 1e-300]), st.floats(-6.0, 15.0).map(lambda x: 10.0**x)
 )
 exponents = st.one_of(
     st.just(0.0), st.floats(-3.0, 1.5).map(lambda x: 10.0**x), st.floats(-3.0, 9.0).map(lambda x: -(10.0**x))

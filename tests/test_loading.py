@@ -19,7 +19,7 @@ from scipy.io import wavfile
 import fingerspice as fs
 from fingerspice.results import runfile
 from fingerspice.results.runfile import GROUP
-from scenes import table1, table1_deck
+from scenes import shipped, table1, table1_deck
 
 AM = fs.AM(150.0, 5000.0, 50.0) + 3.0 * fs.Square(1.0, 50.0, duty=0.25)
 
@@ -35,7 +35,7 @@ def one(name: str) -> fs.Solution:
         return fs.simulate(table1("SQUARE(200 100)"), charge=False, t_stop=0.02)
     if name == "short":
         return fs.simulate(table1(), t_stop=1e-3)
-    return fs.simulate(fs.read_netlist(f"circuits/{name}.cir"))
+    return fs.simulate(shipped(name))
 
 
 RUNS = ["changed", "failed", "no charge", "two_fingers", "amplifier", "fingerpad_square"]

@@ -80,19 +80,6 @@ def test_the_nodes_are_those_of_gauss_and_lobatto_and_symmetric() -> None:
 
 
 @pytest.mark.parametrize("z", Z)
-def test_a_forcing_that_is_a_polynomial_of_the_nodes_degree_is_answered_exactly(z: float) -> None:
-    _, phi, _ = table(z)
-    with mp.workdps(DIGITS):
-        for i, c in enumerate(POINTS):
-            # Each entry is rounded by itself, and they have both signs.
-            size = float(np.abs(phi[:, i]).sum())
-            for degree in range(NODES):
-                powers = [mp.mpf(float(x)) ** degree for x in POINTS[:NODES]]
-                got = mp.fsum(mp.mpf(float(a)) * b for a, b in zip(phi[:, i], powers, strict=True))
-                assert abs(got - moments(z, c)[degree]) <= rounding(z) * size, (i, degree)
-
-
-@pytest.mark.parametrize("z", Z)
 def test_every_entry_is_the_integral_of_its_own_basis_polynomial(z: float) -> None:
     _, phi, _ = table(z)
     with mp.workdps(DIGITS):

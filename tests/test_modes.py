@@ -129,25 +129,6 @@ def test_elements_that_do_not_relax_leave_one_rate_of_zero_less_than_they_are(n:
         assert abs(got - exact) <= 1e-13 * exact + 1e-60
 
 
-@SEARCH
-@given(st.integers(2, 9), st.integers(0, 2**32 - 1))
-def test_one_rate_lies_between_any_two_neighbours_of_the_elements(n: int, seed: int) -> None:
-    r = 10.0 ** np.random.default_rng(seed).uniform(-3.0, 9.0, n)
-    rates, poles = np.sort(modes(r, shares(seed, n, 6.0))[0]), np.sort(r)
-    assert np.all(poles[:-1] <= rates)
-    assert np.all(rates <= poles[1:])
-
-
-def test_the_order_of_the_elements_does_not_matter() -> None:
-    rng = np.random.default_rng(7)
-    r, k = 10.0 ** rng.uniform(0.0, 9.0, 7), shares(7, 7, 2.0)
-    turned = rng.permutation(7)
-    a, b = modes(r, k), modes(r[turned], k[turned])
-    np.testing.assert_array_equal(a[0], b[0])
-    np.testing.assert_allclose(a[3][turned], b[3], rtol=1e-14)
-    np.testing.assert_allclose(a[2][turned], b[2], rtol=1e-13)
-
-
 def test_a_single_element_has_no_mode_and_two_have_their_weighted_mean_rate() -> None:
     assert [x.shape for x in modes(np.array([3.0]), np.array([1.0]))] == [(0,), (0,), (1, 0), (1, 0)]
     rates, gain, _, shape = modes(np.array([2.0, 50.0]), np.array([0.3, 0.7]))

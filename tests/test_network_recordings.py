@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,11 +9,10 @@ import fingerspice as fs
 import recording_errors
 from fingerspice.solve.recordings import block
 from network_reference import Floating
-from scenes import COAT, GAP, assignments, cases, deck
+from scenes import cases, floating, shipped
 
 RATE = 48e3
 pytestmark = pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 
 
 def recording(count: int, high: float = 4000.0, volts: float = 150.0) -> fs.Samples:
@@ -24,18 +21,9 @@ def recording(count: int, high: float = 4000.0, volts: float = 150.0) -> fs.Samp
 
 def driven(name: str, wave: fs.Waveform) -> fs.Circuit:
     """A shipped deck with this waveform in its first source, and 0 in all others."""
-    circuit = fs.read_netlist(CIRCUITS / f"{name}.cir")
+    circuit = shipped(name)
     first = next(e.name for e in circuit.elements if e.name[0] in "VI")
     return circuit.replace({e.name: wave if e.name == first else 0.0 for e in circuit.elements if e.waveform})
-
-
-def floating(between: str = "") -> fs.Circuit:
-    """Source, resistance, Table 1's finger at 5 kHz, and a capacitor to ground: see `network_reference.Floating`."""
-    layers = [
-        f"Xcoat top a area LAYER {assignments(COAT)}", f"Xgap a b area GAP {assignments(GAP)}",
-        "Xskin b body area SKIN d=350u f=5000",
-    ]  # fmt: skip
-    return deck("Vdrive amp 0 0", "Ramp amp top 47k", *layers, "Cbody body 0 150p", between, ".tran 1u 1m uic")
 
 
 def by_hand(samples: fs.Samples, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -112,12 +100,12 @@ def test_chunks_are_the_whole_and_a_run_goes_on_where_another_has_ended(monkeypa
 def test_what_this_form_does_not_cover_is_stepped_as_ever() -> None:
     wave, how = recording(150), {"t_stop": 120.0 / RATE, "rtol": 1e-5}
     # An element between the layers, the other charge law, a second finger.
-    bridged = floating("Rleak a 0 1e9").replace({"Vdrive": wave})
+    bridged = floating("0", "Rleak top 0 1e9").replace({"Vdrive": wave})
     fingers = driven("two_fingers", wave)
     assert fs.simulate(bridged, charge_law="local", **how).method == "exponential"
     assert fs.simulate(floating().replace({"Vdrive": wave}), charge_law="mobile", **how).method == "exponential"
     assert fs.simulate(fingers, charge_law="local", **how).method == "exponential"
-    near = fs.simulate(floating("Rleak a 0 1e15").replace({"Vdrive": wave}), charge_law="local", **how)
+    near = fs.simulate(floating("0", "Rleak top 0 1e15").replace({"Vdrive": wave}), charge_law="local", **how)
     same = fs.simulate(floating().replace({"Vdrive": wave}), charge_law="local", **how, t_eval=near.t)
     assert (near.method, same.method) == ("exponential", "relaxation")
     assert np.abs(near.u_gap - same.u_gap).max() <= near.error.u_gap + same.error.u_gap

@@ -1,4 +1,4 @@
-"""Networks of R, C, V, I and layers, against dense matrix exponentials, hand-written ODEs, laws and phasors."""
+"""Networks of R, C, V, I and layers, against dense matrix exponentials, hand-written ODEs, laws, phasors and Radau."""
 
 from __future__ import annotations
 
@@ -13,19 +13,7 @@ from hypothesis import strategies as st
 import analytic
 import fingerspice as fs
 from network_reference import Floating, Nodal, Tone
-from scenes import COAT, GAP, assignments, deck, finger
-
-CIRCUITS = Path(__file__).resolve().parent.parent / "circuits"
-LAWS = ("local", "mobile")
-
-
-def floating(
-    source: str, resistance: float = 47e3, body: float = 150e-12, tran: str = "1u 1m uic", **gap: object
-) -> fs.Circuit:
-    """Amplifier with output resistance, finger, body capacitance to ground."""
-    return deck(f"Vdrive amp 0 {source}", f"Rout amp drive {resistance!r}", *finger("drive", "body", **gap),
-                f"Cbody body 0 {body!r}", f".tran {tran}")  # fmt: skip
-
+from scenes import COAT, GAP, assignments, deck, every_law, finger, floating, shipped
 
 # Linear networks ---------------------------------------------------------------------------------------------
 
@@ -128,7 +116,7 @@ def test_two_sources_in_two_branches_superpose() -> None:
 # The same stack as a network ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 @pytest.mark.parametrize("source", ["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)", "SIN(60 120 5k)"])
 def test_a_stack_beside_a_load_is_the_stack(source: str, law: str) -> None:
     f = 5000.0 if "5k" in source else 100.0
@@ -148,7 +136,7 @@ def test_a_stack_beside_a_load_is_the_stack(source: str, law: str) -> None:
     assert a.layers == b.layers
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 @pytest.mark.parametrize("source", ["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)"])
 @pytest.mark.parametrize("resistance", ["10m", "1u"])
 def test_a_small_resistor_in_the_way_changes_nothing_and_costs_little(source: str, law: str, resistance: str) -> None:
@@ -176,7 +164,7 @@ def test_a_dispersive_skin_in_a_network_is_the_same_ladder() -> None:
 # Mixed networks against an ODE written out by hand --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 @pytest.mark.parametrize("tau", [0.0, 50e-6])
 def test_amplifier_finger_and_body_follow_the_hand_written_equations(law: str, tau: float) -> None:
     circuit = floating("SIN(120 60 5k)", tau=tau)
@@ -189,7 +177,7 @@ def test_amplifier_finger_and_body_follow_the_hand_written_equations(law: str, t
     assert np.abs(s.q_source - expected["charge"]).max() <= 1e-8 * np.abs(expected["charge"]).max()
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 def test_an_ideal_jump_is_the_limit_of_a_fast_ramp(law: str) -> None:
     # No resistor in the way: the jump splits over capacitors of which some have a fixed value.
     def run(edge: str) -> tuple[float, float]:
@@ -208,7 +196,7 @@ def test_an_ideal_jump_is_the_limit_of_a_fast_ramp(law: str) -> None:
     assert 8.0 < off[1] / off[2] < 12.0
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 def test_errors_are_stated_honestly_on_a_mixed_network(law: str) -> None:
     circuit = floating("SIN(0 200 5k)")
     t = np.linspace(0.0, 1e-3, 301)
@@ -232,7 +220,7 @@ def quadrature(start: float, stop: float, pieces: int) -> tuple[np.ndarray, np.n
 
 
 @pytest.mark.parametrize("area", ["frozen", "coupled"])
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 def test_energy_of_source_resistors_and_capacitors_balances(law: str, area: str) -> None:
     # The gap voltage keeps its sign, so that nothing has a kink: the body leaks.
     circuit = deck("Vdrive amp 0 SIN(140 40 5k)", "Rout amp drive 47k", *finger("drive", "body"), "Cbody body 0 150p",
@@ -276,8 +264,8 @@ def test_energy_of_source_resistors_and_capacitors_balances(law: str, area: str)
     ("body", "share", "coupled"), [("100p", 0.31, 0.325), ("200p", 0.51, 0.534), ("300p", 0.63, 0.647)]
 )
 def test_a_user_who_is_not_grounded_feels_a_part_of_the_force(body: str, share: float, coupled: float) -> None:
-    circuit = fs.read_netlist(CIRCUITS / "ungrounded_user.cir").replace({"Cbody.value": float(body[:-1]) * 1e-12})
-    grounded = fs.read_netlist(CIRCUITS / "fingerpad_5khz.cir")
+    circuit = shipped("ungrounded_user").replace({"Cbody.value": float(body[:-1]) * 1e-12})
+    grounded = shipped("fingerpad_5khz")
     area = 34.8e-6
     phasor = fs.phasor(circuit, area=area).f_el_mean[0] / fs.phasor(grounded, area=area).f_el_mean[0]
     assert phasor == pytest.approx(share, abs=0.005)
@@ -334,7 +322,7 @@ def agreeing(circuit: fs.Circuit, **options: object) -> tuple[fs.Solution, fs.So
 # Kinetics ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 def test_a_fast_area_returns_the_algebraic_law(law: str) -> None:
     def run(tau: float) -> np.ndarray:
         circuit = deck("Vdrive drive 0 SIN(100 80 100)", *finger("drive", "0", f=100.0, tau=tau), ".tran 0.1m 20m uic")
@@ -395,7 +383,7 @@ def test_a_resistor_in_the_way_takes_the_fold_away() -> None:
 # Starting, going on, refusing ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 @pytest.mark.parametrize("tau", [0.0, 1e-4])
 def test_a_run_goes_on_from_another(law: str, tau: float) -> None:
     circuit = floating("SIN(0 200 5k)", tau=tau)
@@ -418,7 +406,7 @@ def test_the_operating_point_of_a_network_with_a_finger_is_at_rest() -> None:
 
 @pytest.mark.parametrize("name", ["ungrounded_user", "amplifier", "current_drive"])
 def test_phasors_of_a_network_are_its_periodic_state(name: str) -> None:
-    circuit = fs.read_netlist(CIRCUITS / f"{name}.cir")
+    circuit = shipped(name)
     p = fs.phasor(circuit, area=35e-6)
     stop = 0.2 if name == "current_drive" else 0.02
     t = np.linspace(stop - 2e-4, stop, 201)
@@ -426,25 +414,6 @@ def test_phasors_of_a_network_are_its_periodic_state(name: str) -> None:
     w = 2.0 * math.pi * 5000.0
     got = 2.0 * np.mean(s.u_gap[:-1] * np.exp(-1j * (w * t[:-1] - math.pi / 2.0)))
     assert abs(got - p.u_gap[0]) <= 1e-6 * abs(p.u_gap[0])
-
-
-@pytest.mark.parametrize(
-    ("request_", "message"),
-    [
-        ({"method": "dop853"}, "unknown method 'dop853'; allowed: auto, exponential, radau, scipy:NAME"),
-        ({"method": "scipy:dop853"}, "unknown method 'scipy:dop853'; allowed: scipy:RK23"),
-        ({"tier": "algebraic"}, "the algebraic tier is not for this network"),
-        ({"tier": "linear"}, "the linear tier is not for this network"),
-        ({"area": -1.0}, "area is -1 m^2"),
-        ({"area": "often"}, "area is 'often'"),
-        ({"charge_law": "both"}, "charge_law is 'both'"),
-        ({"t_stop": -1.0}, "t_stop is -1 s"),
-    ],
-)
-def test_requests_that_cannot_be_run_are_refused(request_: dict[str, object], message: str) -> None:
-    with pytest.raises(fs.InputError) as caught:
-        fs.simulate(floating("SIN(0 200 5k)"), **request_)  # type: ignore[arg-type]
-    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(("seed", "law"), [(9, "mobile"), (20, "local"), (20, "mobile"), (21, "local")])
@@ -465,3 +434,113 @@ def test_a_gap_voltage_that_turns_back_right_after_its_zero_keeps_its_branch(see
     )
     assert run.method == "exponential"
     assert np.abs(run.u_gap - implicit.u_gap).max() <= run.error.u_gap + implicit.error.u_gap
+
+
+# Exponential steps against Radau's ------------------------------------------------------------------------------------
+
+
+SQUARE = "PULSE(120 -120 1m 0 0 1m 2m)"
+MARCHED = {
+    "two unlike fingers": (
+        ["Vdrive a 0 SIN(0 200 5k)", "Rout a b 1k", *finger("b", "body", "one", "1"),
+         *finger("b", "body", "two", "2", fn=0.2), "Rbody body 0 1meg", "Cbody body 0 150p"], 1e-3,
+    ),
+    "slow area": (["Vdrive a 0 SIN(20 120 300)", "Rout a b 1meg", *finger("b", "0", f=300.0, tau=1e-5)], 7e-3),
+    "square": ([f"Vdrive a 0 {SQUARE}", "Rout a b 47k", *finger("b", "0", f=500.0), "Ccable b 0 10p"], 7e-3),
+    "square without a resistor": ([f"Vdrive a 0 {SQUARE}", *finger("a", "0", f=500.0), "Ccable a 0 10p"], 7e-3),
+    "current": (["Idrive 0 a SIN(0 300u 5k 0 0 90)", *finger("a", "0"), "Rload a 0 10meg"], 1e-3),
+    "two tones": (
+        ["Vdrive a m SIN(0 80 100)", "Vfast m 0 SIN(0 60 2k)", "Rout a b 10k", *finger("b", "0", f=100.0)], 15e-3,
+    ),
+}  # fmt: skip
+
+
+@every_law
+@pytest.mark.parametrize("name", MARCHED)
+def test_the_error_stated_covers_the_difference_from_radau(name: str, law: str) -> None:
+    lines, stop = MARCHED[name]
+    circuit = deck(*lines, f".tran {stop / 500.0!r} {stop!r} uic")
+    t = np.sort(np.random.default_rng(1).random(400)) * stop
+    exact = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=1e-10, method="radau")
+    for rtol in (1e-3, 1e-6, 1e-8):
+        s = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=rtol)
+        assert s.method == "exponential"
+        assert np.abs(s.u_gap - exact.u_gap).max() <= s.error.u_gap + exact.error.u_gap
+        assert np.abs(s.f_el - exact.f_el).max() <= s.error.f_el + exact.error.f_el
+        assert s.error.u_gap <= 1.01 * rtol * np.abs(s.u_gap).max() * 1.2
+        largest = np.abs(exact.q_source).max()
+        off = np.abs(s.q_source - exact.q_source).max()
+        assert off <= s.error.q_source + exact.error.q_source + 1e-12 * largest
+        assert np.abs(s.i_source - exact.i_source).max() <= 300.0 * rtol * np.abs(exact.i_source).max()
+
+
+def test_large_voltages_change_the_reference_areas() -> None:
+    circuit = deck("Vdrive a 0 SIN(0 1500 1k)", "Rout a b 1k", *finger("b", "0", f=1000.0), ".tran 5u 3m uic")
+    with pytest.warns(fs.FingerspiceWarning):
+        s = fs.simulate(circuit, rtol=1e-8)
+    with pytest.warns(fs.FingerspiceWarning):
+        exact = fs.simulate(circuit, rtol=1e-10, method="radau")
+    assert s.method == "exponential"
+    # By more than what one reference serves.
+    assert s.area.max() > 2.0 * s.area.min()
+    assert np.abs(s.u_gap - exact.u_gap).max() <= s.error.u_gap + exact.error.u_gap
+
+
+def test_near_a_fold_radau_takes_over() -> None:
+    circuit = deck("Vdrive a 0 SIN(0 200 100)", "Rload a 0 1meg", *finger("a", "0", f=100.0, fn=1e-4), ".tran 20u 10m")
+    s = fs.simulate(circuit, charge_law="mobile", throw=False)
+    assert s.status is fs.Status.FOLD
+    assert s.method == "radau"
+
+
+@every_law
+@pytest.mark.parametrize("source", ["SIN(0 200 5k)", "SIN(30 120 5k)", "PULSE(120 -120 100u 0 0 100u 200u)"])
+def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: str, law: str) -> None:
+    circuit = deck(f"Vdrive a 0 {source}", "Rout a b 47k", *finger("b", "0"), "Ccable b 0 150p", ".tran 1u 12.1m uic")
+    t = np.linspace(0.0, 12.1e-3, 3001)
+    for rtol in (1e-3, 1e-8):
+        run = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=rtol)
+        stepped = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=rtol, method="exponential")
+        assert run.stats["repeated"] > 20
+        assert stepped.stats["repeated"] == 0
+        assert np.abs(run.u_gap - stepped.u_gap).max() <= run.error.u_gap + stepped.error.u_gap
+        assert np.abs(run.q_source - stepped.q_source).max() <= run.error.q_source + stepped.error.q_source
+        whole = np.abs(run.i_source - stepped.i_source).max()
+        assert whole <= 300.0 * rtol * np.abs(stepped.i_source).max()
+        # It goes on from there.
+        after = fs.simulate(circuit, t_stop=13e-3, t_eval=[12.9e-3], charge_law=law, rtol=rtol, start=run)
+        direct = fs.simulate(circuit, t_stop=13e-3, t_eval=[12.9e-3], charge_law=law, rtol=rtol)
+        assert abs(after.u_gap[0] - direct.u_gap[0]) <= 2.0 * (run.error.u_gap + direct.error.u_gap)
+        assert abs(after.q_source[0] - direct.q_source[0]) <= 2.0 * (run.error.q_source + direct.error.q_source)
+
+
+def test_windows_of_a_long_run_join() -> None:
+    circuit = floating("SIN(0 200 5k)")
+    late = np.linspace(1.2, 1.2 + 2e-4, 50)
+    run = fs.simulate(circuit, t_stop=1.21, t_eval=late, rtol=1e-6)
+    near = fs.simulate(circuit, t_stop=0.0503, t_eval=late - 1.15, rtol=1e-6)
+    assert run.method == "exponential"
+    assert np.abs(run.u_gap - near.u_gap).max() <= run.error.u_gap + near.error.u_gap
+
+
+@pytest.mark.parametrize("lines", [["Vfast m 0 SIN(0 60 2k)"], ["Vfast m n SIN(0 60 2k)", "Rout n 0 10k"]])
+def test_a_gap_voltage_that_turns_back_between_nodes_has_crossed_zero(lines: list[str]) -> None:
+    circuit = deck("Vdrive a m SIN(0 80 100)", *lines, *finger("a", "0", f=100.0), ".tran 30u 15m uic")
+    t = np.linspace(0.0, 15e-3, 3001)
+    exact = fs.simulate(circuit, t_eval=t, rtol=1e-10)
+    for rtol in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9):
+        s = fs.simulate(circuit, t_eval=t, rtol=rtol)
+        assert s.stats["zeros"] == exact.stats["zeros"]
+        assert np.abs(s.u_gap - exact.u_gap).max() <= s.error.u_gap + exact.error.u_gap
+
+
+@pytest.mark.parametrize("method", ["auto", "radau"])
+@pytest.mark.parametrize("longest", [1e-3, 2.3e-4])
+def test_no_step_of_a_network_is_longer_than_the_decks_tmax(method: str, longest: float) -> None:
+    # A resistor and a capacitor: 50 V come with exp(-t / 0.1 ms), of which most steps see nothing.
+    lines = ["Vdrive a 0 50", "Rout a b 1k", *finger("b", "0"), "Ccable b 0 100n"]
+    free = fs.simulate(deck(*lines, ".tran 1m 20m uic"), rtol=1e-6, method=method)
+    bound = fs.simulate(deck(*lines, f".tran 1m 20m 0 {longest!r} uic"), rtol=1e-6, method=method)
+    assert free.stats["steps"] < 0.8 * 0.02 / longest
+    assert 0.02 / longest <= bound.stats["steps"] <= 1.2 * 0.02 / longest + free.stats["steps"]
+    assert np.abs(bound.u_gap - free.u_gap).max() <= bound.error.u_gap + free.error.u_gap

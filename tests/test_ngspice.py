@@ -9,13 +9,12 @@ import pytest
 
 import fingerspice as fs
 from ngspice_tools import CIRCUITS, GAP_SIGNALS, run_ngspice, with_charge_law
-from scenes import cases
+from scenes import LAWS, cases, every_law, shipped
 
 STACKS = ["fingerpad", "fingerpad_5khz", "fingerpad_square", "fingerpad_square_5khz", "fingerpad_dispersive"]
 ONE_GAP = ["ungrounded_user", "amplifier", "screen_protector", "current_drive", "am_carrier", "click", "learned_drive"]
 # Sources that ngspice lacks: tests/test_export.py runs what is exported.
 NOT_THERE = ["texture_recording", "chirp", "burst"]
-LAWS = ("local", "mobile")
 SHIPPED = [*STACKS, *ONE_GAP, "two_fingers", "am_bump", *NOT_THERE]
 
 
@@ -44,7 +43,7 @@ def deviation(name, law, max_step=None, edit=lambda text: text, after=0.0):
     )
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 @pytest.mark.parametrize("name", STACKS)
 def test_sines_agree_to_1e_5_of_peak_and_squares_within_what_the_step_allows(name, law):
     # netlist.md: T/1000 gives 1e-6 on sines to 1e-4 on squares.
@@ -52,7 +51,7 @@ def test_sines_agree_to_1e_5_of_peak_and_squares_within_what_the_step_allows(nam
     assert du <= (1e-4 if "square" in name else 1e-5)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 def test_agreement_improves_as_the_square_of_the_step(law):
     coarse, _ = deviation("fingerpad", law, max_step=1e-4)
     fine, area = deviation("fingerpad", law, max_step=1e-6)
@@ -67,7 +66,7 @@ IN_TURN = [(name, law) for i, name in enumerate(ONE_GAP) for law in LAWS[:: (-1)
 
 @pytest.mark.parametrize(("name", "law"), IN_TURN)
 def test_other_circuits_agree_with_their_error_falling_as_the_square_of_the_step(name, law):
-    step = fs.read_netlist(CIRCUITS / f"{name}.cir").tran.step
+    step = shipped(name).tran.step
     coarse, _ = deviation(name, law, after=2e-6)
     fine, area = deviation(name, law, max_step=step / 4.0, after=2e-6)
     assert coarse <= 1e-4
@@ -75,7 +74,7 @@ def test_other_circuits_agree_with_their_error_falling_as_the_square_of_the_step
     assert area <= 4e-2
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 def test_two_fingers_agree(law):
     text = with_charge_law((CIRCUITS / "two_fingers.cir").read_text(), law)
     nodes = ["v(xfirm.top)-v(xfirm.skin)", "v(xlight.top)-v(xlight.skin)", "v(firm)", "v(light)"]
@@ -90,7 +89,7 @@ def test_two_fingers_agree(law):
         assert np.abs(1e6 * ours.area[:, i] - theirs[nodes[2 + i]][keep]).max() <= 5e-3
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 def test_contact_kinetics_agree(law):
     def slow(text):
         return text.replace("c2=5000", "c2=5000 tau=2m").replace(".nodeset", ".ic")

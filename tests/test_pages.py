@@ -12,7 +12,7 @@ import pytest
 import fingerspice as fs
 from fingerspice.base.pages import SCREEN, Page, Table
 from fingerspice.circuit.describe import changes_text, drive_text, heading, waveform_text
-from scenes import table1
+from scenes import shipped, table1
 
 MAKERS: dict[str, Callable[[], Any]] = {
     "circuit": table1,
@@ -22,7 +22,7 @@ MAKERS: dict[str, Callable[[], Any]] = {
     "phasor": lambda: fs.phasor(table1(), np.geomspace(10.0, 1e5, 81)),
     "plan": lambda: fs.plan(table1()),
     "fit": lambda: fs.fit_material(fs.ColeCole(100.0, ((1e4, 1e-3, 0.1),), 1e-3)),
-    "two fingers": lambda: fs.simulate(fs.read_netlist("circuits/two_fingers.cir")),
+    "two fingers": lambda: fs.simulate(shipped("two_fingers")),
     "large circuit": lambda: fs.parse_netlist(
         "t\nV1 n0 0 1\n" + "".join(f"R{i} n{i} n{i + 1} 1k\n" for i in range(300)) + "C1 n300 0 1n\n.tran 1u 1m\n"
     ),

@@ -21,7 +21,7 @@ import fingerspice as fs
 from fingerspice.plots import drawing, traces
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.comparison import compare
-from scenes import deck, table1
+from scenes import deck, shipped, table1
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -174,7 +174,7 @@ def test_the_comparison_shows_its_table_which_has_room_for_the_names_of_several_
     table = comparison.plot().axes[2].tables[0].get_celld()
     assert table[1, 0].get_text().get_text() == "Gap voltage at the fundamental [V]"
     assert table[3, 3].get_text().get_text() == f"{comparison.coupled.f_el_mean:.5g}"
-    figure = compare(fs.read_netlist("circuits/two_fingers.cir"), rtol=1e-5).plot()
+    figure = compare(shipped("two_fingers"), rtol=1e-5).plot()
     figure.canvas.draw()
     cells = figure.axes[2].tables[0].get_celld()
     for row in range(1, 9):
@@ -289,7 +289,7 @@ def test_other_runs_lie_over_it_called_by_what_sets_them_apart(sine: fs.Solution
 
 
 def test_each_finger_keeps_its_colour_in_every_panel_and_has_a_legend_in_each() -> None:
-    run = simulate(fs.read_netlist("circuits/two_fingers.cir"))
+    run = simulate(shipped("two_fingers"))
     figure = run.plot()
     colors: dict[str, set[object]] = {gap: set() for gap in run.gaps}
     for ax in figure.axes:

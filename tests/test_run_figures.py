@@ -18,12 +18,11 @@ from fingerspice.numerics.chebyshev import largest
 from fingerspice.numerics.lobatto import NODES, POINTS
 from fingerspice.results import steps
 from fingerspice.results.summary import Figures
-from scenes import cases, deck, table1
+from scenes import cases, deck, every_law, shipped, table1
 
 AREA = 34.9715871843e-6
 F, U, OFFSET, PHASE = 100.0, 200.0, 60.0, 140.0
 STRESS = 8.854e-12 / (2.0 * 3.5e-6**2)
-LAWS = pytest.mark.parametrize("law", ["local", "mobile"])
 NAMES = [
     "f_el_mean", "f_el_mean_periodic", "f_el_peak", "f_t_mean", "f_t_mean_periodic", "friction_mean", "area_mean",
     "u_gap_peak", "u_gap_rms", "u_gap_amplitude", "u_gap_phase_deg",
@@ -80,7 +79,7 @@ SCENES = {
 }
 
 
-@LAWS
+@every_law
 @pytest.mark.parametrize("scene", SCENES)
 def test_means_and_extremes_are_the_references_within_the_stated_error(scene: str, law: str) -> None:
     source, segments, f, periods = SCENES[scene]
@@ -116,7 +115,7 @@ def number(text: str) -> float:
     return float(value) * {"": 1.0, "k": 1e3, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "n": 1e-9}[unit[:-1]]
 
 
-@LAWS
+@every_law
 def test_figures_of_the_coupled_state_are_the_reference_s_and_so_are_the_printed_ones(law: str) -> None:
     run = fs.simulate(table1(), start="periodic", t_stop=1.0 / F, rtol=1e-9, charge_law=law)
     got, (t, want) = run.summary(), periodic(law)
@@ -230,7 +229,7 @@ RANDOM = [
 @pytest.mark.parametrize(("law", "source", "name"), RANDOM)
 def test_figures_are_the_same_whatever_tstep(law: str, source: str, name: str) -> None:
     rng = np.random.default_rng(len(source) + len(name))
-    circuit = fs.read_netlist(f"circuits/{name}.cir").replace({"Vdrive": source})
+    circuit = shipped(name).replace({"Vdrive": source})
 
     def run(outputs: np.ndarray, rtol: float = 1e-7) -> fs.Solution:
         return fs.simulate(circuit, t_stop=3e-3, t_eval=outputs, charge_law=law, rtol=rtol, throw=False)
@@ -250,10 +249,10 @@ def test_figures_are_the_same_whatever_tstep(law: str, source: str, name: str) -
         assert abs(seen[0][f"{key}_rms"] - np.sqrt(simpson(x**2, x=fine.t) / 3e-3)) <= 3e-6 * np.abs(x).max()
 
 
-@LAWS
+@every_law
 def test_a_run_of_many_periods_has_the_figures_of_its_stepped_twin(law: str) -> None:
     # A period that stands for many, where the skin remembers for dozens of them.
-    circuit = fs.read_netlist("circuits/fingerpad_dispersive.cir").replace({"Vdrive": fs.Sine(150.0, 5000.0)})
+    circuit = shipped("fingerpad_dispersive").replace({"Vdrive": fs.Sine(150.0, 5000.0)})
     times = np.array([0.0, 0.2])
     fast, slow = (
         fs.simulate(circuit, t_stop=0.2, t_eval=times, rtol=1e-8, method=method, charge_law=law)
@@ -281,7 +280,7 @@ def test_the_last_period_may_begin_in_the_middle_of_steps_and_of_repeated_period
 def test_where_the_recorded_steps_fill_their_arrays_changes_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     # With room for one step they are full, too, where a period ends within the present window of the source.
     stop = 0.02 if name in ("amplifier", "two_fingers") else 0.1
-    circuit, how = fs.read_netlist(f"circuits/{name}.cir"), {"charge": name == "am_carrier", "t_stop": stop}
+    circuit, how = shipped(name), {"charge": name == "am_carrier", "t_stop": stop}
     plain = fs.simulate(circuit, rtol=1e-6, **how)
     for setting, capacity in (("CAPACITY", 1), ("CAPACITY", 7), ("_AT_ONCE", 6)):
         with monkeypatch.context() as patch:
@@ -370,7 +369,7 @@ def test_a_steady_state_has_the_figures_of_its_period() -> None:
 
 
 def test_several_fingers_have_a_figure_each() -> None:
-    run = fs.simulate(fs.read_netlist("circuits/two_fingers.cir"))
+    run = fs.simulate(shipped("two_fingers"))
     summary = run.summary()
     for name in NAMES:
         signal = next(k for k in ("f_el", "f_t", "friction", "area", "u_gap") if name.startswith(f"{k}_"))

@@ -11,8 +11,7 @@ from scipy.signal import butter, sosfilt
 
 import fingerspice as fs
 from fingerspice.base.errors import InputError
-from scenes import cases, table1, table1_deck
-from test_network_recordings import floating
+from scenes import cases, dispersive_deck, every_law, floating, table1, table1_deck
 
 RATE, COUNT = 48_000.0, 300
 T_STOP = (COUNT - 1) / RATE
@@ -59,9 +58,6 @@ def weights() -> np.ndarray:
     return np.random.default_rng(5).standard_normal(TIMES.size)
 
 
-every_law = pytest.mark.parametrize("law", ["local", "mobile"])
-
-
 @every_law
 def test_a_sum_over_a_signal(law: str, weights: np.ndarray) -> None:
     of = [{name: weights} for name in ("f_t", "u_gap", "area", "friction")]
@@ -83,12 +79,10 @@ def test_voltages_through_zero_where_the_area_has_a_kink(law: str) -> None:
 
 
 def test_a_dispersive_skin(weights: np.ndarray) -> None:
-    text = table1_deck().replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
-    assert "DISPERSIVE" in text
     # Outputs at samples: those between them would need another loop, which takes long to compile.
     at = {"t_eval": np.arange(0, COUNT, 2)[: weights.size] / RATE}
     of = [{"f_t": weights[: at["t_eval"].size]}]
-    check(fs.parse_netlist(text), 100.0 + noise(6, 40.0), of, 0.5, 5e-7, rtol=1e-7, **at)
+    check(fs.parse_netlist(dispersive_deck()), 100.0 + noise(6, 40.0), of, 0.5, 5e-7, rtol=1e-7, **at)
 
 
 @pytest.mark.parametrize("volts", [80.0 + noise(1, 60.0), noise(1, 60.0)], ids=["above", "through"])

@@ -313,8 +313,7 @@ def rough(t):
 
 
 @pytest.mark.parametrize(
-    "noise",
-    [lambda t: DICE.random(), lambda t: np.where(np.asarray(t) < 0.013, 5.0, DICE.random(np.shape(t)))],
+    "noise", [lambda t: DICE.random(), lambda t: np.where(np.asarray(t) < 0.013, 5.0, DICE.random(np.shape(t)))]
 )
 def test_noise_is_refused_with_what_it_gave_twice_at_one_time(noise) -> None:
     with pytest.raises(fs.InputError, match=r"V and then .* V at the same t = .*give fs\.Samples\(values, rate\)"):

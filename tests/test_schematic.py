@@ -17,9 +17,8 @@ from matplotlib.transforms import Bbox
 import fingerspice as fs
 from commands import Command
 from fingerspice.plots.schematic import MOST_ELEMENTS, Schematic, place, put_beside
-from scenes import cases, table1
+from scenes import CIRCUITS, cases, shipped, table1
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 BRIDGE = """A bridge of long names, a delay, a fixed area and a current
 Vdrive_of_the_whole_bridge drive 0 SIN(0 200 5k) AC 2
 Rupper drive left 1k
@@ -40,7 +39,7 @@ OTHERS = {"bridge": BRIDGE, "ladder": LADDER}
 @pytest.fixture(params=[*sorted(p.stem for p in CIRCUITS.glob("*.cir")), *OTHERS])
 def circuit(request: pytest.FixtureRequest) -> fs.Circuit:
     name: str = request.param
-    return fs.parse_netlist(OTHERS[name]) if name in OTHERS else fs.read_netlist(CIRCUITS / f"{name}.cir")
+    return fs.parse_netlist(OTHERS[name]) if name in OTHERS else shipped(name)
 
 
 def texts(svg: str) -> list[str]:
@@ -156,7 +155,7 @@ def test_a_circuit_too_large_for_a_picture_is_refused() -> None:
 
 
 def test_the_picture_of_a_run_has_the_schematic_about_as_high_on_its_right() -> None:
-    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    circuit = shipped("fingerpad")
     picture = fs.simulate(circuit).plot()
     width, height = picture.get_size_inches()
     whole = put_beside(picture, circuit)

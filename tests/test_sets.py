@@ -19,6 +19,7 @@ from commands import Command
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.explorer.scene import EXAMPLES
 from fingerspice.sets.parameters import DATA, ELEMENTS, KINDS, WAVEFORMS, keys_in, references, tables
+from scenes import shipped
 
 ROOT = Path(__file__).parents[1]
 CIRCUITS = ROOT / "circuits"
@@ -224,7 +225,7 @@ def test_a_thick_glass_takes_nearly_all_of_the_voltage(pad: fs.Circuit) -> None:
 
 
 def test_two_fingers_may_differ() -> None:
-    two = fs.read_netlist(CIRCUITS / "two_fingers.cir")
+    two = shipped("two_fingers")
     both = fs.parameters("moist").apply(two)
     assert [both[name].values["r"] for name in ("Xfirm.Xgap", "Xlight.Xgap")] == [1e5, 1e5]
     made = fs.parameters("dry").apply(both, to="xlight")

@@ -21,7 +21,7 @@ from commands import tree
 from fingerspice.base import files
 from fingerspice.base.files import write_aside
 from fingerspice.results.record import SIGNALS
-from scenes import deck, table1
+from scenes import deck, shipped, table1
 
 SQUARE = "SQUARE(200 100)"
 T_STOP, STEP = 0.03, 1e-4
@@ -147,7 +147,7 @@ def test_arrays_are_read_only_and_the_result_is_frozen(square: fs.Solution) -> N
 
 @pytest.mark.parametrize("name", ["fingerpad", "two_fingers"])
 def test_a_copys_arrays_are_read_only_and_the_same(name: str) -> None:
-    solution = fs.simulate(fs.read_netlist(f"circuits/{name}.cir"), t_stop=2e-3)
+    solution = fs.simulate(shipped(name), t_stop=2e-3)
     samples = fs.Samples(np.arange(3.0), 1e3)
     # Before its signals are made, and after.
     for made in (False, True):

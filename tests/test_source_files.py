@@ -649,7 +649,7 @@ def test_waveforms_of_a_deck_the_command_line_and_python_are_the_same(
 def test_sources_of_the_command_line_are_named_from_the_working_directory(command: Command, tmp_path: Path) -> None:
     Path("far").mkdir()
     Path("decks").mkdir()
-    deck = edited(("SKIN d=350u f=100", "SKIN_DISPERSIVE d=350u"), (".tran 10u 50m uic", "*"))
+    deck = edited((".tran 10u 50m uic", "*"))
     Path("decks/no_end.cir").write_text(deck)
     Path("far/a.wav").write_bytes(wav(packed(np.arange(-200, 200) * 50)))
     Path("far/a.csv").write_text("0 0\n10m 100\n20m -100\n")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import pickle
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,9 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from scenes import cases, deck, table1
+from scenes import CIRCUITS, cases, deck, every_law, shipped, table1
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 AREA = 34.9715871843e-6
-every_law = pytest.mark.parametrize("law", ["local", "mobile"])
 
 
 def by_turns(names: Any) -> list[tuple[Any, str]]:
@@ -425,7 +422,7 @@ HALVED = [
 def test_a_state_found_by_half_a_period_is_that_of_the_whole_one(
     name: str, waveform: fs.Waveform, law: str | None
 ) -> None:
-    circuit = fs.read_netlist(CIRCUITS / f"{name}.cir") if name else table1()
+    circuit = shipped(name) if name else table1()
     half = fs.steady_state(circuit, sources=waveform, charge_law=law, rtol=1e-10)
     # A product with a constant is a source whose half waves nobody vouches for.
     whole = fs.steady_state(circuit, sources=waveform * 1.0, charge_law=law, rtol=1e-10)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy import integrate
@@ -11,16 +9,11 @@ from scipy import integrate
 import fingerspice as fs
 from fingerspice.engine.lanes.rows import INNER, QUICK, Lanes, weigh, weighed
 from fingerspice.solve.recordings.block import LEAST_POINTS
-from scenes import cases
-
-CIRCUITS = Path(__file__).parents[1] / "circuits"
-DISPERSIVE = (CIRCUITS / "fingerpad.cir").read_text().replace("SKIN  d=350u f=100", "SKIN_DISPERSIVE  d=350u")
+from scenes import LAWS, cases, dispersive_deck, table1
 
 
 def circuit_of(skin: str) -> fs.Circuit:
-    if skin == "SKIN":
-        return fs.read_netlist(CIRCUITS / "fingerpad.cir")
-    return fs.parse_netlist(DISPERSIVE, CIRCUITS / "x.cir")
+    return table1() if skin == "SKIN" else fs.parse_netlist(dispersive_deck())
 
 
 def points(seed: int, count: int = 1500) -> tuple[np.ndarray, np.ndarray]:
@@ -48,14 +41,18 @@ def compared(circuit: fs.Circuit, wave: fs.PWL, t: np.ndarray, *rtols: float, **
     return runs
 
 
-@pytest.mark.parametrize("law", ["local", "mobile"])
-@pytest.mark.parametrize("skin", ["SKIN", "SKIN_DISPERSIVE"])
+# For each law, number of modes and rule of nodes, which depends on the tolerance, code is compiled anew, which takes
+# long: the suite has each law under each rule, and each skin.
+FEW = [("SKIN", "local", (1e-3, 1e-5, 1e-7)), ("SKIN", "mobile", (1e-3, 1e-5)), ("SKIN_DISPERSIVE", "mobile", (1e-7,))]
+EVERY = [(skin, law, (1e-3, 1e-5, 1e-7)) for skin in ("SKIN", "SKIN_DISPERSIVE") for law in LAWS]
+
+
+@pytest.mark.parametrize(("skin", "law", "rtols"), EVERY if cases(1, 0) else FEW)
 @pytest.mark.parametrize("seed", range(cases(4, 1)))
-def test_points_at_uneven_times_run_one_step_each_with_the_error_stated(skin: str, seed: int, law: str) -> None:
+def test_points_at_uneven_times_run_one_step_each_with_the_error_stated(
+    seed: int, skin: str, law: str, rtols: tuple[float, ...]
+) -> None:
     circuit, (t, v) = circuit_of(skin), points(seed)
-    # For each law and number of nodes code is compiled anew: with many modes, as of this skin, it takes long.
-    few = (1e-3, 1e-5) if law == "local" else (1e-7,)
-    rtols = (1e-3, 1e-5, 1e-7) if skin == "SKIN" or cases(1, 0) else few
     for run in compared(circuit, fs.PWL(t, v), t, *rtols, charge_law=law):
         assert run.method == "relaxation"
         assert run.stats["steps"] >= t.size - 1
@@ -76,7 +73,7 @@ def test_the_error_is_covered_and_not_overstated_on_random_points() -> None:
     assert np.mean(np.array(over) <= 30.0) >= 0.9
 
 
-@pytest.mark.parametrize("seed", range(4, 17, 2))
+@pytest.mark.parametrize("seed", range(4, 17, cases(2, 4)))
 def test_fast_leaks_beside_long_intervals_have_their_errors_met(seed: int) -> None:
     rng = np.random.default_rng(seed)
     intervals = np.where(rng.uniform(size=1200) < 0.2, 1e-9, 5e-5 * rng.uniform(0.2, 1.0, 1200))

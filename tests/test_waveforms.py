@@ -187,29 +187,6 @@ def test_the_fundamental_is_the_fourier_integral_of_the_formula(case: Case) -> N
     assert math.remainder(difference, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("waveform", "amplitude", "phase"),
-    [
-        (fs.Square(1.0, 100.0), 4.0 / math.pi, 0.0),
-        (fs.Triangle(1.0, 100.0), 8.0 / math.pi**2, 0.0),
-        (fs.Sawtooth(1.0, 100.0), 2.0 / math.pi, math.pi),
-        (fs.Square(1.0, 100.0, duty=0.25), 4.0 / math.pi * math.sin(math.pi / 4), math.pi / 4),
-        (fs.Sine(-3.0, 100.0), 3.0, math.pi),
-        (fs.Sine(3.0, 100.0, phase_deg=30.0), 3.0, math.pi / 6),
-        (fs.Sine(3.0, 100.0, delay=0.001), 3.0, -math.pi / 5),
-        (fs.AM(200.0, 5000.0, 100.0), 100.0, 0.0),
-    ],
-    ids=repr,
-)
-def test_fundamentals_have_their_textbook_amplitude_and_phase(
-    waveform: fs.Waveform, amplitude: float, phase: float
-) -> None:
-    found = waveform.fundamental
-    assert found is not None
-    assert found.amplitude == pytest.approx(amplitude, rel=1e-12)
-    assert math.remainder(found.phase - phase, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-11)
-
-
 SINE = fs.Sine(1.0, 100.0)
 TONELESS = (
     fs.DC(3.0), fs.Sine(0.0, 100.0), fs.Sine(3.0, 100.0, damping=1.0), fs.Chirp(1.0, 10.0, 100.0, 1.0),
