@@ -932,8 +932,12 @@ class _Stack:
 
     def rise(self, u: float, kk: float, side: float) -> float:
         """d p / d u of the mobile equation p = u - kk A(0)/A(|u|), on the given side of 0: 0 at a fold."""
-        a, da = (float(x[0]) for x in self.area(np.array([abs(u)])))
-        return 1.0 + math.copysign(1.0, u or side) * kk * self.a_zero * da / a**2
+        return float(self.rises(np.array([u]), kk, side)[0])
+
+    def rises(self, u: np.ndarray, kk: float, side: float) -> np.ndarray:
+        """`rise` of many gap voltages."""
+        a, da = self.area(np.abs(u))
+        return np.copysign(1.0, np.where(u == 0.0, side, u)) * kk * self.a_zero * da / a**2 + 1.0
 
     def _ramped(self, p: float, kk: float, u: float) -> float:
         """Gap voltage where the source's share has gone to p along a ramp too fast for any leak.
@@ -1301,11 +1305,12 @@ class _Run:
         end = _fields_at(stack, self.nodes, step, np.array([1.0]))[0][0]
         if stack.mobile:
             # Newton's iteration may have leapt past a fold to voltages that no motion leads to.
-            for before, after in pairwise([u, *us, end]):
-                one, other = float(before[stack.gap]), float(after[stack.gap])
+            along = np.array([u, *us, end])
+            kk = np.array([self.stored(x) for x in along[1:]])
+            for one, other, there in zip(along[:-1, stack.gap], along[1:, stack.gap], kk, strict=True):
                 leapt = one * other > 0.0 and abs(math.log(other / one)) > 0.1
-                between = np.geomspace(one, other, 200) if leapt else (one, other)
-                if min(stack.rise(float(x), self.stored(after), s) for x in between) <= 0.0:
+                between = np.geomspace(one, other, 200) if leapt else np.array([one, other])
+                if stack.rises(between, there, s).min() <= 0.0:
                     raise _NoStep("fold")
         return replace(step, u_end=end), us
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import Any, TypeVar
 
 from scipy.stats import binom
 
 import fingerspice as fs
 
+T = TypeVar("T")
 COAT = {"d": "1u", "eps_r": 3.9, "r": "0.2meg"}
 GAP = {
     "d": "3.5u",
@@ -24,7 +25,7 @@ GAP = {
 }
 
 
-def cases(whole: int, few: int) -> int:
+def cases(whole: T, few: T) -> T:
     """How many random cases a statistic takes: `whole` in ``make stress``, which sets STRESS, else `few`."""
     return whole if os.environ.get("STRESS") else few
 

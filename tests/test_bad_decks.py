@@ -196,9 +196,7 @@ BAD = [*DEVICES, *VALUES, *CONTACT, *CIRCUIT, *DIRECTIVES, *SOURCES]
 
 
 @pytest.mark.parametrize(("change", "line", "parts"), BAD, ids=lambda x: x[1] if isinstance(x, tuple) else "")
-def test_what_is_wrong_is_said_in_one_sentence_with_its_line(
-    change: tuple[str, str], line: int, parts: list[str]
-) -> None:
+def test_what_is_wrong_is_a_sentence_with_its_line(change: tuple[str, str], line: int, parts: list[str]) -> None:
     with pytest.raises(fs.InputError) as caught:
         fs.parse_netlist(edited(change), "deck.cir")
     said = str(caught.value)

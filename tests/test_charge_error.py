@@ -183,9 +183,7 @@ def judge(step: Stack | Net, total: list[float], account: Callable[[float], tupl
 @every_law
 @pytest.mark.parametrize("parts", ["stores", "leaks", "leaks by its area", "stores and leaks, also by its area"])
 @pytest.mark.parametrize("seed", range(4))
-def test_what_a_step_of_a_stack_leaves_in_the_charge_is_its_derivative_by_the_voltages(
-    seed: int, parts: str, law: str
-) -> None:
+def test_what_a_stack_leaves_in_the_charge_is_its_derivative_by_the_voltages(seed: int, parts: str, law: str) -> None:
     step = stack(np.random.default_rng([seed, 3]), law, parts)
     total = [step.charge(x, 0.5)[0] - step.charge(x, -0.5)[0] for x in POINTS[PLACES]]
     scale = judge(step, total, lambda before: engine_account(step, before))
@@ -334,9 +332,7 @@ def network(rng: np.random.Generator, law: str, parts: str, slow: bool) -> Net:
 @pytest.mark.parametrize("slow", [False, True], ids=["area at once", "slow area"])
 @pytest.mark.parametrize("parts", ["reference", "stores", "leaks", "reference, stores, leaks"])
 @pytest.mark.parametrize("seed", range(3))
-def test_what_a_step_of_a_network_leaves_in_the_charge_is_its_derivative_by_the_voltages(
-    seed: int, parts: str, slow: bool, law: str
-) -> None:
+def test_what_a_network_leaves_in_the_charge_is_its_derivative(seed: int, parts: str, slow: bool, law: str) -> None:
     step = network(np.random.default_rng([seed, 4]), law, parts, slow)
     places = np.array([e(POINTS[PLACES]) for e in step.errors])
 

@@ -110,14 +110,11 @@ OTHERS = [
 ]
 
 USAGE = [
-    (["run"], "Missing argument 'DECK'"),
-    (["export", "pad.cir"], "Missing option '--output'"),
-    (["rnu", "pad.cir"], "No such command 'rnu'"),
-    (["run", "pad.cir", "--plott"], "No such option"),
-    (["run", "pad.cir", "pad.cir"], "unexpected extra argument"),
-    (["run", "pad.cir", "--rtol", "small"], "--rtol"),
+    (["run"], "Missing argument 'DECK'"), (["export", "pad.cir"], "Missing option '--output'"),
+    (["rnu", "pad.cir"], "No such command 'rnu'"), (["run", "pad.cir", "--plott"], "No such option"),
+    (["run", "pad.cir", "pad.cir"], "unexpected extra argument"), (["run", "pad.cir", "--rtol", "small"], "--rtol"),
     (["figures", "--only", "two"], "--only"),
-]
+]  # fmt: skip
 
 
 @pytest.fixture
@@ -140,7 +137,7 @@ def folder(command: Command, tmp_path: Path) -> Path:
     [*((["run", "pad.cir", "--out", "new", *words], said) for words, said in OPTIONS), *OTHERS, *USAGE],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",
 )
-def test_bad_input_gets_one_sentence_and_leaves_nothing(
+def test_bad_input_gets_a_sentence_and_leaves_nothing(
     command: Command, folder: Path, arguments: list[str], said: str
 ) -> None:
     before = tree(folder)
@@ -156,9 +153,7 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(
     assert tree(folder) == before
 
 
-def test_a_fault_of_the_program_is_one_sentence_with_its_place(
-    command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fault_of_the_program_is_a_sentence_with_its_place(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
         raise errors.pop()
 
@@ -177,24 +172,18 @@ def test_a_fault_of_the_program_is_one_sentence_with_its_place(
 
 
 CHECKED_FIRST = [
-    ("run --rtol 7", "rtol is 7.0; allowed"),
-    ("run --method rk4", "unknown method 'rk4'"),
-    ("run --area frozn", "area is 'frozn'"),
-    ("run --start warm", "start is 'warm'"),
-    ("run --jumps no", "jumps is 'no'"),
-    ("run --stream --netcdf --rtol 7", "rtol is 7.0; allowed"),
-    ("run --stream --netcdf --chunk soon", "--chunk 'soon'"),
-    ("ac --rtol 7 --area coupled", "rtol is 7.0; allowed"),
-    ("ac --area frozn", "area is 'frozn'"),
-    ("ac --sweep dec", "--sweep 'dec'"),
-    ("ac --amplitude 5", "--amplitude goes with --area coupled"),
-    ("compare --rtol 7", "rtol is 7.0; allowed"),
+    ("run --rtol 7", "rtol is 7.0; allowed"), ("run --method rk4", "unknown method 'rk4'"),
+    ("run --area frozn", "area is 'frozn'"), ("run --start warm", "start is 'warm'"),
+    ("run --jumps no", "jumps is 'no'"), ("run --stream --netcdf --rtol 7", "rtol is 7.0; allowed"),
+    ("run --stream --netcdf --chunk soon", "--chunk 'soon'"), ("ac --rtol 7 --area coupled", "rtol is 7.0; allowed"),
+    ("ac --area frozn", "area is 'frozn'"), ("ac --sweep dec", "--sweep 'dec'"),
+    ("ac --amplitude 5", "--amplitude goes with --area coupled"), ("compare --rtol 7", "rtol is 7.0; allowed"),
     ("ac --area coupled --amplitude -5", "amplitude is [-5.0] V; allowed: positive"),
     ("limits --points 1", "points is 1; allowed: 3 to 1000"),
     ("limits --span 0.5", "span is 0.5; allowed: more than 1"),
     ("limits --capability --carrier -5", "--carrier is -5; allowed: > 0"),
     ("design --limit -3", "--limit is -3; allowed: > 0"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("words", "said"), CHECKED_FIRST)
@@ -210,7 +199,7 @@ def test_arguments_are_checked_before_files(command: Command, words: str, said: 
 
 
 @pytest.mark.parametrize("out", ["/proc/new", "/proc", f"new/{'x' * 300}/y", "x/y"])
-def test_a_folder_that_cannot_be_made_is_told_before_the_run(
+def test_a_folder_that_cannot_be_made_is_told(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
 ) -> None:
     if out.startswith("/proc") and not Path("/proc/self").exists():

@@ -9,7 +9,6 @@ import pytest
 
 from fingerspice.engine.many_areas.coupling import (
     STIFF,
-    Coupling,
     Moving,
     answer_mobile,
     cell_currents,
@@ -67,31 +66,23 @@ def cells(seed: int, sizes: tuple[int, ...], fast: int) -> SimpleNamespace:
     return given
 
 
-def filled(given: SimpleNamespace) -> Coupling:
-    out = new_coupling(given.tap.shape[1], len(given.c), 1)
-    fill_coupling(
-        out, H, given.rates, -given.tap.T.copy(), given.tap, given.tap_s, given.c, given.g, given.home, given.cell
-    )
-    return out
-
-
-def eta_of(x: Coupling, given: SimpleNamespace) -> np.ndarray:
-    eta = x.from_modes @ given.w + x.from_rates @ given.lin + x.from_stiff @ given.d
-    return np.ascontiguousarray(eta + x.from_slopes @ given.ds + x.from_sources @ given.s)
-
-
 @pytest.mark.parametrize("fast", [0, 2])
 @pytest.mark.parametrize("sizes", [(3,), (3, 3), (2, 4, 3)])
 @pytest.mark.parametrize("seed", range(3))
 def test_currents_and_the_distance_to_the_fold_under_mobile(seed: int, sizes: tuple[int, ...], fast: int) -> None:
     given = cells(seed, sizes, fast)
-    x = filled(given)
     n_f, n_area = len(given.c), len(sizes)
+    x = new_coupling(given.tap.shape[1], n_f, 1)
+    fill_coupling(
+        x, H, given.rates, -given.tap.T.copy(), given.tap, given.tap_s, given.c, given.g, given.home, given.cell
+    )
+    eta = x.from_modes @ given.w + x.from_rates @ given.lin + x.from_stiff @ given.d
+    eta += x.from_slopes @ given.ds + x.from_sources @ given.s
     chi = np.ascontiguousarray(x.held @ given.w + x.from_slopes @ given.s)
     rho, share, known = np.zeros((n_f, ROWS)), np.zeros((n_f, ROWS)), np.zeros((n_area, ROWS))
     least, first = np.zeros(ROWS), np.searchsorted(given.home, np.arange(n_area + 1))
     moving = Moving(
-        given.u[given.cell].copy(), given.more, given.slope, given.rate, chi, eta_of(x, given), rho, known, share
+        given.u[given.cell].copy(), given.more, given.slope, given.rate, chi, eta, rho, known, share
     )  # fmt: skip
     answer_mobile(
         n_area > 1, x, given.home, first, given.cell, moving, np.zeros((n_f, n_area + 1, ROWS)),
