@@ -44,10 +44,7 @@ OPTIONS = [
     (["--charge-law", "moble"], "charge_law is 'moble'; allowed: 'local' or 'mobile'"),
     (["--rtol", "0"], "rtol is 0.0; allowed: 1e-13 to 0.1"),
     (["--rtol", "nan"], "rtol is nan; allowed: 1e-13 to 0.1"),
-    (
-        ["--method", "rk4"],
-        "unknown method 'rk4'; allowed: auto, exponential, radau, scipy:NAME, torchdiffeq:NAME",
-    ),
+    (["--method", "rk4"], "unknown method 'rk4'; allowed: auto, exponential, radau, scipy:NAME, torchdiffeq:NAME"),
     (["--method", "scipy:RK4"], "unknown method 'scipy:RK4'; allowed: scipy:RK23"),
     (["--set", "Vdrive.amplitude=1e99"], "Sine amplitude is 1e+99 V; allowed: a size up to 1e+12"),
     (["--source", "SIN(0 1e-320 100)"], "the source's peak is 9.99989e-321 V; allowed: 0, or 1e-300 V or more"),
