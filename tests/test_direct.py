@@ -44,10 +44,9 @@ def test_a_sine_from_rest_is_its_phasor_and_what_decays(f: float, phase: float, 
     assert solution.error.u_gap <= 1e-12 * 200.0
 
 
-@pytest.mark.parametrize("f", [10.0, 100.0, 5e3, 1e5])
-def test_a_sine_settles_at_equation_11(f: float) -> None:
-    # Whole periods of the settled state: 45 time constants of the slowest mode, 1.1 kHz at least.
-    first = math.ceil(0.05 * f)
+# Whole periods of the settled state: 45 time constants of the slowest mode, 1.1 kHz at least; and a hundred thousand.
+@pytest.mark.parametrize(("f", "first"), [(10.0, 1), (100.0, 5), (5e3, 250), (5e3, 99_999), (1e5, 5000)])
+def test_a_sine_settles_at_equation_11(f: float, first: int) -> None:
     t = (first + np.linspace(0.0, 1.0, 41)) / f
     solution = linear(f"SIN(0 200 {f!r})", t, (first + 1.0) / f, f)
     expected = ref.periodic_sine_frozen(f, 200.0, AREA).u(within_a_period(t, f))
@@ -337,14 +336,6 @@ def test_a_source_that_is_never_finite_leaves_the_state_as_it_was(tier: str) -> 
     assert solution.state.t == 0.0
     assert solution.state.s_before[0] == 0.0
     assert not solution.state.y.any()
-
-
-def test_a_hundred_thousand_cycles_are_as_exact_as_one() -> None:
-    f = 5000.0
-    phase = np.linspace(0.0, 1.0, 33)
-    solution = linear(f"SIN(0 200 {f!r})", (99_999.0 + phase) / f, 1e5 / f, f, charge=False)
-    expected = ref.periodic_sine_frozen(f, 200.0, AREA).u(within_a_period(solution.t, f))
-    assert np.abs(solution.u_layer - expected).max() <= (1e-12 + rounded_phase(solution.t, f)) * 200.0
 
 
 # The periodic state, and areas by their names -------------------------------------------------------------------
