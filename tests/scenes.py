@@ -26,7 +26,7 @@ GAP = {
 
 
 def cases(whole: T, few: T) -> T:
-    """How many random cases a statistic takes: `whole` in ``make stress``, which sets STRESS, else `few`."""
+    """How many random cases a statistic takes, or which: `whole` in ``make stress``, which sets STRESS, else `few`."""
     return whole if os.environ.get("STRESS") else few
 
 
