@@ -32,7 +32,7 @@ class StackFold:
 def stack_fold(
     params: ref.Parameters, amplitude: float, f: float, *, resisted: bool = False, method: str = "DOP853"
 ) -> StackFold:
-    """Where a sine from rest meets the fold of Table 1's stack on its first rise.
+    """Where a sine from rest meets the fold of Table 1's stack.
 
     `resisted` gives the end behind any series resistance instead, however small: the largest A u_a. From there the gap
     takes more voltage with less charge, and what drives it through a resistor cannot hold it.
@@ -46,7 +46,8 @@ def stack_fold(
 
     def terms(y: np.ndarray) -> tuple[float, float, float, float, np.ndarray]:
         t, u, q_coat, q_skin = y
-        a, slope = (float(x) for x in ref.contact(u, params)[1:3])
+        a, slope = (float(x) for x in ref.contact(abs(u), params)[1:3])
+        slope = slope if u >= 0.0 else -slope
         leak = np.array([q_coat / (a * c[0]), u, q_skin / (a * c[2])])
         leak *= np.array([1.0 / x.r_total + a / x.r_area for x in layers])
         growth = a + u * slope

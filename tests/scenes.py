@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ import fingerspice as fs
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 LAWS = ("local", "mobile")
 every_law = pytest.mark.parametrize("law", LAWS)
+T = TypeVar("T")
 COAT = {"d": "1u", "eps_r": 3.9, "r": "0.2meg"}
 GAP = {
     "d": "3.5u",
@@ -31,8 +32,8 @@ GAP = {
 }
 
 
-def cases(whole: int, few: int) -> int:
-    """How many random cases a statistic takes: `whole` in ``make stress``, which sets STRESS, else `few`."""
+def cases(whole: T, few: T) -> T:
+    """How many random cases a statistic takes, or which: `whole` in ``make stress``, which sets STRESS, else `few`."""
     return whole if os.environ.get("STRESS") else few
 
 

@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -56,12 +57,9 @@ ORDER = (
 )
 # Beside each other, not one on the other.
 STRANGERS = (
-    ("circuit", "engine"),
-    ("netlist", "engine"),
-    ("plots", "solve"),
-    ("physics.phasor", "circuit.statespace"),
+    ("circuit", "engine"), ("netlist", "engine"), ("plots", "solve"), ("physics.phasor", "circuit.statespace"),
     ("physics.phasor", "engine"),
-)
+)  # fmt: skip
 # Methods that call a part above their own, and load it only when they are called.
 LENT = {
     "circuit.circuit.Circuit._replaced": "netlist.netlist",
@@ -74,17 +72,10 @@ LENT = {
     "results.spectrum.PhasorSolution.plot": "plots.traces",
 }
 THIRD_PARTY = {
-    "numerics": {"numpy", "numba"},
-    "physics": {"numpy", "numba"},
-    "engine": {"numpy", "numba"},
-    "circuit": {"numpy"},
-    "netlist": {"numpy"},
-    "sets": set(),
-    "base": {"numba", "numpy", "rich"},
-    "base.errors": set(),
-    "base.units": set(),
+    "numerics": {"numpy", "numba"}, "physics": {"numpy", "numba"}, "engine": {"numpy", "numba"}, "circuit": {"numpy"},
+    "netlist": {"numpy"}, "sets": set(), "base": {"numba", "numpy", "rich"}, "base.errors": set(), "base.units": set(),
     "base.files": set(),
-}
+}  # fmt: skip
 
 
 def name_of(path: Path) -> str:
@@ -94,6 +85,11 @@ def name_of(path: Path) -> str:
 
 
 NAMES = {name_of(path) for path in FILES}
+
+
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def part_of(name: str) -> str:
@@ -131,7 +127,7 @@ def modules(node: ast.AST) -> set[str]:
 
 def imports(path: Path, top_only: bool = False) -> set[str]:
     """Modules that a file imports, for type checking too; with `top_only` only when it is loaded."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     return {x for node in (tree.body if top_only else ast.walk(tree)) for x in modules(node)}
 
 
@@ -155,7 +151,7 @@ def test_imports_go_downward_only_also_those_for_type_checking(path: Path) -> No
     if part == "":
         assert own(path, top_only=True) == set(), "the package loads its parts on first use"
         return
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     function = named(tree, name)
     for node in ast.walk(tree):
         for other in {x.removeprefix("fingerspice.") for x in modules(node) if x.startswith("fingerspice.")}:
@@ -167,7 +163,7 @@ def test_imports_go_downward_only_also_those_for_type_checking(path: Path) -> No
 def test_every_function_that_calls_a_part_above_its_own_exists() -> None:
     found = set()
     for path in FILES:
-        inside = named(ast.parse(path.read_text(encoding="utf-8")), name_of(path))
+        inside = named(tree_of(path), name_of(path))
         found |= {(function, module) for node, function in inside.items() for module in modules(node)}
     assert {(function, f"fingerspice.{other}") for function, other in LENT.items()} <= found
 
@@ -198,7 +194,7 @@ def test_the_lower_parts_need_few_packages(path: Path) -> None:
 
 @each_file
 def test_nothing_evaluates_text_or_unpickles(path: Path) -> None:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
             called = node.func.id if isinstance(node.func, ast.Name) else ""
@@ -215,7 +211,7 @@ def test_compiled_code_calls_other_files_in_the_shared_folders_only(path: Path) 
     # The key of the compiled code's cache holds the state of these folders: see compiled.py.
     if name_of(path).partition(".")[0] in SHARED_FOLDERS:
         return
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     origin = {
         alias.name: node.module
         for node in ast.walk(tree)
@@ -236,7 +232,7 @@ def test_compiled_code_calls_other_files_in_the_shared_folders_only(path: Path) 
 def test_nothing_prints_but_the_command_line(path: Path) -> None:
     if name_of(path) == "cli.terminal":
         return
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
     assert not [n.lineno for n in calls if n.func.id == "print"]
 
@@ -266,7 +262,7 @@ def functions(path: Path) -> Iterator[tuple[str, bool, int, int]]:
                 assert child.end_lineno is not None
                 yield name, compiled, child.end_lineno - first.lineno + 1, given
 
-    yield from visit(ast.parse(path.read_text(encoding="utf-8")), name_of(path))
+    yield from visit(tree_of(path), name_of(path))
 
 
 def test_the_whole_grows_no_more() -> None:

@@ -19,17 +19,13 @@ A_WAVEFORM = "a waveform, a number or a function of time"
 CALLS = [fs.simulate, fs.steady_state, fs.compare, fs.phasor, fs.plan]
 
 
-@pytest.mark.parametrize(
-    ("call", "figure"),
-    [
-        (lambda c, **k: fs.simulate(c, t_stop=0.01, rtol=1e-6, **k), lambda s: s.f_el_mean),
-        (lambda c, **k: fs.steady_state(c, rtol=1e-6, **k), lambda s: s.solution.f_el[-1]),
-        (lambda c, **k: fs.compare(c, rtol=1e-6, **k), lambda s: s.coupled.f_el_mean),
-        (fs.phasor, lambda p: float(p.f_el_mean[0])),
-        (fs.plan, lambda p: p.sensitivity),
-    ],
-    ids=["simulate", "steady_state", "compare", "phasor", "plan"],
-)
+@pytest.mark.parametrize(("call", "figure"), [
+    (lambda c, **k: fs.simulate(c, t_stop=0.01, rtol=1e-6, **k), lambda s: s.f_el_mean),
+    (lambda c, **k: fs.steady_state(c, rtol=1e-6, **k), lambda s: s.solution.f_el[-1]),
+    (lambda c, **k: fs.compare(c, rtol=1e-6, **k), lambda s: s.coupled.f_el_mean),
+    (fs.phasor, lambda p: float(p.f_el_mean[0])),
+    (fs.plan, lambda p: p.sensitivity),
+], ids=["simulate", "steady_state", "compare", "phasor", "plan"])  # fmt: skip
 def test_sources_and_parameters_are_those_of_replace(call: Any, figure: Any) -> None:
     wanted = figure(call(table1().replace({"Vdrive": SQUARE, "Xgap.d": 3e-6})))
     assert figure(call(table1())) != wanted

@@ -86,13 +86,10 @@ CONTACT = [
     (("m_exp=0.52", "m_exp=1.5"), 5, ["Xgap exponents are m_exp=1.5, n_exp=1.41; allowed: 0 < m_exp < n_exp"]),
     (("m_exp=0.52", "m_exp=1.41"), 5, ["allowed: 0 < m_exp < n_exp"]),
     (("m_exp=0.52", "m_exp=-1"), 5, ["Xgap m_exp is -1; allowed: more than 0"]),
-    (
-        ("n_exp=1.41", "n_exp=1000"),
-        5,
-        ["Xgap has a contact whose constants are beyond the range", "nearer to Table 1's"],
-    ),
+    (("n_exp=1.41", "n_exp=1000"), 5, ["Xgap has a contact whose constants are beyond the range",
+     "nearer to Table 1's"]),
     (("m_exp=0.52 beta=32 n_exp=1.41", "m_exp=3 beta=32 n_exp=4"), 5, ["1/m + 1/n = 0.5833; allowed: more than 1"]),
-]
+]  # fmt: skip
 
 CIRCUIT = [
     (("Vdrive drive 0 SIN(0 200 100)", "*"), 0, ["the circuit has no source; allowed: a V element"]),
@@ -101,30 +98,21 @@ CIRCUIT = [
     (("Xskin skin 0 area", "Xskin skin 0 0"), 6, ["Xskin has ground as its area; allowed: the area node of a GAP"]),
     (("Xskin skin 0", "Xskin skin far"), 6, ["node 'far' is floating: only Xskin touches it"]),
     (("Xskin skin 0", "Xskin skin skin"), 6, ["Xskin has both ends on node 'skin'"]),
-    (
-        ("0 area SKIN", "0 aera SKIN"),
-        6,
-        ["node 'aera' gives Xskin its area, but no GAP and no DC source drives it", "Xgap drives 'area'"],
-    ),
+    (("0 area SKIN", "0 aera SKIN"), 6, ["node 'aera' gives Xskin its area, but no GAP and no DC source drives it",
+     "Xgap drives 'area'"]),
     (("Xcoat", "Xgap"), 5, ["element 'Xgap' is defined twice, first at deck.cir:4:1"]),
     ((".end", "Vb drive 0 5"), 8, ["Vdrive and Vb are voltage sources in parallel"]),
-    (
-        ("Xskin skin 0 area SKIN d=350u f=100", edited().split("\n")[4].replace("Xgap top skin", "Xgap2 skin 0")),
-        6,
-        ["deck.cir:6:1: Xgap and Xgap2 both drive the area node 'area'; allowed: one GAP per area"],
-    ),
+    (("Xskin skin 0 area SKIN d=350u f=100", edited().split("\n")[4].replace("Xgap top skin", "Xgap2 skin 0")), 6,
+     ["deck.cir:6:1: Xgap and Xgap2 both drive the area node 'area'; allowed: one GAP per area"]),
     ((".end", "Va area 0 35"), 8, ["Va and Xgap both drive the area node 'area'", "allowed: a_fix= on Xgap"]),
     ((".end", "R1 drive loose 1k"), 8, ["node 'loose' is floating: only R1 touches it"]),
-    (
-        (".end", ".subckt a p\n.ac dec 1 1 2"),
-        9,
-        ["inside .subckt a, which begins at deck.cir:8:1; is its .ends missing?"],
-    ),
+    ((".end", ".subckt a p\n.ac dec 1 1 2"), 9,
+     ["inside .subckt a, which begins at deck.cir:8:1; is its .ends missing?"]),
     ((".end", ".param w=3,5u"), 8, ["',' outside the arguments", "decimal comma write 3.5u"]),
     ((".end", "# note"), 8, ["'#' is no element", "a comment with *"]),
     ((".end", "B1 drive 0 V=5*time"), 8, ["a behavioural source (a function of time is given in Python"]),
     ((".end", "D1 drive 0 diode"), 8, ["'D1' is a diode, which is not supported"]),
-]
+]  # fmt: skip
 
 DIRECTIVES = [
     ((TRAN, ".tran 10u 0"), 7, ["TSTOP is 0; allowed: more than 0 s"]),
@@ -196,9 +184,7 @@ BAD = [*DEVICES, *VALUES, *CONTACT, *CIRCUIT, *DIRECTIVES, *SOURCES]
 
 
 @pytest.mark.parametrize(("change", "line", "parts"), BAD, ids=lambda x: x[1] if isinstance(x, tuple) else "")
-def test_what_is_wrong_is_said_in_one_sentence_with_its_line(
-    change: tuple[str, str], line: int, parts: list[str]
-) -> None:
+def test_what_is_wrong_is_a_sentence_with_its_line(change: tuple[str, str], line: int, parts: list[str]) -> None:
     with pytest.raises(fs.InputError) as caught:
         fs.parse_netlist(edited(change), "deck.cir")
     said = str(caught.value)

@@ -1,12 +1,18 @@
-"""Limits of memory and time, checked before a run: a request that is too large gets one sentence with the number."""
+"""Limits of memory and time, checked before a run: a request that is too large gets one sentence with the number.
+
+A run frees its memory when it is dropped: nothing of it waits for Python's garbage collection, which is rare.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import os
 import platform
 import resource
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -22,6 +28,7 @@ from processes import ended, start
 from scenes import table1
 from waveform_cases import CASES, Case
 
+CIRCUITS = Path(__file__).parents[1] / "circuits"
 GIB = 2**30
 #: What the engine, compiled, and the libraries take; not a tenth of what these requests would.
 ROOM = 4 * GIB
@@ -119,9 +126,7 @@ def test_an_error_asked_for_that_underflows_is_met() -> None:
 
 
 @pytest.mark.parametrize(("source", "r_gap"), [("SIN(0 200 1k)", "10g"), ("SQUARE(200 1k)", "1meg")])
-def test_no_result_depends_on_where_a_walk_over_periods_is_cut(
-    source: str, r_gap: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_result_depends_on_where_a_walk_is_cut(source: str, r_gap: str, monkeypatch: pytest.MonkeyPatch) -> None:
     circuit = fs.parse_netlist(edited((SOURCE, source), ("r=1meg", f"r={r_gap}"), ("f=100", "f=1k")))
     t = np.linspace(0.0, 3.0, 4001)
     calls: list[int] = []
@@ -162,3 +167,50 @@ def test_freed_memory_is_kept_where_the_environment_asks_to_give_it_back() -> No
     # A megabyte is 256 pages, and a hundred of them are used one after another.
     assert faults() > 20_000
     assert faults("keep") < 500
+
+
+@contextlib.contextmanager
+def collected() -> Iterator[list[object]]:
+    """What garbage collection finds of what is made inside; all that is there before is left aside, as it is much."""
+    gc.disable()
+    gc.freeze()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    found: list[object] = []
+    try:
+        yield found
+        gc.collect()
+        found.extend(gc.garbage)
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.unfreeze()
+        gc.enable()
+
+
+@pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
+@pytest.mark.parametrize("name", ["fingerpad", "fingerpad_dispersive", "two_fingers", "screen_protector", "recording"])
+def test_a_run_with_changed_parameters_leaves_no_cycle(name: str) -> None:
+    circuit = fs.read_netlist(CIRCUITS / f"{'fingerpad' if name == 'recording' else name}.cir")
+    gap = next(path for path in circuit.parameters if path.endswith("ap.d"))
+    if name == "recording":
+        circuit = circuit.replace({"Vdrive": fs.Samples(100.0 * np.sin(np.arange(480) * 0.1), 48e3)})
+
+    def use(change: float) -> None:
+        run = fs.simulate(circuit, parameters={gap: circuit.parameters[gap].value * change}, t_stop=9e-3)
+        assert run.summary()["status"] == "SUCCESS"
+        assert len(run.signals) > 3
+        assert run.warnings is not None
+
+    # The first run compiles, and fills caches.
+    use(1.01)
+    with collected() as found:
+        use(1.02)
+    assert [type(one).__name__ for one in found if type(one).__module__.startswith("fingerspice")] == []
+
+
+def test_garbage_collection_would_find_a_cycle() -> None:
+    with collected() as found:
+        run = fs.simulate(fs.read_netlist(CIRCUITS / "fingerpad.cir"), t_stop=1e-3)
+        run.__dict__["own"] = run
+        del run
+    assert "Solution" in {type(one).__name__ for one in found}

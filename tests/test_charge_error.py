@@ -1,10 +1,15 @@
-"""The error that a step adds to the charge, against derivatives of the charge by the voltages, derived here."""
+"""Parts of a step against what is derived here: the error that it adds to the charge, and what couples its cells.
+
+The former is checked against derivatives of the charge by the voltages, the latter against dense solutions of the same
+equations, row by row.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,10 +20,19 @@ from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.readout import N_PLACES
 from fingerspice.engine.many_areas import error as many_charge
 from fingerspice.engine.many_areas import form as blocks
+from fingerspice.engine.many_areas.coupling import (
+    STIFF,
+    Moving,
+    answer_mobile,
+    cell_currents,
+    fill_coupling,
+    new_coupling,
+)
 from fingerspice.engine.many_areas.form import Form
 from fingerspice.engine.one_area import charge, rows
 from fingerspice.engine.one_area.model import Model
 from fingerspice.numerics.lobatto import END, FIRST, MISS, NODES, POINTS, ROWS
+from fingerspice.numerics.modes import diagonalise
 
 PLACES = np.array([0, FIRST, FIRST + 1, FIRST + 2, END])
 A0, H = 35e-6, 1e-3
@@ -183,9 +197,7 @@ def judge(step: Stack | Net, total: list[float], account: Callable[[float], tupl
 @every_law
 @pytest.mark.parametrize("parts", ["stores", "leaks", "leaks by its area", "stores and leaks, also by its area"])
 @pytest.mark.parametrize("seed", range(4))
-def test_what_a_step_of_a_stack_leaves_in_the_charge_is_its_derivative_by_the_voltages(
-    seed: int, parts: str, law: str
-) -> None:
+def test_what_a_stack_leaves_in_the_charge_is_its_derivative_by_the_voltages(seed: int, parts: str, law: str) -> None:
     step = stack(np.random.default_rng([seed, 3]), law, parts)
     total = [step.charge(x, 0.5)[0] - step.charge(x, -0.5)[0] for x in POINTS[PLACES]]
     scale = judge(step, total, lambda before: engine_account(step, before))
@@ -334,9 +346,7 @@ def network(rng: np.random.Generator, law: str, parts: str, slow: bool) -> Net:
 @pytest.mark.parametrize("slow", [False, True], ids=["area at once", "slow area"])
 @pytest.mark.parametrize("parts", ["reference", "stores", "leaks", "reference, stores, leaks"])
 @pytest.mark.parametrize("seed", range(3))
-def test_what_a_step_of_a_network_leaves_in_the_charge_is_its_derivative_by_the_voltages(
-    seed: int, parts: str, slow: bool, law: str
-) -> None:
+def test_what_a_network_leaves_in_the_charge_is_its_derivative(seed: int, parts: str, slow: bool, law: str) -> None:
     step = network(np.random.default_rng([seed, 4]), law, parts, slow)
     places = np.array([e(POINTS[PLACES]) for e in step.errors])
 
@@ -373,3 +383,92 @@ def test_the_places_of_the_error_are_where_this_file_says() -> None:
     assert PLACES.size == N_PLACES
     assert np.all(np.diff(POINTS[PLACES]) > 0.0)
     assert POINTS[PLACES[[0, -1]]].tolist() == [0.0, 1.0]
+
+
+# The coupling between the cells of variable areas ---------------------------------------------------------------
+
+
+def solved(given: SimpleNamespace) -> tuple[np.ndarray, np.ndarray]:
+    """Currents of the cells (n_f, ROWS), and the distance to the fold (ROWS,), by elimination."""
+    fast = given.rates * H > STIFF
+    own = np.where(fast[:, None], given.d, given.lin - given.rates[:, None] * given.w)
+    free = given.tap @ own + given.tap_s @ given.ds
+    met = -given.tap[:, ~fast] @ given.tap[:, ~fast].T
+    currents, distance = np.empty_like(free), np.ones(ROWS)
+    one = np.eye(len(given.c))
+    for i in range(ROWS):
+        e, u = given.more[given.home, i], given.u[:, i]
+        held = np.diag(e * given.c)
+        pushed, turned = e * given.g * u + given.c * u * given.rate[given.home, i], held.copy()
+        for b, a in enumerate(given.home):
+            turned[b, given.cell[a]] += given.c[b] * u[b] * given.slope[a, i]
+        along = np.linalg.solve(one - met @ turned, free[:, i] + met @ pushed)
+        currents[:, i] = pushed + turned @ along
+        distance[i] = np.linalg.det(one - met @ turned) / np.linalg.det(one - met @ held)
+    return currents, distance
+
+
+def cells(seed: int, sizes: tuple[int, ...], fast: int) -> SimpleNamespace:
+    """Modes, sources and cells of areas at every row of a step, with numbers like those of fingers."""
+    rng = np.random.default_rng(seed)
+    n, n_f, n_area = sum(sizes) + 1, sum(sizes), len(sizes)
+    rates = np.sort(rng.uniform(10.0, 3e4, n))
+    rates[n - fast :] = rng.uniform(1.0, 9.0, fast) * 1e6
+    home = np.repeat(np.arange(n_area), sizes)
+    c = rng.uniform(0.5, 2.0, n_f) * 1e-5
+    # Voltages of the cells from the modes, of a network whose capacitances with the areas held are one in the modes:
+    # those of the cells are at most all of it.
+    tap = np.linalg.qr(rng.normal(size=(n, n)))[0][:n_f] / np.sqrt(c * A0)[:, None]
+    w = rng.normal(size=(n, ROWS)) * np.sqrt(c.mean() * A0) * 50.0
+    given = SimpleNamespace(
+        rates=rates, tap=tap, tap_s=rng.normal(size=(n_f, 1)), c=c, g=c * rng.uniform(1e2, 1e4, n_f), home=home,
+        cell=np.array([int(np.flatnonzero(home == a)[0]) for a in range(n_area)]), w=w,
+        lin=rates[:, None] * w * rng.uniform(-1.0, 1.0, (n, ROWS)), d=rng.normal(size=(n, ROWS)) * 1e-5,
+        s=rng.normal(size=(1, ROWS)) * 100.0, ds=rng.normal(size=(1, ROWS)) * 1e5,
+        more=A0 * rng.uniform(-0.15, 0.15, (n_area, ROWS)), slope=A0 * rng.normal(size=(n_area, ROWS)) * 1e-3,
+        rate=A0 * rng.normal(size=(n_area, ROWS)) * 10.0,
+    )  # fmt: skip
+    given.u = tap @ w + given.tap_s @ given.s
+    return given
+
+
+@pytest.mark.parametrize("fast", [0, 2])
+@pytest.mark.parametrize("sizes", [(3,), (3, 3), (2, 4, 3)])
+@pytest.mark.parametrize("seed", range(3))
+def test_currents_and_the_distance_to_the_fold_under_mobile(seed: int, sizes: tuple[int, ...], fast: int) -> None:
+    given = cells(seed, sizes, fast)
+    n_f, n_area = len(given.c), len(sizes)
+    x = new_coupling(given.tap.shape[1], n_f, 1)
+    fill_coupling(
+        x, H, given.rates, -given.tap.T.copy(), given.tap, given.tap_s, given.c, given.g, given.home, given.cell
+    )
+    eta = x.from_modes @ given.w + x.from_rates @ given.lin + x.from_stiff @ given.d
+    eta += x.from_slopes @ given.ds + x.from_sources @ given.s
+    chi = np.ascontiguousarray(x.held @ given.w + x.from_slopes @ given.s)
+    rho, share, known = np.zeros((n_f, ROWS)), np.zeros((n_f, ROWS)), np.zeros((n_area, ROWS))
+    least, first = np.zeros(ROWS), np.searchsorted(given.home, np.arange(n_area + 1))
+    moving = Moving(
+        given.u[given.cell].copy(), given.more, given.slope, given.rate, chi, eta, rho, known, share
+    )  # fmt: skip
+    answer_mobile(
+        n_area > 1, x, given.home, first, given.cell, moving, np.zeros((n_f, n_area + 1, ROWS)),
+        np.zeros((n_f, n_f + 1, ROWS)), least,
+    )  # fmt: skip
+    want, distance = solved(given)
+    j = np.empty_like(rho)
+    cell_currents(x.root, rho, j)
+    np.testing.assert_allclose(j, want, rtol=0.0, atol=1e-10 * np.abs(want).max())
+    np.testing.assert_allclose(least, distance, rtol=1e-10)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 9])
+def test_small_symmetric_matrices_are_diagonalised(n: int) -> None:
+    rng = np.random.default_rng(n)
+    x = rng.normal(size=(n, n)) * np.geomspace(1.0, 1e-5, n)
+    matrix = x.T @ x
+    values, vectors = matrix.copy(), np.empty((n, n))
+    diagonalise(values, vectors)
+    np.testing.assert_allclose(vectors @ vectors.T, np.eye(n), atol=1e-14)
+    np.testing.assert_allclose(vectors @ np.diag(np.diag(values)) @ vectors.T, matrix, atol=1e-15)
+    # Small eigenvalues too: by the singular values of the factor, to their own digits.
+    np.testing.assert_allclose(np.sort(np.diag(values)), np.sort(np.linalg.svd(x)[1] ** 2), rtol=1e-9)

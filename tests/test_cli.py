@@ -43,9 +43,7 @@ def row(report: Any, signal: str) -> Any:
 # run
 
 
-def test_run_writes_data_and_picture_and_prints_a_table_that_names_the_gap_voltage(
-    command: Command, tmp_path: Path
-) -> None:
+def test_run_writes_data_and_picture_and_prints_a_table_with_the_gap_voltage(command: Command, tmp_path: Path) -> None:
     result = command("run", "pad.cir", "--out", "new/folder")
     assert result.code == 0
     assert not result.lines
@@ -145,9 +143,7 @@ def test_a_solve_that_fails_keeps_what_it_has_and_says_when_and_how_close(comman
 
 
 @pytest.mark.parametrize("name", ["run", "compare"])
-def test_a_skin_at_another_frequency_or_a_voltage_that_air_does_not_bear_is_warned_about_once(
-    command: Command, name: str
-) -> None:
+def test_a_skin_at_another_frequency_or_too_much_voltage_is_warned_about_once(command: Command, name: str) -> None:
     result = command(name, "pad.cir", "--no-plot", "--set", "Xskin.f=200")
     assert result.code == 0
     (line,) = result.lines

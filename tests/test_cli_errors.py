@@ -44,10 +44,7 @@ OPTIONS = [
     (["--charge-law", "moble"], "charge_law is 'moble'; allowed: 'local' or 'mobile'"),
     (["--rtol", "0"], "rtol is 0.0; allowed: 1e-13 to 0.1"),
     (["--rtol", "nan"], "rtol is nan; allowed: 1e-13 to 0.1"),
-    (
-        ["--method", "rk4"],
-        "unknown method 'rk4'; allowed: auto, exponential, radau, scipy:NAME, torchdiffeq:NAME",
-    ),
+    (["--method", "rk4"], "unknown method 'rk4'; allowed: auto, exponential, radau, scipy:NAME, torchdiffeq:NAME"),
     (["--method", "scipy:RK4"], "unknown method 'scipy:RK4'; allowed: scipy:RK23"),
     (["--set", "Vdrive.amplitude=1e99"], "Sine amplitude is 1e+99 V; allowed: a size up to 1e+12"),
     (["--source", "SIN(0 1e-320 100)"], "the source's peak is 9.99989e-321 V; allowed: 0, or 1e-300 V or more"),
@@ -110,14 +107,11 @@ OTHERS = [
 ]
 
 USAGE = [
-    (["run"], "Missing argument 'DECK'"),
-    (["export", "pad.cir"], "Missing option '--output'"),
-    (["rnu", "pad.cir"], "No such command 'rnu'"),
-    (["run", "pad.cir", "--plott"], "No such option"),
-    (["run", "pad.cir", "pad.cir"], "unexpected extra argument"),
-    (["run", "pad.cir", "--rtol", "small"], "--rtol"),
+    (["run"], "Missing argument 'DECK'"), (["export", "pad.cir"], "Missing option '--output'"),
+    (["rnu", "pad.cir"], "No such command 'rnu'"), (["run", "pad.cir", "--plott"], "No such option"),
+    (["run", "pad.cir", "pad.cir"], "unexpected extra argument"), (["run", "pad.cir", "--rtol", "small"], "--rtol"),
     (["figures", "--only", "two"], "--only"),
-]
+]  # fmt: skip
 
 
 @pytest.fixture
@@ -140,7 +134,7 @@ def folder(command: Command, tmp_path: Path) -> Path:
     [*((["run", "pad.cir", "--out", "new", *words], said) for words, said in OPTIONS), *OTHERS, *USAGE],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",
 )
-def test_bad_input_gets_one_sentence_and_leaves_nothing(
+def test_bad_input_gets_a_sentence_and_leaves_nothing(
     command: Command, folder: Path, arguments: list[str], said: str
 ) -> None:
     before = tree(folder)
@@ -156,9 +150,7 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(
     assert tree(folder) == before
 
 
-def test_a_fault_of_the_program_is_one_sentence_with_its_place(
-    command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fault_of_the_program_is_a_sentence_with_its_place(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
         raise errors.pop()
 
@@ -177,24 +169,18 @@ def test_a_fault_of_the_program_is_one_sentence_with_its_place(
 
 
 CHECKED_FIRST = [
-    ("run --rtol 7", "rtol is 7.0; allowed"),
-    ("run --method rk4", "unknown method 'rk4'"),
-    ("run --area frozn", "area is 'frozn'"),
-    ("run --start warm", "start is 'warm'"),
-    ("run --jumps no", "jumps is 'no'"),
-    ("run --stream --netcdf --rtol 7", "rtol is 7.0; allowed"),
-    ("run --stream --netcdf --chunk soon", "--chunk 'soon'"),
-    ("ac --rtol 7 --area coupled", "rtol is 7.0; allowed"),
-    ("ac --area frozn", "area is 'frozn'"),
-    ("ac --sweep dec", "--sweep 'dec'"),
-    ("ac --amplitude 5", "--amplitude goes with --area coupled"),
-    ("compare --rtol 7", "rtol is 7.0; allowed"),
+    ("run --rtol 7", "rtol is 7.0; allowed"), ("run --method rk4", "unknown method 'rk4'"),
+    ("run --area frozn", "area is 'frozn'"), ("run --start warm", "start is 'warm'"),
+    ("run --jumps no", "jumps is 'no'"), ("run --stream --netcdf --rtol 7", "rtol is 7.0; allowed"),
+    ("run --stream --netcdf --chunk soon", "--chunk 'soon'"), ("ac --rtol 7 --area coupled", "rtol is 7.0; allowed"),
+    ("ac --area frozn", "area is 'frozn'"), ("ac --sweep dec", "--sweep 'dec'"),
+    ("ac --amplitude 5", "--amplitude goes with --area coupled"), ("compare --rtol 7", "rtol is 7.0; allowed"),
     ("ac --area coupled --amplitude -5", "amplitude is [-5.0] V; allowed: positive"),
     ("limits --points 1", "points is 1; allowed: 3 to 1000"),
     ("limits --span 0.5", "span is 0.5; allowed: more than 1"),
     ("limits --capability --carrier -5", "--carrier is -5; allowed: > 0"),
     ("design --limit -3", "--limit is -3; allowed: > 0"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("words", "said"), CHECKED_FIRST)
@@ -210,7 +196,7 @@ def test_arguments_are_checked_before_files(command: Command, words: str, said: 
 
 
 @pytest.mark.parametrize("out", ["/proc/new", "/proc", f"new/{'x' * 300}/y", "x/y"])
-def test_a_folder_that_cannot_be_made_is_told_before_the_run(
+def test_a_folder_that_cannot_be_made_is_told(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
 ) -> None:
     if out.startswith("/proc") and not Path("/proc/self").exists():

@@ -117,12 +117,6 @@ def test_compiled_code_that_came_with_the_package_is_used_where_nothing_can_be_w
     assert area(copy, code=SHUT + LOGGED + AREA) == (0, [], first[2])
 
 
-def test_compiling_is_announced_in_python_too_by_one_line_and_only_once(copy: Path) -> None:
-    out, err = begun(copy).communicate(timeout=120)
-    assert err == f"fingerspice: note: {ONCE}\n"
-    assert begun(copy).communicate(timeout=120) == (out, "")
-
-
 @faults
 def test_on_a_terminal_compiling_shows_a_bar_that_goes_away(copy: Path) -> None:
     seen, out = on_a_terminal(partial(begun, copy))
@@ -211,27 +205,24 @@ def test_killed_while_it_keeps_compiled_code_it_works_the_next_time(copy: Path) 
 # A change of any source ---------------------------------------------------------------------------------------------
 
 
-def test_a_change_of_one_source_reaches_the_compiled_code_of_another(copy: Path) -> None:
-    before = area(copy)
-    stamp = copy / "__pycache__" / "compiled.stamp"
-    compiled(copy)
+def test_compiling_is_announced_by_one_line_and_repeated_only_after_a_change_of_its_sources(copy: Path) -> None:
+    def change(*names: str) -> None:
+        for name in names:
+            with (copy / name).open("a") as source:
+                source.write("\n# changed\n")
+
+    out, err = begun(copy).communicate(timeout=120)
+    assert err == f"fingerspice: note: {ONCE}\n"
+    before, stamp = compiled(copy), copy / "__pycache__" / "compiled.stamp"
+    change("cli/app.py", "netlist/reader.py")
+    assert begun(copy).communicate(timeout=120) == (out, "")
+    assert compiled(copy) == before
     # `ridge_area` stays as it is; only another module changes.
-    with (copy / "numerics" / "small.py").open("a") as source:
-        source.write("\n# changed\n")
+    change("numerics/small.py")
     written = stamp.stat().st_mtime_ns
-    assert area(copy) == before
+    assert area(copy) == (0, [], out)
     assert stamp.stat().st_mtime_ns > written
     assert min(compiled(copy).values()) > written, "a cache file from before the change is still there"
-
-
-def test_a_change_of_a_file_that_nothing_compiled_depends_on_compiles_nothing(copy: Path) -> None:
-    area(copy)
-    before = compiled(copy)
-    for name in ("cli/app.py", "netlist/reader.py"):
-        with (copy / name).open("a") as source:
-            source.write("\n# changed\n")
-    area(copy)
-    assert compiled(copy) == before
 
 
 # `source` calls `chebyshev.evaluate`, which stands in another file.

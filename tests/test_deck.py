@@ -183,61 +183,30 @@ def test_text_after_the_end_and_uncalled_subcircuits_are_warned_about() -> None:
 
 
 REFUSED = {
-    "L1 a b 1m": "is an inductor, which is not supported; elements are R, C, V, I",
-    "tran 1u 1m": "begins with a dot",
-    "5 a b 1": "'5' is no element",
-    ",": "is no element",
-    "(": "is no element",
-    ".": "is not supported",
-    "R1": "missing node",
-    "R1 a": "missing node",
-    "R1 a b": "missing value",
-    "R1 = 5": "the name before '='",
-    "R1 a b (5": r"'\(' is never closed",
-    "R1 a b 5)": "without an opening",
-    "R1 a b 5}": "without an opening",
-    "R1 a b '5": "' is never closed",
-    'V1 a b "x': '" is never closed',
-    "R1 a {b} 5": "where a node's name belongs",
-    "V1 a b SIN(0 sin(3) 1)": "arithmetic goes in braces",
-    "X1": "needs nodes",
-    "X1 a b area LAYER 1u": "follows the device LAYER",
-    'X1 a b area "LAYER"': "where a device's name belongs",
+    "L1 a b 1m": "is an inductor, which is not supported; elements are R, C, V, I", "tran 1u 1m": "begins with a dot",
+    "5 a b 1": "'5' is no element", ",": "is no element", "(": "is no element", ".": "is not supported",
+    "R1": "missing node", "R1 a": "missing node", "R1 a b": "missing value", "R1 = 5": "the name before '='",
+    "R1 a b (5": r"'\(' is never closed", "R1 a b 5)": "without an opening", "R1 a b 5}": "without an opening",
+    "R1 a b '5": "' is never closed", 'V1 a b "x': '" is never closed', "R1 a {b} 5": "where a node's name belongs",
+    "V1 a b SIN(0 sin(3) 1)": "arithmetic goes in braces", "X1": "needs nodes",
+    "X1 a b area LAYER 1u": "follows the device LAYER", 'X1 a b area "LAYER"': "where a device's name belongs",
     "X1 a b area LAYER d=1u D=2u": "given twice, first at <netlist>:2:19",
-    "X1 a b area LAYER 1d=1": "cannot be a parameter's name",
-    "+ foo": "there is none",
-    ".param": "write .param name=value",
-    ".param x": "write .param name=value",
-    ".param x=": "missing value of 'x'",
-    ".param =3": "name before '='",
-    ".param f(x)=x": "functions are not supported",
-    ".param x={1": "never closed",
-    ".param x={1}+2": "belongs inside",
-    ".param x=1 2": "operator is missing",
-    ".param x=1\n.param X=2": "defined twice, first at <netlist>:2:8",
-    ".param x=x": "in a circle: x -> x",
-    ".param a=b b=c c=d d=b": "in a circle: d -> b -> c -> d",
-    ".subckt": "write .subckt NAME",
-    ".subckt A a b": "without its .ends",
-    ".subckt A a a\n.ends": "given twice",
-    ".subckt A 0\n.ends": "ground",
-    ".subckt A a w=1 b\n.ends": "nodes come first",
-    ".subckt A a\n.ends B": "the names differ",
+    "X1 a b area LAYER 1d=1": "cannot be a parameter's name", "+ foo": "there is none",
+    ".param": "write .param name=value", ".param x": "write .param name=value", ".param x=": "missing value of 'x'",
+    ".param =3": "name before '='", ".param f(x)=x": "functions are not supported", ".param x={1": "never closed",
+    ".param x={1}+2": "belongs inside", ".param x=1 2": "operator is missing",
+    ".param x=1\n.param X=2": "defined twice, first at <netlist>:2:8", ".param x=x": "in a circle: x -> x",
+    ".param a=b b=c c=d d=b": "in a circle: d -> b -> c -> d", ".subckt": "write .subckt NAME",
+    ".subckt A a b": "without its .ends", ".subckt A a a\n.ends": "given twice", ".subckt A 0\n.ends": "ground",
+    ".subckt A a w=1 b\n.ends": "nodes come first", ".subckt A a\n.ends B": "the names differ",
     ".subckt A a\n.ends\n.subckt a b\n.ends": "defined twice, first at <netlist>:2:1",
     ".subckt A a\nX1 a B\n.ends\n.subckt B a\nX1 a A\n.ends\nX1 b A": "calls itself: A -> B -> A",
     ".subckt A a wide=1\n.ends\nX1 b A wid=2": "did you mean 'wide'",
-    ".subckt A a b\n.ends\nX1 c A": r"A has 2 nodes \(a b\), 1 given",
-    ".ends": "without a .subckt",
-    ".include": "needs a file name",
-    ".include 'foo": "never closed",
-    ".include a b": "in quotes",
-    ".include foo.lib": "no folder to look in",
-    ".lib foo bar": "sections",
-    ".control\nfoo": "without its .endc",
-    ".endc": "without a .control",
-    ".ic v(a=3": "never closed",
-    ".ic v(a)=": "missing value of 'v",
-}
+    ".subckt A a b\n.ends\nX1 c A": r"A has 2 nodes \(a b\), 1 given", ".ends": "without a .subckt",
+    ".include": "needs a file name", ".include 'foo": "never closed", ".include a b": "in quotes",
+    ".include foo.lib": "no folder to look in", ".lib foo bar": "sections", ".control\nfoo": "without its .endc",
+    ".endc": "without a .control", ".ic v(a=3": "never closed", ".ic v(a)=": "missing value of 'v",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "message"), REFUSED.items())
@@ -358,14 +327,11 @@ def test_fifty_random_nests_are_what_ngspice_takes_or_refused(tmp_path: Path) ->
     assert all(re.search("allowed: another name|in a circle", refusal) for refusal in refusals), refusals
 
 
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        ("R0 a 0 1\n.subckt s a b w=4 v=1\nR1 a b {v}\n.ends\nX1 a 0 s w=9 v={w}", "w = 7 .* s's own w = 9"),
-        ("R0 a 0 1\n.subckt s a b w=4 v=1\nR1 a b {v}\n.ends\nX1 a 0 s v={w}", "w = 7 .* s's own w = 4"),
-        ("X1 a 0 area SLAB d=4u eps_r=3 rho={d*1e15}", "d = 2e-06 .* SLAB's own d = 4e-06"),
-    ],
-)
+@pytest.mark.parametrize(("call", "said"), [
+    ("R0 a 0 1\n.subckt s a b w=4 v=1\nR1 a b {v}\n.ends\nX1 a 0 s w=9 v={w}", "w = 7 .* s's own w = 9"),
+    ("R0 a 0 1\n.subckt s a b w=4 v=1\nR1 a b {v}\n.ends\nX1 a 0 s v={w}", "w = 7 .* s's own w = 4"),
+    ("X1 a 0 area SLAB d=4u eps_r=3 rho={d*1e15}", "d = 2e-06 .* SLAB's own d = 4e-06"),
+])  # fmt: skip
 def test_a_value_whose_name_ngspice_takes_inside_is_refused(call: str, said: str) -> None:
     with pytest.raises(InputError, match=f"{said}; allowed: another name for one of them"):
         parse_deck(f"captured\n.param w=7 d=2u\n{call}\n.end\n")
@@ -394,26 +360,15 @@ def test_local_files_are_included_and_named_in_places(tmp_path: Path) -> None:
     assert caught.value.where == Where(str(tmp_path / "my parts.lib"), 3, 8)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("../secret.lib", "outside the netlist's folder"),
-        ("/etc/passwd", "outside the netlist's folder"),
-        ("link.lib", "outside the netlist's folder"),
-        ("missing.lib", "does not exist"),
-        ("part.lob", "did you mean 'part.lib'"),
-        ("./part.lob", "'./part.lob' does not exist; did you mean 'part.lib'"),
-        ("sub/inner.lob", "did you mean 'sub/inner.lib'"),
-        ("sbu/inner.lib", "did you mean 'sub/inner.lib'"),
-        ("missing/part.lib", "did you mean 'part.lib'"),
-        ("sub/fingerspce.lib", "did you mean 'fingerspice.lib'"),
-        ("main.cir", "includes itself"),
-        ("loop.lib", "includes itself"),
-        ("sub", "is a folder"),
-        ("end.lib", "not an included file, has .end"),
-        ("x" * 5000, "cannot be read|not a usable"),
-    ],
-)
+@pytest.mark.parametrize(("name", "message"), [
+    ("../secret.lib", "outside the netlist's folder"), ("/etc/passwd", "outside the netlist's folder"),
+    ("link.lib", "outside the netlist's folder"), ("missing.lib", "does not exist"),
+    ("part.lob", "did you mean 'part.lib'"), ("./part.lob", "'./part.lob' does not exist; did you mean 'part.lib'"),
+    ("sub/inner.lob", "did you mean 'sub/inner.lib'"), ("sbu/inner.lib", "did you mean 'sub/inner.lib'"),
+    ("missing/part.lib", "did you mean 'part.lib'"), ("sub/fingerspce.lib", "did you mean 'fingerspice.lib'"),
+    ("main.cir", "includes itself"), ("loop.lib", "includes itself"), ("sub", "is a folder"),
+    ("end.lib", "not an included file, has .end"), ("x" * 5000, "cannot be read|not a usable"),
+])  # fmt: skip
 def test_other_files_are_refused_by_name(tmp_path: Path, name: str, message: str) -> None:
     folder = tmp_path / "deck"
     (folder / "sub").mkdir(parents=True)
@@ -436,16 +391,11 @@ def test_no_name_from_outside_the_folder_is_proposed_for_a_missing_file(tmp_path
     assert "secret.lib" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"", "is empty"),
-        (b" \n\n", "is empty"),
-        (b"t\nR1 a 0 1\0", "NUL"),
-        ("t\nR1 a 0 1\n".encode("utf-16-le"), "not a text file"),
-        (b"t\nC1 a 0 1\x81\n", "neither UTF-8 nor Latin-1 text .byte 0x81 in line 2"),
-    ],
-)
+@pytest.mark.parametrize(("data", "message"), [
+    (b"", "is empty"), (b" \n\n", "is empty"), (b"t\nR1 a 0 1\0", "NUL"),
+    ("t\nR1 a 0 1\n".encode("utf-16-le"), "not a text file"),
+    (b"t\nC1 a 0 1\x81\n", "neither UTF-8 nor Latin-1 text .byte 0x81 in line 2"),
+])  # fmt: skip
 def test_files_that_are_no_netlists_are_refused(tmp_path: Path, data: bytes, message: str) -> None:
     path = tmp_path / "main.cir"
     path.write_bytes(data)

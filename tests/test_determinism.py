@@ -260,9 +260,7 @@ def test_scipys_methods_in_threads_leave_the_warning_filters_as_they_were(monkey
     assert warnings.filters == before
 
 
-def test_nothing_is_left_in_shared_arrays_from_one_call_to_the_next(
-    right: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_left_in_shared_arrays(right: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     from fingerspice.solve.collocation import SCRATCH, Track
 
     march, calls = Track.march, []

@@ -146,17 +146,11 @@ def test_a_table_is_read_from_a_file(tmp_path: Path) -> None:
     assert fs.fit_material(rows[::-1], poles=4).ladder == fs.fit_material(rows, poles=4).ladder
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("f,rho,eps\n1,2\n", "not three numbers"),
-        ("1,2,3\n2,x,3\n3,2,3\n", "row 2"),
-        ("1,2,3\n2,2,3\n", "three frequencies or more"),
-        ("1,2,3\n2,-2,3\n3,2,3\n", "resistivity in row 2 is -2"),
-        ("1,2,3\n1,2,3\n3,2,3\n", "frequencies"),
-        ("", "material data"),
-    ],
-)
+@pytest.mark.parametrize(("text", "says"), [
+    ("f,rho,eps\n1,2\n", "not three numbers"), ("1,2,3\n2,x,3\n3,2,3\n", "row 2"),
+    ("1,2,3\n2,2,3\n", "three frequencies or more"), ("1,2,3\n2,-2,3\n3,2,3\n", "resistivity in row 2 is -2"),
+    ("1,2,3\n1,2,3\n3,2,3\n", "frequencies"), ("", "material data"),
+])  # fmt: skip
 def test_files_that_are_no_material_are_refused(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "bad.csv"
     path.write_text(text)

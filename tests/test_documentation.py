@@ -11,6 +11,7 @@ import re
 import shlex
 import shutil
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -82,8 +83,10 @@ RUNNING = [p for p in PAGES if any(b.language in ("python", "sh") for b in block
 
 
 @pytest.mark.parametrize("page", RUNNING, ids=id_of)
-def test_the_code_of_a_page_runs_from_its_start_to_its_end(page: Path, command: Command, tmp_path: Path) -> None:
+def test_the_code_of_a_page_runs(page: Path, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     os.environ["MPLBACKEND"] = "Agg"
+    few = cases({}, {"frequency": [50.0], "means": 3})
+    monkeypatch.setattr("fingerspice.studies.limits.capability", partial(fs.capability, **few))
     shutil.copytree(CIRCUITS, tmp_path / "circuits")
     population = tmp_path / "circuits" / "population.toml"
     population.write_text(population.read_text().replace("n = 16384", f"n = {cases(16384, 256)}"))
@@ -102,7 +105,8 @@ def test_the_code_of_a_page_runs_from_its_start_to_its_end(page: Path, command: 
             plt.close("all")
             printed = out.getvalue()
         for arguments in commands_of(block) if block.language == "sh" else []:
-            result = command(*arguments)
+            map_of_folds = arguments[0] == "limits" and "--capability" not in arguments
+            result = command(*arguments, *(cases([], ["--points", "3"]) if map_of_folds else []))
             assert result.code == 0, (arguments, result.err)
             printed = result.out
         if block.language == "text":
@@ -178,9 +182,7 @@ def test_the_recording_is_what_its_script_makes() -> None:
     assert path.stat().st_size < 100_000
 
 
-def test_the_command_draws_the_decks_below_and_the_scenes(
-    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_draws_decks_and_scenes(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "circuits").mkdir()
     shutil.copy(CIRCUITS / "click.cir", tmp_path / "circuits")
     some = EXAMPLES[:: cases(1, 7)]

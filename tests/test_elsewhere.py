@@ -97,17 +97,12 @@ def test_no_parasitics_are_no_elements(key: str) -> None:
     assert len(circuit.elements) == 4
 
 
-@pytest.mark.parametrize(
-    ("line", "tran", "noted"),
-    [
-        (".tran 20m", Tran(2e-6, 0.02), True),
-        (".tran 20m uic", Tran(2e-6, 0.02, uic=True), True),
-        (".tran 0 20m", Tran(2e-6, 0.02), True),
-        (".tran 0 20m 5m", Tran(2e-6, 0.02, 0.005), True),
-        (".tran 0 20m 0 10u", Tran(1e-5, 0.02, 0.0, 1e-5), False),
-        (".tran 0 20m 5m 10u uic", Tran(1e-5, 0.02, 0.005, 1e-5, True), False),
-    ],
-)
+@pytest.mark.parametrize(("line", "tran", "noted"), [
+    (".tran 20m", Tran(2e-6, 0.02), True), (".tran 20m uic", Tran(2e-6, 0.02, uic=True), True),
+    (".tran 0 20m", Tran(2e-6, 0.02), True), (".tran 0 20m 5m", Tran(2e-6, 0.02, 0.005), True),
+    (".tran 0 20m 0 10u", Tran(1e-5, 0.02, 0.0, 1e-5), False),
+    (".tran 0 20m 5m 10u uic", Tran(1e-5, 0.02, 0.005, 1e-5, True), False),
+])  # fmt: skip
 def test_ltspices_tran_needs_no_step(line: str, tran: Tran, noted: bool) -> None:
     circuit, said = read((TRAN, line))
     assert circuit.tran == tran
@@ -115,20 +110,17 @@ def test_ltspices_tran_needs_no_step(line: str, tran: Tran, noted: bool) -> None
     assert said == ([expected] if noted else [])
 
 
-@pytest.mark.parametrize(
-    ("source", "wave", "expected"),
-    [
-        ("SINE(1 200 100 1m 2 30)", fs.Sine(200.0, 100.0, 1.0, 30.0, 1e-3, 2.0), ""),
-        (
-            "PWL(0 0 1m 5 +2m 0)", fs.PWL((0.0, 1e-3, 2e-3), (0.0, 5.0, 0.0)),
-            "the time +2m is counted from 0, as in ngspice; LTspice counts it from the point before",
-        ),
-        (
-            "SIN(200 100)", fs.Sine(100.0, 20.0, 200.0),
-            "SIN leaves out FREQ, which is 1/TSTOP then, 20 Hz; its values are VO VA FREQ",
-        ),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("source", "wave", "expected"), [
+    ("SINE(1 200 100 1m 2 30)", fs.Sine(200.0, 100.0, 1.0, 30.0, 1e-3, 2.0), ""),
+    (
+        "PWL(0 0 1m 5 +2m 0)", fs.PWL((0.0, 1e-3, 2e-3), (0.0, 5.0, 0.0)),
+        "the time +2m is counted from 0, as in ngspice; LTspice counts it from the point before",
+    ),
+    (
+        "SIN(200 100)", fs.Sine(100.0, 20.0, 200.0),
+        "SIN leaves out FREQ, which is 1/TSTOP then, 20 Hz; its values are VO VA FREQ",
+    ),
+])  # fmt: skip
 def test_what_ltspice_reads_in_another_way_is_named(source: str, wave: fs.Waveform, expected: str) -> None:
     circuit, said = read(("SIN(0 200 100)", source))
     assert circuit["Vdrive"].waveform == wave
@@ -160,20 +152,11 @@ def test_a_netlist_in_utf_16_with_its_mark_is_read(tmp_path: Path) -> None:
 # R, C and GAP as ngspice takes them
 
 
-@pytest.mark.parametrize(
-    ("line", "value"),
-    [
-        ("R9 drive 0 r=10k", 1e4),
-        ("R9 drive 0 r={g}", 1e4),
-        ("R9 drive 0 R={2*5k}", 1e4),
-        ("R9 drive 0 10k m=4", 2.5e3),
-        ("R9 drive 0 r=10k m=0.5", 2e4),
-        ("R9 drive 0 resistance=10k", 1e4),
-        ("C9 drive 0 c=1n", 1e-9),
-        ("C9 drive 0 c='2*1n' m=3 ic=0", 6e-9),
-        ("C9 drive 0 1n m=2", 2e-9),
-    ],
-)
+@pytest.mark.parametrize(("line", "value"), [
+    ("R9 drive 0 r=10k", 1e4), ("R9 drive 0 r={g}", 1e4), ("R9 drive 0 R={2*5k}", 1e4), ("R9 drive 0 10k m=4", 2.5e3),
+    ("R9 drive 0 r=10k m=0.5", 2e4), ("R9 drive 0 resistance=10k", 1e4), ("C9 drive 0 c=1n", 1e-9),
+    ("C9 drive 0 c='2*1n' m=3 ic=0", 6e-9), ("C9 drive 0 1n m=2", 2e-9),
+])  # fmt: skip
 def test_values_of_r_and_c_by_name_and_by_number_of_parts(line: str, value: float) -> None:
     circuit, said = read((".end", f".params g=10k\n{line}\n.end"))
     assert circuit[line[:2]].values["value"] == pytest.approx(value, rel=1e-15)
@@ -220,17 +203,11 @@ def test_what_only_ngspice_or_ltspice_needs_is_not_worth_a_word(word: str, comma
 
 DOUBTFUL = {
     "V1 a 0 SIN(0 200 0,1)": "0,1 is two numbers, 0 and 1, for a comma separates; if it is a decimal comma write 0.1",
-    "X1 a b c LAYER d=3,5u eps_r=1": "write 3.5u",
-    "X1 a b c LAYER d= 3,5um eps_r=1": "write 3.5um",
-    "V1 a 0 PULSE(0 5 0 1,5n 1n 1m 2m)": "write 1.5n",
-    "V1 a 0 PULSE 0 5 0 -1,5n 1n": "write -1.5n",
-    ".tran 10u 0,05 uic": "write 0.05",
-    ".param w=3,5u": "write 3.5u",
-    "R1 a b 3,5k": "write 3.5k",
-    "R1 1 2 3,5k": "write 3.5k",
-    "V1 a 0 DC 1,5": "write 1.5",
-    ".ac dec 10 0,5 100k": "write 0.5",
-}
+    "X1 a b c LAYER d=3,5u eps_r=1": "write 3.5u", "X1 a b c LAYER d= 3,5um eps_r=1": "write 3.5um",
+    "V1 a 0 PULSE(0 5 0 1,5n 1n 1m 2m)": "write 1.5n", "V1 a 0 PULSE 0 5 0 -1,5n 1n": "write -1.5n",
+    ".tran 10u 0,05 uic": "write 0.05", ".param w=3,5u": "write 3.5u", "R1 a b 3,5k": "write 3.5k",
+    "R1 1 2 3,5k": "write 3.5k", "V1 a 0 DC 1,5": "write 1.5", ".ac dec 10 0,5 100k": "write 0.5",
+}  # fmt: skip
 RIGHT = [
     *("V1 a 0 SIN(0,200,100)", "V1 a 0 SIN(0, 200, 100)", "V1 a 0 PWL(0,0 1m,5 2m,0)", "V1 a 0 PWL(0 0, 1m 5, 2m 0)"),
     *("R1 1,2 10k", "R1 a b {max(1,2)*1k}", "R1 a b '1k*max(1,2)'", ".param w={min(3,5)}", ".ic v(a)=1, v(b)=2"),
@@ -259,13 +236,9 @@ def test_a_changed_library_beside_the_deck_is_warned_about_for_it_is_not_read(na
     path = tmp_path / "deck.cir"
     path.write_text(edited(("fingerspice.lib", name)))
     for text, expected in (
-        (None, 0),
-        (library_text(law), 0),
-        (library_text(law).replace("\n", "\r\n") + "\r\n", 0),
-        (library_text(law).replace("8.854e-12", "8.9e-12"), 1),
-        ("", 1),
-        ("x" * 10_000_000, 1),
-    ):
+        (None, 0), (library_text(law), 0), (library_text(law).replace("\n", "\r\n") + "\r\n", 0),
+        (library_text(law).replace("8.854e-12", "8.9e-12"), 1), ("", 1), ("x" * 10_000_000, 1),
+    ):  # fmt: skip
         if text is not None:
             (tmp_path / name).write_text(text, newline="")
         with warnings.catch_warnings(record=True) as caught:

@@ -201,19 +201,16 @@ def test_bands_add_up_to_the_variance_of_noise() -> None:
     assert 0.5 * np.sum(found.force**2) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: SkinMechanics("x", -1.0, 1.0, 1.0), "mass is -1.0 kg; allowed: finite, 0 or more kg"),
-        (lambda: SkinMechanics("x", 1.0, 1.0, 0.0), "more than 0 N/m"),
-        (lambda: SkinMechanics("x", 1.0, math.nan, 1.0), "damping is nan"),
-        (lambda: Threshold("x", (1.0,), (0.0,)), "two rows of equal length"),
-        (lambda: Threshold("x", (1.0, 2.0), (0.0, 1.0, 2.0)), "two rows of equal length"),
-        (lambda: Threshold("x", (2.0, 1.0), (0.0, 0.0)), "point 2 is 1.0 Hz"),
-        (lambda: Threshold("x", (1.0, 2.0), (math.nan, 0.0)), "point 1 is 1.0 Hz, nan dB"),
-        (lambda: Threshold("x", (1.0, 2.0), (0.0, 0.0), reference=0.0), "reference is 0 m/s.*> 0"),
-    ],
-)
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda: SkinMechanics("x", -1.0, 1.0, 1.0), "mass is -1.0 kg; allowed: finite, 0 or more kg"),
+    (lambda: SkinMechanics("x", 1.0, 1.0, 0.0), "more than 0 N/m"),
+    (lambda: SkinMechanics("x", 1.0, math.nan, 1.0), "damping is nan"),
+    (lambda: Threshold("x", (1.0,), (0.0,)), "two rows of equal length"),
+    (lambda: Threshold("x", (1.0, 2.0), (0.0, 1.0, 2.0)), "two rows of equal length"),
+    (lambda: Threshold("x", (2.0, 1.0), (0.0, 0.0)), "point 2 is 1.0 Hz"),
+    (lambda: Threshold("x", (1.0, 2.0), (math.nan, 0.0)), "point 1 is 1.0 Hz, nan dB"),
+    (lambda: Threshold("x", (1.0, 2.0), (0.0, 0.0), reference=0.0), "reference is 0 m/s.*> 0"),
+])  # fmt: skip
 def test_mechanics_and_thresholds_without_sense_are_refused(make: object, said: str) -> None:
     with pytest.raises(fs.InputError, match=said):
         make()  # type: ignore[operator]

@@ -18,6 +18,7 @@ from fingerspice.engine.lockstep.card import thread_kernel
 from scenes import cases
 
 ROOT = Path(__file__).resolve().parents[1]
+Simulated = dict[str, dict[str, Any]]
 
 CODE = """
 import json, sys
@@ -41,7 +42,7 @@ GAPS = {"Xgap.d": [3e-6, 3.5e-6, 4e-6], "Xgap.r": [3e5, 1e6, 3e6]}
 # The thickness of the skin decides which scene settles last, by which the scenes are ordered.
 VALUES = {"Vdrive.amplitude": [120.0, 180.0, 240.0], "Xskin.d": [4.2e-4, 3.5e-4, 3e-4]}
 REQUESTS: dict[str, tuple[str, dict[str, Any]]] = {
-    "run": ("fingerpad", {"scenes": GAPS, "periods": 5, "outputs": ["f_el_mean", "f_t_rms", "f_el_mean_periodic"]}),
+    "run": ("fingerpad", {"scenes": GAPS, "periods": 2, "outputs": ["f_el_mean", "f_t_rms", "f_el_mean_periodic"]}),
     "periodic": ("fingerpad", {"scenes": GAPS, "periodic": True, "rtol": 1e-6}),
     "square": ("fingerpad", {"scenes": GAPS, "periods": 2, "drive": "SQUARE(150 100)"}),
     "AM": ("am_carrier", {"scenes": GAPS, "t_stop": 0.01, "outputs": ["f_el_mean", "f_t_rms"]}),
@@ -55,7 +56,7 @@ REQUESTS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 @pytest.fixture(scope="module")
-def simulated() -> dict[str, dict[str, Any]]:
+def simulated() -> Simulated:
     """Results on the processor and in the simulator, which reads its variable when numba is imported."""
     asked = [(str(ROOT / "circuits" / f"{deck}.cir"), request) for deck, request in REQUESTS.values()]
     done = subprocess.run(
@@ -67,7 +68,7 @@ def simulated() -> dict[str, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("name", ["run", "periodic", "square", "AM"])
-def test_the_kernel_gives_what_the_processor_gives(simulated: dict[str, dict[str, Any]], name: str) -> None:
+def test_the_kernel_gives_what_the_processor_gives(simulated: Simulated, name: str) -> None:
     found = simulated[name]
     assert found["device"] == "cuda"
     assert found["status"] == [0, 0, 0]
@@ -76,9 +77,7 @@ def test_the_kernel_gives_what_the_processor_gives(simulated: dict[str, dict[str
 
 
 @pytest.mark.parametrize("path", VALUES)
-def test_the_order_of_scenes_does_not_matter_and_the_error_is_that_of_single_runs(
-    simulated: dict[str, dict[str, Any]], path: str
-) -> None:
+def test_the_order_of_scenes_does_not_matter_and_errors_are_of_single_runs(simulated: Simulated, path: str) -> None:
     one, other = simulated[path], simulated[f"{path} turned"]
     assert one["card"][0] == other["card"][0][::-1]
     circuit = fs.read_netlist(ROOT / "circuits" / "fingerpad.cir")
@@ -88,7 +87,7 @@ def test_the_order_of_scenes_does_not_matter_and_the_error_is_that_of_single_run
         assert abs(got / float(np.asarray(exact)) - 1.0) <= stated <= 1e-5
 
 
-def test_gap_voltages_stay_on_the_processor(simulated: dict[str, dict[str, Any]]) -> None:
+def test_gap_voltages_stay_on_the_processor(simulated: Simulated) -> None:
     found = simulated["voltages"]
     assert found["device"] == "cpu"
     assert found["card"] == found["cpu"]

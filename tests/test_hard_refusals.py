@@ -1,27 +1,32 @@
-"""The hard cases without a solution: each is refused with time, place, cause and remedy, without wrong values."""
+"""The hard cases without a solution: each is refused with time, place, cause and remedy, without wrong values.
+
+Also the failure record of a run, and jumps under `mobile`: a run stays on its branch and never skips a fold.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import re
 import warnings
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import pytest
 
 import analytic as ref
 import fingerspice as fs
+import stress
+from commands import Command
+from fingerspice.engine.one_area.model import branch_area, gap_voltage, ramp
+from fingerspice.results.outcome import Failure
+from fingerspice.solve.problem import prepare
 from hard_cases_reference import StackFold, stack_fold
-from scenes import deck, table1
+from scenes import deck, finger, table1
 
 SINE = ref.sine_segments(200.0, 100.0, 0.02)
 V = "Vdrive drive 0 SIN(0 200 100)"
-COAT = "Xcoat drive top area LAYER d=1u eps_r=3.9 r=0.2meg"
-CONTACT = "fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
-GAP = f"Xgap top skin area GAP d=3.5u eps_r=1 r=1meg {CONTACT}"
-SKIN = "Xskin skin 0 area SKIN d=350u f=100"
 
 
 # What is changed, where the table puts the fold in periods, and how near the run is asked to come to it.
@@ -72,8 +77,8 @@ def test_a_run_past_the_fold_stops_there_and_says_where_how_near_why_and_what_to
     # Over nine tenths of the way its error is the one asked for, and the one stated.
     before = kept.t < 0.9 * fold.t
     assert before.sum() > 10
-    whole = dataclasses.replace(ref.TABLE1, **params)
-    expected = ref.transient(SINE, kept.t[before], law="mobile", freq=100.0, params=whole, tol=1e-12)
+    whole, segments = dataclasses.replace(ref.TABLE1, **params), ref.sine_segments(200.0, 100.0, 0.9 * fold.t)
+    expected = ref.transient(segments, kept.t[before], law="mobile", freq=100.0, params=whole, tol=1e-12)
     error = float(np.abs(kept.u_gap[before] - expected.u_gap).max())
     assert error <= min(kept.rtol * fold.u_gap, kept.error.u_gap)
 
@@ -94,8 +99,7 @@ def test_the_local_law_has_no_fold_in_the_same_scene(case: str) -> None:
 @pytest.mark.parametrize(("gap", "rtol"), [(5e-8, 3e-3), (1e-7, 1e-2), (2e-7, 3e-3)])
 def test_a_fold_is_not_believed_while_a_finer_run_meets_it_elsewhere(gap: float, rtol: float) -> None:
     # Steps as coarse as these errors ask for end a hundred-thousandth to a ten-thousandth of the time too late.
-    params = dataclasses.replace(ref.TABLE1, d_a=gap)
-    fold = ref.transient(SINE, [], law="mobile", freq=100.0, params=params, tol=1e-9).fold
+    fold = stack_fold(dataclasses.replace(ref.TABLE1, d_a=gap), 200.0, 100.0)
     circuit = table1().replace({"Xgap.d": gap})
     kept = fs.simulate(circuit, charge_law="mobile", method="radau", rtol=rtol, throw=False)
     assert kept.status is fs.Status.FOLD
@@ -103,28 +107,24 @@ def test_a_fold_is_not_believed_while_a_finer_run_meets_it_elsewhere(gap: float,
 
 
 def test_a_square_of_two_kilovolt_jumps_past_the_fold_at_its_first_reversal() -> None:
-    expected = ref.transient(ref.square_segments(2000.0, 100.0, 1), [], law="mobile", freq=100.0).fold
+    expected = ref.transient(ref.square_segments(2000.0, 100.0, 1), [], law="mobile", freq=100.0)
     with pytest.raises(fs.SolveError, match="the source jumps past the fold at this time") as caught:
         fs.simulate(table1(), sources={"Vdrive": fs.Square(2000.0, 100.0)}, charge_law="mobile")
     assert str(caught.value).startswith("stopped at t = 0.005 s:")
     kept = caught.value.solution
-    assert kept.state.t == pytest.approx(expected.t, rel=1e-15)
-    before = ref.transient(ref.square_segments(2000.0, 100.0, 1), kept.t[:-1], law="mobile", freq=100.0)
+    assert kept.state.t == pytest.approx(expected.fold.t, rel=1e-15)
+    before = expected.at(kept.t[:-1])
     assert np.abs(kept.u_gap[:-1] - before.u_gap).max() <= 1e-8 * np.abs(before.u_gap).max()
     assert np.all(np.isfinite(kept.u_layer))
-
-
-def network_past_its_fold(r_series: float) -> fs.Solution:
-    """The scene of 10 nm with a resistor (ohm) between skin and ground."""
-    lines = [V, COAT, GAP.replace("d=3.5u", "d=10n"), SKIN.replace(" 0 ", " body "), f"Rbody body 0 {r_series!r}"]
-    return fs.simulate(deck(*lines, ".tran 1u 1m uic"), charge_law="mobile", rtol=1e-10, throw=False)
 
 
 def test_behind_a_resistor_the_fold_is_where_the_gap_takes_its_largest_charge() -> None:
     # 1 ohm changes nothing else, yet the run ends a fifth earlier: past that charge no resistor holds the gap.
     fold = stack_fold(dataclasses.replace(ref.TABLE1, d_a=10e-9), 200.0, 100.0, resisted=True)
     assert fold.t < 0.81 * fold_of("gap of 10 nm").t
-    runs = [network_past_its_fold(r) for r in (1.0, 0.01)]
+    lines = V, *finger("drive", "body", f=100.0, d="10n"), ".tran 1u 1m uic"
+    decks = [deck(*lines, f"Rbody body 0 {r_series}") for r_series in (1.0, 0.01)]
+    runs = [fs.simulate(one, charge_law="mobile", rtol=1e-10, throw=False) for one in decks]
     assert all(run.status is fs.Status.FOLD for run in runs)
     assert "distance to the fold" in runs[0].message
     assert "at Xgap" in runs[0].message
@@ -132,33 +132,36 @@ def test_behind_a_resistor_the_fold_is_where_the_gap_takes_its_largest_charge() 
     assert 0.0 <= late[1] < 0.2 * late[0] < 1e-6
 
 
-def until_3_ms(bad: float) -> Any:
-    return lambda t: np.where(np.asarray(t) < 3e-3, 200.0 * np.sin(2.0 * np.pi * 100.0 * np.asarray(t)), bad)
+@lru_cache(None)
+def first_3_ms(law: str) -> ref.Transient:
+    return ref.transient(ref.sine_segments(200.0, 100.0, 3.01e-3), [], law=law, freq=100.0)
 
 
-NETWORK = (V, COAT, GAP, SKIN.replace(" 0 ", " body "), "Cbody body 0 200p", ".tran 10u 20m uic")
+NETWORK = (V, *finger("drive", "body", f=100.0), "Cbody body 0 200p", ".tran 10u 20m uic")
 
 
 @pytest.mark.parametrize(
     ("bad", "law"),
     [*((bad, law) for bad in (math.nan, math.inf, -math.inf) for law in ("local", "mobile")), (math.nan, None)],
 )
-def test_a_source_that_gives_no_number_is_named_with_the_time_and_nothing_after_it_is_returned(
-    bad: float, law: str | None
-) -> None:
+def test_a_source_without_a_number_is_named_with_the_time_and_nothing_follows(bad: float, law: str | None) -> None:
+    def source(t: np.ndarray) -> np.ndarray:
+        return np.where(np.asarray(t) < 3e-3, 200.0 * np.sin(2.0 * np.pi * 100.0 * np.asarray(t)), bad)
+
     circuit = deck(*NETWORK) if law is None else table1()
     with pytest.raises(fs.SolveError) as caught:
-        fs.simulate(circuit, sources={"Vdrive": until_3_ms(bad)}, charge_law=law, t_stop=0.02)
+        fs.simulate(circuit, sources={"Vdrive": source}, charge_law=law, t_stop=0.02)
     for part in ("t = 0.003 s: a source gave NaN or inf", "Vdrive", "nothing after this time is a result"):
         assert part in str(caught.value)
     kept = caught.value.solution
     assert kept.status is fs.Status.SOURCE_NOT_FINITE
+    assert (kept.failure.element, kept.failure.t) == ("Vdrive", pytest.approx(3e-3, rel=1e-9))
     assert kept.t[-1] == pytest.approx(3e-3, rel=1e-10)
     # The last row may stand at 3 ms itself, with the value from the left.
     assert kept.t[-1] <= 3e-3
     assert np.all(np.isfinite(kept.u_gap))
     if law is not None:
-        expected = ref.transient(SINE, kept.t, law=law, freq=100.0)
+        expected = first_3_ms(law).at(kept.t)
         assert np.abs(kept.u_gap - expected.u_gap).max() <= 1e-8 * np.abs(expected.u_gap).max()
 
 
@@ -172,10 +175,10 @@ def test_nan_at_one_instant_that_is_an_output_is_not_passed_over() -> None:
 
 def test_a_loop_of_sources_is_refused_with_the_names_of_all_of_them() -> None:
     with pytest.raises(fs.InputError, match=r"Vdrive.*Vb|Vb.*Vdrive"):
-        deck(V, "Vb drive mid 5", "Vc mid 0 5", COAT, GAP, SKIN, ".tran 10u 10m uic")
+        deck(V, "Vb drive mid 5", "Vc mid 0 5", *finger("drive", "0", f=100.0), ".tran 10u 10m uic")
 
 
-STACK = ["Vdrive drive 0 50", COAT.replace(" r=0.2meg", ""), GAP.replace(" r=1meg", ""), SKIN]
+STACK = ["Vdrive drive 0 50", *(re.sub(r" r=\S+", "", line) for line in finger("drive", "0", f=100.0))]
 
 
 @pytest.mark.parametrize(
@@ -203,3 +206,194 @@ def test_a_node_reached_by_capacitors_only_has_no_operating_point(lines: list[st
 def test_an_area_given_to_a_run_is_a_positive_one(area: float) -> None:
     with pytest.raises(fs.InputError, match=r"area is .* m\^2; allowed: a positive area"):
         fs.simulate(table1(), area=area)
+
+
+# The failure record ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("beside", ["", "Rload drive 0 1meg"], ids=["stack", "network"])
+def test_a_fold_says_when_where_why_and_what_to_change(beside: str) -> None:
+    circuit = table1(gap={"d": "10n"}, extra=beside, tran="20u 10m uic")
+    solution = fs.simulate(circuit, charge_law="mobile", throw=False, rtol=1e-6)
+    failure = solution.failure
+    assert failure is not None
+    assert failure.status is solution.status is fs.Status.FOLD
+    assert failure.element == "Xgap"
+    assert failure.t is not None
+    assert 0.0 < failure.t < 0.5e-3
+    assert "area and gap voltage drive each other on" in failure.cause
+    assert failure.action == "use less voltage, more load, or the local law"
+    assert failure.u_gap == pytest.approx(float(solution.u_gap[-1]))
+    assert failure.area == pytest.approx(float(solution.area[-1]))
+    assert failure.fold_margin is not None
+    assert abs(failure.fold_margin) <= 0.01
+    assert 3 <= len(failure.tried) <= 8
+    assert failure.step == failure.tried[-1].step > 0.0
+    times = [a.t for a in failure.tried]
+    assert times == sorted(times)
+    assert times[-1] == pytest.approx(failure.t, rel=1e-2)
+    assert any(a.error > 1.0 for a in failure.tried)
+    assert failure.history().count("\n") == len(failure.tried)
+    with pytest.raises(fs.SolveError) as caught:
+        fs.simulate(circuit, charge_law="mobile", rtol=1e-6)
+    assert caught.value.failure.to_dict() == failure.to_dict()
+    assert str(caught.value) == solution.message == str(failure)
+
+
+def test_an_error_that_cannot_be_met_is_put_in_figures() -> None:
+    # The gap takes so little of the source that rounding of the source is more than the error asked for.
+    circuit = table1(gap={"r": "1u"})
+    solution = fs.simulate(circuit, t_stop=5e-3, rtol=1e-12, throw=False)
+    failure = solution.failure
+    assert failure is not None
+    assert failure.status is fs.Status.ERROR_NOT_MET
+    assert failure.t is None
+    # What is not known is left out.
+    assert str(failure) == f"{failure.cause}; {failure.action} (at Xgap)"
+    assert str(Failure(failure.status, "a cause", "an action")) == "a cause; an action"
+    assert "estimate" in failure.cause
+    assert failure.action == "ask for a larger rtol"
+
+
+def test_the_command_line_tells_the_same_in_words_and_in_json(command: Command) -> None:
+    words = ["run", "pad.cir", "--charge-law", "mobile", "--set", "Xgap.d=10n", "--no-plot"]
+    plain = command(*words)
+    assert plain.code == 1
+    assert "last steps tried:" in plain.out
+    failure = json.loads(command(*words, "--json").out)["failure"]
+    assert failure["status"] == "FOLD"
+    assert failure["element"] == "Xgap"
+    assert set(failure) == {
+        *("status", "cause", "action", "t", "step", "element", "u_gap", "area", "fold_margin", "tried")
+    }
+    assert set(failure["tried"][0]) == {"t", "step", "error"}
+    compared = command("compare", *words[1:], "--json")
+    assert compared.code == 1
+    assert json.loads(compared.out)["failure"]["status"] == "FOLD"
+
+
+def test_a_run_near_its_fold_warns_and_says_how_near() -> None:
+    circuit = table1().replace({"Vdrive": fs.Sine(50.0, 100.0), "Xgap.d": 1e-7})
+    with pytest.warns(fs.FingerspiceWarning, match="fold of the mobile charge law is near"):
+        near = fs.simulate(circuit, charge_law="mobile", rtol=1e-6, t_stop=0.05)
+    assert near.success
+    assert 0.0 < near.fold_margin_min < 0.2
+    # Looked for between outputs too, and in a run that repeats its periods.
+    with pytest.warns(fs.FingerspiceWarning, match="fold of the mobile charge law is near"):
+        few = fs.simulate(circuit, charge_law="mobile", rtol=1e-6, t_eval=[0.0, 0.05, 0.1], t_stop=0.1)
+    assert few.fold_margin.min() > 0.9
+    assert few.summary()["fold_margin_min"] == pytest.approx(float(near.fold_margin.min()), rel=0.02)
+    far = fs.simulate(circuit, charge_law="local", rtol=1e-6)
+    assert (far.fold_margin_min, far.failure, far.message) == (1.0, None, "success")
+
+
+@pytest.mark.parametrize("t_eval", [[1e-3], [0.0, 1e-3], None])
+def test_a_fold_before_or_between_outputs_leaves_what_there_is(t_eval: list[float] | None) -> None:
+    circuit = table1().replace({"Xgap.d": 1e-8})
+    solution = fs.simulate(circuit, charge_law="mobile", t_eval=t_eval, t_stop=2e-3, throw=False)
+    assert solution.status is fs.Status.FOLD
+    assert solution.t[-1] == pytest.approx(0.02332418286278 * 0.01, rel=1e-9)
+    assert np.all(np.isfinite(solution.u_gap))
+
+
+def test_a_fold_soon_after_a_jump_at_the_start_is_met() -> None:
+    circuit = table1().replace({"Xgap.d": 1e-8})
+    # A step takes the gap's share at once and less than the fold; the leak of the layers then brings it there.
+    runs = [
+        fs.simulate(
+            circuit, sources={"Vdrive": fs.DC(u)}, start="uncharged", charge_law="mobile", t_stop=0.02, throw=False
+        )
+        for u in (2.0, 5.0, 20.0)
+    ]
+    assert all(run.status in (fs.Status.SUCCESS, fs.Status.FOLD) for run in runs)
+    times = [run.failure.t for run in runs if run.failure is not None]
+    assert times == sorted(times, reverse=True)
+    assert times
+
+
+# Jumps under `mobile` ---------------------------------------------------------------------------------------
+
+
+def model_of(scene):
+    how = {"area": "coupled", "start": "deck", "charge": False, "rtol": 1e-6}
+    return prepare(scene.circuit, t_stop=1.0 / scene.frequency, t_eval=None, charge_law="mobile", **how).scene.model
+
+
+def reached(scene, b, u, target):
+    """Where the source's share of the gap voltage meets `target` on the way from u at constant charge, by a scan.
+
+    NaN where it turns back before; None where that is a close call. The share is u - b / A(|u|), A from the reference.
+    """
+    top = 4.0 * (abs(u) + abs(target) + abs(b / ref.area(0.0, scene.params)))
+
+    def share(v):
+        return v - b / ref.area(np.abs(v), scene.params)
+
+    way = math.copysign(1.0, target - float(share(np.array([u]))[0]))
+    far = np.geomspace(1e-12 * top, top, 60_000)
+    grid = np.concatenate([-far[::-1], [0.0], far])
+    grid = np.concatenate([[u], grid[grid > u] if way > 0.0 else grid[grid < u][::-1]])
+    along = way * (share(grid) - target)
+    rise = np.diff(along) / np.abs(np.diff(grid))
+    met = int(np.argmax(along >= 0.0)) if np.any(along >= 0.0) else grid.size - 1
+    turns = np.flatnonzero(rise[:met] < 0.0)
+    if turns.size == 0 and rise[:met].min(initial=1.0) < 0.02:
+        return None
+    if turns.size:
+        return None if rise[:met].min() > -0.02 else math.nan
+    return float(np.interp(0.0, along[met - 1 : met + 1], grid[met - 1 : met + 1]))
+
+
+def test_ramps_go_where_a_scan_goes_and_stop_where_it_turns_back():
+    rng = np.random.default_rng(5)
+    followed = folded = 0
+    for number in range(400):
+        scene = stress.draw(11, number)
+        if not scene.touches:
+            continue
+        model = model_of(scene)
+        u = float(rng.choice([-1.0, 1.0]) * scene.amplitude * model.k_gap * 10.0 ** rng.uniform(-4.0, 0.0))
+        target = float(rng.choice([-1.0, 1.0]) * scene.amplitude * model.k_gap)
+        _, dq = branch_area(model, math.copysign(1.0, u), u)
+        # Charge of either sign, up to some that outweighs the source.
+        b = float(rng.choice([-1.0, 1.0]) * 10.0 ** rng.uniform(-3.0, 1.0) * abs(target)) * model.area0
+        if 1.0 - b * dq < 0.02:
+            continue
+        expected = reached(scene, b, u, target)
+        if expected is None:
+            continue
+        found = ramp(model, target, b / model.area0, u)
+        if math.isnan(expected):
+            assert math.isnan(found), f"scene {number}: {found} V, past a fold"
+            folded += 1
+        else:
+            assert found == pytest.approx(expected, rel=1e-3, abs=1e-6 * abs(target)), f"scene {number}"
+            followed += 1
+    assert followed > 100
+    assert folded >= 10
+
+
+@pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
+@pytest.mark.parametrize("number", [1730, 1974, 9735])
+def test_a_jump_past_a_fold_is_seen_though_the_slope_is_right_at_both_ends(number):
+    # A long stride from large voltage to 0 V, or away from it, finds a rising slope on either side of a fold.
+    scene = stress.draw(0, number)
+    solution = fs.simulate(scene.circuit, charge_law="mobile", rtol=1e-6, throw=False)
+    assert solution.status is fs.Status.FOLD
+    assert solution.failure.t == pytest.approx(0.5 / scene.frequency, rel=1e-12)
+
+
+def test_the_gap_voltage_is_the_root_connected_to_the_guess():
+    # One layer leaks alone, so that its charge tells the voltage: u = k U - b / A folds where (k U - u) A has its top.
+    scene = stress.draw(0, 661)
+    model = model_of(scene)
+    k_u = model.k_gap * scene.amplitude
+    u = np.linspace(k_u, 0.3 * k_u, 200_001)
+    held = (k_u - u) * ref.area(u, scene.params)
+    top = int(np.argmax(np.diff(held) < 0.0))
+    for share, there in ((0.5, True), (0.999, True), (1.001, False), (1.1, False)):
+        found = gap_voltage(model, k_u, -share * held[top] / model.area0, 1.0, u[top // 2])
+        assert (found == found) == there
+        if there:
+            assert found > u[top]
+            assert (k_u - found) * float(ref.area(found, scene.params)) == pytest.approx(share * held[top], rel=1e-9)
