@@ -16,7 +16,7 @@ from analytic import impedance, table1_layers
 from commands import Command
 from fingerspice.base.errors import InputError
 from fingerspice.studies.fit import circuitfit
-from fingerspice.studies.fit.result import Fitted, followed
+from fingerspice.studies.fit.fitting import Fitted, followed
 from scenes import cases, covers, table1_deck
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"

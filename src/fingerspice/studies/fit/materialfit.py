@@ -6,7 +6,6 @@ import csv
 import math
 import re
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,35 +49,35 @@ _PERMITTIVITY = (
     "relative_permittivity|dielectric constant|dk"
 )
 # What a column may hold by its name and unit, of which several with a name the first is that without a unit: the one of
-# `COLUMNS` that it tells, patterns of its names and units, the power of the metre in these, and the power and factor
-# that make of its values in SI units those of the column.
+# `COLUMNS` that it tells, patterns of its names and units, and the power and factor that make of its values in SI units
+# those of the column.
 _KINDS = (
-    ("frequency", _FREQUENCY, f"{_PREFIX}[Hh]z|1/s", 0, 1.0, 1.0),
-    ("frequency", _FREQUENCY, "rad/s", 0, 1.0, 0.5 / np.pi),
-    ("frequency", "w|omega|ω|angular frequency|angular_frequency", "rad/s|1/s", 0, 1.0, 0.5 / np.pi),
+    ("frequency", _FREQUENCY, f"{_PREFIX}[Hh]z|1/s", 1.0, 1.0),
+    ("frequency", _FREQUENCY, "rad/s", 1.0, 0.5 / np.pi),
+    ("frequency", "w|omega|ω|angular frequency|angular_frequency", "rad/s|1/s", 1.0, 0.5 / np.pi),
     ("resistivity", "rho|ρ|rho_sc|resistivity|resistance",
-     f"{_PREFIX}(?:[Oo]hms?|[\u03a9\u2126])[ *·.-]?{_METRE}", 1, 1.0, 1.0),
-    ("resistivity", "sigma|σ|kappa|conductivity|conductance", f"{_PREFIX}S/{_METRE}", -1, -1.0, 1.0),
-    ("permittivity", _PERMITTIVITY, "1|-", 0, 1.0, 1.0),
-    ("permittivity", _PERMITTIVITY, f"{_PREFIX}F/{_METRE}", -1, 1.0, 1.0 / EPS0),
+     f"{_PREFIX}(?:[Oo]hms?|[\u03a9\u2126])[ *·.-]?{_METRE}", 1.0, 1.0),
+    ("resistivity", "sigma|σ|kappa|conductivity|conductance", f"{_PREFIX}S/{_METRE}", -1.0, 1.0),
+    ("permittivity", _PERMITTIVITY, "1|-", 1.0, 1.0),
+    ("permittivity", _PERMITTIVITY, f"{_PREFIX}F/{_METRE}", 1.0, 1.0 / EPS0),
 )  # fmt: skip
-# Possible slips of the user, each with the function from the table as given to the table as meant.
-_SLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
-    ("the frequency is in rad/s", lambda t: t * (0.5 / np.pi, 1.0, 1.0)),
-    ("the second column is a conductivity in S/m", lambda t: t ** (1.0, -1.0, 1.0)),
-    ("the frequency is in kHz", lambda t: t * (1e3, 1.0, 1.0)),
-    ("the resistivity is in ohm cm", lambda t: t * (1.0, 1e-2, 1.0)),
-    ("the resistivity is in kohm m", lambda t: t * (1.0, 1e3, 1.0)),
-    ("resistivity and permittivity have changed places", lambda t: t[:, [0, 2, 1]]),
-    ("frequency and resistivity have changed places", lambda t: t[:, [1, 0, 2]]),
-    ("frequency and permittivity have changed places", lambda t: t[:, [2, 1, 0]]),
-    ("the columns are resistivity, permittivity, frequency", lambda t: t[:, [2, 0, 1]]),
-    ("the columns are permittivity, frequency, resistivity", lambda t: t[:, [1, 2, 0]]),
-    ("the second column is a conductivity in mS/m", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e3, 1.0)),
-    ("the second column is a conductivity in uS/cm", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e4, 1.0)),
-    ("the second column is a conductivity in S/cm", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e-2, 1.0)),
-    ("the frequency is in MHz", lambda t: t * (1e6, 1.0, 1.0)),
-    ("the permittivity is in F/m", lambda t: t * (1.0, 1.0, 1.0 / EPS0)),
+# Possible slips of the user: columns of the table as given, in the order meant; power of the second; and factors.
+_SLIPS = (
+    ("the frequency is in rad/s", (0, 1, 2), 1.0, (0.5 / np.pi, 1.0, 1.0)),
+    ("the second column is a conductivity in S/m", (0, 1, 2), -1.0, (1.0, 1.0, 1.0)),
+    ("the frequency is in kHz", (0, 1, 2), 1.0, (1e3, 1.0, 1.0)),
+    ("the resistivity is in ohm cm", (0, 1, 2), 1.0, (1.0, 1e-2, 1.0)),
+    ("the resistivity is in kohm m", (0, 1, 2), 1.0, (1.0, 1e3, 1.0)),
+    ("resistivity and permittivity have changed places", (0, 2, 1), 1.0, (1.0, 1.0, 1.0)),
+    ("frequency and resistivity have changed places", (1, 0, 2), 1.0, (1.0, 1.0, 1.0)),
+    ("frequency and permittivity have changed places", (2, 1, 0), 1.0, (1.0, 1.0, 1.0)),
+    ("the columns are resistivity, permittivity, frequency", (2, 0, 1), 1.0, (1.0, 1.0, 1.0)),
+    ("the columns are permittivity, frequency, resistivity", (1, 2, 0), 1.0, (1.0, 1.0, 1.0)),
+    ("the second column is a conductivity in mS/m", (0, 1, 2), -1.0, (1.0, 1e3, 1.0)),
+    ("the second column is a conductivity in uS/cm", (0, 1, 2), -1.0, (1.0, 1e4, 1.0)),
+    ("the second column is a conductivity in S/cm", (0, 1, 2), -1.0, (1.0, 1e-2, 1.0)),
+    ("the frequency is in MHz", (0, 1, 2), 1.0, (1e6, 1.0, 1.0)),
+    ("the permittivity is in F/m", (0, 1, 2), 1.0, (1.0, 1.0, 1.0 / EPS0)),
 )
 
 
@@ -94,8 +93,7 @@ def read_table(path: Path) -> FloatArray:
         rows = [row for row in csv.reader(lines, delimiter=mark) if row and not row[0].lstrip().startswith("#")]
     except csv.Error as error:
         raise InputError(f"{path} cannot be read as CSV: {error}") from error
-    head: list[str] = []
-    numbers = []
+    head, numbers = list[str](), list[list[float]]()
     for place, row in enumerate(rows):
         try:
             numbers.append([float(x.replace(",", ".") if mark == ";" else x) for x in row])
@@ -106,26 +104,22 @@ def read_table(path: Path) -> FloatArray:
     if any(len(row) != 3 for row in numbers):
         raise InputError(f"{path} has rows that are not three numbers; allowed: {ALLOWED}")
     table = np.array(numbers, float).reshape(-1, 3)
-    if len(head) != 3:
-        return table
-    # Columns with unknown names fill the places that the others leave.
-    named: dict[str, FloatArray] = {}
-    others = []
-    for name, x in zip(head, table.T, strict=True):
-        column, scale, power, factor = _kind(name, str(path))
-        if not column:
-            others.append(x)
-            continue
+    named, others = dict[str, FloatArray](), list[FloatArray]()
+    for name, x in zip(head if len(head) == 3 else [""] * 3, table.T, strict=True):
+        column, values = _converted(name, x, str(path))
         if column in named:
             names = ", ".join(head)
             raise InputError(f"{path}: two columns are a {column} by their names, {names}; allowed: {ALLOWED}")
-        with np.errstate(divide="ignore"):
-            named[column] = (scale * x) ** power * factor
+        if column:
+            named[column] = values
+        else:
+            others.append(x)
+    # Columns with unknown names fill the places that the others leave.
     return np.column_stack([named[name] if name in named else others.pop(0) for name in COLUMNS])
 
 
-def _kind(name: str, file: str) -> tuple[str, float, float, float]:
-    """The column that a name in a header tells, or "", its unit's size, and power and factor as in `_KINDS`."""
+def _converted(name: str, x: FloatArray, file: str) -> tuple[str, FloatArray]:
+    """The column that a name in a header tells, or "", and its values in SI units."""
     match = re.fullmatch(
         r"(?P<what>[^\[(/]*?)\s*(?:[\[(](?P<bracket>[^\])]*)[\])]|/\s*(?P<slash>.+))?", name.strip().strip("\"'")
     )
@@ -134,19 +128,17 @@ def _kind(name: str, file: str) -> tuple[str, float, float, float]:
         # A name such as f_kHz ends with its unit.
         what, _, unit = what.rpartition("_")
     kinds = [kind for kind in _KINDS if re.fullmatch(kind[1], what, re.IGNORECASE)]
-    for column, _, units, metres, power, factor in kinds:
-        if not unit:
-            return column, 1.0, power, factor
+    for column, _, units, power, factor in kinds:
         found = re.fullmatch(units, unit)
-        if found:
-            parts = found.groupdict()
-            size = _PREFIXES[parts.get("prefix") or ""] * _METRES[parts.get("metre") or "m"] ** metres
-            return column, size, power, factor
+        if found or not unit:
+            parts = found.groupdict() if found else {}
+            metre = _METRES[parts.get("metre") or "m"] ** (-1 if "/" in unit else 1)
+            with np.errstate(divide="ignore"):
+                return column, (_PREFIXES[parts.get("prefix") or ""] * metre * x) ** power * factor
     if kinds:
-        raise InputError(
-            f"{file}: the unit of column {name.strip()!r} is not known; allowed: Hz, rad/s, ohm m, S/m, and 1 or F/m"
-        )
-    return "", 1.0, 1.0, 1.0
+        allowed = "Hz, rad/s, ohm m, S/m, and 1 or F/m"
+        raise InputError(f"{file}: the unit of column {name.strip()!r} is not known; allowed: {allowed}")
+    return "", x
 
 
 @dataclass(frozen=True)
@@ -403,8 +395,8 @@ def _doubt(table: FloatArray, found: Consistency) -> str:
     if found.rms <= NOTABLE and not course:
         return ""
     slips = []
-    for text, meant in _SLIPS:
-        other = meant(table)
+    for text, order, power, factors in _SLIPS:
+        other = table[:, order] ** (1.0, power, 1.0) * factors
         other = other[np.argsort(other[:, 0])]
         if np.all(np.diff(other[:, 0]) > 0.0):
             slips.append((_consistency(*_admittivity(other)).rms, text))
