@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import itertools
 import math
 import time
@@ -20,7 +19,7 @@ from fingerspice.base.announcing import Bar
 from fingerspice.base.arrays import FloatArray, IntArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page
-from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
 from fingerspice.circuit.describe import meaning_of, require_circuit, scenes_warnings
 from fingerspice.circuit.devices import MEASURED as USUAL
 from fingerspice.circuit.devices import MEASURING
@@ -29,9 +28,9 @@ from fingerspice.circuit.statespace import driving_sources
 from fingerspice.results.record import SIGNALS
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.form import REFUSED
+from fingerspice.studies.batch.form import REFUSED, own_path
 from fingerspice.studies.fit import fitting
-from fingerspice.studies.fit.fitting import SIGMA, FitResult, Fitted, Given, Groups, Problem, followed
+from fingerspice.studies.fit.fitting import SIGMA, FitResult, Fitted, Given, Problem, followed
 from fingerspice.studies.steady import phasor
 from fingerspice.waveforms.waveform import Sine, require
 
@@ -69,7 +68,8 @@ class Data:
     conditions: dict[str, FloatArray]
     t: FloatArray | None = None  # (n,): Times, s
     phase: FloatArray | None = None  # (n,): Phase of an impedance, deg
-    groups: Groups | None = None  # Which measurements belong together, such as those of one finger
+    #: Which measurements belong together, such as those of one finger: the name of each one's group (n,), by column
+    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -158,7 +158,7 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
     data = Data(names[name], values, sigma, conditions, t, phase, groups)
     if t is not None and data.varying:
         raise InputError(f"{place} have times and changing conditions; allowed: one run over time, or means")
-    if t is not None and groups is not None:
+    if t is not None and groups:
         raise InputError(f"{place} have times and groups; allowed: groups of means or of impedances")
     return data
 
@@ -174,8 +174,8 @@ def _path(circuit: Circuit, name: str) -> str:
         name = f"{driving[0].name}.{parameter}"
     known = {path.lower(): path for path in circuit.parameters}
     if name.lower() not in known:
-        near = difflib.get_close_matches(name.lower(), known, 1, 0.0)
-        hint = f", such as {known[near[0]]}" if near else ""
+        near = nearest(name, [*known.values()])
+        hint = "" if near is None else f", such as {near}"
         allowed = ", ".join((*(f"{signal}_mean" for signal in _MEANS), IMPEDANCE, PHASE, SIGMA, _TIME))
         raise InputError(
             f"the data have a column {name!r}, which is no parameter of the circuit; allowed: {allowed} with a signal, "
@@ -342,31 +342,26 @@ class Fit(FitResult):
         if data.sigma is None:
             equal = float(np.ptp(self.sigma)) <= 1e-9 * float(self.sigma.max())
             known = f"estimated from the residuals, {'equal for all' if equal else 'as equal shares of the values'}"
-        about = [
-            f"residual {self._rms:.3g} {MEASURED[data.signal]} rms, {share:.2g} % of the largest value; sigma {known}"
-        ]
-        if data.groups is not None:
-            about.append(f"groups by {data.groups.column}: {', '.join(data.groups.labels)}")
         head = f"{len(self.estimates)} parameters fitted to {data.values.size} values of {data.name}"
-        return self._paged(head, about)
+        size = f"{self._rms:.3g} {MEASURED[data.signal]} rms, {share:.2g} % of the largest value"
+        groups = [f"groups by {column}: {', '.join(dict.fromkeys(of))}" for column, of in data.groups.items()]
+        return self._paged(head, [f"residual {size}; sigma {known}", *groups])
 
     def _panels(self) -> list[Drawn]:
-        data, known = self.data, self.circuit.parameters
+        data, circuit = self.data, self.circuit
         signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal
         signal = f"mean {signal}" if data.name.endswith("_mean") else signal
-        names, x, label = ["measured and fitted"] * data.values.size, data.t, "time [s]"
+        # What changed most stands along the axis, and every value of the rest has a curve.
         varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
-        if x is None and varying:
-            (path, x), others = varying[0], varying[1:]
-            unit = known[path].unit
-            label = meaning_of(self.circuit, path) + (f" [{unit}]" if unit else "")
-            keys = [] if data.groups is None else [[f"{data.groups.column} = {one}" for one in data.groups.of]]
-            for path, values in others:
-                keys.append([f"{meaning_of(self.circuit, path)} = {y:g} {known[path].unit}".rstrip() for y in values])
-            if keys:
-                names = [", ".join(told) for told in zip(*keys, strict=True)]
-        elif x is None:
-            x, label = np.arange(1.0, data.values.size + 1.0), "measurement"
+        axes = [(meaning_of(circuit, path), circuit.parameters[path].unit, x) for path, x in varying]
+        if data.t is not None:
+            axes = [("time", "s", data.t)]
+        (label, unit, x), *others = axes or [("measurement", "", 1.0 + np.arange(data.values.size))]
+        groups = data.groups.items() if varying else ()
+        keys = [[f"{column} = {one}" for one in of] for column, of in groups]
+        keys += [[f"{name} = {y:g} {unit}".rstrip() for y in values] for name, unit, values in others]
+        names = list(map(", ".join, zip(*keys, strict=True))) or ["measured and fitted"] * data.values.size
+        label = f"{label} [{unit}]" if unit else label
         return [(names, (x, data.values, self.predicted, self.sigma), label, signal, MEASURED[data.signal])]
 
     def to_dict(self) -> dict[str, Any]:
@@ -380,9 +375,9 @@ class Fit(FitResult):
         }
 
     def _columns(self) -> dict[str, Any]:
-        data, groups = self.data, self.data.groups
-        first = {groups.column: groups.of} if groups is not None else {} if data.t is None else {"t": data.t}
-        return {**first, **data.conditions, data.signal: data.values, "fitted": self.predicted, "sigma": self.sigma}
+        data, time = self.data, {} if self.data.t is None else {"t": self.data.t}
+        known = {**data.groups, **time, **data.conditions, data.signal: data.values}
+        return {**known, "fitted": self.predicted, "sigma": self.sigma}
 
 
 def fit(
@@ -481,11 +476,7 @@ def _request(
     """The checked data; and names, paths and places, as `Task` has them, of what is to be fitted to them."""
     if isinstance(parameters, str) or not parameters:
         raise InputError(f"parameters is {parameters!r}; allowed: a sequence of paths such as ['Xgap.d', 'Xgap.r']")
-    known = {path.lower(): path for path in circuit.parameters}
-    for path in parameters:
-        if path.lower() not in known:
-            circuit.varied({path: 1.0})
-    fitted = [known[path.lower()] for path in parameters]
+    fitted = [own_path(circuit, path) for path in parameters]
     by: str | None = None
     separate: Sequence[str] = ()
     if groups is not None:
@@ -493,14 +484,15 @@ def _request(
         ((by, separate),) = groups.items() if isinstance(groups, Mapping) and len(groups) == 1 else (("", ""),)
         if not isinstance(by, str) or isinstance(separate, str) or not separate:
             raise InputError(f"groups is {groups!r}; allowed: {wanted}")
-        if by.lower() in known:
+        if by.lower() in map(str.lower, circuit.parameters):
             raise InputError(f"groups names the column {by!r}, which is a parameter; allowed: {wanted}")
-    own = [known.get(path.lower()) for path in separate]
-    for path, found in zip(separate, own, strict=True):
-        if found not in fitted:
-            raise InputError(f"groups names {path!r}, which is not fitted; allowed: {', '.join(fitted)}")
+    lost = [path for path in separate if path.lower() not in map(str.lower, fitted)]
+    if lost:
+        raise InputError(f"groups names {lost[0]!r}, which is not fitted; allowed: {', '.join(fitted)}")
     data = _data_of(circuit, given, by)
     names, paths, places = list[str](), list[str](), dict[str, IntArray]()
+    of = data.groups[by] if by is not None else ()
+    every = list(dict.fromkeys(of))
     for path in fitted:
         value = circuit.parameters[path].value
         require(fitted.count(path) == 1, path, "named twice", "once")
@@ -509,9 +501,9 @@ def _request(
         if not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
         places[path], labels = np.full(data.values.size, len(names)), [path]
-        if data.groups is not None and path in own:
-            places[path] += [data.groups.labels.index(label) for label in data.groups.of]
-            labels = [f"{path}[{label}]" for label in data.groups.labels]
+        if path.lower() in map(str.lower, separate):
+            places[path] += [every.index(label) for label in of]
+            labels = [f"{path}[{label}]" for label in every]
         names += labels
         paths += [path] * len(labels)
     return data, tuple(names), tuple(paths), places
@@ -541,7 +533,7 @@ def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
         variance, reach = best.objective / freedom, float(t.ppf(0.975, freedom))
     # The geometric mean of one value is that value to the last digit.
     means = {path: best.values[np.unique(at)] for path, at in task.places.items()}
-    of = () if data.groups is None else data.groups.of
+    labels = [(of, label) for of in data.groups.values() for label in dict.fromkeys(of)]
     return Fit._reported(
         task, best, variance, reach, best.beyond_sigma(..., freedom) if data.sigma is not None else [], profiles,
         data=data,
@@ -550,7 +542,7 @@ def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
         objectives=tuple(end.objective for end in ends),
         freedom=freedom,
         circuit=task.circuit.varied({path: float(np.prod(x ** (1.0 / x.size))) for path, x in means.items()}),
-        circuits={label: task.scene(best.values, row, {}) for row, label in enumerate(of) if label not in of[:row]},
+        circuits={label: task.scene(best.values, of.index(label), {}) for of, label in labels},
     )  # fmt: skip
 
 

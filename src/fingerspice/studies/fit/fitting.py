@@ -33,23 +33,9 @@ Given = Mapping[str, ArrayLike] | str | Path
 Meaning = Callable[[str, Sequence[str]], tuple[str, str, str | None]]
 SIGMA = "sigma"
 _PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
-
-
-class Groups(NamedTuple):
-    """The group of every measurement."""
-
-    column: str  # Name of the column that tells it
-    of: tuple[str, ...]  # Name of each measurement's group
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Every group's name, in the order of the data."""
-        return tuple(dict.fromkeys(self.of))
-
-
 #: Columns (n,) in SI units or, of a circuit's parameters, those of the netlist; where they come from, as subject of a
-#: message; and the groups.
-Measured = tuple[dict[str, FloatArray], str, Groups | None]
+#: message; and the name of every measurement's group, by the column that tells it.
+Measured = tuple[dict[str, FloatArray], str, dict[str, tuple[str, ...]]]
 
 
 def measured_of(
@@ -76,23 +62,24 @@ def measured_of(
         # A number stands for a column of it.
         columns[name] = np.broadcast_to(x, size).copy()
     if by is None:
-        return columns, place, None
+        return columns, place, {}
     cells = np.asarray(given[by])
     if cells.ndim != 1 or cells.dtype.kind not in "iufU":
         raise InputError(f"data column {by!r} tells the group; allowed: a text or a number for every measurement")
     if cells.size != size:
         raise InputError(f"data column {by!r} has {cells.size} rows, others have {size}; allowed: as many")
-    return columns, place, Groups(by, tuple(x if isinstance(x, str) else f"{x:g}" for x in cells.tolist()))
+    return columns, place, {by: tuple(x if isinstance(x, str) else f"{x:g}" for x in cells.tolist())}
 
 
 def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> Measured:
     table = read_text_columns(checked_file(path, MAX_TEXT_BYTES), by)
     if not table.names:
         raise InputError(f"'{path}' has no header; allowed: names with units, such as {example}")
-    found, units, of_share, groups = dict[str, FloatArray](), dict[str, str](), dict[str, str](), None
+    found, units, of_share = dict[str, FloatArray](), dict[str, str](), dict[str, str]()
+    groups = dict[str, tuple[str, ...]]()
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
         if by is not None and name.lower() == by.lower():
-            groups = Groups(by, tuple(table.words[int(number)] for number in table.numbers(i)))
+            groups[by] = tuple(table.words[int(number)] for number in table.numbers(i))
             continue
         key, values, base = meaning(name, table.names)
         if key in found:

@@ -230,21 +230,17 @@ class MaterialFit(Shown):
 
     def _page(self) -> Page:
         ladder, f = self.ladder, self.frequency
-        rows = [
-            (format_si(p / (2.0 * math.pi), "Hz"), f"{k:.4g} S/m")
-            for p, k in zip(ladder.poles, ladder.weights, strict=True)
+        poles = [format_si(p / (2.0 * math.pi), "Hz") for p in ladder.poles]
+        rows = list(zip(poles, (f"{k:.4g} S/m" for k in ladder.weights), strict=True))
+        low, high = (format_si(float(x), "Hz") for x in f[[0, -1]])
+        blocks = [
+            f"material fitted at {f.size} frequencies from {low} to {high}",
+            f"misfit of the admittivity: {100.0 * self.rms:.2g} % rms, {100.0 * self.largest:.2g} % at most",
+            f"no causal and passive material comes nearer than {100.0 * self.kramers_kronig.rms:.2g} % rms",
+            "",
+            f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and",
         ]
-        return Page(
-            [
-                f"material fitted at {f.size} frequencies from {format_si(float(f[0]), 'Hz')} to "
-                f"{format_si(float(f[-1]), 'Hz')}",
-                f"misfit of the admittivity: {100.0 * self.rms:.2g} % rms, {100.0 * self.largest:.2g} % at most",
-                f"no causal and passive material comes nearer than {100.0 * self.kramers_kronig.rms:.2g} % rms",
-                "",
-                f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and",
-                Table(("pole", "weight"), rows),
-            ]
-        )
+        return Page([*blocks, Table(("pole", "weight"), rows)])
 
     def to_netlist(self, name: str) -> str:
         """A subcircuit of slabs in series with the thickness as parameter, for decks here and in ngspice.
@@ -271,26 +267,22 @@ class MaterialFit(Shown):
         from fingerspice.plots import drawing
 
         figure, axes = drawing.new_figure(1, 3, height=2.7)
-        limit, small, fine = self.kramers_kronig, drawing.FONT - 0.5, {"color": drawing.BLUE, "linewidth": 1.4}
         f = np.geomspace(self.frequency[0], self.frequency[-1], 400)
         measured = 1.0 / self.data.real, self.data.imag / (2.0 * np.pi * self.frequency * EPS0)
         fitted = self.ladder.resistivity(f), self.ladder.permittivity(f)
+        limit, fine = self.kramers_kronig, {"color": drawing.BLUE, "linewidth": 1.4}
+        rough = {"color": drawing.VERMILION, "linewidth": 1.0, "label": "any material"}
         for ax, points, line in zip(axes, measured, fitted, strict=False):
             ax.loglog(self.frequency, points, "o", color=drawing.GREY, markersize=2.5, label="data")
             ax.loglog(f, line, label=f"ladder of {len(self.ladder.poles)} poles", **fine)
         axes[2].semilogx(self.frequency, 100.0 * self.misfit, label="ladder", **fine)
-        axes[2].semilogx(
-            limit.frequency, 100.0 * limit.misfit, "--", color=drawing.VERMILION, linewidth=1.0, label="any material"
-        )  # fmt: skip
+        axes[2].semilogx(limit.frequency, 100.0 * limit.misfit, "--", **rough)
         for ax, label in zip(axes, ("Resistivity [Ω m]", "Relative permittivity", "Misfit [%]"), strict=True):
             drawing.dress(ax, label, "Frequency [Hz]")
         for ax in (axes[0], axes[2]):
-            ax.legend(fontsize=small, frameon=False)
-        drawing.caption(
-            figure,
-            f"misfit {100.0 * self.rms:.2g} % rms; no causal and passive material is nearer than "
-            f"{100.0 * limit.rms:.2g} % rms",
-        )
+            ax.legend(fontsize=drawing.FONT - 0.5, frameon=False)
+        nearest = f"no causal and passive material is nearer than {100.0 * limit.rms:.2g} % rms"
+        drawing.caption(figure, f"misfit {100.0 * self.rms:.2g} % rms; {nearest}")
         return figure
 
 
@@ -352,11 +344,10 @@ def fit_material(
         allowed = "rows of f, rho, eps_r"
         require(table.ndim == 2 and table.shape[1] == 3, "material data", f"of shape {table.shape}", allowed)
         require(table.shape[0] >= 3, "material data", f"{table.shape[0]} rows", "three frequencies or more")
-        for column, name in zip(table.T, COLUMNS, strict=True):
-            bad = np.flatnonzero(~((column >= _LEAST) & (column <= _MOST)))
-            if bad.size:
-                allowed = f"more than 0, from {_LEAST:g} to {_MOST:g}"
-                raise InputError(f"{name} in row {bad[0] + 1} is {column[bad[0]]:g}; allowed: {allowed}")
+        bad = np.argwhere(~((table.T >= _LEAST) & (table.T <= _MOST)))
+        if bad.size:
+            (column, row), allowed = bad[0], f"more than 0, from {_LEAST:g} to {_MOST:g}"
+            raise InputError(f"{COLUMNS[column]} in row {row + 1} is {table[row, column]:g}; allowed: {allowed}")
         table = table[np.argsort(table[:, 0])]
         require(bool(np.all(np.diff(table[:, 0]) > 0.0)), "frequencies", "repeated", "each once")
         f, y = _admittivity(table)
@@ -447,10 +438,8 @@ def _fit(f: FloatArray, y: ComplexArray, count: int) -> tuple[Ladder, FloatArray
         missing = "conductivity at zero frequency" if x[0] <= 0.0 else "eps_inf"
         raise InputError(f"the data leave no {missing} above 0 with {count} poles; allowed: fewer poles, or more data")
     kept = x[2:] > 0.0
-    ladder = Ladder(
-        float(x[0]), float(x[1] / EPS0), tuple(map(float, poles[kept])), tuple(map(float, x[2:][kept]))
-    )  # fmt: skip
-    return ladder, np.abs(left)
+    weights = x[2:][kept]
+    return Ladder(float(x[0]), float(x[1] / EPS0), tuple(poles[kept].tolist()), tuple(weights.tolist())), np.abs(left)
 
 
 def _consistency(f: FloatArray, y: ComplexArray) -> Consistency:
