@@ -356,7 +356,8 @@ class Fit(FitResult):
         axes = [(meaning_of(circuit, path), circuit.parameters[path].unit, x) for path, x in varying]
         if data.t is not None:
             axes = [("time", "s", data.t)]
-        (label, unit, x), *others = axes or [("measurement", "", 1.0 + np.arange(data.values.size))]
+        numbers = np.arange(1.0, data.values.size + 1.0, dtype=np.float64)
+        (label, unit, x), *others = axes or [("measurement", "", numbers)]
         groups = data.groups.items() if varying else ()
         keys = [[f"{column} = {one}" for one in of] for column, of in groups]
         keys += [[f"{name} = {y:g} {unit}".rstrip() for y in values] for name, unit, values in others]
