@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 import fingerspice as fs
-from fingerspice.studies.fit.result import Estimate
+from fingerspice.studies.fit.fitting import Estimate
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).resolve().parent / "results" / "fit_coverage.json"

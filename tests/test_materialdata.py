@@ -50,17 +50,30 @@ def test_a_header_says_what_the_columns_are(
     np.testing.assert_allclose(read_table(path), TABLE, rtol=1e-12)
 
 
+ROWS = "\n1,2,3\n2,2,3\n3,2,3\n"
+
+
 @pytest.mark.parametrize(
-    ("head", "said"),
+    ("text", "said"),
     [
-        ("f [furlong],rho,eps_r", r"the unit of column 'f \[furlong\]' is not known; allowed: Hz, rad/s, ohm m"),
-        ("f,rho [ohm],eps_r", r"the unit of column 'rho \[ohm\]' is not known"),
-        ("f,rho,sigma", "two columns are a resistivity by their names, f, rho, sigma; allowed: frequency"),
+        (f"f [furlong],rho,eps_r{ROWS}", r"the unit of column 'f \[furlong\]' is not known; allowed: Hz, rad/s, ohm m"),
+        (f"f,rho [ohm],eps_r{ROWS}", r"the unit of column 'rho \[ohm\]' is not known"),
+        (f"f,rho,sigma{ROWS}", "two columns are a resistivity by their names, f, rho, sigma; allowed: frequency"),
+        ("f,rho,eps\n1,2\n", "not three numbers"),
+        ("1,2,3\n2,x,3\n3,2,3\n", "row 2"),
+        ("1,2,3\n2,2,3\n", "three frequencies or more"),
+        ("1,2,3\n2,-2,3\n3,2,3\n", "resistivity in row 2 is -2"),
+        ("1,2,3\n2,1e-300,3\n3,2,3\n", "resistivity in row 2 is 1e-300"),
+        ("1,2,3\n1,2,3\n3,2,3\n", "frequencies"),
+        ("", "material data"),
+        ('"' + "1" * 140_000, "field larger than field limit"),
     ],
 )
-def test_a_header_that_cannot_be_is_refused(tmp_path: Path, head: str, said: str) -> None:
+def test_files_that_are_no_material_are_refused(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
     with pytest.raises(fs.InputError, match=said):
-        fs.fit_material(written(tmp_path / "skin.csv", head, (F, RHO, EPS)))
+        fs.fit_material(path)
 
 
 @pytest.mark.parametrize(
@@ -128,6 +141,8 @@ def test_too_few_poles_are_warned_about_then_refused() -> None:
 
 def test_a_fit_draws_itself_and_gives_the_lines_for_a_deck(tmp_path: Path) -> None:
     fit = fs.fit_material(TABLE)
+    given = TABLE, TABLE[::-1], written(tmp_path / "skin.csv", "f,rho,eps_r", (F, RHO, EPS))
+    assert len({fs.fit_material(one, poles=4).ladder for one in given}) == 1
     axes = fit.plot().axes
     np.testing.assert_allclose(axes[0].lines[0].get_ydata(), RHO, rtol=1e-12)
     np.testing.assert_allclose(axes[1].lines[0].get_ydata(), EPS, rtol=1e-12)

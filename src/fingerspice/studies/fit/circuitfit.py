@@ -7,7 +7,7 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,16 +19,18 @@ from fingerspice.base.announcing import Bar
 from fingerspice.base.arrays import FloatArray, IntArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page
-from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
 from fingerspice.circuit.describe import meaning_of, require_circuit, scenes_warnings
+from fingerspice.circuit.devices import MEASURED as USUAL
+from fingerspice.circuit.devices import MEASURING
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import driving_sources
 from fingerspice.results.record import SIGNALS
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.form import REFUSED
-from fingerspice.studies.fit.measured import IMPEDANCE, MEASURED, Data, data_of
-from fingerspice.studies.fit.result import FitResult, Fitted, Problem, bounded, estimated, followed, profile_of
+from fingerspice.studies.batch.form import REFUSED, own_path
+from fingerspice.studies.fit import fitting
+from fingerspice.studies.fit.fitting import SIGMA, FitResult, Fitted, Given, Problem, followed
 from fingerspice.studies.steady import phasor
 from fingerspice.waveforms.waveform import Sine, require
 
@@ -37,6 +39,13 @@ if TYPE_CHECKING:
 
     from fingerspice.plots.picture import Drawn
 
+#: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
+MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V", "impedance": "ohm"}
+#: The one measured quantity that is no mean, and the column that may stand beside it.
+IMPEDANCE, PHASE = "impedance", "impedance_phase"
+_MEANS = ("f_el", "f_t", "friction", "area")
+_TIME = "t"
+_UNITS = MEASURED | {f"{signal}_mean": unit for signal, unit in MEASURED.items()} | {_TIME: "s", PHASE: "deg"}
 # Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's.
 _SLOPES = 1e-6
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
@@ -46,6 +55,133 @@ _SPREAD, _FOLLOWED = 4.0, 3
 _CLEARLY, _CHOOSING = 2.0, 4
 # Error of the means by which starts are compared.
 _ROUGH = 1e-5
+
+
+@dataclass(frozen=True)
+class Data:
+    """Measured values with their conditions."""
+
+    signal: str  # A key of `MEASURED`
+    values: FloatArray  # (n,): Measured values in SI units: means, or, with `t`, values over time
+    sigma: FloatArray | None  # (n,): Standard deviation of every value; None where it is not known
+    # (n,): Path to the values that a parameter had in the measurements, in the unit of the netlist
+    conditions: dict[str, FloatArray]
+    t: FloatArray | None = None  # (n,): Times, s
+    phase: FloatArray | None = None  # (n,): Phase of an impedance, deg
+    #: Which measurements belong together, such as those of one finger: the name of each one's group (n,), by column
+    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Name of the measured column."""
+        return self.signal if self.t is not None or self.signal == IMPEDANCE else f"{self.signal}_mean"
+
+    @property
+    def scale(self) -> FloatArray:
+        """Scale of the residuals: sigma, the largest value, or an impedance's own size; those of phases come last."""
+        sizes = np.abs(self.values)
+        own = sizes if self.signal == IMPEDANCE else np.full(sizes.size, float(sizes.max()) or 1.0)
+        scale = own if self.sigma is None else self.sigma
+        # An error of the complex impedance, equal in all directions, is as large across as along.
+        return scale if self.phase is None else np.concatenate([scale, np.degrees(scale / sizes)])
+
+    def unusual(self) -> Iterator[str | None]:
+        """Warnings about measured values and amplitudes that are probably in another unit."""
+        said = "the data's largest"
+        if self.signal in USUAL:
+            yield USUAL[self.signal].warning(f"{said} {self.name}", np.abs(self.values).max(), MEASURED[self.signal])
+        for path, x in self.conditions.items():
+            if self.signal in _MEANS and path.endswith(".amplitude"):
+                yield MEASURING.warning(f"{said} {path}", float(x[np.abs(x).argmax()]), "V")
+
+    @property
+    def varying(self) -> dict[str, FloatArray]:
+        """The conditions that are not the same in all measurements."""
+        return {path: x for path, x in self.conditions.items() if np.ptp(x) > 0.0}
+
+
+def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
+    """The checked data that a caller gave; the column `by` tells which group a measurement belongs to."""
+    if isinstance(given, Mapping) and np.iscomplexobj(given.get(IMPEDANCE, 0.0)):
+        if PHASE in given:
+            raise InputError(f"{IMPEDANCE} is complex, and {PHASE} is given; allowed: one of them")
+        z = np.asanyarray(given[IMPEDANCE])
+        given = {**given, IMPEDANCE: np.abs(z), PHASE: np.angle(z, deg=True)}
+
+    def meaning(name: str, names: Sequence[str]) -> tuple[str, str, str]:
+        key = {"time": _TIME, _TIME: _TIME, SIGMA: SIGMA}.get(name.lower(), name)
+        if key == SIGMA:
+            measured = next((one for one in names if one.removesuffix("_mean") in MEASURED), "")
+            return SIGMA, measured, _UNITS.get(measured, "")
+        return key, key, _UNITS[key] if key in _UNITS else circuit.parameters[_path(circuit, name)].unit
+
+    try:
+        columns, place, groups = fitting.measured_of(given, meaning, "Vdrive.amplitude (V), f_el_mean (N)", by)
+    except InputError as refused:
+        if by is not None or "no rows of numbers" not in refused.message:
+            raise
+        raise InputError(f"{refused.message}; allowed: numbers, and names in the column that groups names") from None
+    names = {f"{name}_mean": name for name in _MEANS}
+    names |= {name: name for name in MEASURED if name != IMPEDANCE} if _TIME in columns else {IMPEDANCE: IMPEDANCE}
+    measured = [name for name in columns if name in names]
+    if len(measured) != 1:
+        what = f"several measured columns ({', '.join(measured)})" if measured else "no measured column"
+        raise InputError(
+            f"{place} have {what}, and the columns {', '.join(columns)}; allowed: one of {', '.join(names)}"
+        )
+    (name,) = measured
+    values = columns.pop(name)
+    sigma, t, phase = (columns.pop(key, None) for key in (SIGMA, _TIME, PHASE))
+    if phase is not None and name != IMPEDANCE:
+        raise InputError(f"{place} have the column {PHASE} beside {name}; allowed: beside {IMPEDANCE}")
+    # A signal over time may be below 0 now and then, by noise, but not on average; magnitudes never are 0.
+    each = name == IMPEDANCE or name.endswith("_mean")
+    checked = values if each else values.mean(keepdims=True)
+    low = np.flatnonzero(checked <= 0.0 if name == IMPEDANCE else checked < 0.0)
+    if low.size and (each or name in _MEANS):
+        where = f"in row {low[0] + (0 if isinstance(given, Mapping) else 1)}" if each else "on average"
+        allowed = "magnitudes above 0" if name == IMPEDANCE else "0 or more"
+        if name.startswith("f_el"):
+            allowed += ", as the electroadhesive force counts as positive where it pulls towards the screen"
+        value = f"{checked[low[0]]:g} {_UNITS[name]}".rstrip()
+        raise InputError(f"{place}: {name} is {value} {where}; allowed: {allowed}")
+    if sigma is not None and not np.all(sigma > 0.0):
+        raise InputError(f"{place}: the smallest sigma is {sigma.min():g}; allowed: more than 0")
+    if t is not None and (name.endswith("_mean") or np.any(np.diff(t) <= 0.0)):
+        raise InputError(f"{place} have the column t; allowed: rising times, with a signal that is no mean")
+    conditions: dict[str, FloatArray] = {}
+    for column, x in columns.items():
+        path = _path(circuit, column)
+        if path in conditions:
+            raise InputError(f"{place} have two columns of {path}; allowed: one")
+        conditions[path] = x
+    data = Data(names[name], values, sigma, conditions, t, phase, groups)
+    if t is not None and data.varying:
+        raise InputError(f"{place} have times and changing conditions; allowed: one run over time, or means")
+    if t is not None and groups:
+        raise InputError(f"{place} have times and groups; allowed: groups of means or of impedances")
+    return data
+
+
+def _path(circuit: Circuit, name: str) -> str:
+    """A condition's path; ``source.`` stands for the only source, and ``frequency`` for its frequency."""
+    name = "source.frequency" if name.lower() == "frequency" else name
+    element, _, parameter = name.partition(".")
+    if element.lower() == "source":
+        driving = driving_sources(circuit)
+        if len(driving) != 1:
+            raise InputError(f"{name} is the only source's, and the circuit has {len(driving)}; allowed: its name")
+        name = f"{driving[0].name}.{parameter}"
+    known = {path.lower(): path for path in circuit.parameters}
+    if name.lower() not in known:
+        near = nearest(name, [*known.values()])
+        hint = "" if near is None else f", such as {near}"
+        allowed = ", ".join((*(f"{signal}_mean" for signal in _MEANS), IMPEDANCE, PHASE, SIGMA, _TIME))
+        raise InputError(
+            f"the data have a column {name!r}, which is no parameter of the circuit; allowed: {allowed} with a signal, "
+            f"and conditions{hint}"
+        )
+    return known[name.lower()]
 
 
 @dataclass(frozen=True)
@@ -60,6 +196,23 @@ class Task(Problem):
     charge_law: str | None
     watch: Callable[[], None]  # Called before every evaluation
 
+    @property
+    def box(self) -> FloatArray:
+        """Bounds also where none are given, far from the start: there are no likely values, and slow runs."""
+        (low, high), near, far = self.bounds.T, self.initial / fitting.FARTHEST, self.initial * fitting.FARTHEST
+        return np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
+
+    def remedy(self, names: tuple[str, ...]) -> str:
+        """A measurement that would add what is missing: at another voltage, frequency or load."""
+        if self.data.t is not None:
+            return "Measure under another voltage or load as well, or fix one of them."
+        both = self.data.varying, self.circuit.parameters
+        varying, known = ({path.rpartition(".")[2] for path in paths} for paths in both)
+        for key, text in (("amplitude", "voltage"), ("frequency", "frequency"), ("fn", "load")):
+            if key in known - varying:
+                return f"Measure at a second {text} as well, or fix one of them."
+        return "Fix one of them to a value known from elsewhere."
+
     def compared(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         self.watch()
         if self.data.signal == IMPEDANCE:
@@ -67,9 +220,9 @@ class Task(Problem):
         found, by = self._means(values) if self.data.t is None else self._signal(values)
         return (found - self.data.values) / self.scale, by * values / self.scale[:, None]
 
-    def _scene(self, values: FloatArray, row: int) -> Circuit:
-        """The circuit of one measurement."""
-        changes = {path: float(x[row]) for path, x in self.data.conditions.items()}
+    def scene(self, values: FloatArray, row: int, conditions: Mapping[str, FloatArray]) -> Circuit:
+        """The circuit of one measurement, under some conditions."""
+        changes = {path: float(x[row]) for path, x in conditions.items()}
         return self.circuit.varied(changes | {path: float(values[at[row]]) for path, at in self.places.items()})
 
     def misses(self, values: FloatArray) -> FloatArray:
@@ -84,7 +237,7 @@ class Task(Problem):
         for number, row in enumerate(first.tolist()):
             rows = sweep.ravel() == number
             at, skin = None if f is None else f[rows], "swept" if self.skin == "follow" else "own"
-            found = phasor(self._scene(values, row), at, skin=skin).impedance
+            found = phasor(self.scene(values, row, data.conditions), at, skin=skin).impedance
             if found is None:
                 raise InputError("several sources see no impedance; allowed: a circuit with one source")
             z[rows] = found
@@ -95,7 +248,7 @@ class Task(Problem):
 
     def _signal(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The predicted signal over time (n,), and its derivatives by the parameters (n, n_parameter)."""
-        circuit = self._scene(values, 0)
+        circuit = self.scene(values, 0, self.data.conditions)
         waves = network_of(circuit).waveforms
         fundamental = waves[0].fundamental if self.skin == "follow" and len(waves) == 1 else None
         if fundamental is not None:
@@ -110,10 +263,8 @@ class Task(Problem):
     def _means(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `_signal`, of means, from batches; the derivatives with an error that suits least squares."""
         by = np.zeros((self.data.values.size, values.size))
-        slopes, found = (
-            self.scenes(values[None], rtol, gradients)
-            for rtol, gradients in ((max(self.rtol, _SLOPES), tuple(self.places)), (self.rtol, ()))
-        )
+        slopes = self.scenes(values[None], max(self.rtol, _SLOPES), tuple(self.places))
+        found = self.scenes(values[None], self.rtol)
         for one, status in ((slopes, "gradient_status"), (found, "status")):
             if np.any(one[status].to_numpy() >= REFUSED):
                 raise InputError(one.attrs["failures"][0])
@@ -191,31 +342,27 @@ class Fit(FitResult):
         if data.sigma is None:
             equal = float(np.ptp(self.sigma)) <= 1e-9 * float(self.sigma.max())
             known = f"estimated from the residuals, {'equal for all' if equal else 'as equal shares of the values'}"
-        about = [
-            f"residual {self._rms:.3g} {MEASURED[data.signal]} rms, {share:.2g} % of the largest value; sigma {known}"
-        ]
-        if data.groups is not None:
-            about.append(f"groups by {data.groups.column}: {', '.join(data.groups.labels)}")
         head = f"{len(self.estimates)} parameters fitted to {data.values.size} values of {data.name}"
-        return self._paged(head, about)
+        size = f"{self._rms:.3g} {MEASURED[data.signal]} rms, {share:.2g} % of the largest value"
+        groups = [f"groups by {column}: {', '.join(dict.fromkeys(of))}" for column, of in data.groups.items()]
+        return self._paged(head, [f"residual {size}; sigma {known}", *groups])
 
     def _panels(self) -> list[Drawn]:
-        data, known = self.data, self.circuit.parameters
+        data, circuit = self.data, self.circuit
         signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal
         signal = f"mean {signal}" if data.name.endswith("_mean") else signal
-        names, x, label = ["measured and fitted"] * data.values.size, data.t, "time [s]"
+        # What changed most stands along the axis, and every value of the rest has a curve.
         varying = sorted(data.varying.items(), key=lambda item: -np.unique(item[1]).size)
-        if x is None and varying:
-            (path, x), others = varying[0], varying[1:]
-            unit = known[path].unit
-            label = meaning_of(self.circuit, path) + (f" [{unit}]" if unit else "")
-            keys = [] if data.groups is None else [[f"{data.groups.column} = {one}" for one in data.groups.of]]
-            for path, values in others:
-                keys.append([f"{meaning_of(self.circuit, path)} = {y:g} {known[path].unit}".rstrip() for y in values])
-            if keys:
-                names = [", ".join(told) for told in zip(*keys, strict=True)]
-        elif x is None:
-            x, label = np.arange(1.0, data.values.size + 1.0), "measurement"
+        axes = [(meaning_of(circuit, path), circuit.parameters[path].unit, x) for path, x in varying]
+        if data.t is not None:
+            axes = [("time", "s", data.t)]
+        numbers = np.arange(1.0, data.values.size + 1.0, dtype=np.float64)
+        (label, unit, x), *others = axes or [("measurement", "", numbers)]
+        groups = data.groups.items() if varying else ()
+        keys = [[f"{column} = {one}" for one in of] for column, of in groups]
+        keys += [[f"{name} = {y:g} {unit}".rstrip() for y in values] for name, unit, values in others]
+        names = list(map(", ".join, zip(*keys, strict=True))) or ["measured and fitted"] * data.values.size
+        label = f"{label} [{unit}]" if unit else label
         return [(names, (x, data.values, self.predicted, self.sigma), label, signal, MEASURED[data.signal])]
 
     def to_dict(self) -> dict[str, Any]:
@@ -229,9 +376,9 @@ class Fit(FitResult):
         }
 
     def _columns(self) -> dict[str, Any]:
-        data, groups = self.data, self.data.groups
-        first = {groups.column: groups.of} if groups is not None else {} if data.t is None else {"t": data.t}
-        return {**first, **data.conditions, data.signal: data.values, "fitted": self.predicted, "sigma": self.sigma}
+        data, time = self.data, {} if self.data.t is None else {"t": self.data.t}
+        known = {**data.groups, **time, **data.conditions, data.signal: data.values}
+        return {**known, "fitted": self.predicted, "sigma": self.sigma}
 
 
 def fit(
@@ -307,7 +454,6 @@ def fit(
     own = {f"{e.name}.f" for e in circuit.by_device("SKIN")} & {*measured.conditions, *paths}
     if skin == "follow" and own and measured.name.endswith("_mean"):
         raise InputError(f"skin='follow' and {own.pop()} are both given; allowed: one of them")
-    start, box = bounded(circuit, paths, measured.values.size * (1 if measured.phase is None else 2), bounds or {})
     bar, begun, count = Bar("fitting", endless=True), time.perf_counter(), itertools.count(1)
 
     def watch() -> None:
@@ -315,8 +461,8 @@ def fit(
         if time.perf_counter() - begun > 1.0:
             bar.show(note=f"evaluation {number}")
 
-    task = Task(start, names, paths, box, measured.scale, measured, places, average, skin, rtol, charge_law, watch)
-    wanted = task.profiled(profiles)
+    how = average, skin, rtol, charge_law, watch
+    task, wanted = Task(circuit, names, paths, measured.scale, measured, places, *how).begun(bounds or {}, profiles)
     for text in filter(None, (*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin))):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     try:
@@ -326,17 +472,12 @@ def fit(
 
 
 def _request(
-    circuit: Circuit, given: Mapping[str, ArrayLike] | str | Path, parameters: Sequence[str],
-    groups: Mapping[str, Sequence[str]] | None,
-) -> tuple[Data, tuple[str, ...], tuple[str, ...], dict[str, IntArray]]:  # fmt: skip
+    circuit: Circuit, given: Given, parameters: Sequence[str], groups: Mapping[str, Sequence[str]] | None
+) -> tuple[Data, tuple[str, ...], tuple[str, ...], dict[str, IntArray]]:
     """The checked data; and names, paths and places, as `Task` has them, of what is to be fitted to them."""
     if isinstance(parameters, str) or not parameters:
         raise InputError(f"parameters is {parameters!r}; allowed: a sequence of paths such as ['Xgap.d', 'Xgap.r']")
-    known = {path.lower(): path for path in circuit.parameters}
-    for path in parameters:
-        if path.lower() not in known:
-            circuit.varied({path: 1.0})
-    fitted = [known[path.lower()] for path in parameters]
+    fitted = [own_path(circuit, path) for path in parameters]
     by: str | None = None
     separate: Sequence[str] = ()
     if groups is not None:
@@ -344,14 +485,15 @@ def _request(
         ((by, separate),) = groups.items() if isinstance(groups, Mapping) and len(groups) == 1 else (("", ""),)
         if not isinstance(by, str) or isinstance(separate, str) or not separate:
             raise InputError(f"groups is {groups!r}; allowed: {wanted}")
-        if by.lower() in known:
+        if by.lower() in map(str.lower, circuit.parameters):
             raise InputError(f"groups names the column {by!r}, which is a parameter; allowed: {wanted}")
-    for path in separate:
-        if known.get(path.lower()) not in fitted:
-            raise InputError(f"groups names {path!r}, which is not fitted; allowed: {', '.join(fitted)}")
-    data = data_of(circuit, given, by)
-    own = {known[path.lower()] for path in separate}
+    lost = [path for path in separate if path.lower() not in map(str.lower, fitted)]
+    if lost:
+        raise InputError(f"groups names {lost[0]!r}, which is not fitted; allowed: {', '.join(fitted)}")
+    data = _data_of(circuit, given, by)
     names, paths, places = list[str](), list[str](), dict[str, IntArray]()
+    of = data.groups[by] if by is not None else ()
+    every = list(dict.fromkeys(of))
     for path in fitted:
         value = circuit.parameters[path].value
         require(fitted.count(path) == 1, path, "named twice", "once")
@@ -360,23 +502,22 @@ def _request(
         if not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
         places[path], labels = np.full(data.values.size, len(names)), [path]
-        if data.groups is not None and path in own:
-            places[path] += [data.groups.labels.index(label) for label in data.groups.of]
-            labels = [f"{path}[{label}]" for label in data.groups.labels]
+        if path.lower() in map(str.lower, separate):
+            places[path] += [every.index(label) for label in of]
+            labels = [f"{path}[{label}]" for label in every]
         names += labels
         paths += [path] * len(labels)
     return data, tuple(names), tuple(paths), places
 
 
-def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
-    """The fit, with the profiles `wanted`."""
+def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
+    """The fit, with the profiles wanted."""
     from scipy.stats import norm, t
 
-    data, n = free.data, free.data.values.size
-    task = dataclasses.replace(free, bounds=free.walls)
-    ends = [followed(task.residuals, task.bounds, begin) for begin in _starts(task, starts)]
+    data, n = task.data, task.data.values.size
+    ends = [followed(task.residuals, task.box, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
-    if not best.found:
+    if best.objective >= fitting.NOT_FOUND:
         raise InputError(
             "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
             "circuit that runs under the conditions of the data"
@@ -386,38 +527,24 @@ def _fitted(free: Task, starts: int, wanted: Sequence[str]) -> Fit:
         task, ends = _with_likelier_noise(task, ends, best)
         best = min(ends, key=lambda end: end.objective)
         freedom -= 1
-    # Variance of the residuals over their scale, and half a 95 % interval over a standard error.
     variance, reach = math.inf, math.inf
     if data.sigma is not None:
         variance, reach = 1.0, float(norm.ppf(0.975))
     elif freedom > 0:
         variance, reach = best.objective / freedom, float(t.ppf(0.975, freedom))
-    error, remedy = np.sqrt(np.diag(best.covariance) * variance), data.remedy(task.circuit)
-    of = () if data.groups is None else data.groups.of
     # The geometric mean of one value is that value to the last digit.
     means = {path: best.values[np.unique(at)] for path, at in task.places.items()}
-    found = Fit(
-        **estimated(
-            task, best, error, np.full(error.size, reach), lambda _: remedy,
-            best.beyond_sigma(..., freedom) if data.sigma is not None else [],
-        ),
+    labels = [(of, label) for of in data.groups.values() for label in dict.fromkeys(of)]
+    return Fit._reported(
+        task, best, variance, reach, best.beyond_sigma(..., freedom) if data.sigma is not None else [], profiles,
         data=data,
         predicted=data.values + (best.residual * task.scale)[:n],
         sigma=data.sigma if data.sigma is not None else math.sqrt(variance) * task.scale[:n],
         objectives=tuple(end.objective for end in ends),
         freedom=freedom,
         circuit=task.circuit.varied({path: float(np.prod(x ** (1.0 / x.size))) for path, x in means.items()}),
-        circuits={
-            label: task.circuit.varied({path: float(best.values[at[row]]) for path, at in task.places.items()})
-            for row, label in enumerate(of)
-            if label not in of[:row]
-        },
+        circuits={label: task.scene(best.values, of.index(label), {}) for of, label in labels},
     )  # fmt: skip
-    # Of chi squared and F with one degree of freedom, quantiles are the squares of those of the normal distribution
-    # and of Student's (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
-    task, room = dataclasses.replace(task, bounds=free.bounds), variance * reach**2
-    found.profiles.update((name, profile_of(task, best, found.estimates[name], room)) for name in wanted)
-    return found
 
 
 def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[Task, list[Fitted]]:
@@ -429,7 +556,7 @@ def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[
     if not np.all(predicted > 0.0) or best.objective == 0.0:
         return task, ends
     shares = dataclasses.replace(task, scale=predicted)
-    others = [followed(shares.residuals, shares.bounds, end.values) for end in ends]
+    others = [followed(shares.residuals, shares.box, end.values) for end in ends]
     least, n = min(end.objective for end in others), predicted.size
     equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
     # Shares that fit to the last bit are the likelier ones.
@@ -444,8 +571,8 @@ def _starts(task: Task, count: int) -> list[FloatArray]:
     initial = task.initial
     if count == 1 or task.data.t is not None or task.data.signal == IMPEDANCE:
         return [initial]
-    low = np.maximum(task.bounds[:, 0], initial / _SPREAD)
-    high = np.minimum(task.bounds[:, 1], initial * _SPREAD)
+    low = np.maximum(task.box[:, 0], initial / _SPREAD)
+    high = np.minimum(task.box[:, 1], initial * _SPREAD)
     share = qmc.Sobol(initial.size, scramble=False).random_base2(math.ceil(math.log2(count)))[1:count]
     tried = np.vstack([initial, np.exp(np.log(low) + share * np.log(high / low))])
     with warnings.catch_warnings():

@@ -21,8 +21,8 @@ from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
 from fingerspice.physics.contact import Contact, ridge_area
-from fingerspice.studies.fit.measured import SIGMA, Given, measured_of
-from fingerspice.studies.fit.result import FitResult, Fitted, Problem, bounded, estimated, followed, profile_of
+from fingerspice.studies.fit import fitting
+from fingerspice.studies.fit.fitting import SIGMA, FitResult, Fitted, Given, Problem
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class Relation(NamedTuple):
         return out
 
 
-def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, ...]:
+def _relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, ...]:
     """The relations in one or several sets of columns; `fn` (N) is the load where no column has it."""
     several = [given] if isinstance(given, (str, Path, Mapping)) else given
     if not isinstance(several, Sequence) or not several:
@@ -92,7 +92,7 @@ def relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, .
     found: dict[tuple[str, bool], list[Any]] = {}
     for number, one in enumerate(several, 1):
         place = "the data" if len(several) == 1 else f"data {number}"
-        columns, place, _ = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
+        columns, place, _ = fitting.measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
         measured = [name for name in MEASURED if name in columns]
         if not measured:
             raise InputError(f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
@@ -157,7 +157,6 @@ class Task(Problem):
         return np.concatenate(parts) / self.scale
 
     def remedy(self, names: tuple[str, ...]) -> str:
-        """The measurement that would tell one parameter, or two apart."""
         bare = {name.rpartition(".")[2] for name in names}
         kinds = {one.kind for one in self.relations}
         loads = [one.fn for one in self.relations if one.kind != "indentation"]
@@ -219,7 +218,7 @@ class ContactFit(FitResult):
     @property
     def line(self) -> str:
         """The fitted parameters as a netlist has them."""
-        return " ".join(f"{path.rpartition('.')[2]}={one.value:.6g}" for path, one in self.estimates.items())
+        return " ".join(f"{path.rpartition('.')[2]}={value:.6g}" for path, value in self.values.items())
 
     def _page(self) -> Page:
         about = []
@@ -245,14 +244,11 @@ class ContactFit(FitResult):
         return panels
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "gap": self.gap,
-            **super().to_dict(),
-            "relations": [
-                {"kind": one.kind, "count": int(one.values.size), "misfit": misfit}
-                for one, misfit in zip(self.relations, self.misfits, strict=True)
-            ],
-        }
+        relations = [
+            {"kind": one.kind, "count": int(one.values.size), "misfit": misfit}
+            for one, misfit in zip(self.relations, self.misfits, strict=True)
+        ]
+        return {"gap": self.gap, **super().to_dict(), "relations": relations}
 
     def _columns(self) -> dict[str, Any]:
         rows = zip(*((one.fn, one.u_gap, one.indentation, one.values) for one in self.relations), strict=True)
@@ -315,7 +311,7 @@ def fit_contact(
         # A parameter may be given without its GAP.
         return name if "." in name else f"{gap}.{name}"
 
-    relations = relations_of(data, own["fn"])
+    relations = _relations_of(data, own["fn"])
     largest = max(float(relation.fn.max()) for relation in relations)
     heavy = DEVICES["GAP"].parameter("fn").unusual("the data's largest", largest)
     if heavy is not None:
@@ -327,27 +323,27 @@ def fit_contact(
     # What is fitted in its logarithm cannot start at 0.
     begin |= {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default or 0.0 for name in names if own[name] == 0.0}
     scale = np.concatenate([np.full(one.values.size, _SHARE) if one.sigma is None else one.sigma for one in relations])
-    paths = tuple(f"{gap}.{name}" for name in names)
-    limits = {named(path): pair for path, pair in (bounds or {}).items()}
-    start, box = bounded(circuit.varied(begin), paths, scale.size, limits)
-    task = Task(start, paths, paths, box, scale, gap, relations)
-    wanted = task.profiled(profiles if isinstance(profiles, bool) else [named(path) for path in profiles])
+    paths = tuple(map(named, names))
+    task, wanted = Task(circuit.varied(begin), paths, paths, scale, gap, relations).begun(
+        {named(path): pair for path, pair in (bounds or {}).items()},
+        profiles if isinstance(profiles, bool) else [named(path) for path in profiles],
+    )
     task, best, pools = _solved(task)
-    if not best.found:
+    if best.objective >= fitting.NOT_FOUND:
         raise InputError(
             f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data; "
             "allowed: values nearer to the data, such as a smaller c2 or a larger alpha"
         )
     # With the warnings that a user who writes these values would get.
     try:
-        fitted = circuit.replace(dict(zip(task.names, best.values.tolist(), strict=True)))
+        fitted = circuit.replace(dict(zip(paths, best.values.tolist(), strict=True)))
     except InputError as refused:
         raise InputError(f"the fitted values do not go with the circuit's others: {refused.message}") from None
-    (error, reach), predicted = _errors(best, pools), task.predict(best.values)
+    variance, reach = _errors(best, pools)
+    predicted = task.predict(best.values)
     sized = zip(relations, predicted, task.split(task.scale), strict=True)
-    notes = _further_notes(task, best, pools)
-    found = ContactFit(
-        **estimated(task, best, error, reach, task.remedy, notes),
+    found = ContactFit._reported(
+        task, best, variance, reach, _further_notes(task, best, pools), wanted,
         circuit=fitted,
         gap=gap,
         relations=relations,
@@ -355,13 +351,11 @@ def fit_contact(
         sigma=tuple(one.sigma if one.sigma is not None else share * values for one, values, share in sized),
         freedom=scale.size - len(paths),
         reach=dict(zip(paths, reach.tolist(), strict=True)),
-    )
+    )  # fmt: skip
     for relation, misfit in zip(relations, found.misfits, strict=True):
         if misfit > _TOO_MUCH:
             said = f"the {relation.name} misses the data by {100.0 * misfit:.2g} % rms; its relation may not hold for"
             warnings.warn(f"{said} them, or a column is in another unit", FingerspiceWarning, stacklevel=2)
-    for path in wanted:
-        found.profiles[path] = profile_of(task, best, found.estimates[path], found.reach[path] ** 2)
     return found
 
 
@@ -409,8 +403,8 @@ def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
         members.setdefault(key, []).append((relation.name, at))
     begin = task.initial
     for _ in range(_ROUNDS):
-        best, pools, scale = followed(task.residuals, task.bounds, begin), list[Pool](), task.scale.copy()
-        leverage = np.sum(orth(best.by_log, _LEAST) ** 2, axis=1)
+        best, pools = fitting.followed(task.residuals, task.box, begin), list[Pool]()
+        leverage, scale = np.sum(orth(best.by_log, _LEAST) ** 2, axis=1), task.scale.copy()
         for (_, unknown), own in members.items():
             at = np.concatenate([at for _, at in own])
             freedom = at.size - float(leverage[at].sum()) if unknown else math.inf
@@ -425,7 +419,7 @@ def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
 
 
 def _errors(best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, FloatArray]:
-    """Standard errors of the logarithms, and Student's t with the degrees of freedom of Satterthwaite.
+    """Variance of every parameter's residuals over their scale, and Student's t with the freedom of Satterthwaite.
 
     (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946.) Each pool has its own variance, known from its own
     residuals, and a part in the variance of a parameter; without a measure of one that has a part, nothing is known.
@@ -440,7 +434,7 @@ def _errors(best: Fitted, pools: Sequence[Pool]) -> tuple[FloatArray, FloatArray
         inverse = np.where(shares > _NO_PART, each, 0.0).sum(axis=0)
         reach = np.where(inverse > 0.0, t.ppf(0.975, 1.0 / inverse), norm.ppf(0.975))
     known = np.isfinite(inverse)
-    return np.where(known, np.sqrt(np.diag(covariance)), math.inf), np.where(known, reach, math.inf)
+    return np.where(known, 1.0, math.inf), np.where(known, reach, math.inf)
 
 
 def _further_notes(task: Task, best: Fitted, pools: Sequence[Pool]) -> list[str]:

@@ -6,7 +6,6 @@ import csv
 import math
 import re
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,35 +49,35 @@ _PERMITTIVITY = (
     "relative_permittivity|dielectric constant|dk"
 )
 # What a column may hold by its name and unit, of which several with a name the first is that without a unit: the one of
-# `COLUMNS` that it tells, patterns of its names and units, the power of the metre in these, and the power and factor
-# that make of its values in SI units those of the column.
+# `COLUMNS` that it tells, patterns of its names and units, and the power and factor that make of its values in SI units
+# those of the column.
 _KINDS = (
-    ("frequency", _FREQUENCY, f"{_PREFIX}[Hh]z|1/s", 0, 1.0, 1.0),
-    ("frequency", _FREQUENCY, "rad/s", 0, 1.0, 0.5 / np.pi),
-    ("frequency", "w|omega|ω|angular frequency|angular_frequency", "rad/s|1/s", 0, 1.0, 0.5 / np.pi),
+    ("frequency", _FREQUENCY, f"{_PREFIX}[Hh]z|1/s", 1.0, 1.0),
+    ("frequency", _FREQUENCY, "rad/s", 1.0, 0.5 / np.pi),
+    ("frequency", "w|omega|ω|angular frequency|angular_frequency", "rad/s|1/s", 1.0, 0.5 / np.pi),
     ("resistivity", "rho|ρ|rho_sc|resistivity|resistance",
-     f"{_PREFIX}(?:[Oo]hms?|[\u03a9\u2126])[ *·.-]?{_METRE}", 1, 1.0, 1.0),
-    ("resistivity", "sigma|σ|kappa|conductivity|conductance", f"{_PREFIX}S/{_METRE}", -1, -1.0, 1.0),
-    ("permittivity", _PERMITTIVITY, "1|-", 0, 1.0, 1.0),
-    ("permittivity", _PERMITTIVITY, f"{_PREFIX}F/{_METRE}", -1, 1.0, 1.0 / EPS0),
+     f"{_PREFIX}(?:[Oo]hms?|[\u03a9\u2126])[ *·.-]?{_METRE}", 1.0, 1.0),
+    ("resistivity", "sigma|σ|kappa|conductivity|conductance", f"{_PREFIX}S/{_METRE}", -1.0, 1.0),
+    ("permittivity", _PERMITTIVITY, "1|-", 1.0, 1.0),
+    ("permittivity", _PERMITTIVITY, f"{_PREFIX}F/{_METRE}", 1.0, 1.0 / EPS0),
 )  # fmt: skip
-# Possible slips of the user, each with the function from the table as given to the table as meant.
-_SLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
-    ("the frequency is in rad/s", lambda t: t * (0.5 / np.pi, 1.0, 1.0)),
-    ("the second column is a conductivity in S/m", lambda t: t ** (1.0, -1.0, 1.0)),
-    ("the frequency is in kHz", lambda t: t * (1e3, 1.0, 1.0)),
-    ("the resistivity is in ohm cm", lambda t: t * (1.0, 1e-2, 1.0)),
-    ("the resistivity is in kohm m", lambda t: t * (1.0, 1e3, 1.0)),
-    ("resistivity and permittivity have changed places", lambda t: t[:, [0, 2, 1]]),
-    ("frequency and resistivity have changed places", lambda t: t[:, [1, 0, 2]]),
-    ("frequency and permittivity have changed places", lambda t: t[:, [2, 1, 0]]),
-    ("the columns are resistivity, permittivity, frequency", lambda t: t[:, [2, 0, 1]]),
-    ("the columns are permittivity, frequency, resistivity", lambda t: t[:, [1, 2, 0]]),
-    ("the second column is a conductivity in mS/m", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e3, 1.0)),
-    ("the second column is a conductivity in uS/cm", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e4, 1.0)),
-    ("the second column is a conductivity in S/cm", lambda t: t ** (1.0, -1.0, 1.0) * (1.0, 1e-2, 1.0)),
-    ("the frequency is in MHz", lambda t: t * (1e6, 1.0, 1.0)),
-    ("the permittivity is in F/m", lambda t: t * (1.0, 1.0, 1.0 / EPS0)),
+# Possible slips of the user: columns of the table as given, in the order meant; power of the second; and factors.
+_SLIPS = (
+    ("the frequency is in rad/s", (0, 1, 2), 1.0, (0.5 / np.pi, 1.0, 1.0)),
+    ("the second column is a conductivity in S/m", (0, 1, 2), -1.0, (1.0, 1.0, 1.0)),
+    ("the frequency is in kHz", (0, 1, 2), 1.0, (1e3, 1.0, 1.0)),
+    ("the resistivity is in ohm cm", (0, 1, 2), 1.0, (1.0, 1e-2, 1.0)),
+    ("the resistivity is in kohm m", (0, 1, 2), 1.0, (1.0, 1e3, 1.0)),
+    ("resistivity and permittivity have changed places", (0, 2, 1), 1.0, (1.0, 1.0, 1.0)),
+    ("frequency and resistivity have changed places", (1, 0, 2), 1.0, (1.0, 1.0, 1.0)),
+    ("frequency and permittivity have changed places", (2, 1, 0), 1.0, (1.0, 1.0, 1.0)),
+    ("the columns are resistivity, permittivity, frequency", (2, 0, 1), 1.0, (1.0, 1.0, 1.0)),
+    ("the columns are permittivity, frequency, resistivity", (1, 2, 0), 1.0, (1.0, 1.0, 1.0)),
+    ("the second column is a conductivity in mS/m", (0, 1, 2), -1.0, (1.0, 1e3, 1.0)),
+    ("the second column is a conductivity in uS/cm", (0, 1, 2), -1.0, (1.0, 1e4, 1.0)),
+    ("the second column is a conductivity in S/cm", (0, 1, 2), -1.0, (1.0, 1e-2, 1.0)),
+    ("the frequency is in MHz", (0, 1, 2), 1.0, (1e6, 1.0, 1.0)),
+    ("the permittivity is in F/m", (0, 1, 2), 1.0, (1.0, 1.0, 1.0 / EPS0)),
 )
 
 
@@ -94,8 +93,7 @@ def read_table(path: Path) -> FloatArray:
         rows = [row for row in csv.reader(lines, delimiter=mark) if row and not row[0].lstrip().startswith("#")]
     except csv.Error as error:
         raise InputError(f"{path} cannot be read as CSV: {error}") from error
-    head: list[str] = []
-    numbers = []
+    head, numbers = list[str](), list[list[float]]()
     for place, row in enumerate(rows):
         try:
             numbers.append([float(x.replace(",", ".") if mark == ";" else x) for x in row])
@@ -106,26 +104,22 @@ def read_table(path: Path) -> FloatArray:
     if any(len(row) != 3 for row in numbers):
         raise InputError(f"{path} has rows that are not three numbers; allowed: {ALLOWED}")
     table = np.array(numbers, float).reshape(-1, 3)
-    if len(head) != 3:
-        return table
-    # Columns with unknown names fill the places that the others leave.
-    named: dict[str, FloatArray] = {}
-    others = []
-    for name, x in zip(head, table.T, strict=True):
-        column, scale, power, factor = _kind(name, str(path))
-        if not column:
-            others.append(x)
-            continue
+    named, others = dict[str, FloatArray](), list[FloatArray]()
+    for name, x in zip(head if len(head) == 3 else [""] * 3, table.T, strict=True):
+        column, values = _converted(name, x, str(path))
         if column in named:
             names = ", ".join(head)
             raise InputError(f"{path}: two columns are a {column} by their names, {names}; allowed: {ALLOWED}")
-        with np.errstate(divide="ignore"):
-            named[column] = (scale * x) ** power * factor
+        if column:
+            named[column] = values
+        else:
+            others.append(x)
+    # Columns with unknown names fill the places that the others leave.
     return np.column_stack([named[name] if name in named else others.pop(0) for name in COLUMNS])
 
 
-def _kind(name: str, file: str) -> tuple[str, float, float, float]:
-    """The column that a name in a header tells, or "", its unit's size, and power and factor as in `_KINDS`."""
+def _converted(name: str, x: FloatArray, file: str) -> tuple[str, FloatArray]:
+    """The column that a name in a header tells, or "", and its values in SI units."""
     match = re.fullmatch(
         r"(?P<what>[^\[(/]*?)\s*(?:[\[(](?P<bracket>[^\])]*)[\])]|/\s*(?P<slash>.+))?", name.strip().strip("\"'")
     )
@@ -134,19 +128,17 @@ def _kind(name: str, file: str) -> tuple[str, float, float, float]:
         # A name such as f_kHz ends with its unit.
         what, _, unit = what.rpartition("_")
     kinds = [kind for kind in _KINDS if re.fullmatch(kind[1], what, re.IGNORECASE)]
-    for column, _, units, metres, power, factor in kinds:
-        if not unit:
-            return column, 1.0, power, factor
+    for column, _, units, power, factor in kinds:
         found = re.fullmatch(units, unit)
-        if found:
-            parts = found.groupdict()
-            size = _PREFIXES[parts.get("prefix") or ""] * _METRES[parts.get("metre") or "m"] ** metres
-            return column, size, power, factor
+        if found or not unit:
+            parts = found.groupdict() if found else {}
+            metre = _METRES[parts.get("metre") or "m"] ** (-1 if "/" in unit else 1)
+            with np.errstate(divide="ignore"):
+                return column, (_PREFIXES[parts.get("prefix") or ""] * metre * x) ** power * factor
     if kinds:
-        raise InputError(
-            f"{file}: the unit of column {name.strip()!r} is not known; allowed: Hz, rad/s, ohm m, S/m, and 1 or F/m"
-        )
-    return "", 1.0, 1.0, 1.0
+        allowed = "Hz, rad/s, ohm m, S/m, and 1 or F/m"
+        raise InputError(f"{file}: the unit of column {name.strip()!r} is not known; allowed: {allowed}")
+    return "", x
 
 
 @dataclass(frozen=True)
@@ -238,21 +230,17 @@ class MaterialFit(Shown):
 
     def _page(self) -> Page:
         ladder, f = self.ladder, self.frequency
-        rows = [
-            (format_si(p / (2.0 * math.pi), "Hz"), f"{k:.4g} S/m")
-            for p, k in zip(ladder.poles, ladder.weights, strict=True)
+        poles = [format_si(p / (2.0 * math.pi), "Hz") for p in ladder.poles]
+        rows = list(zip(poles, (f"{k:.4g} S/m" for k in ladder.weights), strict=True))
+        low, high = (format_si(float(x), "Hz") for x in f[[0, -1]])
+        blocks = [
+            f"material fitted at {f.size} frequencies from {low} to {high}",
+            f"misfit of the admittivity: {100.0 * self.rms:.2g} % rms, {100.0 * self.largest:.2g} % at most",
+            f"no causal and passive material comes nearer than {100.0 * self.kramers_kronig.rms:.2g} % rms",
+            "",
+            f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and",
         ]
-        return Page(
-            [
-                f"material fitted at {f.size} frequencies from {format_si(float(f[0]), 'Hz')} to "
-                f"{format_si(float(f[-1]), 'Hz')}",
-                f"misfit of the admittivity: {100.0 * self.rms:.2g} % rms, {100.0 * self.largest:.2g} % at most",
-                f"no causal and passive material comes nearer than {100.0 * self.kramers_kronig.rms:.2g} % rms",
-                "",
-                f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and",
-                Table(("pole", "weight"), rows),
-            ]
-        )
+        return Page([*blocks, Table(("pole", "weight"), rows)])
 
     def to_netlist(self, name: str) -> str:
         """A subcircuit of slabs in series with the thickness as parameter, for decks here and in ngspice.
@@ -279,26 +267,22 @@ class MaterialFit(Shown):
         from fingerspice.plots import drawing
 
         figure, axes = drawing.new_figure(1, 3, height=2.7)
-        limit, small, fine = self.kramers_kronig, drawing.FONT - 0.5, {"color": drawing.BLUE, "linewidth": 1.4}
         f = np.geomspace(self.frequency[0], self.frequency[-1], 400)
         measured = 1.0 / self.data.real, self.data.imag / (2.0 * np.pi * self.frequency * EPS0)
         fitted = self.ladder.resistivity(f), self.ladder.permittivity(f)
+        limit, fine = self.kramers_kronig, {"color": drawing.BLUE, "linewidth": 1.4}
+        rough = {"color": drawing.VERMILION, "linewidth": 1.0, "label": "any material"}
         for ax, points, line in zip(axes, measured, fitted, strict=False):
             ax.loglog(self.frequency, points, "o", color=drawing.GREY, markersize=2.5, label="data")
             ax.loglog(f, line, label=f"ladder of {len(self.ladder.poles)} poles", **fine)
         axes[2].semilogx(self.frequency, 100.0 * self.misfit, label="ladder", **fine)
-        axes[2].semilogx(
-            limit.frequency, 100.0 * limit.misfit, "--", color=drawing.VERMILION, linewidth=1.0, label="any material"
-        )  # fmt: skip
+        axes[2].semilogx(limit.frequency, 100.0 * limit.misfit, "--", **rough)
         for ax, label in zip(axes, ("Resistivity [Ω m]", "Relative permittivity", "Misfit [%]"), strict=True):
             drawing.dress(ax, label, "Frequency [Hz]")
         for ax in (axes[0], axes[2]):
-            ax.legend(fontsize=small, frameon=False)
-        drawing.caption(
-            figure,
-            f"misfit {100.0 * self.rms:.2g} % rms; no causal and passive material is nearer than "
-            f"{100.0 * limit.rms:.2g} % rms",
-        )
+            ax.legend(fontsize=drawing.FONT - 0.5, frameon=False)
+        nearest = f"no causal and passive material is nearer than {100.0 * limit.rms:.2g} % rms"
+        drawing.caption(figure, f"misfit {100.0 * self.rms:.2g} % rms; {nearest}")
         return figure
 
 
@@ -360,11 +344,10 @@ def fit_material(
         allowed = "rows of f, rho, eps_r"
         require(table.ndim == 2 and table.shape[1] == 3, "material data", f"of shape {table.shape}", allowed)
         require(table.shape[0] >= 3, "material data", f"{table.shape[0]} rows", "three frequencies or more")
-        for column, name in zip(table.T, COLUMNS, strict=True):
-            bad = np.flatnonzero(~((column >= _LEAST) & (column <= _MOST)))
-            if bad.size:
-                allowed = f"more than 0, from {_LEAST:g} to {_MOST:g}"
-                raise InputError(f"{name} in row {bad[0] + 1} is {column[bad[0]]:g}; allowed: {allowed}")
+        bad = np.argwhere(~((table.T >= _LEAST) & (table.T <= _MOST)))
+        if bad.size:
+            (column, row), allowed = bad[0], f"more than 0, from {_LEAST:g} to {_MOST:g}"
+            raise InputError(f"{COLUMNS[column]} in row {row + 1} is {table[row, column]:g}; allowed: {allowed}")
         table = table[np.argsort(table[:, 0])]
         require(bool(np.all(np.diff(table[:, 0]) > 0.0)), "frequencies", "repeated", "each once")
         f, y = _admittivity(table)
@@ -403,8 +386,8 @@ def _doubt(table: FloatArray, found: Consistency) -> str:
     if found.rms <= NOTABLE and not course:
         return ""
     slips = []
-    for text, meant in _SLIPS:
-        other = meant(table)
+    for text, order, power, factors in _SLIPS:
+        other = table[:, order] ** (1.0, power, 1.0) * factors
         other = other[np.argsort(other[:, 0])]
         if np.all(np.diff(other[:, 0]) > 0.0):
             slips.append((_consistency(*_admittivity(other)).rms, text))
@@ -455,10 +438,8 @@ def _fit(f: FloatArray, y: ComplexArray, count: int) -> tuple[Ladder, FloatArray
         missing = "conductivity at zero frequency" if x[0] <= 0.0 else "eps_inf"
         raise InputError(f"the data leave no {missing} above 0 with {count} poles; allowed: fewer poles, or more data")
     kept = x[2:] > 0.0
-    ladder = Ladder(
-        float(x[0]), float(x[1] / EPS0), tuple(map(float, poles[kept])), tuple(map(float, x[2:][kept]))
-    )  # fmt: skip
-    return ladder, np.abs(left)
+    weights = x[2:][kept]
+    return Ladder(float(x[0]), float(x[1] / EPS0), tuple(poles[kept].tolist()), tuple(weights.tolist())), np.abs(left)
 
 
 def _consistency(f: FloatArray, y: ComplexArray) -> Consistency:

@@ -1,7 +1,4 @@
-"""Least squares in the logarithms of a circuit's parameters: their bounds, and the way from a start.
-
-What every fit reports: parameters with intervals, correlations, profiles, and what the data cannot tell.
-"""
+"""One fit: measured columns, least squares in the logarithms of a circuit's parameters, and what is reported."""
 
 from __future__ import annotations
 
@@ -9,63 +6,117 @@ import itertools
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray
+from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.numerics.modes import AT, derivative
 from fingerspice.results.outcome import SolveError
+from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_columns
 
 if TYPE_CHECKING:
     from fingerspice.plots.picture import Drawn, Picture
 
+#: One set of measured columns, or the path of a table.
+Given = Mapping[str, ArrayLike] | str | Path
+#: What a name in a header means, with all names of the header beside it: the column's key, the key of the column whose
+#: unit it has (of a standard deviation that of the values, else its own), and this unit, or None where none is known.
+Meaning = Callable[[str, Sequence[str]], tuple[str, str, str | None]]
+SIGMA = "sigma"
+_PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
+#: Columns (n,) in SI units or, of a circuit's parameters, those of the netlist; where they come from, as subject of a
+#: message; and the name of every measurement's group, by the column that tells it.
+Measured = tuple[dict[str, FloatArray], str, dict[str, tuple[str, ...]]]
+
+
+def measured_of(
+    given: Given, meaning: Meaning, example: str, by: str | None = None, place: str = "the data"
+) -> Measured:
+    """The columns that a caller gave, of which `by` tells groups; `example` is a header, `place` names no table."""
+    if isinstance(given, (str, Path)):
+        return _from_table(Path(given), meaning, example, by)
+    if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
+        raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
+    if by is not None and by not in given:
+        raise InputError(f"the data have no column {by!r}, which groups names; they have {', '.join(given)}")
+    columns = {name: real_numbers(f"data column {name!r}", x, "numbers") for name, x in given.items() if name != by}
+    size = max((x.size for x in columns.values()), default=0)
+    for name, x in columns.items():
+        if x.shape not in ((), (size,)):
+            raise InputError(
+                f"data column {name!r} has the shape {x.shape}, others have {size} rows; allowed: as many, or one "
+                "number for all"
+            )
+        bad = np.flatnonzero(~np.isfinite(x))
+        if bad.size:
+            raise InputError(f"data column {name!r} is {x.flat[bad[0]]} in row {bad[0]}; allowed: finite numbers")
+        # A number stands for a column of it.
+        columns[name] = np.broadcast_to(x, size).copy()
+    if by is None:
+        return columns, place, {}
+    cells = np.asarray(given[by])
+    if cells.ndim != 1 or cells.dtype.kind not in "iufU":
+        raise InputError(f"data column {by!r} tells the group; allowed: a text or a number for every measurement")
+    if cells.size != size:
+        raise InputError(f"data column {by!r} has {cells.size} rows, others have {size}; allowed: as many")
+    return columns, place, {by: tuple(x if isinstance(x, str) else f"{x:g}" for x in cells.tolist())}
+
+
+def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> Measured:
+    table = read_text_columns(checked_file(path, MAX_TEXT_BYTES), by)
+    if not table.names:
+        raise InputError(f"'{path}' has no header; allowed: names with units, such as {example}")
+    found, units, of_share = dict[str, FloatArray](), dict[str, str](), dict[str, str]()
+    groups = dict[str, tuple[str, ...]]()
+    for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
+        if by is not None and name.lower() == by.lower():
+            groups[by] = tuple(table.words[int(number)] for number in table.numbers(i))
+            continue
+        key, values, base = meaning(name, table.names)
+        if key in found:
+            raise InputError(f"'{path}' has two columns {name!r}; allowed: one")
+        if key != values and unit == "%":
+            of_share[key], base = values, ""
+        # The prefix of an area is squared with its unit.
+        power = 2 if base == "m^2" else 1
+        known = {prefix + base: factor**power for prefix, factor in _PREFIXES.items()} if base else {"%": 0.01}
+        known |= {"": 1.0} | (dict.fromkeys(("mm2", "mm²"), 1e-6) if power == 2 else {})
+        if base is not None and unit not in known:
+            scaled = ", with k, m, u or n before it where need be" if base else ""
+            raise InputError(f"'{path}': the unit of column {name!r} is {unit!r}; allowed: {base or 'none'}{scaled}")
+        found[key], units[key] = table.numbers(i) * (1.0 if base is None else known[unit]), unit
+    for key, values in of_share.items():
+        # Beside values in % (a friction coefficient), a standard deviation in % is of their unit, and no share of them.
+        if units.get(values, "%") != "%":
+            found[key] = found[key] * np.abs(found[values])
+    return found, f"the data in '{path}'", groups
+
+
+# Least squares
+
 #: What data that cannot be predicted are off by, over their scale.
 REFUSED = 1e6
+#: An objective from here on is of such data.
+NOT_FOUND = 0.5 * REFUSED**2
 # Error of the least squares' last step, relative; and the largest number of evaluations, and of refused ones.
 _CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
 # Step of the differences in a parameter's logarithm, at which those of fourth order are exact to rounding.
 _STEP = 1e-3
-# A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
-_FARTHEST = 1e3
+#: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
+FARTHEST = 1e3
 # Singular values of the derivatives below this share of the largest are rounding.
 _LEAST = 1e-9
 # Residuals this unlikely by noise of the given sigma are named.
 _UNLIKELY = 1e-3
-
-
-def bounded(
-    circuit: Circuit, paths: Sequence[str], count: int, given: Mapping[str, tuple[float, float]]
-) -> tuple[Circuit, FloatArray]:
-    """The circuit to start from, and smallest and largest values, shape (n_parameter, 2): 0 and infinity by default.
-
-    A start outside its bounds moves to the nearer one, with a warning. Fewer data (`count`) than `paths` are refused.
-    """
-    if count < len(paths):
-        raise InputError(f"{count} data cannot tell {len(paths)} parameters; allowed: at least as many data")
-    for path in given:
-        if path.lower() not in map(str.lower, paths):
-            raise InputError(f"bounds names {path}, which is not fitted; allowed: {', '.join(paths)}")
-    lower, out = {path.lower(): tuple(pair) for path, pair in given.items()}, []
-    for path in paths:
-        pair = lower.get(path.lower(), (0.0, math.inf))
-        if len(pair) != 2 or not 0.0 <= pair[0] < pair[1]:
-            raise InputError(f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
-        value = circuit.parameters[path].value
-        moved = min(max(value, pair[0]), pair[1])
-        if moved != value:
-            said = f"{path} is {value:g}, outside its bounds {pair[0]:g} to {pair[1]:g}: it starts at {moved:g}"
-            warnings.warn(said, FingerspiceWarning, stacklevel=3)
-            circuit = circuit.varied({path: moved})
-        out.append(pair)
-    return circuit, np.array(out, float)
 
 
 @dataclass(frozen=True)
@@ -75,8 +126,9 @@ class Problem:
     circuit: Circuit  # With the values to start from
     names: tuple[str, ...]  # What is fitted: paths, with the group in brackets where a parameter has a value in each
     paths: tuple[str, ...]  # The path of each
-    bounds: FloatArray  # (n_parameter, 2): Smallest and largest values
     scale: FloatArray  # (n,): By which residuals are divided
+    #: (n_parameter, 2): Smallest and largest values, 0 and infinity by default; made by `begun`
+    bounds: FloatArray = field(default_factory=lambda: np.empty((0, 2)), kw_only=True)
 
     @property
     def initial(self) -> FloatArray:
@@ -84,13 +136,16 @@ class Problem:
         return np.array([self.circuit.parameters[path].value for path in self.paths])
 
     @property
-    def walls(self) -> FloatArray:
-        """Bounds also where none are given, far from the start: there are no likely values, and slow runs."""
-        (low, high), near, far = self.bounds.T, self.initial / _FARTHEST, self.initial * _FARTHEST
-        return np.column_stack([np.where(low > 0.0, low, near), np.where(high < math.inf, high, far)])
+    def box(self) -> FloatArray:
+        """The bounds within which is searched, shape (n_parameter, 2)."""
+        return self.bounds
 
     def misses(self, values: FloatArray) -> FloatArray:
         """Residuals over their scale, shape (n,)."""
+        raise NotImplementedError
+
+    def remedy(self, names: tuple[str, ...]) -> str:
+        """What would tell one parameter, or two apart."""
         raise NotImplementedError
 
     def compared(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -109,16 +164,35 @@ class Problem:
         except (InputError, SolveError):
             return np.full(self.scale.size, REFUSED), np.zeros((self.scale.size, values.size))
 
-    def profiled(self, wanted: bool | Sequence[str]) -> list[str]:
-        """The names whose profiles are wanted, in the circuit's own spelling."""
-        if isinstance(wanted, bool):
-            return list(self.names) if wanted else []
+    def begun(
+        self, bounds: Mapping[str, tuple[float, float]], profiles: bool | Sequence[str]
+    ) -> tuple[Self, Sequence[str]]:
+        """With bounds as given, and a start moved into them; and the names whose profiles are wanted, as they are."""
+        if self.scale.size < len(self.paths):
+            allowed = "at least as many data"
+            raise InputError(f"{self.scale.size} data cannot tell {len(self.paths)} parameters; allowed: {allowed}")
+        lower, circuit, box = {path.lower(): tuple(pair) for path, pair in bounds.items()}, self.circuit, []
+        for path in bounds:
+            if path.lower() not in map(str.lower, self.paths):
+                raise InputError(f"bounds names {path}, which is not fitted; allowed: {', '.join(self.paths)}")
+        for path in self.paths:
+            pair = lower.get(path.lower(), (0.0, math.inf))
+            if len(pair) != 2 or not 0.0 <= pair[0] < pair[1]:
+                raise InputError(f"bounds of {path} are {pair}; allowed: two values with 0 <= low < high")
+            value = circuit.parameters[path].value
+            moved = min(max(value, pair[0]), pair[1])
+            if moved != value:
+                said = f"{path} is {value:g}, outside its bounds {pair[0]:g} to {pair[1]:g}: it starts at {moved:g}"
+                warnings.warn(said, FingerspiceWarning, stacklevel=3)
+                circuit = circuit.varied({path: moved})
+            box.append(pair)
         known = {name.lower(): name for name in self.names}
+        wanted = ([*known] if profiles else []) if isinstance(profiles, bool) else profiles
         for name in wanted:
             if not isinstance(name, str) or name.lower() not in known:
                 allowed = ", ".join(self.names)
                 raise InputError(f"profiles names {name!r}, which is not fitted; allowed: True, or {allowed}")
-        return [known[name.lower()] for name in wanted]
+        return replace(self, circuit=circuit, bounds=np.array(box, float)), [known[name.lower()] for name in wanted]
 
 
 class Fitted(NamedTuple):
@@ -132,17 +206,9 @@ class Fitted(NamedTuple):
     closed: bool
 
     @property
-    def found(self) -> bool:
-        """Whether the data can be predicted with these values."""
-        return self.objective < 0.5 * REFUSED**2
-
-    @property
     def covariance(self) -> FloatArray:
-        """Covariance of the logarithms of the parameters, for residuals of variance 1.
-
-        Combinations of parameters that no datum feels have a large variance, and not an infinite one, of which no
-        correlation would be known.
-        """
+        """Covariance of the logarithms of the parameters, for residuals of variance 1."""
+        # What no datum feels has a large variance, and not an infinite one, of which no correlation would be known.
         _, singular, right = np.linalg.svd(self.by_log, full_matrices=False)
         spread = 1.0 / np.maximum(singular, _LEAST * max(float(singular.max()), 1e-300))
         return np.asarray((right.T * spread**2) @ right)
@@ -265,6 +331,52 @@ class FitResult(Shown):
     notes: tuple[str, ...]
     profiles: dict[str, Profile] = field(default_factory=dict)
 
+    @classmethod
+    def _reported(
+        cls, task: Problem, best: Fitted, variance: Any, half: Any, more: Sequence[str], profiles: Sequence[str],
+        **own: Any,
+    ) -> Self:  # fmt: skip
+        """What the best fit tells, with what is a kind's `own`.
+
+        `variance` is that of the residuals over their scale, and `half` half an interval over a standard error of the
+        logarithm, for all parameters or each; `more` are further notes.
+        """
+        covariance, estimates, notes, rooms = best.covariance, dict[str, Estimate](), list[str](), dict[str, float]()
+        spread = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(spread, spread)
+        error = np.sqrt(np.diag(covariance) * variance).tolist()
+        rows = zip(
+            task.names, task.paths, task.box, task.initial.tolist(), best.values.tolist(), error,
+            *(np.broadcast_to(x, spread.shape).tolist() for x in (variance, half)), strict=True,
+        )  # fmt: skip
+        for name, path, box, start, value, off, square, far in rows:
+            at_bound = bool(np.any(np.abs(value / box[np.isfinite(box) & (box > 0.0)] - 1.0) < _AT_BOUND))
+            ratio = math.exp(far * off) if far * off < _NO_END else math.inf
+            # Of chi squared and F with one degree of freedom, quantiles are the squares of those of the normal
+            # distribution and of Student's (Bates and Watts, Nonlinear regression analysis, 1988, section 6.1).
+            unit, rooms[name] = task.circuit.parameters[path].unit, square * far**2
+            estimates[name] = Estimate(name, unit, value, start, value * off, value / ratio, value * ratio, at_bound)
+            if at_bound:
+                told = f"{value:g} {unit}".rstrip()
+                notes.append(f"{name} is at its bound, {told}: its interval is not that of a free parameter.")
+        for (i, a), (j, b) in itertools.combinations(enumerate(task.names), 2):
+            if abs(correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
+                notes.append(
+                    f"{a} and {b} are not told apart (correlation {correlation[i, j]:+.4f}): they change these data in "
+                    f"almost the same way, and only a combination of both is known. {task.remedy((a, b))}"
+                )
+        named = " ".join(notes)
+        notes += [
+            f"Of {name} these data tell next to nothing: its error is larger than itself. {task.remedy((name,))}"
+            for name, off in zip(task.names, error, strict=True)
+            if not off < _UNKNOWN and name not in named
+        ]
+        return cls(
+            estimates=estimates, correlation=correlation, objective=best.objective, count=best.residual.size,
+            evaluations=best.evaluations, closed=best.closed, notes=(*notes, *more),
+            profiles={name: _profile_of(task, best, estimates[name], rooms[name]) for name in profiles}, **own,
+        )  # fmt: skip
+
     def _panels(self) -> list[Drawn]:
         raise NotImplementedError
 
@@ -346,58 +458,17 @@ class FitResult(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as plain numbers and texts; `parameters` has a row for each."""
+        profiles = [{name: np.asarray(x).tolist() for name, x in vars(one).items()} for one in self.profiles.values()]
         return {
             "parameters": [vars(e) for e in self.estimates.values()],
             "correlation": self.correlation.tolist(),
             "objective": self.objective,
             "notes": list(self.notes),
-            "profiles": [
-                {name: np.asarray(x).tolist() for name, x in vars(one).items()} for one in self.profiles.values()
-            ],
+            "profiles": profiles,
         }
 
 
-def estimated(
-    task: Problem, best: Fitted, error: FloatArray, reach: FloatArray,
-    remedy: Callable[[tuple[str, ...]], str], more: Sequence[str],
-) -> dict[str, Any]:  # fmt: skip
-    """Fields of a `FitResult` from the best fit.
-
-    `error` has the standard errors of the logarithms and `reach` how many of them half an interval is; `remedy` says of
-    one or two parameters what would tell them, and `more` are further notes.
-    """
-    estimates, notes = {}, []
-    numbers = (x.tolist() for x in (task.initial, best.values, error, reach))
-    for name, path, box, start, value, off, far in zip(task.names, task.paths, task.bounds, *numbers, strict=True):
-        at_bound = bool(np.any(np.abs(value / box[np.isfinite(box) & (box > 0.0)] - 1.0) < _AT_BOUND))
-        ratio = math.exp(far * off) if far * off < _NO_END else math.inf
-        unit = task.circuit.parameters[path].unit
-        estimates[name] = Estimate(name, unit, value, start, value * off, value / ratio, value * ratio, at_bound)
-        if at_bound:
-            own = f"{value:g} {unit}".rstrip()
-            notes.append(f"{name} is at its bound, {own}: its interval is not that of a free parameter.")
-    covariance = best.covariance
-    spread = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(spread, spread)
-    for (i, a), (j, b) in itertools.combinations(enumerate(task.names), 2):
-        if abs(correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
-            notes.append(
-                f"{a} and {b} are not told apart (correlation {correlation[i, j]:+.4f}): they change these data in "
-                f"almost the same way, and only a combination of both is known. {remedy((a, b))}"
-            )
-    named = " ".join(notes)
-    notes += [
-        f"Of {name} these data tell next to nothing: its error is larger than itself. {remedy((name,))}"
-        for name, off in zip(task.names, error.tolist(), strict=True)
-        if not off < _UNKNOWN and name not in named
-    ]
-    return {
-        "estimates": estimates, "correlation": correlation, "objective": best.objective, "count": best.residual.size,
-        "evaluations": best.evaluations, "closed": best.closed, "notes": (*notes, *more),
-    }  # fmt: skip
-
-
-def profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profile:
+def _profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profile:
     """The profile of a parameter; in its interval the objective is at most by `room` worse than the best."""
     from scipy.optimize import brentq
 
@@ -427,10 +498,10 @@ def profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profi
         return math.sqrt(max(look(here + sign * far) - best.objective, 0.0)) - math.sqrt(limit - best.objective)
 
     ends, opened = [], []
-    for sign, word, bound in zip((-1, 1), ("below", "above"), task.bounds[place].tolist(), strict=True):
+    for sign, word, bound in zip((-1, 1), (" below", " above"), task.bounds[place].tolist(), strict=True):
         begin = np.delete(best.values, place)
         with np.errstate(divide="ignore"):
-            farthest = min(math.log(_FARTHEST), abs(float(np.log(bound)) - here))
+            farthest = min(math.log(FARTHEST), abs(float(np.log(bound)) - here))
         near, far = 0.0, min(max(1.5 * error, 1e-6), 0.5, farthest)
         while look(here + sign * far) <= limit and far < farthest:
             near, far = far, min(_GROWTH * far, farthest)
@@ -442,7 +513,7 @@ def profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profi
             ends.append(math.exp(here + sign * away))
     low, high = ends
     if opened:
-        shape = "open" if len(opened) == 2 else f"open {opened[0]}"
+        shape = "open" + ("" if len(opened) == 2 else opened[0])
     else:
         reach = here - math.log(low), math.log(high) - here
         shape = "skewed" if max(reach) > _SKEWED * min(reach) else "symmetric"
