@@ -32,7 +32,6 @@ from fingerspice.studies.batch.form import (
     checked_scenes,
     gradients_of,
     lockstep_form,
-    task_of,
     why_alone,
 )
 from fingerspice.studies.batch.ladder import Ladder, Slopes
@@ -123,7 +122,7 @@ def batch(
     require(device in ("cpu", "cuda"), "device", repr(device), "'cpu' or 'cuda'")
     if device == "cuda":
         require_card()
-    task = task_of(circuit, outputs, rtol, t_stop, periods, periodic, points, device)
+    task = Task(circuit, outputs, rtol, t_stop, periods, periodic, points, device)
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
     if threads is not None:
         threads = whole_number("threads", threads, 1)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -53,39 +54,57 @@ _CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
 _LEAST_RTOL_OF_SLOPES = 5e-7
 
 
-@dataclass
 class Task:
-    """A checked request, whose attributes are arguments of `batch`, and what is found.
+    """A request, which is checked, and what is found; most attributes are arguments of `batch`.
 
     One of `t_stop` and `periods` is given. It asks for its outputs, or, if it has `paths`, for the derivatives of its
     outputs, which are means.
     """
 
-    circuit: Circuit
-    outputs: tuple[str, ...]
-    rtol: float
-    t_stop: float | None
-    periods: float | None
-    periodic: bool
-    points: int
-    device: str  # Gap voltages stay on the processor
-    scenes: dict[str, FloatArray] = field(default_factory=dict)  # Values by path, (n,) each
-    # The parameters by which the means are to be differentiated, in the circuit's own spelling, each with those that
-    # grow in proportion to it: the frequency of a source with that of a skin
-    paths: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    clock: str | None = None  # The frequency of the only source, if it is one of `paths`
+    scenes: dict[str, FloatArray]  # Values by path, (n,) each
     # What is found: (n,) each, (n, n_parameter) of derivatives, or (n, width) of gap voltages, which become NaN last; a
     # scene without a result has NaN
-    values: dict[str, FloatArray] = field(default_factory=dict)
-    error: FloatArray = field(init=False)  # (n,): Stated error, of outputs relative to themselves
-    status: NDArray[np.int8] = field(init=False)  # (n,): Index into `STATUS_NAMES`, and -1 before there are results
-    messages: dict[int, str] = field(default_factory=dict)  # Of the scenes without a result
-    ordinary: str = ""  # Why some scenes were not in lockstep
+    values: dict[str, FloatArray]
+    error: FloatArray  # (n,): Stated error, of outputs relative to themselves
+    status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`, and -1 before there are results
+    messages: dict[int, str]  # Of the scenes without a result
+    ordinary: str  # Why some scenes were not in lockstep
 
-    @property
-    def traced(self) -> bool:
-        """Whether gap voltages are wanted."""
-        return "u_gap" in self.outputs
+    def __init__(
+        self, circuit: Circuit, outputs: Sequence[str], rtol: float, t_stop: float | None, periods: float | None,
+        periodic: bool, points: int, device: str,
+    ) -> None:  # fmt: skip
+        self.circuit, self.periodic = circuit, periodic
+        self.rtol, self.points = rtol_given(rtol, LEAST_RTOL), whole_number("points", points, 2)
+        require(self.points % 2 == 0, "points", self.points, "an even number, 2 or more")
+        self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+        for name in self.outputs:
+            if name not in ("u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)):
+                kinds = ", ".join(f"_{kind}" for kind in _KINDS)
+                signals = ", ".join(SIGNALS_OF_BATCH)
+                raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
+        require(len(self.outputs) > 0, "outputs", "empty", "one or more names")
+        # Gap voltages stay on the processor.
+        self.traced = "u_gap" in self.outputs
+        self.device = "cpu" if self.traced else device
+        if periods is not None and t_stop is not None:
+            raise InputError("t_stop and periods are both given; allowed: one of them")
+        self.t_stop = None if t_stop is None else positive_number("t_stop", t_stop, "s")
+        self.periods = None if periods is None else positive_number("periods", periods)
+        if periodic and (periods is not None or t_stop is not None):
+            raise InputError("periodic=True takes one period, and t_stop or periods is given; allowed: neither")
+        if periodic:
+            self.periods = 1.0
+        elif periods is None and t_stop is None:
+            if circuit.tran is None:
+                raise InputError(
+                    "no t_stop: the deck has no .tran line and none was given; give t_stop in s, or periods"
+                )
+            self.t_stop = circuit.tran.stop
+        # The parameters by which the means are to be differentiated, in the circuit's own spelling, each with those
+        # that grow in proportion to it: the frequency of a source with that of a skin
+        self.paths: dict[str, tuple[str, ...]] = {}
+        self.clock: str | None = None  # The frequency of the only source, if it is one of `paths`
 
     @property
     def n(self) -> int:
@@ -100,6 +119,7 @@ class Task:
     def begin(self, values: dict[str, FloatArray]) -> None:
         """Take these arrays for the values; no scene is done."""
         self.values, self.error, self.status = values, np.full(self.n, np.nan), np.full(self.n, -1, np.int8)
+        self.messages, self.ordinary = {}, ""
 
     def count(self, frequency: FloatArray) -> FloatArray:
         """Number of periods in runs with sources of these frequencies (Hz)."""
@@ -123,34 +143,6 @@ class Task:
                              "frequency follow it, or several of fixed frequencies in a ratio of whole "
                              "numbers")  # fmt: skip
         return np.full(self.n, 1.0 / period)
-
-
-def task_of(
-    circuit: Circuit, outputs: Sequence[str], rtol: float, t_stop: float | None, periods: float | None, periodic: bool,
-    points: int, device: str,
-) -> Task:  # fmt: skip
-    """The checked request, without scenes; arguments as of `batch`."""
-    rtol, points = rtol_given(rtol, LEAST_RTOL), whole_number("points", points, 2)
-    require(points % 2 == 0, "points", points, "an even number, 2 or more")
-    outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    for name in outputs:
-        if name not in ("u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)):
-            kinds = ", ".join(f"_{kind}" for kind in _KINDS)
-            signals = ", ".join(SIGNALS_OF_BATCH)
-            raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
-    require(len(outputs) > 0, "outputs", "empty", "one or more names")
-    if periods is not None and t_stop is not None:
-        raise InputError("t_stop and periods are both given; allowed: one of them")
-    t_stop = None if t_stop is None else positive_number("t_stop", t_stop, "s")
-    periods = None if periods is None else positive_number("periods", periods)
-    if periodic and (periods is not None or t_stop is not None):
-        raise InputError("periodic=True takes one period, and t_stop or periods is given; allowed: neither")
-    if periods is None and t_stop is None and not periodic:
-        if circuit.tran is None:
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s, or periods")
-        t_stop = circuit.tran.stop
-    periods, device = 1.0 if periodic else periods, "cpu" if "u_gap" in outputs else device
-    return Task(circuit, outputs, rtol, t_stop, periods, periodic, points, device)
 
 
 def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
@@ -244,8 +236,10 @@ def gradients_of(task: Task, gradients: Sequence[str], skin: str) -> Task | None
             raise InputError(f"skin='follow', and gradients names {path}, with which the skin's frequency changes; "
                              "allowed: the frequency of the only source, or skin='own'")  # fmt: skip
     together = {path: (path, *(skins if path == clock else ())) for path in paths}
-    return replace(task, outputs=outputs, scenes=scenes, paths=together, clock=clock if clock in paths else None,
-                   messages={})  # fmt: skip
+    asked = copy(task)
+    asked.outputs, asked.traced, asked.scenes, asked.paths = outputs, False, scenes, together
+    asked.clock = clock if clock in paths else None
+    return asked
 
 
 @dataclass(frozen=True)
