@@ -18,8 +18,8 @@ from scenes import cases, table1
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 OUTPUTS = ("f_el_mean", "f_el_mean_periodic", "f_t_rms", "u_gap_rms")
 # A loop is compiled, in ten seconds, for every number of modes, tones, moments and powers of the area's polynomial, of
-# which there are 8 at first, below an rtol of 5e-5 16, and below 5e-7 24. So one sine and squares mostly go without root
-# mean squares, for which three moments are followed instead of one.
+# which there are 8 at first, below an rtol of 5e-5 16, and below 5e-7 24. So most tests go without root mean squares,
+# for which three moments are followed instead of one.
 FEW = OUTPUTS[: cases(4, 2)]
 
 
