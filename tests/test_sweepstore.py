@@ -26,7 +26,7 @@ from scipy import stats
 import fingerspice as fs
 from commands import Command, tree
 from fingerspice.studies.sweep import chunks
-from fingerspice.studies.sweep.populations import Draws, make_plan
+from fingerspice.studies.sweep.populations import Draws, Plan
 from processes import forked, no_room_here
 from scenes import cases
 
@@ -56,6 +56,16 @@ def circuit() -> fs.Circuit:
 @pytest.fixture(autouse=True)
 def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chunks, "CHUNK", 64)
+
+
+@pytest.fixture(scope="module")
+def _forked_workers() -> Iterator[None]:
+    """Workers are forks of one process that has imported what they need; those of `SCRIPT` start as a user's do."""
+    utils = pytest.importorskip("distributed.utils")
+    with pytest.importorskip("dask").config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        # Dask's own list, which it sets first, is without this package.
+        utils.get_mp_context().set_forkserver_preload(["distributed", "scipy.stats", "xarray", chunks.__name__])
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +121,7 @@ def killing(pids: Callable[[], list[int]], store: Path, most: int) -> Iterator[l
 
 
 def test_draws_in_parts_are_those_of_the_whole(circuit: fs.Circuit) -> None:
-    plan = make_plan(circuit, PARAMETERS, 1 << 14, 5, 1 << 30)
+    plan = Plan(circuit, PARAMETERS, 1 << 14, 5, 1 << 30)
     draws = plan.quantiles(stats.qmc.Sobol(2, scramble=True, bits=30, rng=5).random(plan.n))
     for count in (1 << 9, 1 << 14):
         parts = [Draws(plan, count).part(i) for i in range(plan.n // count)]
@@ -168,6 +178,7 @@ def test_a_single_set_of_parameters_goes_into_a_store(circuit: fs.Circuit, tmp_p
     assert (done.code, done.lines) == (0, [])
 
 
+@pytest.mark.usefixtures("_forked_workers")
 def test_workers_that_are_killed_again_and_again_cost_nothing(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path
 ) -> None:
@@ -185,7 +196,7 @@ def test_workers_that_are_killed_again_and_again_cost_nothing(
 
 
 @pytest.fixture
-def _given_up_at_once() -> Iterator[None]:
+def _given_up_at_once(_forked_workers: None) -> Iterator[None]:
     """A scheduler gives up a chunk with the first worker that is lost with it."""
     # Its own settings come with it.
     pytest.importorskip("distributed")
@@ -236,11 +247,12 @@ def test_a_chunk_that_costs_its_worker_is_named_and_the_others_are_in_the_store(
 
 SCRIPT = """
 import sys
-import fingerspice as fs
-import test_sweepstore as here
-from fingerspice.studies.sweep import chunks
 
 if __name__ == "__main__":
+    import fingerspice as fs
+    import test_sweepstore as here
+    from fingerspice.studies.sweep import chunks
+
     chunks.CHUNK = 64
     circuit = fs.read_netlist(here.CIRCUITS / "fingerpad.cir")
     fs.sweep(circuit, here.PARAMETERS, store=sys.argv[1], workers=1, **here.HOW)
@@ -300,6 +312,7 @@ def cluster_of(workers: int, processes: bool) -> Any:
     )  # fmt: skip
 
 
+@pytest.mark.usefixtures("_forked_workers")
 def test_dask_workers_that_are_killed_again_and_again_cost_nothing(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -352,14 +365,18 @@ def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
     assert tree(path) == whole
 
 
-def test_a_scheduler_that_does_not_answer_is_refused_within_seconds(circuit: fs.Circuit, tmp_path: Path) -> None:
+def test_a_scheduler_that_does_not_answer_is_refused_within_seconds(
+    circuit: fs.Circuit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("distributed")
+    assert chunks.PATIENCE <= 5.0
+    monkeypatch.setattr(chunks, "PATIENCE", 0.5)
     begun = time.perf_counter()
     for address in ("tcp://127.0.0.1:1", "nowhere"):
         with pytest.raises(fs.InputError, match=f"no scheduler answers at {address}") as told:
             fs.sweep(circuit, PARAMETERS, store=tmp_path / "s.zarr", scheduler=address, **HOW)
         assert "\n" not in str(told.value)
-    assert time.perf_counter() - begun < 15.0
+    assert time.perf_counter() - begun < 15.0 - 2.0 * 4.5
     assert not list(tmp_path.iterdir())
 
 
@@ -477,6 +494,7 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "fingers.toml"
 
 
+@pytest.mark.usefixtures("_forked_workers")
 def test_the_command_fills_a_store_shard_by_shard(file: Path, command: Command) -> None:
     store = file.parent / "o.zarr"
     words = ("sweep", str(file), "--store", str(store))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, whole_number
+from fingerspice.base.arrays import FloatArray, IntArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit, scenes_warnings
@@ -27,18 +27,14 @@ from fingerspice.studies.batch.form import (
     REFUSED,
     SIGNALS_OF_BATCH,
     STATUS_NAMES,
-    Answers,
-    Gradients,
     LockstepForm,
     Task,
     checked_scenes,
-    frequencies,
     gradients_of,
     lockstep_form,
-    task_of,
     why_alone,
 )
-from fingerspice.studies.batch.ladder import Figures, Ladder, Slopes
+from fingerspice.studies.batch.ladder import Ladder, Slopes
 from fingerspice.studies.steady import SteadyState, steady_state
 from fingerspice.waveforms.waveform import require
 
@@ -126,189 +122,82 @@ def batch(
     require(device in ("cpu", "cuda"), "device", repr(device), "'cpu' or 'cuda'")
     if device == "cuda":
         require_card()
-    task = task_of(circuit, outputs, rtol, t_stop, periods, periodic, points, device)
+    task = Task(circuit, outputs, rtol, t_stop, periods, periodic, points, device)
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
     if threads is not None:
         threads = whole_number("threads", threads, 1)
+    elif hasattr(os, "sched_getaffinity"):
+        threads = len(os.sched_getaffinity(0))
     scenes = checked_scenes(circuit, parameters)
-    changed = dict(scenes)
+    task.scenes, skins = dict(scenes), circuit.by_device("SKIN")
     if skin == "follow":
-        frequency = frequencies(circuit, scenes, of_skin=True)
-        for element in circuit.by_device("SKIN"):
+        frequency = task.frequencies(of_skin=True)
+        for element in skins:
             if f"{element.name}.f" in scenes:
                 raise InputError(f"skin='follow' and {element.name}.f are both given; allowed: one of them")
-            changed[f"{element.name}.f"] = frequency
+            task.scenes[f"{element.name}.f"] = frequency
     for text in scenes_warnings(circuit, task.t_stop, scenes, skin):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    asked = gradients_of(task, gradients, scenes, skin)
-    form = lockstep_form(circuit, changed)
-    recorded = isinstance(form, LockstepForm) and form.recording is not None
-    why = why_alone(form, task.outputs)
-    with ThreadPoolExecutor(threads or _processors()) as pool:
-        found = _unfilled(task, changed, recorded)
-        _find(task, changed, why or form, found, pool)
-        slopes = None if asked is None else _slopes(asked, changed, found, pool)
-    about = {
-        "skin": _skin(circuit, scenes, skin), "n_ordinary": found.n_ordinary, "ordinary": found.ordinary,
+    slopes, form = gradients_of(task, gradients, skin), lockstep_form(circuit, task.scenes)
+    why, recorded = why_alone(form, task.outputs), isinstance(form, LockstepForm) and form.recording is not None
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        _begin(task, recorded)
+        _find(task, why or form, pool)
+        if slopes is not None:
+            slopes.begin({name: np.full((task.n, len(slopes.paths)), np.nan) for name in slopes.outputs})
+            slopes.status = np.where(task.status >= REFUSED, task.status, slopes.status)
+            form = lockstep_form(circuit, slopes.scenes)
+            unlike = why_alone(form, slopes.outputs, slopes.rtol)
+            if not unlike and slopes.clock is not None and slopes.t_stop is not None:
+                unlike = f"{slopes.clock} changes the number of periods in t_stop"
+            _find(slopes, unlike or form, pool)
+    said = "the skin's data follow the source's frequency" if skins else "there is no SKIN"
+    if skins and skin == "own":
+        varied = any(path.lower().endswith(".frequency") for path in scenes)
+        held = ", ".join(f"{e.name}.f" for e in skins)
+        said = f"the skin's data are those at its own {held}{', whatever the source frequency is' if varied else ''}"
+    attrs = {
+        "skin": said, "n_ordinary": task.n_ordinary, "ordinary": task.ordinary,
         "device": "cpu" if why or recorded else task.device,
     }  # fmt: skip
-    return _dataset(task if asked is None else asked, scenes, found, slopes, about)
+    return _dataset(task, slopes, scenes, attrs)
 
 
-def _processors() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _unfilled(task: Task, scenes: Mapping[str, FloatArray], recorded: bool) -> Answers:
-    """Answers for the outputs, of which none are found."""
-    n, width = next(iter(scenes.values())).size, 0
+def _begin(task: Task, recorded: bool) -> None:
+    """Take memory for the outputs, none of which is found."""
+    n, width = task.n, 0
     if task.traced or (recorded and task.t_stop is None):
         # Refused for what has no period, such as a recording.
-        count = task.count(frequencies(task.circuit, scenes))
+        count = task.count(task.frequencies())
         width = math.ceil(float(count.max()) * task.points - 1e-9) if task.traced else 0
     require(n * width <= _MOST_VOLTAGES, "outputs", f"of {n * width:.3g} gap voltages", f"at most {_MOST_VOLTAGES:g}")
     # The memory of gap voltages, which is much, is taken by the threads that write them.
-    values = {name: np.empty((n, width)) if name == "u_gap" else np.full(n, np.nan) for name in task.outputs}
-    return Answers.empty(values, n)
+    task.begin({name: np.empty((n, width)) if name == "u_gap" else np.full(n, np.nan) for name in task.outputs})
 
 
-def _slopes(task: Task, scenes: Mapping[str, FloatArray], figures: Answers, pool: ThreadPoolExecutor) -> Answers:
-    """The derivatives that `task` asks for, in all scenes that have `figures`."""
-    wanted, known, n = task.gradients, task.circuit.parameters, figures.error.size
-    assert wanted is not None
-    found = Answers.empty({name: np.full((n, len(wanted.paths)), np.nan) for name in task.outputs}, n)
-    failed = figures.status >= REFUSED
-    found.status[failed] = figures.status[failed]
-    every = {**scenes, **{path: np.full(n, known[path].value) for path in wanted.paths if path not in scenes}}
-    form = lockstep_form(task.circuit, every)
-    why = why_alone(form, task.outputs, task.rtol)
-    if not why and wanted.clock is not None and task.t_stop is not None:
-        why = f"{wanted.clock} changes the number of periods in t_stop"
-    _find(task, every, why or form, found, pool)
-    return found
-
-
-def _find(
-    task: Task, scenes: Mapping[str, FloatArray], form: LockstepForm | str, found: Answers, pool: ThreadPoolExecutor
-) -> None:
-    """Find what `task` asks for in all scenes that are not done; `form` may be why none of them goes in lockstep."""
-    ladder = Figures if task.gradients is None else Slopes
+def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> None:
+    """Find what a task asks for in all scenes that are not done; `form` may be why none of them goes in lockstep."""
+    ladder = Slopes if task.paths else Ladder
     if isinstance(form, LockstepForm):
-        lower = {path.lower(): array for path, array in scenes.items()}
-        recorded = form.recording is not None
-        clock = np.full(found.error.size, form.frequency) if recorded else frequencies(task.circuit, scenes)
-
-        def climb(job: tuple[int, IntArray]) -> None:
-            halves, members = job
-            some = {path: array[members] for path, array in lower.items()}
-            ladder(task, form, some, members, found).climb(halves)
-
         # Jobs have no scene in common, so that threads write to different places.
-        list(pool.map(climb, _jobs(task, task.count(clock), found.status < 0, recorded)))
-    rest = np.flatnonzero(found.status < 0)
+        list(pool.map(lambda job: ladder(task, form, job[1]).climb(job[0]), _jobs(task, form)))
+    rest = np.flatnonzero(task.status < 0)
     if task.traced:
-        found.values["u_gap"][rest] = np.nan
+        task.values["u_gap"][rest] = np.nan
     if rest.size:
-        found.ordinary = form if isinstance(form, str) else ladder.unmet
-        _find_alone(ladder, task, scenes, rest, found, pool)
+        task.ordinary = form if isinstance(form, str) else ladder.unmet
+        _find_alone(task, ladder, rest, pool)
 
 
-def _find_alone(
-    ladder: type[Ladder], task: Task, scenes: Mapping[str, FloatArray], rest: IntArray, found: Answers,
-    pool: ThreadPoolExecutor,
-) -> None:  # fmt: skip
-    """Find what `task` asks for in the scenes `rest`, each by itself."""
-    by_period = (task.periods is not None and not task.periodic) or task.traced
-    frequency = frequencies(task.circuit, scenes) if by_period else np.ones(found.error.size)
-    allowed, finest = ladder.limit * task.rtol, RTOL_RANGE[0]
+def _jobs(task: Task, form: LockstepForm) -> list[tuple[int, IntArray]]:
+    """Jobs of the scenes not done whose runs last for whole numbers of half periods: that number, and the scenes.
 
-    def alone(i: int) -> tuple[int, dict[str, FloatArray]]:
-        rtol = max(_OVER_PEAK * task.rtol, finest)
-        try:
-            circuit = task.circuit.varied({path: float(array[i]) for path, array in scenes.items()})
-            values, error = _run_alone(task, circuit, float(frequency[i]), rtol)
-            if error > allowed and rtol > finest:
-                # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
-                closer = max(0.5 * rtol * allowed / error, finest)
-                values, error = _run_alone(task, circuit, float(frequency[i]), closer)
-        except (InputError, SolveError) as failure:
-            found.status[i] = REFUSED if isinstance(failure, InputError) else FAILED
-            found.messages[i] = f"{ladder.named}{failure}"
-            return i, {}
-        found.error[i], found.status[i] = error, ONE_BY_ONE
-        return i, values
-
-    # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        ran = list(pool.map(alone, rest.tolist()))
-    for i, values in ran:
-        for name, value in values.items():
-            if value.ndim == 1 and found.values[name].ndim == 1:
-                # Several gaps have one column each.
-                found.values[name] = np.full((found.error.size, value.size), np.nan)
-            found.values[name][(i, slice(value.size)) if value.ndim == 1 else i] = value
-
-
-def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
-    """What is wanted of a scene from one run, and its stated error; `frequency` (Hz) is that of its periods."""
-    wanted, stop, t = task.gradients, task.stop(frequency), None
-    paths = () if wanted is None else tuple(dict.fromkeys(p for path in wanted.paths for p in wanted.together[path]))
-    ran: Solution | SteadyState
-    if task.periodic:
-        points = task.points if wanted is None else 4
-        ran = steady_state(circuit, rtol=rtol, points=points, charge=False, sensitivities=paths)
-        trace = ran.solution if task.traced else None
-    else:
-        if wanted is not None:
-            t = np.array([stop])
-        elif task.traced:
-            t = np.arange(math.ceil(stop * frequency * task.points - 1e-9)) / (frequency * task.points)
-        ran = trace = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False, sensitivities=paths)
-    # Largest of the errors of the gap voltage relative to its peak, and of the force relative to its mean.
-    pairs = (ran.error.u_gap, ran.u_gap_peak), (ran.error.f_el, ran.f_el_mean)
-    sizes = [(off, 0.0 if size is None else float(np.min(size))) for off, size in pairs]
-    error = max((off / size for off, size in sizes if size > 0.0), default=0.0)
-    if wanted is not None:
-        # The error of a change by all of the parameter is about ten times that of the run.
-        return {name: _slopes_of(task, wanted, circuit, ran, name, stop) for name in task.outputs}, Slopes.limit * error
-    values = {}
-    for name in task.outputs:
-        if name == "u_gap":
-            assert trace is not None
-            u = np.asarray(trace.u_gap)
-            values[name] = u[:-1] if task.periodic else u
-            continue
-        signal = next(s for s in SIGNALS_OF_BATCH if name.startswith(f"{s}_"))
-        value = ran._figures.value(signal, name[len(signal) + 1 :])
-        values[name] = np.asarray(math.nan if value is None else value, float)
-    return values, error
-
-
-def _slopes_of(
-    task: Task, wanted: Gradients, circuit: Circuit, ran: Solution | SteadyState, name: str, stop: float
-) -> FloatArray:
-    """Derivatives of a mean by the parameters `wanted`."""
-    known = circuit.parameters
-    # For a change of each parameter by all of itself.
-    each = {path: getattr(one, name) * known[path].value for path, one in ran.sensitivities.items()}
-    by = [sum(each[other] for other in wanted.together[path]) for path in wanted.paths]
-    if wanted.clock is not None and task.periods is not None and isinstance(ran, Solution):
-        # The run ends after a number of periods: its end moves with the frequency, and the mean with its end.
-        start = circuit.tran.start if circuit.tran is not None else 0.0
-        gained = float(getattr(ran, name.removesuffix("_mean"))[-1]) - float(getattr(ran, name))
-        by[wanted.paths.index(wanted.clock)] -= gained * stop / (stop - start)
-    return np.array([x / known[path].value for x, path in zip(by, wanted.paths, strict=True)])
-
-
-def _jobs(task: Task, count: FloatArray, chosen: BoolArray, recorded: bool) -> list[tuple[int, IntArray]]:
-    """Jobs of the `chosen` scenes whose runs last for whole numbers of half periods: that number, and the scenes.
-
-    `count` (n,) is the number of periods in every run. Under a recording (`recorded`) half a period is a sample.
+    Under a recording half a period is a sample.
     """
+    recorded = form.recording is not None
+    count = task.count(np.full(task.n, form.frequency) if recorded else task.frequencies())
     halves = np.round(2.0 * count)
-    good = chosen & (halves >= 1.0) & (np.abs(2.0 * count - halves) <= _WHOLE * halves)
+    good = (task.status < 0) & (halves >= 1.0) & (np.abs(2.0 * count - halves) <= _WHOLE * halves)
     if any(name.endswith("_periodic") for name in task.outputs):
         good &= halves >= 2.0
     jobs = []
@@ -321,27 +210,110 @@ def _jobs(task: Task, count: FloatArray, chosen: BoolArray, recorded: bool) -> l
     return jobs
 
 
-def _dataset(
-    task: Task, scenes: Mapping[str, FloatArray], found: Answers, slopes: Answers | None, attrs: dict[str, Any]
-) -> Dataset:
-    """The answers with their coordinates and units."""
+def _find_alone(task: Task, ladder: type[Ladder], rest: IntArray, pool: ThreadPoolExecutor) -> None:
+    """Find what a task asks for in the scenes `rest`, each by itself."""
+    by_period = (task.periods is not None and not task.periodic) or task.traced
+    frequency = task.frequencies() if by_period else np.ones(task.n)
+    allowed, finest = ladder.limit * task.rtol, RTOL_RANGE[0]
+
+    def alone(i: int) -> dict[str, FloatArray]:
+        rtol = max(_OVER_PEAK * task.rtol, finest)
+        try:
+            circuit = task.circuit.varied({path: float(array[i]) for path, array in task.scenes.items()})
+            values, error = _run_alone(task, circuit, float(frequency[i]), rtol)
+            if error > allowed and rtol > finest:
+                # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
+                closer = max(0.5 * rtol * allowed / error, finest)
+                values, error = _run_alone(task, circuit, float(frequency[i]), closer)
+        except (InputError, SolveError) as failure:
+            task.status[i] = REFUSED if isinstance(failure, InputError) else FAILED
+            task.messages[i] = f"{ladder.named}{failure}"
+            return {}
+        task.error[i], task.status[i] = error, ONE_BY_ONE
+        return values
+
+    # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ran = list(pool.map(alone, rest.tolist()))
+    for i, values in zip(rest, ran, strict=True):
+        for name, value in values.items():
+            if value.ndim == 1 and task.values[name].ndim == 1:
+                # Several gaps have one column each.
+                task.values[name] = np.full((task.n, value.size), np.nan)
+            task.values[name][(i, slice(value.size)) if value.ndim == 1 else i] = value
+
+
+def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
+    """What is wanted of a scene from one run, and its stated error; `frequency` (Hz) is that of its periods."""
+    stop, t = (task.periods or 1.0) / frequency if task.t_stop is None else task.t_stop, None
+    paths = tuple(dict.fromkeys(path for together in task.paths.values() for path in together))
+    ran: Solution | SteadyState
+    if task.periodic:
+        ran = steady_state(circuit, rtol=rtol, points=4 if paths else task.points, charge=False, sensitivities=paths)
+    else:
+        if paths:
+            t = np.array([stop])
+        elif task.traced:
+            t = np.arange(math.ceil(stop * frequency * task.points - 1e-9)) / (frequency * task.points)
+        ran = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False, sensitivities=paths)
+    # Largest of the errors of the gap voltage relative to its peak, and of the force relative to its mean.
+    pairs = (ran.error.u_gap, ran.u_gap_peak), (ran.error.f_el, ran.f_el_mean)
+    sizes = [(off, 0.0 if size is None else float(np.min(size))) for off, size in pairs]
+    error = max((off / size for off, size in sizes if size > 0.0), default=0.0)
+    if paths:
+        # The error of a change by all of the parameter is about ten times that of the run.
+        return {name: _slopes_of(task, circuit, ran, name, stop) for name in task.outputs}, Slopes.limit * error
+    values = {}
+    for name in task.outputs:
+        if name == "u_gap":
+            u = np.asarray(ran.solution.u_gap if isinstance(ran, SteadyState) else ran.u_gap)
+            values[name] = u[:-1] if task.periodic else u
+            continue
+        signal = _signal_of(name)
+        value = ran._figures.value(signal, name[len(signal) + 1 :])
+        values[name] = np.asarray(math.nan if value is None else value, float)
+    return values, error
+
+
+def _slopes_of(task: Task, circuit: Circuit, ran: Solution | SteadyState, name: str, stop: float) -> FloatArray:
+    """Derivatives of a mean by the parameters of a task."""
+    known = circuit.parameters
+    # For a change of each parameter by all of itself.
+    each = {path: getattr(one, name) * known[path].value for path, one in ran.sensitivities.items()}
+    by = {path: sum(each[other] for other in together) for path, together in task.paths.items()}
+    if task.clock is not None and task.periods is not None and isinstance(ran, Solution):
+        # The run ends after a number of periods: its end moves with the frequency, and the mean with its end.
+        start = circuit.tran.start if circuit.tran is not None else 0.0
+        gained = float(getattr(ran, name.removesuffix("_mean"))[-1]) - float(getattr(ran, name))
+        by[task.clock] -= gained * stop / (stop - start)
+    return np.array([x / known[path].value for path, x in by.items()])
+
+
+def _signal_of(output: str) -> str:
+    return next(s for s in SIGNALS_OF_BATCH if output == s or output.startswith(f"{s}_"))
+
+
+def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], attrs: dict[str, Any]) -> Dataset:
+    """The answers with the values given, `scenes`, as coordinates, and units."""
     from xarray import Dataset
 
     known = task.circuit.parameters
     meanings = {"flag_values": list(range(len(STATUS_NAMES))), "flag_meanings": " ".join(STATUS_NAMES)}
     data: dict[str, Any] = {}
-    for name, values in found.values.items():
-        signal = next(s for s in SIGNALS_OF_BATCH if name == s or name.startswith(f"{s}_"))
+    for name, values in task.values.items():
+        signal = _signal_of(name)
         unit = "deg" if name.endswith("phase_deg") else SIGNALS[signal][0]
         dims = ("scene",) if values.ndim == 1 else ("scene", "turn" if name == "u_gap" else "gap")
         data[name] = (dims, values, {"units": unit, "long_name": f"{SIGNALS[signal][1]}{name[len(signal) :]}"})
-    data["error"] = ("scene", found.error, {"units": "1", "long_name": "stated error, relative"})
-    data["status"] = ("scene", found.status, meanings)
+    data["error"] = ("scene", task.error, {"units": "1", "long_name": "stated error, relative"})
+    data["status"] = ("scene", task.status, meanings)
     coords: dict[str, Any] = {path: ("scene", array, {"units": known[path].unit}) for path, array in scenes.items()}
-    if "u_gap" in found.values:
-        turns = np.arange(found.values["u_gap"].shape[1]) / task.points
+    if task.traced:
+        turns = np.arange(task.values["u_gap"].shape[1]) / task.points
         coords["turn"] = ("turn", turns, {"units": "1", "long_name": "time in periods of the source"})
-    if slopes is not None and task.gradients is not None:
+    messages = task.messages
+    if slopes is not None:
         for name, values in slopes.values.items():
             unit, text = SIGNALS[name.removesuffix("_mean")][:2]
             about = {"units": f"{unit} per parameter_unit", "long_name": f"derivative of {text}_mean by each parameter"}
@@ -350,20 +322,10 @@ def _dataset(
         data["gradient_error"] = ("scene", slopes.error, {"units": "1", "long_name": told})
         data["gradient_status"] = ("scene", slopes.status, meanings)
         attrs |= {"ordinary_gradients": slopes.ordinary, "n_ordinary_gradients": slopes.n_ordinary}
-        found.messages |= slopes.messages
-        paths = list(task.gradients.paths)
+        messages = messages | slopes.messages
+        paths = list(slopes.paths)
         coords |= {"parameter": paths, "parameter_unit": ("parameter", [known[path].unit for path in paths])}
-    length = {"t_stop": task.t_stop} if task.t_stop is not None else {"periods": task.periods}
-    failures = [f"scene {i}: {found.messages[i]}" for i in sorted(found.messages)[:MESSAGES]]
+    length = {"periods": task.periods} if task.t_stop is None else {"t_stop": task.t_stop}
+    failures = [f"scene {i}: {messages[i]}" for i in sorted(messages)[:MESSAGES]]
     attrs |= {"rtol": task.rtol, "periodic": int(task.periodic), **length, "failures": failures}
     return Dataset(data, coords, attrs)
-
-
-def _skin(circuit: Circuit, scenes: Mapping[str, FloatArray], skin: str) -> str:
-    """Text about the frequency at which the skin's data are taken."""
-    skins = circuit.by_device("SKIN")
-    if skin == "follow" or not skins:
-        return "the skin's data follow the source's frequency" if skins else "there is no SKIN"
-    held = ", ".join(f"{e.name}.f" for e in skins)
-    varied = any(path.lower().endswith(".frequency") for path in scenes)
-    return f"the skin's data are those at its own {held}{', whatever the source frequency is' if varied else ''}"

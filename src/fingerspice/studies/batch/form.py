@@ -1,21 +1,19 @@
-"""The request of a batch (`Task`), checked, and its answers (`Answers`).
-
-Which scenes of a batch go in lockstep, what it gives, and the tables of their values for `scenes`.
-"""
+"""The request of a batch, checked, with its answers (`Task`); what goes in lockstep, and the table of its values."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev as powers
 from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray, IntArray, positive_number, real_numbers, whole_number
+from fingerspice.base.arrays import FloatArray, positive_number, real_numbers, whole_number
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import Value
@@ -38,101 +36,113 @@ LOCKSTEP, ONE_BY_ONE, REFUSED, FAILED = 0, 1, 2, 3
 STATUS_NAMES = ("lockstep", "one_by_one", "refused", "failed")
 # A relative change of a parameter by which it is seen whether the source's tone depends on it.
 _SEEN = 1e-3
+#: For each figure that lockstep gives, the moments that it needs: the means of u^2 A (0), (u^2 A)^2 (1) and u^2 (2).
+FIGURES: dict[str, tuple[int, ...]] = {
+    "f_el_mean": (0,), "f_el_rms": (1,), "f_t_mean": (0,), "f_t_rms": (0, 1), "friction_mean": (0,),
+    "friction_rms": (0, 1), "u_gap_rms": (2,),
+}  # fmt: skip
+# Parameters that must be equal in all scenes of a lockstep, because the form of the equations depends on them.
+_FORM = ("m_exp", "n_exp", "a_fix", "tau")
+# Most layers and most tones of a lockstep: code is compiled for each number of cells and of tones.
+_MOST_LAYERS, _MOST_TONES = 4, 4
+_LAYERS = ("LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP")
+# Largest ratio of a tone's frequency to that of the whole source.
+_MOST_PERIODS = 2000
+# Numbers of points tried for the universal curve's Chebyshev series, and the relative error allowed.
+_CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
+# Smallest rtol at which derivatives are taken in lockstep: below it their kinks would take too many steps.
+_LEAST_RTOL_OF_SLOPES = 5e-7
 
 
-@dataclass(frozen=True)
-class Gradients:
-    """The parameters by which the means are to be differentiated."""
-
-    paths: tuple[str, ...]  # In the circuit's own spelling
-    # Each parameter with those that grow in proportion to it: the frequency of a source with that of a skin
-    together: Mapping[str, tuple[str, ...]]
-    clock: str | None  # The frequency of the only source, if it is one of the parameters
-
-
-@dataclass(frozen=True)
 class Task:
-    """A checked request; its attributes are arguments of `batch`, with exactly one of `t_stop` and `periods` given.
+    """A request, which is checked, and what is found; most attributes are arguments of `batch`.
 
-    It asks for derivatives of its outputs, which are means, if it has `gradients`. Gap voltages stay on the processor.
+    One of `t_stop` and `periods` is given. It asks for its outputs, or, if it has `paths`, for the derivatives of its
+    outputs, which are means.
     """
 
-    circuit: Circuit
-    outputs: tuple[str, ...]
-    rtol: float
-    t_stop: float | None
-    periods: float | None
-    periodic: bool
-    points: int
-    device: str
-    gradients: Gradients | None = None
-
-    @property
-    def traced(self) -> bool:
-        """Whether gap voltages are wanted."""
-        return "u_gap" in self.outputs
-
-    def stop(self, frequency: float) -> float:
-        """End of a run with a source of this frequency (Hz), s."""
-        return self.t_stop if self.t_stop is not None else (self.periods or 1.0) / frequency
-
-    def count(self, frequency: FloatArray) -> FloatArray:
-        """Number of periods in runs with sources of these frequencies (Hz)."""
-        if self.t_stop is not None:
-            return np.asarray(frequency * self.t_stop)
-        return np.full(frequency.shape, self.periods)
-
-
-@dataclass
-class Answers:
-    """Outputs of some scenes, or their derivatives; a scene without a result has NaN."""
-
-    # (n,) each, (n, n_parameter) for derivatives, or (n, width) for gap voltages, which become NaN last
+    scenes: dict[str, FloatArray]  # Values by path, (n,) each
+    # What is found: (n,) each, (n, n_parameter) of derivatives, or (n, width) of gap voltages, which become NaN last; a
+    # scene without a result has NaN
     values: dict[str, FloatArray]
     error: FloatArray  # (n,): Stated error, of outputs relative to themselves
-    status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`, and -1 before results have been entered
-    messages: dict[int, str] = field(default_factory=dict)  # Of the scenes without a result
-    ordinary: str = ""  # Why some scenes were not in lockstep
+    status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`, and -1 before there are results
+    messages: dict[int, str]  # Of the scenes without a result
+    ordinary: str  # Why some scenes were not in lockstep
+
+    def __init__(
+        self, circuit: Circuit, outputs: Sequence[str], rtol: float, t_stop: float | None, periods: float | None,
+        periodic: bool, points: int, device: str,
+    ) -> None:  # fmt: skip
+        self.circuit, self.periodic = circuit, periodic
+        self.rtol, self.points = rtol_given(rtol, LEAST_RTOL), whole_number("points", points, 2)
+        require(self.points % 2 == 0, "points", self.points, "an even number, 2 or more")
+        self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+        for name in self.outputs:
+            if name not in ("u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)):
+                kinds = ", ".join(f"_{kind}" for kind in _KINDS)
+                signals = ", ".join(SIGNALS_OF_BATCH)
+                raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
+        require(len(self.outputs) > 0, "outputs", "empty", "one or more names")
+        # Gap voltages stay on the processor.
+        self.traced = "u_gap" in self.outputs
+        self.device = "cpu" if self.traced else device
+        if periods is not None and t_stop is not None:
+            raise InputError("t_stop and periods are both given; allowed: one of them")
+        self.t_stop = None if t_stop is None else positive_number("t_stop", t_stop, "s")
+        self.periods = None if periods is None else positive_number("periods", periods)
+        if periodic and (periods is not None or t_stop is not None):
+            raise InputError("periodic=True takes one period, and t_stop or periods is given; allowed: neither")
+        if periodic:
+            self.periods = 1.0
+        elif periods is None and t_stop is None:
+            if circuit.tran is None:
+                raise InputError(
+                    "no t_stop: the deck has no .tran line and none was given; give t_stop in s, or periods"
+                )
+            self.t_stop = circuit.tran.stop
+        # The parameters by which the means are to be differentiated, in the circuit's own spelling, each with those
+        # that grow in proportion to it: the frequency of a source with that of a skin
+        self.paths: dict[str, tuple[str, ...]] = {}
+        self.clock: str | None = None  # The frequency of the only source, if it is one of `paths`
+
+    @property
+    def n(self) -> int:
+        """Number of scenes."""
+        return next(iter(self.scenes.values())).size
 
     @property
     def n_ordinary(self) -> int:
         """Number of scenes not in lockstep."""
         return int(np.count_nonzero(self.status != LOCKSTEP))
 
-    @classmethod
-    def empty(cls, values: dict[str, FloatArray], n: int) -> Answers:
-        """Answers of n scenes, none of them done."""
-        return cls(values, np.full(n, np.nan), np.full(n, -1, np.int8))
+    def begin(self, values: dict[str, FloatArray]) -> None:
+        """Take these arrays for the values; no scene is done."""
+        self.values, self.error, self.status = values, np.full(self.n, np.nan), np.full(self.n, -1, np.int8)
+        self.messages, self.ordinary = {}, ""
 
+    def count(self, frequency: FloatArray) -> FloatArray:
+        """Number of periods in runs with sources of these frequencies (Hz)."""
+        return np.full(self.n, self.periods) if self.t_stop is None else np.asarray(frequency * self.t_stop)
 
-def task_of(
-    circuit: Circuit, outputs: Sequence[str], rtol: float, t_stop: float | None, periods: float | None, periodic: bool,
-    points: int, device: str,
-) -> Task:  # fmt: skip
-    """The checked request; arguments as of `batch`."""
-    rtol, points = rtol_given(rtol, LEAST_RTOL), whole_number("points", points, 2)
-    require(points % 2 == 0, "points", points, "an even number, 2 or more")
-    if isinstance(outputs, str):
-        outputs = (outputs,)
-    known = ["u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)]
-    for name in outputs:
-        if name not in known:
-            kinds = ", ".join(f"_{kind}" for kind in _KINDS)
-            signals = ", ".join(SIGNALS_OF_BATCH)
-            raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
-    require(len(outputs) > 0, "outputs", "empty", "one or more names")
-    if periods is not None and t_stop is not None:
-        raise InputError("t_stop and periods are both given; allowed: one of them")
-    t_stop = None if t_stop is None else positive_number("t_stop", t_stop, "s")
-    periods = None if periods is None else positive_number("periods", periods)
-    if periodic and (periods is not None or t_stop is not None):
-        raise InputError("periodic=True takes one period, and t_stop or periods is given; allowed: neither")
-    if periods is None and t_stop is None and not periodic:
-        if circuit.tran is None:
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s, or periods")
-        t_stop = circuit.tran.stop
-    periods, device = 1.0 if periodic else periods, "cpu" if "u_gap" in outputs else device
-    return Task(circuit, tuple(outputs), rtol, t_stop, periods, periodic, points, device)
+    def frequencies(self, of_skin: bool = False) -> FloatArray:
+        """The source's frequency in every scene, Hz: that of several together, or the one that a SKIN follows.
+
+        Refused if no source has a period, or several have none in common; a SKIN can follow one source only.
+        """
+        on = [e for e in driving_sources(self.circuit) if e.waveform is not None and e.waveform.period is not None]
+        waves = [e.waveform for e in on if e.waveform is not None]
+        if len(on) == 1:
+            given = self.scenes.get(f"{on[0].name}.frequency")
+            tone = waves[0].tone() if of_skin else None
+            return given if given is not None else np.full(self.n, tone or 1.0 / (waves[0].period or math.nan))
+        moved = any(f"{e.name}.frequency" in self.scenes for e in on)
+        period = None if of_skin or moved or not on else Sum(tuple(waves)).period
+        if period is None:
+            raise InputError(f"{len(on)} sources have a period; allowed: one, where periods, u_gap or the skin's "
+                             "frequency follow it, or several of fixed frequencies in a ratio of whole "
+                             "numbers")  # fmt: skip
+        return np.full(self.n, 1.0 / period)
 
 
 def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
@@ -143,9 +153,8 @@ def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dic
     for path, values in parameters.items():
         name = own_path(circuit, path)
         array = real_numbers(path, values, "an array of numbers")
-        require(
-            array.ndim <= 1 and array.size > 0, path, f"of shape {array.shape}", "one number, or one row of numbers"
-        )
+        allowed = "one number, or one row of numbers"
+        require(array.ndim <= 1 and array.size > 0, path, f"of shape {array.shape}", allowed)
         if name in given:
             raise InputError(f"{name} is given twice; allowed: once")
         given[name] = array
@@ -156,7 +165,23 @@ def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dic
     n = max(sizes.values(), default=1)
     scenes = {path: np.ascontiguousarray(np.broadcast_to(array, (n,))) for path, array in given.items()}
     for path, array in scenes.items():
-        _check_values(circuit, path, array)
+        name, _, parameter = path.rpartition(".")
+        element, allowed, bad = circuit[name], "numbers", np.isnan(array)
+        if not bad.any() and parameter in element.values:
+            spec = element.spec.parameter(parameter)
+            bad = ~((array >= spec.least) & (array <= spec.most))
+            bad &= ~((array == 0.0) & spec.may_be_zero) & ~((array == np.inf) & spec.may_be_infinite)
+            allowed = spec.allowed()
+        elif not bad.any():
+            # The legal values of a waveform's parameter form an interval: testing its ends is enough.
+            for i in (int(np.argmin(array)), int(np.argmax(array))):
+                try:
+                    circuit.varied({path: float(array[i])})
+                except InputError as error:
+                    raise InputError(f"scene {i}: {error}") from None
+        if bad.any():
+            i = int(np.argmax(bad))
+            raise InputError(f"{path} is {array[i]:g} in scene {i}; allowed: {allowed}")
     return scenes
 
 
@@ -174,52 +199,8 @@ def own_path(circuit: Circuit, path: Any) -> str:
     return known[path.lower()]
 
 
-def _check_values(circuit: Circuit, path: str, array: FloatArray) -> None:
-    """Refuse NaN and values that the parameter does not accept; the message names the scene."""
-    name, _, parameter = path.rpartition(".")
-    element = circuit[name]
-    bad = np.isnan(array)
-    if not bad.any() and parameter in element.values:
-        spec = element.spec.parameter(parameter)
-        bad = ~((array >= spec.least) & (array <= spec.most))
-        bad &= ~((array == 0.0) & spec.may_be_zero) & ~((array == np.inf) & spec.may_be_infinite)
-        allowed = spec.allowed()
-    elif not bad.any():
-        # The legal values of a waveform's parameter form an interval: testing the smallest and the largest is enough.
-        for i in (int(np.argmin(array)), int(np.argmax(array))):
-            try:
-                circuit.varied({path: float(array[i])})
-            except InputError as error:
-                raise InputError(f"scene {i}: {error}") from None
-    else:
-        allowed = "numbers"
-    if bad.any():
-        i = int(np.argmax(bad))
-        raise InputError(f"{path} is {array[i]:g} in scene {i}; allowed: {allowed}")
-
-
-def frequencies(circuit: Circuit, scenes: Mapping[str, FloatArray], of_skin: bool = False) -> FloatArray:
-    """The source's frequency in every scene, Hz: that of several sources together, or the one that a SKIN follows.
-
-    Refused if no source has a period, or several have none in common; a SKIN can follow one source only.
-    """
-    n = next(iter(scenes.values())).size
-    on = [e for e in driving_sources(circuit) if e.waveform is not None and e.waveform.period is not None]
-    waves = [e.waveform for e in on if e.waveform is not None]
-    if len(on) == 1:
-        given = scenes.get(f"{on[0].name}.frequency")
-        tone = waves[0].tone() if of_skin else None
-        return given if given is not None else np.full(n, tone or 1.0 / (waves[0].period or math.nan))
-    moved = any(f"{e.name}.frequency" in scenes for e in on)
-    period = None if of_skin or moved or not on else Sum(tuple(waves)).period
-    if period is None:
-        raise InputError(f"{len(on)} sources have a period; allowed: one, where periods, u_gap or the skin's frequency "
-                         "follow it, or several of fixed frequencies in a ratio of whole numbers")  # fmt: skip
-    return np.full(n, 1.0 / period)
-
-
-def gradients_of(task: Task, gradients: Sequence[str], scenes: Mapping[str, FloatArray], skin: str) -> Task | None:
-    """The checked request of derivatives in scenes with these values by path; None for none."""
+def gradients_of(task: Task, gradients: Sequence[str], skin: str) -> Task | None:
+    """The checked request of derivatives in the scenes of a task; None for none."""
     circuit = task.circuit
     if isinstance(gradients, str):
         raise InputError(f"gradients is {gradients!r}; allowed: a sequence of paths such as ('Xgap.d',)")
@@ -233,68 +214,40 @@ def gradients_of(task: Task, gradients: Sequence[str], scenes: Mapping[str, Floa
         raise InputError(f"gradients are asked for, and the circuit has {number} GAPs; allowed: one")
     if len(set(paths)) < len(paths):
         raise InputError(f"gradients is {paths!r}; allowed: every parameter once")
-    for path in paths:
-        value = circuit.parameters[path].value
+    scenes, values = dict(task.scenes), {path: circuit.parameters[path].value for path in paths}
+    for path, value in values.items():
         if path not in scenes and not (math.isfinite(value) and value != 0.0):
             raise InputError(
                 f"gradients names {path}, which is {value:g}; allowed: parameters whose value is finite and not 0, as "
                 "steps are relative to it"
             )
+        scenes.setdefault(path, np.full(task.n, value))
     on = driving_sources(circuit)
     clock = f"{on[0].name}.frequency" if len(on) == 1 else None
     skins = tuple(f"{e.name}.f" for e in circuit.by_device("SKIN")) if skin == "follow" else ()
-    for path in paths:
-        if path in skins or (skins and path != clock and _turns(circuit, path)):
+    for path, value in values.items():
+        turned = path in skins
+        if skins and not turned and path != clock:
+            # Whether the parameter changes the frequency of a source.
+            name, moved = path.rpartition(".")[0], circuit.varied({path: value * (1.0 + _SEEN)})
+            own, other = circuit[name].waveform, moved[name].waveform
+            turned = own is not None and other is not None and own.tone() != other.tone()
+        if turned:
             raise InputError(f"skin='follow', and gradients names {path}, with which the skin's frequency changes; "
                              "allowed: the frequency of the only source, or skin='own'")  # fmt: skip
     together = {path: (path, *(skins if path == clock else ())) for path in paths}
-    return replace(task, outputs=outputs, gradients=Gradients(paths, together, clock if clock in paths else None))
-
-
-def _turns(circuit: Circuit, path: str) -> bool:
-    """Whether a parameter changes the frequency of a source."""
-    name = path.rpartition(".")[0]
-    moved = circuit.varied({path: circuit.parameters[path].value * (1.0 + _SEEN)})
-    own, other = circuit[name].waveform, moved[name].waveform
-    return own is not None and other is not None and own.tone() != other.tone()
-
-
-Curves = tuple[FloatArray, FloatArray, FloatArray]
-# Parameters that must be equal in all scenes of a lockstep, because the form of the equations depends on them.
-_FORM = ("m_exp", "n_exp", "a_fix", "tau")
-# Most layers and most tones of a lockstep: code is compiled for each number of cells and of tones.
-_MOST_LAYERS, _MOST_TONES = 4, 4
-_LAYERS = ("LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP")
-# Largest ratio of a tone's frequency to that of the whole source.
-_MOST_PERIODS = 2000
-# Numbers of points tried for the universal curve's Chebyshev series, and the relative error allowed.
-_CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
-# Smallest rtol at which derivatives are taken in lockstep: below it their kinks would take too many steps.
-_LEAST_RTOL_OF_SLOPES = 5e-7
-_Figure = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
-#: For each figure, the indices of the moments that it needs, and the function that gives it from the moments (4, n),
-#: the load, the stress at 1 V and the friction coefficient.
-FIGURES: dict[str, tuple[tuple[int, ...], _Figure]] = {
-    "f_el_mean": ((0,), lambda m, load, stress, mu: stress * m[0]),
-    "f_el_rms": ((1,), lambda m, load, stress, mu: stress * np.sqrt(m[1])),
-    "f_t_mean": ((0,), lambda m, load, stress, mu: mu * (load + stress * m[0])),
-    "f_t_rms": ((0, 1), lambda m, load, stress, mu: mu * _loaded(m, load, stress)),
-    "friction_mean": ((0,), lambda m, load, stress, mu: mu * (load + stress * m[0]) / load),
-    "friction_rms": ((0, 1), lambda m, load, stress, mu: mu * _loaded(m, load, stress) / load),
-    "u_gap_rms": ((2,), lambda m, load, stress, mu: np.sqrt(m[2])),
-}
-
-
-def _loaded(m: FloatArray, load: FloatArray, stress: FloatArray) -> FloatArray:
-    """Root mean square of the sum of load and electroadhesive force, N."""
-    return np.asarray(np.sqrt(load * load + 2.0 * load * stress * m[0] + stress * stress * m[1]))
+    asked = copy(task)
+    asked.outputs, asked.traced, asked.scenes, asked.paths = outputs, False, scenes, together
+    asked.clock = clock if clock in paths else None
+    return asked
 
 
 @dataclass(frozen=True)
 class LockstepForm:
     """Properties that all scenes in lockstep have in common."""
 
-    stack: Stack  # With a gap
+    stack: Stack
+    gap: Element
     # The sources that are on; each with the sign of the gap along the loop times the sign of the source
     sources: tuple[tuple[Element, float], ...]
     multiples: tuple[int, ...]  # Frequency of every tone of the sources' sum, in that of the sum
@@ -304,77 +257,61 @@ class LockstepForm:
     jumping: bool  # Whether the source is a square
     recording: Samples | None  # The samples of the only source, if it is a recording
 
-    @cached_property
-    def gap(self) -> Element:
-        """The gap."""
-        assert self.stack.gap_layer is not None
-        return self.stack.layers[self.stack.gap_layer]
-
     @property
     def cells(self) -> int:
         """Number of cells of all layers."""
         return self.stack.c.size
-
-    @cached_property
-    def places(self) -> tuple[int, IntArray]:
-        """Index of the gap among the cells, and those of the cells whose leak has a total resistance."""
-        assert self.stack.gap is not None
-        of_cells = [self.stack.layers[self.stack.layer_of[i]].device for i in range(self.cells)]
-        return self.stack.gap, np.array([i for i, device in enumerate(of_cells) if device in ("LAYER", "GAP")])
 
 
 def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str:
     """The common form of scenes in lockstep, or the reason why there is none; `varied` has the paths that vary."""
     if not is_stack(circuit):
         return "the circuit is no series stack of layers"
-    stack = build_stack(circuit)
-    if stack.contact is None or stack.gap is None or stack.area_given is not None:
+    stack, tran = build_stack(circuit), circuit.tran
+    if stack.contact is None or stack.gap is None or stack.gap_layer is None or stack.area_given is not None:
         return "the stack has no contact whose area follows the gap"
     if not {e.device for e in stack.layers} <= set(_LAYERS) or not 2 <= len(stack.layers) <= _MOST_LAYERS:
         return f"the stack has other layers than {', '.join(_LAYERS)}, or not 2 to {_MOST_LAYERS} of them"
     if (circuit.charge_law or "local") != "local" or circuit.work != "gap":
         return "the charge law is mobile, or the total voltage is held"
-    found = _form_of_sources(stack)
-    if isinstance(found, str):
-        return found
-    recording = found.recording
-    charged = found.jumping if recording is None else recording.between(0, 1)[0] != 0.0
+    sources = tuple((e, float(turn * stack.sign[stack.gap])) for e, turn in stack.sources if e.waveform != DC(0.0))
+    waves = [e.waveform for e, _ in sources]
+    recording = as_samples(waves[0]) if len(waves) == 1 and waves[0] is not None else None
+    jumping = recording is None and any(isinstance(wave, Square | Pulse) for wave in waves)
+    tones = [hz for wave in waves for hz in _source_of(wave)[0]]
+    multiples: tuple[int, ...] = (1,)
+    frequency, charged = None, jumping
+    if recording is not None:
+        if recording.start != 0.0:
+            return "the recording does not start at 0 s"
+        frequency, charged = 0.5 * recording.rate, recording.between(0, 1)[0] != 0.0
+    elif not (tones and all(tones) and len(tones) <= (1 if jumping else _MOST_TONES)):
+        return (
+            f"the sources are not 1 to {_MOST_TONES} plain sines, not a square that starts with its period, and not a "
+            "recording"
+        )
+    elif len(tones) > 1:
+        period = stack.waveform.period
+        if period is None or max(tones) * period > _MOST_PERIODS:
+            return "the sources' tones have no common period, or one of very many of their own"
+        multiples, frequency = tuple(round(hz * period) for hz in tones), 1.0 / period
     varied = [path.lower() for path in varied]
-    if not _starts_uncharged(circuit, charged, varied):
+    given = circuit.initial or any(e.initial is not None for e in circuit.elements)
+    if tran is not None and not tran.uic:
+        # The operating point of sines that start at 0 V is the uncharged state.
+        others = [e.waveform for e in circuit.by_device("V") if not isinstance(e.waveform, AM)]
+        charged = charged or any(getattr(wave, "phase_deg", 0.0) for wave in others)
+        given = given or charged or any(path.endswith(".phase_deg") for path in varied)
+    if given or (tran is not None and tran.start > 0.0):
         return "the run does not start uncharged, or its figures start late"
-    fixed = () if found.frequency is None else ("frequency",)
-    may_vary = {e.name.lower(): set(_source_of(e.waveform)[1]).difference(fixed) for e, _ in found.sources}
+    fixed = () if frequency is None else ("frequency",)
+    may_vary = {e.name.lower(): set(_source_of(e.waveform)[1]).difference(fixed) for e, _ in sources}
     layers = {e.name.lower() for e in stack.layers}
     for path in varied:
         name, _, parameter = path.rpartition(".")
         if parameter not in may_vary[name] if name in may_vary else parameter in _FORM or name not in layers:
             return f"{path} varies"
-    return found
-
-
-def _form_of_sources(stack: Stack) -> LockstepForm | str:
-    """The form that the sources of a stack allow, whatever varies; or the reason why there is none."""
-    assert stack.gap is not None
-    sources = tuple((e, float(turn * stack.sign[stack.gap])) for e, turn in stack.sources if e.waveform != DC(0.0))
-    waves = [e.waveform for e, _ in sources]
-    recording = as_samples(waves[0]) if len(waves) == 1 and waves[0] is not None else None
-    if recording is not None:
-        if recording.start != 0.0:
-            return "the recording does not start at 0 s"
-        return LockstepForm(stack, sources, (1,), 0.5 * recording.rate, False, recording)
-    jumping = any(isinstance(wave, Square | Pulse) for wave in waves)
-    tones = [hz for wave in waves for hz in _source_of(wave)[0]]
-    if not (tones and all(tones) and len(tones) <= (1 if jumping else _MOST_TONES)):
-        return (
-            f"the sources are not 1 to {_MOST_TONES} plain sines, not a square that starts with its period, and not a "
-            "recording"
-        )
-    if len(tones) == 1:
-        return LockstepForm(stack, sources, (1,), None, jumping, None)
-    period = stack.waveform.period
-    if period is None or max(tones) * period > _MOST_PERIODS:
-        return "the sources' tones have no common period, or one of very many of their own"
-    return LockstepForm(stack, sources, tuple(round(hz * period) for hz in tones), 1.0 / period, False, None)
+    return LockstepForm(stack, stack.layers[stack.gap_layer], sources, multiples, frequency, jumping, recording)
 
 
 def why_alone(form: LockstepForm | str, outputs: Iterable[str], slopes_at: float | None = None) -> str:
@@ -417,18 +354,6 @@ def _source_of(wave: object) -> tuple[tuple[float, ...], tuple[str, ...]]:
         case Pulse(half_wave=True, rise=0.0, delay=0.0):
             return (wave.tone() or 0.0,), ()
     return (0.0,), ()
-
-
-def _starts_uncharged(circuit: Circuit, charged: bool, varied: Iterable[str]) -> bool:
-    """Whether the uncharged state starts all runs; `charged`: whether the source is not 0 V there."""
-    tran = circuit.tran
-    if circuit.initial or any(e.initial is not None for e in circuit.elements) or (tran and tran.start > 0.0):
-        return False
-    if tran is None or tran.uic:
-        return True
-    # The operating point of sines that start at 0 V is the uncharged state.
-    phases = [getattr(e.waveform, "phase_deg", 0.0) for e in circuit.by_device("V") if not isinstance(e.waveform, AM)]
-    return not charged and not any(phases) and not any(path.endswith(".phase_deg") for path in varied)
 
 
 def _tones_of(wave: object, given: Mapping[str, Value]) -> list[tuple[Value, Value]]:
@@ -497,23 +422,18 @@ def _contact_rows(v: Mapping[str, Value]) -> tuple[Value, ...]:
 
 
 @lru_cache(maxsize=32)
-def curves_of(m: float, n: float, degree: int) -> Curves | None:
+def curves_of(m: float, n: float, degree: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Power series of the universal curve of two exponents, Chebyshev nodes and matrix of a degree, as for `march`.
 
     None if no series of the allowed sizes reaches the error allowed.
     """
     p = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
-
-    def curve(x: FloatArray) -> FloatArray:
-        return universal_curve_array(x, 1.0 / m, p)
-
-    series = chebyshev.fit(curve, 0.0, LARGEST_X, _CURVE_ERROR, _CURVE_SIZES)
+    series = chebyshev.fit(lambda x: universal_curve_array(x, 1.0 / m, p), 0.0, LARGEST_X, _CURVE_ERROR, _CURVE_SIZES)
     if series is None:
         return None
-    at = chebyshev.nodes(degree + 1, -1.0, 1.0)
-    to_series = chebyshev.coefficients(np.eye(degree + 1))
     to_powers = np.zeros((degree + 1, degree + 1))
-    for k in range(degree + 1):
-        to_powers[: k + 1, k] = powers.cheb2poly(np.eye(degree + 1)[k, : k + 1])
-    highest_first = np.ascontiguousarray((to_powers @ to_series)[::-1])
-    return np.ascontiguousarray(powers.cheb2poly(series)[::-1]), at, highest_first
+    for k, one in enumerate(np.eye(degree + 1)):
+        to_powers[: k + 1, k] = powers.cheb2poly(one[: k + 1])
+    highest_first = (to_powers @ chebyshev.coefficients(np.eye(degree + 1)))[::-1]
+    at = chebyshev.nodes(degree + 1, -1.0, 1.0)
+    return np.ascontiguousarray(powers.cheb2poly(series)[::-1]), at, np.ascontiguousarray(highest_first)

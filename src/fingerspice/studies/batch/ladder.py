@@ -5,8 +5,6 @@ What is wanted of scenes in lockstep, with its error: figures and gap voltages, 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +15,7 @@ from fingerspice.engine.lockstep.march import N_PORTION, march, march_samples
 from fingerspice.engine.lockstep.scenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
 from fingerspice.engine.lockstep.step import ALL_MOMENTS, START_TIMES, marks_of
 from fingerspice.numerics.modes import STEP
-from fingerspice.studies.batch.form import FIGURES, LOCKSTEP, Answers, LockstepForm, Task, curves_of, peak_of, table_of
+from fingerspice.studies.batch.form import FIGURES, LOCKSTEP, LockstepForm, Task, curves_of, peak_of, table_of
 
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
 # and (of the highest) under several; and initial degree of the area's polynomial, of which each takes the compiler 8 s.
@@ -45,6 +43,29 @@ _PIECES = ((5e-5, 8), (5e-7, 12), (0.0, 24))
 _PIECE_START, _MOST_PIECES = 2, 20
 #: A scene is accepted if its estimate is at most this fraction of the error allowed.
 ENOUGH = 0.7
+# The relative round-off added to every stated error.
+_ROUNDING = 1e-11
+# The error is estimated as this share of the change from half the steps to all steps, by the smallest rtol served. The
+# order is 4, which would give a fifteenth. But the kink of 1/A where the gap voltage is 0 has order 2, with a factor
+# that depends on where between two steps it falls: that is most of a small error. Pieces of 4 and of 8 steps are still
+# far from the order.
+_STATED, _STATED_JUMPING = ((5e-6, 0.25), (5e-7, 0.5), (0.0, 0.8)), 0.5
+# Where a step is longer than this many of the fastest time constants, the start of a run from rest is not resolved, and
+# the change is no larger than the error; it is smaller where that start is most of the error.
+_STIFF, _STATED_STIFF = 2.0, ((5e-6, 0.8), (0.0, 2.5))
+# A gap voltage shows the kinks at its zeros more than means do.
+_STATED_TRACED = 0.8
+# Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
+# 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
+_STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
+# What decays after a start away from 0 V meets steps of several lengths, whose errors may cancel with half the steps.
+_STATED_STARTED = 2.0
+# A run of degree d has this rounding error, relative, besides 2^d times 1e-16: the area's polynomial's coefficients
+# lose a digit in two to the rounding with every power.
+_ROUNDING_OF_SLOPES, _EPS = 1e-13, 1.1e-16
+# The stated error of a derivative has this many changes from half the steps to all steps, under tones and under
+# squares. Under tones a kink's error is about as large as the change, or larger where that is small by chance.
+_STATED_SLOPES, _STATED_SLOPES_JUMPING = 3.0, 2.0
 
 
 class Level(NamedTuple):
@@ -66,116 +87,35 @@ class Run(NamedTuple):
     trace: FloatArray
 
 
-class Ladder(ABC):
-    """Scenes in lockstep: the steps are doubled until what is wanted of a scene has an error that is small enough.
+class Ladder:
+    """Scenes in lockstep: the steps are doubled until the outputs of a scene have an error that is small enough.
 
     A scene is integrated `copies` times; the table has the first copies of all scenes, then all second ones, and so on.
     """
 
     copies = 1
-    n_moment = 1
     limit = 1.0  # Error allowed to what is wanted, over rtol
     stated = ENOUGH  # Estimate over the error that is stated
     closer = 1.0  # Factor on the tolerance that ends the search for a periodic state
     # As an estimate may be small by chance, doubling the steps may not reduce it by more than this factor.
-    most_gain: float
+    most_gain = 24.0
     highest_degree = HIGHEST_DEGREE  # Of the area's polynomial
     gives_up = True  # Whether scenes are given up for which more steps are no help
-    named: str  # What comes before the message of a scene that cannot be run
-    unmet: str  # Why scenes of a form that lockstep takes may have no result from it
+    named = ""  # What comes before the message of a scene that cannot be run
+    # Why scenes of a form that lockstep takes may have no result from it
+    unmet = "what does not end after half periods or at a sample, or does not meet its error in lockstep"
 
-    def __init__(
-        self, task: Task, form: LockstepForm, scenes: Mapping[str, FloatArray], members: IntArray, found: Answers
-    ) -> None:
+    def __init__(self, task: Task, form: LockstepForm, members: IntArray) -> None:
         self.task, self.form = task, form
-        self.scenes = scenes  # Values by path in lower case, (copies n,)
-        self.members, self.found = members, found  # (n,): Places of the scenes among the answers
-        self.table = table_of(form, scenes)  # (n_row, copies n)
+        self.members = members  # (n,): Places of the scenes in the task
+        # Values by path in lower case, (copies n,)
+        self.scenes = {path.lower(): array[members] for path, array in task.scenes.items()}
+        self.table = table_of(form, self.scenes)  # (n_row, copies n)
+        self.names = [name for name in task.outputs if name != "u_gap"]
+        # Rows of the moments that the figures need
+        self.needed = sorted({i for name in self.names for i in FIGURES[name.removesuffix("_periodic")]} or {0})
+        self.n_moment = ALL_MOMENTS if self.needed[-1] else 1
         self._look()
-        self.prepare()
-
-    @abstractmethod
-    def prepare(self) -> None:
-        """Do what comes before the first steps."""
-
-    @abstractmethod
-    def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
-        """Estimated errors of what is wanted of the scenes `pending`."""
-
-    @abstractmethod
-    def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
-        """Put what is wanted of the scenes that are `good` among `pending` into the answers."""
-
-    def figure(self, name: str, moments: FloatArray, columns: IntArray) -> FloatArray:
-        """An output of some columns of the table, from their moments."""
-        others, gap = self.table[CELL_ROWS * self.form.cells :], self.form.gap
-        mu = self.scenes.get(f"{gap.name.lower()}.mu")
-        friction = np.full(columns.size, gap.values["mu"]) if mu is None else mu[columns]
-        of_moments = FIGURES[name.removesuffix("_periodic")][1]
-        return of_moments(moments, others[LOAD, columns], others[STRESS, columns], friction)
-
-    def columns(self, some: IntArray) -> IntArray:
-        """Places of all copies of some scenes in the table."""
-        return np.add.outer(np.arange(self.copies) * self.members.size, some).ravel()
-
-    def climb(self, halves: int) -> None:
-        """Find what is wanted in runs of so many half periods; scenes whose error stays too large stay not done."""
-        # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
-        order = np.argsort(self.slowest) if halves > 4 else np.arange(self.members.size)
-        for pieces in np.unique(self.pieces[self.possible]).tolist():
-            pending = order[(self.possible & (self.pieces == pieces))[order]]
-            for covered in _COVERED:
-                pending = self._climb(self._first(halves, pieces, covered), pending)
-
-    def _climb(self, level: Level, pending: IntArray) -> IntArray:
-        """Find what is wanted of scenes, and return those whose gap voltage the area's polynomial does not serve."""
-        form, found, rtol = self.form, self.found, self.task.rtol
-        most = _MOST_STEPS * max(form.multiples) if form.recording is None else _PARTS[1]
-        doubtful = rtol < _DOUBTFUL and not form.jumping and form.recording is None
-        gain = _GAIN_IN_DOUBT if doubtful else self.most_gain
-        before: Run | None = None
-        last, outside = np.full(pending.size, np.inf), [pending[:0]]
-        while pending.size and level.steps <= most:
-            run = self._run(level, self.columns(pending), before)
-            if run is None:
-                break
-            error, resolved = self.error(level, run, pending), self.least[pending] <= level.steps
-            error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
-            good = (error <= ENOUGH * self.limit * rtol) & resolved & (before is not None or not doubtful)
-            self.enter(level, run, pending, good)
-            at = self.members[pending[good]]
-            found.error[at], found.status[at] = error[good] / self.stated, LOCKSTEP
-            tail = run.fine[-1].reshape(self.copies, -1)
-            beyond, left = np.isinf(tail).any(axis=0), ~good
-            if self.gives_up:
-                # A scene whose estimate grows from twice the steps: the explicit steps may be unstable around that
-                # area. And where the area's polynomial of the highest degree is what limits the error.
-                beyond |= ~good & resolved & (error > last)
-                final = level.degree >= HIGHEST_DEGREE and before is not None
-                left &= (tail <= ENOUGH * rtol).all(axis=0) | (not final)
-            left &= ~beyond
-            outside.append(pending[beyond])
-            kept = np.tile(left, self.copies)
-            before = Run(run.fine[:, kept], run.fine[:, kept], run.trace[kept], run.trace[kept])
-            last, pending = error[left], pending[left]
-            degree = max(level.degree, min(level.degree + _MORE_DEGREE, self.highest_degree))
-            level = level._replace(steps=2 * level.steps, degree=degree)
-        return np.concatenate(outside)
-
-    def _first(self, halves: int, pieces: int, covered: float) -> Level:
-        """The level to begin with."""
-        rtol, highest = self.task.rtol, max(self.form.multiples)
-        _, one, several, degree = next(rung for rung in _RUNGS if rtol >= rung[0])
-        steps = one if highest == 1 else several * highest
-        if pieces > 1:
-            steps = 2 * pieces * next(s for least, s in _PIECES if rtol >= least)
-        if self.form.recording is not None:
-            steps = _PARTS[0]
-        if self.task.traced:
-            # Half of the steps, too, are an even number.
-            points = self.task.points * (1 if self.task.points % 4 == 0 else 2)
-            steps = points * -(-steps // points)
-        return Level(halves, pieces, covered, steps, degree)
 
     def _look(self) -> None:
         """Find what the scenes need of their steps, each of shape (n,)."""
@@ -204,7 +144,66 @@ class Ladder(ABC):
         # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
         self.least = 2.0 * first * self.decays / _LONGEST_STEP
 
-    def _run(self, level: Level, columns: IntArray, before: Run | None) -> Run | None:
+    def climb(self, halves: int) -> None:
+        """Find what is wanted in runs of so many half periods; scenes whose error stays too large stay not done."""
+        # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
+        order = np.argsort(self.slowest) if halves > 4 else np.arange(self.members.size)
+        rtol, highest = self.task.rtol, max(self.form.multiples)
+        _, one, several, degree = next(rung for rung in _RUNGS if rtol >= rung[0])
+        for pieces in np.unique(self.pieces[self.possible]).tolist():
+            steps = one if highest == 1 else several * highest
+            if pieces > 1:
+                steps = 2 * pieces * next(s for least, s in _PIECES if rtol >= least)
+            if self.form.recording is not None:
+                steps = _PARTS[0]
+            if self.task.traced:
+                # Half of the steps, too, are an even number.
+                points = self.task.points * (1 if self.task.points % 4 == 0 else 2)
+                steps = points * -(-steps // points)
+            pending = order[(self.possible & (self.pieces == pieces))[order]]
+            for covered in _COVERED:
+                pending = self._climb(Level(halves, pieces, covered, steps, degree), pending)
+
+    def _climb(self, level: Level, pending: IntArray) -> IntArray:
+        """Find what is wanted of scenes, and return those whose gap voltage the area's polynomial does not serve."""
+        form, task, rtol = self.form, self.task, self.task.rtol
+        most = _MOST_STEPS * max(form.multiples) if form.recording is None else _PARTS[1]
+        doubtful = rtol < _DOUBTFUL and not form.jumping and form.recording is None
+        gain = _GAIN_IN_DOUBT if doubtful else self.most_gain
+        before: tuple[FloatArray, FloatArray] | None = None  # Results and gap voltages with half the steps
+        last, outside = np.full(pending.size, np.inf), [pending[:0]]
+        while pending.size and level.steps <= most:
+            run = self._run(level, self._columns(pending), before)
+            if run is None:
+                break
+            error, resolved = self.error(level, run, pending), self.least[pending] <= level.steps
+            error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
+            good = (error <= ENOUGH * self.limit * rtol) & resolved & (before is not None or not doubtful)
+            self.enter(level, run, pending, good)
+            at = self.members[pending[good]]
+            task.error[at], task.status[at] = error[good] / self.stated, LOCKSTEP
+            tail = run.fine[-1].reshape(self.copies, -1)
+            beyond, left = np.isinf(tail).any(axis=0), ~good
+            if self.gives_up:
+                # A scene whose estimate grows from twice the steps: the explicit steps may be unstable around that
+                # area. And where the area's polynomial of the highest degree is what limits the error.
+                beyond |= ~good & resolved & (error > last)
+                final = level.degree >= HIGHEST_DEGREE and before is not None
+                left &= (tail <= ENOUGH * rtol).all(axis=0) | (not final)
+            left &= ~beyond
+            outside.append(pending[beyond])
+            kept = np.tile(left, self.copies)
+            before = run.fine[:, kept], run.trace[kept]
+            last, pending = error[left], pending[left]
+            degree = max(level.degree, min(level.degree + _MORE_DEGREE, self.highest_degree))
+            level = level._replace(steps=2 * level.steps, degree=degree)
+        return np.concatenate(outside)
+
+    def _columns(self, some: IntArray) -> IntArray:
+        """Places of all copies of some scenes in the table."""
+        return np.add.outer(np.arange(self.copies) * self.members.size, some).ravel()
+
+    def _run(self, level: Level, columns: IntArray, before: tuple[FloatArray, FloatArray] | None) -> Run | None:
         """Integrate columns of the table, for half the steps, too, where `before` has no results; None: no curve."""
         task, form, halves, steps = self.task, self.form, level.halves, level.steps
         curves = curves_of(form.gap.values["m_exp"], form.gap.values["n_exp"], level.degree)
@@ -212,10 +211,13 @@ class Ladder(ABC):
             return None
         sizes = steps // 2 if before is None else 0, steps
         waves = _waves(sizes[0], form), _waves(sizes[1], form)
-        widths = [halves * n // 2 if self.task.traced else 0 for n in sizes]
-        traces = np.empty((columns.size, widths[0])), np.empty((columns.size, widths[1]))
-        lengths = form.cells - 1, waves[1].shape[1], form.places[1].size, level.degree + 1, self.n_moment
-        marks, scenes = marks_of(*lengths), (self.table, columns, form.places, curves)
+        coarse, fine = (np.empty((columns.size, halves * n // 2 if task.traced else 0)) for n in sizes)
+        # Index of the gap among the cells, and those of the cells whose leak has a total resistance
+        assert form.stack.gap is not None
+        devices = [form.stack.layers[i].device for i in form.stack.layer_of]
+        leaks: IntArray = np.array([i for i, device in enumerate(devices) if device in ("LAYER", "GAP")])
+        lengths = form.cells - 1, waves[1].shape[1], leaks.size, level.degree + 1, self.n_moment
+        marks, scenes = marks_of(*lengths), (self.table, columns, (form.stack.gap, leaks), curves)
         block = new_block(self.table.shape[0], level.pieces, marks)
         if form.recording is not None:
             out = np.empty((2, (1 + N_PORTION) * self.n_moment + 3, columns.size))
@@ -229,76 +231,41 @@ class Ladder(ABC):
                 out = march_on_card(scenes, source, how, _MOST_PIECES if form.jumping else 0, lengths)
             else:
                 out = np.empty((2, 2 * self.n_moment + 3, columns.size))
-                march(scenes, source, how, block, out, traces, marks)
-        if before is None:
-            return Run(out[0], out[1], traces[0], traces[1])
-        return Run(before.fine, out[1], before.trace, traces[1])
+                march(scenes, source, how, block, out, (coarse, fine), marks)
+        return Run(out[0], out[1], coarse, fine) if before is None else Run(before[0], out[1], before[1], fine)
 
-
-def _waves(n: int, form: LockstepForm) -> FloatArray:
-    """Sine and cosine of every tone at the times that `step.run` needs; a square's value in both halves."""
-    if form.recording is not None:
-        return np.empty((0, 1))
-    if n == 0 or form.jumping:
-        return np.array([[1.0], [-1.0]])[: 2 * n]
-    # The phase in turns is reduced before it is multiplied by 2 pi, so that high tones keep their accuracy.
-    times = np.concatenate([np.arange(n), START_TIMES])
-    turns = np.outer(times, form.multiples) % n * (2.0 * np.pi / n)
-    return np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(times.size, -1)
-
-
-# The relative round-off added to every stated error.
-_ROUNDING = 1e-11
-# The error is estimated as this share of the change from half the steps to all steps, by the smallest rtol served. The
-# order is 4, which would give a fifteenth. But the kink of 1/A where the gap voltage is 0 has order 2, with a factor
-# that depends on where between two steps it falls: that is most of a small error. Pieces of 4 and of 8 steps are still
-# far from the order.
-_STATED, _STATED_JUMPING = ((5e-6, 0.25), (5e-7, 0.5), (0.0, 0.8)), 0.5
-# Where a step is longer than this many of the fastest time constants, the start of a run from rest is not resolved, and
-# the change is no larger than the error; it is smaller where that start is most of the error.
-_STIFF, _STATED_STIFF = 2.0, ((5e-6, 0.8), (0.0, 2.5))
-# A gap voltage shows the kinks at its zeros more than means do.
-_STATED_TRACED = 0.8
-# Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
-# 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
-_STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
-# What decays after a start away from 0 V meets steps of several lengths, whose errors may cancel with half the steps.
-_STATED_STARTED = 2.0
-# A run of degree d has this rounding error, relative, besides 2^d times 1e-16: the area's polynomial's coefficients
-# lose a digit in two to the rounding with every power.
-_ROUNDING_OF_SLOPES, _EPS = 1e-13, 1.1e-16
-# The stated error of a derivative has this many changes from half the steps to all steps, under tones and under
-# squares. Under tones a kink's error is about as large as the change, or larger where that is small by chance.
-_STATED_SLOPES, _STATED_SLOPES_JUMPING = 3.0, 2.0
-
-
-class Figures(Ladder):
-    """The outputs that a batch is asked for."""
-
-    most_gain = 24.0
-    named = ""
-    unmet = "what does not end after half periods or at a sample, or does not meet its error in lockstep"
-
-    def prepare(self) -> None:
-        """Find the rows of the moments that the figures need."""
-        self.names = [name for name in self.task.outputs if name != "u_gap"]
-        self.needed = sorted({i for name in self.names for i in FIGURES[name.removesuffix("_periodic")][0]} or {0})
-        self.n_moment = ALL_MOMENTS if self.needed[-1] else 1
+    def figure(self, name: str, m: FloatArray, columns: IntArray) -> FloatArray:
+        """An output of some columns of the table, from their moments."""
+        signal, kind = name.removesuffix("_periodic").rsplit("_", 1)
+        if signal == "u_gap":
+            return np.asarray(np.sqrt(m[2]))
+        others, gap = self.table[CELL_ROWS * self.form.cells :], self.form.gap
+        load, stress = others[LOAD, columns], others[STRESS, columns]
+        if signal == "f_el":
+            return np.asarray(stress * (m[0] if kind == "mean" else np.sqrt(m[1])))
+        mu = self.scenes.get(f"{gap.name.lower()}.mu")
+        friction = np.full(columns.size, gap.values["mu"]) if mu is None else mu[columns]
+        # Sum of load and electroadhesive force, N.
+        normal = load + stress * m[0]
+        if kind == "rms":
+            normal = np.sqrt(load * load + 2.0 * load * stress * m[0] + stress * stress * m[1])
+        return np.asarray(friction * normal if signal == "f_t" else friction * normal / load)
 
     def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
-        """Of the moments, those of the last period are the second ones."""
+        """Put what is wanted of the scenes that are `good` among `pending` into the task."""
         at = pending[good]
         for name in self.names:
+            # Of the moments, those of the last period are the second ones.
             first = self.n_moment if name.endswith("_periodic") or self.task.periodic else 0
             moments = run.fine[first : first + self.n_moment, good]
-            self.found.values[name][self.members[at]] = self.figure(name, moments, at)
+            self.task.values[name][self.members[at]] = self.figure(name, moments, at)
         if self.task.traced:
-            u, some = self.found.values["u_gap"], run.trace[good, :: level.steps // self.task.points]
+            u, some = self.task.values["u_gap"], run.trace[good, :: level.steps // self.task.points]
             u[self.members[at], : some.shape[1]] = some
             u[self.members[at], some.shape[1] :] = np.nan
 
     def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
-        """The largest of all outputs, relative to themselves."""
+        """Estimated error of the scenes `pending`: the largest of all outputs, relative to themselves."""
         peak, closing, tail = run.fine[-3:]
         changes = [np.zeros(peak.size)]
         for row in self.needed:
@@ -324,8 +291,7 @@ class Figures(Ladder):
     def _share(self, level: Level, decays: FloatArray, least: FloatArray) -> FloatArray | float:
         """The error as a share of the change."""
         if self.form.recording is not None:
-            stack = self.form.stack
-            return _STATED_RECORDED if self.form.cells == len(stack.layers) else _STATED_DISPERSIVE
+            return _STATED_RECORDED if self.form.cells == len(self.form.stack.layers) else _STATED_DISPERSIVE
         if self.form.jumping:
             return _STATED_JUMPING
         own, stiff = (next(s for rtol, s in shares if self.task.rtol >= rtol) for shares in (_STATED, _STATED_STIFF))
@@ -354,27 +320,25 @@ class Slopes(Ladder):
     named = "gradients: "
     unmet = "what does not end after half periods, or does not meet its error in lockstep"
 
-    def prepare(self) -> None:
-        """Make the copies of the scenes."""
-        assert self.task.gradients is not None
-        self.wanted = self.task.gradients
-        self.given = np.array([self.scenes[path.lower()] for path in self.wanted.paths])  # (n_parameter, n)
+    def __init__(self, task: Task, form: LockstepForm, members: IntArray) -> None:
+        super().__init__(task, form, members)
+        self.given = np.array([self.scenes[path.lower()] for path in task.paths])  # (n_parameter, n)
         self.possible &= (np.isfinite(self.given) & (self.given != 0.0)).all(axis=0)
-        self.copies = 2 * len(self.wanted.paths)
-        moved = {path: np.tile(array, (2, len(self.wanted.paths), 1)) for path, array in self.scenes.items()}
-        for k, path in enumerate(self.wanted.paths):
-            for other in self.wanted.together[path]:
+        self.copies = 2 * len(task.paths)
+        moved = {path: np.tile(array, (2, len(task.paths), 1)) for path, array in self.scenes.items()}
+        for k, together in enumerate(task.paths.values()):
+            for path in together:
                 for side, sign in enumerate((-1.0, 1.0)):
-                    moved[other.lower()][side, k] *= 1.0 + sign * STEP
+                    moved[path.lower()][side, k] *= 1.0 + sign * STEP
         self.scenes = {path: array.ravel() for path, array in moved.items()}
-        self.table = table_of(self.form, self.scenes)
+        self.table = table_of(form, self.scenes)
 
     def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
         """Per unit of the parameter."""
         at = pending[good]
         change, _ = self._changes(run.fine[0], pending)
         for j, name in enumerate(self.task.outputs):
-            self.found.values[name][self.members[at]] = (change[j][:, good] / self.given[:, at]).T
+            self.task.values[name][self.members[at]] = (change[j][:, good] / self.given[:, at]).T
 
     def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
         """For a change of a parameter by all of itself, relative to the output; the largest of all."""
@@ -395,8 +359,20 @@ class Slopes(Ladder):
 
         `mean` is the mean of u^2 A in all copies of the scenes.
         """
-        columns, outputs = self.columns(pending), self.task.outputs
+        columns, outputs = self._columns(pending), self.task.outputs
         values = np.array([self.figure(name, mean[None], columns) for name in outputs])
-        low, high = np.moveaxis(values.reshape(len(outputs), 2, len(self.wanted.paths), -1), 1, 0)
+        low, high = np.moveaxis(values.reshape(len(outputs), 2, len(self.task.paths), -1), 1, 0)
         size, change = np.abs(0.5 * (low + high)), (high - low) / (2.0 * STEP)
         return change, change / np.where(size > 0.0, size, 1.0)
+
+
+def _waves(n: int, form: LockstepForm) -> FloatArray:
+    """Sine and cosine of every tone at the times that `step.run` needs; a square's value in both halves."""
+    if form.recording is not None:
+        return np.empty((0, 1))
+    if n == 0 or form.jumping:
+        return np.array([[1.0], [-1.0]])[: 2 * n]
+    # The phase in turns is reduced before it is multiplied by 2 pi, so that high tones keep their accuracy.
+    times = np.concatenate([np.arange(n), START_TIMES])
+    turns = np.outer(times, form.multiples) % n * (2.0 * np.pi / n)
+    return np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(times.size, -1)

@@ -17,7 +17,7 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from inspect import signature
 from multiprocessing import parent_process
@@ -69,49 +69,83 @@ def programs() -> str:
     return f"fingerspice {__version__}, NumPy {np.__version__}, SciPy {scipy.__version__}"
 
 
-@dataclass(frozen=True)
 class Work:
     """A sweep with its store, and all that it takes to run any chunk of it."""
 
-    plan: Plan
-    options: Mapping[str, Any]  # Of `batch`
-    path: Path
-    block: tuple[int, ...]  # Scenes of a chunk along each dimension
-    outputs: dict[str, Array]  # With ``error`` and, as the last, ``status``
-    drawn: dict[str, Array]  # The drawn parameters, along ``scene``
-    draws: Draws | None
-    programs: str
-
-    @property
-    def _grid(self) -> tuple[int, ...]:
-        return tuple(-(-size // own) for size, own in zip(self.plan.sizes, self.block, strict=True))
-
-    @property
-    def chunks(self) -> int:
-        """Number of chunks."""
-        return math.prod(self._grid)
+    def __init__(self, plan: Plan, options: Mapping[str, Any], path: Path) -> None:
+        """The first scene is run to see what outputs there are."""
+        self.plan, self.path, self.programs = plan, path.absolute(), programs()
+        self.options = options  # Of `batch`
+        circuit = plan.circuit
+        # What a parameter does not accept: values of the grid, and quantiles beyond which there are draws.
+        beyond = plan.quantiles(np.repeat([[1.0 / plan.n], [1.0 - 1.0 / plan.n]], len(plan.drawn), axis=1))
+        for name, values in (plan.grid | plan.fixed | beyond).items():
+            try:
+                # Sets of parameters that do not differ have no paths.
+                if paths := plan.paths({name: values}):
+                    checked_scenes(circuit, paths)
+            except InputError as error:
+                kind = "the distribution of" if name in plan.drawn else "the values of"
+                raise InputError(f"{kind} {name}: {error}") from None
+        middle = plan.quantiles(np.full((1, len(plan.drawn)), 0.5))
+        ends = plan.spread({name: values[[0, -1]] for name, values in plan.grid.items()}, middle)
+        told = scenes_warnings(
+            circuit, options.get("t_stop"), checked_scenes(circuit, ends), options.get("skin", "own")
+        )
+        for text in told:
+            warnings.warn(text, FingerspiceWarning, stacklevel=4)
+        scene = plan.spread({name: values[:1] for name, values in plan.grid.items()}, middle)
+        with warnings.catch_warnings():
+            # Of one scene.
+            warnings.simplefilter("ignore", FingerspiceWarning)
+            first = batch(circuit, scene, **options)
+        if "u_gap" in first:
+            raise InputError("outputs are u_gap, and a store has figures, which are one number for each scene")
+        status, failures = int(first.status[0]), first.attrs["failures"]
+        if status >= REFUSED and len(circuit.by_device("GAP")) > 1:
+            raise InputError(f"the middle of the sweep has no result ({failures[0]}); allowed: one that has")
+        self.block: tuple[int, ...] = ()  # Scenes of a chunk along each dimension
+        for length in reversed(plan.sizes):
+            size = CHUNK if status == LOCKSTEP else SLOW_CHUNK
+            self.block = min(length, max(1, size // math.prod(self.block))), *self.block
+        self._grid = tuple(-(-size // own) for size, own in zip(plan.sizes, self.block, strict=True))
+        self.chunks = math.prod(self._grid)
+        require(self.chunks <= MOST_CHUNKS, "the sweep", f"{math.prod(plan.sizes):,} scenes", "at most "
+                f"{MOST_CHUNKS:,} chunks of {math.prod(self.block):,}")  # fmt: skip
+        self.draws = Draws(plan, self.block[-1]) if plan.drawn else None
+        # With ``error`` and, as the last, ``status``
+        self.outputs = {
+            str(name): Array(
+                self.path / str(name), (*plan.dims, *map(str, one.dims[1:])), (*plan.sizes, *one.shape[1:]),
+                (*self.block, *one.shape[1:]), dict(one.attrs),
+            )
+            for name, one in first.data_vars.items()
+        }  # fmt: skip
+        last = self.outputs.pop(STATUS)
+        flags = dict(last.attributes)
+        flags |= {"flag_values": [*flags["flag_values"], MISSING], "flag_meanings": f"{flags['flag_meanings']} missing"}
+        self.outputs[STATUS] = replace(last, kind="i1", fill=MISSING, attributes=flags)
+        # The drawn parameters
+        self.drawn = {
+            name: Array(self.path / name, ("scene",), plan.sizes[-1:], self.block[-1:], {"units": plan.units[name]})
+            for name in plan.drawn
+        }
+        without = ("n_ordinary", "ordinary", "failures")
+        self.about = {key: value for key, value in first.attrs.items() if key not in without} | plan.about
 
     def _place(self, index: int) -> tuple[int, ...]:
         """Number of a chunk along each dimension: chunks one after another have the same draws at other places."""
         return tuple(int(i) for i in np.unravel_index(index, self._grid, "F" if self.plan.drawn else "C"))
 
-    def _pieces(self, index: int) -> Iterator[tuple[str, Array, tuple[int, ...]]]:
+    def pieces(self, index: int) -> Iterator[tuple[str, Array, tuple[int, ...]]]:
         """Arrays of a chunk, and its place in each, ``status`` last; the first place of a grid has the draws."""
         at = dict(zip(self.plan.dims, self._place(index), strict=True))
         first = not any(at[name] for name in self.plan.grid)
         for name, one in ((self.drawn if first else {}) | self.outputs).items():
             yield name, one, tuple(at.get(dim, 0) for dim in one.dims)
 
-    def is_done(self, index: int) -> bool:
-        """Whether a chunk has been written as a whole, and has not changed since."""
-        return all(one.fault(place) is None for _, one, place in self._pieces(index))
-
-    def marked(self) -> int:
-        """Number of chunks that are marked as done."""
-        return sum(len(files) for _, _, files in os.walk(self.path / STATUS / "c"))
-
-    def open(self, about: Mapping[str, Any]) -> None:
-        """Create the store with these attributes, or make sure that the one there is of this sweep.
+    def open(self) -> None:
+        """Create the store, or make sure that the one there is of this sweep.
 
         Anything else there, or the store of another sweep, is refused and stays.
         """
@@ -122,7 +156,7 @@ class Work:
                 of = {NAMES: list(plan.names[name])} if name in plan.names else {"units": plan.units[name]}
                 arrays[name] = Array(self.path / name, (name,), values.shape, values.shape, of, fill=0.0)
             try:
-                create(self.path, {**about, RUN: json.dumps(own)}, arrays, plan.grid)
+                create(self.path, {**self.about, RUN: json.dumps(own)}, arrays, plan.grid)
             except OSError as error:
                 raise InputError(f"cannot write {self.path}: {error.strerror or error}") from None
         held = _identity_at(self.path)
@@ -136,8 +170,7 @@ class Work:
 
     def _identity(self) -> dict[str, Any]:
         """All inputs that determine the bytes of the store, by which a later call recognises it."""
-        plan, circuit = self.plan, self.plan.circuit
-        values: dict[str, Any] = {}
+        plan, circuit, values = self.plan, self.plan.circuit, dict[str, Any]()
         for name, one in (plan.grid | plan.fixed).items():
             values[name] = hashlib.sha256(one.tobytes()).hexdigest() if one.size > 8 else one.tolist()
             if name in plan.names:
@@ -146,8 +179,8 @@ class Work:
             # Nine digits are the same on every machine.
             values[name] = [f"{x:.9g}" for x in law.ppf(_PROBES)]
         # Options count alike, given or not.
-        own = {name: one.default for name, one in signature(batch).parameters.items() if one.default is not one.empty}
-        options = {**own, **self.options}
+        known = signature(batch).parameters.items()
+        options = {name: one.default for name, one in known if one.default is not one.empty} | dict(self.options)
         del options["threads"]
         outputs = options["outputs"]
         options["outputs"] = [outputs] if isinstance(outputs, str) else list(outputs)
@@ -196,12 +229,10 @@ class Work:
             self._write(index, values)
         failures = []
         for told in found.attrs["failures"]:
-            # Scenes are told by their numbers in the whole sweep.
-            scene, _, message = told.partition(": ")
-            place = np.unravel_index(int(scene.removeprefix("scene ")), sizes)
-            whole = [one.start + int(i) for one, i in zip(part, place, strict=True)]
-            number = np.ravel_multi_index(whole, self.plan.sizes) if whole else 0
-            failures.append(f"scene {number}: {message}")
+            # Scenes are told by their numbers in the whole sweep; a sweep without dimensions is one scene.
+            scene, _, message = told.removeprefix("scene ").partition(": ")
+            place = np.add([one.start for one in part], np.unravel_index(int(scene), sizes)).astype(int)
+            failures.append(f"scene {np.ravel_multi_index(tuple(place), self.plan.sizes) if part else 0}: {message}")
         return found.sizes["scene"], failures
 
     def _computed(self, index: int, part: tuple[slice, ...]) -> tuple[Dataset, dict[str, NDArray[Any]]]:
@@ -212,7 +243,7 @@ class Work:
 
     def _write(self, index: int, values: Mapping[str, NDArray[Any]]) -> None:
         try:
-            for name, one, place in self._pieces(index):
+            for name, one, place in self.pieces(index):
                 one.put(place, np.asarray(values[name]))
         except OSError as error:
             raise InputError(f"cannot write {self.path}: {error.strerror or error}; {_GOES_ON}") from None
@@ -224,63 +255,6 @@ def _identity_at(path: Path) -> dict[str, Any]:
         return dict(json.loads(attributes_of(path)[RUN]))
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path} is there already and is no store of a sweep; allowed: another path") from None
-
-
-def make_work(plan: Plan, options: Mapping[str, Any], path: Path) -> tuple[Work, dict[str, Any]]:
-    """The sweep as chunks, and the attributes of its store; its first scene is run to see what outputs there are."""
-    _check_values(plan)
-    circuit, skin = plan.circuit, options.get("skin", "own")
-    middle = plan.quantiles(np.full((1, len(plan.drawn)), 0.5))
-    ends = plan.spread({name: values[[0, -1]] for name, values in plan.grid.items()}, middle)
-    for text in scenes_warnings(circuit, options.get("t_stop"), checked_scenes(circuit, ends), skin):
-        warnings.warn(text, FingerspiceWarning, stacklevel=4)
-    with warnings.catch_warnings():
-        # Of one scene.
-        warnings.simplefilter("ignore", FingerspiceWarning)
-        first = batch(circuit, plan.spread({name: values[:1] for name, values in plan.grid.items()}, middle), **options)
-    if "u_gap" in first:
-        raise InputError("outputs are u_gap, and a store has figures, which are one number for each scene")
-    if int(first.status[0]) >= REFUSED and len(circuit.by_device("GAP")) > 1:
-        raise InputError(f"the middle of the sweep has no result ({first.attrs['failures'][0]}); allowed: one that has")
-    path = path.absolute()
-    block: tuple[int, ...] = ()
-    for length in reversed(plan.sizes):
-        size = CHUNK if int(first.status[0]) == LOCKSTEP else SLOW_CHUNK
-        block = min(length, max(1, size // math.prod(block))), *block
-    outputs = {
-        str(name): Array(
-            path / str(name), (*plan.dims, *map(str, one.dims[1:])), (*plan.sizes, *one.shape[1:]),
-            (*block, *one.shape[1:]), dict(one.attrs),
-        )
-        for name, one in first.data_vars.items()
-    }  # fmt: skip
-    status = outputs.pop(STATUS)
-    flags = dict(status.attributes)
-    flags |= {"flag_values": [*flags["flag_values"], MISSING], "flag_meanings": f"{flags['flag_meanings']} missing"}
-    outputs[STATUS] = replace(status, kind="i1", fill=MISSING, attributes=flags)
-    drawn = {
-        name: Array(path / name, ("scene",), plan.sizes[-1:], block[-1:], {"units": plan.units[name]})
-        for name in plan.drawn
-    }
-    work = Work(plan, options, path, block, outputs, drawn, Draws(plan, block[-1]) if drawn else None, programs())
-    require(work.chunks <= MOST_CHUNKS, "the sweep", f"{math.prod(plan.sizes):,} scenes", f"at most {MOST_CHUNKS:,} "
-            f"chunks of {math.prod(block):,}")  # fmt: skip
-    about = {key: value for key, value in first.attrs.items() if key not in ("n_ordinary", "ordinary", "failures")}
-    return work, about | plan.about
-
-
-def _check_values(plan: Plan) -> None:
-    """Refuse what a parameter does not accept: values of the grid, and quantiles beyond which there are draws."""
-    ends = plan.quantiles(np.repeat([[1.0 / plan.n], [1.0 - 1.0 / plan.n]], len(plan.drawn), axis=1))
-    for name, values in (plan.grid | plan.fixed | ends).items():
-        if not (paths := plan.paths({name: values})):
-            # Sets of parameters that do not differ.
-            continue
-        try:
-            checked_scenes(plan.circuit, paths)
-        except InputError as error:
-            kind = "the distribution of" if name in plan.drawn else "the values of"
-            raise InputError(f"{kind} {name}: {error}") from None
 
 
 def stored(
@@ -296,14 +270,15 @@ def stored(
     require(good, "shard", shard, "two whole numbers (i, m), with i from 1 to m")
     if os.path.lexists(path):
         _identity_at(path)
-    work, about = make_work(plan, options, path)
+    work = Work(plan, options, path)
     here = workers is None and scheduler is None
     if not here:
-        work = replace(work, options={"threads": 1, **options})
+        work.options = {"threads": 1, **options}
     with nullcontext() if here else _client(workers and min(workers, work.chunks), scheduler) as client:
-        work.open(about)
+        work.open()
         begun, mine = time.perf_counter(), range(shard[0] - 1, work.chunks, shard[1])
-        missing = [index for index in mine if not work.is_done(index)]
+        # Chunks that have not been written as a whole, or have changed since
+        missing = [i for i in mine if any(one.fault(place) is not None for _, one, place in work.pieces(i))]
         answers = _here(work, missing) if here or not missing else _by_scheduler(work, missing, client)
         failures: list[str] = []
         scenes, there, whole = 0, len(mine) - len(missing), max(len(mine), 1)
@@ -311,7 +286,7 @@ def stored(
             for number, (count, told) in enumerate(answers, there + 1):
                 failures, scenes = failures + told, scenes + count
                 show(number / whole, lambda s, count=scenes: f"{count / s:,.3g} scenes/s,")
-        lacking = work.chunks - work.marked()
+        lacking = work.chunks - sum(len(files) for _, _, files in os.walk(work.path / STATUS / "c"))
         if not lacking:
             tidy(work.path)
         took = time.perf_counter() - begun

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from itertools import product
 from pathlib import Path
@@ -38,9 +37,9 @@ QUANTILES = (0.05, 0.5, 0.95)
 _EDGE = 1e-12
 # Resamples of the population for the intervals of the indices. (scipy's own cannot be given a seed.)
 RESAMPLES = 499
+_NUMBERS = "a number, an array of numbers, or a frozen distribution of scipy.stats such as norm(3.5e-6, 0.3e-6)"
 
 
-@dataclass(frozen=True)
 class Plan:
     """Parameters of a circuit that make a grid, those that are drawn (`n` draws by `seed`), those that are one number.
 
@@ -48,16 +47,56 @@ class Plan:
     is a name as well, whose numbers count the sets.
     """
 
-    circuit: Circuit  # With the values that named sets give to every scene
-    n: int
-    seed: int
-    grid: dict[str, FloatArray] = field(default_factory=dict)
-    drawn: dict[str, Any] = field(default_factory=dict)
-    fixed: dict[str, FloatArray] = field(default_factory=dict)
-    # The paths of each name, with the value that its numbers are factors of, or with the values of the sets, (n_set,).
-    own: dict[str, Mapping[str, float | FloatArray]] = field(default_factory=dict)
-    units: dict[str, str] = field(default_factory=dict)
-    names: dict[str, tuple[str, ...]] = field(default_factory=dict)  # Of the sets that a name counts
+    def __init__(self, circuit: Circuit, asked: Mapping[str, Any], n: int, seed: int, most: int) -> None:
+        """Of what `sweep` is asked for as its `parameters`, with `most` draws or fewer."""
+        require_circuit(circuit)
+        if not isinstance(asked, Mapping) or not asked:
+            raise InputError(f"parameters is {asked!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
+        n, self.seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
+        power = most.bit_length() - 1
+        require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
+        sets: dict[str, tuple[tuple[str, ...], dict[str, FloatArray]]] = {}
+        for kind in (kind for kind in KINDS if kind in asked):
+            if isinstance(asked[kind], str):
+                circuit = _applied(circuit, kind, asked[kind])[0]
+            else:
+                circuit, names, differ = _together(circuit, kind, asked[kind])
+                sets[kind] = names, differ
+        rest = [name for name in asked if name in sets or name not in KINDS]
+        if not rest:
+            raise InputError(
+                f"parameters is {dict(asked)!r}, and nothing varies; allowed: a list of sets, an array or a "
+                "distribution beside it"
+            )
+        self.n, self.circuit = n, circuit  # With the values that named sets give to every scene
+        self.grid: dict[str, FloatArray] = {}
+        self.drawn: dict[str, Any] = {}
+        self.fixed: dict[str, FloatArray] = {}
+        # The paths of each name, with the value that its numbers are factors of, or the values of the sets, (n_set,)
+        self.own: dict[str, Mapping[str, float | FloatArray]] = {}
+        self.units: dict[str, str] = {}
+        self.names: dict[str, tuple[str, ...]] = {}  # Of the sets that a name counts
+        known, taken = circuit.parameters, Counter[str]()
+        for given in rest:
+            value, name = asked[given], given
+            if given in sets:
+                self.names[name], self.own[name] = sets[given]
+                self.grid[name], paths = np.arange(len(self.names[name]), dtype=float), list(self.own[name])
+            else:
+                paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
+                name, alone = ",".join(paths), len(paths) == 1
+                self.own[name] = {path: 1.0 if alone else known[path].value for path in paths}
+                self.units[name] = known[name].unit if alone else "1"
+                if hasattr(value, "ppf"):
+                    self.drawn[name] = value
+                else:
+                    array = real_numbers(name, value, _NUMBERS)
+                    row = array.ndim < 2 and array.size > 0
+                    require(row, name, f"of shape {array.shape}", "numbers in one row")
+                    (self.grid if array.ndim else self.fixed)[name] = array
+            taken.update(paths)
+            if twice := [path for path, count in taken.items() if count > 1]:
+                raise InputError(f"{twice[0]} is given twice, where sets that differ in it count; allowed: once")
 
     @property
     def dims(self) -> tuple[str, ...]:
@@ -119,10 +158,10 @@ class Draws:
         # Sums of point 0 and the points `count`, 2 `count`, ..., (n_drawn,) each.
         self._steps: list[NDArray[np.int64]] = []
         engine, at = self._engine(), count
-        first = _bits(engine.random(1))[0] if at < plan.n else 0
+        first = self._bits(engine, 1) if at < plan.n else 0
         while at < plan.n:
             engine.fast_forward(at - engine.num_generated)
-            self._steps.append(_bits(engine.random(1))[0] ^ first)
+            self._steps.append((self._bits(engine, 1) ^ first)[0])
             at *= 2
 
     def _engine(self) -> Any:
@@ -131,10 +170,13 @@ class Draws:
 
         return qmc.Sobol(len(self.plan.drawn), scramble=True, bits=BITS, rng=self.plan.seed)
 
+    def _bits(self, engine: Any, count: int) -> NDArray[np.int64]:
+        return np.asarray(engine.random(count) * 2.0**BITS, np.int64)
+
     @cached_property
     def _first(self) -> NDArray[np.int64]:
         """Bits of the first part, shape (count, n_drawn): a process that is sent the draws makes them once."""
-        return _bits(self._engine().random(self.count))
+        return self._bits(self._engine(), self.count)
 
     # Two chunks may run at once, and those after them mostly have the same draws.
     @lru_cache(2)  # noqa: B019
@@ -147,62 +189,8 @@ class Draws:
         return self.plan.quantiles(np.asarray(bits * 2.0**-BITS, float))
 
 
-def _bits(points: FloatArray) -> NDArray[np.int64]:
-    return np.asarray(points * 2.0**BITS, np.int64)
-
-
-def make_plan(circuit: Circuit, asked: Mapping[str, Any], n: int, seed: int, most: int) -> Plan:
-    """The plan of what `sweep` is asked for as its `parameters`, with `most` draws or fewer."""
-    require_circuit(circuit)
-    if not isinstance(asked, Mapping) or not asked:
-        raise InputError(f"parameters is {asked!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
-    n, seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
-    power = most.bit_length() - 1
-    require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
-    tables: dict[str, dict[str, Mapping[str, Any]]] = {}
-    for kind in (kind for kind in KINDS if kind in asked):
-        if isinstance(asked[kind], str):
-            circuit = _applied(circuit, kind, asked[kind])[0]
-        else:
-            circuit, tables[kind] = _together(circuit, kind, asked[kind])
-    rest = [name for name in asked if name in tables or name not in KINDS]
-    if not rest:
-        raise InputError(
-            f"parameters is {dict(asked)!r}, and nothing varies; allowed: a list of sets, an array or a distribution "
-            "beside it"
-        )
-    plan, taken = Plan(circuit, n, seed), Counter[str]()
-    for given in rest:
-        if given in tables:
-            sets = tables[given]
-            paths = list(next(iter(sets.values())))
-            plan.names[given], plan.grid[given] = tuple(sets), np.arange(len(sets), dtype=float)
-            plan.own[given] = {path: np.array([one[path] for one in sets.values()], float) for path in paths}
-        else:
-            paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
-            _place(plan, paths, asked[given])
-        taken.update(paths)
-        if twice := [path for path, count in taken.items() if count > 1]:
-            raise InputError(f"{twice[0]} is given twice, where sets that differ in it count; allowed: once")
-    return plan
-
-
-def _place(plan: Plan, paths: list[str], value: Any) -> None:
-    """Enter what is asked for under some paths in a plan."""
-    path, alone, known = ",".join(paths), len(paths) == 1, plan.circuit.parameters
-    plan.own[path] = {one: 1.0 if alone else known[one].value for one in paths}
-    plan.units[path] = known[path].unit if alone else "1"
-    if hasattr(value, "ppf"):
-        plan.drawn[path] = value
-        return
-    allowed = "a number, an array of numbers, or a frozen distribution of scipy.stats such as norm(3.5e-6, 0.3e-6)"
-    array = real_numbers(path, value, allowed)
-    require(array.ndim < 2 and array.size > 0, path, f"of shape {array.shape}", "numbers in one row")
-    (plan.grid if array.ndim else plan.fixed)[path] = array
-
-
-def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, dict[str, Mapping[str, Any]]]:
-    """The circuit with the values in which several sets agree, and by set and path those in which they differ."""
+def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, tuple[str, ...], dict[str, FloatArray]]:
+    """The circuit with the values in which several sets agree, the sets' names, and by path values that differ."""
     given = list(names) if isinstance(names, list | tuple | np.ndarray) else []
     if not given or not all(isinstance(name, str) for name in given):
         raise InputError(f"{kind} is {names!r}; allowed: the name of a set of parameters, or a list of names")
@@ -216,15 +204,12 @@ def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, dict[st
         )
     own = circuit.parameters
     whole = {
-        path: [float(one.get(path, own[path].value)) for one in found.values()]
+        path: np.array([one.get(path, own[path].value) for one in found.values()], float)
         for path in dict.fromkeys(path for one in found.values() for path in one)
     }
-    same = {path: each[0] for path, each in whole.items() if len({*each}) == 1}
+    same = {path: float(each[0]) for path, each in whole.items() if np.all(each == each[0])}
     differ = {path: each for path, each in whole.items() if path not in same}
-    sets: dict[str, Mapping[str, Any]] = {
-        name: {path: each[i] for path, each in differ.items()} for i, name in enumerate(found)
-    }
-    return circuit.replace(same) if same else circuit, sets
+    return circuit.replace(same) if same else circuit, tuple(found), differ
 
 
 def _applied(circuit: Circuit, kind: str, entry: str) -> tuple[Circuit, str, Mapping[str, Any]]:
@@ -298,7 +283,7 @@ def sweep(
     if store is not None:
         from fingerspice.studies.sweep.chunks import stored
 
-        plan = make_plan(circuit, parameters, n, seed, MOST_STORED_SAMPLES)
+        plan = Plan(circuit, parameters, n, seed, MOST_STORED_SAMPLES)
         return stored(plan, options, Path(store), workers, scheduler, shard)
     if workers is not None or scheduler is not None or tuple(shard) != (1, 1):
         raise InputError(
@@ -306,7 +291,7 @@ def sweep(
         )
     from xarray import Dataset
 
-    plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
+    plan = Plan(circuit, parameters, n, seed, MOST_SAMPLES)
     total = math.prod(plan.sizes)
     require(total <= MOST_SCENES, "the sweep", f"{total:,} scenes", f"at most {MOST_SCENES:,}, or a store")
     draws = Draws(plan, n).part(0) if plan.drawn else {}
@@ -356,7 +341,7 @@ def sobol(
     InputError
         As `sweep`; if nothing is drawn; and if a scene has no result, because indices need all of them.
     """
-    plan = make_plan(circuit, parameters, n, seed, MOST_SAMPLES)
+    plan = Plan(circuit, parameters, n, seed, MOST_SAMPLES)
     require(bool(plan.drawn), "parameters", "all numbers", "one distribution or more, such as scipy.stats.norm(...)")
     confidence = real_number("confidence", confidence, "a number between 0 and 1")
     require(0.0 < confidence < 1.0, "confidence", confidence, "a number between 0 and 1")
@@ -440,20 +425,15 @@ def ranking(found: Dataset, output: str) -> list[dict[str, Any]]:
     A row has ``place`` (values on the grid), ``parameter``, ``first``, ``total``, ``low`` and ``high`` (of ``total``).
     """
     dims = [str(dim) for dim in found[f"{output}_total"].dims[:-1]]
+    kinds = {"first": "first", "total": "total", "low": "total_low", "high": "total_high"}
     rows: list[dict[str, Any]] = []
     for index in np.ndindex(*(found.sizes[dim] for dim in dims)):
         one = found.isel(dict(zip(dims, index, strict=True)))
-        first, total, low, high = (
-            one[f"{output}_{kind}"].values for kind in ("first", "total", "total_low", "total_high")
-        )
+        figures = {key: one[f"{output}_{kind}"].values for key, kind in kinds.items()}
         place = {dim: one[dim].item() for dim in dims}
-        rows += [
-            {
-                "place": place, "parameter": str(one.parameter.values[j]), "first": float(first[j]),
-                "total": float(total[j]), "low": float(low[j]), "high": float(high[j]),
-            }
-            for j in np.argsort(-total, kind="stable")
-        ]  # fmt: skip
+        for j in np.argsort(-figures["total"], kind="stable"):
+            numbers = {key: float(values[j]) for key, values in figures.items()}
+            rows.append({"place": place, "parameter": str(one.parameter.values[j]), **numbers})
     return rows
 
 
@@ -461,10 +441,8 @@ def summary(found: Dataset) -> list[dict[str, float | str]]:
     """Median, 5 and 95 percent and mean of every output of `sweep`, over all its scenes, as rows."""
     rows: list[dict[str, float | str]] = []
     for name, one in found.data_vars.items():
-        if name in ("error", "status", "u_gap"):
-            continue
-        low, middle, high = np.nanquantile(one.values, [0.05, 0.5, 0.95]).tolist()
-        unit = str(one.attrs.get("units", ""))
-        mean = float(np.nanmean(one.values))
-        rows.append({"output": str(name), "unit": unit, "p5": low, "median": middle, "p95": high, "mean": mean})
+        if name not in ("error", "status", "u_gap"):
+            low, middle, high = np.nanquantile(one.values, [0.05, 0.5, 0.95]).tolist()
+            unit, mean = str(one.attrs.get("units", "")), float(np.nanmean(one.values))
+            rows.append({"output": str(name), "unit": unit, "p5": low, "median": middle, "p95": high, "mean": mean})
     return rows
