@@ -178,7 +178,9 @@ class Ladder:
                 break
             error, resolved = self.error(level, run, pending), self.least[pending] <= level.steps
             error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
-            good = (error <= ENOUGH * self.limit * rtol) & resolved & (before is not None or not doubtful)
+            # What decays after a start away from 0 V may have the same error with half the steps, once.
+            once = (before is None) & (doubtful | (self.least > self.decays)[pending])
+            good = (error <= ENOUGH * self.limit * rtol) & resolved & ~once
             self.enter(level, run, pending, good)
             at = self.members[pending[good]]
             task.error[at], task.status[at] = error[good] / self.stated, LOCKSTEP
