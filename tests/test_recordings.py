@@ -12,6 +12,7 @@ import analytic
 import fingerspice as fs
 import recording_errors
 from fingerspice.numerics.linear import moments
+from fingerspice.solve.recordings import run as lanes_of_a_run
 from fingerspice.waveforms.samples import as_samples
 from scenes import cases, every_law, table1_deck
 
@@ -97,6 +98,15 @@ def test_what_the_sweeps_leave_is_stated(number: int) -> None:
     found = recording_errors.judge(recording_errors.draw(number), rtols)
     assert len(found) == 4 * len(rtols)
     assert [x for x in found if not x.covered] == []
+
+
+def test_starts_of_pieces_that_are_left_far_off_are_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = [recording_errors.judge(recording_errors.draw(n), (1e-6,)) for n in (57, 129)]
+    monkeypatch.setattr(lanes_of_a_run, "OF_STARTS", 1e4 * lanes_of_a_run.OF_STARTS)
+    left = [recording_errors.judge(recording_errors.draw(n), (1e-6,)) for n in (57, 129)]
+    for before, after in zip(asked, left, strict=True):
+        assert max(y.true / x.true for x, y in zip(before, after, strict=True)) > 3.0
+        assert all(x.covered for x in after)
 
 
 def test_stated_errors_cover_the_true_ones_and_what_was_asked_is_met() -> None:
