@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray, views_of
-from fingerspice.circuit.network import network_modes
 from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
 from fingerspice.engine.collocation.exponential import forget, new_tables
@@ -328,7 +327,7 @@ def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, l
 
 def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
     network, net = scene.network, scene.net
-    modes = network_modes(network, area)
+    modes = scene.modes_at(area) if area is not scene.area0 else scene.modes
     n, n_s = modes.gains.shape
     slow, fed = net.slow >= 0, _fed(scene)
     n_slow = int(np.count_nonzero(slow))
