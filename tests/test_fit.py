@@ -17,7 +17,7 @@ from commands import Command
 from fingerspice.base.errors import InputError
 from fingerspice.studies.fit import circuitfit
 from fingerspice.studies.fit.fitting import Fitted, followed
-from scenes import cases, covers, table1_deck
+from scenes import cases, covers, table1, table1_deck
 
 CIRCUITS = Path(__file__).parents[1] / "circuits"
 TRUE = {"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6, "Xgap.alpha": 48.0}
@@ -107,6 +107,13 @@ def test_a_signal_over_time_which_noise_may_take_below_0(circuit: fs.Circuit) ->
     assert noisy.min() < 0.0
     found = fs.fit(circuit, {"t": t, "f_el": noisy}, ["Xgap.d"]).estimates
     assert found["Xgap.d"].value == pytest.approx(circuit.parameters["Xgap.d"].value, rel=1e-2)
+
+
+def test_the_source_may_be_fitted_by_its_short_name() -> None:
+    circuit, t = table1(), np.linspace(0.0, 0.02, 41)
+    force = fs.simulate(circuit.replace({"Vdrive.amplitude": 170.0}), t_eval=t, rtol=1e-9).f_el
+    found = fs.fit(circuit, {"t": t, "f_el": force}, ["source.amplitude"], bounds={"SOURCE.amplitude": (150.0, 250.0)})
+    assert found.estimates["Vdrive.amplitude"].value == pytest.approx(170.0, rel=1e-6)
 
 
 def test_what_one_voltage_cannot_tell_is_said(circuit: fs.Circuit) -> None:

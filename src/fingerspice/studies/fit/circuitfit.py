@@ -461,8 +461,8 @@ def fit(
         if time.perf_counter() - begun > 1.0:
             bar.show(note=f"evaluation {number}")
 
-    how = average, skin, rtol, charge_law, watch
-    task, wanted = Task(circuit, names, paths, measured.scale, measured, places, *how).begun(bounds or {}, profiles)
+    task = Task(circuit, names, paths, measured.scale, measured, places, average, skin, rtol, charge_law, watch)
+    task, wanted = task.begun({own_path(circuit, path): box for path, box in (bounds or {}).items()}, profiles)
     for text in filter(None, (*measured.unusual(), *scenes_warnings(circuit, None, measured.conditions, skin))):
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     try:
