@@ -46,6 +46,8 @@ MENDED = {
     (0, 4495): "right",  # The force's peak stood between the last two nodes of a panel.
     (0, 1304): "right",  # Runs were refused for the error of a node whose fast decay no gap feels.
     (0, 1596): "refused: fold",  # The path from where the steps had met the fold went back in time.
+    # After a run near a fold in the same process they ended at their start, and took no implicit steps.
+    **dict.fromkeys(((0, 2540), (0, 2975)), "right"),
     (0, 3546): "right",  # The error of a mode that no leak drains, of 1e12 V, was carried by a difference of that size.
     (0, 3553): "refused: fold",  # The reference's own: its end of a step leapt past the fold.
     # Their gap voltage is near rounding of the source's, and a fold ends them.

@@ -31,8 +31,8 @@ from fingerspice.waveforms.waveform import DOUBLE, require
 RTOL_RANGE = (1e-13, 0.1)
 METHODS, LIBRARIES = ("auto", "exponential", "radau"), ("scipy", "torchdiffeq")
 # Statuses of a run by exponential steps after which another method is tried: for a stack, and for a network.
-BEYOND_STACKS = (Status.FOLD, Status.TOO_MANY_STEPS)
-BEYOND_NETWORKS = (*BEYOND_STACKS, Status.STEP_UNDERFLOW, Status.ERROR_NOT_MET)
+BEYOND_STACKS = (Status.FOLD, Status.TOO_MANY_STEPS, Status.STEP_UNDERFLOW)
+BEYOND_NETWORKS = (*BEYOND_STACKS, Status.ERROR_NOT_MET)
 STARTS = ("deck", "uncharged", "dc", "periodic")
 
 
