@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import fingerspice as fs
 import stress
 from scenes import cases
 
@@ -46,7 +47,7 @@ MENDED = {
     (0, 4495): "right",  # The force's peak stood between the last two nodes of a panel.
     (0, 1304): "right",  # Runs were refused for the error of a node whose fast decay no gap feels.
     (0, 1596): "refused: fold",  # The path from where the steps had met the fold went back in time.
-    # After a run near a fold in the same process they ended at their start, and took no implicit steps.
+    # Their first step fits more than 2^63 times into the run: that number overflowed, and every step was of 0 s.
     **dict.fromkeys(((0, 2540), (0, 2975)), "right"),
     (0, 3546): "right",  # The error of a mode that no leak drains, of 1e12 V, was carried by a difference of that size.
     (0, 3553): "refused: fold",  # The reference's own: its end of a step leapt past the fold.
@@ -67,6 +68,18 @@ OTHERS = {
 @pytest.mark.parametrize(("seed", "number"), [*MENDED, *list(OTHERS)[: cases(len(OTHERS), 0)]])
 def test_a_scene_that_was_wrong_or_endless_is_mended(seed: int, number: int) -> None:
     assert stress.judge(stress.draw(seed, number)).end == (MENDED | OTHERS)[seed, number]
+
+
+@pytest.mark.filterwarnings("ignore:.*breaks down")
+@pytest.mark.parametrize("number", [2540, 2975])
+def test_a_first_step_of_a_1e20th_of_the_run_is_an_exponential_one(number: int) -> None:
+    scene = stress.draw(0, number)
+    with np.errstate(all="ignore"):
+        solution = fs.simulate(scene.circuit, charge_law=scene.law, rtol=1e-6, method="exponential")
+        expected = scene.expected(solution.t).u_gap
+    turns = 2.0 * scene.frequency * solution.t
+    missed = np.abs(solution.u_gap - expected)[np.abs(turns - np.rint(turns)) > 1e-6]  # A jump has two sides.
+    assert missed.max() <= stress.REFERENCE * scene.amplitude
 
 
 def test_scenes_reach_over_twelve_decades_and_repeat() -> None:

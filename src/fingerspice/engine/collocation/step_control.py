@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows
-from fingerspice.engine.collocation.readout import (
-    Control,
-    series_of,
-)
+from fingerspice.engine.collocation.readout import Control, series_of
 from fingerspice.engine.network import Segment, source
 from fingerspice.engine.one_area.model import Model, choose_branch, dot, gap_voltage, jump_charge, ramp, write_row_at
 from fingerspice.numerics.chebyshev import evaluate
@@ -123,7 +120,8 @@ def choose_step(
     target = remaining
     if coupled and 0.0 < ahead < remaining:
         target = ahead
-    h = target / math.ceil(target / h) if h < target else target
+    # `math.ceil` is an integer in compiled code: it would overflow from 1e19 steps on.
+    h = target / np.ceil(target / h) if h < target else target
     if is_series:
         # A series must not be evaluated beyond its end: the last step of a segment ends exactly there.
         if h >= remaining * (1.0 - 1e-9):
