@@ -311,13 +311,13 @@ class Record(Signals):
     rows: FloatArray
     has_charge: bool = False
 
-    def __post_init__(self) -> None:
-        network = self.network
-        found = ((network.areas[i].gap, network.contacts[i]) for i in network.fingers)
-        fingers = tuple((gap.name, contact) for gap, contact in found if gap is not None and contact is not None)
-        layers, sources = (tuple(e.name for e in some) for some in (network.layers, network.sources))
-        vars(self).update(layers=layers, sources=sources, fingers=fingers)
-        super().__post_init__()
+    @cached_property
+    def fingers(self) -> tuple[tuple[str, Contact], ...]:  # type: ignore[override]
+        found = ((self.network.areas[i].gap, self.network.contacts[i]) for i in self.network.fingers)
+        return tuple((gap.name, contact) for gap, contact in found if gap is not None and contact is not None)
+
+    layers = cached_property(lambda self: tuple(e.name for e in self.network.layers))
+    sources = cached_property(lambda self: tuple(e.name for e in self.network.sources))
 
     @cached_property
     def _x(self) -> FloatArray:

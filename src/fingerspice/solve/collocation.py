@@ -39,7 +39,7 @@ from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import sided
 from fingerspice.solve.problem import Problem, Tables, ramp, segment_of
-from fingerspice.solve.runs import Progress, Run, integrate
+from fingerspice.solve.runs import Progress, Run, excess_of, integrate
 from fingerspice.solve.scenes import Scene, kept_with
 from fingerspice.solve.starting import StackState, as_marched, from_stack, from_written, model_of, row_width, to_stack
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, OutOfRangeError, Stepping
@@ -499,7 +499,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
         run.continuous = one.recorded()
         one.stated(run)
         attempts += 1
-        worst = run.excess(problem.rounding) / rtol
+        worst = excess_of(run.gaps, problem.rounding) / rtol
         # A trial (`try_out`) that predicts too large an error stops the run early, with ERROR_NOT_MET.
         is_whole = run.status is not Status.ERROR_NOT_MET
         if is_whole and (run.status is not Status.SUCCESS or worst <= 1.0):

@@ -36,6 +36,7 @@ from fingerspice.solve.runs import (
     Run,
     apart,
     closed_form,
+    excess_of,
     gap_signals,
     integrate,
     nodes_apart,
@@ -242,7 +243,7 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
     run.end_where_it_stopped()
     run.margin = min(margin, float(run.record(problem).fold_margin[-1])) if mobile and run.t.size else margin
     again = partial(_integrate, scheme=fine, tol=taken, u_scale=u_scale)
-    run.continuous = closed_form(problem, again, _BETWEEN * run.excess(problem.rounding))
+    run.continuous = closed_form(problem, again, _BETWEEN * excess_of(run.gaps, problem.rounding))
     run.note = f"{reason}; implicit steps took over, {run.stats['steps']} of them" if reason else ""
     return run
 
@@ -320,7 +321,7 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
     if problem.charge:
         at = slice(problem.initial.y.size - problem.initial.s_before.size, problem.initial.y.size)
         run.charge_error = apart(probed.rows[:, at], beside.rows[:, at])
-    return run.excess(max(ROUNDING * u_scale, problem.rounding))
+    return excess_of(run.gaps, max(ROUNDING * u_scale, problem.rounding))
 
 
 _QUIET = threading.Lock()
@@ -471,7 +472,7 @@ def solve_foreign(problem: Problem, method: str, rtol: float, progress: Progress
         for gap, mine, other in zip(run.gaps, gap_signals(ours), gap_signals(theirs), strict=True):
             gap[2:] += list(map(apart, mine, other))
         run.node_error = (reference.node_error or 0.0) + nodes_apart(ours, theirs)
-        worst = run.excess(max(ROUNDING * u_scale, problem.rounding)) / rtol
+        worst = excess_of(run.gaps, max(ROUNDING * u_scale, problem.rounding)) / rtol
         if run.status is not Status.SUCCESS:
             if reference.status is Status.FOLD:
                 run.status, run.t_failed = reference.status, reference.t_failed

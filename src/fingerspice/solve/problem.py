@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, Literal
 
@@ -30,7 +30,6 @@ from fingerspice.waveforms.sampling import (
     SourceTable,
     breakpoints_at,
     is_sampled,
-    misses,
     on_breakpoint,
     same_time,
     source_table,
@@ -75,8 +74,10 @@ class Problem:
     left: BoolArray = field(default_factory=lambda: np.empty(0, bool))
 
     def at(self, t: FloatArray, left: BoolArray) -> Problem:
-        """The problem with other outputs."""
-        return replace(self, t_out=t, left=left)
+        """The problem with other outputs, and with all that is known about it."""
+        other = object.__new__(Problem)
+        vars(other).update(vars(self), t_out=t, left=left)
+        return other
 
     @property
     def network(self) -> Network:
@@ -96,7 +97,7 @@ class Problem:
         n = self.scene.network.k.shape[0]
         return max(self.scene.u_peak, float(np.abs(self.initial.y[:n]).max(initial=0.0)))
 
-    @property
+    @cached_property
     def rounding(self) -> float:
         """Round-off of a gap's voltage, V: a smaller voltage is 0, and has no sign."""
         return ROUNDING * max(self.largest, self.scene.u_size)
@@ -173,8 +174,10 @@ def prepare(
 def to_ends(t: FloatArray, t_start: float, t_stop: float) -> None:
     """Set times (s, ascending) that pass an end of the run by rounding to that end, in place."""
     slack = same_time(t_stop)
-    t[slice(*t.searchsorted([t_start - slack, t_start]))] = t_start
-    t[slice(*t.searchsorted([t_stop, t_stop + slack], "right"))] = t_stop
+    if t[0] < t_start:
+        t[slice(*t.searchsorted([t_start - slack, t_start]))] = t_start
+    if t[-1] > t_stop:
+        t[slice(*t.searchsorted([t_stop, t_stop + slack], "right"))] = t_stop
 
 
 def check_length(waveform: Waveform, t_start: float, t_stop: float) -> None:
@@ -214,12 +217,13 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
     moved = t
     for w0, w1 in itertools.pairwise(span if windows == 1 else np.linspace(*span, windows + 1)):
         edges = problem.breakpoints() if windows == 1 else problem.waveform.breakpoints(w0, w1)
-        near = edges[misses(t, edges, same_time(1.0))] if edges.size else edges
-        moved = t.copy() if near.size and moved is t else moved
-        slack = same_time(1.0) * np.abs(near)
-        spans = zip(near, t.searchsorted(near - slack), t.searchsorted(near + slack, "right"), strict=True)
-        for edge, first, last in spans:
-            moved[first:last] = edge
+        reach = same_time(1.0) * np.abs(edges)
+        first = t.searchsorted(edges - reach)
+        near = np.flatnonzero(np.abs(t.take(first, mode="clip") - edges) <= reach)
+        edges, first, last = edges[near], first[near], t.searchsorted((edges + reach)[near], "right")
+        for k in np.flatnonzero((t[first] != edges) | (t[last - 1] != edges)):
+            moved = t.copy() if moved is t else moved
+            moved[first[k] : last[k]] = edges[k]
     return moved
 
 
@@ -233,8 +237,8 @@ def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[
     t_out, left = kept_with(kept, key, 1, lambda: _output_times(problem, jumps))
     if t_out.size > KEPT_OUTPUTS:
         kept.pop(key, None)
-    # Check again, because each jump adds two outputs.
-    check_outputs(problem.circuit, t_out.size)
+        # Check again, because each jump adds two outputs.
+        check_outputs(problem.circuit, t_out.size)
     return t_out, left
 
 
@@ -289,7 +293,6 @@ class Tables:
     def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
         self.problem, self.no_chirps = problem, no_chirps
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
-        check_length(problem.waveform, problem.t_start, problem.t_stop)
         span = problem.t_stop - problem.t_start
         rate = max(
             problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,

@@ -91,10 +91,6 @@ class Run:
         gaps[:, 3] += f_el
         self.gaps = gaps
 
-    def excess(self, rounding: float) -> float:
-        """See `excess_of`."""
-        return excess_of(self.gaps, rounding)
-
 
 def excess_of(gaps: FloatArray, rounding: float) -> float:
     """Largest ratio of a stated error to its peak, see `Run.gaps`; a gap within `rounding` (V) of 0 V is not judged."""

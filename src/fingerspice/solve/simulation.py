@@ -25,7 +25,7 @@ from fingerspice.solve.derivatives import check_request, sensitivities_of
 from fingerspice.solve.nodal import solve_coupled, solve_foreign
 from fingerspice.solve.planning import asked, make_plan, run_warnings
 from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare
-from fingerspice.solve.runs import ROUGH, Progress, Run, run_failure
+from fingerspice.solve.runs import ROUGH, Progress, Run, excess_of, run_failure
 from fingerspice.waveforms.waveform import DOUBLE, require
 
 RTOL_RANGE = (1e-13, 0.1)
@@ -326,7 +326,7 @@ def state_error(problem: Problem, run: Run, plan: Plan, rtol: float) -> None:
             gap[2:] = np.maximum(gap[2:], (share * gap[0], share**2 * gap[1]))
     # A closed form is not refused for its round-off, however small `rtol` is: no other method has a smaller error.
     judged = plan.tier == "coupled" or plan.error_bound > 0.0 or run.rough > 0.0
-    if run.status is Status.SUCCESS and judged and run.excess(rounding) > rtol:
+    if run.status is Status.SUCCESS and judged and excess_of(run.gaps, rounding) > rtol:
         run.status = Status.ERROR_NOT_MET
     if coarse:
         run.add_error(coarse)

@@ -186,7 +186,7 @@ class Stepping(Integration):
         alike = (self.t - self.problem.t_start) / period - self.repeated if period else 0.0
         known, spread = float(self.control["error_q"]), max(self.collected[1].tolist(), default=0.0)
         estimate = SAFETY * math.sqrt(known**2 + max(alike - 1.0, 0.0) * spread)
-        held = self.capacitance * (self.largest + float(peaks[:, readout.PEAK_U].max()))
+        held = self.capacitance * (self.largest + max(peaks[:, readout.PEAK_U].tolist()))
         moved = max(float(self.control["peak_q"]), *map(abs, self.y[-self.s_before.size :].tolist()))
         # Every step adds the round-off of the charge that is held, and the relative error of the areas' polynomials is
         # also a relative error of all charge moved.

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import BoolArray, FloatArray, positive_number, real_numbers
+from fingerspice.base.arrays import FloatArray, positive_number, real_numbers
 from fingerspice.base.compiled import jit
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.engine.collocation.readout import SAME_TIME
@@ -167,13 +167,6 @@ def on_grid(t: FloatArray, start: float, step: float, slack: float) -> bool:
         if missed > 0:
             return False
     return True
-
-
-def misses(t: FloatArray, marks: FloatArray, slack: float) -> BoolArray:
-    """For each mark, whether a time is within a share `slack` of it but not equal to it; times and marks ascend."""
-    reach = slack * np.abs(marks)
-    near = t.searchsorted(marks + reach, "right") - t.searchsorted(marks - reach)
-    return np.asarray(near > t.searchsorted(marks, "right") - t.searchsorted(marks))
 
 
 def breakpoints_at(waveform: Waveform, t: float) -> FloatArray:

@@ -301,7 +301,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None) -> Ru
             run = march.run(t_out, problem.left, one.recorded(problem, out))
             run.stats["rejected"] += refused
             # Else the peaks stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
-            if run.excess(problem.rounding) <= rtol:
+            if excess_of(run.gaps, problem.rounding) <= rtol:
                 run.continuous = closed_form(replace(problem, charge=False), again, rtol)
                 return run
     return None
