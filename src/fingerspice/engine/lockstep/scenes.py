@@ -207,6 +207,18 @@ def _polynomials(matrix: FloatArray, values: FloatArray, area: int, c: FloatArra
 
 
 @jit_rows
+def _slopes(area: int, c: FloatArray, marks: Marks) -> None:
+    """Derivative of 1/A by |u| at 0 V, where the polynomial's variable is -1, into the row behind the coefficients."""
+    count, lanes = len(marks[3]), len(marks[5])
+    for i in range(lanes):
+        total, value = 0.0, c[area * lanes + i]
+        for d in range(1, count):
+            total = value - total
+            value = c[(area + d) * lanes + i] - value
+        c[(area + count) * lanes + i] = total * c[lockstep.SCALE * lanes + i]
+
+
+@jit_rows
 def _respond(
     t: FloatArray, tones: FloatArray, k: FloatArray, gain: FloatArray, rates: FloatArray, start: FloatArray,
     c: FloatArray, gap: int, leaks: NDArray[np.int64], marks: Marks,
@@ -297,7 +309,7 @@ def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int,
     lane, modes, cells, both = (lanes,), (m * lanes,), ((m + 1) * lanes,), ((m + 1) * m * lanes,)
     weights = lockstep.N_WEIGHTS * m * lanes
     found = (
-        ((area_row(m, w, k) + d) * lanes,),  # Constants, as `step` takes them
+        ((area_row(m, w, k) + d + 1) * lanes,),  # Constants, as `step` takes them
         modes,  # Modes at the start, V
         (m, lanes), (m, lanes),  # Rates (1/s), and drive of a source of constant pieces
         (rows * lanes,),  # Columns of the table
@@ -312,7 +324,7 @@ def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int,
         cells, cells, cells, lane, modes, both, both, (d * lanes,), (2, m + 1), (2, m), (2, m + 1, m), (2, m + 1),
     )  # fmt: skip
     stepping = (
-        (weights,), (pieces, 3, weights),  # Weights, as `step.run` takes them
+        (weights,), (pieces, weights),  # Weights, as `step.run` takes them
         (n_state(m, k, count) * lanes,),  # State
         (count * lanes,),  # Sums over the last period
         modes,  # Modes at the start of the last period
@@ -324,7 +336,7 @@ def block_shapes(rows: int, pieces: int, marks: Marks) -> tuple[tuple[tuple[int,
         lane,
         # Length of the shortest step, s; in a run from rest, then the number of half periods after which it has settled
         lane,
-        (11, lanes),  # Scratch of `step.weigh`
+        (9, lanes),  # Scratch of `step.weigh`
     )  # fmt: skip
     return found, scratch, stepping
 
@@ -367,6 +379,7 @@ def fill_block(
         tail = max(abs(c[area * lanes + i]), 2.0 / 3.0 * abs(c[(area + 1) * lanes + i])) / 2.0 ** (d_all - 1)
         covered = b[XI * lanes + i] * top[i] <= LARGEST_X
         tails[i] = tail / c[(area + d_all) * lanes + i] if covered else math.inf
+    _slopes(area, c, marks)
     find_rates(k, moved, r, c[(area + d_all) * lanes : (area + d_all + 1) * lanes], rates, near, marks)
     find_modes(rates, scratch, marks)
     link(gap, leaks, moved, feed, shape, c, marks)

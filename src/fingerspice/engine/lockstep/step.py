@@ -1,11 +1,13 @@
 """Many series stacks at once, in lockstep: the steps of `fs.batch`, and their weights.
 
-In the modes of a stack with its area held, the change of the area contributes a few per cent of the modes' rates. An
-exponential Adams method (Hochbruck and Ostermann 2010, section 2.5) solves the linear part exactly:
+In the modes of a stack with its area held, the change of the area contributes a few per cent of the modes' rates.
+Exponential quadrature (Hochbruck and Ostermann 2010, section 2.1) solves the linear part exactly:
 z' = -rate z + drive w + n(w, z), with n linear in dq = 1/A - 1/A0 times the voltages of the leaks, which are the cells
 whose leak has a total resistance, and dq a polynomial in |u_gap|. The waves w are sine and cosine of every tone of the
-source, without a drive, as z is then what is left beside the steady response; or the value of a source of constant
-pieces. Each step predicts with order 3, evaluates the nonlinear term once, and corrects with order 4.
+source, without a drive, as z is then what is left beside the steady response; or the value of a source that is a
+straight line in every step. Each step takes Simpson's rule, with one evaluation of the nonlinear term in its middle and
+one at its end: both are predicted, evaluated, and the end is corrected. Where the gap voltage changes its sign within a
+step, what Simpson's rule misses of the kink of 1/A is added in closed form, for a voltage that is then a straight line.
 
 A block holds `LANES` scenes, one in each lane, and every quantity is a row with one entry for each lane. The only loop
 over the lanes is in a function of its own, whose loops have constant lengths: those of tuples without content. So it is
@@ -21,136 +23,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.base.compiled import jit, jit_rows
-
-
-@jit
-def moment_integrals(y: float) -> tuple[float, float, float, float]:
-    """Integrals of exp(-y (1 - s)) s^k over [0, 1] for k = 0, 1, 2, 3, y >= 0."""
-    if y < 0.3:
-        # k = 3: the sum of (-y)^j 3! / (j + 4)! from its last term on; then a recursion down to k = 0, which damps
-        # rounding.
-        total = 0.0
-        for j in range(11, -1, -1):
-            total = 1.0 - y * total * (1.0 / (j + 5.0))
-        third = total / 4.0
-        second = (1.0 - y * third) / 3.0
-        first = 0.5 * (1.0 - y * second)
-        return 1.0 - y * first, first, second, third
-    zeroth = -math.expm1(-y) / y
-    first = (1.0 - zeroth) / y
-    second = (1.0 - 2.0 * first) / y
-    return zeroth, first, second, (1.0 - 3.0 * second) / y
-
-
-def _basis(nodes: tuple[float, ...], rows: int) -> NDArray[np.float64]:
-    """Powers, lowest first, of the Lagrange polynomials of some nodes; rows beyond them are 0."""
-    out = np.zeros((rows, 4))
-    for i, node in enumerate(nodes):
-        others = [x for x in nodes if x != node]
-        powers = np.poly(others) / np.prod([node - x for x in others]) if others else np.ones(1)
-        out[i, : powers.size] = powers[::-1]
-    return out
-
-
-# Steps by the values that they have: none before the start of the step (the first of all), one (the second), two at
-# equal distances, and the first and second step after the step has been doubled. The distances are in steps.
-_BEFORE = ((), (-1.0,), (-1.0, -2.0), (-0.5, -1.0), (-1.0, -1.5))
-#: For each kind of step, the polynomials of predictor (3) and corrector (4) by powers, shape (5, 7, 4).
-_POLYNOMIALS = np.stack([
-    np.concatenate([_basis((0.0, *before), 3), _basis((1.0, 0.0, *before), 4)]) for before in _BEFORE
-])  # fmt: skip
-# Number of doublings that give the moments of a step, and the largest product of rate and step that they serve.
-_DOUBLED = 6
-_MOST = 0.3 * 2.0**_DOUBLED
-#: Kinds of the first, second and further steps: of the first piece, and of the others.
-_KINDS = np.array([[0, 1, 2], [3, 4, 2]])
-
-
-@jit_rows
-def _shortest(rates: FloatArray, h: FloatArray, moments: FloatArray, marks: Marks) -> None:
-    """Moments of every lane, shape (5, lanes), over a 64th of a step, whose sum needs no exponential function."""
-    for i in range(len(marks[5])):
-        y = rates[i] * h[i] * (1.0 / 2.0**_DOUBLED)
-        total = 0.0
-        for j in range(11, -1, -1):
-            total = 1.0 - y * total * (1.0 / (j + 5.0))
-        m3 = total / 4.0
-        m2 = (1.0 - y * m3) * (1.0 / 3.0)
-        m1 = 0.5 * (1.0 - y * m2)
-        m0 = 1.0 - y * m1
-        moments[0, i], moments[1, i], moments[2, i], moments[3, i], moments[4, i] = 1.0 - y * m0, m0, m1, m2, m3
-
-
-@jit_rows
-def _double(moments: FloatArray, longer: FloatArray, marks: Marks) -> None:
-    """Moments over twice the length of a step, shape (5, lanes): exp(-y), then those of `moment_integrals`."""
-    for i in range(len(marks[5])):
-        e, m0, m1, m2, m3 = moments[0, i], moments[1, i], moments[2, i], moments[3, i], moments[4, i]
-        longer[0, i] = e * e
-        longer[1, i] = 0.5 * (e * m0 + m0)
-        longer[2, i] = 0.25 * (e * m1 + m0 + m1)
-        longer[3, i] = 0.125 * (e * m2 + m0 + 2.0 * m1 + m2)
-        longer[4, i] = 0.0625 * (e * m3 + m0 + 3.0 * (m1 + m2) + m3)
-
-
-@jit_rows
-def _weigh_rows(
-    powers: FloatArray, h: FloatArray, drive: FloatArray, moments: FloatArray, g: FloatArray, mode: int, marks: Marks
-) -> None:  # fmt: skip
-    """Weights of a step of length h (lanes,) for one mode, from its moments and the polynomials of its kind, (7, 4)."""
-    n_modes, lanes = len(marks[0]), len(marks[5])
-    for i in range(lanes):
-        g[(DECAY * n_modes + mode) * lanes + i] = moments[0, i]
-        g[(DRIVE * n_modes + mode) * lanes + i] = drive[i] * h[i] * moments[1, i]
-    for row in range(7):
-        p0, p1, p2, p3 = powers[row, 0], powers[row, 1], powers[row, 2], powers[row, 3]
-        at = ((PREDICT + row) * n_modes + mode) * lanes
-        for i in range(lanes):
-            total = p0 * moments[1, i] + p1 * moments[2, i] + p2 * moments[3, i] + p3 * moments[4, i]
-            g[at + i] = h[i] * total
-
-
-@jit
-def weigh(
-    shortest: FloatArray, rates: FloatArray, drive: FloatArray, g: Weights, scratch: FloatArray, marks: Marks
-) -> None:  # fmt: skip
-    """Weights of every lane for a step of length 0 and for the pieces, the first of steps of length `shortest` (s).
-
-    `rates` and `drive` have shape (n_mode, lanes); `scratch` (11, lanes) is overwritten.
-    """
-    m_all, lanes = len(marks[0]), len(marks[5])
-    still, moving = g
-    still[:] = 0.0
-    still[DECAY * m_all * lanes : (DECAY + 1) * m_all * lanes] = 1.0
-    h = scratch[10]
-    for m in range(m_all):
-        now, longer = scratch[:5], scratch[5:10]
-        for i in range(lanes):
-            h[i] = shortest[i]
-        _shortest(rates[m], shortest, now, marks)
-        for _ in range(_DOUBLED):
-            _double(now, longer, marks)
-            now, longer = longer, now
-        for i in range(lanes):
-            y = rates[m, i] * h[i]
-            if y > _MOST:
-                now[1, i], now[2, i], now[3, i], now[4, i] = moment_integrals(y)
-                now[0, i] = 1.0 - y * now[1, i]
-        for piece in range(moving.shape[0]):
-            for step in range(3):
-                _weigh_rows(_POLYNOMIALS[_KINDS[min(piece, 1), step]], h, drive[m], now, moving[piece, step], m, marks)
-            _double(now, longer, marks)
-            now, longer = longer, now
-            for i in range(lanes):
-                h[i] *= 2.0
-
+from fingerspice.base.compiled import jit, jit_rows, jit_within_rows
 
 LANES = 32
 """Scenes of a block on the processor."""
-START_TIMES = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0, 1.5, 2.0)
-"""Times of the shorter steps at the start of a run without jumps, in steps."""
-START = len(START_TIMES) - 1
+START, START_STEPS = 3, (0, 0, 1, 2)
+"""Doublings of the shortest step, an eighth, to a step; and to the steps that a run without jumps begins with."""
+START_TIMES = (0.0, 0.0625, 0.125, 0.1875, 0.25, 0.375, 0.5, 0.75, 1.0)
+"""Times of their ends and middles, in steps."""
+# Number of doublings that give the moments of half a step, and the largest product of rate and length that they serve.
+_DOUBLED = 6
+_MOST = 0.3 * 2.0**_DOUBLED
 
 Mark = tuple[tuple[()], ...]
 """A tuple of which only the length counts, which compiled code knows as a constant; it is passed without any cost."""
@@ -158,20 +41,21 @@ Marks = tuple[Mark, Mark, Mark, Mark, Mark, Mark]
 """Marks for the modes, waves, leaks, powers of the polynomial, moments and lanes."""
 
 Weights = tuple[FloatArray, NDArray[np.float64]]
-"""Weights of a step of length 0; and for every piece of a window those of its first and second step and of all others,
-shape (pieces, 3, n)."""
+"""Weights of a step of length 0; and of the steps of every piece of a window, each twice as long, (pieces, n)."""
 
 # Rows of the constants: the scale of |u| to [-1, 1]; u by modes, and by waves; the voltages of the leaks by waves, and
-# by modes, leak after leak; n by leaks, mode after mode; and the polynomial of 1/A.
+# by modes, leak after leak; n by leaks, mode after mode; the polynomial of 1/A; and its derivative by |u| at 0 V.
 SCALE, SHAPE = 0, 1
-# Rows of the weights, each for every mode: decay, drive; predictor's weights of the nonlinear term at this step and the
-# two before; corrector's weights at the next step, this one and the two before.
-DECAY, DRIVE, PREDICT, PREDICT_OLD, PREDICT_OLDER = 0, 1, 2, 3, 4
-CORRECT, CORRECT_NOW, CORRECT_OLD, CORRECT_OLDER, N_WEIGHTS = 5, 6, 7, 8, 9
-# Rows of the state for every mode: z, the nonlinear term now, one and two steps before, and two scratch rows of a step.
-Z, RATE, OLD, OLDER, KEPT, GUESS, N_STATE = 0, 1, 2, 3, 4, 5, 6
+# Rows of the weights, each for every mode. To the middle: decay, source at both ends, and the powers of the polynomial
+# that predicts the nonlinear term. To the end: decay, source at both ends, nonlinear term at start and middle and their
+# second difference, as predicted; at start, middle and end, as corrected; and what Simpson's rule misses of |u|.
+HALF, HALF_SOURCE, HALF_SOURCE_END, HALF_NOW, HALF_TREND, HALF_CURVE, DECAY, SOURCE, SOURCE_END = range(9)
+PREDICT, PREDICT_MIDDLE, PREDICT_CURVE, CORRECT, CORRECT_MIDDLE, CORRECT_END, KINK, N_WEIGHTS = range(9, 17)
+# Rows of the state for every mode: z, the nonlinear term at the start of the step, in the middle of the step before and
+# at the start of that, and a guess.
+Z, RATE, MIDDLE, OLD, GUESS, N_STATE = 0, 1, 2, 3, 4, 5
 # Rows of the state after those: gap voltage, its peak, then the integrands' latest values and their weighted sums, and
-# last dq times the voltage of every leak.
+# last dq times the voltage of every leak, and this voltage.
 GAP, PEAK, VALUE = 0, 1, 2
 ALL_MOMENTS = 3
 """Number of the integrands u^2 A, (u^2 A)^2 and u^2. (A itself has a kink where u is 0: its sum is of order 2 only.)"""
@@ -191,147 +75,246 @@ def area_row(m: int, w: int, k: int) -> int:
 @jit
 def n_state(m: int, k: int, moments: int) -> int:
     """Rows of the state, with m modes and k leaks."""
-    return N_STATE * m + VALUE + 2 * moments + k
+    return N_STATE * m + VALUE + 2 * moments + 2 * k
+
+
+@jit
+def moment_integrals(y: float) -> tuple[float, float, float]:
+    """Integrals of exp(-y (1 - s)) s^k over [0, 1] for k = 0, 1, 2, y >= 0."""
+    if y < 0.3:
+        # k = 2: the sum of (-y)^j 2! / (j + 3)! from its last term on; then a recursion down to k = 0, which damps
+        # rounding.
+        total = 0.0
+        for j in range(11, -1, -1):
+            total = 1.0 - y * total * (1.0 / (j + 4.0))
+        second = total / 3.0
+        first = 0.5 * (1.0 - y * second)
+        return 1.0 - y * first, first, second
+    zeroth = -math.expm1(-y) / y
+    first = (1.0 - zeroth) / y
+    return zeroth, first, (1.0 - 2.0 * first) / y
 
 
 @jit_rows
-def _step(
-    c: FloatArray, g: FloatArray, s: FloatArray, source: FloatArray, before: float, weight: float, marks: Marks,
-) -> None:  # fmt: skip
-    """One step of every lane; adds `weight` times the integrands at its end to their sums.
+def _shortest(rates: FloatArray, h: FloatArray, moments: FloatArray, marks: Marks) -> None:
+    """Moments of every lane, shape (4, lanes), over a 64th of half a step, whose sum needs no exponential function."""
+    for i in range(len(marks[5])):
+        y = rates[i] * h[i] * (0.5 / 2.0**_DOUBLED)
+        total = 0.0
+        for j in range(11, -1, -1):
+            total = 1.0 - y * total * (1.0 / (j + 4.0))
+        m2 = total * (1.0 / 3.0)
+        m1 = 0.5 * (1.0 - y * m2)
+        m0 = 1.0 - y * m1
+        moments[0, i], moments[1, i], moments[2, i], moments[3, i] = 1.0 - y * m0, m0, m1, m2
 
-    `source` holds the waves at the end of the step, and `before` the first of them at its start.
+
+@jit_rows
+def _double(moments: FloatArray, longer: FloatArray, marks: Marks) -> None:
+    """Moments over twice the length of a step, shape (4, lanes): exp(-y), then those of `moment_integrals`."""
+    for i in range(len(marks[5])):
+        e, m0, m1, m2 = moments[0, i], moments[1, i], moments[2, i], moments[3, i]
+        longer[0, i] = e * e
+        longer[1, i] = 0.5 * (e * m0 + m0)
+        longer[2, i] = 0.25 * (e * m1 + m0 + m1)
+        longer[3, i] = 0.125 * (e * m2 + m0 + 2.0 * m1 + m2)
+
+
+@jit_rows
+def _weigh_rows(
+    h: FloatArray, drive: FloatArray, half: FloatArray, whole: FloatArray, g: FloatArray, mode: int, marks: Marks
+) -> None:
+    """Weights of a step of length h (lanes,) for one mode, from its moments over half of it and over all of it."""
+    m_all, lanes = len(marks[0]), len(marks[5])
+    for i in range(lanes):
+        length, by, m0, m1, m2 = 0.5 * h[i], drive[i], half[1, i], half[2, i], half[3, i]
+        g[(HALF * m_all + mode) * lanes + i] = half[0, i]
+        g[(HALF_SOURCE * m_all + mode) * lanes + i] = by * length * (m0 - 0.5 * m1)
+        g[(HALF_SOURCE_END * m_all + mode) * lanes + i] = by * length * 0.5 * m1
+        g[(HALF_NOW * m_all + mode) * lanes + i] = length * m0
+        g[(HALF_TREND * m_all + mode) * lanes + i] = length * m1
+        g[(HALF_CURVE * m_all + mode) * lanes + i] = length * 0.5 * m2
+        g[(KINK * m_all + mode) * lanes + i] = h[i] * half[0, i]
+    for i in range(lanes):
+        length, by, m0, m1, m2 = h[i], drive[i], whole[1, i], whole[2, i], whole[3, i]
+        g[(DECAY * m_all + mode) * lanes + i] = whole[0, i]
+        g[(SOURCE * m_all + mode) * lanes + i] = by * length * (m0 - m1)
+        g[(SOURCE_END * m_all + mode) * lanes + i] = by * length * m1
+        g[(PREDICT * m_all + mode) * lanes + i] = length * (m0 - 2.0 * m1)
+        g[(PREDICT_MIDDLE * m_all + mode) * lanes + i] = length * 2.0 * m1
+        g[(PREDICT_CURVE * m_all + mode) * lanes + i] = length * (4.0 * m2 - 2.0 * m1)
+        g[(CORRECT * m_all + mode) * lanes + i] = length * (m0 - 3.0 * m1 + 2.0 * m2)
+        g[(CORRECT_MIDDLE * m_all + mode) * lanes + i] = length * 4.0 * (m1 - m2)
+        g[(CORRECT_END * m_all + mode) * lanes + i] = length * (2.0 * m2 - m1)
+
+
+@jit
+def weigh(
+    shortest: FloatArray, rates: FloatArray, drive: FloatArray, g: Weights, scratch: FloatArray, marks: Marks
+) -> None:  # fmt: skip
+    """Weights of every lane for a step of length 0 and for the pieces, the first of steps of length `shortest` (s).
+
+    `rates` and `drive` have shape (n_mode, lanes); `scratch` (9, lanes) is overwritten.
+    """
+    m_all, lanes = len(marks[0]), len(marks[5])
+    still, moving = g
+    still[:] = 0.0
+    still[HALF * m_all * lanes : (HALF + 1) * m_all * lanes] = 1.0
+    still[DECAY * m_all * lanes : (DECAY + 1) * m_all * lanes] = 1.0
+    h = scratch[8]
+    for m in range(m_all):
+        half, whole = scratch[:4], scratch[4:8]
+        for i in range(lanes):
+            h[i] = shortest[i]
+        _shortest(rates[m], shortest, half, marks)
+        for _ in range(_DOUBLED):
+            _double(half, whole, marks)
+            half, whole = whole, half
+        for i in range(lanes):
+            y = 0.5 * rates[m, i] * h[i]
+            if y > _MOST:
+                half[1, i], half[2, i], half[3, i] = moment_integrals(y)
+                half[0, i] = 1.0 - y * half[1, i]
+        for piece in range(moving.shape[0]):
+            _double(half, whole, marks)
+            _weigh_rows(h, drive[m], half, whole, moving[piece], m, marks)
+            half, whole = whole, half
+            for i in range(lanes):
+                h[i] *= 2.0
+
+
+@jit_within_rows
+def _change(c: FloatArray, u: float, area: int, powers: Mark, lanes: int, i: int) -> float:
+    """dq at a gap voltage, without the polynomial's last term, which belongs to 1/A0."""
+    v = abs(u) * c[SCALE * lanes + i] - 1.0
+    q = c[area * lanes + i]
+    for d in range(1, len(powers) - 1):
+        q = q * v + c[(area + d) * lanes + i]
+    return float(q * v)
+
+
+@jit_within_rows
+def _by_waves(c: FloatArray, row: int, source: FloatArray, waves: Mark, lanes: int, i: int) -> float:
+    total = c[row * lanes + i] * source[0]
+    for w in range(1, len(waves)):
+        total += c[(row + w) * lanes + i] * source[w]
+    return float(total)
+
+
+@jit_rows
+def step(
+    c: FloatArray, g: FloatArray, s: FloatArray, source: tuple[FloatArray, FloatArray, FloatArray], trend: float,
+    weight: float, marks: Marks,
+) -> None:  # fmt: skip
+    """One step of every lane; adds `weight` times Simpson's sums of the integrands over it to their sums.
+
+    `source` holds the waves at the start, in the middle and at the end of the step; `trend` is the length of the step
+    over that of the one before, 0 for a step that has none before it.
     """
     modes, waves, leaks, powers, moments, scenes = marks
-    m_all, w_all, l_all, d_all, count = len(modes), len(waves), len(leaks), len(powers) - 1, len(moments)
-    lanes = len(scenes)
+    m_all, w_all, l_all, count, lanes = len(modes), len(waves), len(leaks), len(moments), len(scenes)
     of_u = SHAPE + m_all
     of_w = of_u + w_all
     of_z = of_w + l_all * w_all
     of_leak = of_z + l_all * m_all
     area = of_leak + m_all * l_all
+    rest, slope = area + len(powers) - 1, area + len(powers)
     own = N_STATE * m_all
     value, total = own + VALUE, own + VALUE + count
     current = total + count
+    start, middle, end = source
+    first, last, share = start[0], end[0], trend / (1.0 + trend)
     for i in range(lanes):
-        wave = c[of_u * lanes + i] * source[0]
-        for w in range(1, w_all):
-            wave += c[(of_u + w) * lanes + i] * source[w]
-        u = wave
+        u = _by_waves(c, of_u, middle, waves, lanes, i)
         for m in range(m_all):
-            kept = g[(DECAY * m_all + m) * lanes + i] * s[(Z * m_all + m) * lanes + i]
-            kept += g[(DRIVE * m_all + m) * lanes + i] * before
-            guess = kept + g[(PREDICT * m_all + m) * lanes + i] * s[(RATE * m_all + m) * lanes + i]
-            guess += g[(PREDICT_OLD * m_all + m) * lanes + i] * s[(OLD * m_all + m) * lanes + i]
-            guess += g[(PREDICT_OLDER * m_all + m) * lanes + i] * s[(OLDER * m_all + m) * lanes + i]
-            s[(KEPT * m_all + m) * lanes + i] = kept
+            now, between = s[(RATE * m_all + m) * lanes + i], s[(MIDDLE * m_all + m) * lanes + i]
+            curve = trend * ((now - between) - (between - s[(OLD * m_all + m) * lanes + i]))
+            guess = g[(HALF * m_all + m) * lanes + i] * s[(Z * m_all + m) * lanes + i]
+            guess += g[(HALF_NOW * m_all + m) * lanes + i] * now
+            guess += g[(HALF_TREND * m_all + m) * lanes + i] * (trend * (now - between) + 0.5 * curve)
+            guess += g[(HALF_CURVE * m_all + m) * lanes + i] * (trend * curve)
+            if w_all == 1:
+                guess += g[(HALF_SOURCE * m_all + m) * lanes + i] * first
+                guess += g[(HALF_SOURCE_END * m_all + m) * lanes + i] * last
             s[(GUESS * m_all + m) * lanes + i] = guess
             u += c[(SHAPE + m) * lanes + i] * guess
-        v = abs(u) * c[SCALE * lanes + i] - 1.0
-        q = c[area * lanes + i]
-        for d in range(1, d_all):
-            q = q * v + c[(area + d) * lanes + i]
-        q *= v
+        q = _change(c, u, area, powers, lanes, i)
         for k in range(l_all):
-            change = c[(of_w + k * w_all) * lanes + i] * source[0]
-            for w in range(1, w_all):
-                change += c[(of_w + k * w_all + w) * lanes + i] * source[w]
+            change = _by_waves(c, of_w + k * w_all, middle, waves, lanes, i)
             for m in range(m_all):
                 change += c[(of_z + k * m_all + m) * lanes + i] * s[(GUESS * m_all + m) * lanes + i]
             s[(current + k) * lanes + i] = q * change
+            s[(current + l_all + k) * lanes + i] = change
+        square = u * u
+        force = square / (q + c[rest * lanes + i])
+        wave = _by_waves(c, of_u, end, waves, lanes, i)
         u = wave
         for m in range(m_all):
             rate = c[(of_leak + m * l_all) * lanes + i] * s[current * lanes + i]
             for k in range(1, l_all):
                 rate += c[(of_leak + m * l_all + k) * lanes + i] * s[(current + k) * lanes + i]
-            now, old = s[(RATE * m_all + m) * lanes + i], s[(OLD * m_all + m) * lanes + i]
-            z = s[(KEPT * m_all + m) * lanes + i] + g[(CORRECT * m_all + m) * lanes + i] * rate
-            z += g[(CORRECT_NOW * m_all + m) * lanes + i] * now
-            z += g[(CORRECT_OLD * m_all + m) * lanes + i] * old
-            z += g[(CORRECT_OLDER * m_all + m) * lanes + i] * s[(OLDER * m_all + m) * lanes + i]
+            now = s[(RATE * m_all + m) * lanes + i]
+            # The polynomial through the middle of the step before, the start and the middle of this one.
+            curve = share * ((rate - now) - trend * (now - s[(MIDDLE * m_all + m) * lanes + i]))
+            s[(MIDDLE * m_all + m) * lanes + i] = rate
+            kept = g[(DECAY * m_all + m) * lanes + i] * s[(Z * m_all + m) * lanes + i]
+            if w_all == 1:
+                kept += g[(SOURCE * m_all + m) * lanes + i] * first + g[(SOURCE_END * m_all + m) * lanes + i] * last
+            s[(Z * m_all + m) * lanes + i] = kept
+            guess = kept + g[(PREDICT * m_all + m) * lanes + i] * now
+            guess += g[(PREDICT_MIDDLE * m_all + m) * lanes + i] * rate
+            guess += g[(PREDICT_CURVE * m_all + m) * lanes + i] * curve
+            s[(GUESS * m_all + m) * lanes + i] = guess
+            u += c[(SHAPE + m) * lanes + i] * guess
+        q = _change(c, u, area, powers, lanes, i)
+        # The integral of |u| less Simpson's rule, on a straight line between both ends.
+        before = s[(own + GAP) * lanes + i]
+        size = abs(before) + abs(u)
+        missed = (before * before + u * u) / (2.0 * size + 1e-300) - (size + 2.0 * abs(before + u)) / 6.0
+        missed = c[slope * lanes + i] * missed if before * u < 0.0 else 0.0
+        for k in range(l_all):
+            change = _by_waves(c, of_w + k * w_all, end, waves, lanes, i)
+            for m in range(m_all):
+                change += c[(of_z + k * m_all + m) * lanes + i] * s[(GUESS * m_all + m) * lanes + i]
+            s[(current + k) * lanes + i] = q * change
+            s[(current + l_all + k) * lanes + i] *= missed
+        u = wave
+        for m in range(m_all):
+            rate = c[(of_leak + m * l_all) * lanes + i] * s[current * lanes + i]
+            kink = c[(of_leak + m * l_all) * lanes + i] * s[(current + l_all) * lanes + i]
+            for k in range(1, l_all):
+                rate += c[(of_leak + m * l_all + k) * lanes + i] * s[(current + k) * lanes + i]
+                kink += c[(of_leak + m * l_all + k) * lanes + i] * s[(current + l_all + k) * lanes + i]
+            z = s[(Z * m_all + m) * lanes + i] + g[(KINK * m_all + m) * lanes + i] * kink
+            now = s[(RATE * m_all + m) * lanes + i]
+            z += g[(CORRECT * m_all + m) * lanes + i] * now
+            z += g[(CORRECT_MIDDLE * m_all + m) * lanes + i] * s[(MIDDLE * m_all + m) * lanes + i]
+            z += g[(CORRECT_END * m_all + m) * lanes + i] * rate
             s[(Z * m_all + m) * lanes + i] = z
-            s[(OLDER * m_all + m) * lanes + i] = old
             s[(OLD * m_all + m) * lanes + i] = now
             s[(RATE * m_all + m) * lanes + i] = rate
             u += c[(SHAPE + m) * lanes + i] * z
         s[(own + GAP) * lanes + i] = u
         s[(own + PEAK) * lanes + i] = max(s[(own + PEAK) * lanes + i], abs(u))
-        a = 1.0 / (q + c[(area + d_all) * lanes + i])
-        force = u * u * a
-        s[value * lanes + i] = force
-        s[total * lanes + i] += weight * force
+        latest = u * u / (q + c[rest * lanes + i])
+        s[total * lanes + i] += weight * (s[value * lanes + i] + 4.0 * force + latest)
+        s[value * lanes + i] = latest
         if count > 1:
-            s[(value + 1) * lanes + i] = force * force
-            s[(total + 1) * lanes + i] += weight * (force * force)
+            latest *= latest
+            s[(total + 1) * lanes + i] += weight * (s[(value + 1) * lanes + i] + 4.0 * force * force + latest)
+            s[(value + 1) * lanes + i] = latest
+            s[(total + 2) * lanes + i] += weight * (s[(value + 2) * lanes + i] + 4.0 * square + u * u)
             s[(value + 2) * lanes + i] = u * u
-            s[(total + 2) * lanes + i] += weight * (u * u)
-
-
-@jit_rows
-def _add_latest(first: int, count: int, weight: float, s: FloatArray, marks: Marks) -> None:
-    """Add `weight` times the latest values to the sums."""
-    lanes = len(marks[5])
-    for i in range(count * lanes):
-        s[(first + count) * lanes + i] += weight * s[first * lanes + i]
 
 
 @jit
-def quadrature(k: int, steps: int) -> float:
-    """Weight of value k of `steps` + 1 equidistant values in Gregory's quadrature of order 4, in step lengths.
-
-    Simpson's rule, of the same order, serves 2 or 4 steps, where the two ends of Gregory's would overlap.
-    """
-    end = min(k, steps - k)
-    if steps < 5:
-        return (1.0 if end == 0 else 4.0 if k % 2 == 1 else 2.0) / 3.0
-    return 0.375 if end == 0 else 7.0 / 6.0 if end == 1 else 23.0 / 24.0 if end == 2 else 1.0
-
-
-@jit
-def _record(s: FloatArray, gap: int, trace: FloatArray, at: int, marks: Marks) -> None:
-    """Write the gap voltages, row `gap` of the state, into column `at` of the trace, shape (lanes, n)."""
+def _record(s: FloatArray, trace: FloatArray, at: int, marks: Marks) -> None:
+    """Write the gap voltages of the state into column `at` of the trace, shape (lanes, n)."""
     if trace.size > 0:
         lanes = len(marks[5])
-        stride = trace.size // lanes
+        gap, stride = (N_STATE * len(marks[0]) + GAP) * lanes, trace.size // lanes
         for i in range(lanes):
-            trace[i * stride + at] = s[gap * lanes + i]
-
-
-@jit
-def _window(
-    c: FloatArray, g: NDArray[np.float64], s: FloatArray, wave: FloatArray, places: tuple[int, int, int],
-    steps: tuple[int, int], unit: float, trace: FloatArray, at: int, marks: Marks,
-) -> None:  # fmt: skip
-    """Take steps of one length, a range of Gregory's rule.
-
-    `g` (3, n) are weights of the first, second and further steps; `places` the row of the waves at the start, its
-    change from step to step, and the row after which the first one follows; `steps` their number, and how many of this
-    length precede them; `unit` their length in that of the sums. The `trace` takes the gap voltages before the steps,
-    from column `at` on unless that is negative.
-    """
-    count, own = len(marks[4]), N_STATE * len(marks[0])
-    place, stride, period = places
-    _add_latest(own + VALUE, count, unit * quadrature(0, steps[0]), s, marks)
-    for k in range(steps[0]):
-        if at >= 0:
-            _record(s, own + GAP, trace, at + k, marks)
-        before = wave[place, 0]
-        place = place + stride if place + stride != period else 0
-        weight = unit * quadrature(k + 1, steps[0])
-        _step(c, g[min(k + steps[1], 2)], s, wave[place], before, weight, marks)
-
-
-@jit
-def _ease_in(
-    c: FloatArray, g: NDArray[np.float64], s: FloatArray, wave: FloatArray, trace: FloatArray, marks: Marks
-) -> None:  # fmt: skip
-    """The first two steps of a run, in `START` shorter ones, as the first of all has no step before it."""
-    period, gap = wave.shape[0] - START - 1, N_STATE * len(marks[0]) + GAP
-    _record(s, gap, trace, 0, marks)
-    _window(c, g[0], s, wave, (period, 1, period), (4, 0), 0.125, trace, -1, marks)
-    _window(c, g[1], s, wave, (period + 4, 1, period), (2, 0), 0.25, trace, -1, marks)
-    _record(s, gap, trace, 1, marks)
-    _window(c, g[2], s, wave, (period + 6, 1, period), (2, 0), 0.5, trace, -1, marks)
+            trace[i * stride + at] = s[gap + i]
 
 
 @jit
@@ -341,31 +324,30 @@ def run(
 ) -> None:  # fmt: skip
     """Integrate a block's scenes over some half periods, from the state `s` on: at the start modes, and 0 for the rest.
 
-    `wave` (n + START + 1, len(waves)) has the waves at the n steps of a period, and at `START_TIMES`; of a turned
-    source (2, 1) its values in both halves of a period. `how` is the number of half periods that lie behind, 0 at the
-    start of a run; and of those when this ends; number of steps in each; and whether the source is turned: it is
+    `wave` (2 n + 9, len(waves)) has the waves at ends and middles of the n steps of a period, and at `START_TIMES`; of
+    a turned source (2, 1) its values in both halves of a period. `how` is the number of half periods that lie behind, 0
+    at the start of a run; and of those when this ends; number of steps in each; and whether the source is turned: it is
     constant for a half period, then jumps to its negative, and the method restarts. Such a half period has the pieces
-    that `g` has: of equally many steps, which are twice as long in every piece as in the one before. Without jumps, all
-    of these half periods are a range of Gregory's rule. The `trace` (lanes * steps,) or (0,) takes the gap voltage
-    before each step of the run, V.
+    that `g` has: of equally many steps, which are twice as long in every piece as in the one before. The `trace`
+    (lanes * steps,) or (0,) takes the gap voltage before each step of the run, V.
     """
     done, halves, half, turned = how
-    pieces = g[1].shape[0]
-    if not turned:
-        begun = 0
-        if done == 0:
-            _step(c, g[0], s, wave[0], 0.0, 0.0, marks)
-            _ease_in(c, g[1], s, wave, trace, marks)
-            begun = 2
-        steps, before = (halves - done) * half - begun, 0 if done == 0 else 2
-        place = (done % 2 * half + begun) % (2 * half)
-        _window(c, g[1][3], s, wave, (place, 1, 2 * half), (steps, before), 1.0, trace, done * half + begun, marks)
-        return
-    for window in range(done, halves):
+    pieces, period, stride = g[1].shape[0], wave.shape[0] - len(START_TIMES), 0 if turned else 1
+    shortest, before = pieces / (2.0**pieces - 1.0) if turned else 0.125, START
+    for k in range(done * half, halves * half):
+        starts, piece, parts = k == 0 or (turned and k % half == 0), k % half * pieces // half if turned else START, 1
+        if k == 0 and not turned:
+            parts = len(START_STEPS)
         # A step of length 0 evaluates the nonlinear term and the integrands.
-        _step(c, g[0], s, wave[window % 2], 0.0, 0.0, marks)
-        steps, unit = half // pieces, pieces / (2.0**pieces - 1.0)
-        for piece in range(pieces):
-            at = window * half + piece * steps
-            _window(c, g[1][piece], s, wave, (window % 2, 0, -1), (steps, 0), unit, trace, at, marks)
-            unit *= 2.0
+        for part in range(-1 if starts else 0, parts):
+            if part == 0:
+                _record(s, trace, k, marks)
+            if parts > 1:
+                piece = START_STEPS[max(part, 0)]
+            at = k // half % 2 if turned else (period + 2 * max(part, 0) if k == 0 else 2 * k % period)
+            between, end = (at, at) if part < 0 else (at + stride, at + 2 * stride)
+            trend = 0.0 if part < 0 or (part == 0 and starts) else 2.0 ** (piece - before)
+            weight = 0.0 if part < 0 else shortest * 2.0**piece / 6.0
+            rows = wave[at], wave[between], wave[end if end != period else 0]
+            step(c, g[0] if part < 0 else g[1][piece], s, rows, trend, weight, marks)
+            before = piece

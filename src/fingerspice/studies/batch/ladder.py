@@ -19,9 +19,9 @@ from fingerspice.studies.batch.form import FIGURES, LOCKSTEP, LockstepForm, Task
 
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
 # and (of the highest) under several; and initial degree of the area's polynomial, of which each takes the compiler 8 s.
-_RUNGS = ((5e-4, 40, 32, 8), (5e-5, 64, 48, 8), (5e-6, 96, 96, 16), (5e-7, 144, 144, 16), (0.0, 144, 144, 24))
-# By how much that grows with every doubling of the steps, its highest, and the largest number of steps.
-_MORE_DEGREE, HIGHEST_DEGREE, _MOST_STEPS = 8, 24, 8192
+_RUNGS = ((5e-4, 20, 16, 8), (5e-5, 32, 24, 8), (5e-6, 48, 48, 16), (5e-7, 72, 72, 16), (0.0, 64, 64, 16))
+# By how much that grows where the last coefficient is more than this share of rtol; and the largest number of steps.
+_MORE_DEGREE, _SMALL_TAIL, _MOST_STEPS = 8, 0.1, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
 # Largest gap voltage that the area's polynomial covers, as a ratio to its estimate: the second one for scenes that the
@@ -30,42 +30,39 @@ _PARTS = (2, 16)
 _COVERED = 1.2, 1.8
 # Allowed defect of the periodic state relative to rtol, and that of a run from rest that ends when it has settled.
 _CLOSING, _SETTLED = 0.02, 0.05
-# Under sines and below this rtol, where the kinks are most of the error, no scene is accepted before the steps have
-# been doubled once, with a smaller factor by which that may reduce the estimate.
-_DOUBTFUL, _GAIN_IN_DOUBT = 5e-7, 12.0
 # Longest first step after a jump of a square, and longest step at all of a run whose source is not 0 V at its start, in
 # time constants of the fastest cell; and the voltage at the start that counts as 0 V, over all tones. Also from
 # there a leaking gap's voltage jumps, as it leads the source: below this rtol the first step is as short as a square's.
-_LONGEST_STEP, _FROM_ZERO, _LEADING = 1.0, 1e-12, 5e-6
+_LONGEST_STEP, _FROM_ZERO, _LEADING = 1.0, 1e-12, 5e-5
+# Under sines and below this rtol no scene is accepted before the steps have been doubled once.
+_DOUBTFUL = 5e-7
 # Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
 # `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
-_PIECES = ((5e-5, 8), (5e-7, 12), (0.0, 24))
+_PIECES = ((5e-5, 4), (5e-6, 6), (5e-7, 8), (0.0, 16))
 _PIECE_START, _MOST_PIECES = 2, 20
 #: A scene is accepted if its estimate is at most this fraction of the error allowed.
 ENOUGH = 0.7
 # The relative round-off added to every stated error.
 _ROUNDING = 1e-11
-# The error is estimated as this share of the change from half the steps to all steps, by the smallest rtol served. The
-# order is 4, which would give a fifteenth. But the kink of 1/A where the gap voltage is 0 has order 2, with a factor
-# that depends on where between two steps it falls: that is most of a small error. Pieces of 4 and of 8 steps are still
+# The error is estimated as this share of the change from half the steps to all steps. The order is 4, which would give
+# a fifteenth, and 3 for what the kinks of 1/A leave, where the gap voltage is 0. Pieces of 2 and of 4 steps are still
 # far from the order.
-_STATED, _STATED_JUMPING = ((5e-6, 0.25), (5e-7, 0.5), (0.0, 0.8)), 0.5
+_STATED, _STATED_JUMPING = 0.25, 0.5
 # Where a step is longer than this many of the fastest time constants, the start of a run from rest is not resolved, and
 # the change is no larger than the error; it is smaller where that start is most of the error.
-_STIFF, _STATED_STIFF = 2.0, ((5e-6, 0.8), (0.0, 2.5))
+_STIFF, _STATED_STIFF = 2.0, 0.8
 # A gap voltage shows the kinks at its zeros more than means do.
 _STATED_TRACED = 0.8
 # Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
 # 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
 _STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
 # What decays after a start away from 0 V meets steps of several lengths, whose errors may cancel with half the steps.
-_STATED_STARTED = 2.0
-# A run of degree d has this rounding error, relative, besides 2^d times 1e-16: the area's polynomial's coefficients
-# lose a digit in two to the rounding with every power.
-_ROUNDING_OF_SLOPES, _EPS = 1e-13, 1.1e-16
-# The stated error of a derivative has this many changes from half the steps to all steps, under tones and under
-# squares. Under tones a kink's error is about as large as the change, or larger where that is small by chance.
-_STATED_SLOPES, _STATED_SLOPES_JUMPING = 3.0, 2.0
+_STATED_STARTED = 0.8
+# Rounding error of a run in which the area's polynomial has degree d, relative: 2^d times this, by which the powers'
+# coefficients are larger than those of Chebyshev's series. And, in a derivative, that of all else.
+_EPS, _ROUNDING_OF_SLOPES = 4.4e-16, 1e-13
+# The stated error of a derivative has this many changes from half the steps to all steps.
+_STATED_SLOPES = 2.0
 
 
 class Level(NamedTuple):
@@ -99,7 +96,7 @@ class Ladder:
     closer = 1.0  # Factor on the tolerance that ends the search for a periodic state
     # As an estimate may be small by chance, doubling the steps may not reduce it by more than this factor.
     most_gain = 24.0
-    highest_degree = HIGHEST_DEGREE  # Of the area's polynomial
+    highest_degree = 24  # Of the area's polynomial
     gives_up = True  # Whether scenes are given up for which more steps are no help
     named = ""  # What comes before the message of a scene that cannot be run
     # Why scenes of a form that lockstep takes may have no result from it
@@ -140,7 +137,7 @@ class Ladder:
         elif not periodic:
             sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
             from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
-            first = np.where(from_zero, START_TIMES[1] if self.task.rtol < _LEADING else 0.0, 1.0)
+            first = np.where(from_zero, START_TIMES[2] if self.task.rtol < _LEADING else 0.0, 1.0)
         # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
         self.least = 2.0 * first * self.decays / _LONGEST_STEP
 
@@ -169,7 +166,8 @@ class Ladder:
         form, task, rtol = self.form, self.task, self.task.rtol
         most = _MOST_STEPS * max(form.multiples) if form.recording is None else _PARTS[1]
         doubtful = rtol < _DOUBTFUL and not form.jumping and form.recording is None
-        gain = _GAIN_IN_DOUBT if doubtful else self.most_gain
+        # No degree whose rounding is too large.
+        highest = self.highest_degree if 0.3 * rtol > 2.0**self.highest_degree * _EPS else 16
         before: tuple[FloatArray, FloatArray] | None = None  # Results and gap voltages with half the steps
         last, outside = np.full(pending.size, np.inf), [pending[:0]]
         while pending.size and level.steps <= most:
@@ -177,7 +175,7 @@ class Ladder:
             if run is None:
                 break
             error, resolved = self.error(level, run, pending), self.least[pending] <= level.steps
-            error = np.where(np.isfinite(last), np.maximum(error, last / gain), error)
+            error = np.where(np.isfinite(last), np.maximum(error, last / self.most_gain), error)
             # What decays after a start away from 0 V may have the same error with half the steps, once.
             once = (before is None) & (doubtful | (self.least > self.decays)[pending])
             good = (error <= ENOUGH * self.limit * rtol) & resolved & ~once
@@ -190,14 +188,16 @@ class Ladder:
                 # A scene whose estimate grows from twice the steps: the explicit steps may be unstable around that
                 # area. And where the area's polynomial of the highest degree is what limits the error.
                 beyond |= ~good & resolved & (error > last)
-                final = level.degree >= HIGHEST_DEGREE and before is not None
+                final = level.degree >= highest and before is not None
                 left &= (tail <= ENOUGH * rtol).all(axis=0) | (not final)
             left &= ~beyond
             outside.append(pending[beyond])
             kept = np.tile(left, self.copies)
             before = run.fine[:, kept], run.trace[kept]
             last, pending = error[left], pending[left]
-            degree = max(level.degree, min(level.degree + _MORE_DEGREE, self.highest_degree))
+            degree = level.degree
+            if tail[:, left].max(initial=0.0) > _SMALL_TAIL * rtol:
+                degree = max(degree, min(degree + _MORE_DEGREE, highest))
             level = level._replace(steps=2 * level.steps, degree=degree)
         return np.concatenate(outside)
 
@@ -288,7 +288,7 @@ class Ladder:
         # The area's polynomial of the run with half the steps may be another one.
         change = np.max(changes, axis=0) + run.coarse[-1]
         share = self._share(level, self.decays[pending], self.least[pending])
-        return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING)
+        return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING + 2.0**level.degree * _EPS)
 
     def _share(self, level: Level, decays: FloatArray, least: FloatArray) -> FloatArray | float:
         """The error as a share of the change."""
@@ -296,9 +296,8 @@ class Ladder:
             return _STATED_RECORDED if self.form.cells == len(self.form.stack.layers) else _STATED_DISPERSIVE
         if self.form.jumping:
             return _STATED_JUMPING
-        own, stiff = (next(s for rtol, s in shares if self.task.rtol >= rtol) for shares in (_STATED, _STATED_STIFF))
-        own = _STATED_TRACED if self.task.traced else own
-        share = np.where(2.0 * decays > _STIFF * level.steps, max(own, stiff), own)
+        own = _STATED_TRACED if self.task.traced else _STATED
+        share = np.where(2.0 * decays > _STIFF * level.steps, max(own, _STATED_STIFF), own)
         # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
         return np.where(least > decays, _STATED_STARTED, share)
 
@@ -308,14 +307,14 @@ class Slopes(Ladder):
 
     Copies of a scene have one of the parameters smaller, then larger, by a step. The steps do not depend on a
     parameter: a difference has the error of the method and hardly any noise. The tangents of the same steps would have
-    this error, too: it comes from the kink of 1/A where the gap voltage is 0, which has order 1 in a derivative.
+    this error, too: it comes from the kink of 1/A where the gap voltage is 0, whose order is less by 1 in a derivative.
     """
 
     limit = 10.0  # For a change of the parameter by all of itself
     stated = 1.0
     # What ends the search for a periodic state moves a difference by 1 / STEP of itself.
     closer = STEP
-    # Kinks have order 1, with a factor that depends on where between two steps they fall.
+    # What kinks leave depends on where between two steps they fall.
     most_gain = 8.0
     highest_degree = 16
     gives_up = False
@@ -353,8 +352,7 @@ class Slopes(Ladder):
         # The polynomial's error is one of Chebyshev's, whose slope is larger by its degree.
         tail = level.degree * (tail + run.coarse[-1].reshape(self.copies, -1).max(axis=0))
         noise = 2.0 * closing + _ROUNDING_OF_SLOPES + 2.0**level.degree * _EPS
-        share = _STATED_SLOPES_JUMPING if self.form.jumping else _STATED_SLOPES
-        return np.asarray(share * change + cut + tail + noise / STEP)
+        return np.asarray(_STATED_SLOPES * change + cut + tail + noise / STEP)
 
     def _changes(self, mean: FloatArray, pending: IntArray) -> tuple[FloatArray, FloatArray]:
         """Changes of outputs by each parameter, for all of it, shape (n_output, n_parameter, n), and relative to them.
@@ -375,6 +373,6 @@ def _waves(n: int, form: LockstepForm) -> FloatArray:
     if n == 0 or form.jumping:
         return np.array([[1.0], [-1.0]])[: 2 * n]
     # The phase in turns is reduced before it is multiplied by 2 pi, so that high tones keep their accuracy.
-    times = np.concatenate([np.arange(n), START_TIMES])
+    times = np.concatenate([0.5 * np.arange(2 * n), START_TIMES])
     turns = np.outer(times, form.multiples) % n * (2.0 * np.pi / n)
     return np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(times.size, -1)
