@@ -185,12 +185,16 @@ def weigh(
 
 @jit_within_rows
 def _change(c: FloatArray, u: float, area: int, powers: Mark, lanes: int, i: int) -> float:
-    """dq at a gap voltage, without the polynomial's last term, which belongs to 1/A0."""
+    """dq at a gap voltage: the polynomial, of degree 4 k, without its last term, which belongs to 1/A0."""
     v = abs(u) * c[SCALE * lanes + i] - 1.0
-    q = c[area * lanes + i]
-    for d in range(1, len(powers) - 1):
-        q = q * v + c[(area + d) * lanes + i]
-    return float(q * v)
+    # Four sums in powers of v^4, as in a single one every product would wait for the last.
+    square, at = v * v, area * lanes + i
+    fourth, third, second, first = c[at], c[at + lanes], c[at + 2 * lanes], c[at + 3 * lanes]
+    for d in range(4, len(powers) - 1, 4):
+        by, at = square * square, (area + d) * lanes + i
+        fourth, third = fourth * by + c[at], third * by + c[at + lanes]
+        second, first = second * by + c[at + 2 * lanes], first * by + c[at + 3 * lanes]
+    return float(v * ((fourth * v + third) * square + (second * v + first)))
 
 
 @jit_within_rows
