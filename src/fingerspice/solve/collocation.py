@@ -38,7 +38,7 @@ from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import State, Status
 from fingerspice.results.record import sided
-from fingerspice.solve.problem import Problem, Tables, ramp, segment_of
+from fingerspice.solve.problem import ROUNDING, Problem, Tables, ramp, segment_of
 from fingerspice.solve.runs import Progress, Run, excess_of, integrate
 from fingerspice.solve.scenes import Scene, kept_with
 from fingerspice.solve.starting import StackState, as_marched, from_stack, from_written, model_of, row_width, to_stack
@@ -480,8 +480,8 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
     met = tables.peak() if is_stack or problem.scene.is_sampled else 0.0
     u_scale = scale_of(problem, met) if is_stack else max(problem.largest, met) or GUESS
     tol, top, nfev, attempts, tries_out = LOCAL_SHARE * rtol, 0.0, 0, 0, True
-    # The voltages of sources that cancel are rounding errors of those of their parts.
-    finest = FINEST * max(1.0, problem.scene.u_size / u_scale)
+    # What is left of sources that cancel has fewer digits than these; what a gap takes of a source has as many as that.
+    finest = FINEST * max(1.0, problem.scene.u_size / (met or u_scale))
     while True:
         one = stepping(problem, rtol, max(tol, finest), u_scale, top, repeat)
         if tries_out:
@@ -493,8 +493,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
             continue
         run.by_layer = True
         run.end_where_it_stopped()
-        nfev += run.nfev
-        run.nfev = nfev
+        run.nfev = nfev = nfev + run.nfev
         run.stats["repeated"] = one.repeated
         run.continuous = one.recorded()
         one.stated(run)
@@ -506,7 +505,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
             return run
         peak = float(run.gaps[:, 0].max(initial=0.0))
         # A peak smaller than its own error may still vanish with a finer tolerance, so that case is not hopeless.
-        hopeless = rtol * peak < problem.rounding and run.error.u_gap < peak
+        hopeless = rtol * peak < ROUNDING / FINEST * finest * u_scale and run.error.u_gap < peak
         if hopeless or tol <= finest or attempts >= ATTEMPTS:
             if is_whole:
                 run.status = Status.ERROR_NOT_MET

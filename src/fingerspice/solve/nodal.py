@@ -227,7 +227,8 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
         elif run.status is not Status.SUCCESS or (worst <= 1.0 and beside.status is not Status.FOLD):
             break
         else:
-            # This branch is also taken where the coarser run has met a fold that this run passed without one.
+            # Also where the coarser run alone has met a fold. Rounding of the nodes' voltages may be too large, too.
+            last |= 0.0 < rtol * run.gaps[:, 0].max(initial=0.0) < FINEST * u_scale
             run.status = Status.ERROR_NOT_MET if last else run.status
             tol = max(tol * min(0.3, 0.5 / worst if worst > 0.0 else 0.3), finest)
         if last:

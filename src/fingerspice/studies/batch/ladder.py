@@ -19,7 +19,7 @@ from fingerspice.studies.batch.form import FIGURES, LOCKSTEP, LockstepForm, Task
 
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
 # and (of the highest) under several; and initial degree of the area's polynomial, of which each takes the compiler 8 s.
-_RUNGS = ((5e-4, 20, 16, 8), (5e-5, 32, 24, 8), (5e-6, 48, 48, 16), (5e-7, 72, 72, 16), (0.0, 64, 64, 16))
+_RUNGS = ((5e-4, 20, 16, 8), (5e-5, 32, 24, 8), (5e-6, 48, 48, 16), (5e-7, 72, 72, 16), (0.0, 112, 112, 16))
 # By how much that grows where the last coefficient is more than this share of rtol; and the largest number of steps.
 _MORE_DEGREE, _SMALL_TAIL, _MOST_STEPS = 8, 0.1, 8192
 # Under a recording: initial number of steps a sample, and the largest.
@@ -34,8 +34,6 @@ _CLOSING, _SETTLED = 0.02, 0.05
 # time constants of the fastest cell; and the voltage at the start that counts as 0 V, over all tones. Also from
 # there a leaking gap's voltage jumps, as it leads the source: below this rtol the first step is as short as a square's.
 _LONGEST_STEP, _FROM_ZERO, _LEADING = 1.0, 1e-12, 5e-5
-# Under sines and below this rtol no scene is accepted before the steps have been doubled once.
-_DOUBTFUL = 5e-7
 # Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
 # `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
 _PIECES = ((5e-5, 4), (5e-6, 6), (5e-7, 8), (0.0, 16))
@@ -165,7 +163,6 @@ class Ladder:
         """Find what is wanted of scenes, and return those whose gap voltage the area's polynomial does not serve."""
         form, task, rtol = self.form, self.task, self.task.rtol
         most = _MOST_STEPS * max(form.multiples) if form.recording is None else _PARTS[1]
-        doubtful = rtol < _DOUBTFUL and not form.jumping and form.recording is None
         # No degree whose rounding is too large.
         highest = self.highest_degree if 0.3 * rtol > 2.0**self.highest_degree * _EPS else 16
         before: tuple[FloatArray, FloatArray] | None = None  # Results and gap voltages with half the steps
@@ -177,7 +174,7 @@ class Ladder:
             error, resolved = self.error(level, run, pending), self.least[pending] <= level.steps
             error = np.where(np.isfinite(last), np.maximum(error, last / self.most_gain), error)
             # What decays after a start away from 0 V may have the same error with half the steps, once.
-            once = (before is None) & (doubtful | (self.least > self.decays)[pending])
+            once = (before is None) & (self.least > self.decays)[pending]
             good = (error <= ENOUGH * self.limit * rtol) & resolved & ~once
             self.enter(level, run, pending, good)
             at = self.members[pending[good]]
