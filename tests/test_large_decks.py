@@ -141,6 +141,12 @@ def test_brackets_of_any_depth_are_read_or_refused() -> None:
     assert refusal(f".param x={'{' * 100_000}") == "{ is never closed"
 
 
+def test_brackets_behind_numbers_are_refused_in_linear_time() -> None:
+    # Each of them was once followed as far as a name may reach, two minutes in all.
+    with pytest.raises(fs.InputError, match="'\\(' is never closed"):
+        fs.parse_netlist(f"a deck\nV1 a 0 SIN(0 1 100)\nC1 a 0 1n\n.tran 1u 1m uic{'(1' * 100_000}\n")
+
+
 def test_subcircuits_nested_in_each_other_are_read() -> None:
     read = parse_deck("t\n" + lines(lambda i: f".subckt s{i} a") + ".ends\n" * MANY + "R1 a 0 1\n")
     assert len(read.statements) == 1

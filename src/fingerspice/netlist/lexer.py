@@ -216,7 +216,7 @@ def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Gro
         if len(top.words) < plain and lexeme.kind == "word":
             lexeme, after = _with_brackets(lexemes, index)
         following = lexemes[after].kind if after < count else ""
-        probe = _probe(lexemes, index) if probes and following == "(" else None
+        probe = _probe(lexemes, index) if probes and following == "(" and not _NUMERIC.match(lexeme.text) else None
         if probe is not None or (following == "=" and lexeme.kind not in _MARKS):
             key, equals = probe or (lexeme, after)
             _assign(inside, key, lexemes[equals + 1 : equals + 3])
