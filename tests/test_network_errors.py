@@ -170,6 +170,8 @@ def test_the_nodes_error_is_stated_and_does_not_refuse_a_run() -> None:
     run.node_error = 1e-5
     run.add_error(2e-5)
     assert run.error.v_nodes == pytest.approx(3e-5)
+    # That of the force, 2 F du / u more, and no share of the nodes'.
+    assert excess_of(run.gaps, 1e-12) == pytest.approx(8.1e-7)
 
 
 # Two fingers, one at a small share of the other's voltage -------------------------------------------------------------

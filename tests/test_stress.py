@@ -50,10 +50,7 @@ MENDED = {
     # Their first step fits more than 2^63 times into the run: that number overflowed, and every step was of 0 s.
     **dict.fromkeys(((0, 2540), (0, 2975)), "right"),
     (0, 5806): "right",  # A gap took 1e-8 of the source, and so many digits of it as the source has were thought lost.
-    (
-        0,
-        3636,
-    ): "refused: rounding",  # Implicit steps went on for 20 s though rounding was more than the error asked for.
+    (0, 3636): "refused: rounding",  # Implicit steps took 20 s though rounding alone was more than the error asked for.
     (0, 3546): "right",  # The error of a mode that no leak drains, of 1e12 V, was carried by a difference of that size.
     (0, 3553): "refused: fold",  # The reference's own: its end of a step leapt past the fold.
     # Their gap voltage is near rounding of the source's, and a fold ends them.

@@ -49,9 +49,8 @@ STAGES, STAGES_BESIDE, BESIDE = 7, 5, 10.0
 # Residual of Newton's method that both runs may have in common, and their difference does not show, as a fraction of
 # the step tolerance.
 ALIKE = 0.05
-# Error allowed in a step, relative to the error asked for.
-LOCAL_SHARE = 0.2
-FINEST = 1e-14
+# Error allowed in a step, over the one asked for; the least one, and rounding that all errors have, over the voltages.
+LOCAL_SHARE, FINEST, ROUNDED = 0.2, 1e-14, 4e-15
 # Longest step, relative to the shortest time scale of the sources: its stages must not alias the sources.
 LONGEST_STEP = 0.5
 # Number of equidistant times at which the two runs are compared: least, per period, and most.
@@ -228,7 +227,7 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
             break
         else:
             # Also where the coarser run alone has met a fold. Rounding of the nodes' voltages may be too large, too.
-            last |= 0.0 < rtol * run.gaps[:, 0].max(initial=0.0) < FINEST * u_scale
+            last |= 0.0 < rtol * run.gaps[:, 0].max(initial=0.0) < ROUNDED * u_scale
             run.status = Status.ERROR_NOT_MET if last else run.status
             tol = max(tol * min(0.3, 0.5 / worst if worst > 0.0 else 0.3), finest)
         if last:
@@ -308,7 +307,7 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
 
     Returns the largest stated error relative to the peak of its gap, of voltages and forces.
     """
-    both, gaps = (alike + 4e-15) * u_scale, []
+    both, gaps = (alike + ROUNDED) * u_scale, []
     fine, coarse = probed.record(problem), beside.record(problem)
     # Between the times compared, the steps may have seen larger voltages, and forces if the area has no time constant.
     met = itertools.chain(run.gaps[:, :2].tolist(), itertools.repeat((0.0, 0.0)))

@@ -237,8 +237,8 @@ def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[
     t_out, left = kept_with(kept, key, 1, lambda: _output_times(problem, jumps))
     if t_out.size > KEPT_OUTPUTS:
         kept.pop(key, None)
-        # Check again, because each jump adds two outputs.
-        check_outputs(problem.circuit, t_out.size)
+    # Check again, because each jump adds two outputs.
+    check_outputs(problem.circuit, t_out.size)
     return t_out, left
 
 
