@@ -423,9 +423,7 @@ def _of_alike(c: Alike, factor: float) -> float:
     return factor * c.x.sum()
 
 
-@jit_by_kind(Outer=_of_outer, Alike=_of_alike)
-def _chosen(c: Outer | Alike, factor: float) -> float:
-    raise NotImplementedError
+_chosen = jit_by_kind(Outer=_of_outer, Alike=_of_alike)
 
 
 @njit

@@ -219,24 +219,24 @@ def _cached(*, noalias: bool = False, **options: Any) -> Callable[[Function], Fu
     return compile_when_called
 
 
-def jit_by_kind(**functions: Callable[..., Any]) -> Callable[[Function], Function]:
-    """A function that stands for one of several in compiled code, chosen by the class of its first argument.
+def _of_kind(*given: Any) -> Any:
+    """What `jit_by_kind` stands for; never run."""
+    raise NotImplementedError
 
-    These are given by the names of the classes, which are named tuples. All take the same arguments as the function
-    decorated, whose body is never run.
+
+def jit_by_kind(**functions: Callable[..., Any]) -> Any:
+    """In compiled code one of several functions, chosen by the class of the first argument.
+
+    They are given by the names of the classes, which are named tuples, and take the same arguments.
     """
+    chosen: Any = njit(_of_kind)
 
-    def stands_for(function: Function) -> Function:
-        chosen: Any = njit(function)
+    def called(args: Any) -> Any:
+        return functions[args[0].instance_class.__name__]
 
-        def called(args: Any) -> Any:
-            return functions[args[0].instance_class.__name__]
-
-        chosen.get_call_template = lambda args, kws: called(args).get_call_template(args, kws)
-        chosen.get_overload = lambda args: called(args).get_overload(args)
-        return cast(Function, chosen)
-
-    return stands_for
+    chosen.get_call_template = lambda args, kws: called(args).get_call_template(args, kws)
+    chosen.get_overload = lambda args: called(args).get_overload(args)
+    return chosen
 
 
 if cast(Any, config).DISABLE_JIT:

@@ -13,18 +13,8 @@ from numpy.typing import NDArray
 
 from fingerspice.base.arrays import ComplexArray, FloatArray, IntArray
 from fingerspice.base.compiled import borrow, jit
+from fingerspice.engine import network
 from fingerspice.engine.collocation.readout import note
-from fingerspice.engine.network import (
-    Net,
-    Room,
-    Sources,
-    at_sources,
-    capacitances,
-    choose_signs,
-    gap_voltage,
-    rates,
-    residual,
-)
 from fingerspice.numerics.modes import copy_to, invert
 
 # Entry of `counters`: evaluations of the right-hand side.
@@ -73,11 +63,11 @@ class Work(NamedTuple):
 class Nodal(NamedTuple):
     """A network and its sources, as the implicit steps take them; `room` and `work` are scratch arrays."""
 
-    net: Net
-    room: Room
+    net: network.Net
+    room: network.Room
     scheme: Scheme
     work: Work
-    sources: Sources
+    sources: network.Sources
     jump: bool  # Whether the sources' "time" is the fraction of a jump
     sign: FloatArray  # (n_area,): Branch of each area; 0: to be chosen
     scale: FloatArray  # (size,): Size of each entry of the state, to which its error is relative
@@ -85,7 +75,7 @@ class Nodal(NamedTuple):
 
 
 @jit
-def new_work(net: Net, stages: int, n_eigen: int, size: int) -> Work:
+def new_work(net: network.Net, stages: int, n_eigen: int, size: int) -> Work:
     """Room for steps of a state of `size`."""
     n_s = net.b.shape[1]
     m = size - n_s
@@ -106,7 +96,7 @@ def linearise(c: Nodal, y: FloatArray) -> None:
     net, room, work, jump, sign, scale = c.net, c.room, c.work, c.jump, c.sign, c.scale
     n = net.k.shape[0]
     m = work.slope.shape[0]
-    capacitances(net, room, y, sign)
+    network.capacitances(net, room, y, sign)
     work.mass[:] = 0.0
     for i in range(m):
         largest = 1.0 if i >= n else 0.0
@@ -118,11 +108,11 @@ def linearise(c: Nodal, y: FloatArray) -> None:
             work.mass[i, i] = 1.0
         work.weight[i] = 1.0 / largest
     copy_to(work.stage, y)
-    residual(net, room, jump, y, sign, work.rate, room.base)
+    network.residual(net, room, jump, y, sign, work.rate, room.base)
     for j in range(m):
         change = 1e-7 * (abs(y[j]) + scale[j])
         work.stage[j] = y[j] + change
-        residual(net, room, jump, work.stage, sign, work.rate, room.probe)
+        network.residual(net, room, jump, work.stage, sign, work.rate, room.probe)
         work.stage[j] = y[j]
         for i in range(m):
             work.slope[i, j] = work.weight[i] * (room.probe[i] - room.base[i]) / change
@@ -183,7 +173,7 @@ def _residuals(c: Nodal, h: float, y: FloatArray) -> None:
         _stage(scheme, work, i, h, y)
         copy_to(room.s, work.s[i])
         copy_to(room.ds, work.ds[i])
-        residual(net, room, jump, work.stage, sign, work.k[i], room.base)
+        network.residual(net, room, jump, work.stage, sign, work.k[i], room.base)
         for j in range(m):
             work.residual[i, j] = work.weight[j] * room.base[j]
         # Nothing depends on the charges: they are only integrated.
@@ -205,7 +195,7 @@ def step(c: Nodal, t: float, h: float, y: FloatArray, counters: IntArray) -> flo
         return math.inf
     k = work.k
     for i in range(stages):
-        at_sources(c.sources, work.place, work.base[0], t + scheme.c[i] * h, work.s[i], work.ds[i])
+        network.at_sources(c.sources, work.place, work.base[0], t + scheme.c[i] * h, work.s[i], work.ds[i])
     before = math.inf
     for iteration in range(12):
         _residuals(c, h, y)
@@ -249,7 +239,7 @@ def step(c: Nodal, t: float, h: float, y: FloatArray, counters: IntArray) -> flo
             _stage(scheme, work, i, h, y)
             copy_to(room.s, work.s[i])
             copy_to(room.ds, work.ds[i])
-            if not rates(net, room, jump, work.stage, sign, work.rate):
+            if not network.rates(net, room, jump, work.stage, sign, work.rate):
                 return math.inf
     return norm if norm == norm else math.inf
 
@@ -335,7 +325,7 @@ class Passage(NamedTuple):
 def _signed(c: Nodal, i: int, t: float, h: float, theta: float, y: FloatArray) -> float:
     """Gap voltage i (V) at fraction `theta` of a step, times the sign of its branch: negative off the branch."""
     _look(c, t, h, theta, y)
-    off: float = c.sign[i] * gap_voltage(c.net, c.room, i, c.work.stage)
+    off: float = c.sign[i] * network.gap_voltage(c.net, c.room, i, c.work.stage)
     return off
 
 
@@ -343,7 +333,7 @@ def _signed(c: Nodal, i: int, t: float, h: float, theta: float, y: FloatArray) -
 def _look(c: Nodal, t: float, h: float, theta: float, y: FloatArray) -> None:
     """State and sources at fraction `theta` of the step that starts at y, into `work.stage` and `room`."""
     dense_state(theta, y, c.work.poly, c.work.stage)
-    at_sources(c.sources, c.work.place, c.work.base[0], t + theta * h, c.room.s, c.room.ds)
+    network.at_sources(c.sources, c.work.place, c.work.base[0], t + theta * h, c.room.s, c.room.ds)
 
 
 @jit
@@ -408,7 +398,7 @@ def _write_outputs(c: Nodal, run: Passage, t: float, h: float, t_new: float) -> 
         for j in range(y.size):
             run.rows[i, j] = work.stage[j]
         if run.charge:
-            rates(c.net, c.room, False, work.stage, c.sign, work.rate)
+            network.rates(c.net, c.room, False, work.stage, c.sign, work.rate)
             for j in range(n_s):
                 run.rows[i, y.size + j] = work.rate[y.size - n_s + j]
         counters[OUTPUT] += 1
@@ -421,7 +411,7 @@ def _account(c: Nodal, run: Passage, t: float, h: float) -> None:
         _look(c, t, h, 0.25 * part, run.y)
         for i in range(run.peaks.size):
             if c.net.gap[i] >= 0:
-                run.peaks[i] = max(run.peaks[i], abs(gap_voltage(c.net, c.room, i, c.work.stage)))
+                run.peaks[i] = max(run.peaks[i], abs(network.gap_voltage(c.net, c.room, i, c.work.stage)))
 
 
 @jit
@@ -442,9 +432,9 @@ def _prepare(c: Nodal, run: Passage, now: FloatArray, slopes: FloatArray) -> boo
     copy_to(c.room.ds, slopes)
     for i in range(c.sign.size):
         if c.sign[i] == 0.0:
-            choose_signs(c.net, c.room, c.jump, run.y, c.sign)
+            network.choose_signs(c.net, c.room, c.jump, run.y, c.sign)
             break
-    if not rates(c.net, c.room, c.jump, run.y, c.sign, c.work.rate):
+    if not network.rates(c.net, c.room, c.jump, run.y, c.sign, c.work.rate):
         return False
     copy_to(c.work.start, c.work.rate)
     linearise(c, run.y)
@@ -497,7 +487,7 @@ def _move(c: Nodal, run: Passage, t: float, h: float, stop: float, last: bool) -
     if control[JUMPED] > 0.0:
         control[H_AFTER_JUMP] = h
         control[JUMPED] = 0.0
-    at_sources(c.sources, c.work.place, base, t_new, run.s_before, c.room.ds)
+    network.at_sources(c.sources, c.work.place, base, t_new, run.s_before, c.room.ds)
     control[BASE], control[T] = (stop, 0.0) if last else (base, t_new)
     run.counters[ACCEPTED] += 1
 
@@ -522,7 +512,7 @@ def advance(c: Nodal, run: Passage, t_end: float) -> int:
         work.base[0] = base
         stop = _next_edge(c, base + t, t_end)
         room_left = (stop - base) - t
-        at_sources(c.sources, work.place, base, t, now, slopes)
+        network.at_sources(c.sources, work.place, base, t, now, slopes)
         if not c.jump:
             for i in range(now.size):
                 if abs(now[i] - run.s_before[i]) > ROUNDING * max(abs(now[i]), abs(run.s_before[i])):

@@ -49,10 +49,10 @@ class Iterates(NamedTuple):
     guess: FloatArray
 
 
-@jit_by_kind(OneArea=evaluate_one, ManyAreas=evaluate_many)
-def _evaluate(circuit: Any, state: Any) -> bool:
-    """The nonlinear term at the modes of the step at hand; False beyond a fold."""
-    raise NotImplementedError
+# The nonlinear term of a circuit in a run at the modes of the step at hand, False beyond a fold; and at other modes,
+# with both as rows of `work.spare`.
+_evaluate = jit_by_kind(OneArea=evaluate_one, ManyAreas=evaluate_many)
+_probe = jit_by_kind(OneArea=probe_one, ManyAreas=probe_many)
 
 
 @jit_within
@@ -216,8 +216,21 @@ def forget(tables: Tables) -> None:
     tables.used[:] = 0
 
 
+@jit_within
+def take_tables(
+    tables: Tables, level: int, h: float, rates: FloatArray, gap: FloatArray, state: Any, weight: FloatArray
+) -> None:
+    """Take the tables of a step of length h (s) around a reference, and what its modes do to the gap (see `weigh`)."""
+    step = state.step[0]
+    step.slot = _make_tables(
+        rates, level, h, tables.h, tables.level, tables.used, tables.decay, tables.phi, tables.miss
+    )  # fmt: skip
+    step.tabled = h
+    weigh(rates, gap, tables.decay[step.slot], h, weight)
+
+
 @jit
-def make_tables(
+def _make_tables(
     rates: FloatArray, level: int, h: float, keys_h: FloatArray, keys_level: IntArray, count: IntArray,
     decay: FloatArray, phi: FloatArray, miss: FloatArray,
 ) -> int:  # fmt: skip
@@ -289,12 +302,6 @@ _SHIFT = 1e-7
 _SLIGHT = 0.01
 # Most iterations, and the move over the shift below which the next iteration does not matter.
 _PASSES, _ENOUGH = 6, 0.3
-
-
-@jit_by_kind(OneArea=probe_one, ManyAreas=probe_many)
-def _probe(circuit: Any, state: Any, w: FloatArray, pull: FloatArray) -> bool:
-    """The nonlinear term at other modes w, into `pull`; both are rows of `work.spare`. False beyond a fold."""
-    raise NotImplementedError
 
 
 @jit_rows

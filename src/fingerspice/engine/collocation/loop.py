@@ -13,43 +13,13 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import borrow, jit, jit_by_kind, jit_within
-from fingerspice.engine.collocation.readout import (
-    ACCEPTED,
-    DONE,
-    ERROR_F,
-    ERROR_U,
-    EXCESSIVE,
-    GO_ON,
-    LOOKED_AT,
-    PEAK_F,
-    PEAK_U,
-    REJECTED,
-    RETRY,
-    SAME_TIME,
-    LoopState,
-    note,
-)  # fmt: skip
+from fingerspice.engine.collocation import readout
+from fingerspice.engine.collocation.readout import LoopState
 from fingerspice.engine.collocation.step_control import NOT_FRESH, Pace, accept, allowed_factor, rung, shorten
-from fingerspice.engine.many_areas.step import (
-    ManyAreas,
-    attempt_many,
-    begin_many,
-    beyond_many,
-    complete_many,
-    end_many,
-    refuse_many,
-    start_many,
-)
-from fingerspice.engine.one_area.step import (
-    OneArea,
-    attempt_one,
-    begin_one,
-    beyond_one,
-    complete_one,
-    end_one,
-    refuse_one,
-    start_one,
-)  # fmt: skip
+from fingerspice.engine.many_areas import step as network
+from fingerspice.engine.many_areas.step import ManyAreas
+from fingerspice.engine.one_area import step as stack
+from fingerspice.engine.one_area.step import OneArea
 
 # The coupling may make the slowest mode slower than with the area frozen; this fraction of its rate is a safe bound.
 RATE_SHARE = 0.5
@@ -95,7 +65,7 @@ def next_stop(looks: Looks, edges: FloatArray, t_end: float) -> float:
     t = float(min(v[NEXT], v[TRIAL]))
     if t < t_end:
         for i in range(edges.size):
-            if abs(edges[i] - t) <= SAME_TIME * abs(edges[i]):
+            if abs(edges[i] - t) <= readout.SAME_TIME * abs(edges[i]):
                 return float(min(edges[i], t_end))
     return min(t, t_end)
 
@@ -144,46 +114,14 @@ def look(looks: Looks, s: LoopState) -> bool:
 
 
 Circuit = OneArea | ManyAreas
-
-
-@jit_by_kind(OneArea=start_one, ManyAreas=start_many)
-def start(circuit: Circuit, state: LoopState) -> None:
-    """Begin a call of the loop."""
-
-
-@jit_by_kind(OneArea=begin_one, ManyAreas=begin_many)
-def begin(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
-    """Find where the next step starts, and the length to try first."""
-    raise NotImplementedError
-
-
-@jit_by_kind(OneArea=attempt_one, ManyAreas=attempt_many)
-def attempt(circuit: Circuit, pace: Pace, state: LoopState) -> int:
-    """Solve a step of the length to be tried, and estimate its error."""
-    raise NotImplementedError
-
-
-@jit_by_kind(OneArea=refuse_one, ManyAreas=refuse_many)
-def refuse(circuit: Circuit, state: LoopState) -> int:
-    """Why no shorter step would do after one that was rejected; GO_ON if one may."""
-    raise NotImplementedError
-
-
-@jit_by_kind(OneArea=beyond_one, ManyAreas=beyond_many)
-def beyond(circuit: Circuit, pace: Pace, state: LoopState) -> float:
-    """Fraction of a rejected step at which the next one should end, if it went far beyond a zero; or 2."""
-    raise NotImplementedError
-
-
-@jit_by_kind(OneArea=complete_one, ManyAreas=complete_many)
-def complete(circuit: Circuit, pace: Pace, state: LoopState) -> int:
-    """End an accepted step, write its outputs, account for its errors, and move to its end."""
-    raise NotImplementedError
-
-
-@jit_by_kind(OneArea=end_one, ManyAreas=end_many)
-def end(circuit: Circuit, state: LoopState) -> None:
-    """End a call of the loop."""
+# The parts of a step, which both kinds of circuits have: begin a call of the loop; find where the next step starts, and
+# the length to try first; solve a step of that length, and estimate its error; tell why no shorter step would do after
+# one that was rejected (GO_ON if one may); the fraction of it at which the next one should end, if it went far beyond a
+# zero, or 2; end an accepted step, write its outputs, account for its errors, and move to its end; end a call.
+_start, _begin, _attempt, _refuse, _beyond, _complete, _end = (
+    jit_by_kind(OneArea=getattr(stack, part), ManyAreas=getattr(network, part))
+    for part in ("start", "begin", "attempt", "refuse", "beyond", "complete", "end")
+)
 
 
 @jit_within
@@ -191,12 +129,12 @@ def worst(peaks: FloatArray) -> float:
     """Largest ratio of the estimated error to the peak so far, over the voltages and forces of all gaps."""
     found, largest = 0.0, 0.0
     for a in range(peaks.shape[0]):
-        largest = max(largest, peaks[a, PEAK_U])
+        largest = max(largest, peaks[a, readout.PEAK_U])
     for a in range(peaks.shape[0] - 1):
-        if peaks[a, PEAK_U] > _UNNOTICED * largest:
-            found = max(found, peaks[a, ERROR_U] / peaks[a, PEAK_U])
-            if peaks[a, PEAK_F] > 0.0:
-                found = max(found, peaks[a, ERROR_F] / peaks[a, PEAK_F])
+        if peaks[a, readout.PEAK_U] > _UNNOTICED * largest:
+            found = max(found, peaks[a, readout.ERROR_U] / peaks[a, readout.PEAK_U])
+            if peaks[a, readout.PEAK_F] > 0.0:
+                found = max(found, peaks[a, readout.ERROR_F] / peaks[a, readout.PEAK_F])
     return found
 
 
@@ -210,17 +148,17 @@ def march_on(circuit: Circuit, pace: Pace, state: LoopState, looks: Looks, t_end
     while True:
         stop = next_stop(looks, circuit.sources.edges, t_end)
         code = march(circuit, pace, state, stop)
-        if code != DONE:
+        if code != readout.DONE:
             return code
-        slack = SAME_TIME * abs(stop)
+        slack = readout.SAME_TIME * abs(stop)
         if stop >= looks.values[TRIAL] - slack:
             looks.values[TRIAL] = math.inf
             if worst(state.peaks) > looks.values[ACCEPTABLE]:
-                return EXCESSIVE
+                return readout.EXCESSIVE
         if stop >= looks.values[NEXT] - slack and look(looks, state):
-            return LOOKED_AT
+            return readout.LOOKED_AT
         if state.control[0].t >= t_end:
-            return DONE
+            return readout.DONE
 
 
 @jit_within
@@ -233,15 +171,15 @@ def march(circuit: Circuit, pace: Pace, state: LoopState, t_end: float) -> int:
     # Arrays without a reference count: it would cost an atomic operation at every access to a tuple.
     circuit, state = borrow(circuit), borrow(state)
     state.step[0].trusted = 1
-    start(circuit, state)
+    _start(circuit, state)
     while True:
-        code = begin(circuit, pace, state, t_end)
-        if code == GO_ON:
+        code: int = _begin(circuit, pace, state, t_end)
+        if code == readout.GO_ON:
             code = _find_length(circuit, pace, state)
-        if code == GO_ON:
-            code = complete(circuit, pace, state)
-        if code >= DONE:
-            end(circuit, state)
+        if code == readout.GO_ON:
+            code = _complete(circuit, pace, state)
+        if code >= readout.DONE:
+            _end(circuit, state)
             return code
 
 
@@ -251,26 +189,28 @@ def _find_length(circuit: Circuit, pace: Pace, state: LoopState) -> int:
     step, control, counters = state.step[0], state.control[0], state.counters
     step.wanted, step.tries = control.h, 1
     while True:
-        code = attempt(circuit, pace, state)
-        if code == RETRY:
+        code: int = _attempt(circuit, pace, state)
+        if code == readout.RETRY:
             continue
-        if code != GO_ON:
+        if code != readout.GO_ON:
             return code
         h, error, converged = step.length, step.step_error, step.converged > 0
-        note(state.tried, counters[ACCEPTED] + counters[REJECTED], control.t, h, error / pace.tol)
+        readout.note(
+            state.tried, counters[readout.ACCEPTED] + counters[readout.REJECTED], control.t, h, error / pace.tol
+        )
         if converged and not pace.controlled:
-            return GO_ON
+            return readout.GO_ON
         factor = allowed_factor(error, pace.tol)
         if error <= pace.tol:
             accept(h, step.wanted, factor, step.tries, step.fresh, step.trusted > 0, control)
             step.fresh = NOT_FRESH
-            return GO_ON
+            return readout.GO_ON
         step.tries += 1
-        counters[REJECTED] += 1
-        code = refuse(circuit, state)
-        if code != GO_ON:
+        counters[readout.REJECTED] += 1
+        code = _refuse(circuit, state)
+        if code != readout.GO_ON:
             return code
-        reach = beyond(circuit, pace, state)
+        reach = _beyond(circuit, pace, state)
         if reach < 2.0:
             step.length = rung(h * min(0.9, reach))
         else:

@@ -79,18 +79,6 @@ def new_steps(capacity: int, columns: int) -> Steps:
 
 
 @jit
-def record(
-    times: FloatArray, recorded: FloatArray, place: int, t: float, h: float, t_new: float, theta: float,
-    values: FloatArray,
-) -> None:  # fmt: skip
-    """Put a step in its place."""
-    times[place, 0], times[place, 1], times[place, 2], times[place, 3] = t, h, t_new, theta
-    for c in range(recorded.shape[1]):
-        for j in range(NODES):
-            recorded[place, c, j] = values[c, j]
-
-
-@jit
 def note(tried: FloatArray, number: int, t: float, h: float, error: float) -> None:
     """Keep a step tried, its error over the one allowed, in place of the oldest."""
     place = number % tried.shape[0]
@@ -161,6 +149,16 @@ def error_at(places: FloatArray, theta: float, error: FloatArray) -> None:
     share = (theta - _AT[p]) / (_AT[p + 1] - _AT[p])
     for k in range(places.shape[0]):
         error[k] = (1.0 - share) * places[k, p] + share * places[k, p + 1]
+
+
+@jit
+def end_at(
+    theta: float, w: FloatArray, places: FloatArray, basis: FloatArray, w0: FloatArray, error: FloatArray
+) -> None:
+    """The modes, and their error, at fraction `theta` of the step, to which `basis` belongs."""
+    for k in range(w0.size):
+        w0[k] = at(w[k], basis)
+    error_at(places, theta, error)
 
 
 @jit_rows
@@ -485,7 +483,11 @@ def write_step(s: LoopState, t: float, values: FloatArray, coefficients: FloatAr
     counters, kept_times = s.counters, s.kept.times
     h, theta, t_new = s.step[0].length, s.step[0].theta, s.step[0].t_new
     if s.steps.times.shape[0] > 0:
-        record(s.steps.times, s.steps.values, counters[RECORDED], t, h, t_new, theta, values)
+        times, nodes, place = s.steps.times, s.steps.values, counters[RECORDED]
+        times[place, 0], times[place, 1], times[place, 2], times[place, 3] = t, h, t_new, theta
+        for c in range(nodes.shape[1]):
+            for j in range(NODES):
+                nodes[place, c, j] = values[c, j]
         counters[RECORDED] += 1
     first = counters[OUTPUT]
     has_outputs = first < s.outputs.t.size and s.outputs.t[first] <= t_new

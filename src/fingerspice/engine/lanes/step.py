@@ -311,19 +311,14 @@ def _end_under_mobile(marks: Any, c: Any, weights: FloatArray, fades: bool, stat
             state[(at.w + t) * lanes + i] = state[(at.w + leaks + t) * lanes + i]
 
 
-def _of_kind(*given: Any) -> Any:
-    """Stands for the functions below in Python; compiled code calls one of those named there."""
-    raise NotImplementedError
-
-
 # Prepare a step that begins at the part `a` of a sample: whether modes fade in it.
-_begin = jit_by_kind(StackMarks=_begin_at_once, MobileMarks=_begin_at_once, NetworkMarks=smooth)(_of_kind)
+_begin = jit_by_kind(StackMarks=_begin_at_once, MobileMarks=_begin_at_once, NetworkMarks=smooth)
 # Drives at a later node j from what is predicted there.
 _drives_at_node = jit_by_kind(
     StackMarks=_drives_of_stack, MobileMarks=_drives_under_mobile, NetworkMarks=bent_drives_at
-)(_of_kind)  # fmt: skip
+)  # fmt: skip
 # From the modes at the end of a step, xi and the drives there, for the start of the next one.
-_end = jit_by_kind(StackMarks=_end_of_stack, MobileMarks=_end_under_mobile, NetworkMarks=end_bent)(_of_kind)
+_end = jit_by_kind(StackMarks=_end_of_stack, MobileMarks=_end_under_mobile, NetworkMarks=end_bent)
 
 
 def _step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: FloatArray, a: float, b: float) -> None:
@@ -353,7 +348,7 @@ def _step(marks: Any, c: Any, weights: FloatArray, state: FloatArray, after: Flo
 # A network's step is larger: as a function of its own it is a tenth faster, as a stack's is within its loop.
 step = jit_by_kind(
     StackMarks=jit_within_rows(_step), MobileMarks=jit_within_rows(_step), NetworkMarks=jit_rows(_step)
-)(_of_kind)  # fmt: skip
+)  # fmt: skip
 
 
 @jit_within_rows

@@ -12,34 +12,11 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.collocation.exponential import Tables, between, largest, left_over
-from fingerspice.engine.collocation.readout import (
-    ERROR_U,
-    N_PLACES,
-    Control,
-    row_of,
-)
+from fingerspice.engine.collocation.readout import ERROR_U, N_PLACES, Control, row_of
 from fingerspice.engine.collocation.step_control import first_wrong, leaves
-from fingerspice.engine.many_areas import form as blocks
+from fingerspice.engine.many_areas import form as forms
 from fingerspice.engine.many_areas.coupling import cell_currents
-from fingerspice.engine.many_areas.form import (
-    AREA,
-    CELL_U,
-    LIN,
-    MORE,
-    PULL,
-    SLOPE,
-    USED,
-    D,
-    Form,
-    J,
-    Leaks,
-    W,
-    Work,
-    clear,
-    combine,
-    mode_rates,
-    wanted,
-)
+from fingerspice.engine.many_areas.form import Form, Leaks, Work
 from fingerspice.engine.one_area.charge import LOBE, integrate
 from fingerspice.numerics.lobatto import DERIVATIVE, END, MISS, NODES, POINTS, ROWS
 
@@ -117,7 +94,7 @@ def assess(
     modes, s, off, places, run, carried, size = (
         work.modes, work.s, work.off, work.places, work.run, work.carried, work.size
     )  # fmt: skip
-    w, lin, pull, used = modes[W], modes[LIN], modes[PULL], modes[USED]
+    w, lin, pull, used = modes[forms.W], modes[forms.LIN], modes[forms.PULL], modes[forms.USED]
     shape, follow, gap, rates, phi, miss = (
         form.shape, form.follow, form.gap, leaks.rates, tables.phi[slot], tables.miss[slot]
     )  # fmt: skip
@@ -241,7 +218,7 @@ def write_columns(
         for e in range(s.shape[0]):
             for i in range(ROWS):
                 values[j, i] -= follow[j, e] * s[e, i]
-    combine(shape, w[:n], values[:n])
+    forms.combine(shape, w[:n], values[:n])
     for k in range(n, first_z):
         for i in range(ROWS):
             values[k, i] = w[k, i]
@@ -286,8 +263,8 @@ def charge_rows(
     """
     mobile, stored, stored_s, lost, lost_s = form.mobile, form.stored, form.stored_s, leaks.lost, leaks.lost_s
     through, c, g, home = form.through, form.c, leaks.g, form.home
-    w, rate, s, ds = work.modes[W], work.modes[D], work.s, work.ds
-    u, more, j, room = work.cells[CELL_U], work.areas[MORE], work.cells[J], work.room
+    w, rate, s, ds = work.modes[forms.W], work.modes[forms.D], work.s, work.ds
+    u, more, j, room = work.cells[forms.CELL_U], work.areas[forms.MORE], work.cells[forms.J], work.room
     n = stored.shape[1]
     collected, leak, moved = room[0], room[1], room[2]
     for a in range(stored.shape[0]):
@@ -342,19 +319,19 @@ def charge_error(
         for p in range(N_PLACES):
             brief[k, p] = missed[p - 1, k] if 0 < p < N_PLACES - 1 else (missed[4, k] if p == 0 else 0.0)
             lasting[k, p] = places[k, p] - (brief[k, p] if p > 0 else 0.0)
-    _cell_errors(form, lasting, areas[SLOPE], cell_slips[0])
-    _cell_errors(form, brief, areas[SLOPE], cell_slips[1])
+    _cell_errors(form, lasting, areas[forms.SLOPE], cell_slips[0])
+    _cell_errors(form, brief, areas[forms.SLOPE], cell_slips[1])
     off_briefly = np.empty(N_PLACES)
     for source in range(form.stored.shape[0]):
         first, second, third = between(z[source])
         swing, end, lobe, apart = 0.0, 0.0, 0.0, 0.0
         if not form.mobile:
-            swing, end = _area_missed(form, source, u, areas[AREA])
+            swing, end = _area_missed(form, source, u, areas[forms.AREA])
         for p in range(1, N_PLACES - 1):
-            leak = _leak(form, source, p, lost, g, brief, cell_slips[1], u, areas[MORE])
+            leak = _leak(form, source, p, lost, g, brief, cell_slips[1], u, areas[forms.MORE])
             lobe = max(lobe, _HALF_LOBE * h * abs(leak))
         for p in range(N_PLACES):
-            held = _held(form, source, p, brief, cell_slips[1], u, areas[MORE])
+            held = _held(form, source, p, brief, cell_slips[1], u, areas[forms.MORE])
             own = first if p == 1 else (second if p == 2 else (third if p == 3 else 0.0))
             off_briefly[p] = max(abs(held), abs(own), swing, lobe)
             apart = max(apart, abs(own - held) if 0 < p < N_PLACES - 1 else 0.0)
@@ -365,15 +342,15 @@ def charge_error(
         added, last_leak, last_theta = 0.0, 0.0, 0.0
         for p in range(N_PLACES):
             row = row_of(p)
-            leak = _leak(form, source, p, lost, g, lasting, cell_slips[0], u, areas[MORE])
+            leak = _leak(form, source, p, lost, g, lasting, cell_slips[0], u, areas[forms.MORE])
             if p > 0:
                 reached = min(POINTS[row], theta)
                 part = (reached - last_theta) / (POINTS[row] - last_theta)
-                turned = 0.0 if form.mobile else _turned(form, source, p, cell_slips[0], u, areas[AREA])
+                turned = 0.0 if form.mobile else _turned(form, source, p, cell_slips[0], u, areas[forms.AREA])
                 added += part * (0.5 * h * (POINTS[row] - last_theta) * (leak + last_leak) + turned)
                 last_theta = POINTS[row]
             last_leak = leak
-            now = _held(form, source, p, lasting, cell_slips[0], u, areas[MORE])
+            now = _held(form, source, p, lasting, cell_slips[0], u, areas[forms.MORE])
             known = now + collected[0, source] + added
             error = math.sqrt(known * known + off_briefly[p] * off_briefly[p] + collected[1, source])
             control.error_q = max(control.error_q, error)
@@ -479,17 +456,17 @@ def step_charges(
 ) -> None:  # fmt: skip
     """Charges gained since the start of a converged step, and currents, of the sources at its nodes."""
     modes, cells, areas = work.modes, work.cells, work.areas
-    w, cell_u = modes[blocks.W], cells[blocks.CELL_U]
-    mode_rates(h, leaks.rates, w, modes[blocks.LIN], modes[blocks.PULL], False, modes[blocks.D])
-    clear(cell_u)
-    combine(form.tap, w[: form.shape.shape[0]], cell_u)
-    combine(form.tap_s, work.s, cell_u)
-    cell_currents(work.own.root, cells[blocks.RHO], cells[blocks.J])
+    w, cell_u = modes[forms.W], cells[forms.CELL_U]
+    forms.mode_rates(h, leaks.rates, w, modes[forms.LIN], modes[forms.PULL], False, modes[forms.D])
+    forms.clear(cell_u)
+    forms.combine(form.tap, w[: form.shape.shape[0]], cell_u)
+    forms.combine(form.tap_s, work.s, cell_u)
+    cell_currents(work.own.root, cells[forms.RHO], cells[forms.J])
     if not form.mobile:
         for a in range(form.cell.size):
             if form.cell[a] >= 0 and form.slow[a] < 0:
-                wanted(
+                forms.wanted(
                     True, sign[a], form.powers[a], form.slopes[a], form.lo[a], form.scale[a], form.curves[a],
-                    areas[blocks.U, a], areas[blocks.AREA, a], areas[blocks.SLOPE, a],
+                    areas[forms.U, a], areas[forms.AREA, a], areas[forms.SLOPE, a],
                 )  # fmt: skip
     charge_rows(form, work, leaks, h, integral, z, current)

@@ -23,18 +23,10 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
 from fingerspice.engine.collocation.readout import CONTROL, N_PLACES, WRITTEN_AT_ONCE
-from fingerspice.engine.many_areas.coupling import (
-    STIFF,
-    Coupling,
-    Moving,
-    answer_alone,
-    answer_mobile,
-    answer_together,
-    new_coupling,
-)
+from fingerspice.engine.many_areas import coupling as couplings
 from fingerspice.engine.network import Sources
 from fingerspice.engine.one_area import rows as stack_rows
-from fingerspice.engine.one_area.rows import N_FLAT, polynomial_rows
+from fingerspice.engine.one_area.rows import polynomial_rows
 from fingerspice.numerics.lobatto import BETWEEN, DERIVATIVE, NODES, POINTS, ROWS
 from fingerspice.numerics.modes import copy_to
 from fingerspice.physics.contact import inverse_area
@@ -132,7 +124,6 @@ class Jump(NamedTuple):
 class Work(NamedTuple):
     """Arrays that steps work in; those with ROWS behind hold one value for each row of a step."""
 
-    r: FloatArray
     s: FloatArray
     ds: FloatArray
     modes: FloatArray
@@ -140,7 +131,7 @@ class Work(NamedTuple):
     areas: FloatArray
     matrix: FloatArray
     mixed: FloatArray
-    own: Coupling  # Of the step at hand
+    own: couplings.Coupling  # Of the step at hand
     at: IntArray  # (1,): Number of the reference in use
     w0: FloatArray
     places: FloatArray
@@ -174,10 +165,11 @@ def new_network_work(n: int, modes: int, cells: int, areas: int, sources: int, c
     leaks = Leaks(z(modes), z((modes, sources)), z(cells), z(areas), z((sources, n)), z((sources, sources)))
     jump = Jump(z(sources), z(sources), z(2, CONTROL), z(areas), z((areas, 2)), leaks)
     return Work(
-        z((sources, N_FLAT, ROWS)), z((sources, ROWS)), z((sources, ROWS)), z((8, modes, ROWS)), z((8, cells, ROWS)),
-        z((8, areas, ROWS)), z((cells, cells + 1, ROWS)), z((cells, areas + 1, ROWS)), new_coupling(n, cells, sources),
-        z(1, whole), z(modes), z((modes, N_PLACES)), z(modes), z((columns, ROWS)), z((columns, ROWS)),
-        z((2, WRITTEN_AT_ONCE)), z((4, ROWS)), z((N_PLACES, modes + sources)), z((2, modes, N_PLACES)),
+        z((sources, ROWS)), z((sources, ROWS)), z((8, modes, ROWS)), z((8, cells, ROWS)),
+        z((8, areas, ROWS)), z((cells, cells + 1, ROWS)), z((cells, areas + 1, ROWS)),
+        couplings.new_coupling(n, cells, sources), z(1, whole), z(modes), z((modes, N_PLACES)), z(modes),
+        z((columns, ROWS)), z((columns, ROWS)), z((2, WRITTEN_AT_ONCE)), z((4, ROWS)),
+        z((N_PLACES, modes + sources)), z((2, modes, N_PLACES)),
         z((2, N_PLACES, cells + areas)), z((modes, N_PLACES - 1)), z((6, modes, ROWS)), z((8, cells, ROWS)),
         z((8, areas, ROWS)), z(sources, whole), z(sources), z(sources), z(areas), z(modes), z(sources),
         z((areas, N_PLACES)), z(NODES), jump,
@@ -226,7 +218,7 @@ def mode_rates(
     """Derivatives of the modes: of stiff modes (perhaps only of these) by the derivative of their polynomials."""
     for k in range(w.shape[0]):
         rate = rates[k]
-        if rate * h > STIFF:
+        if rate * h > couplings.STIFF:
             for i in range(ROWS):
                 out[k, i] = 0.0
             for m in range(NODES):
@@ -296,7 +288,7 @@ def _moving(
         slope[i] = 0.0
     if mobile:
         for i in range(ROWS):
-            rate[i] = unit * (d[i] if rate_k * h > STIFF else lin[i] - rate_k * w[i] + forced[i])
+            rate[i] = unit * (d[i] if rate_k * h > couplings.STIFF else lin[i] - rate_k * w[i] + forced[i])
 
 
 @jit_rows
@@ -342,8 +334,8 @@ def evaluate(
         combine(coupling.from_stiff, d[:n], eta)
     if mobile:
         combine_from(coupling.held, w, cells[CHI_S], chi)
-        rows = Moving(u, more, slope, rate, chi, eta, rho, areas[KNOWN], cells[SHARE])
-        answer_mobile(
+        rows = couplings.Moving(u, more, slope, rate, chi, eta, rho, areas[KNOWN], cells[SHARE])
+        couplings.answer_mobile(
             several, coupling, form.home, form.first, form.cell, rows, work.mixed, work.matrix, least
         )  # fmt: skip
         for i in range(ROWS):
@@ -351,9 +343,9 @@ def evaluate(
             if not least[i] > 0.0:
                 return False
     elif several:
-        answer_together(form.home, coupling.answer, coupling.cross, more, cells[SHARE], eta, rho)
+        couplings.answer_together(form.home, coupling.answer, coupling.cross, more, cells[SHARE], eta, rho)
     else:
-        answer_alone(form.home, coupling.answer, more, eta, rho)
+        couplings.answer_alone(form.home, coupling.answer, more, eta, rho)
     combine(coupling.feed, rho, pull[:n])
     return True
 
@@ -400,18 +392,16 @@ def probe_many(c: Any, s: Any, w: FloatArray, pull: FloatArray) -> bool:
 
 @jit
 def source_rows(
-    sources: Sources, index: IntArray, t: float, h: float, slopes: bool, r: FloatArray, s: FloatArray, ds: FloatArray
+    sources: Sources, index: IntArray, t: float, h: float, slopes: bool, room: FloatArray, s: FloatArray, ds: FloatArray
 ) -> None:
     """Values of the sources at all rows of a step and, if wanted, their slopes."""
     for e in range(s.shape[0]):
         row = sources.first[e] + index[e]
         start = sources.edges[row]
         stack_rows.source_rows(
-            sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, slopes, r[e]
-        )
-        for i in range(ROWS):
-            s[e, i] = r[e, stack_rows.SOURCE, i]
-            ds[e, i] = r[e, stack_rows.SLOPE, i]
+            sources.terms[row - e], sources.series[row - e], sources.edges[row + 1] - start, t - start, h, slopes, s[e],
+            ds[e], room,
+        )  # fmt: skip
 
 
 @jit

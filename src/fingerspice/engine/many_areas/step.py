@@ -15,65 +15,14 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.compiled import jit, jit_within
-from fingerspice.engine.collocation.exponential import Iterates, Tables, carry, converge, make_tables, respond, weigh
-from fingerspice.engine.collocation.readout import (
-    ACCEPTED,
-    AGAIN,
-    DONE,
-    GO_ON,
-    N_PLACES,
-    NFEV,
-    NO_STEP,
-    PAUSED,
-    RECORDED,
-    REFERENCE,
-    REJECTED,
-    RETRY,
-    TOO_MANY,
-    ZEROS,
-    LoopState,
-    account,
-    at,
-    basis_at,
-    error_at,
-    is_wanted,
-    may_shorten,
-    write_step,
-)
-from fingerspice.engine.collocation.step_control import (
-    AFTER_EDGE,
-    AFTER_ZERO,
-    NOT_FRESH,
-    Pace,
-    choose_step,
-    farthest_off,
-    first_wrong,
-)
-from fingerspice.engine.many_areas import form as blocks
+from fingerspice.engine.collocation import exponential, readout, step_control
+from fingerspice.engine.collocation.exponential import Iterates, Tables
+from fingerspice.engine.collocation.readout import LoopState
+from fingerspice.engine.collocation.step_control import Pace
+from fingerspice.engine.many_areas import error as errors
+from fingerspice.engine.many_areas import form as forms
 from fingerspice.engine.many_areas.coupling import Moving, answer_mobile, take_coupling
-from fingerspice.engine.many_areas.error import (
-    account_nodes,
-    assess,
-    charge_error,
-    charged,
-    first_zero,
-    load,
-    step_charges,
-    store,
-    turn_at_start,
-    write_columns,
-)
-from fingerspice.engine.many_areas.form import (
-    Form,
-    Work,
-    clear,
-    combine,
-    follow_sources,
-    free,
-    leaks_of,
-    ramp_rows,
-    source_rows,
-)
+from fingerspice.engine.many_areas.form import Form, Work
 from fingerspice.engine.network import Sources, at_sources
 from fingerspice.engine.one_area.system import LEVEL_RATIO
 from fingerspice.numerics.lobatto import END, NODES, POINTS
@@ -180,19 +129,19 @@ def branch_of(c: ManyAreas, s: LoopState) -> FloatArray:
 
 
 @jit_within
-def start_many(c: ManyAreas, s: LoopState) -> None:
+def start(c: ManyAreas, s: LoopState) -> None:
     """Begin a call of the loop, or go on after a pause, which changes nothing."""
     form, work, step, counters = c.form, c.work, s.step[0], s.counters
     n = form.shape.shape[0]
-    step.pause_at = counters[ACCEPTED] + 1 + _AT_ONCE // form.rates.size
+    step.pause_at = counters[readout.ACCEPTED] + 1 + _AT_ONCE // form.rates.size
     # Other runs may have used the tables since the last call.
     s.step[0].tabled = 0.0
     if step.is_paused > 0:
         step.is_paused = 0
         return
-    step.flips, step.fresh = 0, NOT_FRESH
+    step.flips, step.fresh = 0, step_control.NOT_FRESH
     step.in_jump, step.has_begun, step.unconverged = 0, 0, 0
-    step.accepted_before = counters[ACCEPTED]
+    step.accepted_before = counters[readout.ACCEPTED]
     step.several = 0
     for b in range(1, form.home.size):
         step.several |= int(form.home[b] != form.home[0])
@@ -202,7 +151,7 @@ def start_many(c: ManyAreas, s: LoopState) -> None:
     for i in range(work.segment.size):
         work.segment[i] = 0
     work.areas[:] = 0.0
-    start_at(form.area0, work.areas[blocks.AREA])
+    start_at(form.area0, work.areas[forms.AREA])
     for k in range(work.size.size):
         work.size[k] = form.size[k] if k < n else c.u_scale
 
@@ -217,40 +166,40 @@ def _all_zero(x: FloatArray) -> bool:
 
 
 @jit_within
-def begin_many(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
+def begin(c: ManyAreas, pace: Pace, s: LoopState, t_end: float) -> int:
     """Where the next step starts: at an edge of a source, within a jump, or later; and its length."""
     form, work, step, control, counters = c.form, c.work, s.step[0], s.control[0], s.counters
     if step.in_jump > 0 and control.t >= 1.0:
         _leave_jump(c, s)
-    if counters[ACCEPTED] + counters[REJECTED] > step.most:
-        return TOO_MANY
+    if counters[readout.ACCEPTED] + counters[readout.REJECTED] > step.most:
+        return readout.TOO_MANY
     step.stop, step.at_edge = 1.0, 0
     if step.in_jump > 0:
         copy_to(work.now, c.s_before)
     else:
         if step.has_begun > 0 and control.t >= t_end:
-            return DONE
-        if counters[ACCEPTED] >= step.pause_at or counters[RECORDED] >= s.steps.times.shape[0] > 0:
+            return readout.DONE
+        if counters[readout.ACCEPTED] >= step.pause_at or counters[readout.RECORDED] >= s.steps.times.shape[0] > 0:
             step.is_paused = 1
-            return PAUSED
+            return readout.PAUSED
         _look_at_sources(c, s, t_end)
         if step.in_jump == 0 and control.t >= t_end:
-            return DONE
+            return readout.DONE
     t = control.t
     if step.at_edge > 0:
         # Step lengths after a jump are often those after the previous jump.
         control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
-        step.fresh = AFTER_EDGE
-    load(form.inverse, form.follow, s.y, work.now, work.w0)
+        step.fresh = step_control.AFTER_EDGE
+    errors.load(form.inverse, form.follow, s.y, work.now, work.w0)
     _choose_branches(c, s, t)
     if step.in_jump == 0 and far_from(form, work.here) and not _take_reference(c, s):
-        return REFERENCE
-    rates = leaks_of(c, s).rates
+        return readout.REFERENCE
+    rates = forms.leaks_of(c, s).rates
     longest = Pace(pace.tol, 1.0, True, pace.charge) if step.in_jump > 0 else pace
     is_series = c.sources.series.shape[1] > 0 and step.in_jump == 0
     # If all rates are zero, the time constant is infinite.
-    step.length = choose_step(longest, 1.0 / rates.max(), True, is_series, t, step.stop - t, control)
-    return GO_ON
+    step.length = step_control.choose_step(longest, 1.0 / rates.max(), True, is_series, t, step.stop - t, control)
+    return readout.GO_ON
 
 
 @jit_within
@@ -354,8 +303,8 @@ def _take_reference(c: ManyAreas, s: LoopState) -> bool:
     go_over(c.references, found, form, s.error)
     work.at[0], s.step[0].tabled = found, 0.0
     copy_to(work.size[: form.shape.shape[0]], form.size)
-    start_at(form.area0, work.areas[blocks.AREA])
-    load(form.inverse, form.follow, s.y, work.now, work.w0)
+    start_at(form.area0, work.areas[forms.AREA])
+    errors.load(form.inverse, form.follow, s.y, work.now, work.w0)
     return True
 
 
@@ -370,7 +319,7 @@ _UNCONVERGED, _UNCONVERGED_SHARE = 40, 0.2
 @jit_within
 def _take_coupling(c: ManyAreas, s: LoopState) -> None:
     """The coupling of the areas for steps of the length to be tried."""
-    form, work, leaks = c.form, c.work, leaks_of(c, s)
+    form, work, leaks = c.form, c.work, forms.leaks_of(c, s)
     which = 2 * work.at[0] + int(s.step[0].in_jump > 0)
     take_coupling(
         work.own, which, s.step[0].length, leaks.rates, form.feed, form.tap, form.tap_s, form.c, leaks.g, form.home,
@@ -379,90 +328,85 @@ def _take_coupling(c: ManyAreas, s: LoopState) -> None:
 
 
 @jit_within
-def attempt_many(c: ManyAreas, pace: Pace, s: LoopState) -> int:
+def attempt(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
     form, work, step, tables, tol = c.form, c.work, s.step[0], c.tables, pace.tol
-    leaks, branch, t, in_jump = leaks_of(c, s), branch_of(c, s), s.control[0].t, s.step[0].in_jump > 0
+    leaks, branch, t, in_jump = forms.leaks_of(c, s), branch_of(c, s), s.control[0].t, s.step[0].in_jump > 0
     h = step.length
     if h != step.tabled:
-        step.slot = make_tables(
-            leaks.rates, -1 if in_jump else work.at[0], h, tables.h, tables.level, tables.used, tables.decay,
-            tables.phi, tables.miss,
-        )  # fmt: skip
-        step.tabled = h
+        exponential.take_tables(tables, -1 if in_jump else work.at[0], h, leaks.rates, work.size, s, work.weight)
         _take_coupling(c, s)
         step.whole = int(work.own.key[1] == 0)
-        weigh(leaks.rates, work.size, tables.decay[step.slot], h, work.weight)
     if in_jump:
-        ramp_rows(t, h, work.jump.before, work.jump.after, work.s, work.ds)
+        forms.ramp_rows(t, h, work.jump.before, work.jump.after, work.s, work.ds)
     else:
         slopes = pace.charge or step.smooth == 0
-        source_rows(c.sources, work.segment, t, h, slopes, work.r, work.s, work.ds)
-    follow_sources(form, work, leaks.gain)
-    modes, u, guess = work.modes, work.areas[blocks.U], work.areas[blocks.GUESS]
-    w, base, pull = modes[blocks.W], modes[blocks.BASE], modes[blocks.PULL]
-    clear(guess)
-    clear(work.cells[blocks.RHO])
-    free(tables.decay[step.slot], work.w0, w)
-    respond(modes[blocks.LIN], tables.phi[step.slot], w, base)
-    used, pull_before, left_before = modes[blocks.USED], modes[blocks.PULL_BEFORE], modes[blocks.LEFT_BEFORE]
+        forms.source_rows(c.sources, work.segment, t, h, slopes, work.room, work.s, work.ds)
+    forms.follow_sources(form, work, leaks.gain)
+    modes, u, guess = work.modes, work.areas[forms.U], work.areas[forms.GUESS]
+    w, base, pull = modes[forms.W], modes[forms.BASE], modes[forms.PULL]
+    forms.clear(guess)
+    forms.clear(work.cells[forms.RHO])
+    forms.free(tables.decay[step.slot], work.w0, w)
+    exponential.respond(modes[forms.LIN], tables.phi[step.slot], w, base)
+    used, pull_before, left_before = modes[forms.USED], modes[forms.PULL_BEFORE], modes[forms.LEFT_BEFORE]
     iterates = Iterates(w, base, pull, used, pull_before, left_before, work.weight, u, guess)
-    passes, closed, answer = converge(c, s, iterates, 0.3 * tol)
-    s.counters[NFEV] += passes * NODES
+    passes, closed, answer = exponential.converge(c, s, iterates, 0.3 * tol)
+    s.counters[readout.NFEV] += passes * NODES
     step.converged, step.step_error, step.grown = int(closed), math.inf, 1.0
     # An iteration that has not converged says nothing about the sign of the gap voltage.
     if not closed:
-        return GO_ON
-    if step.flips <= c.sign.size and turn_at_start(form.cell, u, c.sign, tol, t, branch):
+        return readout.GO_ON
+    if step.flips <= c.sign.size and errors.turn_at_start(form.cell, u, c.sign, tol, t, branch):
         step.flips += 1
-        return RETRY
+        return readout.RETRY
     if form.mobile:
         step.grown = 1.0 / work.room[3].min()
-    carry(c, s, iterates, form.gap, answer)
-    error = assess(form, work, leaks, tables, step.slot, h, s.error, step.grown)
-    step.step_error = max(error, charged(form.cell, u, work.areas[blocks.AREA])) if pace.charge else error
-    return GO_ON
+    exponential.carry(c, s, iterates, form.gap, answer)
+    error = errors.assess(form, work, leaks, tables, step.slot, h, s.error, step.grown)
+    step.step_error = max(error, errors.charged(form.cell, u, work.areas[forms.AREA])) if pace.charge else error
+    return readout.GO_ON
 
 
 @jit_within
-def refuse_many(c: ManyAreas, s: LoopState) -> int:
+def refuse(c: ManyAreas, s: LoopState) -> int:
     """Why no shorter step would do after one that was rejected; GO_ON if one may."""
     step, t = s.step[0], s.control[0].t
     step.unconverged += int(step.converged == 0)
     # The error of a shorter step says nothing about the length at which the iteration converges.
     step.trusted = step.converged
-    accepted = s.counters[ACCEPTED] - step.accepted_before
+    accepted = s.counters[readout.ACCEPTED] - step.accepted_before
     stuck = step.unconverged > _UNCONVERGED + _UNCONVERGED_SHARE * accepted
     # A step of this length is rounding of the time: if it is rejected, there is a singularity.
     lost = step.length <= 1e-13 * max(abs(t), 1e-3 * (step.stop - t))
-    return NO_STEP if stuck or lost or (step.whole > 0 and 1.0 / step.grown < _NEAR_FOLD) else GO_ON
+    return readout.NO_STEP if stuck or lost or (step.whole > 0 and 1.0 / step.grown < _NEAR_FOLD) else readout.GO_ON
 
 
 @jit_within
-def beyond_many(c: ManyAreas, pace: Pace, s: LoopState) -> float:
+def beyond(c: ManyAreas, pace: Pace, s: LoopState) -> float:
     """Fraction of a rejected step at which the next one should end, soon after a zero far beyond which it went; or 2.
 
     There the branch of an area has no meaning, and the error says nothing.
     """
-    form, u, end = c.form, c.work.areas[blocks.U], 1.0
+    form, u, end = c.form, c.work.areas[forms.U], 1.0
     for a in range(c.sign.size):
         if form.cell[a] >= 0 and c.sign[a] * u[a, END] < form.lo[a]:
-            found = first_wrong(u[a], c.sign[a], pace.tol)
+            found = step_control.first_wrong(u[a], c.sign[a], pace.tol)
             if found > 1:
                 end = min(end, 1.1 * POINTS[found])
     return end if end < 1.0 else 2.0
 
 
 @jit_within
-def complete_many(c: ManyAreas, pace: Pace, s: LoopState) -> int:
+def complete(c: ManyAreas, pace: Pace, s: LoopState) -> int:
     """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
     work, step, control, t = c.work, s.step[0], s.control[0], s.control[0].t
     h, stop = step.length, step.stop
     step.t_new, step.theta, step.crossed = t + h, 1.0, -1
     if step.t_new >= stop or stop - step.t_new <= 1e-12 * h:
         step.t_new, step.theta = stop, min(1.0, (stop - t) / h)
-    u, turned_enough = work.areas[blocks.U], step.flips > c.sign.size
-    step.crossed, step.theta, step.t_new = first_zero(
+    u, turned_enough = work.areas[forms.U], step.flips > c.sign.size
+    step.crossed, step.theta, step.t_new = errors.first_zero(
         c.form.cell, u, c.sign, pace.tol, t, h, step.theta, step.t_new, turned_enough, work.room[0]
     )  # fmt: skip
     a = step.crossed
@@ -470,30 +414,30 @@ def complete_many(c: ManyAreas, pace: Pace, s: LoopState) -> int:
         branch = branch_of(c, s)
         c.sign[a], branch[a, 0], branch[a, 1] = -c.sign[a], t, math.inf
         step.flips += 1
-        return AGAIN
+        return readout.AGAIN
     if turned_enough:
         off = 0.0
         for b in range(c.sign.size):
             if c.form.cell[b] >= 0:
-                off = max(off, farthest_off(u[b], c.sign[b], step.theta))
-        if off > pace.tol and may_shorten(s, t):
-            return AGAIN
+                off = max(off, step_control.farthest_off(u[b], c.sign[b], step.theta))
+        if off > pace.tol and readout.may_shorten(s, t):
+            return readout.AGAIN
     if c.form.mobile and step.whole == 0:
         step.grown = _magnified_whole(c, s)
         _take_coupling(c, s)
     if not 0.0 < step.grown < math.inf:
-        return NO_STEP
+        return readout.NO_STEP
     control.magnified = max(control.magnified, step.grown)
     step.flips = 0
-    basis_at(step.theta, work.basis)
+    readout.basis_at(step.theta, work.basis)
     _write(c, pace, s, t)
     _account(c, s)
     _move(c, s)
     if a >= 0:
         _cross(c, s, a)
     control.t = step.t_new
-    s.counters[ACCEPTED] += 1
-    return GO_ON
+    s.counters[readout.ACCEPTED] += 1
+    return readout.GO_ON
 
 
 @jit_within
@@ -506,13 +450,13 @@ def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
     own, areas, spare = work.own, work.areas, work.spare_cells
     which = 2 * work.at[0] + int(s.step[0].in_jump > 0)
     take_coupling(own, which, 0.0, form.rates, form.feed, form.tap, form.tap_s, form.c, form.g, form.home, form.cell)
-    clear(spare[blocks.CHI])
-    clear(spare[blocks.ETA])
-    combine(own.held, work.modes[blocks.W][: form.shape.shape[0]], spare[blocks.CHI])
-    combine(own.from_slopes, work.s, spare[blocks.CHI])
+    forms.clear(spare[forms.CHI])
+    forms.clear(spare[forms.ETA])
+    forms.combine(own.held, work.modes[forms.W][: form.shape.shape[0]], spare[forms.CHI])
+    forms.combine(own.from_slopes, work.s, spare[forms.CHI])
     rows = Moving(
-        areas[blocks.U], areas[blocks.MORE], areas[blocks.SLOPE], areas[blocks.RATE], spare[blocks.CHI],
-        spare[blocks.ETA], spare[blocks.RHO], work.spare_areas[blocks.KNOWN], spare[blocks.SHARE],
+        areas[forms.U], areas[forms.MORE], areas[forms.SLOPE], areas[forms.RATE], spare[forms.CHI],
+        spare[forms.ETA], spare[forms.RHO], work.spare_areas[forms.KNOWN], spare[forms.SHARE],
     )  # fmt: skip
     answer_mobile(
         s.step[0].several > 0, own, form.home, form.first, form.cell, rows, work.mixed, work.matrix, work.room[3]
@@ -525,21 +469,21 @@ def _magnified_whole(c: ManyAreas, s: LoopState) -> float:
 def _write(c: ManyAreas, pace: Pace, s: LoopState, t: float) -> None:
     """Charges of a step that began at t (s or, in a jump, a fraction), and its outputs."""
     form, work, step, values = c.form, c.work, s.step[0], c.work.values
-    leaks, first_z, n_y = leaks_of(c, s), s.y.size - c.s_before.size, s.y.size
+    leaks, first_z, n_y = forms.leaks_of(c, s), s.y.size - c.s_before.size, s.y.size
     if pace.charge:
-        step_charges(form, work, leaks, step.length, c.integral, c.sign, values[first_z:n_y], values[n_y:])
-        charge_error(
-            form, work, step.length, leaks.lost, leaks.g, step.theta, work.cells[blocks.CELL_U], work.areas,
+        errors.step_charges(form, work, leaks, step.length, c.integral, c.sign, values[first_z:n_y], values[n_y:])
+        errors.charge_error(
+            form, work, step.length, leaks.lost, leaks.g, step.theta, work.cells[forms.CELL_U], work.areas,
             values[first_z:], s.collected, s.control[0],
         )  # fmt: skip
     for e in range(c.s_before.size):
-        work.gained[e] = at(values[first_z + e], work.basis) if pace.charge else 0.0
-    if s.step[0].in_jump > 0 or not is_wanted(s, step.t_new):
+        work.gained[e] = readout.at(values[first_z + e], work.basis) if pace.charge else 0.0
+    if s.step[0].in_jump > 0 or not readout.is_wanted(s, step.t_new):
         return
-    write_columns(
-        form.shape.shape[0], first_z, pace.charge, form.shape, form.follow, work.modes[blocks.W], work.s, s.y, values
+    errors.write_columns(
+        form.shape.shape[0], first_z, pace.charge, form.shape, form.follow, work.modes[forms.W], work.s, s.y, values
     )  # fmt: skip
-    write_step(s, t, values, work.coefficients, work.outputs)
+    readout.write_step(s, t, values, work.coefficients, work.outputs)
 
 
 @jit_within
@@ -551,33 +495,27 @@ def _account(c: ManyAreas, s: LoopState) -> None:
             area_off = 0.0
             if form.slow[a] >= 0:
                 # The mode of a delayed area is the area itself.
-                for p in range(N_PLACES):
+                for p in range(readout.N_PLACES):
                     area_off = max(area_off, abs(work.places[form.slow[a], p]))
-            account(
-                areas[blocks.U, a], areas[blocks.AREA, a], form.stress[a], s.step[0].theta, work.run[a], area_off,
+            readout.account(
+                areas[forms.U, a], areas[forms.AREA, a], form.stress[a], s.step[0].theta, work.run[a], area_off,
                 s.peaks[a],
             )  # fmt: skip
-    account_nodes(form.node, form.node_s, work.places, work.off, s.peaks[c.sign.size])
+    errors.account_nodes(form.node, form.node_s, work.places, work.off, s.peaks[c.sign.size])
 
 
 @jit_within
 def _move(c: ManyAreas, s: LoopState) -> None:
     """State and error at the end of a step, or where it is cut short."""
     form, work, theta, t_new = c.form, c.work, s.step[0].theta, s.step[0].t_new
-    w, w0, before, after = work.modes[blocks.W], work.w0, work.jump.before, work.jump.after
-    for k in range(w0.size):
-        w0[k] = at(w[k], work.basis)
-    if theta < 1.0:
-        error_at(work.places, theta, s.error)
-    else:
-        for k in range(w0.size):
-            s.error[k] = work.places[k, N_PLACES - 1]
+    w, w0, before, after = work.modes[forms.W], work.w0, work.jump.before, work.jump.after
+    readout.end_at(theta, w, work.places, work.basis, w0, s.error)
     if s.step[0].in_jump > 0:
         for e in range(before.size):
             c.s_before[e] = before[e] + t_new * (after[e] - before[e])
     else:
         at_sources(c.sources, work.segment, t_new, 0.0, c.s_before, work.slopes_now)
-    store(form.shape, form.follow, w0, c.s_before, work.gained, s.y)
+    errors.store(form.shape, form.follow, w0, c.s_before, work.gained, s.y)
 
 
 @jit_within
@@ -586,15 +524,15 @@ def _cross(c: ManyAreas, s: LoopState, a: int) -> None:
     control, branch, t_new = s.control[0], branch_of(c, s), s.step[0].t_new
     c.sign[a] = -c.sign[a]
     branch[a, 0], branch[a, 1] = t_new, t_new - branch[a, 0]
-    s.counters[ZEROS] += 1
+    s.counters[readout.ZEROS] += 1
     # The area has a kink here, which excites the fast modes again.
     if control.h_after_zero > 0.0:
         control.h, control.allowed = control.h_after_zero, 0.0
-    s.step[0].fresh = AFTER_ZERO
+    s.step[0].fresh = step_control.AFTER_ZERO
 
 
 @jit_within
-def end_many(c: ManyAreas, s: LoopState) -> None:
+def end(c: ManyAreas, s: LoopState) -> None:
     """End a call of the loop: if it stopped within a jump, the time is that of the jump."""
     if s.step[0].in_jump > 0:
         resume_time(c, s)

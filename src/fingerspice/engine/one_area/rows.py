@@ -93,12 +93,11 @@ def _add_cosines(amplitude: float, phase: FloatArray, out: FloatArray) -> None:
 
 @jit
 def source_rows(
-    terms: FloatArray, series: FloatArray, length: float, t0: float, h: float, want_slope: bool, r: FloatArray
-) -> None:
+    terms: FloatArray, series: FloatArray, length: float, t0: float, h: float, want_slope: bool, out: FloatArray,
+    slope: FloatArray, scratch: FloatArray,
+) -> None:  # fmt: skip
     """Fill source, and its slope if wanted, for a step of length h that starts t0 into a segment (see `Segment`)."""
-    out = r[SOURCE]
-    slope = r[SLOPE]
-    phase = r[SCRATCH]
+    phase, rate = scratch[0], scratch[1]
     for i in range(ROWS):
         out[i] = 0.0
         slope[i] = 0.0
@@ -116,7 +115,6 @@ def source_rows(
                 phase[i] = phi + (omega + 0.5 * beta * tau) * tau
             _add_cosines(c, phase, out)
             if want_slope:
-                rate = r[MORE]
                 for i in range(ROWS):
                     phase[i] += 0.5 * _PI_HIGH
                     rate[i] = 0.0

@@ -15,67 +15,15 @@ import numpy as np
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within
-from fingerspice.engine.collocation.exponential import (
-    Iterates,
-    Tables,
-    assess,
-    between,
-    carry,
-    converge,
-    make_tables,
-    weigh,
-)
-from fingerspice.engine.collocation.readout import (
-    ACCEPTED,
-    AGAIN,
-    DONE,
-    ERROR_U,
-    FIRST_PASSES,
-    GO_ON,
-    MOST_PASSES,
-    MOST_STEPS,
-    N_PLACES,
-    NFEV,
-    NO_STEP,
-    OUT_OF_RANGE,
-    PAUSED,
-    PEAK_U,
-    RECORDED,
-    REJECTED,
-    RETRY,
-    TOO_MANY,
-    ZEROS,
-    LoopState,
-    account,
-    at,
-    basis_at,
-    error_at,
-    is_wanted,
-    layers,
-    may_shorten,
-    row_of,
-    write_step,
-)
-from fingerspice.engine.collocation.step_control import (
-    AFTER_EDGE,
-    AFTER_ZERO,
-    NOT_FRESH,
-    Pace,
-    change_level,
-    choose_step,
-    dip,
-    enter,
-    farthest_off,
-    first_wrong,
-    nearest_level,
-    rung,
-    take_branch,
-    zero,
-)
+from fingerspice.engine.collocation import exponential, readout, step_control
+from fingerspice.engine.collocation.exponential import Iterates, Tables
+from fingerspice.engine.collocation.readout import N_PLACES, LoopState
+from fingerspice.engine.collocation.step_control import Pace
 from fingerspice.engine.network import Segment, Sources, segment_at, source
+from fingerspice.engine.one_area import rows
 from fingerspice.engine.one_area.charge import charge_step
 from fingerspice.engine.one_area.model import branch_area, dot, turns_at_zero
-from fingerspice.engine.one_area.rows import DQ, GUESS, SCRATCH, SOURCE, X_GAP, Q, U, Work, largest_size, source_rows
+from fingerspice.engine.one_area.rows import DQ, GUESS, SCRATCH, SLOPE, SOURCE, X_GAP, Q, U, Work
 from fingerspice.engine.one_area.system import System
 from fingerspice.numerics.lobatto import END, NODES, POINTS, ROWS
 
@@ -98,7 +46,7 @@ class OneArea(NamedTuple):
 
 
 @jit_within
-def start_one(c: OneArea, s: LoopState) -> None:
+def start(c: OneArea, s: LoopState) -> None:
     """Begin a call of the loop: find the segment of the source, unless the run was paused."""
     step, control, counters = s.step[0], s.control[0], s.counters
     # Other runs may have used the tables since the last call.
@@ -110,32 +58,32 @@ def start_one(c: OneArea, s: LoopState) -> None:
     step.index = segment_at(edges, control.t) - 1 if edges[0] < control.t else -1
     # The segment is entered at the first step, as its edge is not before the present time.
     step.start, step.edge, step.since, step.begun = 0.0, control.t, 0.0, control.t
-    step.fresh, step.evaluated = NOT_FRESH, counters[NFEV]
-    step.most = counters[ACCEPTED] + counters[REJECTED] + MOST_STEPS
+    step.fresh, step.evaluated = step_control.NOT_FRESH, counters[readout.NFEV]
+    step.most = counters[readout.ACCEPTED] + counters[readout.REJECTED] + readout.MOST_STEPS
 
 
 @jit_within
-def begin_one(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
+def begin(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
     """Where the next step starts: after a jump of the source, from the modes of the reference area; and its length."""
     step, control, counters = s.step[0], s.control[0], s.counters
     model, t = c.system.model, control.t
     if not t < t_end:
-        return DONE
-    if counters[RECORDED] >= s.steps.times.shape[0] > 0:
+        return readout.DONE
+    if counters[readout.RECORDED] >= s.steps.times.shape[0] > 0:
         step.is_paused = 1
-        return PAUSED
-    evaluated = counters[NFEV] - step.evaluated
-    if counters[ACCEPTED] + counters[REJECTED] > step.most:
-        return TOO_MANY
-    if evaluated > NODES * FIRST_PASSES:
+        return readout.PAUSED
+    evaluated = counters[readout.NFEV] - step.evaluated
+    if counters[readout.ACCEPTED] + counters[readout.REJECTED] > step.most:
+        return readout.TOO_MANY
+    if evaluated > NODES * readout.FIRST_PASSES:
         longest = (t - step.begun) / pace.h_max
-        if evaluated > NODES * (FIRST_PASSES + MOST_PASSES * longest):
-            return TOO_MANY
+        if evaluated > NODES * (readout.FIRST_PASSES + readout.MOST_PASSES * longest):
+            return readout.TOO_MANY
     while t >= step.edge:
         step.index += 1
         step.start, step.edge = c.sources.edges[step.index], c.sources.edges[step.index + 1]
         if step.edge > t and not _enter_segment(c, pace, s):
-            return NO_STEP
+            return readout.NO_STEP
     step.stop = min(step.edge, t_end)
     _take_level(c, s)
     project, w0 = c.system.project[step.level], c.work.w0
@@ -144,10 +92,10 @@ def begin_one(c: OneArea, pace: Pace, s: LoopState, t_end: float) -> int:
         for i in range(w0.size):
             w0[k] += project[k, i] * s.y[i]
     length = step.stop - step.start
-    step.length = choose_step(
+    step.length = step_control.choose_step(
         pace, model.tau, model.coupled, c.sources.series.shape[1] > 0, t, length - step.since, control
     )  # fmt: skip
-    return GO_ON
+    return readout.GO_ON
 
 
 @jit_within
@@ -156,19 +104,19 @@ def _enter_segment(c: OneArea, pace: Pace, s: LoopState) -> bool:
     step, control, model = s.step[0], s.control[0], c.system.model
     # Time is counted from the edge: a transient after it may be faster than the rounding of t.
     step.since = control.t - step.start
-    step.begun, step.evaluated = control.t, s.counters[NFEV]
+    step.begun, step.evaluated = control.t, s.counters[readout.NFEV]
     u_source = source_voltage(c, s, step.since)
     if model.mobile or pace.charge:
-        if not enter(model, pace.charge, u_source, s.y, control):
+        if not step_control.enter(model, pace.charge, u_source, s.y, control):
             return False
     else:
         control.u_gap = model.k_gap * u_source
         for i in range(model.gap.size):
             control.u_gap += model.gap[i] * s.y[i]
-        take_branch(1.0 if control.u_gap >= 0.0 or not model.coupled else -1.0, control)
+        step_control.take_branch(1.0 if control.u_gap >= 0.0 or not model.coupled else -1.0, control)
     # Try the step that was right after the edge before: similar jumps often need similar steps.
     control.h, control.too_long, control.allowed = control.h_after_edge, 0.0, 0.0
-    step.fresh = AFTER_EDGE
+    step.fresh = step_control.AFTER_EDGE
     return True
 
 
@@ -187,11 +135,11 @@ def _take_level(c: OneArea, s: LoopState) -> None:
     n, now = system.model.gap.size, 0
     if system.q0.size > 1:
         q, _ = branch_area(system.model, s.control[0].sign, s.control[0].u_gap)
-        now = nearest_level(system.q0, q)
+        now = step_control.nearest_level(system.q0, q)
     if now == step.level:
         return
     if error[n] != now:
-        change_level(system.live, system.project, int(error[n]), now, error)
+        step_control.change_level(system.live, system.project, int(error[n]), now, error)
         error[n] = now
     step.level, s.step[0].tabled = now, 0.0
 
@@ -212,20 +160,16 @@ def _linear(
 
 
 @jit_within
-def attempt_one(c: OneArea, pace: Pace, s: LoopState) -> int:
+def attempt(c: OneArea, pace: Pace, s: LoopState) -> int:
     """Solve a step of the length to be tried, and estimate its error (infinite where it did not converge)."""
     system, work, step, control, counters = c.system, c.work, s.step[0], s.control[0], s.counters
     model, r, tol, level, sign = system.model, c.work.r, pace.tol, s.step[0].level, s.control[0].sign
     h, u_rows = step.length, work.r[U]
     if h != step.tabled:
-        tables = c.tables
-        step.slot = make_tables(
-            system.rates[level], level, h, tables.h, tables.level, tables.used, tables.decay, tables.phi, tables.miss
-        )  # fmt: skip
-        step.tabled = h
-        weigh(system.rates[level], system.gap[level], tables.decay[step.slot], h, work.weight)
-    source_rows(
-        c.sources.terms[step.index], c.sources.series[step.index], step.edge - step.start, step.since, h, pace.charge, r
+        exponential.take_tables(c.tables, level, h, system.rates[level], system.gap[level], s, work.weight)
+    rows.source_rows(
+        c.sources.terms[step.index], c.sources.series[step.index], step.edge - step.start, step.since, h, pace.charge,
+        r[SOURCE], r[SLOPE], r[SCRATCH:],
     )  # fmt: skip
     if model.mobile:
         for i in range(ROWS):
@@ -235,30 +179,32 @@ def attempt_one(c: OneArea, pace: Pace, s: LoopState) -> int:
         work.w, work.base, work.pull, work.used, work.pull_before, work.left_before, work.weight, r[U : U + 1],
         r[GUESS : GUESS + 1],
     )  # fmt: skip
-    passes, closed, answer = converge(c, s, iterates, 0.3 * tol)
-    counters[NFEV] += passes * NODES
-    step.wrong = first_wrong(u_rows, sign, tol) if model.coupled else 0
+    passes, closed, answer = exponential.converge(c, s, iterates, 0.3 * tol)
+    counters[readout.NFEV] += passes * NODES
+    step.wrong = step_control.first_wrong(u_rows, sign, tol) if model.coupled else 0
     # Node 1 may be off its branch only because the iteration did not converge: also require a start near 0 V.
     at_zero = sign * u_rows[0] <= _AT_ZERO * min(abs(u_rows[1]), system.u_top)
     if step.wrong == 1 and step.flips < 2 and at_zero:
         # The step starts at a zero, and the gap voltage leaves it to the other side: change the branch.
         if turns_at_zero(model, r[X_GAP, 0], -sign):
             control.margin = 0.0
-            return NO_STEP
+            return readout.NO_STEP
         return flip(s)
-    step.below = dip(u_rows, sign, tol, step.wrong, work.coefficients[0]) if model.coupled and closed else 0.0
+    step.below = (
+        step_control.dip(u_rows, sign, tol, step.wrong, work.coefficients[0]) if model.coupled and closed else 0.0
+    )
     if 0.0 < step.below < POINTS[1] and at_zero:
         # The gap voltage starts at a zero and soon returns to it: a shorter step resolves this.
-        counters[REJECTED] += 1
-        step.length = rung(2.0 * step.below * h)
+        counters[readout.REJECTED] += 1
+        step.length = step_control.rung(2.0 * step.below * h)
         step.wanted = control.h = step.length
         step.flips = 0
-        return RETRY
+        return readout.RETRY
     step.converged, step.step_error = int(closed), math.inf
     if closed:
-        carry(c, s, iterates, system.gap[level : level + 1], answer)
-        step.step_error, step.grown = assess(system, c.tables, work, step.slot, level, s.error)
-    return GO_ON
+        exponential.carry(c, s, iterates, system.gap[level : level + 1], answer)
+        step.step_error, step.grown = exponential.assess(system, c.tables, work, step.slot, level, s.error)
+    return readout.GO_ON
 
 
 @jit_within
@@ -266,27 +212,27 @@ def flip(s: LoopState) -> int:
     """Change the branch of the area, and start again."""
     s.control[0].sign = -s.control[0].sign
     s.step[0].flips += 1
-    return AGAIN
+    return readout.AGAIN
 
 
 @jit_within
-def refuse_one(c: OneArea, s: LoopState) -> int:
+def refuse(c: OneArea, s: LoopState) -> int:
     """Why no shorter step would do after one that was rejected; GO_ON if one may."""
     system, step, r = c.system, s.step[0], c.work.r
     model = system.model
     # A step rejected beyond the end of the area's polynomial: shorter ones would creep up to the kink there.
-    if model.coupled and abs(s.control[0].u_gap) > 0.9 * system.u_top and largest_size(r[U]) > system.u_top:
-        return OUT_OF_RANGE
+    if model.coupled and abs(s.control[0].u_gap) > 0.9 * system.u_top and rows.largest_size(r[U]) > system.u_top:
+        return readout.OUT_OF_RANGE
     # A step of the size of the time's rounding is rejected: the solution has a singularity here.
     if step.length <= 1e-15 * step.since + 1e-25 * (step.edge - step.start):
-        return NO_STEP
+        return readout.NO_STEP
     if model.mobile and 1.0 - model.area0 * r[X_GAP, 0] * r[DQ, 0] < _NEAR_FOLD:
-        return NO_STEP
-    return GO_ON
+        return readout.NO_STEP
+    return readout.GO_ON
 
 
 @jit_within
-def beyond_one(c: OneArea, pace: Pace, s: LoopState) -> float:
+def beyond(c: OneArea, pace: Pace, s: LoopState) -> float:
     """Fraction of a rejected step at which the next one should end, soon after a zero far beyond which it went; or 2.
 
     There the branch of the area has no meaning, and the error says nothing.
@@ -311,14 +257,14 @@ def node_error(
     moved = np.zeros(N_PLACES)
     for p in range(N_PLACES):
         for k in range(gap.size):
-            own[k, p] = area0 * r[Q, row_of(p)] * places[k, p]
+            own[k, p] = area0 * r[Q, readout.row_of(p)] * places[k, p]
     for k in range(gap.size):
-        missed[1], missed[2], missed[3] = between(w[k])
+        missed[1], missed[2], missed[3] = exponential.between(w[k])
         for p in range(N_PLACES):
-            own[k, p] -= area0 * r[Q, row_of(p)] * missed[p]
+            own[k, p] -= area0 * r[Q, readout.row_of(p)] * missed[p]
             moved[p] += gap[k] * own[k, p]
     for p in range(N_PLACES):
-        row = row_of(p)
+        row = readout.row_of(p)
         moved[p] *= area0 * r[DQ, row] / max(1.0 - area0 * r[X_GAP, row] * r[DQ, row], 1e-12)
     worst = 0.0
     for i in range(k_node.size):
@@ -328,11 +274,11 @@ def node_error(
                 values[j] += node[i, k] * w[k, j]
             values[j] *= area0 * r[Q, j]
             values[j] += k_node[i] * r[SOURCE, j]
-        missed[1], missed[2], missed[3] = between(values)
+        missed[1], missed[2], missed[3] = exponential.between(values)
         for p in range(N_PLACES):
             total = missed[p]
             for k in range(gap.size):
-                total += node[i, k] * (own[k, p] + moved[p] * w[k, row_of(p)])
+                total += node[i, k] * (own[k, p] + moved[p] * w[k, readout.row_of(p)])
             worst = max(worst, abs(total))
     return worst
 
@@ -340,7 +286,7 @@ def node_error(
 @jit_rows
 def _linear_error(node: FloatArray, k_node: FloatArray, source: FloatArray, places: FloatArray) -> float:
     """Largest error of a node's voltage under `local`, where the voltages are linear in the modes and the source, V."""
-    first, second, third = between(source)
+    first, second, third = exponential.between(source)
     worst = 0.0
     for i in range(k_node.size):
         share = k_node[i]
@@ -357,7 +303,7 @@ def _linear_error(node: FloatArray, k_node: FloatArray, source: FloatArray, plac
 
 
 @jit_within
-def complete_one(c: OneArea, pace: Pace, s: LoopState) -> int:
+def complete(c: OneArea, pace: Pace, s: LoopState) -> int:
     """End an accepted step at a zero or an edge, write its outputs, account for its errors, and move to its end."""
     step, control, t = s.step[0], s.control[0], s.control[0].t
     h, since, length = step.length, step.since, step.stop - step.start
@@ -367,12 +313,14 @@ def complete_one(c: OneArea, pace: Pace, s: LoopState) -> int:
         reached = length
         step.theta = min(1.0, (length - since) / h)
     if step.wrong > 0 or step.below > 0.0:
-        crossing = zero(c.work.r[U], control.sign, step.wrong, step.below, c.work.coefficients[0])
+        crossing = step_control.zero(c.work.r[U], control.sign, step.wrong, step.below, c.work.coefficients[0])
         if since + crossing * h <= since:
             if step.flips < 2:
                 return flip(s)
-            if farthest_off(c.work.r[U], control.sign, step.theta) > pace.tol and may_shorten(s, since):
-                return AGAIN
+            if step_control.farthest_off(c.work.r[U], control.sign, step.theta) > pace.tol and readout.may_shorten(
+                s, since
+            ):
+                return readout.AGAIN
         elif since + crossing * h <= reached and crossing <= step.theta:
             step.theta, reached, step.crossed = crossing, since + crossing * h, 0
     step.flips = 0
@@ -381,12 +329,12 @@ def complete_one(c: OneArea, pace: Pace, s: LoopState) -> int:
     _account(c, s)
     _move(c, pace.charge, s)
     if step.crossed >= 0 and not _cross(c, s):
-        return NO_STEP
+        return readout.NO_STEP
     control.t, step.since = step.t_new, reached
     if control.t >= step.stop:
         control.u_before = source_voltage(c, s, control.t - step.start)
-    s.counters[ACCEPTED] += 1
-    return OUT_OF_RANGE if s.peaks[0, PEAK_U] > c.system.u_top else GO_ON
+    s.counters[readout.ACCEPTED] += 1
+    return readout.OUT_OF_RANGE if s.peaks[0, readout.PEAK_U] > c.system.u_top else readout.GO_ON
 
 
 @jit_within
@@ -400,10 +348,10 @@ def _write(c: OneArea, pace: Pace, s: LoopState, t: float) -> None:
             system, work, level, c.integral, step.length, s.y[work.w0.size], step.theta, s.control[0], s.collected,
             values[n_shown], values[n_shown + 1],
         )  # fmt: skip
-    if not is_wanted(s, step.t_new):
+    if not readout.is_wanted(s, step.t_new):
         return
-    layers(model.mobile, model.area0, system.k_shown, shown, work.w, work.r[SOURCE], work.r[Q], values)
-    write_step(s, t, values, work.coefficients, work.outputs)
+    readout.layers(model.mobile, model.area0, system.k_shown, shown, work.w, work.r[SOURCE], work.r[Q], values)
+    readout.write_step(s, t, values, work.coefficients, work.outputs)
 
 
 @jit_within
@@ -416,11 +364,11 @@ def _account(c: OneArea, s: LoopState) -> None:
         r[SCRATCH, i] = 1.0 / r[Q, i]
         if model.mobile and model.coupled and i < NODES and POINTS[i] <= step.theta:
             control.margin = min(control.margin, 1.0 - model.area0 * r[X_GAP, i] * r[DQ, i])
-    account(r[U], r[SCRATCH], system.stress, step.theta, work.run, 0.0, s.peaks[0])
+    readout.account(r[U], r[SCRATCH], system.stress, step.theta, work.run, 0.0, s.peaks[0])
     v_error = node_error(
         model.mobile, model.area0, system.node[level], system.k_node, system.gap[level], work.w, r, work.places
     )  # fmt: skip
-    s.peaks[1, ERROR_U] = max(s.peaks[1, ERROR_U], v_error)
+    s.peaks[1, readout.ERROR_U] = max(s.peaks[1, readout.ERROR_U], v_error)
 
 
 @jit_within
@@ -429,20 +377,11 @@ def _move(c: OneArea, charge: bool, s: LoopState) -> None:
     system, work, control, theta, y = c.system, c.work, s.control[0], s.step[0].theta, s.y
     n, r, w, w0, places, basis, error = work.w0.size, work.r, work.w, work.w0, work.places, work.basis, s.error
     n_shown = system.shown.shape[1]
-    if theta < 1.0:
-        basis_at(theta, basis)
-        for k in range(n):
-            w0[k] = at(w[k], basis)
-        error_at(places, theta, error)
-        if charge:
-            y[n], control.last_q = at(work.values[n_shown], basis), at(r[Q], basis)
-        control.u_gap = 0.0 if s.step[0].crossed >= 0 else at(r[U], basis)
-    else:
-        for k in range(n):
-            w0[k], error[k] = w[k, END], places[k, N_PLACES - 1]
-        if charge:
-            y[n], control.last_q = work.values[n_shown, END], r[Q, END]
-        control.u_gap = r[U, END]
+    readout.basis_at(theta, basis)
+    readout.end_at(theta, w, places, basis, w0, error)
+    if charge:
+        y[n], control.last_q = readout.at(work.values[n_shown], basis), readout.at(r[Q], basis)
+    control.u_gap = 0.0 if s.step[0].crossed >= 0 else readout.at(r[U], basis)
     live = system.live[s.step[0].level]
     for i in range(n):
         y[i] = 0.0
@@ -457,7 +396,7 @@ def _cross(c: OneArea, s: LoopState) -> bool:
     control.sign = -control.sign
     control.branch_length = t_new - control.branch_start
     control.branch_start = t_new
-    s.counters[ZEROS] += 1
+    s.counters[readout.ZEROS] += 1
     if turns_at_zero(model, dot(model.gap, s.y), control.sign):
         control.t = t_new
         control.sign = -control.sign
@@ -471,10 +410,10 @@ def _cross(c: OneArea, s: LoopState) -> bool:
     elif control.h_after_zero > 0.0:
         control.h = control.h_after_zero
         control.allowed = 0.0
-    s.step[0].fresh = AFTER_ZERO
+    s.step[0].fresh = step_control.AFTER_ZERO
     return True
 
 
 @jit_within
-def end_one(c: OneArea, s: LoopState) -> None:
+def end(c: OneArea, s: LoopState) -> None:
     """End a call of the loop: nothing is left to do."""
