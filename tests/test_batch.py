@@ -13,7 +13,7 @@ import fingerspice as fs
 from batches import check, population, singles, singly
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.engine.lockstep import step as lockstep
-from fingerspice.engine.lockstep.step import marks_of, moment_integrals
+from fingerspice.engine.lockstep.step import marks_of
 from scenes import cases, table1
 
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")
@@ -371,13 +371,6 @@ def test_bad_input_is_refused_in_one_sentence(parameters: Any, options: dict[str
     with pytest.raises(fs.InputError, match=message) as caught:
         fs.batch(table1(), parameters, **options)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("y", [0.0, 1e-9, 0.05, 0.299, 0.3, 0.7, 3.0, 40.0])
-def test_weights_of_a_step_are_integrals_of_the_decay(y: float) -> None:
-    for k, found in enumerate(moment_integrals(y)):
-        expected = quad(lambda s, k=k: np.exp(-y * (1.0 - s)) * s**k, 0.0, 1.0, epsabs=1e-13, epsrel=1e-13)[0]
-        assert found == pytest.approx(expected, rel=2e-13)
 
 
 @pytest.mark.parametrize("y", [0.0, 1e-6, 0.3, 5.0, 19.0, 38.0, 39.0, 200.0])

@@ -17,13 +17,12 @@ block is one scene, in a thread of its own (`engine.lockstep.card`).
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.compiled import jit, jit_rows, jit_within_rows
+from fingerspice.numerics.linear import moments as integrals
 
 LANES = 32
 """Scenes of a block on the processor."""
@@ -78,23 +77,6 @@ def n_state(m: int, k: int, moments: int) -> int:
     return N_STATE * m + VALUE + 2 * moments + 2 * k
 
 
-@jit
-def moment_integrals(y: float) -> tuple[float, float, float]:
-    """Integrals of exp(-y (1 - s)) s^k over [0, 1] for k = 0, 1, 2, y >= 0."""
-    if y < 0.3:
-        # k = 2: the sum of (-y)^j 2! / (j + 3)! from its last term on; then a recursion down to k = 0, which damps
-        # rounding.
-        total = 0.0
-        for j in range(11, -1, -1):
-            total = 1.0 - y * total * (1.0 / (j + 4.0))
-        second = total / 3.0
-        first = 0.5 * (1.0 - y * second)
-        return 1.0 - y * first, first, second
-    zeroth = -math.expm1(-y) / y
-    first = (1.0 - zeroth) / y
-    return zeroth, first, (1.0 - 2.0 * first) / y
-
-
 @jit_rows
 def _shortest(rates: FloatArray, h: FloatArray, moments: FloatArray, marks: Marks) -> None:
     """Moments of every lane, shape (4, lanes), over a 64th of half a step, whose sum needs no exponential function."""
@@ -111,7 +93,7 @@ def _shortest(rates: FloatArray, h: FloatArray, moments: FloatArray, marks: Mark
 
 @jit_rows
 def _double(moments: FloatArray, longer: FloatArray, marks: Marks) -> None:
-    """Moments over twice the length of a step, shape (4, lanes): exp(-y), then those of `moment_integrals`."""
+    """Moments over twice the length of a step, shape (4, lanes): exp(-y), then the integrals of exp(-y (1 - s)) s^k."""
     for i in range(len(marks[5])):
         e, m0, m1, m2 = moments[0, i], moments[1, i], moments[2, i], moments[3, i]
         longer[0, i] = e * e
@@ -173,7 +155,7 @@ def weigh(
         for i in range(lanes):
             y = 0.5 * rates[m, i] * h[i]
             if y > _MOST:
-                half[1, i], half[2, i], half[3, i] = moment_integrals(y)
+                integrals(y, half[1:, i])
                 half[0, i] = 1.0 - y * half[1, i]
         for piece in range(moving.shape[0]):
             _double(half, whole, marks)
