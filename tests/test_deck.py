@@ -411,7 +411,7 @@ def test_missing_files_folders_and_huge_files_are_refused(tmp_path: Path) -> Non
         read_deck(tmp_path)
     with (tmp_path / "huge.cir").open("wb") as huge:
         huge.truncate(2**27)
-    with pytest.raises(InputError, match="larger than 64 MiB"):
+    with pytest.raises(InputError, match="has 128 MiB; allowed: at most 64 MiB"):
         read_deck(tmp_path / "huge.cir")
 
 

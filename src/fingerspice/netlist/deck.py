@@ -131,8 +131,8 @@ class Flattener:
         for line in instance.definition.elements:
             self._element(line, instance)
         for name, line, rest in instance.definition.directives:
-            words = group(lex(line, rest), probes=True)
-            args, params = instance.scope.words(words.words), dict[str, Value]()
+            words, params = group(lex(line, rest), probes=True), dict[str, Value]()
+            args = instance.scope.words(words.words)
             for key, value in instance.scope.pairs(words).items():
                 probe = name == ".ic" and key.startswith("v(")
                 flat = f"v({instance.node(key[2:-1].strip())[0]})" if probe else key
@@ -185,17 +185,13 @@ class Flattener:
         *nodes, device = plain
         if device.kind != "word":
             raise InputError(f"{device.written} stands where a device's name belongs", device.where)
-        native, key = device.text.upper(), device.text.lower()
-        around = (instance, *instance.around)
+        native, key, around = device.text.upper(), device.text.lower(), (instance, *instance.around)
         while around and key not in around[0].definition.inner:
             around = around[1:]
         called = around[0].definition.inner[key] if around else None
-        if native in layer_devices():
-            called, shown, wanted = None, native, DEVICES[native].nodes
-        elif called is not None:
-            shown, wanted = called.name, called.ports
-        else:
+        if called is None and native not in layer_devices():
             raise InputError(_unknown_device(plain, instance), device.where)
+        shown, wanted = (called.name, called.ports) if called else (native, DEVICES[native].nodes)
         if len(nodes) != len(wanted):
             count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}"
             names = f" ({' '.join(wanted)})" if wanted else ""
@@ -205,8 +201,7 @@ class Flattener:
             params = scope.pairs(words, bare="arithmetic")
             given = {key: value.value for key, value in params.items() if isinstance(value, Number)}
             _refuse_captured(native, given, words, scope)
-            where = lexemes[0].where
-            self.deck.statements.append(Statement(name, native, canonical, written, (), params, where))
+            self.deck.statements.append(Statement(name, native, canonical, written, (), params, lexemes[0].where))
             return
         self._count(called, instance, device.where)
         ports = dict(zip(called.ports, instance.nodes(nodes), strict=True))
@@ -231,15 +226,12 @@ class Flattener:
                 raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
         self._expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
         self._expanded_text += called.characters
-        problem = ""
         if len(instance.calls) >= MAX_DEPTH:
-            problem = f"subcircuits call each other more than {MAX_DEPTH} deep"
-        elif self._expanded > MAX_EXPANDED:
-            problem = f"the subcircuits expand to more than {MAX_EXPANDED:,} lines"
-        elif self._expanded_text > MAX_EXPANDED_TEXT:
-            problem = f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text"
-        if problem:
-            raise InputError(problem, where)
+            raise InputError(f"subcircuits call each other more than {MAX_DEPTH} deep", where)
+        if self._expanded > MAX_EXPANDED:
+            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
+        if self._expanded_text > MAX_EXPANDED_TEXT:
+            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
 
 
 def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:

@@ -14,6 +14,7 @@ import re
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
+from graphlib import CycleError, TopologicalSorter
 from typing import Literal, NamedTuple, TypeAlias
 
 from fingerspice.base.errors import InputError, Where
@@ -389,38 +390,23 @@ class Scope:
 
     def solve(self) -> dict[str, float]:
         """The parameters' values; each definition, in any order, is evaluated after those of the parameters in it."""
-        known: dict[str, Expression] = {}
-        for root in self._definitions:
-            stack = [root]
-            while stack:
-                name = stack[-1]
-                if name in self.values:
-                    stack.pop()
-                    continue
-                text = self._definitions[name].value
-                if name not in known:
-                    known[name] = compile_expression(text.text, text.place)
-                waiting = [n for n in known[name].names if n in self._definitions and n not in self.values]
-                if not waiting:
-                    self.preset(name, self.number(text))
-                elif any(n in known for n in waiting):
-                    raise self._circle(known, name)  # a compiled definition without a value is on the stack: a circle
-                stack.extend(waiting)
+        texts = {name: one.value for name, one in self._definitions.items() if name not in self.values}
+        graph = dict[str, list[str]]()
+        for name, text in texts.items():
+            graph[name] = [n for n in compile_expression(text.text, text.place).names if n in texts]
+        try:
+            for name in TopologicalSorter(graph).static_order():
+                self.preset(name, self.number(texts[name]))
+        except CycleError as error:
+            # From a parameter to those in its definition, which graphlib gives backwards.
+            circle = error.args[1][:0:-1]
+            path = [circle[-1], *circle]
+            shown = [self._definitions[name].key.text for name in path]
+            if len(shown) > 12:
+                shown[6:-5] = ["..."]
+            problem = f"parameters refer to each other in a circle: {' -> '.join(shown)}"
+            raise InputError(problem, self._definitions[path[0]].key.where) from None
         return self.values
-
-    def _circle(self, known: dict[str, Expression], start: str) -> InputError:
-        """The error that names the parameters of a circle; following undefined names from `start` leads into it."""
-        order, name = dict[str, None](), start
-        while name not in order:
-            order[name] = None
-            name = next(n for n in known[name].names if n in known and n not in self.values)
-        path = list(order)
-        path = [*path[path.index(name) :], name]
-        shown = [self._definitions[name].key.text for name in path]
-        if len(shown) > 12:
-            shown[6:-5] = ["..."]
-        problem = f"parameters refer to each other in a circle: {' -> '.join(shown)}"
-        return InputError(problem, self._definitions[path[0]].key.where)
 
     def number(self, lexeme: Lexeme) -> Number:
         """Value of a lexeme that must be arithmetic, with or without braces."""

@@ -19,8 +19,8 @@ from fingerspice.circuit.network import checked
 from fingerspice.netlist.deck import parse_deck, read_deck, with_comma
 from fingerspice.netlist.expressions import Call, Number, Token, Value
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
-from fingerspice.netlist.reader import MAX_WARNINGS, Deck, Directive, SourceFiles, Statement
-from fingerspice.netlist.sources import Context, Source, read_source
+from fingerspice.netlist.reader import MAX_WARNINGS, Context, Deck, Directive, Statement
+from fingerspice.netlist.sources import read_source
 from fingerspice.waveforms.waveform import DC, Waveform, check_range
 
 #: The parameter that gives the number of equal parts in parallel.
@@ -101,7 +101,7 @@ def _circuit(deck: Deck) -> Circuit:
 
 def _read(deck: Deck, notes: list[str]) -> Circuit:
     tran = next((read_tran(directive, notes) for directive in deck.named(".tran")), None)
-    context = Context(tran, SourceFiles(None if deck.path is None else deck.path.parent))
+    context = Context(tran, None if deck.path is None else deck.path.parent)
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
     work, unused = read_options(deck.named(".options"))
     initial, unused_starts = read_initial(deck.named(".ic"), elements, tran is None or tran.uic)
@@ -148,21 +148,21 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
     """
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
-    context = Context(tran, SourceFiles(anywhere=files), in_deck=False)
+    context = Context(tran, in_deck=False, anywhere=files)
     try:
         deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
         if len(deck.statements) != 1:
             raise InputError("not one source; allowed: such as SQUARE(200 100)")
-        source = source_of(deck.statements[0]._replace(name="source"), context)
-        if source.ac is not None:
+        waveform, ac, notes = read_source(deck.statements[0]._replace(name="source"), context)
+        if ac is not None:
             raise InputError("AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
     except InputError as error:
         comma = decimal_comma(f"V1 a 0 {text}")
         raise InputError(f"{text!r}: {error.message}" + (f"; note {comma}" if comma else "")) from None
-    for note in (*deck.warnings, *source.notes):
+    for note in (*deck.warnings, *notes):
         # A note begins with a place in the one-source deck made here, which the user does not know: cut it off.
         warnings.warn(f"{text!r}: {note.partition(': ')[2]}", FingerspiceWarning, stacklevel=2)
-    return source.waveform
+    return waveform
 
 
 def sweep_from_text(text: str) -> AcSweep:
@@ -190,7 +190,7 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
     read: dict[str, Any] = {}
     values: dict[str, float] = {}
     if device in "VI":
-        read["waveform"], read["ac"], differences = source_of(own, context)
+        read["waveform"], read["ac"], differences = read_source(own, context)
         notes.extend(differences)
     elif device in "RC":
         values, read["initial"] = _read_passive(own, notes)
@@ -216,31 +216,6 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
             out[0] = replace(element, nodes=(inner, nodes[1]), node_names=(written, names[1]))
         out.append(Element(written, kind, ends, ends_written, value, where=where))
     return out
-
-
-def source_of(statement: Statement, context: Context) -> Source:
-    """The source that a V or I element's statement describes."""
-    name, body, params = statement.name, list(statement.body), statement.params
-    last = body[-1] if body else None
-    if "wavefile" in params and not any(isinstance(word, Call) for word in body):
-        # LTspice's `wavefile=path [chan=n]`: 1 V at full scale, and the first channel if none is chosen.
-        path = params["wavefile"]
-        where = path.key or path.where
-        for key, value in params.items():
-            if key not in ("wavefile", "chan"):
-                raise InputError(f"{name} takes no parameter {key!r} beside wavefile=; allowed: chan=", value.key)
-        channel = params.get("chan", Number(0.0, "0", where))
-        body.append(Call("wavefile", (path, Number(1.0, "1", where), channel), {}, where))
-    elif params:
-        # ngspice takes PWL(...) r=10m as well as PWL(... r=10m), and the brackets of PWL(file=...) may be left out.
-        inner = last.params if isinstance(last, Call) else {}
-        if not isinstance(last, Call | Token) or last.text.lower() != "pwl" or set(inner) & set(params):
-            key = next(iter(params))
-            takes = ", ".join(p.capitalize() for p in DEVICES[statement.device].beside)
-            hint = f"; allowed: {takes}, besides its value" if takes else ""
-            raise InputError(f"{name} takes no parameter {key!r}{hint}", params[key].key)
-        body[-1] = Call(last.text, last.args if isinstance(last, Call) else (), {**inner, **params}, last.where)
-    return read_source(name, body, context, statement.where)
 
 
 def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:

@@ -17,6 +17,7 @@ from pathlib import Path, PurePath
 from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
+from fingerspice.circuit.circuit import Tran
 from fingerspice.circuit.devices import layer_devices
 from fingerspice.netlist.expressions import Value, Word, definitions
 from fingerspice.netlist.lexer import (
@@ -32,6 +33,7 @@ from fingerspice.netlist.lexer import (
     nearest,
     split_lines,
 )
+from fingerspice.waveforms.files import file_fault
 
 #: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
 LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
@@ -57,26 +59,10 @@ def read_text(path: Path, shown: str, where: Where | None = None, root: Path | N
 
     `shown` is the path as the user wrote it at the place `where`; files outside the folder `root` are not proposed.
     """
-    try:
-        if path.is_dir():
-            problem = "is a folder, not a file"
-        elif not path.exists():
-            problem = f"does not exist{_similar_file(path, shown, root)}"
-        elif not path.is_file():
-            problem = "is not an ordinary file"
-        elif path.stat().st_size > MAX_BYTES:
-            problem = f"is larger than {MAX_BYTES >> 20} MiB"
-        else:
-            return _decoded(path.read_bytes(), shown, where)
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        problem = f"cannot be read: {_reason(error)}"
-    raise InputError(f"'{shown}' {problem}", where)
-
-
-def _reason(error: Exception) -> str:
-    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    if not (fault := file_fault(path, MAX_BYTES)):
+        return _decoded(path.read_bytes(), shown, where)
+    hint = _similar_file(path, shown, root) if fault == "does not exist" else ""
+    raise InputError(f"'{shown}' {fault}{hint}", where)
 
 
 def text_of(path: Path) -> tuple[str, Path]:
@@ -90,7 +76,7 @@ def text_of(path: Path) -> tuple[str, Path]:
         with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as source:
             data = source.read(MAX_BYTES + 1)
     except OSError as error:
-        raise InputError(f"'{path}' cannot be read: {_reason(error)}") from None
+        raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from None
     if len(data) > MAX_BYTES:
         raise InputError(f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
     return _decoded(data, str(path), None), Path("stdin")
@@ -116,10 +102,12 @@ def _decoded(data: bytes, shown: str, where: Where | None) -> str:
 
 
 @dataclass
-class SourceFiles:
-    """Finds the recordings and tables of sources: a deck's in its folder or below, a user's own anywhere."""
+class Context:
+    """What a source may refer to: the .tran line, and files, a deck's in its folder or below, a user's own anywhere."""
 
+    tran: Tran | None  # On whose times SPICE's defaults depend
     folder: Path | None = None  # Folder of the deck; None for a deck given as text
+    in_deck: bool = True  # Whether the source stands in a deck, which a SPICE may read, too
     # Whether any file may be read, relative to the working directory: for sources given by the user, not by a deck
     anywhere: bool = False
     size: int = 0  # Total size of the files named so far, bytes; a file counts each time that it is named
@@ -140,7 +128,8 @@ class SourceFiles:
                 path = folder / name.replace("\\", "/")
             self.size += path.stat().st_size if path.is_file() else 0
         except (OSError, RuntimeError) as error:  # a name that is too long, or the folder of an unknown user
-            raise InputError(f"'{name}' cannot be read: {_reason(error)}", where) from None
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"'{name}' cannot be read: {reason}", where) from None
         if self.size > MAX_SOURCE_BYTES:
             raise InputError(f"the sources' files are larger than {MAX_SOURCE_BYTES >> 20:,} MiB in all", where)
         return path
@@ -153,11 +142,7 @@ def library_changed(root: Path, folder: Path, name: str) -> bool:
         if not path.is_relative_to(root) or not path.is_file():
             return False
         own = library_text(next(law for law, file in LIBRARIES.items() if file == path.name.lower()))
-        # A file of more than four bytes per character cannot be equal, and need not be read.
-        if path.stat().st_size > 4 * len(own):
-            return True
-        text = read_text(path, name)
-        read, shipped = ([line.rstrip() for line in split_lines(x.rstrip())] for x in (text, own))
+        read, shipped = ([line.rstrip() for line in split_lines(x.rstrip())] for x in (read_text(path, name), own))
         return read != shipped
     except (OSError, ValueError, RuntimeError):
         # A file that cannot be read is not this version's library.

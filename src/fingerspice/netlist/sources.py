@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 from fingerspice.base.errors import InputError, Where
-from fingerspice.circuit.circuit import SmallSignal, Tran
+from fingerspice.circuit.circuit import SmallSignal
+from fingerspice.circuit.devices import DEVICES
 from fingerspice.netlist.expressions import Call, Number, Token, Word
 from fingerspice.netlist.lexer import is_unit, nearest
-from fingerspice.netlist.reader import SourceFiles
+from fingerspice.netlist.reader import Context, Statement
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.periodic import PWL, Burst, Pulse, Repeat, Sawtooth, Square, Triangle
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import AM, DC, Chirp, Exp, Sine, Waveform
 
 _KEPT_BYTES = 2**25  # A larger WAV file is read in parts when needed: 32 MiB are six minutes of 16 bits at 48 kHz.
-
-
-class Context(NamedTuple):
-    """Data that the text of a source may refer to."""
-
-    tran: Tran | None  # The .tran line, on whose times SPICE's defaults depend
-    files: SourceFiles  # Finds recordings and tables
-    in_deck: bool = True  # Whether the text stands in a deck, which a SPICE may read, too
 
 
 def _number(word: Word, what: str) -> float:
@@ -87,12 +81,16 @@ class _Arguments:
         word = self.words.get(name)
         return word.text if isinstance(word, Token) else self.whole(name)
 
+    def upsampled(self, recording: Samples) -> Samples:
+        """The recording, upsampled by the factor that is given."""
+        factor = self.whole("upsample")
+        return recording if factor is None else recording.upsampled(factor)
+
     def file(self, name: str = "path") -> Path:
         """The file that a word names."""
         if name not in self.words:
             self.refuse(f"{self.name} names no file")
-        word = self.words[name]
-        return self.context.files.find(word.text, word.where)
+        return self.context.find(self.words[name].text, self.words[name].where)
 
 
 def _sin(a: _Arguments) -> Waveform:
@@ -138,22 +136,19 @@ def _wavefile(a: _Arguments) -> Waveform:
     path = a.file()
     if "gain" not in a.words:
         a.refuse(f"{a.name} has no gain, the V at full scale")
-    factor, small = a.whole("upsample"), not path.is_file() or path.stat().st_size <= _KEPT_BYTES
-    read = Samples.from_wav(path, _number(a.words["gain"], "gain"), a.whole("channel"), at_once=small)
-    return read if factor is None else read.upsampled(factor)
+    small = not path.is_file() or path.stat().st_size <= _KEPT_BYTES
+    return a.upsampled(Samples.from_wav(path, _number(a.words["gain"], "gain"), a.whole("channel"), at_once=small))
 
 
 def _table(a: _Arguments) -> Waveform:
     path = a.file()
     rate = _number(a.words["rate"], "TABLE rate") if "rate" in a.words else None
-    table = read_table(path, a.column("time"), a.column("value"), rate)
-    factor = a.whole("upsample")
-    if table.rate is not None:
-        recording = Samples(table.values, table.rate)
-        return recording if factor is None else recording.upsampled(factor)
-    if factor is not None:
+    values, rate, times = read_table(path, a.column("time"), a.column("value"), rate)
+    if rate is not None:
+        return a.upsampled(Samples(values, rate))
+    if "upsample" in a.words:
         raise InputError("TABLE upsample goes with a rate, and this table has times", a.call.where)
-    return PWL(table.times, table.values)  # type: ignore[arg-type]
+    return PWL(times, values)  # type: ignore[arg-type]
 
 
 def _burst(a: _Arguments) -> Waveform:
@@ -212,24 +207,15 @@ _SFFM = "SFFM changed its argument order between ngspice versions; write the wav
 _ALIASES = {"sine": "sin", "wav": "wavefile"}
 
 
-class Source(NamedTuple):
-    """Waveform and small signal of a V or I element, from the words after its nodes."""
+def read_source(statement: Statement, context: Context) -> tuple[Waveform, SmallSignal | None, list[str]]:
+    """Waveform and small signal of a V or I element, and warnings about words that ngspice reads differently.
 
-    waveform: Waveform
-    ac: SmallSignal | None
-    notes: tuple[str, ...]  # Warnings about words that ngspice reads differently
-
-
-def read_source(name: str, body: Sequence[Word], context: Context, where: Where) -> Source:
-    """Read the words after the nodes of the V or I element `name`, which stands at the place `where`.
-
-    They are ``[DC] value``, ``AC ...`` and at most one source function.
+    The words after its nodes are ``[DC] value``, ``AC ...`` and at most one source function.
     """
     level: float | None = None
     ac: SmallSignal | None = None
     waveform: Waveform | None = None
-    notes: tuple[str, ...] = ()
-    words = deque(body)
+    name, words, notes = statement.name, deque(_words(statement)), list[str]()
     while words:
         word = words.popleft()
         if isinstance(word, Number):
@@ -244,11 +230,10 @@ def read_source(name: str, body: Sequence[Word], context: Context, where: Where)
             raise InputError(problem, word.where)
         if isinstance(word, Token):
             # A call may also be written without brackets: SIN 0 200 100.
-            numbers: list[Number] = []
-            while words and isinstance(words[0], Number):
-                numbers.append(words[0])
+            numbers = tuple(itertools.takewhile(lambda one: isinstance(one, Number), words))
+            word = Call(key, numbers, {}, word.where)
+            for _ in numbers:
                 words.popleft()
-            word = Call(key, tuple(numbers), {}, word.where)
         if key in _LEVELS and word.params:
             problem = f"{name}: {key.upper()} has no parameter {next(iter(word.params))!r}; allowed: {_LEVELS[key]}"
             raise InputError(problem, next(iter(word.params.values())).key)
@@ -268,10 +253,35 @@ def read_source(name: str, body: Sequence[Word], context: Context, where: Where)
             raise InputError(f"{name} has two source functions, the second is {key.upper()}", word.where)
         else:
             waveform = _read_call(name, key, word, context)
-            notes = tuple(f"{word.where}: {name}: {note}" for note in _differences(key, waveform, word))
+            notes = [f"{word.where}: {name}: {note}" for note in _differences(key, waveform, word)]
     if waveform is None and level is None and ac is None:
-        raise InputError(f"{name} has no value; allowed: a number or one of {_KNOWN}", where)
-    return Source(waveform if waveform is not None else DC(level or 0.0), ac, notes)
+        raise InputError(f"{name} has no value; allowed: a number or one of {_KNOWN}", statement.where)
+    return waveform if waveform is not None else DC(level or 0.0), ac, notes
+
+
+def _words(statement: Statement) -> list[Word]:
+    """The words after the nodes, with the `key=value` pairs behind them in the calls to which they belong."""
+    name, body, params = statement.name, list(statement.body), statement.params
+    last = body[-1] if body else None
+    if "wavefile" in params and not any(isinstance(word, Call) for word in body):
+        # LTspice's `wavefile=path [chan=n]`: 1 V at full scale, and the first channel if none is chosen.
+        path = params["wavefile"]
+        where = path.key or path.where
+        for key, value in params.items():
+            if key not in ("wavefile", "chan"):
+                raise InputError(f"{name} takes no parameter {key!r} beside wavefile=; allowed: chan=", value.key)
+        channel = params.get("chan", Number(0.0, "0", where))
+        body.append(Call("wavefile", (path, Number(1.0, "1", where), channel), {}, where))
+    elif params:
+        # ngspice takes PWL(...) r=10m as well as PWL(... r=10m), and the brackets of PWL(file=...) may be left out.
+        inner = last.params if isinstance(last, Call) else {}
+        if not isinstance(last, Call | Token) or last.text.lower() != "pwl" or set(inner) & set(params):
+            key = next(iter(params))
+            takes = ", ".join(p.capitalize() for p in DEVICES[statement.device].beside)
+            hint = f"; allowed: {takes}, besides its value" if takes else ""
+            raise InputError(f"{name} takes no parameter {key!r}{hint}", params[key].key)
+        body[-1] = Call(last.text, last.args if isinstance(last, Call) else (), {**inner, **params}, last.where)
+    return body
 
 
 def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:

@@ -114,8 +114,9 @@ class Columns:
         return Columns(self.file, (), self.data.reshape(-1, 2), (), lines)
 
 
-def read_text_columns(path: Path, label: str | None = None) -> Columns:
+def read_text_columns(path: str | Path, label: str | None = None) -> Columns:
     """Columns of a text file, with one count of cells in all rows; the column `label` has words. Errors name lines."""
+    path = checked_file(path, MAX_TEXT_BYTES)
     numbered = _lines(path)
     rows = [(number, line) for number, line in numbered if not line.lstrip().startswith(_COMMENTED)]
     place = None
@@ -259,15 +260,6 @@ _OTHERS = {
 
 
 @dataclass(frozen=True)
-class Recording:
-    """Values against time, either at a rate or at times."""
-
-    values: FloatArray  # (n,): V, or A
-    rate: float | None = None  # Samples per second
-    times: FloatArray | None = None  # (n,): s, not decreasing
-
-
-@dataclass(frozen=True)
 class WavLayout:
     """Position and number format of the samples in a WAV file, so that some of them can be read."""
 
@@ -382,8 +374,8 @@ def _wav_chunks(path: Path, file: BinaryIO) -> tuple[str, bytes, int, int]:
 def read_table(
     path: str | Path, time: str | int | None = None, value: str | int | None = None, rate: float | None = None, *,
     pairs: bool = False,
-) -> Recording:  # fmt: skip
-    """Columns of a table: a text file with one row per line, or an NPZ file of NumPy.
+) -> tuple[FloatArray, float | None, FloatArray | None]:  # fmt: skip
+    """Values (V or A) of a table with their rate (Hz) or their times (s): a text of one row a line, or NumPy's NPZ.
 
     Numbers in a text have decimal points and may have SPICE's scales (``1m``); commas, tabs or blanks separate them.
     Lines that begin with ``#``, ``;`` or ``*`` are comments, and so is what follows a blank and ``;`` behind numbers.
@@ -399,8 +391,6 @@ def read_table(
     path = checked_file(path, MAX_BYTES)
     with path.open("rb") as file:
         packed = file.read(4) == b"PK\x03\x04" or path.suffix.lower() == ".npz"
-    if not packed:
-        checked_file(path, MAX_TEXT_BYTES)
     found, own_rate = _npz_columns(path) if packed else (read_text_columns(path), None)
     found = found.paired() if pairs else found
     check_count(str(path), found.data.shape[0])
@@ -416,7 +406,7 @@ def read_table(
     # A column that is named as times is one even beside a rate, which it may contradict.
     named = [i for i, name in enumerate(found.names) if name.lower() in _TIME_NAMES]
     if rate is not None and not (columns > 1 and (named or (columns == 2 and value is None))):
-        return Recording(found.scaled(_chosen(found, value, "value", 1, 0), "V"), rate)
+        return found.scaled(_chosen(found, value, "value", 1, 0), "V"), rate, None
     at = named[0] if time is None and len(named) == 1 else _chosen(found, time, "time", 2, 0)
     t = found.scaled(at, "s")
     values = found.scaled(_chosen(found, value, "value", 2, 1 - at, other=at), "V")
@@ -427,33 +417,34 @@ def read_table(
         problem = f"{found.place(i + 1)}: the time {t[i + 1]:g} s follows {t[i]:g} s{taken}"
         raise InputError(f"{problem}; allowed: not decreasing")
     if rate is None:
-        return Recording(values, None, t)
+        return values, None, t
     late = np.abs((t - t[0]) * rate - np.arange(t.size)) > _JITTER
     if late.any():
         i = int(np.argmax(late))
         problem = f"the time {t[i]:g} s is not that of sample {i} at {rate:g} Hz, {t[0] + i / rate:g} s"
         raise InputError(f"{found.place(i)}: {problem}; allowed: times or a rate, or both that agree")
-    return Recording(values, rate)
+    return values, rate, None
 
 
 def checked_file(path: str | Path, most: int) -> Path:
     """The path, after a check that it is a readable ordinary file, not empty and not larger than `most` bytes."""
-    path, fault = Path(path), ""
+    path = Path(path)
+    if fault := file_fault(path, most) or ("" if path.stat().st_size else "is empty"):
+        raise InputError(f"'{path}' {fault}")
+    return path
+
+
+def file_fault(path: Path, most: int) -> str:
+    """Why an ordinary file of at most `most` bytes cannot be read; an empty text for one that can."""
     try:
         if not path.is_file():
             there = "is not an ordinary file" if path.exists() else "does not exist"
-            fault = "is a folder, not a file" if path.is_dir() else there
-        else:
-            path.open("rb").close()
-            size = path.stat().st_size
-            fault = "is empty" if not size else ""
-            if size > most:
-                fault = f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB"
+            return "is a folder, not a file" if path.is_dir() else there
+        path.open("rb").close()
+        size = path.stat().st_size
+        return f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB" if size > most else ""
     except (OSError, ValueError) as error:
-        fault = f"cannot be read: {getattr(error, 'strerror', None) or error}"
-    if fault:
-        raise InputError(f"'{path}' {fault}")
-    return path
+        return f"cannot be read: {getattr(error, 'strerror', None) or error}"
 
 
 def check_count(what: str, count: int) -> None:

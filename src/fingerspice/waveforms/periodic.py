@@ -31,15 +31,20 @@ MOST_LISTED = 20_000_000
 _WINDOW = 1_000_000
 
 
-def runs_through(first: float, last: float, count: int, t0: float, t1: float) -> FloatArray:
-    """Indices of periods `first` to `last`, over t0 to t1 (s), of `count` breakpoints each; too many are refused."""
-    total = (last - first + 1.0) * count
+def runs_through(
+    period: float, count: int, t0: float, t1: float, first: float = 0.0, least: float = -math.inf
+) -> FloatArray:  # fmt: skip
+    """Numbers (n, 1) of the periods from `first` (s) on that touch t0 to t1 (s), and of one more on either side.
+
+    None is below `least`. Too many breakpoints, of which each period has `count`, are refused.
+    """
+    low = max(least, np.floor((t0 - first) / period) - 1.0)
+    high = max(low, np.ceil((t1 - first) / period) + 1.0)
+    total = (high - low + 1.0) * count
     if not total <= MOST_LISTED:
-        raise InputError(
-            f"the source has {total:.3g} breakpoints from {t0:g} s to {t1:g} s; allowed: at most {MOST_LISTED:.0e} at "
-            "once: a shorter run, or a longer period"
-        )
-    return np.arange(first, last + 1.0)
+        problem = f"the source has {total:.3g} breakpoints from {t0:g} s to {t1:g} s"
+        raise InputError(f"{problem}; allowed: at most {MOST_LISTED:.0e} at once: a shorter run, or a longer period")
+    return np.arange(low, high + 1.0)[:, None]
 
 
 def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]:
@@ -80,10 +85,8 @@ class Ramps(Waveform):
         assert self.period is not None
         times = self.knots[0]
         body = times[times >= self._first - self._origin]
-        low = max(1.0, np.floor((t0 - self._first) / self.period) - 1.0)
-        high = max(low, np.ceil((t1 - self._first) / self.period) + 1.0)
-        starts = self._origin + runs_through(low, high, body.size, t0, t1) * self.period
-        return np.concatenate([self._origin + times, (starts[:, None] + body).ravel()])
+        starts = self._origin + runs_through(self.period, body.size, t0, t1, self._first, least=1.0) * self.period
+        return np.concatenate([self._origin + times, (starts + body).ravel()])
 
     def _edges(self, t0: float, t1: float) -> FloatArray:
         if self.period is None:
@@ -242,9 +245,9 @@ class PWL(Ramps):
         InputError
             If the file cannot be read (the message names the line), or has a rate and no times.
         """
-        table = read_table(path, time, value, pairs=pairs)
-        require(table.times is not None, f"'{path}'", "a table with a rate", "one with times; fs.Samples.from_table")
-        return cls(table.times, table.values)  # type: ignore[arg-type]
+        values, _, times = read_table(path, time, value, pairs=pairs)
+        require(times is not None, f"'{path}'", "a table with a rate", "one with times; fs.Samples.from_table")
+        return cls(times, values)  # type: ignore[arg-type]
 
     @cached_property
     def knots(self) -> tuple[FloatArray, FloatArray]:
@@ -288,9 +291,8 @@ class _Periodic(Ramps):
     def _times(self, t0: float, t1: float) -> FloatArray:
         # Computed as (k + x) / f, an edge is rounded to the same double as the time that a user writes for it.
         x = self.knots[0] * self.frequency
-        low, high = (np.floor((t0 - self._shift) * self.frequency), np.ceil((t1 - self._shift) * self.frequency))
-        runs = runs_through(low - 1.0, high + 1.0, x.size, t0, t1)
-        return np.asarray(((runs[:, None] + x) / self.frequency + self._shift).ravel())
+        runs = runs_through(1.0 / self.frequency, x.size, t0, t1, self._shift)
+        return np.asarray(((runs + x) / self.frequency + self._shift).ravel())
 
     def breakpoint_rate(self) -> float:
         return 4.0 * self.frequency
@@ -388,9 +390,10 @@ _ROUNDING_OF_TIMES = 8e-16
 
 
 class _Stretches(Waveform):
-    """The first stretch of another waveform, once or again and again; 0 V elsewhere."""
+    """The first stretch of another waveform, once from `delay` (s) on or, with a period, for ever; 0 V elsewhere."""
 
     waveform: Waveform
+    delay: float = 0.0
     _stretch: float  # Length of the stretch, s
 
     def __post_init__(self) -> None:
@@ -400,7 +403,16 @@ class _Stretches(Waveform):
 
     def _begin(self, t: FloatArray) -> FloatArray:
         """Start (s) of the stretch in which, or next to which, each time is."""
-        raise NotImplementedError
+        return np.full(t.shape, self.delay) if self.period is None else np.floor(t / self.period) * self.period
+
+    def _edges(self, t0: float, t1: float) -> FloatArray:
+        if self.period is None:
+            return np.asarray(self.delay + self._marks)
+        marks = self._marks[:-1]
+        return np.asarray((runs_through(self.period, marks.size, t0, t1) * self.period + marks).ravel())
+
+    def breakpoint_rate(self) -> float:
+        return self.waveform.breakpoint_rate() if self.period is None else self._marks.size / self.period
 
     @cached_property
     def _marks(self) -> FloatArray:
@@ -471,15 +483,6 @@ class Burst(_Stretches):
         require(self.delay >= 0.0, "burst delay", f"{self.delay:g} s", ">= 0")
         self._declare(_stretch=self.duration, course=(self.delay, self.delay + self.duration))
 
-    def _begin(self, t: FloatArray) -> FloatArray:
-        return np.full(t.shape, self.delay)
-
-    def _edges(self, t0: float, t1: float) -> FloatArray:
-        return np.asarray(self.delay + self._marks)
-
-    def breakpoint_rate(self) -> float:
-        return self.waveform.breakpoint_rate()
-
 
 @dataclass(frozen=True)
 class Repeat(_Stretches):
@@ -503,17 +506,6 @@ class Repeat(_Stretches):
         super().__post_init__()
         require(self.period > 0.0, "repeat period", f"{self.period:g} s", "> 0")
         self._declare(_stretch=self.period)
-
-    def _begin(self, t: FloatArray) -> FloatArray:
-        return np.floor(t / self.period) * self.period
-
-    def _edges(self, t0: float, t1: float) -> FloatArray:
-        marks = self._marks[:-1]
-        low, high = math.floor(t0 / self.period) - 1.0, math.ceil(t1 / self.period) + 1.0
-        return np.asarray((runs_through(low, high, marks.size, t0, t1)[:, None] * self.period + marks).ravel())
-
-    def breakpoint_rate(self) -> float:
-        return self._marks.size / self.period
 
     def tone(self) -> float | None:
         inside = self.waveform.waveform if isinstance(self.waveform, Burst) else self.waveform

@@ -109,9 +109,9 @@ class Samples(Ramps):
         InputError
             If the file cannot be read (the message names the line), or has times and no rate.
         """
-        table = read_table(path, None, value, rate)
-        require(table.rate is not None, f"'{path}'", "a table with times", "one with a rate; fs.PWL.from_table")
-        return cls(table.values, table.rate)  # type: ignore[arg-type]
+        values, rate, _ = read_table(path, None, value, rate)
+        require(rate is not None, f"'{path}'", "a table with times", "one with a rate; fs.PWL.from_table")
+        return cls(values, rate)  # type: ignore[arg-type]
 
     def upsampled(self, factor: int = 16) -> Samples:
         """The same recording at `factor` (2 to 64) times the rate, by band-limited interpolation.

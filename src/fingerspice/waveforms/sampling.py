@@ -106,8 +106,8 @@ class Function(Waveform):
     def _edges(self, t0: float, t1: float) -> FloatArray:
         if self.repeat is None or not self.breaks:
             return np.array(self.breaks)
-        runs = runs_through(np.floor(t0 / self.repeat) - 1.0, np.ceil(t1 / self.repeat), len(self.breaks), t0, t1)
-        return np.unique((runs[:, None] * self.repeat + np.array(self.breaks)).ravel())
+        runs = runs_through(self.repeat, len(self.breaks), t0, t1)
+        return np.unique(runs * self.repeat + np.array(self.breaks))
 
     def breakpoint_rate(self) -> float:
         return len(self.breaks) / self.repeat if self.repeat else 0.0
