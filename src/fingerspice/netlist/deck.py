@@ -17,6 +17,7 @@ from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.expressions import Bare, Number, Scope, Value
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
 from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, Deck, Directive, Reader, Statement, Subcircuit, text_of
+from fingerspice.waveforms.waveform import refuse
 
 #: Largest number of characters of a title that are shown; the middle of a longer title is left out.
 LONGEST_TITLE = 200
@@ -55,12 +56,9 @@ def parse_deck(text: str, path: Path | None = None) -> Deck:
     `path` is that of the file with this text; without it only the libraries of native devices can be included.
     """
     deck = Deck(text, path)
-    if not text.strip("\ufeff \t\r\n"):
-        raise InputError(f"'{deck.file}' is empty: a netlist begins with a title line")
-    if len(text) > MAX_BYTES:
-        raise InputError(f"'{deck.file}' is larger than {MAX_BYTES >> 20} MiB")
-    if "\0" in text:
-        raise InputError(f"'{deck.file}' is not text (it holds NUL characters)")
+    refuse(not text.strip("\ufeff \t\r\n"), f"'{deck.file}' is empty: a netlist begins with a title line")
+    refuse(len(text) > MAX_BYTES, f"'{deck.file}' is larger than {MAX_BYTES >> 20} MiB")
+    refuse("\0" in text, f"'{deck.file}' is not text (it holds NUL characters)")
     reader = Reader(deck)
     title, *lines = reader.split(text.removeprefix("\ufeff"))
     deck.title = printable(_TITLE.sub("", title.strip()), LONGEST_TITLE)
@@ -136,8 +134,7 @@ class Flattener:
             for key, value in instance.scope.pairs(words).items():
                 probe = name == ".ic" and key.startswith("v(")
                 flat = f"v({instance.node(key[2:-1].strip())[0]})" if probe else key
-                if flat in params:
-                    raise InputError(f".ic gives node {flat[2:-1]!r} twice", value.key)
+                refuse(flat in params, f".ic gives node {flat[2:-1]!r} twice", value.key)
                 params[flat] = value
             self.deck.directives.append(Directive(name, args, params, line.where(), line.text))
 
@@ -154,16 +151,14 @@ class Flattener:
         if len(name) > MAX_NAME:
             raise InputError(f"an element's name of {len(name)} characters: at most {MAX_NAME} are allowed", where)
         earlier = self._names.setdefault(name.lower(), where)
-        if earlier is not where:
-            raise InputError(f"element '{name}' is defined twice, first at {earlier}", where)
+        refuse(earlier is not where, f"element '{name}' is defined twice, first at {earlier}", where)
         if letter == "X":
             self._call(name, lexemes, instance)
             return
         scope, words = instance.scope, group(lexemes[1:], plain=2)
         nodes = [word for word in words.words[:2] if isinstance(word, Lexeme)]
-        if len(nodes) < 2 or (len(words.words) == 2 and not words.params):
-            missing = "node" if len(nodes) < 2 else "value"
-            raise InputError(f"missing {missing}: a {DEVICES[letter].what} is written {name} node node value", where)
+        missing = "node" if len(nodes) < 2 else "" if len(words.words) > 2 or words.params else "value"
+        refuse(missing, f"missing {missing}: a {DEVICES[letter].what} is written {name} node node value", where)
         canonical, written = zip(*instance.nodes(nodes), strict=True)
         # A word of a resistor or capacitor names a parameter, those of a source are keywords (DC, SIN).
         bare: Bare = "name" if letter in "RC" else "nothing"
@@ -180,11 +175,9 @@ class Flattener:
             problem = f"'{stray.text}' follows the parameters: nodes and the device's name come first{hint}"
             raise InputError(problem, stray.where)
         plain = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
-        if not plain:
-            raise InputError(f"missing value: {name} needs nodes and a device's name", lexemes[0].where)
+        refuse(not plain, f"missing value: {name} needs nodes and a device's name", lexemes[0].where)
         *nodes, device = plain
-        if device.kind != "word":
-            raise InputError(f"{device.written} stands where a device's name belongs", device.where)
+        refuse(device.kind != "word", f"{device.written} stands where a device's name belongs", device.where)
         native, key, around = device.text.upper(), device.text.lower(), (instance, *instance.around)
         while around and key not in around[0].definition.inner:
             around = around[1:]
@@ -226,10 +219,8 @@ class Flattener:
                 raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
         self._expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
         self._expanded_text += called.characters
-        if len(instance.calls) >= MAX_DEPTH:
-            raise InputError(f"subcircuits call each other more than {MAX_DEPTH} deep", where)
-        if self._expanded > MAX_EXPANDED:
-            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
+        refuse(len(instance.calls) >= MAX_DEPTH, f"subcircuits call each other more than {MAX_DEPTH} deep", where)
+        refuse(self._expanded > MAX_EXPANDED, f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
         if self._expanded_text > MAX_EXPANDED_TEXT:
             raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
 

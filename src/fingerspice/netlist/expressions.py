@@ -20,6 +20,7 @@ from typing import Literal, NamedTuple, TypeAlias
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number, spice_text, suspicious_mega
 from fingerspice.netlist.lexer import Assignment, Group, Lexeme, Line, nearest
+from fingerspice.waveforms.waveform import refuse
 
 #: Limits: characters of an expression, nested brackets, `?` in an expression, and signs in a row.
 MAX_LENGTH, MAX_DEPTH, MAX_QUESTIONS, MAX_SIGNS = 2000, 25, 25, 3
@@ -38,11 +39,9 @@ class Problem(Exception):
 
 def _power(base: float, exponent: float) -> float:
     """`base ^ exponent`; a negative base needs an even exponent, as ngspice takes the base's absolute value."""
-    if base < 0.0 and not (exponent % 2.0 == 0.0):
-        raise Problem(
-            f"({base:g})^({exponent:g}) has a negative base, whose absolute value ngspice takes: "
-            "write pow(x, y) or abs(x)^y"
-        )
+    if base < 0.0 and exponent % 2.0 != 0.0:
+        problem = f"({base:g})^({exponent:g}) has a negative base, whose absolute value ngspice takes"
+        raise Problem(f"{problem}: write pow(x, y) or abs(x)^y")
     return math.pow(base, exponent)
 
 
@@ -69,12 +68,9 @@ _COMPARISONS = {
 }  # fmt: skip
 #: Operators between two values, from loose to tight. `||` and `&&` have the function of all their values' truths.
 _LEVELS: tuple[Mapping[str, Callable[..., float]], ...] = (
-    {"||": any},
-    {"&&": all},
-    _COMPARISONS,
-    {"+": operator.add, "-": operator.sub},
-    {"*": operator.mul, "/": operator.truediv},
-)
+    {"||": any}, {"&&": all}, _COMPARISONS,
+    {"+": operator.add, "-": operator.sub}, {"*": operator.mul, "/": operator.truediv},
+)  # fmt: skip
 _FAILURES: Mapping[type[Exception], str] = {
     ZeroDivisionError: "divides by zero",
     OverflowError: "is too large for a number (1.8e308)",
@@ -377,9 +373,8 @@ class Scope:
         self._definitions: dict[str, Assignment] = {}
         for definition in definitions:
             key, name = definition.key, definition.key.text.lower()
-            if name in RESERVED:
-                problem = f"parameter '{key.text}' has the name of a function of ngspice; allowed: another name"
-                raise InputError(problem, key.where)
+            problem = f"parameter '{key.text}' has the name of a function of ngspice; allowed: another name"
+            refuse(name in RESERVED, problem, key.where)
             first = self._definitions.setdefault(name, definition)
             if first is not definition:
                 raise InputError(f"parameter '{key.text}' is defined twice, first at {first.key.where}", key.where)
@@ -410,8 +405,7 @@ class Scope:
 
     def number(self, lexeme: Lexeme) -> Number:
         """Value of a lexeme that must be arithmetic, with or without braces."""
-        if lexeme.kind == "string":
-            raise InputError(f"a number is needed, not the text {lexeme.written}", lexeme.where)
+        refuse(lexeme.kind == "string", f"a number is needed, not the text {lexeme.written}", lexeme.where)
         expression = compile_expression(lexeme.text, lexeme.place)
         mega = Token(expression.mega[0], lexeme.place(expression.mega[1])) if expression.mega else None
         for name in expression.names:
@@ -434,8 +428,7 @@ class Scope:
             # Arithmetic of numbers and known parameters only
             names = _names_in(text)
             if names is not None and all(name in self._visible or name in CONSTANTS for name in names):
-                if bare == "name":
-                    raise InputError(f"arithmetic goes in braces: {{{text}}}", where)
+                refuse(bare == "name", f"arithmetic goes in braces: {{{text}}}", where)
                 known = True
         if bare != "nothing" and known:
             return self.number(lexeme)
@@ -496,8 +489,7 @@ def definitions(line: Line, start: int) -> list[Assignment]:
     for (key, begin), end in zip(keys, ends[1:], strict=True):
         raw = line.text[begin:end]
         text = raw.strip(" \t,")
-        if not text:
-            raise InputError(f"missing value of '{key.text}'", key.where)
+        refuse(not text, f"missing value of '{key.text}'", key.where)
         value = Lexeme("word", text, begin + len(raw) - len(raw.lstrip(" \t,")), line)
         if text[0] in "{'":
             closing = "}" if text[0] == "{" else "'"

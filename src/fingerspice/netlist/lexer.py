@@ -42,8 +42,7 @@ def decimal_comma(text: str) -> str | None:
         others = [c for c, m in zip(chunks, matches, strict=True) if m is None]
         if all(NUMBER.fullmatch(c) or c.isalpha() for c in others) and (others or len(chunks) == len(words) == 1):
             found += matches
-    for match in filter(None, found):
-        whole, part = match[1], match[2]
+    for whole, part in (match.groups() for match in filter(None, found)):
         return (
             f"{whole},{part} is two numbers, {whole} and {part}, for a comma separates; if it is a decimal comma "
             f"write {whole}.{part}"
@@ -79,7 +78,6 @@ _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
 #: Pattern of a separator or a mark; their number is an upper bound of the number of words.
 SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
 _BRACE = re.compile(r"[{}]")
-_MARKS = ("(", ")", "=")
 MAX_NAME = 400  # Characters of a name
 _KEY = re.compile(r"[A-Za-z_]\w*")
 _NUMERIC = re.compile(r"[+-]?\.?[0-9]")
@@ -142,9 +140,7 @@ class Group:
 
 def split_lines(text: str) -> list[str]:
     """Physical lines as an editor counts them, which only LF, CRLF and CR end."""
-    if "\r" in text:
-        text = text.replace("\r\n", "\n").replace("\r", "\n")
-    return text.split("\n")
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
 def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]:
@@ -217,7 +213,7 @@ def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Gro
             lexeme, after = _with_brackets(lexemes, index)
         following = lexemes[after].kind if after < count else ""
         probe = _probe(lexemes, index) if probes and following == "(" and not _NUMERIC.match(lexeme.text) else None
-        if probe is not None or (following == "=" and lexeme.kind not in _MARKS):
+        if probe is not None or (following == "=" and lexeme.kind not in ("(", ")", "=")):
             key, equals = probe or (lexeme, after)
             _assign(inside, key, lexemes[equals + 1 : equals + 3])
             index = equals + 2

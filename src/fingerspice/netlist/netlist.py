@@ -21,7 +21,7 @@ from fingerspice.netlist.expressions import Call, Number, Token, Value
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
 from fingerspice.netlist.reader import MAX_WARNINGS, Context, Deck, Directive, Statement
 from fingerspice.netlist.sources import read_source
-from fingerspice.waveforms.waveform import DC, Waveform, check_range
+from fingerspice.waveforms.waveform import DC, Waveform, check_range, refuse
 
 #: The parameter that gives the number of equal parts in parallel.
 _COPIES = "m"
@@ -33,17 +33,13 @@ _LTSPICE_START = {
     "nodiscard": "outputs begin at TSTART here; allowed: TSTART left out",
     "step": "loads are not stepped here; allowed: a source with steps, PULSE or PWL",
 }
-_NGSPICE_OPTIONS = frozenset(
-    """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5 itl6 keepopinfo
-    klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter numdgt opts
-    pivrel pivtol ramptime reltol rshunt savecurrents seed seedinfo sparse srcsteps temp tnom trtol trytocompact
-    vntol warn xmu""".split()  # noqa: SIM905
-)
-_LTSPICE_OPTIONS = frozenset(
-    """baudrate cshunt delay fastaccess flagloads gfloat gshunt measdgt meascplxfmt minclockguide mindeltagmin nomarch
-    noopiter plotabstol plotreltol plotvntol plotwinsize ptranmax ptrantau srcstepmethod sstol thev_induc
-    topologycheck""".split()  # noqa: SIM905
-)
+_NGSPICE_OPTIONS = """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5
+    itl6 keepopinfo klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter
+    numdgt opts pivrel pivtol ramptime reltol rshunt savecurrents seed seedinfo sparse srcsteps temp tnom trtol
+    trytocompact vntol warn xmu""".split()  # noqa: SIM905
+_LTSPICE_OPTIONS = """baudrate cshunt delay fastaccess flagloads gfloat gshunt measdgt meascplxfmt minclockguide
+    mindeltagmin nomarch noopiter plotabstol plotreltol plotvntol plotwinsize ptranmax ptrantau srcstepmethod sstol
+    thev_induc topologycheck""".split()  # noqa: SIM905
 
 
 def read_netlist(path: str | Path) -> Circuit:
@@ -111,8 +107,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
         notes[MAX_WARNINGS:] = [f"{more} more warnings are not shown"]
     laws = {"mobile" if "mobile" in name.lower() else "local" for name in deck.libraries}
     ac = next(map(read_ac, deck.named(".ac")), None)
-    if len(laws) > 1:
-        raise InputError("both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
+    refuse(len(laws) > 1, "both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
     law, said, effectless = next(iter(laws), None), tuple(notes), (*deck.unused, *unused, *unused_starts)
     return checked(Circuit(deck.title, elements, tran, ac, initial, law, work, said, effectless, deck.text, deck.path))
 
@@ -151,11 +146,9 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
     context = Context(tran, in_deck=False, anywhere=files)
     try:
         deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
-        if len(deck.statements) != 1:
-            raise InputError("not one source; allowed: such as SQUARE(200 100)")
+        refuse(len(deck.statements) != 1, "not one source; allowed: such as SQUARE(200 100)")
         waveform, ac, notes = read_source(deck.statements[0]._replace(name="source"), context)
-        if ac is not None:
-            raise InputError("AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
+        refuse(ac is not None, "AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
     except InputError as error:
         comma = decimal_comma(f"V1 a 0 {text}")
         raise InputError(f"{text!r}: {error.message}" + (f"; note {comma}" if comma else "")) from None
@@ -169,8 +162,7 @@ def sweep_from_text(text: str) -> AcSweep:
     """A sweep from text such as ``dec 10 10 100k``."""
     try:
         sweeps = parse_deck(f"sweep\n.ac {text}\n").named(".ac")
-        if not sweeps:
-            raise InputError("not a sweep")
+        refuse(not sweeps, "not a sweep")
         return read_ac(sweeps[0])
     except InputError as error:
         raise InputError(f"{text!r}: {error.message}") from None
@@ -201,7 +193,7 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
         named = params.get(parameter)
         given = statement.body[0] if parameter == "value" and statement.body else named
         # One warning per number is enough.
-        if not (isinstance(given, Number) and _doubts(given, element.spec.parameter(parameter))):
+        if not (isinstance(given, Number) and any(_doubts(given, element.spec.parameter(parameter)))):
             notes.append(f"{where if given is None else given.where}: {text}")
     out = [element]
     for key, part in beside.items():
@@ -252,8 +244,7 @@ def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, flo
             reason = ", there are no inductors here" if key == "lser" else ""
             raise InputError(f"{name} takes no parameter {key!r}{reason}; allowed: {shown}", part.key)
     given = [*statement.body, *(params[key] for key in kind.aliases if key in params)]
-    if len(given) != 1:
-        raise InputError(f"{name} needs one value in {spec.unit}, {len(given)} are given", statement.where)
+    refuse(len(given) != 1, f"{name} needs one value in {spec.unit}, {len(given)} are given", statement.where)
     word = given[0]
     if not isinstance(word, Number):
         raise InputError(f"{name} value is {word.text!r}; allowed: a number {spec.unit}", word.where)
@@ -278,8 +269,7 @@ def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> fl
         allowed = f"a number{unit}, or the name of a .param"
         raise InputError(f"{name} {spec.name} is {given.text!r}; allowed: {allowed}", given.where)
     trap = unit_trap(spec, given.text)
-    if trap:
-        raise InputError(f"{name} {spec.name} {trap}", given.where)
+    refuse(trap, f"{name} {spec.name} {trap}", given.where)
     notes.extend(f"{place}: {name} {spec.name}: {doubt}" for place, doubt in _doubts(given, spec))
     if not spec.accepts(given.value):
         plain = f"{given.value:g}{unit}"
@@ -288,14 +278,12 @@ def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> fl
     return given.value
 
 
-def _doubts(given: Number, spec: ParameterSpec) -> list[tuple[Where, str]]:
+def _doubts(given: Number, spec: ParameterSpec) -> Iterator[tuple[Where, str]]:
     """Warnings about the notation of a number, each with the place that it is about."""
-    found = []
     if given.mega is not None and (note := mega_note(given.mega.text, given.value, spec)):
-        found.append((given.mega.where, note))
+        yield given.mega.where, note
     if exponent_and_scale(given.text):
-        found.append((given.where, f"{given.text} is {given.value:g}: exponent and scale both count"))
-    return found
+        yield given.where, f"{given.text} is {given.value:g}: exponent and scale both count"
 
 
 # Directives
@@ -304,8 +292,7 @@ def _doubts(given: Number, spec: ParameterSpec) -> list[tuple[Where, str]]:
 def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]:
     """The numbers and the other words of a directive's line."""
     for arg in directive.args:
-        if isinstance(arg, Call):
-            raise InputError(f"{directive.name}: {arg.text!r} is not understood; allowed: {usage}", arg.where)
+        refuse(isinstance(arg, Call), f"{directive.name}: {arg.text!r} is not understood; allowed: {usage}", arg.where)
     for key, value in directive.params.items():
         raise InputError(f"{directive.name} takes no {key!r}; allowed: {usage}", value.key)
     numbers = [arg for arg in directive.args if isinstance(arg, Number)]
@@ -322,9 +309,9 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
     for word in words:
         if word in _LTSPICE_START:
             raise InputError(f".tran {word}: {_LTSPICE_START[word]}", directive.where)
-    if any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4:
-        apart = "; a unit joins its number, such as 20m" if any(is_unit(w) for w in words) else ""
-        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}{apart}", directive.where)
+    apart = "; a unit joins its number, such as 20m" if any(is_unit(w) for w in words) else ""
+    problem = f"{directive.text.strip()!r} is not understood; allowed: {usage}{apart}"
+    refuse(any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4, problem, directive.where)
     step, stop, start, longest = [None, numbers[0], None, None] if len(numbers) == 1 else [*numbers, None, None][:4]
     assert stop is not None
     _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")
@@ -385,21 +372,17 @@ def read_initial(
     area_nodes = {e.nodes[2] for e in layers}
     out: dict[str, float] = {}
     for directive in directives:
-        if directive.args:
-            raise InputError(f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
+        refuse(directive.args, f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
         for key, value in directive.params.items():
             place = value.key
-            if not (key.startswith("v(") and key.endswith(")")):
-                raise InputError(f".ic {key!r} is not understood; {usage}", place)
+            refuse(not (key.startswith("v(") and key.endswith(")")), f".ic {key!r} is not understood; {usage}", place)
             if not isinstance(value, Number):
                 raise InputError(f".ic {key} is {value.text!r}; allowed: a number V", place)
             node = key[2:-1]
             if node not in nodes:
                 raise InputError(f".ic names node {node!r}, which is not in the circuit{nearest(node, nodes)}", place)
-            if node in out:
-                raise InputError(f".ic gives node {node!r} twice", place)
-            if node == "0" and value.value != 0.0:
-                raise InputError(f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
+            refuse(node in out, f".ic gives node {node!r} twice", place)
+            refuse(node == "0" and value.value != 0.0, f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
             if node in area_nodes and not 1e-30 <= value.value <= 1e30:
                 raise InputError(f".ic {key} is {value.text} mm^2; allowed: more than 0, from 1e-30 to 1e30", place)
             out[node] = value.value if node in area_nodes else start_volts(f".ic {key}", value)
@@ -413,10 +396,7 @@ def read_initial(
 
 def start_volts(what: str, number: Number) -> float:
     """A start voltage (V), which must be within the range allowed for sources."""
-    try:
-        check_range(what, number.value, "V")
-    except InputError as error:
-        raise InputError(error.message, number.where) from None
+    check_range(what, number.value, "V", number.where)
     return number.value
 
 
@@ -433,8 +413,7 @@ def read_options(directives: list[Directive]) -> tuple[str, tuple[str, ...]]:
             if key == "work":
                 if text not in WORK_READINGS:
                     raise InputError(f".options work is {text!r}; allowed: {' or '.join(WORK_READINGS)}", place)
-                if work not in (None, text):
-                    raise InputError(f".options work is given twice, first {work}, then {text}", place)
+                refuse(work not in (None, text), f".options work is given twice, first {work}, then {text}", place)
                 work = text
             elif key in _NGSPICE_OPTIONS or key in _LTSPICE_OPTIONS:
                 unused.append(f".options {key}")

@@ -34,6 +34,7 @@ from fingerspice.netlist.lexer import (
     split_lines,
 )
 from fingerspice.waveforms.files import file_fault
+from fingerspice.waveforms.waveform import refuse
 
 #: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
 LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
@@ -77,8 +78,7 @@ def text_of(path: Path) -> tuple[str, Path]:
             data = source.read(MAX_BYTES + 1)
     except OSError as error:
         raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from None
-    if len(data) > MAX_BYTES:
-        raise InputError(f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
+    refuse(len(data) > MAX_BYTES, f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
     return _decoded(data, str(path), None), Path("stdin")
 
 
@@ -86,8 +86,7 @@ def _decoded(data: bytes, shown: str, where: Where | None) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         # LTspice writes UTF-16 if a name has letters that Latin-1 lacks.
         return data.decode("utf-16", "replace")
-    if b"\0" in data:
-        raise InputError(f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
+    refuse(b"\0" in data, f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -193,8 +192,7 @@ def inside(root: Path, folder: Path, name: str, where: Where) -> Path:
         allowed = path.is_relative_to(root)
     except (OSError, ValueError, RuntimeError):  # RuntimeError: a circle of links
         raise InputError(f"'{name}' is not a usable file name", where) from None
-    if not allowed:
-        raise InputError(f"'{name}' lies outside the netlist's folder, where nothing is read", where)
+    refuse(not allowed, f"'{name}' lies outside the netlist's folder, where nothing is read", where)
     return path
 
 
@@ -319,9 +317,8 @@ class Reader:
     def split(self, text: str, where: Where | None = None) -> list[str]:
         """Physical lines of the deck or of an included file; refuses more than `MAX_LINES` lines in all."""
         self._lines += 1 + text.count("\n") + text.count("\r")
-        if self._lines > MAX_LINES:
-            problem = f"the netlist has {self._lines:,} lines; allowed: {MAX_LINES:,}, included files counted"
-            raise InputError(problem, where or self.root.where)
+        problem = f"the netlist has {self._lines:,} lines; allowed: {MAX_LINES:,}, included files counted"
+        refuse(self._lines > MAX_LINES, problem, where or self.root.where)
         return split_lines(text)
 
     def read_deck(self, lines: list[str]) -> None:
@@ -333,8 +330,7 @@ class Reader:
             self._take(line)
         if self._control is not None:
             raise InputError(".control without its .endc", self._control.where())
-        if len(self._open) > 1:
-            raise InputError(f".subckt {self._open[-1].name} without its .ends", self._open[-1].where)
+        refuse(len(self._open) > 1, f".subckt {self._open[-1].name} without its .ends", self._open[-1].where)
 
     def warn(self, message: str, where: Where) -> None:
         """Keep a warning with its place, unless there are many already."""
@@ -373,13 +369,12 @@ class Reader:
         here, place, text = self._open[-1], line.where(), line.text[rest:]
         match name:
             case ".tran" | ".ac" | ".option" | ".options" | ".ic":
-                if here is not self.root and name != ".ic":
-                    opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
-                    raise InputError(f"{name} does not belong inside {opened}?", place)
+                opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
+                inside_one = here is not self.root and name != ".ic"
+                refuse(inside_one, f"{name} does not belong inside {opened}?", place)
                 if name in (".tran", ".ac"):
                     for other, first, _ in here.directives:
-                        if other == name:
-                            raise InputError(f"{name} is given twice, first at {first.where()}", place)
+                        refuse(other == name, f"{name} is given twice, first at {first.where()}", place)
                 here.directives.append((".options" if name == ".option" else name, line, rest))
             case ".param":
                 here.params += definitions(line, rest)
@@ -387,8 +382,7 @@ class Reader:
             case ".subckt":
                 self._open.append(self._subcircuit(line, rest))
             case ".ends":
-                if len(self._open) == 1:
-                    raise InputError(".ends without a .subckt before it", place)
+                refuse(len(self._open) == 1, ".ends without a .subckt before it", place)
                 closed = self._open.pop().name
                 if text.strip() and closed and text.strip().lower() != closed.lower():
                     raise InputError(f".ends {text.strip()} closes .subckt {closed}: the names differ", place)
@@ -398,8 +392,7 @@ class Reader:
                 self._control = line
                 self.deck.unused[name] = None
             case ".end":
-                if self._reading:
-                    raise InputError("only the netlist itself, not an included file, has .end", place)
+                refuse(self._reading, "only the netlist itself, not an included file, has .end", place)
                 self._ended = True
             case ".endc":
                 raise InputError(".endc without a .control before it", place)
@@ -431,17 +424,14 @@ class Reader:
             port = word.text.lower()
             if port in ("0", "gnd"):
                 raise InputError("ground is the same node everywhere and cannot be a subcircuit's node", word.where)
-            if port in ports:
-                raise InputError(f"node '{word.text}' is given twice", word.where)
+            refuse(port in ports, f"node '{word.text}' is given twice", word.where)
             ports[port] = None
         defaults = list(words.params.values())
         for _, value in defaults:
-            if value.kind == "string":
-                raise InputError("a number is needed, not a text", value.where)
+            refuse(value.kind == "string", "a number is needed, not a text", value.where)
         defined = Subcircuit(name, line.where(), tuple(ports), defaults, characters=len(line.text))
         first = around.inner.setdefault(name.lower(), defined)
-        if first is not defined:
-            raise InputError(f"subcircuit '{name}' is defined twice, first at {first.where}", defined.where)
+        refuse(first is not defined, f"subcircuit '{name}' is defined twice, first at {first.where}", defined.where)
         return defined
 
     def _include(self, directive: str, line: Line, rest: int) -> None:
@@ -450,16 +440,13 @@ class Reader:
         words = name.split()
         if name[:1] in ("'", '"') and name:
             inner, closed, after = name[1:].partition(name[0])
-            if not closed:
-                raise InputError(f"{name[0]} is never closed", where)
+            refuse(not closed, f"{name[0]} is never closed", where)
             name, words = inner, [inner, *after.split()]
-        if not name.strip():
-            raise InputError(f"{directive} needs a file name", line.where())
-        if len(words) > 1:
-            problem = "one file name is allowed; put a name with blanks in quotes"
-            if directive == ".lib":
-                problem = "sections of a library are not supported: put the section into a file and .include it"
-            raise InputError(problem, where)
+        refuse(not name.strip(), f"{directive} needs a file name", line.where())
+        problem = "one file name is allowed; put a name with blanks in quotes"
+        if directive == ".lib":
+            problem = "sections of a library are not supported: put the section into a file and .include it"
+        refuse(len(words) > 1, problem, where)
         folder = self._reading[-1].parent if self._reading else self._folder
         base = name.replace("\\", "/").rpartition("/")[2]
         if base.lower() in LIBRARIES.values():
@@ -471,16 +458,13 @@ class Reader:
         if folder is None or self._folder is None or self.deck.path is None:
             raise InputError(f"'{name}' cannot be included: a netlist given as text has no folder to look in", where)
         path = inside(self._folder, folder, name, where)
-        if path in (self.deck.path.resolve(), *self._reading):
-            raise InputError(f"'{name}' includes itself", where)
+        refuse(path in (self.deck.path.resolve(), *self._reading), f"'{name}' includes itself", where)
         self.deck.files.append(path)
-        if len(self.deck.files) > MAX_INCLUDES or len(self._reading) >= MAX_INCLUDE_DEPTH:
-            problem = f"too many included files: at most {MAX_INCLUDES}, nested {MAX_INCLUDE_DEPTH} deep"
-            raise InputError(problem, where)
+        problem = f"too many included files: at most {MAX_INCLUDES}, nested {MAX_INCLUDE_DEPTH} deep"
+        refuse(len(self.deck.files) > MAX_INCLUDES or len(self._reading) >= MAX_INCLUDE_DEPTH, problem, where)
         text = read_text(path, name, where, self._folder)
         self._size += len(text)
-        if self._size > MAX_BYTES:
-            raise InputError(f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
+        refuse(self._size > MAX_BYTES, f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
         self._reading.append(path)
         shown = str(Path(self.deck.file).parent / path.relative_to(self._folder))
         for included in logical_lines(self.split(text, where), shown):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -18,7 +17,7 @@ from fingerspice.netlist.reader import Context, Statement
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.periodic import PWL, Burst, Pulse, Repeat, Sawtooth, Square, Triangle
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import AM, DC, Chirp, Exp, Sine, Waveform
+from fingerspice.waveforms.waveform import AM, DC, Chirp, Exp, Sine, Waveform, refuse
 
 _KEPT_BYTES = 2**25  # A larger WAV file is read in parts when needed: 32 MiB are six minutes of 16 bits at 48 kHz.
 
@@ -62,9 +61,8 @@ class _Arguments:
     def step_or(self, name: str) -> float:
         """An argument whose SPICE default is TSTEP."""
         tran = self.context.tran
-        if name not in self.words and tran is None:
-            default = "which defaults to TSTEP, and there is no .tran line"
-            raise InputError(f"{self.name} leaves out {name}, {default}; allowed: give {name}", self.call.where)
+        problem = f"{self.name} leaves out {name}, which defaults to TSTEP, and there is no .tran line"
+        refuse(name not in self.words and tran is None, f"{problem}; allowed: give {name}", self.call.where)
         return self.get(name, tran.step if tran else math.nan)
 
     def whole(self, name: str) -> int | None:
@@ -72,8 +70,7 @@ class _Arguments:
         if name not in self.words:
             return None
         value = _number(self.words[name], name)
-        if value != int(value):
-            raise InputError(f"{name} is {value:g}; allowed: a whole number", self.words[name].where)
+        refuse(value != int(value), f"{name} is {value:g}; allowed: a whole number", self.words[name].where)
         return int(value)
 
     def column(self, name: str) -> str | int | None:
@@ -116,8 +113,7 @@ def _exp(a: _Arguments) -> Waveform:
 def _pwl(a: _Arguments) -> Waveform:
     shift, repeat = a.get("td", 0.0), a.get("r", -1.0)
     if "file" in a.words:
-        if a.call.args:
-            raise InputError("PWL has points and file= too; allowed: one of them", a.call.where)
+        refuse(a.call.args, "PWL has points and file= too; allowed: one of them", a.call.where)
         points = PWL.from_table(a.file("file"), pairs=True)
         given, levels = points.times, points.values
     else:
@@ -146,8 +142,7 @@ def _table(a: _Arguments) -> Waveform:
     values, rate, times = read_table(path, a.column("time"), a.column("value"), rate)
     if rate is not None:
         return a.upsampled(Samples(values, rate))
-    if "upsample" in a.words:
-        raise InputError("TABLE upsample goes with a rate, and this table has times", a.call.where)
+    refuse("upsample" in a.words, "TABLE upsample goes with a rate, and this table has times", a.call.where)
     return PWL(times, values)  # type: ignore[arg-type]
 
 
@@ -219,35 +214,31 @@ def read_source(statement: Statement, context: Context) -> tuple[Waveform, Small
     while words:
         word = words.popleft()
         if isinstance(word, Number):
-            if level is not None or waveform is not None:
-                allowed = "one value or source function, such as SIN(0 200 100)"
-                raise InputError(f"{name}: a second value {word.text!r}; allowed: {allowed}", word.where)
+            problem = f"{name}: a second value {word.text!r}; allowed: one value or source function"
+            refuse(level is not None or waveform is not None, f"{problem}, such as SIN(0 200 100)", word.where)
             level = word.value
             continue
         key = _ALIASES.get(word.text.lower(), word.text.lower())
-        if isinstance(word, Token) and is_unit(key) and (level is not None or waveform is not None):
-            problem = f"{name}: {word.text!r} stands apart; a unit joins its number, such as 5{word.text}"
-            raise InputError(problem, word.where)
+        apart = isinstance(word, Token) and is_unit(key) and (level is not None or waveform is not None)
+        refuse(apart, f"{name}: {word.text!r} stands apart; a unit joins its number, such as 5{word.text}", word.where)
         if isinstance(word, Token):
             # A call may also be written without brackets: SIN 0 200 100.
-            numbers = tuple(itertools.takewhile(lambda one: isinstance(one, Number), words))
-            word = Call(key, numbers, {}, word.where)
-            for _ in numbers:
+            numbers = list[Number]()
+            while words and isinstance(words[0], Number):
+                numbers.append(words[0])
                 words.popleft()
+            word = Call(key, tuple(numbers), {}, word.where)
         if key in _LEVELS and word.params:
             problem = f"{name}: {key.upper()} has no parameter {next(iter(word.params))!r}; allowed: {_LEVELS[key]}"
             raise InputError(problem, next(iter(word.params.values())).key)
         if key == "dc":
-            if len(word.args) != 1:
-                raise InputError(f"{name}: DC needs one value", word.where)
+            refuse(len(word.args) != 1, f"{name}: DC needs one value", word.where)
             level = _number(word.args[0], f"{name} DC")
         elif key == "ac":
-            if ac is not None:
-                raise InputError(f"{name} has AC twice; allowed: {_LEVELS[key]} once", word.where)
+            refuse(ac is not None, f"{name} has AC twice; allowed: {_LEVELS[key]} once", word.where)
             given = [_number(arg, f"{name} AC") for arg in word.args]
-            if len(given) > 2:
-                problem = f"{name}: AC takes at most 2 values, {len(given)} given; allowed: {_LEVELS[key]}"
-                raise InputError(problem, word.where)
+            problem = f"{name}: AC takes at most 2 values, {len(given)} given; allowed: {_LEVELS[key]}"
+            refuse(len(given) > 2, problem, word.where)
             ac = SmallSignal(*given)
         elif waveform is not None:
             raise InputError(f"{name} has two source functions, the second is {key.upper()}", word.where)
@@ -287,8 +278,7 @@ def _words(statement: Statement) -> list[Word]:
 def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
     function = SOURCES.get(key)
     refused = _SFFM if key == "sffm" else function.refused if function and context.in_deck else ""
-    if refused:
-        raise InputError(f"{name}: {refused}", call.where)
+    refuse(refused, f"{name}: {refused}", call.where)
     if function is None:
         hint = nearest(key, SOURCES)
         raise InputError(f"{name}: unknown source {key.upper()!r}{hint}; allowed: {_KNOWN}", call.where)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray, positive_number
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number
+from fingerspice.waveforms.waveform import refuse
 
 _UNIT = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
 # Names that simulators give to a voltage between nodes or the current of an element: V(n001), I(R1), Ix(u1:in).
@@ -106,8 +107,7 @@ class Columns:
         rows, columns = self.data.shape
         if self.names or (rows > 1 and columns > 1):
             return self
-        if self.data.size % 2:
-            raise InputError(f"'{self.file}' holds {self.data.size} numbers; allowed: pairs of time and value")
+        refuse(self.data.size % 2, f"'{self.file}' holds {self.data.size} numbers; allowed: pairs of time and value")
         for column in range(columns):
             self.numbers(column)
         lines = None if self.lines is None else np.resize(self.lines[::2], self.data.size // 2)
@@ -123,8 +123,7 @@ def read_text_columns(path: str | Path, label: str | None = None) -> Columns:
     if label is not None and rows:
         # The rows of such a table need not begin with a number: they are those below the first.
         named = [_unit(cell)[0].lower() for cell in _cells(rows[0][1], _separator(rows[0][1]))]
-        if label.lower() not in named:
-            raise InputError(f"'{path}' has no column {label!r} in its header; it has {', '.join(named)}")
+        refuse(label.lower() not in named, f"'{path}' has no column {label!r} in its header; it has {', '.join(named)}")
         place = named.index(label.lower())
     first = next((i for i, (_, line) in enumerate(rows) if (i if label else _FIRST_NUMBER.match(line))), None)
     if first is None:
@@ -151,8 +150,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     """The lines of a text file that are not empty, by their numbers from 1, without comments behind numbers."""
     data = path.read_bytes()
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    if b"\0" in data and not wide:
-        raise InputError(f"'{path}' is no text; allowed: a table as text, or an NPZ file")
+    refuse(b"\0" in data and not wide, f"'{path}' is no text; allowed: a table as text, or an NPZ file")
     try:
         lines = data.decode("utf-16" if wide else "utf-8-sig").splitlines()
     except UnicodeDecodeError:
@@ -282,8 +280,7 @@ class WavLayout:
                 raw = file.read((last - first) * block)
         except OSError as error:
             raise InputError(f"'{self.path}' cannot be read: {error.strerror}") from None
-        if len(raw) < (last - first) * block:
-            raise InputError(f"'{self.path}' has become shorter while it was read")
+        refuse(len(raw) < (last - first) * block, f"'{self.path}' has become shorter while it was read")
         if width in (1, 2, 4, 8):
             stored = np.frombuffer(raw, self.kind).reshape(-1, self.channels)[:, self.channel]
         else:
@@ -314,21 +311,17 @@ def wav_layout(path: str | Path, channel: int | None = None, most: int = LARGEST
     width = block // max(channels, 1)
     whole = bits == 8 * width and width in (4, 8) if tag == 3 else 0 < bits <= 8 * width and (bits > 8 or width == 1)
     # Of floats, some programs write no number of bytes a second.
-    if not whole or width > 8 or block != channels * width or (tag == 1 and pace != rate * block):
-        problem = f"{channels} channels of {bits} bits take {block} bytes, at {rate} Hz {pace} bytes a second"
-        raise InputError(f"'{path}' is broken: its header says that {problem}")
-    if rate == 0:
-        raise InputError(f"'{path}' is broken: its header gives a rate of 0 Hz")
-    if length == 0:
-        raise InputError(f"'{path}' holds no samples")
-    if length % block:
-        raise InputError(f"'{path}' is cut short or broken: {length} bytes are no whole number of samples of {block}")
-    if channel is None and channels > 1:
-        raise InputError(f"'{path}' has {channels} channels and none is chosen; allowed: channel=0 to {channels - 1}")
+    said = f"{channels} channels of {bits} bits take {block} bytes, at {rate} Hz {pace} bytes a second"
+    wrong = not whole or width > 8 or block != channels * width or (tag == 1 and pace != rate * block)
+    refuse(wrong, f"'{path}' is broken: its header says that {said}")
+    refuse(rate == 0, f"'{path}' is broken: its header gives a rate of 0 Hz")
+    refuse(length == 0, f"'{path}' holds no samples")
+    refuse(length % block, f"'{path}' is cut short or broken: {length} bytes are no whole number of samples of {block}")
+    allowed = "channel=0, its only one" if channels == 1 else f"channel=0 to {channels - 1}"
+    refuse(channel is None and channels > 1, f"'{path}' has {channels} channels and none is chosen; allowed: {allowed}")
     number = 0 if channel is None else channel
-    if isinstance(number, bool | str) or number != int(number) or not 0 <= number < channels:
-        allowed = "channel=0, its only one" if channels == 1 else f"channel=0 to {channels - 1}"
-        raise InputError(f"'{path}' has no channel {number!r}; allowed: {allowed}")
+    wrong = isinstance(number, bool | str) or number != int(number) or not 0 <= number < channels
+    refuse(wrong, f"'{path}' has no channel {number!r}; allowed: {allowed}")
     kind = f"{order}{'f' if tag == 3 else 'u' if width == 1 else 'i'}{width}"
     return WavLayout(path, rate, channels, int(number), length // block, kind, offset)
 
@@ -449,8 +442,7 @@ def file_fault(path: Path, most: int) -> str:
 
 def check_count(what: str, count: int) -> None:
     """Refuse more than `MAX_SAMPLES` samples, the most that are kept in memory."""
-    if count > MAX_SAMPLES:
-        raise InputError(f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
+    refuse(count > MAX_SAMPLES, f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
 
 
 def _chosen(
@@ -459,12 +451,10 @@ def _chosen(
     """Index of a column, which is not `other`; if none is given, the default in a table of at most `most` columns."""
     if column is not None:
         index = found.index(column)
-        if index == other:
-            raise InputError(f"'{found.file}': the column {column!r} is both time and value; allowed: two columns")
+        refuse(index == other, f"'{found.file}': the column {column!r} is both time and value; allowed: two columns")
         return index
-    if found.data.shape[1] > most:
-        way = "name the column" if found.names else "the number of the column"
-        raise InputError(f"'{found.file}' has {found.listed()}; allowed: {way} of the {role}")
+    way = "name the column" if found.names else "the number of the column"
+    refuse(found.data.shape[1] > most, f"'{found.file}' has {found.listed()}; allowed: {way} of the {role}")
     return default
 
 
@@ -494,9 +484,7 @@ def _npz_columns(path: Path) -> tuple[Columns, float | None]:
             problem = f"'{path}': the array {name!r} has shape {array.shape}"
             raise InputError(f"{problem}; allowed: one row a column, and one number named rate")
     lengths = {array.size for array in arrays.values()}
-    if len(lengths) > 1:
-        shown = ", ".join(f"{name} {array.size}" for name, array in arrays.items())
-        raise InputError(f"'{path}' has arrays of different length ({shown}); allowed: one length")
-    if not arrays or lengths == {0}:
-        raise InputError(f"'{path}' holds no numbers")
+    shown = ", ".join(f"{name} {array.size}" for name, array in arrays.items())
+    refuse(len(lengths) > 1, f"'{path}' has arrays of different length ({shown}); allowed: one length")
+    refuse(not arrays or lengths == {0}, f"'{path}' holds no numbers")
     return Columns(path, tuple(arrays), np.column_stack(list(arrays.values()))), rate

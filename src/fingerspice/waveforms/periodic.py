@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.waveform import Waveform, as_waveform, check_range, require, terms_of
+from fingerspice.waveforms.waveform import OSCILLATION, Waveform, as_waveform, check_range, require, terms_of
 
 # A waveform with at most this many knots is not divided into windows, however close together its knots are.
 FEW_KNOTS = 1000
@@ -168,8 +168,7 @@ class Ramps(Waveform):
 
 
 def _once(times: FloatArray) -> FloatArray:
-    """The times, ascending, each once; of those that differ only by rounding, as the end of a period and the start of
-    the next, the first."""
+    """The times, ascending, each once; of those that differ only by rounding, as two periods do, the first."""
     times = np.unique(times)
     return times[np.diff(times, prepend=-np.inf) > 1e-15 * np.abs(times)]
 
@@ -267,9 +266,7 @@ class _Periodic(Ramps):
     # Times of the knots in periods, values over the offset in amplitudes, and whether half of it is the other half
     # turned over
     _shape: ClassVar[tuple[tuple[float, ...], tuple[float, ...], bool]]
-    units: ClassVar[dict[str, str]] = {
-        "amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s"
-    }  # fmt: skip
+    units: ClassVar[dict[str, str]] = OSCILLATION
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -306,7 +303,7 @@ class Square(_Periodic):
     """
 
     duty: float = 0.5
-    units: ClassVar[dict[str, str]] = {"amplitude": "V", "frequency": "Hz", "duty": "", **_Periodic.units}
+    units: ClassVar[dict[str, str]] = {"amplitude": "V", "frequency": "Hz", "duty": "", **OSCILLATION}
 
     # Beside the frequency the duty comes first, as in netlists; the fields that all shapes have precede it otherwise.
     def __init__(

@@ -177,9 +177,8 @@ class Samples(Ramps):
         """The samples that determine the values between two times (s), as a waveform that needs no other samples."""
         low, high = self._around(t0, t1)
         out = object.__new__(Samples)
-        out._declare(
-            values=read_only(self.between(low, high)), rate=self.rate, start=self.start, _number=self._number + low
-        )
+        values = read_only(self.between(low, high))
+        out._declare(values=values, rate=self.rate, start=self.start, _number=self._number + low)
         return out
 
     def _number_of(self, t: float) -> float:

@@ -282,11 +282,9 @@ class Refiner:
     scale: float = 0.0  # Largest |U| (V) seen
     steepest: float = 0.0  # Largest |dU/dt| (V/s) seen
     series: list[FloatArray] = field(default_factory=list)  # (POINTS,): Chebyshev coefficients on each interval
-    # Times (s) at which neighbouring series differ, and the difference (V)
-    jumps: list[tuple[float, float]] = field(default_factory=list)
-    # located, narrow: Times (s) of the jumps found by bisection, and of intervals much shorter than the output step
-    located: list[float] = field(default_factory=list)
-    narrow: list[float] = field(default_factory=list)
+    # Times (s) at which neighbouring series differ, the difference (V), and whether bisection found the jump
+    jumps: list[tuple[float, float, bool]] = field(default_factory=list)
+    narrow: list[float] = field(default_factory=list)  # Times (s) of intervals much shorter than the output step
     # Start (s) of each short interval, and the change (V) over it
     short: list[tuple[float, float]] = field(default_factory=list)
     not_finite: float | None = None  # Time (s) of the first NaN or inf
@@ -328,8 +326,7 @@ class Refiner:
                 waiting += piece.halves(misfit, misfit, idle)
             else:
                 # An interval of this width without a good series holds a jump (or a kink), which becomes an edge.
-                self.jumps.append((hi, float(values[-1] - values[0])))
-                self.located.append(hi)
+                self.jumps.append((hi, float(values[-1] - values[0]), True))
                 if self.series:
                     self.edges[-1] = hi
         return True
@@ -351,7 +348,7 @@ class Refiner:
                     del self.edges[-1], self.series[-1]
                     again += before.halves(largest=piece.largest)
                 return again
-            self.jumps.append((piece.lo, change))
+            self.jumps.append((piece.lo, change, False))
         self.edges.append(piece.hi)
         self.series.append(series)
         return []
@@ -417,9 +414,10 @@ class Refiner:
 
     def warn(self) -> None:
         """Warn once of jumps, and once of narrow features, that were found without having been declared."""
-        real = [(t, dv) for t, dv in self.jumps if abs(dv) > self._least]
+        real = [(t, dv) for t, dv, _ in self.jumps if abs(dv) > self._least]
         # Around a jump, a kink, or a NaN short series are expected; report only the short ones far from all of these.
-        known = [*self.located, *(t for t, _ in real), *([] if self.not_finite is None else [self.not_finite])]
+        known = [t for t, dv, located in self.jumps if located or abs(dv) > self._least]
+        known += [] if self.not_finite is None else [self.not_finite]
         apart = [t for t in self.narrow if all(abs(t - k) > 8.0 * self.step for k in known)]
         if self.short:
             # The first edge: short series whose change sums to more than `_STEEP` in a tenth of a step.

@@ -22,12 +22,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
-from fingerspice.base.errors import InputError
+from fingerspice.base.errors import InputError, Where
 
 #: Largest and smallest absolute value allowed of a nonzero number, by unit (the entry V also serves A).
 RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}
 #: The same limits for all other units.
 ANY_RANGE = (1e30, 1e-30)
+#: Units of the numbers that every oscillation has.
+OSCILLATION = {"amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s"}
 TAU = 2.0 * math.pi
 # Places in [0, 1], both ends among them, one in each of 512 equal parts: so irregular that no carrier is 0 at all.
 _SPREAD = np.append((np.arange(512) + np.modf(np.arange(512) * 0.6180339887498949)[0]) / 512.0, 1.0)
@@ -87,8 +89,7 @@ class Waveform:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is computed when it is first asked for."""
-        found = {name: getattr(type(self), name, None) for name in vars(self)}
-        return {name: value for name, value in vars(self).items() if not isinstance(found[name], cached_property)}
+        return {k: v for k, v in vars(self).items() if not isinstance(getattr(type(self), k, None), cached_property)}
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
@@ -223,7 +224,7 @@ def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
     return DC(real_number("a source", value, allowed))
 
 
-def check_range(what: str, values: ArrayLike, unit: str) -> None:
+def check_range(what: str, values: ArrayLike, unit: str, where: Where | None = None) -> None:
     """Refuse finite numbers so large or so small that their products and quotients would overflow or underflow."""
     largest, smallest = RANGES.get(unit, ANY_RANGE)
     size = np.abs(values)
@@ -231,13 +232,19 @@ def check_range(what: str, values: ArrayLike, unit: str) -> None:
     if bad.size:
         given = float(np.ravel(values)[bad[0]])
         allowed = f"0, or a size from {smallest:g} to {largest:g}" if smallest else f"a size up to {largest:g}"
-        raise InputError(f"{what} is {given:g} {unit}".rstrip() + f"; allowed: {allowed}")
+        raise InputError(f"{what} is {given:g} {unit}".rstrip() + f"; allowed: {allowed}", where)
 
 
 def require(condition: bool, what: str, given: Any, allowed: str) -> None:
     """Refuse an argument that does not meet a condition: the message names the given value and the allowed ones."""
     if not condition:
         raise InputError(f"{what} is {given}; allowed: {allowed}")
+
+
+def refuse(wrong: object, problem: str, where: Where | None = None) -> None:
+    """Refuse what is wrong, at its place in a netlist if it has one."""
+    if wrong:
+        raise InputError(problem, where)
 
 
 def terms_of(m: int, *terms: tuple[FloatArray | float, ...]) -> FloatArray:
@@ -290,9 +297,7 @@ class Sine(Waveform):
     phase_deg: float = 0.0
     delay: float = 0.0
     damping: float = 0.0
-    units: ClassVar[dict[str, str]] = {
-        "amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s", "damping": "1/s"
-    }  # fmt: skip
+    units: ClassVar[dict[str, str]] = {**OSCILLATION, "damping": "1/s"}
 
     def __post_init__(self) -> None:
         super().__post_init__()
