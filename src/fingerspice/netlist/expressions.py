@@ -124,21 +124,9 @@ class Expression:
                 self.mega = found, position
             position = match.end()
         self._pieces.append(_Piece("end", "", len(text)))
-        self._term = self._condition()
+        self.term = self._condition()
         self._refuse_going_on()
         self._pieces.clear()
-
-    def evaluate(self, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
-        """Value of the expression, given the values of names (lower case); a value that is not finite is refused."""
-        try:
-            value = float(self._term(names))
-        except Problem as problem:
-            raise InputError(problem.message, place(problem.position)) from None
-        except (ZeroDivisionError, OverflowError, ValueError) as error:
-            raise InputError(f"'{self.text}' {_FAILURES[type(error)]}", place(0)) from None
-        if not math.isfinite(value):
-            raise InputError(f"'{self.text}' gives {value:g}, not a finite number", place(0))
-        return value
 
     def _take(self, *texts: str) -> _Piece | None:
         """The next piece if it is one of these."""
@@ -302,12 +290,20 @@ def _called(name: str, arguments: list[Term], text: str, names: Mapping[str, flo
 compiled = lru_cache(maxsize=8192)(Expression)
 
 
-def compile_expression(text: str, place: Callable[[int], Where]) -> Expression:
-    """Check an expression, without its braces or quotes; `place` gives the place of one of its characters."""
+def evaluated(text: str, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
+    """Finite value of an expression, without its braces or quotes, given the values of names (lower case).
+
+    `place` gives the place of one of its characters.
+    """
     try:
-        return compiled(text)
+        value = float(compiled(text).term(names))
     except Problem as problem:
         raise InputError(problem.message, place(problem.position)) from None
+    except (ZeroDivisionError, OverflowError, ValueError) as error:
+        raise InputError(f"'{text}' {_FAILURES[type(error)]}", place(0)) from None
+    if not math.isfinite(value):
+        raise InputError(f"'{text}' gives {value:g}, not a finite number", place(0))
+    return value
 
 
 # Words
@@ -358,6 +354,13 @@ class Call(NamedTuple):
 Word: TypeAlias = Number | Token | Call
 
 
+def number(word: Word, what: str, allowed: str = "a number or {expression}") -> Number:
+    """The word, which must be a number; `what` names it in the message."""
+    if not isinstance(word, Number):
+        raise InputError(f"{what} is {word.text!r}; allowed: {allowed}", word.where)
+    return word
+
+
 class Scope:
     """The parameters of the deck or of one subcircuit call, which also sees those of its callers (`parent`).
 
@@ -386,11 +389,10 @@ class Scope:
     def solve(self) -> dict[str, float]:
         """The parameters' values; each definition, in any order, is evaluated after those of the parameters in it."""
         texts = {name: one.value for name, one in self._definitions.items() if name not in self.values}
-        graph = dict[str, list[str]]()
-        for name, text in texts.items():
-            graph[name] = [n for n in compile_expression(text.text, text.place).names if n in texts]
+        # What is no arithmetic has no names, and is refused when its turn comes.
+        graph = {name: _names_in(text.text) or () for name, text in texts.items()}
         try:
-            for name in TopologicalSorter(graph).static_order():
+            for name in filter(texts.__contains__, TopologicalSorter(graph).static_order()):
                 self.preset(name, self.number(texts[name]))
         except CycleError as error:
             # From a parameter to those in its definition, which graphlib gives backwards.
@@ -406,11 +408,11 @@ class Scope:
     def number(self, lexeme: Lexeme) -> Number:
         """Value of a lexeme that must be arithmetic, with or without braces."""
         refuse(lexeme.kind == "string", f"a number is needed, not the text {lexeme.written}", lexeme.where)
-        expression = compile_expression(lexeme.text, lexeme.place)
+        value, expression = evaluated(lexeme.text, self._visible, lexeme.place), compiled(lexeme.text)
         mega = Token(expression.mega[0], lexeme.place(expression.mega[1])) if expression.mega else None
         for name in expression.names:
             mega = mega or self._mega.get(name)
-        return Number(expression.evaluate(self._visible, lexeme.place), lexeme.written, lexeme.where, mega)
+        return Number(value, lexeme.written, lexeme.where, mega)
 
     def references(self, lexeme: Lexeme) -> dict[str, float]:
         """Values in this scope of the parameters in a lexeme; empty if the lexeme is not arithmetic."""

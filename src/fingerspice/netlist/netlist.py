@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.units import exponent_and_scale, format_si
@@ -17,7 +17,7 @@ from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Circuit, Element
 from fingerspice.circuit.devices import DEVICES, REST_AREA, ParameterSpec, mega_note, unit_trap, unusual
 from fingerspice.circuit.network import checked
 from fingerspice.netlist.deck import parse_deck, read_deck, with_comma
-from fingerspice.netlist.expressions import Call, Number, Token, Value
+from fingerspice.netlist.expressions import Call, Number, Token, Value, number
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
 from fingerspice.netlist.reader import MAX_WARNINGS, Context, Deck, Directive, Statement
 from fingerspice.netlist.sources import read_source
@@ -245,19 +245,13 @@ def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, flo
             raise InputError(f"{name} takes no parameter {key!r}{reason}; allowed: {shown}", part.key)
     given = [*statement.body, *(params[key] for key in kind.aliases if key in params)]
     refuse(len(given) != 1, f"{name} needs one value in {spec.unit}, {len(given)} are given", statement.where)
-    word = given[0]
-    if not isinstance(word, Number):
-        raise InputError(f"{name} value is {word.text!r}; allowed: a number {spec.unit}", word.where)
-    value = _value(name, spec, word, notes)
+    value = _value(name, spec, number(given[0], f"{name} value", f"a number {spec.unit}"), notes)
     copies = params.get(_COPIES)
     if copies is not None:
         if not isinstance(copies, Number) or not 1e-6 <= copies.value <= 1e6:
             raise InputError(f"{name} m is {copies.text!r}; allowed: a number of parts side by side", copies.where)
         value = value / copies.value if device == "R" else value * copies.value
-    initial = params.get("ic")
-    if isinstance(initial, Token):
-        raise InputError(f"{name} IC is {initial.text!r}; allowed: a number V", initial.where)
-    return {"value": value}, None if initial is None else start_volts(f"{name} IC", initial)
+    return {"value": value}, start_volts(f"{name} IC", params["ic"]) if "ic" in params else None
 
 
 def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> float:
@@ -315,8 +309,8 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
     step, stop, start, longest = [None, numbers[0], None, None] if len(numbers) == 1 else [*numbers, None, None][:4]
     assert stop is not None
     _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")
-    for what, number in (("TSTOP", stop), ("TMAX", longest)):
-        _require(number is None or 1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 s")
+    for what, given in (("TSTOP", stop), ("TMAX", longest)):
+        _require(given is None or 1e-30 <= given.value <= 1e30, what, given, "1e-30 to 1e30 s")
     if step is None or step.value == 0.0:
         step = longest
     if step is None:
@@ -351,9 +345,9 @@ def read_ac(directive: Directive) -> AcSweep:
     _require(n.value >= 1 and n.value == int(n.value) and n.value <= 1e6, "N", n, "a whole number, 1 to 1e6")
     _require(low.value > 0.0, "FSTART", low, "more than 0 Hz")
     _require(high.value >= low.value, "FSTOP", high, f"at least FSTART = {low.text}")
-    for what, number in (("FSTART", low), ("FSTOP", high)):
-        _require(1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 Hz")
-    scale: Literal["dec", "oct", "lin"] = words[0]  # type: ignore[assignment]
+    for what, given in (("FSTART", low), ("FSTOP", high)):
+        _require(1e-30 <= given.value <= 1e30, what, given, "1e-30 to 1e30 Hz")
+    scale = words[0]
     spans = 1.0 if scale == "lin" else math.log(high.value / low.value, 10.0 if scale == "dec" else 2.0)
     _require(n.value * spans <= 1e6, "N", n, f"at most 1e6 frequencies in a sweep, here {n.value * spans:.3g}")
     return AcSweep(scale, int(n.value), low.value, high.value)
@@ -394,10 +388,11 @@ def read_initial(
     return out, (*without, *(f"IC= of {e.name}" for e in elements if e.initial is not None and not uic))
 
 
-def start_volts(what: str, number: Number) -> float:
+def start_volts(what: str, word: Value) -> float:
     """A start voltage (V), which must be within the range allowed for sources."""
-    check_range(what, number.value, "V", number.where)
-    return number.value
+    value = number(word, what, "a number V").value
+    check_range(what, value, "V", word.where)
+    return value
 
 
 def read_options(directives: list[Directive]) -> tuple[str, tuple[str, ...]]:

@@ -11,7 +11,7 @@ from typing import NamedTuple, NoReturn
 from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import SmallSignal
 from fingerspice.circuit.devices import DEVICES
-from fingerspice.netlist.expressions import Call, Number, Token, Word
+from fingerspice.netlist.expressions import Call, Number, Token, Word, number
 from fingerspice.netlist.lexer import is_unit, nearest
 from fingerspice.netlist.reader import Context, Statement
 from fingerspice.waveforms.files import read_table
@@ -20,12 +20,6 @@ from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import AM, DC, Chirp, Exp, Sine, Waveform, refuse
 
 _KEPT_BYTES = 2**25  # A larger WAV file is read in parts when needed: 32 MiB are six minutes of 16 bits at 48 kHz.
-
-
-def _number(word: Word, what: str) -> float:
-    if not isinstance(word, Number):
-        raise InputError(f"{what} is {word.text!r}; allowed: a number or {{expression}}", word.where)
-    return word.value
 
 
 class _Arguments:
@@ -56,7 +50,7 @@ class _Arguments:
 
     def get(self, name: str, default: float = math.nan) -> float:
         """A number by its name."""
-        return _number(self.words[name], f"{self.name} {name}") if name in self.words else default
+        return number(self.words[name], f"{self.name} {name}").value if name in self.words else default
 
     def step_or(self, name: str) -> float:
         """An argument whose SPICE default is TSTEP."""
@@ -69,7 +63,7 @@ class _Arguments:
         """A whole number by its name; None if it is left out."""
         if name not in self.words:
             return None
-        value = _number(self.words[name], name)
+        value = number(self.words[name], name).value
         refuse(value != int(value), f"{name} is {value:g}; allowed: a whole number", self.words[name].where)
         return int(value)
 
@@ -117,7 +111,7 @@ def _pwl(a: _Arguments) -> Waveform:
         points = PWL.from_table(a.file("file"), pairs=True)
         given, levels = points.times, points.values
     else:
-        numbers = [_number(arg, "PWL value") for arg in a.call.args]
+        numbers = [number(arg, "PWL value").value for arg in a.call.args]
         if len(numbers) < 2 or len(numbers) % 2:
             raise InputError(f"PWL needs pairs of time and value, {len(numbers)} numbers given", a.call.where)
         given, levels = tuple(numbers[0::2]), tuple(numbers[1::2])
@@ -133,12 +127,13 @@ def _wavefile(a: _Arguments) -> Waveform:
     if "gain" not in a.words:
         a.refuse(f"{a.name} has no gain, the V at full scale")
     small = not path.is_file() or path.stat().st_size <= _KEPT_BYTES
-    return a.upsampled(Samples.from_wav(path, _number(a.words["gain"], "gain"), a.whole("channel"), at_once=small))
+    gain = number(a.words["gain"], "gain").value
+    return a.upsampled(Samples.from_wav(path, gain, a.whole("channel"), at_once=small))
 
 
 def _table(a: _Arguments) -> Waveform:
     path = a.file()
-    rate = _number(a.words["rate"], "TABLE rate") if "rate" in a.words else None
+    rate = a.get("rate") if "rate" in a.words else None
     values, rate, times = read_table(path, a.column("time"), a.column("value"), rate)
     if rate is not None:
         return a.upsampled(Samples(values, rate))
@@ -233,10 +228,10 @@ def read_source(statement: Statement, context: Context) -> tuple[Waveform, Small
             raise InputError(problem, next(iter(word.params.values())).key)
         if key == "dc":
             refuse(len(word.args) != 1, f"{name}: DC needs one value", word.where)
-            level = _number(word.args[0], f"{name} DC")
+            level = number(word.args[0], f"{name} DC").value
         elif key == "ac":
             refuse(ac is not None, f"{name} has AC twice; allowed: {_LEVELS[key]} once", word.where)
-            given = [_number(arg, f"{name} AC") for arg in word.args]
+            given = [number(arg, f"{name} AC").value for arg in word.args]
             problem = f"{name}: AC takes at most 2 values, {len(given)} given; allowed: {_LEVELS[key]}"
             refuse(len(given) > 2, problem, word.where)
             ac = SmallSignal(*given)
