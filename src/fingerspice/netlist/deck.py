@@ -19,8 +19,7 @@ from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, gro
 from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, Deck, Directive, Reader, Statement, Subcircuit, text_of
 from fingerspice.waveforms.waveform import refuse
 
-#: Largest number of characters of a title that are shown; the middle of a longer title is left out.
-LONGEST_TITLE = 200
+LONGEST_TITLE = 200  #: Characters of a title that are shown; the middle of a longer title is left out.
 #: Limits of subcircuit calls: total number of expanded lines and characters, and nesting.
 MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
@@ -92,8 +91,7 @@ class _Instance:
 
     definition: Subcircuit
     scope: Scope
-    # The instances around the definition, innermost first, whose subcircuits an X line may call, too
-    around: tuple[_Instance, ...] = ()
+    around: tuple[_Instance, ...] = ()  # Those around the definition, innermost first, whose subcircuits it may call
     prefix: str = ""  # as written, ends in a dot
     ports: dict[str, tuple[str, str]] = field(default_factory=dict)
     calls: tuple[Subcircuit, ...] = ()  # definitions being expanded, outermost first

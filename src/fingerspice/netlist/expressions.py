@@ -22,8 +22,7 @@ from fingerspice.base.units import parse_number, spice_text, suspicious_mega
 from fingerspice.netlist.lexer import Assignment, Group, Lexeme, Line, nearest
 from fingerspice.waveforms.waveform import refuse
 
-#: Limits: characters of an expression, nested brackets, `?` in an expression, and signs in a row.
-MAX_LENGTH, MAX_DEPTH, MAX_QUESTIONS, MAX_SIGNS = 2000, 25, 25, 3
+MAX_LENGTH, MAX_DEPTH, MAX_QUESTIONS, MAX_SIGNS = 2000, 25, 25, 3  #: Characters, brackets, `?`, signs in a row.
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
 #: Function from the values of parameters, whose names are in lower case, to the value of a part of an expression.
@@ -84,7 +83,7 @@ _LEX = re.compile(
     r"(?P<space>\s+)"
     r"|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[\w.]*)"
     r"|(?P<name>[A-Za-z_]\w*)"
-    r"|(?P<op>\*\*|&&|\|\||[<>=!]=|[-+*/^<>(),?:])"
+    r"|(?P<op>\*\*|&&|\|\||[<>=!]=|[-+*/^<>(),?:])|(?P<other>.)"
 )
 
 
@@ -107,14 +106,13 @@ class Expression:
         self.names: dict[str, int] = {}  # In lower case, constants included, and the position of each one's first use
         self.mega: tuple[str, int] | None = None  # The first number written with a capital M, and its position
         self._pieces: list[_Piece] = []
-        self._at = position = questions = 0
+        self._at = questions = 0
         self._brackets: list[tuple[_Piece, bool]] = []  # open, each with whether it encloses a function's arguments
-        while position < len(text):
-            match = _LEX.match(text, position)
-            if match is None:
-                hint = ": a comparison is ==" if text[position] == "=" else ""
-                raise Problem(f"{text[position]!r} does not belong in arithmetic{hint}", position)
-            kind, found = match.lastgroup or "", match.group()
+        for match in _LEX.finditer(text):
+            kind, found, position = match.lastgroup or "", match.group(), match.start()
+            if kind == "other":
+                hint = ": a comparison is ==" if found == "=" else ""
+                raise Problem(f"{found!r} does not belong in arithmetic{hint}", position)
             questions += found == "?"
             if questions > MAX_QUESTIONS:
                 raise Problem(f"more than {MAX_QUESTIONS} '?' in one expression", position)
@@ -122,7 +120,6 @@ class Expression:
                 self._pieces.append(_Piece(kind, found, position))
             if kind == "number" and self.mega is None and suspicious_mega(found):
                 self.mega = found, position
-            position = match.end()
         self._pieces.append(_Piece("end", "", len(text)))
         self.term = self._condition()
         self._refuse_going_on()
@@ -286,8 +283,7 @@ def _called(name: str, arguments: list[Term], text: str, names: Mapping[str, flo
     return float(function(*(argument(names) for argument in arguments)))
 
 
-#: The expression of a text; raises `Problem` if it is not arithmetic.
-compiled = lru_cache(maxsize=8192)(Expression)
+compiled = lru_cache(maxsize=8192)(Expression)  #: The expression of a text; raises `Problem` if it is not arithmetic.
 
 
 def evaluated(text: str, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
@@ -334,8 +330,7 @@ class Number(NamedTuple):
     value: float  # The value in SI units
     text: str  # As written, braces included
     where: Where  # The place of its first character
-    # The number with a capital M from which the value was computed: M is milli, and perhaps meant as mega
-    mega: Token | None = None
+    mega: Token | None = None  # The number with a capital M, milli and perhaps meant as mega, that the value is from
     key: Where | None = None  # Place of the key of a `key=value` pair
 
 
@@ -371,8 +366,7 @@ class Scope:
     def __init__(self, definitions: Iterable[Assignment], parent: Scope | None = None) -> None:
         self.values: dict[str, float] = {}
         self._visible: ChainMap[str, float] = ChainMap(self.values, *(parent._visible.maps if parent else ()))
-        # As in `Number`
-        self._mega: ChainMap[str, Token | None] = ChainMap({}, *(parent._mega.maps if parent else ()))
+        self._mega: ChainMap[str, Token | None] = ChainMap({}, *(parent._mega.maps if parent else ()))  # As in `Number`
         self._definitions: dict[str, Assignment] = {}
         for definition in definitions:
             key, name = definition.key, definition.key.text.lower()

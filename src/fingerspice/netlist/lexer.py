@@ -23,8 +23,7 @@ _COMMA = re.compile(r"(?<![\w.,])([+-]?[0-9]+),([0-9]+[a-zµμ]*)(?![\w.,])", re
 _ASSIGNED = re.compile(rf"=\s*{_COMMA.pattern}", re.IGNORECASE)
 NUMBER = re.compile(r"[+-]?\.?[0-9][\w.+-]*")
 _UNIT = re.compile(r"(?:[tgkmunpfµμ]|meg|mil)?(?:m|v|a|s|n|f|hz|ohm|ω)?", re.IGNORECASE)
-#: Largest number and length of the known words that are compared: a comparison takes the product of the two lengths.
-MAX_KNOWN, MAX_COMPARED = 1000, 60
+MAX_KNOWN, MAX_COMPARED = 1000, 60  #: Number and length of the words compared, which takes the product of two lengths.
 
 
 def decimal_comma(text: str) -> str | None:
@@ -75,8 +74,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 #: As in ngspice a `;`, a `//` after a blank, or a `$` between blanks starts a comment, except in double quotes.
 _COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)//|(?<!\S)\$(?!\S))')
 _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
-#: Pattern of a separator or a mark; their number is an upper bound of the number of words.
-SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
+SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")  #: A separator or a mark: there are no more words than these.
 _BRACE = re.compile(r"[{}]")
 MAX_NAME = 400  # Characters of a name
 _KEY = re.compile(r"[A-Za-z_]\w*")
@@ -88,8 +86,7 @@ class Line(NamedTuple):
 
     file: str  # The file's name as shown to the user
     text: str  # From the first character that is not blank
-    # Of each physical line: the position of its text, its number, and what a position in it lacks to its column
-    parts: tuple[tuple[int, int, int], ...]
+    parts: tuple[tuple[int, int, int], ...]  # Of each physical line: position of its text, number, column less position
 
     def where(self, position: int = 0) -> Where:
         """Place of one character of the text."""

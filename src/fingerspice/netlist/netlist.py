@@ -23,10 +23,8 @@ from fingerspice.netlist.reader import MAX_WARNINGS, Context, Deck, Directive, S
 from fingerspice.netlist.sources import read_source
 from fingerspice.waveforms.waveform import DC, Waveform, check_range, refuse
 
-#: The parameter that gives the number of equal parts in parallel.
-_COPIES = "m"
-#: Number of outputs of a run whose .tran has no TSTEP.
-LTSPICE_OUTPUTS = 10_000
+_COPIES = "m"  #: The parameter that gives the number of equal parts in parallel.
+LTSPICE_OUTPUTS = 10_000  #: Number of outputs of a run whose .tran has no TSTEP.
 _LTSPICE_START = {
     "startup": "sources are not ramped up here; allowed: a source that rises by itself, such as PWL(0 0 20u 5)",
     "steady": "no run stops by itself here; allowed: fs.steady_state(circuit), which finds the periodic state",

@@ -39,8 +39,7 @@ from fingerspice.waveforms.waveform import refuse
 #: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
 LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
 
-#: Largest size of a file, and of all the files that a deck's sources name, bytes.
-MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30
+MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30  #: Of a file, and of all the files that a deck's sources name.
 
 
 @cache
@@ -84,16 +83,14 @@ def text_of(path: Path) -> tuple[str, Path]:
 
 def _decoded(data: bytes, shown: str, where: Where | None) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        # LTspice writes UTF-16 if a name has letters that Latin-1 lacks.
-        return data.decode("utf-16", "replace")
+        return data.decode("utf-16", "replace")  # LTspice writes UTF-16 if a name has letters that Latin-1 lacks.
     refuse(b"\0" in data, f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         broken = error.start
     try:
-        # LTspice writes its micro sign in the Latin-1 of Windows.
-        return cp1252.Codec().decode(data)[0]
+        return cp1252.Codec().decode(data)[0]  # LTspice writes its micro sign in the Latin-1 of Windows.
     except UnicodeDecodeError:
         number = data[:broken].count(b"\n") + 1
         problem = f"'{shown}' is neither UTF-8 nor Latin-1 text (byte 0x{data[broken]:02x} in line {number})"
@@ -107,8 +104,7 @@ class Context:
     tran: Tran | None  # On whose times SPICE's defaults depend
     folder: Path | None = None  # Folder of the deck; None for a deck given as text
     in_deck: bool = True  # Whether the source stands in a deck, which a SPICE may read, too
-    # Whether any file may be read, relative to the working directory: for sources given by the user, not by a deck
-    anywhere: bool = False
+    anywhere: bool = False  # Whether any file may be read, relative to the working directory: for a user's own sources
     size: int = 0  # Total size of the files named so far, bytes; a file counts each time that it is named
 
     def find(self, name: str, where: Where) -> Path:
@@ -144,8 +140,7 @@ def library_changed(root: Path, folder: Path, name: str) -> bool:
         read, shipped = ([line.rstrip() for line in split_lines(x.rstrip())] for x in (read_text(path, name), own))
         return read != shipped
     except (OSError, ValueError, RuntimeError):
-        # A file that cannot be read is not this version's library.
-        return True
+        return True  # A file that cannot be read is not this version's library.
 
 
 def _similar_file(path: Path, shown: str, root: Path | None) -> str:
@@ -221,10 +216,8 @@ ELSEWHERE = {
         (".savebias", ".loadbias"), "a run goes on from another in Python, fs.simulate(circuit, start=solution)"
     ),
 }
-#: Limits of a netlist with its included files: a word takes up to 500 bytes of memory, and a line 200.
-MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000
-#: Largest number of warnings that are shown.
-MAX_WARNINGS = 100
+MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000  #: Of all files: a word takes up to 500 bytes of memory, and a line 200.
+MAX_WARNINGS = 100  #: Largest number of warnings that are shown.
 MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
@@ -239,8 +232,7 @@ class Directive(NamedTuple):
 
     name: str  # Name in lower case, with its dot
     args: tuple[Word, ...]
-    # Values of `key=value` pairs by key in lower case; `.ic v(area)=1` has the key ``v(area)`` of the flat circuit
-    params: dict[str, Value]
+    params: dict[str, Value]  # By key in lower case; `.ic v(area)=1` has the key ``v(area)`` of the flat circuit
     where: Where  # Place of the dot
     text: str  # The line as written, continuations joined
 
@@ -250,8 +242,7 @@ class Statement(NamedTuple):
 
     name: str  # Name as written, with the names of the enclosing calls in front: ``Xfinger.Xgap``
     device: str  # Entry of `DEVICES`
-    # Nodes in lower case, ground as ``0``; a node inside a subcircuit has the names of the enclosing calls in front
-    nodes: tuple[str, ...]
+    nodes: tuple[str, ...]  # In lower case, ground as ``0``; inside a subcircuit with the enclosing calls in front
     node_names: tuple[str, ...]  # The same nodes as written
     body: tuple[Word, ...]  # The words after the nodes; empty for an X
     params: dict[str, Value]  # Values of `key=value` pairs by key in lower case

@@ -34,8 +34,7 @@ class _Arguments:
             self.refuse(f"{self.name} needs {function.required} values, {given} given")
         if given > len(names) > 0:
             hint = "; Ncycles is not supported, a burst is BURST(amplitude frequency cycles), in Python fs.Burst"
-            # LTspice has one more argument.
-            self.usage += hint if function.counted and given == len(names) + 1 else ""
+            self.usage += hint if function.counted and given == len(names) + 1 else ""  # LTspice has one more argument.
             self.refuse(f"{self.name} takes at most {len(names)} values, {given} given")
         self.words: dict[str, Word] = dict(zip(names, call.args, strict=False))
         for key, value in call.params.items():
@@ -190,11 +189,9 @@ SOURCES: Mapping[str, Function] = {
     ),
 }  # fmt: skip
 _KNOWN = ", ".join(name.upper() for name, function in SOURCES.items() if not function.refused)
-#: What is no source function, with what is allowed.
-_LEVELS = {"dc": "DC value", "ac": "AC [magnitude [phase]]"}
+_LEVELS = {"dc": "DC value", "ac": "AC [magnitude [phase]]"}  #: What is no source function, with what is allowed.
 _SFFM = "SFFM changed its argument order between ngspice versions; write the waveform as PWL"
-#: Names in LTspice, and a short one for the command line.
-_ALIASES = {"sine": "sin", "wav": "wavefile"}
+_ALIASES = {"sine": "sin", "wav": "wavefile"}  #: Names in LTspice, and a short one for the command line.
 
 
 def read_source(statement: Statement, context: Context) -> tuple[Waveform, SmallSignal | None, list[str]]:
@@ -217,8 +214,7 @@ def read_source(statement: Statement, context: Context) -> tuple[Waveform, Small
         apart = isinstance(word, Token) and is_unit(key) and (level is not None or waveform is not None)
         refuse(apart, f"{name}: {word.text!r} stands apart; a unit joins its number, such as 5{word.text}", word.where)
         if isinstance(word, Token):
-            # A call may also be written without brackets: SIN 0 200 100.
-            numbers = list[Number]()
+            numbers = list[Number]()  # A call may also be written without brackets: SIN 0 200 100.
             while words and isinstance(words[0], Number):
                 numbers.append(words[0])
                 words.popleft()

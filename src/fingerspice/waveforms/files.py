@@ -34,10 +34,8 @@ _COMMENTED = ("#", ";", "*")
 _COMMENT = re.compile(r"^(\s*[^\s;]+\s[^;]*\s);.*")
 # A line that begins with a number or NaN, in the first cell that is not empty, and so is no header.
 _FIRST_NUMBER = re.compile(r"[\s,;\"]*(?:[+-]?\.?\d|[+-]?(?:nan|inf)\b|$)", re.IGNORECASE)
-# Begins the line above each run in LTspice's export of a .step.
-_STEPPED = "Step Information:"
-# Largest number of column names shown in a message.
-_SHOWN = 8
+_STEPPED = "Step Information:"  # Begins the line above each run in LTspice's export of a .step.
+_SHOWN = 8  # Largest number of column names shown in a message.
 
 
 @dataclass(frozen=True)
@@ -233,21 +231,15 @@ def _number(cell: str) -> float:
         return parse_number(cell)
 
 
-#: Largest size of a binary file and of a text file, bytes.
-MAX_BYTES, MAX_TEXT_BYTES = 2**30, 2**26
-#: Largest number of samples: an hour at 48 kHz has 1.7e8, which take 1.4 GB.
-MAX_SAMPLES = 200_000_000
-#: Largest size of a WAV file that is read piece by piece, bytes.
-LARGEST_STREAMED = 2**40
-# Largest deviation, in samples, of a file's times from those that its rate gives: the written times are rounded.
-_JITTER = 0.1
+MAX_BYTES, MAX_TEXT_BYTES = 2**30, 2**26  #: Largest size of a binary file and of a text file, bytes.
+MAX_SAMPLES = 200_000_000  #: Largest number of samples: an hour at 48 kHz has 1.7e8, which take 1.4 GB.
+LARGEST_STREAMED = 2**40  #: Largest size of a WAV file that is read piece by piece, bytes.
+_JITTER = 0.1  # Largest distance, in samples, of a file's times from those of its rate: written times are rounded.
 _RATE_NAMES = ("rate", "fs", "sample_rate")
 _TIME_NAMES = ("t", "time")
-# Sizes of samples that stand for an unknown one, in headers that were written before a live stream ended: the samples
-# go on to the end of the file. SoX writes the second one.
+# Sizes that stand for an unknown one in a live stream's header, the second by SoX: samples go on to the file's end.
 _UNKNOWN_SIZES = (0xFFFFFFFF, 0x7FFFF000)
-# Most chunks of a file that are looked at, so that a crafted one takes no minutes.
-_MOST_CHUNKS = 10_000
+_MOST_CHUNKS = 10_000  # Most chunks of a file that are looked at, so that a crafted one takes no minutes.
 # Names of number formats that are not read.
 _FORMATS = {2: "ADPCM", 6: "ALAW", 7: "MULAW", 17: "DVI_ADPCM", 85: "MPEGLAYER3"}
 # First bytes of other file formats, to name the format in the message.
@@ -266,8 +258,7 @@ class WavLayout:
     channels: int
     channel: int  # The one that is read
     count: int  # Samples of each channel
-    # Number format as NumPy writes it, such as ``<i2``; NumPy itself does not know those of 3, 5, 6 or 7 bytes
-    kind: str
+    kind: str  # As NumPy writes it, such as ``<i2``; NumPy itself does not know those of 3, 5, 6 or 7 bytes
     offset: int  # Position of the first sample, bytes
 
     def read(self, first: int, last: int) -> FloatArray:

@@ -21,14 +21,10 @@ from fingerspice.base.errors import InputError
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.waveform import OSCILLATION, Waveform, as_waveform, check_range, require, terms_of
 
-# A waveform with at most this many knots is not divided into windows, however close together its knots are.
-FEW_KNOTS = 1000
-# Most points that the text of a PWL shows.
-MOST_SHOWN = 10_000
-#: Largest number of breakpoints listed at once; each takes about 40 bytes, the arrays computed from it included.
-MOST_LISTED = 20_000_000
-#: Number of breakpoints in a window of time; the values at all times in one window are looked up together.
-_WINDOW = 1_000_000
+FEW_KNOTS = 1000  # With so many knots or less a waveform is not divided into windows, however close they are.
+MOST_SHOWN = 10_000  # Most points that the text of a PWL shows.
+MOST_LISTED = 20_000_000  #: Breakpoints listed at once; each takes about 40 bytes, with the arrays computed from it.
+_WINDOW = 1_000_000  #: Breakpoints in a window of time; the values at all times in one are looked up together.
 
 
 def runs_through(
@@ -66,9 +62,8 @@ class Ramps(Waveform):
     ever; earlier knots occur once.
     """
 
-    # Time (s) from which the waveform is periodic, and the time from which its knots' times are counted.
-    _first: float = 0.0
-    _origin: float = 0.0
+    _first: float = 0.0  # Time (s) from which the waveform is periodic
+    _origin: float = 0.0  # Time (s) from which the times of its knots are counted
 
     @cached_property
     def knots(self) -> tuple[FloatArray, FloatArray]:
@@ -161,8 +156,7 @@ class Ramps(Waveform):
     def breakpoint_rate(self) -> float:
         times, _ = self.knots
         if self.period is None and times.size <= FEW_KNOTS:
-            # The rate is only used to divide time into windows; so few breakpoints need none.
-            return 0.0
+            return 0.0  # The rate is only used to divide time into windows; so few breakpoints need none.
         span = self.period or (times[-1] - times[0])
         return times.size / span if span > 0.0 else 0.0
 
@@ -382,8 +376,7 @@ class Pulse(Ramps):
         return np.array(t), np.array(v)
 
 
-# A time within this relative distance of a breakpoint differs from it only by rounding, and is replaced by it.
-_ROUNDING_OF_TIMES = 8e-16
+_ROUNDING_OF_TIMES = 8e-16  # A time so near a breakpoint, relatively, differs from it by rounding: it is replaced.
 
 
 class _Stretches(Waveform):

@@ -20,12 +20,9 @@ from fingerspice.waveforms.waveform import DC, RANGES, Product, Sum, Waveform, c
 # Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
 # to 0.46 of the rate.
 _WING, _BETA = 32, 8.0
-# Number of samples of a file that are read at once.
-AT_ONCE = 1 << 20
-# Largest distance of a time from the grid, relative to the spacing; rounding of the times themselves comes on top.
-ON_GRID, ROUNDING = 1e-9, 1e-15
-# Largest number of grid samples for each point of a PWL: beyond it, few long lines are faster taken one by one.
-MOST_PER_POINT = 8
+AT_ONCE = 1 << 20  # Number of samples of a file that are read at once.
+ON_GRID, ROUNDING = 1e-9, 1e-15  # Largest distance of a time from the grid, in spacings, and its own rounding.
+MOST_PER_POINT = 8  # Grid samples for each point of a PWL: beyond it, few long lines are faster taken one by one.
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +138,7 @@ class Samples(Ramps):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         if "values" in state:
-            # NumPy unpickles every array as writable.
-            self.values.flags.writeable = False
+            self.values.flags.writeable = False  # NumPy unpickles every array as writable.
 
     @property
     def count(self) -> int:
@@ -235,8 +231,7 @@ class Samples(Ramps):
 
 def _check_samples(values: FloatArray, first: int) -> None:
     """Refuse samples (V) that are not finite or too large; `first` is the number of the first of them."""
-    # An extreme value is NaN if any value is.
-    ends = [values.min(), values.max()]
+    ends = [values.min(), values.max()]  # An extreme value is NaN if any value is.
     if not np.all(np.isfinite(ends)):
         bad = np.flatnonzero(~np.isfinite(values))
         raise InputError(f"sample number {first + bad[0]} is {values[bad[0]]}; allowed: finite numbers")
@@ -252,8 +247,7 @@ class _WavFile(Samples):
     def __init__(self, layout: WavLayout, gain: float) -> None:
         self._declare(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
         require(self.count >= 2, "samples", f"shape ({self.count},)", "one row of two or more")
-        # Integers are finite, and within full scale.
-        sure = layout.kind[1] != "f" and abs(gain) <= RANGES["V"][0]
+        sure = layout.kind[1] != "f" and abs(gain) <= RANGES["V"][0]  # Integers are finite, and within full scale.
         for first in range(0, 0 if sure else self.count, AT_ONCE):
             _check_samples(self.between(first, min(first + AT_ONCE, self.count)), first)
 

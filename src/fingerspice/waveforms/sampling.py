@@ -25,12 +25,9 @@ from fingerspice.numerics import chebyshev
 from fingerspice.waveforms.periodic import Ramps, in_windows, runs_through
 from fingerspice.waveforms.waveform import DOUBLE, Waveform, require
 
-#: Longest segment of an oscillation, in periods; longer ones are divided, since a phase's rounding error grows with it.
-_PERIODS_PER_SEGMENT = 64.0
-# Number of times compared between two looks whether one has missed.
-_AT_ONCE = 1024
-# Units in the last place of the time by which a function is looked at beside a break, for its limits there.
-_ASIDE = 8.0
+_PERIODS_PER_SEGMENT = 64.0  #: Longest segment of an oscillation: a phase's rounding error grows with it.
+_AT_ONCE = 1024  # Number of times compared between two looks whether one has missed.
+_ASIDE = 8.0  # Units in the last place of the time by which a function is looked at beside a break.
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +70,7 @@ class Function(Waveform):
         if t.ndim == 0:
             return np.asarray(self._scalar(np.float64(t)))
         try:
-            # A function may work in place: it gets times of its own.
-            out = self._taken(self.function(t.copy()))
+            out = self._taken(self.function(t.copy()))  # A function may work in place: it gets times of its own.
             # A function written for one number may give wrong values for an array without raising: compare one value.
             if out.shape == t.shape and (
                 t.size == 0 or np.array_equal(out.flat[t.size // 2], self._scalar(t.flat[t.size // 2]), True)
@@ -89,8 +85,7 @@ class Function(Waveform):
         try:
             value = self.function(t)
         except (TypeError, IndexError):
-            # A function of arrays only.
-            value = self.function(np.array([t]))
+            value = self.function(np.array([t]))  # A function of arrays only.
         try:
             return float(self._taken(value).item())
         except ValueError:  # InputError is one
@@ -119,12 +114,10 @@ class SourceTable:
 
     edges: FloatArray  # (m + 1,): Segment edges, s
     terms: FloatArray  # (m, k, 6)
-    # (m, l): Chebyshev coefficients of each segment's series, which is added to its terms; l = 0 without series
-    series: FloatArray
+    series: FloatArray  # (m, l): Chebyshev coefficients of each segment, added to its terms; l = 0 without series
     scale: float = 0.0  # Largest |U| (V) at the points where the series were fitted and checked; 0 without series
     not_finite: float | None = None  # Time (s) of the first NaN or inf; the table then ends just before it
-    # Largest misfit (V) that finer series do not reduce, because it is round-off of the function's own values
-    rough: float = 0.0
+    rough: float = 0.0  # Largest misfit (V) that finer series do not reduce: round-off of the function's own values
 
     def values(self, t: FloatArray) -> FloatArray:
         """Values (V) of the series at times (s) within the table."""
@@ -241,10 +234,8 @@ WIDEST = 0.5 * _LONGEST * float(np.diff(np.sort(_PLACES)).max())
 # After `_IDLE` halvings in a row that do not reduce the misfit, a misfit below `_ROUGHEST` (relative to the largest
 # |U|, for values in doubles) is taken for round-off of the function's values.
 _IDLE, _ROUGHEST = 3, 1e-8
-# Smallest change over short series, relative to the largest |U|, that is reported as an edge; at a kink it is smaller.
-_STEEP = 0.05
-# Smallest tolerance, V: below it doubles are nearly denormal and lose digits, so that no function appears smooth.
-_NOTHING = 1e-290
+_STEEP = 0.05  # Least change over short series, relative to the largest |U|, that is told as an edge; a kink has less.
+_NOTHING = 1e-290  # Smallest tolerance, V: below it doubles are nearly denormal, and no function appears smooth.
 # An interval halved more than `_DEEP` times lies at a jump or a kink, around which some 60 such intervals are needed. A
 # table may have `_MOST_DEEP` of them, and `_MOST_DEEP_EACH` more for each of its initial intervals.
 _DEEP, _MOST_DEEP, _MOST_DEEP_EACH = 12, 10_000, 100

@@ -24,17 +24,14 @@ from numpy.typing import ArrayLike
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError, Where
 
-#: Largest and smallest absolute value allowed of a nonzero number, by unit (the entry V also serves A).
-RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}
-#: The same limits for all other units.
-ANY_RANGE = (1e30, 1e-30)
+RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}  #: Largest and smallest size of a number other than 0; V serves A, too.
+ANY_RANGE = (1e30, 1e-30)  #: The same limits for all other units.
 #: Units of the numbers that every oscillation has.
 OSCILLATION = {"amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s"}
 TAU = 2.0 * math.pi
 # Places in [0, 1], both ends among them, one in each of 512 equal parts: so irregular that no carrier is 0 at all.
 _SPREAD = np.append((np.arange(512) + np.modf(np.arange(512) * 0.6180339887498949)[0]) / 512.0, 1.0)
-#: Distance of neighbouring doubles, relative to their size.
-DOUBLE = 2.0**-52
+DOUBLE = 2.0**-52  #: Distance of neighbouring doubles, relative to their size.
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
 #: Most cycles of a part in a common period, and the largest relative rounding error of a ratio of two periods.
 MOST_CYCLES, _ROUNDING = 10**6, 2e-15
@@ -60,17 +57,12 @@ class Waveform:
     units: ClassVar[dict[str, str]] = {}  #: Unit of each numeric field
     period: float | None = None  #: Period in s after any delay, or None
     settled: float = 0.0  #: Time (s) from which the waveform is periodic
-    #: Distance of neighbouring numbers of the kind that the values are computed in, relative to their size
-    precision: float = DOUBLE
-    #: Times (s) before the first and after the second of which the waveform is constant
-    course: tuple[float, float] = (-math.inf, math.inf)
-    #: Whether each half period after `settled` is the negative of the half period before it
-    half_wave: bool = False
-    # Times (s, ascending) at which the waveform is not smooth, and the shortest time scale (s) between them.
-    _breaks: tuple[float, ...] = ()
-    _quick: float = math.inf
-    # Names of fields that may be infinite.
-    _endless: ClassVar[tuple[str, ...]] = ()
+    precision: float = DOUBLE  #: Distance of neighbouring numbers of the kind that the values are computed in
+    course: tuple[float, float] = (-math.inf, math.inf)  #: Before and after these times (s) it is constant
+    half_wave: bool = False  #: Whether each half period after `settled` is the negative of the half period before it
+    _breaks: tuple[float, ...] = ()  # Times (s, ascending) at which the waveform is not smooth
+    _quick: float = math.inf  # Shortest time scale (s) between them
+    _endless: ClassVar[tuple[str, ...]] = ()  # Names of fields that may be infinite.
 
     def __post_init__(self) -> None:
         """Make doubles of the fields that have a unit, and refuse what is no number of it."""
@@ -159,8 +151,7 @@ class Waveform:
             half = 0.5 * np.diff(cuts)[:, None]
             t = 0.5 * (cuts[1:] + cuts[:-1])[:, None] + half * _GAUSS_X
             total += complex(np.sum(half * _GAUSS_W * self.value(t) * np.exp(-1j * TAU * frequency * t)))
-        # The phase refers to a sine: U ~ Im(P exp(i Omega t)).
-        p = 2j * total / length
+        p = 2j * total / length  # The phase refers to a sine: U ~ Im(P exp(i Omega t)).
         if abs(p) <= 1e-12 * self.peak(start, stop):
             return None
         return Fundamental(frequency, abs(p), math.atan2(p.imag, p.real))
@@ -332,8 +323,7 @@ class Sine(Waveform):
         phase = math.radians(self.phase_deg)
         level = np.where(on, self.offset, self.offset + self.amplitude * math.sin(phase))
         decay = np.exp(-self.damping * np.maximum(start - self.delay, 0.0))
-        # Terms are cosines: sin(x) = cos(x - pi/2).
-        angle = TAU * self._turns(start) + phase - 0.5 * math.pi
+        angle = TAU * self._turns(start) + phase - 0.5 * math.pi  # Terms are cosines: sin(x) = cos(x - pi/2).
         wave = np.where(on, self.amplitude * decay, 0.0), 0.0, -self.damping, TAU * self.frequency, angle
         return terms_of(start.size, (level,), wave)
 
