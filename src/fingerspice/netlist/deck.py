@@ -10,13 +10,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import dropwhile
 from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.expressions import Bare, Number, Scope, Value
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
-from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, Deck, Directive, Reader, Statement, Subcircuit, text_of
+from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, Deck, Directive, Reader, Statement, Subcircuit
 from fingerspice.waveforms.waveform import refuse
 
 LONGEST_TITLE = 200  #: Characters of a title that are shown; the middle of a longer title is left out.
@@ -41,18 +42,10 @@ _STATEMENT = re.compile(
 )
 
 
-def read_deck(path: str | Path) -> Deck:
-    """Read a netlist file, which may include files from its own folder only.
-
-    Standard input (``-``), a device or a pipe is a deck called ``stdin`` in the working directory.
-    """
-    return parse_deck(*text_of(Path(path)))
-
-
 def parse_deck(text: str, path: Path | None = None) -> Deck:
     """Read a netlist, whose first line is the title.
 
-    `path` is that of the file with this text; without it only the libraries of native devices can be included.
+    Files are included from the folder of `path`, that of the file with this text; without it, only native libraries.
     """
     deck = Deck(text, path)
     refuse(not text.strip("\ufeff \t\r\n"), f"'{deck.file}' is empty: a netlist begins with a title line")
@@ -112,10 +105,7 @@ class _Instance:
 
 
 class Flattener:
-    """Turns the lines of a deck into statements and directives.
-
-    A call is replaced by the statements of its subcircuit. An `.ic` line has the nodes of the flat circuit.
-    """
+    """Turns the lines of a deck, its subcircuit calls expanded, into statements and directives of the flat circuit."""
 
     def __init__(self, deck: Deck) -> None:
         self.deck = deck
@@ -176,9 +166,8 @@ class Flattener:
         refuse(not plain, f"missing value: {name} needs nodes and a device's name", lexemes[0].where)
         *nodes, device = plain
         refuse(device.kind != "word", f"{device.written} stands where a device's name belongs", device.where)
-        native, key, around = device.text.upper(), device.text.lower(), (instance, *instance.around)
-        while around and key not in around[0].definition.inner:
-            around = around[1:]
+        native, key = device.text.upper(), device.text.lower()
+        around = tuple(dropwhile(lambda one: key not in one.definition.inner, (instance, *instance.around)))
         called = around[0].definition.inner[key] if around else None
         if called is None and native not in layer_devices():
             raise InputError(_unknown_device(plain, instance), device.where)
@@ -210,10 +199,9 @@ class Flattener:
 
     def _count(self, called: Subcircuit, instance: _Instance, where: Where) -> None:
         """Count what a call expands to; refuse circles, and what is too deep or too much."""
-        names = [sub.name for sub in (*instance.calls, called)]
         for start, outer in enumerate(instance.calls):
             if outer is called:
-                path = " -> ".join(names[start:])
+                path = " -> ".join(sub.name for sub in (*instance.calls[start:], called))
                 raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
         self._expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
         self._expanded_text += called.characters
@@ -228,11 +216,9 @@ def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: S
     for given, (key, value) in words.params.items():
         for name, here in caller.references(value).items():
             if name != given and own.get(name, here) != here:
-                problem = (
-                    f"{key.text}={value.written} means {name} = {here:g} of the calling netlist here, and in ngspice "
-                    f"{device}'s own {name} = {own[name]:g}; allowed: another name for one of them"
-                )
-                raise InputError(problem, value.where)
+                problem = f"{key.text}={value.written} means {name} = {here:g} of the calling netlist here"
+                problem += f", and in ngspice {device}'s own {name} = {own[name]:g}"
+                raise InputError(f"{problem}; allowed: another name for one of them", value.where)
 
 
 def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:

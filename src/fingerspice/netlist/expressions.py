@@ -278,8 +278,7 @@ def _called(name: str, arguments: list[Term], text: str, names: Mapping[str, flo
     given = len(arguments)
     if given != wanted:
         more = f"; write {name}({name}(a, b), c), as ngspice 39 leaves some out" if given > 2 == wanted else ""
-        plural = "" if wanted == 1 else "s"
-        raise Problem(f"{name} takes {wanted} argument{plural}, {given} given: {text}{more}")
+        raise Problem(f"{name} takes {wanted} argument{'' if wanted == 1 else 's'}, {given} given: {text}{more}")
     return float(function(*(argument(names) for argument in arguments)))
 
 
@@ -287,10 +286,7 @@ compiled = lru_cache(maxsize=8192)(Expression)  #: The expression of a text; rai
 
 
 def evaluated(text: str, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
-    """Finite value of an expression, without its braces or quotes, given the values of names (lower case).
-
-    `place` gives the place of one of its characters.
-    """
+    """Finite value of an expression without its braces, given those of names; `place` is that of a character."""
     try:
         value = float(compiled(text).term(names))
     except Problem as problem:

@@ -42,10 +42,8 @@ def decimal_comma(text: str) -> str | None:
         if all(NUMBER.fullmatch(c) or c.isalpha() for c in others) and (others or len(chunks) == len(words) == 1):
             found += matches
     for whole, part in (match.groups() for match in filter(None, found)):
-        return (
-            f"{whole},{part} is two numbers, {whole} and {part}, for a comma separates; if it is a decimal comma "
-            f"write {whole}.{part}"
-        )
+        said = f"{whole},{part} is two numbers, {whole} and {part}, for a comma separates"
+        return f"{said}; if it is a decimal comma write {whole}.{part}"
     return None
 
 

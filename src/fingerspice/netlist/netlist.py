@@ -16,10 +16,10 @@ from fingerspice.base.units import exponent_and_scale, format_si
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Circuit, Element, Tran
 from fingerspice.circuit.devices import DEVICES, REST_AREA, ParameterSpec, mega_note, unit_trap, unusual
 from fingerspice.circuit.network import checked
-from fingerspice.netlist.deck import parse_deck, read_deck, with_comma
+from fingerspice.netlist.deck import parse_deck, with_comma
 from fingerspice.netlist.expressions import Call, Number, Token, Value, number
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
-from fingerspice.netlist.reader import MAX_WARNINGS, Context, Deck, Directive, Statement
+from fingerspice.netlist.reader import MAX_WARNINGS, Context, Deck, Directive, Statement, text_of
 from fingerspice.netlist.sources import read_source
 from fingerspice.waveforms.waveform import DC, Waveform, check_range, refuse
 
@@ -55,7 +55,7 @@ def read_netlist(path: str | Path) -> Circuit:
     """
     if not isinstance(path, str | os.PathLike):
         raise InputError(f"read_netlist is given {path!r}; allowed: the path of a netlist, such as 'deck.cir'")
-    return _circuit(read_deck(path))
+    return _circuit(parse_deck(*text_of(Path(path))))
 
 
 def parse_netlist(text: str, path: str | Path | None = None) -> Circuit:
@@ -126,11 +126,9 @@ def _unusual(
         period = e.waveform.period if e.waveform is not None else None
         # A source whose frequency is unusual has a warning already.
         if tran is not None and period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
-            step, longest = format_si(tran.step, "s"), format_si(period, "s")
-            yield (
-                f"{deck.named('.tran')[0].where}: {e.name}: TSTEP is {step}, longer than this source's period of "
-                f"{longest}: the outputs do not show its course, and the figures of a run still do"
-            )
+            place, step, longest = deck.named(".tran")[0].where, format_si(tran.step, "s"), format_si(period, "s")
+            note = f"{place}: {e.name}: TSTEP is {step}, longer than this source's period of {longest}"
+            yield f"{note}: the outputs do not show its course, and the figures of a run still do"
 
 
 def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Waveform:
@@ -170,10 +168,7 @@ def sweep_from_text(text: str) -> AcSweep:
 
 
 def read_elements(statement: Statement, context: Context, notes: list[str]) -> list[Element]:
-    """The element of a statement, and the elements for LTspice's ``Rser``, ``Rpar`` and ``Cpar``.
-
-    Warnings are added to `notes`.
-    """
+    """The element of a statement, and those for LTspice's ``Rser``, ``Rpar`` and ``Cpar``; `notes` gets warnings."""
     name, device, nodes, names, _, params, where = statement
     beside = {key: params[key] for key in DEVICES[device].beside if key in params}
     own = statement._replace(params={k: v for k, v in params.items() if k not in beside})
@@ -188,8 +183,7 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
         values = _device_values(own, notes)
     element = Element(name, device, nodes, names, MappingProxyType(values), where=where, **read)
     for parameter, text in unusual(element):
-        named = params.get(parameter)
-        given = statement.body[0] if parameter == "value" and statement.body else named
+        given = statement.body[0] if parameter == "value" and statement.body else params.get(parameter)
         # One warning per number is enough.
         if not (isinstance(given, Number) and any(_doubts(given, element.spec.parameter(parameter)))):
             notes.append(f"{where if given is None else given.where}: {text}")
@@ -217,8 +211,7 @@ def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
         if key not in known:
             # On an X line m=... is ngspice's number of copies.
             hint = "; the exponent is m_exp" if key == _COPIES and "m_exp" in known else nearest(key, known)
-            problem = f"{name}: {device} has no parameter {key!r}{hint}; allowed: {', '.join(known)}"
-            raise InputError(problem, given.key)
+            raise InputError(f"{name}: {device} has no parameter {key!r}{hint}; allowed: {', '.join(known)}", given.key)
     values = {}
     for key, spec in known.items():
         if key in params:
@@ -292,10 +285,7 @@ def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]
 
 
 def read_tran(directive: Directive, notes: list[str]) -> Tran:
-    """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``, and LTspice's ``.tran TSTOP`` and ``.tran 0 TSTOP [TSTART [TMAX]]``.
-
-    If no TSTEP is given, a warning with the TSTEP that is used is added to `notes`.
-    """
+    """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``; LTspice's may lack TSTEP, of which `notes` gets a warning."""
     usage = ".tran TSTEP TSTOP [TSTART [TMAX]] [uic]"
     numbers, words = _numbers(directive, usage)
     for word in words:
@@ -314,10 +304,8 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
     if step is None:
         every = stop.value / LTSPICE_OUTPUTS
         step = Number(every, f"{every:g}", directive.where)
-        notes.append(
-            f"{directive.where}: {directive.text.strip()!r} has no TSTEP, which LTspice does not need: "
-            f"{LTSPICE_OUTPUTS:,} outputs, one every {every:g} s"
-        )
+        note = f"{directive.where}: {directive.text.strip()!r} has no TSTEP, which LTspice does not need"
+        notes.append(f"{note}: {LTSPICE_OUTPUTS:,} outputs, one every {every:g} s")
     _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
     _require(1e-30 <= step.value <= 1e30, "TSTEP", step, "1e-30 to 1e30 s")
     _require(step.value <= stop.value, "TSTEP", step, f"at most TSTOP = {stop.text} (the output step comes first)")

@@ -144,10 +144,9 @@ def library_changed(root: Path, folder: Path, name: str) -> bool:
 
 
 def _similar_file(path: Path, shown: str, root: Path | None) -> str:
-    """The clause ``; did you mean 'folder/file'?`` for a missing file, or an empty text.
+    """The clause ``; did you mean 'folder/file'?`` for a missing file, written as its name is, or an empty text.
 
-    The search goes through the file's folder or, if that is missing, the folder with the nearest name, and then through
-    the parent folder. The proposal is written relative to the same folder as the missing file's name.
+    The search goes through the file's folder, or else that with the nearest name, and then through the parent folder.
     """
     folder, below = path.parent, [path.name]
     while not folder.is_dir() and folder != folder.parent:
@@ -159,8 +158,7 @@ def _similar_file(path: Path, shown: str, root: Path | None) -> str:
     found = _nearest_path(folder, below) or _nearest_path(folder, below[-1:])
     # A library of native devices is built in and need not exist in the folder: propose it, too.
     names = [*([found[-1]] if found else []), *(LIBRARIES.values() if root is not None else ())]
-    name = closest(path.name, names)
-    if found is not None and name in (found[-1], None):
+    if found is not None and closest(path.name, names) in (found[-1], None):
         return f"; did you mean '{PurePath(*written, *found).as_posix()}'?"
     return nearest(path.name, names)
 

@@ -283,15 +283,11 @@ def _differences(key: str, waveform: Waveform, call: Call) -> list[str]:
     """Warnings about numbers that ngspice 39 or LTspice reads differently, or that were left out."""
     if isinstance(waveform, Exp) and 0.0 in (waveform.td1, waveform.td2):
         which = " and ".join(n for n, x in (("TD1", waveform.td1), ("TD2", waveform.td2)) if x == 0.0)
-        return [
-            f"{key.upper()} has {which} = 0, which is 0 s here and not in ngspice 39, which takes TSTEP for TD1 = 0 "
-            "and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once"
-        ]
+        note = f"{key.upper()} has {which} = 0, which is 0 s here and not in ngspice 39, which takes TSTEP for TD1 = 0"
+        return [f"{note} and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once"]
     if isinstance(waveform, Sine) and len(call.args) < 3:
-        return [
-            f"{call.text.upper()} leaves out FREQ, which is 1/TSTOP then, {waveform.frequency:g} Hz; its values are VO "
-            "VA FREQ"
-        ]
+        note = f"{call.text.upper()} leaves out FREQ, which is 1/TSTOP then, {waveform.frequency:g} Hz"
+        return [f"{note}; its values are VO VA FREQ"]
     later = [arg.text for arg in call.args[2::2] if isinstance(arg, Number) and arg.text.startswith("+")]
     if key == "pwl" and later:
         return [f"the time {later[0]} is counted from 0, as in ngspice; LTspice counts it from the point before"]

@@ -76,9 +76,8 @@ class Columns:
         """Index of a column given by its name, of which there has to be one, or by its number."""
         count = self.data.shape[1]
         if isinstance(column, str):
-            if not self.names:
-                raise InputError(f"'{self.file}' has no header that names a column {column!r}; allowed: its number, "
-                                 f"0 to {count - 1}")  # fmt: skip
+            problem = f"'{self.file}' has no header that names a column {column!r}"
+            refuse(not self.names, f"{problem}; allowed: its number, 0 to {count - 1}")
             exact = [i for i, name in enumerate(self.names) if name == column]
             found = exact or [i for i, name in enumerate(self.names) if name.lower() == column.lower()]
             if len(found) != 1:
@@ -384,9 +383,8 @@ def read_table(
         raise InputError(f"'{path}': the rate given is {rate:g} Hz, and its own is {own_rate:g} Hz; allowed: one rate")
     rate = own_rate if rate is None else positive_number(f"'{path}': the rate", rate, "Hz")
     columns = found.data.shape[1]
-    if rate is None and columns == 1:
-        raise InputError(f"'{path}' has one column and no rate; allowed: a column of times too, or rate= in Hz; "
-                         "PWL FILE= takes alternating times and values")  # fmt: skip
+    allowed = "a column of times too, or rate= in Hz; PWL FILE= takes alternating times and values"
+    refuse(rate is None and columns == 1, f"'{path}' has one column and no rate; allowed: {allowed}")
     # A column that is named as times is one even beside a rate, which it may contradict.
     named = [i for i, name in enumerate(found.names) if name.lower() in _TIME_NAMES]
     if rate is not None and not (columns > 1 and (named or (columns == 2 and value is None))):

@@ -23,7 +23,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.engine.collocation.readout import SAME_TIME
 from fingerspice.numerics import chebyshev
 from fingerspice.waveforms.periodic import Ramps, in_windows, runs_through
-from fingerspice.waveforms.waveform import DOUBLE, Waveform, require
+from fingerspice.waveforms.waveform import DOUBLE, Waveform, refuse, require
 
 _PERIODS_PER_SEGMENT = 64.0  #: Longest segment of an oscillation: a phase's rounding error grows with it.
 _AT_ONCE = 1024  # Number of times compared between two looks whether one has missed.
@@ -101,8 +101,7 @@ class Function(Waveform):
     def _edges(self, t0: float, t1: float) -> FloatArray:
         if self.repeat is None or not self.breaks:
             return np.array(self.breaks)
-        runs = runs_through(self.repeat, len(self.breaks), t0, t1)
-        return np.unique(runs * self.repeat + np.array(self.breaks))
+        return np.unique(runs_through(self.repeat, len(self.breaks), t0, t1) * self.repeat + np.array(self.breaks))
 
     def breakpoint_rate(self) -> float:
         return len(self.breaks) / self.repeat if self.repeat else 0.0
@@ -288,8 +287,7 @@ class Refiner:
         # The ends of a window are breakpoints, where the waveform may jump: series use interior points only.
         longest = min(_LONGEST * self.step, 2.0 * self.waveform.shortest_time())
         count = max(1, math.ceil((b - a) / longest))
-        cuts = np.linspace(a, b, count + 1).tolist()
-        waiting = [_Interval(lo, hi) for lo, hi in itertools.pairwise(cuts)][::-1]
+        waiting = [_Interval(lo, hi) for lo, hi in itertools.pairwise(np.linspace(a, b, count + 1).tolist())][::-1]
         self.allowed += _MOST_DEEP_EACH * count
         while waiting:
             piece = waiting.pop()
@@ -381,17 +379,13 @@ class Refiner:
         i = int(np.argmax(np.abs(again - values)))
         remedy = "of noise draw the values once and give fs.Samples(values, rate)"
         # A function of arrays may sum in another order at the second call, so allow the last digits to differ.
-        if abs(again[i] - values[i]) > self._roughest:
-            raise InputError(
-                f"the source function gives {values[i]:.4g} V and then {again[i]:.4g} V at the same t = {t[i]:.9g} s; "
-                f"allowed: the same value at the same time; {remedy}"
-            )
-        if self.deep == self.allowed:
-            raise InputError(
-                f"the source function is too rough to be followed near t = {piece.lo:.9g} s: {self.deep} pieces as "
-                f"short as {piece.hi - piece.lo:.2g} s were not smooth; allowed: smooth between jumps that are few, or "
-                f"declared by Function(f, breaks=(...)); {remedy}"
-            )
+        said = f"gives {values[i]:.4g} V and then {again[i]:.4g} V at the same t = {t[i]:.9g} s"
+        problem = f"the source function {said}; allowed: the same value at the same time; {remedy}"
+        refuse(abs(again[i] - values[i]) > self._roughest, problem)
+        said = f"{self.deep} pieces as short as {piece.hi - piece.lo:.2g} s were not smooth"
+        problem = f"the source function is too rough to be followed near t = {piece.lo:.9g} s: {said}"
+        allowed = "smooth between jumps that are few, or declared by Function(f, breaks=(...))"
+        refuse(self.deep == self.allowed, f"{problem}; allowed: {allowed}; {remedy}")
 
     @property
     def _roughest(self) -> float:
@@ -421,15 +415,11 @@ class Refiner:
         if real:
             t, dv = real[0]
             more = f" and {len(real) - 1} more times" if len(real) > 1 else ""
-            told.append(
-                f"the source function jumps by {dv:.4g} V at t = {t:.9g} s{more}; it was not declared: "
-                "give Function(f, breaks=(...)) the times for exact edges"
-            )
+            said = f"the source function jumps by {dv:.4g} V at t = {t:.9g} s{more}"
+            told.append(f"{said}; it was not declared: give Function(f, breaks=(...)) the times for exact edges")
         if apart:
-            told.append(
-                f"the source function has a feature narrower than the output step {self.step:.3g} s "
-                f"near t = {min(apart):.9g} s; it was resolved where it was seen, but others may be missed: "
-                "give Function(f, breaks=(...)) its edges"
-            )
+            said = f"has a feature narrower than the output step {self.step:.3g} s near t = {min(apart):.9g} s"
+            advice = "others may be missed: give Function(f, breaks=(...)) its edges"
+            told.append(f"the source function {said}; it was resolved where it was seen, but {advice}")
         for text in told:
             warnings.warn(text, FingerspiceWarning, stacklevel=2)

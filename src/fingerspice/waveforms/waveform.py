@@ -175,10 +175,7 @@ class Waveform:
         return float(np.max([size.max(), *at_breakpoints]))
 
     def cancelling(self, t0: float, t1: float) -> float:
-        """Sum of the peaks (V) over [t0, t1] of parts that may cancel in U; 0 for a waveform of one part.
-
-        Rounding errors of U are relative to this sum.
-        """
+        """Sum of the peaks (V) over [t0, t1] of parts that may cancel in U, for rounding errors; 0 of one part."""
         return 0.0
 
     def __add__(self, other: Waveform | float) -> Waveform:
