@@ -172,10 +172,8 @@ class Flattener:
         if called is None and native not in layer_devices():
             raise InputError(_unknown_device(plain, instance), device.where)
         shown, wanted = (called.name, called.ports) if called else (native, DEVICES[native].nodes)
-        if len(nodes) != len(wanted):
-            count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}"
-            names = f" ({' '.join(wanted)})" if wanted else ""
-            raise InputError(f"{name}: {shown} has {count}{names}, {len(nodes)} given", device.where)
+        count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}" + (f" ({' '.join(wanted)})" if wanted else "")
+        refuse(len(nodes) != len(wanted), f"{name}: {shown} has {count}, {len(nodes)} given", device.where)
         if called is None:
             canonical, written = zip(*instance.nodes(nodes), strict=True)
             params = scope.pairs(words, bare="arithmetic")

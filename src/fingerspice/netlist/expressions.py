@@ -474,9 +474,8 @@ def definitions(line: Line, start: int) -> list[Assignment]:
             raise InputError(problem, line.where(match.start()))
     ends = [*(key.position for key, _ in keys), len(line.text)]
     before = line.text[start : ends[0]].strip(" \t,")
-    if before or not keys:
-        given = f"'{before}'" if before else "nothing"
-        raise InputError(f".param is followed by {given}: write .param name=value", line.where(start))
+    given = f"'{before}'" if before else "nothing"
+    refuse(before or not keys, f".param is followed by {given}: write .param name=value", line.where(start))
     out = []
     for (key, begin), end in zip(keys, ends[1:], strict=True):
         raw = line.text[begin:end]
@@ -485,10 +484,9 @@ def definitions(line: Line, start: int) -> list[Assignment]:
         value = Lexeme("word", text, begin + len(raw) - len(raw.lstrip(" \t,")), line)
         if text[0] in "{'":
             closing = "}" if text[0] == "{" else "'"
-            if len(text) < 2 or text[-1] != closing:
-                known = closing in text[1:]
-                problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
-                raise InputError(problem, value.where)
+            known = closing in text[1:]
+            problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
+            refuse(len(text) < 2 or text[-1] != closing, problem, value.where)
             value = value._replace(kind="expression", text=text[1:-1])
         out.append(Assignment(key, value))
     return out

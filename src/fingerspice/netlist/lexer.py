@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
+from fingerspice.waveforms.waveform import refuse
 
 # Hints
 
@@ -151,8 +152,7 @@ def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]
             continue
         column = 1 + len(text) - len(bare)
         if bare[0] == "+":
-            if not texts:
-                raise InputError("'+' continues the line before, but there is none", Where(file, number, column))
+            refuse(not texts, "'+' continues the line before, but there is none", Where(file, number, column))
             column, bare = column + 1, bare[1:]
         elif texts:
             yield Line(file, " ".join(texts), tuple(parts))
@@ -170,15 +170,13 @@ def lex(line: Line, start: int = 0) -> list[Lexeme]:
         match = _LEX.match(text, position)
         if match is None:
             opening, depth = text[position], 0
-            if opening != "{":
-                problem = "'}' without an opening '{'" if opening == "}" else f"{opening} is never closed"
-                raise InputError(problem, line.where(position))
+            problem = "'}' without an opening '{'" if opening == "}" else f"{opening} is never closed"
+            refuse(opening != "{", problem, line.where(position))
             for brace in _BRACE.finditer(text, position):
                 depth += 1 if brace.group() == "{" else -1
                 if depth == 0:
                     break
-            if depth != 0:
-                raise InputError("'{' is never closed", line.where(position))
+            refuse(depth != 0, "'{' is never closed", line.where(position))
             lexemes.append(Lexeme("expression", text[position + 1 : brace.start()], position, line))
             position = brace.end()
             continue
@@ -218,14 +216,11 @@ def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Gro
         elif lexeme.kind == "=":
             raise InputError("the name before '=' is missing", lexeme.where)
         elif lexeme.kind == ")":
-            if not brackets:
-                raise InputError("')' without an opening '('", lexeme.where)
+            refuse(not brackets, "')' without an opening '('", lexeme.where)
             inside = brackets.pop()[1]
         elif following == "(" and lexeme.kind == "word" and not _NUMERIC.match(lexeme.text) and len(top.words) >= plain:
-            if inside is not top:
-                name = lexeme.text
-                problem = f"'{name}(' inside brackets: arithmetic goes in braces, as in {{{name}(...)}}"
-                raise InputError(problem, lexeme.where)
+            problem = f"'{lexeme.text}(' inside brackets: arithmetic goes in braces, as in {{{lexeme.text}(...)}}"
+            refuse(inside is not top, problem, lexeme.where)
             brackets.append((lexemes[after], inside))
             inside = Group(lexeme)
             top.words.append(inside)

@@ -53,8 +53,8 @@ def read_netlist(path: str | Path) -> Circuit:
     InputError
         If the file cannot be read or has an error; the message gives its place and the allowed alternatives.
     """
-    if not isinstance(path, str | os.PathLike):
-        raise InputError(f"read_netlist is given {path!r}; allowed: the path of a netlist, such as 'deck.cir'")
+    problem = f"read_netlist is given {path!r}; allowed: the path of a netlist, such as 'deck.cir'"
+    refuse(not isinstance(path, str | os.PathLike), problem)
     return _circuit(parse_deck(*text_of(Path(path))))
 
 
@@ -126,7 +126,8 @@ def _unusual(
         period = e.waveform.period if e.waveform is not None else None
         # A source whose frequency is unusual has a warning already.
         if tran is not None and period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
-            place, step, longest = deck.named(".tran")[0].where, format_si(tran.step, "s"), format_si(period, "s")
+            step, longest = format_si(tran.step, "s"), format_si(period, "s")
+            place = str(deck.named(".tran")[0].where)
             note = f"{place}: {e.name}: TSTEP is {step}, longer than this source's period of {longest}"
             yield f"{note}: the outputs do not show its course, and the figures of a run still do"
 
@@ -203,9 +204,8 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
 
 
 def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
-    name, device, params = statement.name, statement.device, statement.params
-    if statement.nodes[2] == "0":
-        raise InputError(f"{name} has ground as its area; allowed: the area node of a GAP", statement.where)
+    name, device, params, where = statement.name, statement.device, statement.params, statement.where
+    refuse(statement.nodes[2] == "0", f"{name} has ground as its area; allowed: the area node of a GAP", where)
     known = {p.name: p for p in DEVICES[device].parameters}
     for key, given in params.items():
         if key not in known:
@@ -220,7 +220,7 @@ def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
             values[key] = spec.default
         else:
             unit = f" ({spec.unit})" if spec.unit else ""
-            raise InputError(f"{name}: {device} needs {key}{unit}, missing here", statement.where)
+            raise InputError(f"{name}: {device} needs {key}{unit}, missing here", where)
     return values
 
 

@@ -163,6 +163,7 @@ class Function(NamedTuple):
     refused: str = ""  # Why it is refused in decks, which a SPICE may read, too; --source takes it
 
 
+_CHANGED = "changed its argument order between ngspice versions; write the waveform as PWL"
 #: Source functions by name; an entry is all that a new source function needs.
 SOURCES: Mapping[str, Function] = {
     "sin": Function(_sin, "VO VA FREQ TD THETA PHASE", 2, counted=True),
@@ -174,9 +175,7 @@ SOURCES: Mapping[str, Function] = {
     "sawtooth": Function(_plain(Sawtooth), "amplitude frequency", 2),
     "chirp": Function(_plain(Chirp), "amplitude f0 f1 duration", 4),
     "am": Function(
-        _plain(AM), "amplitude carrier envelope depth", 3,
-        refused="AM changed its argument order between ngspice versions; write the waveform as PWL, or give it by "
-        "--source",
+        _plain(AM), "amplitude carrier envelope depth", 3, refused=f"AM {_CHANGED}, or give it by --source",
     ),
     "burst": Function(_burst, "amplitude frequency cycles every", 3),
     "wavefile": Function(
@@ -190,7 +189,6 @@ SOURCES: Mapping[str, Function] = {
 }  # fmt: skip
 _KNOWN = ", ".join(name.upper() for name, function in SOURCES.items() if not function.refused)
 _LEVELS = {"dc": "DC value", "ac": "AC [magnitude [phase]]"}  #: What is no source function, with what is allowed.
-_SFFM = "SFFM changed its argument order between ngspice versions; write the waveform as PWL"
 _ALIASES = {"sine": "sin", "wav": "wavefile"}  #: Names in LTspice, and a short one for the command line.
 
 
@@ -268,7 +266,7 @@ def _words(statement: Statement) -> list[Word]:
 
 def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
     function = SOURCES.get(key)
-    refused = _SFFM if key == "sffm" else function.refused if function and context.in_deck else ""
+    refused = f"SFFM {_CHANGED}" if key == "sffm" else function.refused if function and context.in_deck else ""
     refuse(refused, f"{name}: {refused}", call.where)
     if function is None:
         hint = nearest(key, SOURCES)

@@ -80,9 +80,8 @@ class Columns:
             refuse(not self.names, f"{problem}; allowed: its number, 0 to {count - 1}")
             exact = [i for i, name in enumerate(self.names) if name == column]
             found = exact or [i for i, name in enumerate(self.names) if name.lower() == column.lower()]
-            if len(found) != 1:
-                what = "several columns" if found else "no column"
-                raise InputError(f"'{self.file}' has {what} {column!r}; it has {self.listed()}")
+            what = "several columns" if found else "no column"
+            refuse(len(found) != 1, f"'{self.file}' has {what} {column!r}; it has {self.listed()}")
             return found[0]
         if not (column == int(column) and 0 <= column < count):
             raise InputError(f"'{self.file}' has no column {column}; it has {self.listed()}")
@@ -459,12 +458,12 @@ def _npz_columns(path: Path) -> tuple[Columns, float | None]:
     # Exceptions of zipfile and NumPy for broken files, and for arrays of objects, which NumPy refuses to load.
     except (ValueError, OSError, zipfile.BadZipFile, EOFError, KeyError, MemoryError, NotImplementedError) as error:
         raise InputError(f"'{path}' cannot be read as NPZ: {str(error).partition('. ')[0]}") from None
-    if size > 8 * MAX_SAMPLES:
-        raise InputError(f"'{path}' unpacks to {size / 1e9:.3g} GB; allowed: at most {8e-9 * MAX_SAMPLES:g} GB")
+    most = 8 * MAX_SAMPLES
+    refuse(size > most, f"'{path}' unpacks to {size / 1e9:.3g} GB; allowed: at most {1e-9 * most:g} GB")
     for name, array in loaded.items():
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
-            kind = getattr(array, "dtype", "another kind")
-            raise InputError(f"'{path}': the array {name!r} is of {kind}; allowed: real numbers")
+        kind = getattr(array, "dtype", "another kind")
+        real = isinstance(array, np.ndarray) and array.dtype.kind in "iuf"
+        refuse(not real, f"'{path}': the array {name!r} is of {kind}; allowed: real numbers")
         if array.ndim == 0 and name.lower() in _RATE_NAMES:
             rate = float(array)
         elif array.ndim == 1:
