@@ -80,10 +80,9 @@ _POWERS = ("^", "**")
 _OPERATORS = frozenset(("?", ":", *_POWERS, *(sign for level in _LEVELS for sign in level)))
 
 _LEX = re.compile(
-    r"(?P<space>\s+)"
-    r"|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[\w.]*)"
+    r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[\w.]*)"
     r"|(?P<name>[A-Za-z_]\w*)"
-    r"|(?P<op>\*\*|&&|\|\||[<>=!]=|[-+*/^<>(),?:])|(?P<other>.)"
+    r"|(?P<op>\*\*|&&|\|\||[<>=!]=|[-+*/^<>(),?:])|(?P<other>\S))"
 )
 
 
@@ -108,16 +107,16 @@ class Expression:
         self._pieces: list[_Piece] = []
         self._at = questions = 0
         self._brackets: list[tuple[_Piece, bool]] = []  # open, each with whether it encloses a function's arguments
-        for match in _LEX.finditer(text):
-            kind, found, position = match.lastgroup or "", match.group(), match.start()
+        for match in _LEX.finditer(text.rstrip()):
+            kind = match.lastgroup or ""
+            found, position = match[kind], match.start(kind)
             if kind == "other":
                 hint = ": a comparison is ==" if found == "=" else ""
                 raise Problem(f"{found!r} does not belong in arithmetic{hint}", position)
             questions += found == "?"
             if questions > MAX_QUESTIONS:
                 raise Problem(f"more than {MAX_QUESTIONS} '?' in one expression", position)
-            if kind != "space":
-                self._pieces.append(_Piece(kind, found, position))
+            self._pieces.append(_Piece(kind, found, position))
             if kind == "number" and self.mega is None and suspicious_mega(found):
                 self.mega = found, position
         self._pieces.append(_Piece("end", "", len(text)))
@@ -136,18 +135,16 @@ class Expression:
     def _refuse_going_on(self) -> None:
         """Refuse what cannot follow a complete value."""
         kind, text, position = self._pieces[self._at]
-        if kind == "end":
-            if self._brackets:
-                raise Problem("'(' is never closed", self._brackets[-1][0].position)
-        elif text == ")":
-            if not self._brackets:
-                raise Problem("')' without an opening '('", position)
-        elif text == ":":
+        if kind == "end" and self._brackets:
+            raise Problem("'(' is never closed", self._brackets[-1][0].position)
+        if text == ")" and not self._brackets:
+            raise Problem("')' without an opening '('", position)
+        if text == ":":
             raise Problem("':' without its '?' (a ? b : c)", position)
-        elif text != ",":
-            raise Problem(f"an operator is missing before '{text}'", position)
-        elif not (self._brackets and self._brackets[-1][1]):
+        if text == "," and not (self._brackets and self._brackets[-1][1]):
             raise Problem("',' outside the arguments of a function", position)
+        if text not in ("", ")", ","):
+            raise Problem(f"an operator is missing before '{text}'", position)
 
     def _condition(self) -> Term:
         """`a ? b : c`; conditions after `:` group to the right."""
@@ -299,7 +296,6 @@ def evaluated(text: str, names: Mapping[str, float], place: Callable[[int], Wher
 
 
 # Words
-
 _NUMERIC = re.compile(r"[+-]|\.?[0-9]")
 _FILE_NAME = re.compile(r".*[/\\].*|.*\.[A-Za-z]\w*")
 _PLAIN_NUMBER = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?[A-Za-z]*")

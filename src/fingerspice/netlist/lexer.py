@@ -17,7 +17,6 @@ from fingerspice.base.errors import InputError, Where
 from fingerspice.waveforms.waveform import refuse
 
 # Hints
-
 _LISTS = re.compile(r"\{[^{}]*\}|'[^']*'|\"[^\"]*\"")
 _CALL = re.compile(r"\(([^()]*)\)")
 _COMMA = re.compile(r"(?<![\w.,])([+-]?[0-9]+),([0-9]+[a-zµμ]*)(?![\w.,])", re.IGNORECASE)
@@ -69,7 +68,6 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 # Lines
-
 #: As in ngspice a `;`, a `//` after a blank, or a `$` between blanks starts a comment, except in double quotes.
 _COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)//|(?<!\S)\$(?!\S))')
 _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
