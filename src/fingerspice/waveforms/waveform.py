@@ -69,8 +69,8 @@ class Waveform:
         for name, unit in self.units.items():
             what = f"{type(self).__name__} {name}"
             value = real_number(what, getattr(self, name), f"a number of {unit}" if unit else "a number")
-            if not (math.isfinite(value) or (value == math.inf and name in self._endless)):
-                raise InputError(f"{what} is {value}; allowed: a finite number")
+            fine = math.isfinite(value) or (value == math.inf and name in self._endless)
+            require(fine, what, value, "a finite number")
             largest, smallest = RANGES.get(unit, ANY_RANGE)
             if value != 0.0 and not smallest <= abs(value) <= largest:
                 check_range(what, value, unit)
