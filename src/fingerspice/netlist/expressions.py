@@ -36,6 +36,11 @@ class Problem(Exception):
         self.message, self.position = message, position
 
 
+def _refuse(wrong: object, message: str, position: int = 0) -> None:
+    if wrong:
+        raise Problem(message, position)
+
+
 def _power(base: float, exponent: float) -> float:
     """`base ^ exponent`; a negative base needs an even exponent, as ngspice takes the base's absolute value."""
     if base < 0.0 and exponent % 2.0 != 0.0:
@@ -45,8 +50,7 @@ def _power(base: float, exponent: float) -> float:
 
 
 def _pwr(base: float, exponent: float) -> float:
-    if base < 0.0:
-        raise Problem("pwr of a negative base differs between simulators: write pow(x, y) or pow(abs(x), y)")
+    _refuse(base < 0.0, "pwr of a negative base differs between simulators: write pow(x, y) or pow(abs(x), y)")
     return math.pow(base, exponent)
 
 
@@ -99,8 +103,7 @@ class Expression:
     """
 
     def __init__(self, text: str) -> None:
-        if len(text) > MAX_LENGTH:
-            raise Problem(f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
+        _refuse(len(text) > MAX_LENGTH, f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
         self.text = text
         self.names: dict[str, int] = {}  # In lower case, constants included, and the position of each one's first use
         self.mega: tuple[str, int] | None = None  # The first number written with a capital M, and its position
@@ -114,8 +117,7 @@ class Expression:
                 hint = ": a comparison is ==" if found == "=" else ""
                 raise Problem(f"{found!r} does not belong in arithmetic{hint}", position)
             questions += found == "?"
-            if questions > MAX_QUESTIONS:
-                raise Problem(f"more than {MAX_QUESTIONS} '?' in one expression", position)
+            _refuse(questions > MAX_QUESTIONS, f"more than {MAX_QUESTIONS} '?' in one expression", position)
             self._pieces.append(_Piece(kind, found, position))
             if kind == "number" and self.mega is None and suspicious_mega(found):
                 self.mega = found, position
@@ -137,14 +139,11 @@ class Expression:
         kind, text, position = self._pieces[self._at]
         if kind == "end" and self._brackets:
             raise Problem("'(' is never closed", self._brackets[-1][0].position)
-        if text == ")" and not self._brackets:
-            raise Problem("')' without an opening '('", position)
-        if text == ":":
-            raise Problem("':' without its '?' (a ? b : c)", position)
+        _refuse(text == ")" and not self._brackets, "')' without an opening '('", position)
+        _refuse(text == ":", "':' without its '?' (a ? b : c)", position)
         if text == "," and not (self._brackets and self._brackets[-1][1]):
             raise Problem("',' outside the arguments of a function", position)
-        if text not in ("", ")", ","):
-            raise Problem(f"an operator is missing before '{text}'", position)
+        _refuse(text not in ("", ")", ","), f"an operator is missing before '{text}'", position)
 
     def _condition(self) -> Term:
         """`a ? b : c`; conditions after `:` group to the right."""
@@ -189,13 +188,11 @@ class Expression:
         begin, negative = self._at, False
         while (sign := self._take("+", "-")) is not None:
             negative ^= sign.text == "-"
-            if self._at - begin > MAX_SIGNS:
-                raise Problem(f"more than {MAX_SIGNS} signs in a row", sign.position)
+            _refuse(self._at - begin > MAX_SIGNS, f"more than {MAX_SIGNS} signs in a row", sign.position)
         end, value = self._at, self._value()
         power = self._take(*_POWERS)
         if power is not None:
-            if of_power:  # ngspice groups to the left, and mathematics to the right
-                raise Problem("a second '^' in a row has two readings: use brackets", power.position)
+            _refuse(of_power, "a second '^' in a row has two readings: use brackets", power.position)
             value = partial(_folded, value, [(_power, self._signed(of_power=True))])
         for index in range(max(begin, 1), end):
             before, sign, number, after = self._pieces[index - 1 : index + 3]
@@ -210,8 +207,7 @@ class Expression:
         kind, text, position = piece = self._pieces[self._at]
         if text == "(":
             return self._in_brackets(False)[0]
-        if kind == "op":
-            raise Problem(f"a value is missing before '{text}'", position)
+        _refuse(kind == "op", f"a value is missing before '{text}'", position)
         if kind == "end":
             self._refuse_going_on()
             raise Problem("a value is missing at the end" if self._at else "the expression is empty", position)
@@ -238,8 +234,7 @@ class Expression:
         """The expressions in brackets: one, or a function's arguments."""
         opening = self._pieces[self._at]
         self._brackets.append((opening, of_call))
-        if len(self._brackets) > MAX_DEPTH:
-            raise Problem(f"brackets nested deeper than {MAX_DEPTH}", opening.position)
+        _refuse(len(self._brackets) > MAX_DEPTH, f"brackets nested deeper than {MAX_DEPTH}", opening.position)
         terms: list[Term] = []
         while self._pieces[self._at].text != ")" or not terms:
             self._at += 1  # the opening bracket, or a comma

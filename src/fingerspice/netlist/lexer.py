@@ -5,7 +5,6 @@ Nothing here depends on the meaning of a word: the callers distinguish names, va
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import re
 from bisect import bisect_right
@@ -14,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
+from fingerspice.circuit.circuit import nearest as most_alike
 from fingerspice.waveforms.waveform import refuse
 
 # Hints
@@ -54,11 +54,8 @@ def is_unit(word: str) -> bool:
 
 def closest(word: str, known: Iterable[str]) -> str | None:
     """The known word whose spelling is nearest to `word`, regardless of case; None if none is similar."""
-    if len(word) > MAX_COMPARED:
-        return None
-    lower = {name.lower(): name for name in itertools.islice(known, MAX_KNOWN) if len(name) <= MAX_COMPARED}
-    close = difflib.get_close_matches(word.lower(), lower, n=1)
-    return lower[close[0]] if close else None
+    short = [name for name in itertools.islice(known, MAX_KNOWN) if len(name) <= MAX_COMPARED]
+    return None if len(word) > MAX_COMPARED else most_alike(word, short, least=0.6)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

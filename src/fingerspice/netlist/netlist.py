@@ -140,11 +140,11 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
     """
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
-    context = Context(tran, in_deck=False, anywhere=files)
+    context, notes = Context(tran, in_deck=False, anywhere=files), list[str]()
     try:
         deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
         refuse(len(deck.statements) != 1, "not one source; allowed: such as SQUARE(200 100)")
-        waveform, ac, notes = read_source(deck.statements[0]._replace(name="source"), context)
+        waveform, ac = read_source(deck.statements[0]._replace(name="source"), context, notes)
         refuse(ac is not None, "AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
     except InputError as error:
         comma = decimal_comma(f"V1 a 0 {text}")
@@ -176,8 +176,7 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
     read: dict[str, Any] = {}
     values: dict[str, float] = {}
     if device in "VI":
-        read["waveform"], read["ac"], differences = read_source(own, context)
-        notes.extend(differences)
+        read["waveform"], read["ac"] = read_source(own, context, notes)
     elif device in "RC":
         values, read["initial"] = _read_passive(own, notes)
     else:

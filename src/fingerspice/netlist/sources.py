@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -131,9 +131,8 @@ def _wavefile(a: _Arguments) -> Waveform:
 
 
 def _table(a: _Arguments) -> Waveform:
-    path = a.file()
-    rate = a.get("rate") if "rate" in a.words else None
-    values, rate, times = read_table(path, a.column("time"), a.column("value"), rate)
+    path, given = a.file(), a.get("rate") if "rate" in a.words else None
+    values, rate, times = read_table(path, a.column("time"), a.column("value"), given)
     if rate is not None:
         return a.upsampled(Samples(values, rate))
     refuse("upsample" in a.words, "TABLE upsample goes with a rate, and this table has times", a.call.where)
@@ -192,15 +191,15 @@ _LEVELS = {"dc": "DC value", "ac": "AC [magnitude [phase]]"}  #: What is no sour
 _ALIASES = {"sine": "sin", "wav": "wavefile"}  #: Names in LTspice, and a short one for the command line.
 
 
-def read_source(statement: Statement, context: Context) -> tuple[Waveform, SmallSignal | None, list[str]]:
-    """Waveform and small signal of a V or I element, and warnings about words that ngspice reads differently.
+def read_source(statement: Statement, context: Context, notes: list[str]) -> tuple[Waveform, SmallSignal | None]:
+    """Waveform and small signal of a V or I element; `notes` gets warnings about what ngspice reads differently.
 
     The words after its nodes are ``[DC] value``, ``AC ...`` and at most one source function.
     """
     level: float | None = None
     ac: SmallSignal | None = None
     waveform: Waveform | None = None
-    name, words, notes = statement.name, deque(_words(statement)), list[str]()
+    name, words = statement.name, deque(_words(statement))
     while words:
         word = words.popleft()
         if isinstance(word, Number):
@@ -233,10 +232,10 @@ def read_source(statement: Statement, context: Context) -> tuple[Waveform, Small
             raise InputError(f"{name} has two source functions, the second is {key.upper()}", word.where)
         else:
             waveform = _read_call(name, key, word, context)
-            notes = [f"{word.where}: {name}: {note}" for note in _differences(key, waveform, word)]
+            notes.extend(f"{word.where}: {name}: {note}" for note in _differences(key, waveform, word))
     if waveform is None and level is None and ac is None:
         raise InputError(f"{name} has no value; allowed: a number or one of {_KNOWN}", statement.where)
-    return waveform if waveform is not None else DC(level or 0.0), ac, notes
+    return waveform if waveform is not None else DC(level or 0.0), ac
 
 
 def _words(statement: Statement) -> list[Word]:
@@ -277,16 +276,15 @@ def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
         raise error if error.where else InputError(f"{name}: {error.message}", call.where) from None
 
 
-def _differences(key: str, waveform: Waveform, call: Call) -> list[str]:
+def _differences(key: str, waveform: Waveform, call: Call) -> Iterator[str]:
     """Warnings about numbers that ngspice 39 or LTspice reads differently, or that were left out."""
     if isinstance(waveform, Exp) and 0.0 in (waveform.td1, waveform.td2):
         which = " and ".join(n for n, x in (("TD1", waveform.td1), ("TD2", waveform.td2)) if x == 0.0)
         note = f"{key.upper()} has {which} = 0, which is 0 s here and not in ngspice 39, which takes TSTEP for TD1 = 0"
-        return [f"{note} and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once"]
+        yield f"{note} and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once"
     if isinstance(waveform, Sine) and len(call.args) < 3:
         note = f"{call.text.upper()} leaves out FREQ, which is 1/TSTOP then, {waveform.frequency:g} Hz"
-        return [f"{note}; its values are VO VA FREQ"]
+        yield f"{note}; its values are VO VA FREQ"
     later = [arg.text for arg in call.args[2::2] if isinstance(arg, Number) and arg.text.startswith("+")]
     if key == "pwl" and later:
-        return [f"the time {later[0]} is counted from 0, as in ngspice; LTspice counts it from the point before"]
-    return []
+        yield f"the time {later[0]} is counted from 0, as in ngspice; LTspice counts it from the point before"

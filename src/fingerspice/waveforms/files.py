@@ -134,9 +134,15 @@ def read_text_columns(path: str | Path, label: str | None = None) -> Columns:
         raise InputError(f"'{path}', line {begin}: {said}")
     separator = _separator(line)
     count = len(_cells(line, separator))
-    above = [one for one in numbered if one[0] < begin][-1:]
-    header = [_unit(name) for name in _header(path, *above[0], separator, count)] if above else []
-    names, units = zip(*header, strict=True) if header else ((), ())
+    # The line above the first numbers has the names, unless it is a comment or, here `;`, there is none.
+    number, text = [(0, ";"), *((one, above.strip()) for one, above in numbered if one < begin)][-1]
+    header = _cells(text.lstrip("#"), separator)
+    if len(header) != count or text[0] in ";*":
+        hint = ", or are its commas decimal commas" if separator == "," and count == 2 * len(header) else ""
+        problem = f"'{path}', line {number}: the header names {len(header)} columns, and the rows have {count}"
+        refuse(not text.startswith(_COMMENTED), f"{problem}: is a name missing{hint}?")
+        header = []
+    names, units = zip(*map(_unit, header), strict=True) if header else ((), ())
     table, faults, words = _numbers(path, rows[first:], separator, count, place)
     places = np.array([number for number, _ in rows[first:]])
     return Columns(path, names, table, units, places, faults, words)
@@ -185,19 +191,6 @@ def _refuse_semicolons(path: Path, number: int, line: str) -> None:
         raise InputError(f"{problem}; allowed: commas, tabs or blanks between numbers with points")
 
 
-def _header(path: Path, number: int, line: str, separator: str | None, count: int) -> list[str]:
-    """Column names from the line above the first numbers, which may be a comment; empty if it holds no names."""
-    text = line.strip()
-    names = _cells(text.lstrip("#"), separator)
-    if len(names) == count and text[0] not in ";*":
-        return names
-    if text.startswith(_COMMENTED):
-        return []
-    hint = ", or are its commas decimal commas" if separator == "," and count == 2 * len(names) else ""
-    raise InputError(f"'{path}', line {number}: the header names {len(names)} columns, and the rows have {count}: is "
-                     f"a name missing{hint}?")  # fmt: skip
-
-
 def _numbers(
     path: Path, rows: list[tuple[int, str]], separator: str | None, count: int, label: int | None
 ) -> tuple[FloatArray, dict[int, str], tuple[str, ...]]:
@@ -223,10 +216,9 @@ def _numbers(
 
 
 def _number(cell: str) -> float:
-    try:
+    with suppress(ValueError):
         return float(cell)
-    except ValueError:
-        return parse_number(cell)
+    return parse_number(cell)
 
 
 MAX_BYTES, MAX_TEXT_BYTES = 2**30, 2**26  #: Largest size of a binary file and of a text file, bytes.
