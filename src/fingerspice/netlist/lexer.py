@@ -159,8 +159,7 @@ def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]
 
 def lex(line: Line, start: int = 0) -> list[Lexeme]:
     """Lexemes of a line from a position on; blanks and commas separate them."""
-    text, position = line.text, start
-    lexemes: list[Lexeme] = []
+    text, position, lexemes = line.text, start, list[Lexeme]()
     while position < len(text):
         match = _LEX.match(text, position)
         if match is None:
@@ -259,17 +258,15 @@ def _probe(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int] | None:
 def _assign(inside: Group, key: Lexeme, following: list[Lexeme]) -> None:
     """Enter the pair `key = value`, given up to two of the lexemes after its `=`."""
     name, where, problem = key.text.lower(), key.where, ""
-    value = following[0] if following else None
-    after = following[1].kind if len(following) > 1 else ""
+    kinds = [lexeme.kind for lexeme in following]
     if key.kind not in ("word", "probe") or (key.kind == "word" and not _KEY.fullmatch(key.text)):
         problem = f"{key.written} cannot be a parameter's name: letters, digits and _ are allowed"
     elif name in inside.params:
         problem = f"'{key.text}' is given twice, first at {inside.params[name].key.where}"
-    elif value is not None and (value.kind == "(" or (after == "(" and value.kind == "word")):
+    elif kinds[:1] == ["("] or kinds == ["word", "("]:
         problem = f"the value of '{key.text}' holds brackets: arithmetic goes in braces, as in {{(a + b)*2}}"
-        where = value.where
-    elif value is None or value.kind in (")", "=") or (after == "=" and value.kind == "word"):
+        where = following[0].where
+    elif not kinds or kinds[0] in (")", "=") or kinds == ["word", "="]:
         problem = f"missing value of '{key.text}'"
-    if problem or value is None:
-        raise InputError(problem, where)
-    inside.params[name] = Assignment(key, value)
+    refuse(problem, problem, where)
+    inside.params[name] = Assignment(key, following[0])

@@ -358,8 +358,7 @@ class Reader:
         match name:
             case ".tran" | ".ac" | ".option" | ".options" | ".ic":
                 opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
-                inside_one = here is not self.root and name != ".ic"
-                refuse(inside_one, f"{name} does not belong inside {opened}?", place)
+                refuse(here is not self.root and name != ".ic", f"{name} does not belong inside {opened}?", place)
                 if name in (".tran", ".ac"):
                     for other, first, _ in here.directives:
                         refuse(other == name, f"{name} is given twice, first at {first.where()}", place)
