@@ -290,7 +290,6 @@ def evaluated(text: str, names: Mapping[str, float], place: Callable[[int], Wher
     return value
 
 
-# Words
 _NUMERIC = re.compile(r"[+-]|\.?[0-9]")
 _FILE_NAME = re.compile(r".*[/\\].*|.*\.[A-Za-z]\w*")
 _PLAIN_NUMBER = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?[A-Za-z]*")

@@ -16,7 +16,6 @@ from fingerspice.base.errors import InputError, Where
 from fingerspice.circuit.circuit import nearest as most_alike
 from fingerspice.waveforms.waveform import refuse
 
-# Hints
 _LISTS = re.compile(r"\{[^{}]*\}|'[^']*'|\"[^\"]*\"")
 _CALL = re.compile(r"\(([^()]*)\)")
 _COMMA = re.compile(r"(?<![\w.,])([+-]?[0-9]+),([0-9]+[a-zµμ]*)(?![\w.,])", re.IGNORECASE)
@@ -64,7 +63,6 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f"; did you mean '{found}'?" if found is not None else ""
 
 
-# Lines
 #: As in ngspice a `;`, a `//` after a blank, or a `$` between blanks starts a comment, except in double quotes.
 _COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)//|(?<!\S)\$(?!\S))')
 _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")

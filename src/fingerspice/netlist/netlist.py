@@ -165,9 +165,6 @@ def sweep_from_text(text: str) -> AcSweep:
         raise InputError(f"{text!r}: {error.message}") from None
 
 
-# Elements
-
-
 def read_elements(statement: Statement, context: Context, notes: list[str]) -> list[Element]:
     """The element of a statement, and those for LTspice's ``Rser``, ``Rpar`` and ``Cpar``; `notes` gets warnings."""
     name, device, nodes, names, _, params, where = statement
@@ -268,9 +265,6 @@ def _doubts(given: Number, spec: ParameterSpec) -> Iterator[tuple[Where, str]]:
         yield given.mega.where, note
     if exponent_and_scale(given.text):
         yield given.where, f"{given.text} is {given.value:g}: exponent and scale both count"
-
-
-# Directives
 
 
 def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]:

@@ -189,7 +189,6 @@ def inside(root: Path, folder: Path, name: str, where: Where) -> Path:
     return path
 
 
-# Lines
 _GREEK_MU = re.compile(r"(?<![\w.])([0-9.]+(?:e[+-]?[0-9]+)?)μ", re.IGNORECASE)
 #: Directives that only other simulators know, each with the alternative here.
 ELSEWHERE = {
