@@ -45,10 +45,11 @@ class Samples(Ramps):
     units: ClassVar[dict[str, str]] = {"rate": "Hz", "start": "s"}
     # Number of the sample `values[0]` in the whole recording, whose sample number 0 is at `start`.
     _number: ClassVar[int] = 0
+    count: ClassVar[int]  #: Number of samples
 
     def __post_init__(self) -> None:
         values = read_only(real_numbers("the row of samples", self.values, "two or more numbers in V").copy())
-        self._declare(values=values)
+        self._declare(values=values, count=values.size)
         require(values.ndim == 1 and values.size >= 2, "samples", f"shape {values.shape}", "one row of two or more")
         _check_samples(values, 0)
         super().__post_init__()
@@ -140,11 +141,6 @@ class Samples(Ramps):
         if "values" in state:
             self.values.flags.writeable = False  # NumPy unpickles every array as writable.
 
-    @property
-    def count(self) -> int:
-        """Number of samples."""
-        return self.values.size
-
     def __repr__(self) -> str:
         return self._text
 
@@ -174,7 +170,7 @@ class Samples(Ramps):
         low, high = self._around(t0, t1)
         out = object.__new__(Samples)
         values = read_only(self.between(low, high))
-        out._declare(values=values, rate=self.rate, start=self.start, _number=self._number + low)
+        out._declare(values=values, count=high - low, rate=self.rate, start=self.start, _number=self._number + low)
         return out
 
     def _number_of(self, t: float) -> float:
@@ -245,7 +241,7 @@ class _WavFile(Samples):
     gain: float
 
     def __init__(self, layout: WavLayout, gain: float) -> None:
-        self._declare(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
+        self._declare(layout=layout, gain=gain, rate=float(layout.rate), start=0.0, count=layout.count)
         require(self.count >= 2, "samples", f"shape ({self.count},)", "one row of two or more")
         sure = layout.kind[1] != "f" and abs(gain) <= RANGES["V"][0]  # Integers are finite, and within full scale.
         for first in range(0, 0 if sure else self.count, AT_ONCE):
@@ -259,10 +255,6 @@ class _WavFile(Samples):
     @cached_property
     def values(self) -> FloatArray:
         return read_only(self.between(0, self.count))
-
-    @property
-    def count(self) -> int:
-        return int(self.layout.count)
 
     def digest(self) -> str:
         with self.layout.path.open("rb") as file:
