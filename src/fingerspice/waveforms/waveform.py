@@ -433,8 +433,10 @@ class _Combination(Waveform):
     def __post_init__(self) -> None:
         super().__post_init__()
         rate = sum(1.0 / part.shortest_time() for part in self.parts)
-        settled = max(part.settled for part in self.parts)
-        self._declare(period=_common_period(self.parts), settled=settled, _quick=1.0 / rate if rate else math.inf)
+        quick, settled = 1.0 / rate if rate else math.inf, max(part.settled for part in self.parts)
+        first, last = zip(*(part.course for part in self.parts), strict=True)
+        course, period = (min(first), max(last)), _common_period(self.parts)
+        self._declare(period=period, settled=settled, course=course, _quick=quick)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.asarray(self._joined(part.value(t, side) for part in self.parts))
@@ -455,11 +457,6 @@ class _Combination(Waveform):
     @property
     def precision(self) -> float:  # type: ignore[override]
         return max(part.precision for part in self.parts)
-
-    @property
-    def course(self) -> tuple[float, float]:  # type: ignore[override]
-        first, last = zip(*(part.course for part in self.parts), strict=True)
-        return min(first), max(last)
 
     def _tones(self) -> list[float]:
         return [tone for part in self.parts if (tone := part.tone()) is not None]
