@@ -382,7 +382,9 @@ def read_table(
         return found.scaled(_chosen(found, value, "value", 1, 0), "V"), rate, None
     at = named[0] if time is None and len(named) == 1 else _chosen(found, time, "time", 2, 0)
     t = found.scaled(at, "s")
-    values = found.scaled(_chosen(found, value, "value", 2, 1 - at, other=at), "V")
+    chosen = _chosen(found, value, "value", 2, 1 - at)
+    refuse(chosen == at, f"'{path}': the column {value!r} is both time and value; allowed: two columns")
+    values = found.scaled(chosen, "V")
     back = np.flatnonzero(t[1:] < t[:-1])
     if back.size:
         i = int(back[0])
@@ -425,14 +427,10 @@ def check_count(what: str, count: int) -> None:
     refuse(count > MAX_SAMPLES, f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
 
 
-def _chosen(
-    found: Columns, column: str | int | None, role: str, most: int, default: int, other: int | None = None
-) -> int:  # fmt: skip
-    """Index of a column, which is not `other`; if none is given, the default in a table of at most `most` columns."""
+def _chosen(found: Columns, column: str | int | None, role: str, most: int, default: int) -> int:
+    """Index of a column; if none is given, the default in a table of at most `most` columns."""
     if column is not None:
-        index = found.index(column)
-        refuse(index == other, f"'{found.file}': the column {column!r} is both time and value; allowed: two columns")
-        return index
+        return found.index(column)
     way = "name the column" if found.names else "the number of the column"
     refuse(found.data.shape[1] > most, f"'{found.file}' has {found.listed()}; allowed: {way} of the {role}")
     return default
