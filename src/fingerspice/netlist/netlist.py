@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -98,7 +98,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     context = Context(tran, None if deck.path is None else deck.path.parent)
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
     work, unused = read_options(deck.named(".options"))
-    initial, unused_starts = read_initial(deck.named(".ic"), elements, tran is None or tran.uic)
+    initial, unused_starts = read_start(deck.named(".ic"), elements, tran is None or tran.uic)
     notes.extend(_unusual(deck, elements, tran, initial))
     more = len(notes) - MAX_WARNINGS
     if more > 1:
@@ -110,9 +110,7 @@ def _read(deck: Deck, notes: list[str]) -> Circuit:
     return checked(Circuit(deck.title, elements, tran, ac, initial, law, work, said, effectless, deck.text, deck.path))
 
 
-def _unusual(
-    deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initial: Mapping[str, float]
-) -> Iterator[str]:
+def _unusual(deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initial: dict[str, float]) -> Iterator[str]:
     """Warnings about unusual areas given by start values or sources, and outputs too far apart for a source."""
     nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
     areas = [("", f".ic v({node})", value) for node, value in initial.items() if node in nodes]
@@ -332,9 +330,7 @@ def read_ac(directive: Directive) -> AcSweep:
     return AcSweep(scale, int(n.value), low.value, high.value)
 
 
-def read_initial(
-    directives: list[Directive], elements: tuple[Element, ...], uic: bool
-) -> tuple[dict[str, float], tuple[str, ...]]:
+def read_start(given: list[Directive], elements: tuple[Element, ...], uic: bool) -> tuple[dict[str, float], list[str]]:
     """``.ic v(node)=value``: start values by canonical node, in V, or in mm^2 of an area node, and what has no effect.
 
     Without effect are with ``uic`` those where no layer or capacitor without ``IC=`` is, else every ``IC=``.
@@ -344,7 +340,7 @@ def read_initial(
     layers = [e for e in elements if e.spec.is_layer]
     area_nodes = {e.nodes[2] for e in layers}
     out: dict[str, float] = {}
-    for directive in directives:
+    for directive in given:
         refuse(directive.args, f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
         for key, value in directive.params.items():
             place = value.key
@@ -364,7 +360,7 @@ def read_initial(
     used = {node for e in started for node in e.nodes[:2]} if uic else set(out)
     used = used - area_nodes | {e.nodes[2] for e in gaps if not uic or e.values["tau"] > 0.0}
     without = [f".ic v({node})" for node in out if node not in used]
-    return out, (*without, *(f"IC= of {e.name}" for e in elements if e.initial is not None and not uic))
+    return out, without + [f"IC= of {e.name}" for e in elements if e.initial is not None and not uic]
 
 
 def start_volts(what: str, word: Value) -> float:
