@@ -43,9 +43,8 @@ def _refuse(wrong: object, message: str, position: int = 0) -> None:
 
 def _power(base: float, exponent: float) -> float:
     """`base ^ exponent`; a negative base needs an even exponent, as ngspice takes the base's absolute value."""
-    if base < 0.0 and exponent % 2.0 != 0.0:
-        problem = f"({base:g})^({exponent:g}) has a negative base, whose absolute value ngspice takes"
-        raise Problem(f"{problem}: write pow(x, y) or abs(x)^y")
+    problem = f"({base:g})^({exponent:g}) has a negative base, whose absolute value ngspice takes"
+    _refuse(base < 0.0 and exponent % 2.0 != 0.0, f"{problem}: write pow(x, y) or abs(x)^y")
     return math.pow(base, exponent)
 
 
@@ -197,9 +196,8 @@ class Expression:
         for index in range(max(begin, 1), end):
             before, sign, number, after = self._pieces[index - 1 : index + 3]
             moved = number.kind != "number" or (after.text in _POWERS and before.text not in _POWERS)
-            if sign.text == "-" and before.text in _OPERATORS and moved:
-                problem = "a '-' after an operator has two readings here: use brackets, as in 2*(-x)"
-                raise Problem(problem, sign.position)
+            problem = "a '-' after an operator has two readings here: use brackets, as in 2*(-x)"
+            _refuse(sign.text == "-" and before.text in _OPERATORS and moved, problem, sign.position)
         return (lambda names: -value(names)) if negative else value
 
     def _value(self) -> Term:

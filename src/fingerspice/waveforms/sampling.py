@@ -202,12 +202,10 @@ def source_table(
         between = np.concatenate([*cuts, edges[-1:]])
     terms = waveform.terms(between[:-1], between[1:])
     if terms is not None:
-        edges = between
-        if no_chirps and np.any(terms[:, :, 5] != 0.0):
-            # The output step is not used here, so that no result depends on the outputs asked for.
-            step = 0.1 * waveform.shortest_time()
-        else:
-            return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
+        if not (no_chirps and np.any(terms[:, :, 5] != 0.0)):
+            return SourceTable(between, np.ascontiguousarray(terms), np.zeros((between.size - 1, 0)))
+        # The output step is not used here, so that no result depends on the outputs asked for.
+        edges, step = between, 0.1 * waveform.shortest_time()
     pieces = Refiner(waveform, tol, step, [float(t0)], shortest, scale)
     for a, b in itertools.pairwise(edges):
         if not pieces.cover(float(a), float(b)):
@@ -215,8 +213,7 @@ def source_table(
     if terms is None:
         pieces.warn()
     found, series = np.array(pieces.edges), np.array(pieces.series).reshape(-1, POINTS)
-    nothing = np.zeros((len(series), 1, 6))
-    return SourceTable(found, nothing, series, pieces.scale, pieces.not_finite, pieces.rough)
+    return SourceTable(found, np.zeros((len(series), 1, 6)), series, pieces.scale, pieces.not_finite, pieces.rough)
 
 
 POINTS = 20
