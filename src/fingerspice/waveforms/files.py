@@ -72,9 +72,16 @@ class Columns:
         called = f"({shown})" if self.names else f"without a header (0 to {count - 1})"
         return f"{count} column{'s' if count > 1 else ''} {called}"
 
-    def index(self, column: str | int) -> int:
-        """Index of a column given by its name, of which there has to be one, or by its number."""
+    def index(self, column: str | int | None, role: str, most: int, default: int) -> int:
+        """Index of a column given by its name, of which there has to be one, or by its number; else the default.
+
+        A table of more than `most` columns has no default for the role.
+        """
         count = self.data.shape[1]
+        if column is None:
+            way = "name the column" if self.names else "the number of the column"
+            refuse(count > most, f"'{self.file}' has {self.listed()}; allowed: {way} of the {role}")
+            return default
         if isinstance(column, str):
             problem = f"'{self.file}' has no header that names a column {column!r}"
             refuse(not self.names, f"{problem}; allowed: its number, 0 to {count - 1}")
@@ -379,10 +386,10 @@ def read_table(
     # A column that is named as times is one even beside a rate, which it may contradict.
     named = [i for i, name in enumerate(found.names) if name.lower() in _TIME_NAMES]
     if rate is not None and not (columns > 1 and (named or (columns == 2 and value is None))):
-        return found.scaled(_chosen(found, value, "value", 1, 0), "V"), rate, None
-    at = named[0] if time is None and len(named) == 1 else _chosen(found, time, "time", 2, 0)
+        return found.scaled(found.index(value, "value", 1, 0), "V"), rate, None
+    at = named[0] if time is None and len(named) == 1 else found.index(time, "time", 2, 0)
     t = found.scaled(at, "s")
-    chosen = _chosen(found, value, "value", 2, 1 - at)
+    chosen = found.index(value, "value", 2, 1 - at)
     refuse(chosen == at, f"'{path}': the column {value!r} is both time and value; allowed: two columns")
     values = found.scaled(chosen, "V")
     back = np.flatnonzero(t[1:] < t[:-1])
@@ -425,15 +432,6 @@ def file_fault(path: Path, most: int) -> str:
 def check_count(what: str, count: int) -> None:
     """Refuse more than `MAX_SAMPLES` samples, the most that are kept in memory."""
     refuse(count > MAX_SAMPLES, f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
-
-
-def _chosen(found: Columns, column: str | int | None, role: str, most: int, default: int) -> int:
-    """Index of a column; if none is given, the default in a table of at most `most` columns."""
-    if column is not None:
-        return found.index(column)
-    way = "name the column" if found.names else "the number of the column"
-    refuse(found.data.shape[1] > most, f"'{found.file}' has {found.listed()}; allowed: {way} of the {role}")
-    return default
 
 
 def _npz_columns(path: Path) -> tuple[Columns, float | None]:
