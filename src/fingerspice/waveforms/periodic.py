@@ -257,8 +257,7 @@ class _Periodic(Ramps):
     phase_deg: float = 0.0
     delay: float = 0.0
     _shift: ClassVar[float]  # Time of the shape's start, s
-    # Times of the knots in periods, values over the offset in amplitudes, and whether half of it is the other half
-    # turned over
+    # Times of the knots in periods, values over the offset in amplitudes, whether one half is the other turned over
     _shape: ClassVar[tuple[tuple[float, ...], tuple[float, ...], bool]]
     units: ClassVar[dict[str, str]] = OSCILLATION
 

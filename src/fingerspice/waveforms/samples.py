@@ -17,8 +17,7 @@ from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, 
 from fingerspice.waveforms.periodic import FEW_KNOTS, PWL, Ramps
 from fingerspice.waveforms.waveform import DC, RANGES, Product, Sum, Waveform, check_range, require
 
-# Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
-# to 0.46 of the rate.
+# Half-width of the filter in samples, beta of its Kaiser window: the gain is 1 within 0.02 % up to 0.46 of the rate.
 _WING, _BETA = 32, 8.0
 AT_ONCE = 1 << 20  # Number of samples of a file that are read at once.
 ON_GRID, ROUNDING = 1e-9, 1e-15  # Largest distance of a time from the grid, in spacings, and its own rounding.

@@ -217,8 +217,7 @@ def source_table(
 
 
 POINTS = 20
-# The points `_PROOF` between the nodes, at which a series is compared with the function, are irregular: so no periodic
-# function can agree with its series at all of them and differ elsewhere.
+# Between the nodes a series is compared at irregular points: no periodic function agrees at all and differs elsewhere.
 _AT_START = (-1.0) ** np.arange(POINTS)
 _PROOF = 2.0 * np.modf(np.arange(1, 28) * 0.6180339887498949)[0] - 1.0
 _PLACES = np.concatenate([chebyshev.nodes(POINTS, -1.0, 1.0), _PROOF])
