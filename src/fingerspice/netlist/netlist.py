@@ -318,13 +318,12 @@ def read_ac(directive: Directive) -> AcSweep:
     numbers, words = _numbers(directive, usage)
     if len(words) != 1 or words[0] not in ("dec", "oct", "lin") or len(numbers) != 3:
         raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}", directive.where)
-    n, low, high = numbers
+    scale, (n, low, high) = words[0], numbers
     _require(n.value >= 1 and n.value == int(n.value) and n.value <= 1e6, "N", n, "a whole number, 1 to 1e6")
     _require(low.value > 0.0, "FSTART", low, "more than 0 Hz")
     _require(high.value >= low.value, "FSTOP", high, f"at least FSTART = {low.text}")
     for what, given in (("FSTART", low), ("FSTOP", high)):
         _require(1e-30 <= given.value <= 1e30, what, given, "1e-30 to 1e30 Hz")
-    scale = words[0]
     spans = 1.0 if scale == "lin" else math.log(high.value / low.value, 10.0 if scale == "dec" else 2.0)
     _require(n.value * spans <= 1e6, "N", n, f"at most 1e6 frequencies in a sweep, here {n.value * spans:.3g}")
     return AcSweep(scale, int(n.value), low.value, high.value)
