@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from fingerspice.base.errors import Where
-from fingerspice.netlist.expressions import compile_expression
+from fingerspice.netlist.expressions import evaluated
 
 DECK = """\
 Fingerpad
@@ -35,4 +35,4 @@ def evaluate(text: str, names: Mapping[str, float], where: Where) -> float:
     def place(position: int) -> Where:
         return Where(where.file, where.line, where.column + position)
 
-    return compile_expression(text, place).evaluate({name.lower(): value for name, value in names.items()}, place)
+    return evaluated(text, {name.lower(): value for name, value in names.items()}, place)

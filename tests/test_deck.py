@@ -13,9 +13,9 @@ import pytest
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.netlist import reader
-from fingerspice.netlist.deck import parse_deck, read_deck
+from fingerspice.netlist.deck import parse_deck
 from fingerspice.netlist.expressions import Call, Number, Token
-from fingerspice.netlist.reader import Deck, Statement
+from fingerspice.netlist.reader import Deck, Statement, text_of
 from ngspice_tools import call_ngspice
 
 PAPER = """Fingerpad on a 3M-coated touchscreen, Table 1
@@ -349,14 +349,14 @@ def test_local_files_are_included_and_named_in_places(tmp_path: Path) -> None:
     path = tmp_path / "main.cir"
     path.write_text("t\n.inc 'my parts.lib'\nR1 a 0 {r}\n")
     (tmp_path / "my parts.lib").write_text(".param r=5\n.lib FingerSpice_mobile.LIB\n")
-    read = read_deck(path)
+    read = parse_deck(*text_of(path))
     assert value(read.statements[0].body[0]) == 5.0
     assert read.files == [tmp_path.resolve() / "my parts.lib"]
     assert read.libraries == ["FingerSpice_mobile.LIB"]
     assert read.path == path
     (tmp_path / "my parts.lib").write_text("\n\nR1 a 0 2k7\n")
     with pytest.raises(InputError, match=r"write 2\.7k") as caught:
-        read_deck(path)
+        parse_deck(*text_of(path))
     assert caught.value.where == Where(str(tmp_path / "my parts.lib"), 3, 8)
 
 
@@ -379,7 +379,7 @@ def test_other_files_are_refused_by_name(tmp_path: Path, name: str, message: str
     (folder / "end.lib").write_text(".end\n")
     (folder / "main.cir").write_text(f"t\n.include {name}\n")
     with pytest.raises(InputError, match=message) as caught:
-        read_deck(folder / "main.cir")
+        parse_deck(*text_of(folder / "main.cir"))
     assert caught.value.where is not None
 
 
@@ -400,19 +400,19 @@ def test_files_that_are_no_netlists_are_refused(tmp_path: Path, data: bytes, mes
     path = tmp_path / "main.cir"
     path.write_bytes(data)
     with pytest.raises(InputError, match=message):
-        read_deck(path)
+        parse_deck(*text_of(path))
 
 
 def test_missing_files_folders_and_huge_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "finger.cir").write_text("t\n")
     with pytest.raises(InputError, match=r"does not exist; did you mean '.*/finger\.cir'\?$"):
-        read_deck(tmp_path / "fingr.cir")
+        parse_deck(*text_of(tmp_path / "fingr.cir"))
     with pytest.raises(InputError, match="is a folder"):
-        read_deck(tmp_path)
+        parse_deck(*text_of(tmp_path))
     with (tmp_path / "huge.cir").open("wb") as huge:
         huge.truncate(2**27)
-    with pytest.raises(InputError, match="larger than 64 MiB"):
-        read_deck(tmp_path / "huge.cir")
+    with pytest.raises(InputError, match="has 128 MiB; allowed: at most 64 MiB"):
+        parse_deck(*text_of(tmp_path / "huge.cir"))
 
 
 def test_reading_a_deck_imports_nothing_heavy() -> None:

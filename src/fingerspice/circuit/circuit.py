@@ -358,8 +358,8 @@ def _unknown(kind: str, given: str, known: list[str]) -> str:
     return f"unknown {kind} {given!r}; " + ("there is none" if near is None else f"nearest: {near!r}")
 
 
-def nearest(given: str, known: list[str]) -> str | None:
-    """The known name that a given one resembles most, whatever the case; None only if no name is known."""
+def nearest(given: str, known: list[str], least: float = 0.0) -> str | None:
+    """The known name that a given one resembles most, whatever the case; None if none does by `least` (0 to 1)."""
     lower = {k.lower(): k for k in known}
-    near = get_close_matches(given.lower(), lower, 1, 0.0)
+    near = get_close_matches(given.lower(), lower, 1, least)
     return lower[near[0]] if near else None

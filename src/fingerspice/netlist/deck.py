@@ -10,16 +10,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import dropwhile
 from pathlib import Path
 
 from fingerspice.base.errors import InputError, Where, printable
 from fingerspice.circuit.devices import DEVICES, layer_devices
 from fingerspice.netlist.expressions import Bare, Number, Scope, Value
 from fingerspice.netlist.lexer import MAX_NAME, NUMBER, Group, Lexeme, Line, group, is_unit, lex, nearest
-from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, Deck, Directive, Reader, Statement, Subcircuit, text_of
+from fingerspice.netlist.reader import DIRECTIVES, MAX_BYTES, Deck, Directive, Reader, Statement, Subcircuit
+from fingerspice.waveforms.waveform import refuse
 
-#: Largest number of characters of a title that are shown; the middle of a longer title is left out.
-LONGEST_TITLE = 200
+LONGEST_TITLE = 200  #: Characters of a title that are shown; the middle of a longer title is left out.
 #: Limits of subcircuit calls: total number of expanded lines and characters, and nesting.
 MAX_EXPANDED = 100_000
 MAX_EXPANDED_TEXT = 4 * 2**20
@@ -41,26 +42,15 @@ _STATEMENT = re.compile(
 )
 
 
-def read_deck(path: str | Path) -> Deck:
-    """Read a netlist file, which may include files from its own folder only.
-
-    Standard input (``-``), a device or a pipe is a deck called ``stdin`` in the working directory.
-    """
-    return parse_deck(*text_of(Path(path)))
-
-
 def parse_deck(text: str, path: Path | None = None) -> Deck:
     """Read a netlist, whose first line is the title.
 
-    `path` is that of the file with this text; without it only the libraries of native devices can be included.
+    Files are included from the folder of `path`, that of the file with this text; without it, only native libraries.
     """
     deck = Deck(text, path)
-    if not text.strip("\ufeff \t\r\n"):
-        raise InputError(f"'{deck.file}' is empty: a netlist begins with a title line")
-    if len(text) > MAX_BYTES:
-        raise InputError(f"'{deck.file}' is larger than {MAX_BYTES >> 20} MiB")
-    if "\0" in text:
-        raise InputError(f"'{deck.file}' is not text (it holds NUL characters)")
+    refuse(not text.strip("\ufeff \t\r\n"), f"'{deck.file}' is empty: a netlist begins with a title line")
+    refuse(len(text) > MAX_BYTES, f"'{deck.file}' is larger than {MAX_BYTES >> 20} MiB")
+    refuse("\0" in text, f"'{deck.file}' is not text (it holds NUL characters)")
     reader = Reader(deck)
     title, *lines = reader.split(text.removeprefix("\ufeff"))
     deck.title = printable(_TITLE.sub("", title.strip()), LONGEST_TITLE)
@@ -94,8 +84,7 @@ class _Instance:
 
     definition: Subcircuit
     scope: Scope
-    # The instances around the definition, innermost first, whose subcircuits an X line may call, too
-    around: tuple[_Instance, ...] = ()
+    around: tuple[_Instance, ...] = ()  # Those around the definition, innermost first, whose subcircuits it may call
     prefix: str = ""  # as written, ends in a dot
     ports: dict[str, tuple[str, str]] = field(default_factory=dict)
     calls: tuple[Subcircuit, ...] = ()  # definitions being expanded, outermost first
@@ -116,10 +105,7 @@ class _Instance:
 
 
 class Flattener:
-    """Turns the lines of a deck into statements and directives.
-
-    A call is replaced by the statements of its subcircuit. An `.ic` line has the nodes of the flat circuit.
-    """
+    """Turns the lines of a deck, its subcircuit calls expanded, into statements and directives of the flat circuit."""
 
     def __init__(self, deck: Deck) -> None:
         self.deck = deck
@@ -131,13 +117,12 @@ class Flattener:
         for line in instance.definition.elements:
             self._element(line, instance)
         for name, line, rest in instance.definition.directives:
-            words = group(lex(line, rest), probes=True)
-            args, params = instance.scope.words(words.words), dict[str, Value]()
+            words, params = group(lex(line, rest), probes=True), dict[str, Value]()
+            args = instance.scope.words(words.words)
             for key, value in instance.scope.pairs(words).items():
                 probe = name == ".ic" and key.startswith("v(")
                 flat = f"v({instance.node(key[2:-1].strip())[0]})" if probe else key
-                if flat in params:
-                    raise InputError(f".ic gives node {flat[2:-1]!r} twice", value.key)
+                refuse(flat in params, f".ic gives node {flat[2:-1]!r} twice", value.key)
                 params[flat] = value
             self.deck.directives.append(Directive(name, args, params, line.where(), line.text))
 
@@ -154,16 +139,14 @@ class Flattener:
         if len(name) > MAX_NAME:
             raise InputError(f"an element's name of {len(name)} characters: at most {MAX_NAME} are allowed", where)
         earlier = self._names.setdefault(name.lower(), where)
-        if earlier is not where:
-            raise InputError(f"element '{name}' is defined twice, first at {earlier}", where)
+        refuse(earlier is not where, f"element '{name}' is defined twice, first at {earlier}", where)
         if letter == "X":
             self._call(name, lexemes, instance)
             return
         scope, words = instance.scope, group(lexemes[1:], plain=2)
         nodes = [word for word in words.words[:2] if isinstance(word, Lexeme)]
-        if len(nodes) < 2 or (len(words.words) == 2 and not words.params):
-            missing = "node" if len(nodes) < 2 else "value"
-            raise InputError(f"missing {missing}: a {DEVICES[letter].what} is written {name} node node value", where)
+        missing = "node" if len(nodes) < 2 else "" if len(words.words) > 2 or words.params else "value"
+        refuse(missing, f"missing {missing}: a {DEVICES[letter].what} is written {name} node node value", where)
         canonical, written = zip(*instance.nodes(nodes), strict=True)
         # A word of a resistor or capacitor names a parameter, those of a source are keywords (DC, SIN).
         bare: Bare = "name" if letter in "RC" else "nothing"
@@ -180,33 +163,23 @@ class Flattener:
             problem = f"'{stray.text}' follows the parameters: nodes and the device's name come first{hint}"
             raise InputError(problem, stray.where)
         plain = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
-        if not plain:
-            raise InputError(f"missing value: {name} needs nodes and a device's name", lexemes[0].where)
+        refuse(not plain, f"missing value: {name} needs nodes and a device's name", lexemes[0].where)
         *nodes, device = plain
-        if device.kind != "word":
-            raise InputError(f"{device.written} stands where a device's name belongs", device.where)
+        refuse(device.kind != "word", f"{device.written} stands where a device's name belongs", device.where)
         native, key = device.text.upper(), device.text.lower()
-        around = (instance, *instance.around)
-        while around and key not in around[0].definition.inner:
-            around = around[1:]
+        around = tuple(dropwhile(lambda one: key not in one.definition.inner, (instance, *instance.around)))
         called = around[0].definition.inner[key] if around else None
-        if native in layer_devices():
-            called, shown, wanted = None, native, DEVICES[native].nodes
-        elif called is not None:
-            shown, wanted = called.name, called.ports
-        else:
+        if called is None and native not in layer_devices():
             raise InputError(_unknown_device(plain, instance), device.where)
-        if len(nodes) != len(wanted):
-            count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}"
-            names = f" ({' '.join(wanted)})" if wanted else ""
-            raise InputError(f"{name}: {shown} has {count}{names}, {len(nodes)} given", device.where)
+        shown, wanted = (called.name, called.ports) if called else (native, DEVICES[native].nodes)
+        count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}" + (f" ({' '.join(wanted)})" if wanted else "")
+        refuse(len(nodes) != len(wanted), f"{name}: {shown} has {count}, {len(nodes)} given", device.where)
         if called is None:
             canonical, written = zip(*instance.nodes(nodes), strict=True)
             params = scope.pairs(words, bare="arithmetic")
             given = {key: value.value for key, value in params.items() if isinstance(value, Number)}
             _refuse_captured(native, given, words, scope)
-            where = lexemes[0].where
-            self.deck.statements.append(Statement(name, native, canonical, written, (), params, where))
+            self.deck.statements.append(Statement(name, native, canonical, written, (), params, lexemes[0].where))
             return
         self._count(called, instance, device.where)
         ports = dict(zip(called.ports, instance.nodes(nodes), strict=True))
@@ -224,22 +197,16 @@ class Flattener:
 
     def _count(self, called: Subcircuit, instance: _Instance, where: Where) -> None:
         """Count what a call expands to; refuse circles, and what is too deep or too much."""
-        names = [sub.name for sub in (*instance.calls, called)]
         for start, outer in enumerate(instance.calls):
             if outer is called:
-                path = " -> ".join(names[start:])
+                path = " -> ".join(sub.name for sub in (*instance.calls[start:], called))
                 raise InputError(f"subcircuit '{called.name}' calls itself: {path}", where)
         self._expanded += 1 + len([*called.elements, *called.params, *called.defaults, *called.directives])
         self._expanded_text += called.characters
-        problem = ""
-        if len(instance.calls) >= MAX_DEPTH:
-            problem = f"subcircuits call each other more than {MAX_DEPTH} deep"
-        elif self._expanded > MAX_EXPANDED:
-            problem = f"the subcircuits expand to more than {MAX_EXPANDED:,} lines"
-        elif self._expanded_text > MAX_EXPANDED_TEXT:
-            problem = f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text"
-        if problem:
-            raise InputError(problem, where)
+        refuse(len(instance.calls) >= MAX_DEPTH, f"subcircuits call each other more than {MAX_DEPTH} deep", where)
+        refuse(self._expanded > MAX_EXPANDED, f"the subcircuits expand to more than {MAX_EXPANDED:,} lines", where)
+        if self._expanded_text > MAX_EXPANDED_TEXT:
+            raise InputError(f"the subcircuits expand to more than {MAX_EXPANDED_TEXT >> 20} MiB of text", where)
 
 
 def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: Scope) -> None:
@@ -247,11 +214,9 @@ def _refuse_captured(device: str, own: dict[str, float], words: Group, caller: S
     for given, (key, value) in words.params.items():
         for name, here in caller.references(value).items():
             if name != given and own.get(name, here) != here:
-                problem = (
-                    f"{key.text}={value.written} means {name} = {here:g} of the calling netlist here, and in ngspice "
-                    f"{device}'s own {name} = {own[name]:g}; allowed: another name for one of them"
-                )
-                raise InputError(problem, value.where)
+                problem = f"{key.text}={value.written} means {name} = {here:g} of the calling netlist here"
+                problem += f", and in ngspice {device}'s own {name} = {own[name]:g}"
+                raise InputError(f"{problem}; allowed: another name for one of them", value.where)
 
 
 def _unknown_device(words: list[Lexeme], instance: _Instance) -> str:

@@ -14,14 +14,15 @@ import re
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
+from graphlib import CycleError, TopologicalSorter
 from typing import Literal, NamedTuple, TypeAlias
 
 from fingerspice.base.errors import InputError, Where
 from fingerspice.base.units import parse_number, spice_text, suspicious_mega
 from fingerspice.netlist.lexer import Assignment, Group, Lexeme, Line, nearest
+from fingerspice.waveforms.waveform import refuse
 
-#: Limits: characters of an expression, nested brackets, `?` in an expression, and signs in a row.
-MAX_LENGTH, MAX_DEPTH, MAX_QUESTIONS, MAX_SIGNS = 2000, 25, 25, 3
+MAX_LENGTH, MAX_DEPTH, MAX_QUESTIONS, MAX_SIGNS = 2000, 25, 25, 3  #: Characters, brackets, `?`, signs in a row.
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
 #: Function from the values of parameters, whose names are in lower case, to the value of a part of an expression.
@@ -35,19 +36,20 @@ class Problem(Exception):
         self.message, self.position = message, position
 
 
+def _refuse(wrong: object, message: str, position: int = 0) -> None:
+    if wrong:
+        raise Problem(message, position)
+
+
 def _power(base: float, exponent: float) -> float:
     """`base ^ exponent`; a negative base needs an even exponent, as ngspice takes the base's absolute value."""
-    if base < 0.0 and not (exponent % 2.0 == 0.0):
-        raise Problem(
-            f"({base:g})^({exponent:g}) has a negative base, whose absolute value ngspice takes: "
-            "write pow(x, y) or abs(x)^y"
-        )
+    problem = f"({base:g})^({exponent:g}) has a negative base, whose absolute value ngspice takes"
+    _refuse(base < 0.0 and exponent % 2.0 != 0.0, f"{problem}: write pow(x, y) or abs(x)^y")
     return math.pow(base, exponent)
 
 
 def _pwr(base: float, exponent: float) -> float:
-    if base < 0.0:
-        raise Problem("pwr of a negative base differs between simulators: write pow(x, y) or pow(abs(x), y)")
+    _refuse(base < 0.0, "pwr of a negative base differs between simulators: write pow(x, y) or pow(abs(x), y)")
     return math.pow(base, exponent)
 
 
@@ -68,12 +70,9 @@ _COMPARISONS = {
 }  # fmt: skip
 #: Operators between two values, from loose to tight. `||` and `&&` have the function of all their values' truths.
 _LEVELS: tuple[Mapping[str, Callable[..., float]], ...] = (
-    {"||": any},
-    {"&&": all},
-    _COMPARISONS,
-    {"+": operator.add, "-": operator.sub},
-    {"*": operator.mul, "/": operator.truediv},
-)
+    {"||": any}, {"&&": all}, _COMPARISONS,
+    {"+": operator.add, "-": operator.sub}, {"*": operator.mul, "/": operator.truediv},
+)  # fmt: skip
 _FAILURES: Mapping[type[Exception], str] = {
     ZeroDivisionError: "divides by zero",
     OverflowError: "is too large for a number (1.8e308)",
@@ -84,10 +83,9 @@ _POWERS = ("^", "**")
 _OPERATORS = frozenset(("?", ":", *_POWERS, *(sign for level in _LEVELS for sign in level)))
 
 _LEX = re.compile(
-    r"(?P<space>\s+)"
-    r"|(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[\w.]*)"
+    r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[\w.]*)"
     r"|(?P<name>[A-Za-z_]\w*)"
-    r"|(?P<op>\*\*|&&|\|\||[<>=!]=|[-+*/^<>(),?:])"
+    r"|(?P<op>\*\*|&&|\|\||[<>=!]=|[-+*/^<>(),?:])|(?P<other>\S))"
 )
 
 
@@ -104,44 +102,28 @@ class Expression:
     """
 
     def __init__(self, text: str) -> None:
-        if len(text) > MAX_LENGTH:
-            raise Problem(f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
+        _refuse(len(text) > MAX_LENGTH, f"an expression of {len(text)} characters: at most {MAX_LENGTH} are allowed")
         self.text = text
         self.names: dict[str, int] = {}  # In lower case, constants included, and the position of each one's first use
         self.mega: tuple[str, int] | None = None  # The first number written with a capital M, and its position
         self._pieces: list[_Piece] = []
-        self._at = position = questions = 0
+        self._at = questions = 0
         self._brackets: list[tuple[_Piece, bool]] = []  # open, each with whether it encloses a function's arguments
-        while position < len(text):
-            match = _LEX.match(text, position)
-            if match is None:
-                hint = ": a comparison is ==" if text[position] == "=" else ""
-                raise Problem(f"{text[position]!r} does not belong in arithmetic{hint}", position)
-            kind, found = match.lastgroup or "", match.group()
+        for match in _LEX.finditer(text.rstrip()):
+            kind = match.lastgroup or ""
+            found, position = match[kind], match.start(kind)
+            if kind == "other":
+                hint = ": a comparison is ==" if found == "=" else ""
+                raise Problem(f"{found!r} does not belong in arithmetic{hint}", position)
             questions += found == "?"
-            if questions > MAX_QUESTIONS:
-                raise Problem(f"more than {MAX_QUESTIONS} '?' in one expression", position)
-            if kind != "space":
-                self._pieces.append(_Piece(kind, found, position))
+            _refuse(questions > MAX_QUESTIONS, f"more than {MAX_QUESTIONS} '?' in one expression", position)
+            self._pieces.append(_Piece(kind, found, position))
             if kind == "number" and self.mega is None and suspicious_mega(found):
                 self.mega = found, position
-            position = match.end()
         self._pieces.append(_Piece("end", "", len(text)))
-        self._term = self._condition()
+        self.term = self._condition()
         self._refuse_going_on()
         self._pieces.clear()
-
-    def evaluate(self, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
-        """Value of the expression, given the values of names (lower case); a value that is not finite is refused."""
-        try:
-            value = float(self._term(names))
-        except Problem as problem:
-            raise InputError(problem.message, place(problem.position)) from None
-        except (ZeroDivisionError, OverflowError, ValueError) as error:
-            raise InputError(f"'{self.text}' {_FAILURES[type(error)]}", place(0)) from None
-        if not math.isfinite(value):
-            raise InputError(f"'{self.text}' gives {value:g}, not a finite number", place(0))
-        return value
 
     def _take(self, *texts: str) -> _Piece | None:
         """The next piece if it is one of these."""
@@ -154,18 +136,13 @@ class Expression:
     def _refuse_going_on(self) -> None:
         """Refuse what cannot follow a complete value."""
         kind, text, position = self._pieces[self._at]
-        if kind == "end":
-            if self._brackets:
-                raise Problem("'(' is never closed", self._brackets[-1][0].position)
-        elif text == ")":
-            if not self._brackets:
-                raise Problem("')' without an opening '('", position)
-        elif text == ":":
-            raise Problem("':' without its '?' (a ? b : c)", position)
-        elif text != ",":
-            raise Problem(f"an operator is missing before '{text}'", position)
-        elif not (self._brackets and self._brackets[-1][1]):
+        if kind == "end" and self._brackets:
+            raise Problem("'(' is never closed", self._brackets[-1][0].position)
+        _refuse(text == ")" and not self._brackets, "')' without an opening '('", position)
+        _refuse(text == ":", "':' without its '?' (a ? b : c)", position)
+        if text == "," and not (self._brackets and self._brackets[-1][1]):
             raise Problem("',' outside the arguments of a function", position)
+        _refuse(text not in ("", ")", ","), f"an operator is missing before '{text}'", position)
 
     def _condition(self) -> Term:
         """`a ? b : c`; conditions after `:` group to the right."""
@@ -210,20 +187,17 @@ class Expression:
         begin, negative = self._at, False
         while (sign := self._take("+", "-")) is not None:
             negative ^= sign.text == "-"
-            if self._at - begin > MAX_SIGNS:
-                raise Problem(f"more than {MAX_SIGNS} signs in a row", sign.position)
+            _refuse(self._at - begin > MAX_SIGNS, f"more than {MAX_SIGNS} signs in a row", sign.position)
         end, value = self._at, self._value()
         power = self._take(*_POWERS)
         if power is not None:
-            if of_power:  # ngspice groups to the left, and mathematics to the right
-                raise Problem("a second '^' in a row has two readings: use brackets", power.position)
+            _refuse(of_power, "a second '^' in a row has two readings: use brackets", power.position)
             value = partial(_folded, value, [(_power, self._signed(of_power=True))])
         for index in range(max(begin, 1), end):
             before, sign, number, after = self._pieces[index - 1 : index + 3]
             moved = number.kind != "number" or (after.text in _POWERS and before.text not in _POWERS)
-            if sign.text == "-" and before.text in _OPERATORS and moved:
-                problem = "a '-' after an operator has two readings here: use brackets, as in 2*(-x)"
-                raise Problem(problem, sign.position)
+            problem = "a '-' after an operator has two readings here: use brackets, as in 2*(-x)"
+            _refuse(sign.text == "-" and before.text in _OPERATORS and moved, problem, sign.position)
         return (lambda names: -value(names)) if negative else value
 
     def _value(self) -> Term:
@@ -231,8 +205,7 @@ class Expression:
         kind, text, position = piece = self._pieces[self._at]
         if text == "(":
             return self._in_brackets(False)[0]
-        if kind == "op":
-            raise Problem(f"a value is missing before '{text}'", position)
+        _refuse(kind == "op", f"a value is missing before '{text}'", position)
         if kind == "end":
             self._refuse_going_on()
             raise Problem("a value is missing at the end" if self._at else "the expression is empty", position)
@@ -259,8 +232,7 @@ class Expression:
         """The expressions in brackets: one, or a function's arguments."""
         opening = self._pieces[self._at]
         self._brackets.append((opening, of_call))
-        if len(self._brackets) > MAX_DEPTH:
-            raise Problem(f"brackets nested deeper than {MAX_DEPTH}", opening.position)
+        _refuse(len(self._brackets) > MAX_DEPTH, f"brackets nested deeper than {MAX_DEPTH}", opening.position)
         terms: list[Term] = []
         while self._pieces[self._at].text != ")" or not terms:
             self._at += 1  # the opening bracket, or a comma
@@ -296,24 +268,25 @@ def _called(name: str, arguments: list[Term], text: str, names: Mapping[str, flo
     given = len(arguments)
     if given != wanted:
         more = f"; write {name}({name}(a, b), c), as ngspice 39 leaves some out" if given > 2 == wanted else ""
-        plural = "" if wanted == 1 else "s"
-        raise Problem(f"{name} takes {wanted} argument{plural}, {given} given: {text}{more}")
+        raise Problem(f"{name} takes {wanted} argument{'' if wanted == 1 else 's'}, {given} given: {text}{more}")
     return float(function(*(argument(names) for argument in arguments)))
 
 
-#: The expression of a text; raises `Problem` if it is not arithmetic.
-compiled = lru_cache(maxsize=8192)(Expression)
+compiled = lru_cache(maxsize=8192)(Expression)  #: The expression of a text; raises `Problem` if it is not arithmetic.
 
 
-def compile_expression(text: str, place: Callable[[int], Where]) -> Expression:
-    """Check an expression, without its braces or quotes; `place` gives the place of one of its characters."""
+def evaluated(text: str, names: Mapping[str, float], place: Callable[[int], Where]) -> float:
+    """Finite value of an expression without its braces, given those of names; `place` is that of a character."""
     try:
-        return compiled(text)
+        value = float(compiled(text).term(names))
     except Problem as problem:
         raise InputError(problem.message, place(problem.position)) from None
+    except (ZeroDivisionError, OverflowError, ValueError) as error:
+        raise InputError(f"'{text}' {_FAILURES[type(error)]}", place(0)) from None
+    if not math.isfinite(value):
+        raise InputError(f"'{text}' gives {value:g}, not a finite number", place(0))
+    return value
 
-
-# Words
 
 _NUMERIC = re.compile(r"[+-]|\.?[0-9]")
 _FILE_NAME = re.compile(r".*[/\\].*|.*\.[A-Za-z]\w*")
@@ -341,8 +314,7 @@ class Number(NamedTuple):
     value: float  # The value in SI units
     text: str  # As written, braces included
     where: Where  # The place of its first character
-    # The number with a capital M from which the value was computed: M is milli, and perhaps meant as mega
-    mega: Token | None = None
+    mega: Token | None = None  # The number with a capital M, milli and perhaps meant as mega, that the value is from
     key: Where | None = None  # Place of the key of a `key=value` pair
 
 
@@ -361,6 +333,13 @@ class Call(NamedTuple):
 Word: TypeAlias = Number | Token | Call
 
 
+def number(word: Word, what: str, allowed: str = "a number or {expression}") -> Number:
+    """The word, which must be a number; `what` names it in the message."""
+    if not isinstance(word, Number):
+        raise InputError(f"{what} is {word.text!r}; allowed: {allowed}", word.where)
+    return word
+
+
 class Scope:
     """The parameters of the deck or of one subcircuit call, which also sees those of its callers (`parent`).
 
@@ -371,14 +350,12 @@ class Scope:
     def __init__(self, definitions: Iterable[Assignment], parent: Scope | None = None) -> None:
         self.values: dict[str, float] = {}
         self._visible: ChainMap[str, float] = ChainMap(self.values, *(parent._visible.maps if parent else ()))
-        # As in `Number`
-        self._mega: ChainMap[str, Token | None] = ChainMap({}, *(parent._mega.maps if parent else ()))
+        self._mega: ChainMap[str, Token | None] = ChainMap({}, *(parent._mega.maps if parent else ()))  # As in `Number`
         self._definitions: dict[str, Assignment] = {}
         for definition in definitions:
             key, name = definition.key, definition.key.text.lower()
-            if name in RESERVED:
-                problem = f"parameter '{key.text}' has the name of a function of ngspice; allowed: another name"
-                raise InputError(problem, key.where)
+            problem = f"parameter '{key.text}' has the name of a function of ngspice; allowed: another name"
+            refuse(name in RESERVED, problem, key.where)
             first = self._definitions.setdefault(name, definition)
             if first is not definition:
                 raise InputError(f"parameter '{key.text}' is defined twice, first at {first.key.where}", key.where)
@@ -389,48 +366,31 @@ class Scope:
 
     def solve(self) -> dict[str, float]:
         """The parameters' values; each definition, in any order, is evaluated after those of the parameters in it."""
-        known: dict[str, Expression] = {}
-        for root in self._definitions:
-            stack = [root]
-            while stack:
-                name = stack[-1]
-                if name in self.values:
-                    stack.pop()
-                    continue
-                text = self._definitions[name].value
-                if name not in known:
-                    known[name] = compile_expression(text.text, text.place)
-                waiting = [n for n in known[name].names if n in self._definitions and n not in self.values]
-                if not waiting:
-                    self.preset(name, self.number(text))
-                elif any(n in known for n in waiting):
-                    raise self._circle(known, name)  # a compiled definition without a value is on the stack: a circle
-                stack.extend(waiting)
+        texts = {name: one.value for name, one in self._definitions.items() if name not in self.values}
+        # What is no arithmetic has no names, and is refused when its turn comes.
+        graph = {name: _names_in(text.text) or () for name, text in texts.items()}
+        try:
+            for name in filter(texts.__contains__, TopologicalSorter(graph).static_order()):
+                self.preset(name, self.number(texts[name]))
+        except CycleError as error:
+            # From a parameter to those in its definition, which graphlib gives backwards.
+            circle = error.args[1][:0:-1]
+            path = [circle[-1], *circle]
+            shown = [self._definitions[name].key.text for name in path]
+            if len(shown) > 12:
+                shown[6:-5] = ["..."]
+            problem = f"parameters refer to each other in a circle: {' -> '.join(shown)}"
+            raise InputError(problem, self._definitions[path[0]].key.where) from None
         return self.values
-
-    def _circle(self, known: dict[str, Expression], start: str) -> InputError:
-        """The error that names the parameters of a circle; following undefined names from `start` leads into it."""
-        order, name = dict[str, None](), start
-        while name not in order:
-            order[name] = None
-            name = next(n for n in known[name].names if n in known and n not in self.values)
-        path = list(order)
-        path = [*path[path.index(name) :], name]
-        shown = [self._definitions[name].key.text for name in path]
-        if len(shown) > 12:
-            shown[6:-5] = ["..."]
-        problem = f"parameters refer to each other in a circle: {' -> '.join(shown)}"
-        return InputError(problem, self._definitions[path[0]].key.where)
 
     def number(self, lexeme: Lexeme) -> Number:
         """Value of a lexeme that must be arithmetic, with or without braces."""
-        if lexeme.kind == "string":
-            raise InputError(f"a number is needed, not the text {lexeme.written}", lexeme.where)
-        expression = compile_expression(lexeme.text, lexeme.place)
+        refuse(lexeme.kind == "string", f"a number is needed, not the text {lexeme.written}", lexeme.where)
+        value, expression = evaluated(lexeme.text, self._visible, lexeme.place), compiled(lexeme.text)
         mega = Token(expression.mega[0], lexeme.place(expression.mega[1])) if expression.mega else None
         for name in expression.names:
             mega = mega or self._mega.get(name)
-        return Number(expression.evaluate(self._visible, lexeme.place), lexeme.written, lexeme.where, mega)
+        return Number(value, lexeme.written, lexeme.where, mega)
 
     def references(self, lexeme: Lexeme) -> dict[str, float]:
         """Values in this scope of the parameters in a lexeme; empty if the lexeme is not arithmetic."""
@@ -448,8 +408,7 @@ class Scope:
             # Arithmetic of numbers and known parameters only
             names = _names_in(text)
             if names is not None and all(name in self._visible or name in CONSTANTS for name in names):
-                if bare == "name":
-                    raise InputError(f"arithmetic goes in braces: {{{text}}}", where)
+                refuse(bare == "name", f"arithmetic goes in braces: {{{text}}}", where)
                 known = True
         if bare != "nothing" and known:
             return self.number(lexeme)
@@ -503,22 +462,19 @@ def definitions(line: Line, start: int) -> list[Assignment]:
             raise InputError(problem, line.where(match.start()))
     ends = [*(key.position for key, _ in keys), len(line.text)]
     before = line.text[start : ends[0]].strip(" \t,")
-    if before or not keys:
-        given = f"'{before}'" if before else "nothing"
-        raise InputError(f".param is followed by {given}: write .param name=value", line.where(start))
+    given = f"'{before}'" if before else "nothing"
+    refuse(before or not keys, f".param is followed by {given}: write .param name=value", line.where(start))
     out = []
     for (key, begin), end in zip(keys, ends[1:], strict=True):
         raw = line.text[begin:end]
         text = raw.strip(" \t,")
-        if not text:
-            raise InputError(f"missing value of '{key.text}'", key.where)
+        refuse(not text, f"missing value of '{key.text}'", key.where)
         value = Lexeme("word", text, begin + len(raw) - len(raw.lstrip(" \t,")), line)
         if text[0] in "{'":
             closing = "}" if text[0] == "{" else "'"
-            if len(text) < 2 or text[-1] != closing:
-                known = closing in text[1:]
-                problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
-                raise InputError(problem, value.where)
+            known = closing in text[1:]
+            problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
+            refuse(len(text) < 2 or text[-1] != closing, problem, value.where)
             value = value._replace(kind="expression", text=text[1:-1])
         out.append(Assignment(key, value))
     return out

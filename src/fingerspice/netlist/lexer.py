@@ -5,7 +5,6 @@ Nothing here depends on the meaning of a word: the callers distinguish names, va
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import re
 from bisect import bisect_right
@@ -14,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
-
-# Hints
+from fingerspice.circuit.circuit import nearest as most_alike
+from fingerspice.waveforms.waveform import refuse
 
 _LISTS = re.compile(r"\{[^{}]*\}|'[^']*'|\"[^\"]*\"")
 _CALL = re.compile(r"\(([^()]*)\)")
@@ -23,8 +22,7 @@ _COMMA = re.compile(r"(?<![\w.,])([+-]?[0-9]+),([0-9]+[a-zµμ]*)(?![\w.,])", re
 _ASSIGNED = re.compile(rf"=\s*{_COMMA.pattern}", re.IGNORECASE)
 NUMBER = re.compile(r"[+-]?\.?[0-9][\w.+-]*")
 _UNIT = re.compile(r"(?:[tgkmunpfµμ]|meg|mil)?(?:m|v|a|s|n|f|hz|ohm|ω)?", re.IGNORECASE)
-#: Largest number and length of the known words that are compared: a comparison takes the product of the two lengths.
-MAX_KNOWN, MAX_COMPARED = 1000, 60
+MAX_KNOWN, MAX_COMPARED = 1000, 60  #: Number and length of the words compared, which takes the product of two lengths.
 
 
 def decimal_comma(text: str) -> str | None:
@@ -42,12 +40,9 @@ def decimal_comma(text: str) -> str | None:
         others = [c for c, m in zip(chunks, matches, strict=True) if m is None]
         if all(NUMBER.fullmatch(c) or c.isalpha() for c in others) and (others or len(chunks) == len(words) == 1):
             found += matches
-    for match in filter(None, found):
-        whole, part = match[1], match[2]
-        return (
-            f"{whole},{part} is two numbers, {whole} and {part}, for a comma separates; if it is a decimal comma "
-            f"write {whole}.{part}"
-        )
+    for whole, part in (match.groups() for match in filter(None, found)):
+        said = f"{whole},{part} is two numbers, {whole} and {part}, for a comma separates"
+        return f"{said}; if it is a decimal comma write {whole}.{part}"
     return None
 
 
@@ -58,11 +53,8 @@ def is_unit(word: str) -> bool:
 
 def closest(word: str, known: Iterable[str]) -> str | None:
     """The known word whose spelling is nearest to `word`, regardless of case; None if none is similar."""
-    if len(word) > MAX_COMPARED:
-        return None
-    lower = {name.lower(): name for name in itertools.islice(known, MAX_KNOWN) if len(name) <= MAX_COMPARED}
-    close = difflib.get_close_matches(word.lower(), lower, n=1)
-    return lower[close[0]] if close else None
+    short = [name for name in itertools.islice(known, MAX_KNOWN) if len(name) <= MAX_COMPARED]
+    return None if len(word) > MAX_COMPARED else most_alike(word, short, least=0.6)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -71,15 +63,11 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f"; did you mean '{found}'?" if found is not None else ""
 
 
-# Lines
-
 #: As in ngspice a `;`, a `//` after a blank, or a `$` between blanks starts a comment, except in double quotes.
 _COMMENT = re.compile(r'"[^"]*"|(;|(?<!\S)//|(?<!\S)\$(?!\S))')
 _LEX = re.compile(r"""[\s,]+|([()=])|("[^"]*")|('[^']*')|([^\s,()={}'"]+)""")
-#: Pattern of a separator or a mark; their number is an upper bound of the number of words.
-SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")
+SPLIT = re.compile(r"""[\s,]+|[()={}'"]""")  #: A separator or a mark: there are no more words than these.
 _BRACE = re.compile(r"[{}]")
-_MARKS = ("(", ")", "=")
 MAX_NAME = 400  # Characters of a name
 _KEY = re.compile(r"[A-Za-z_]\w*")
 _NUMERIC = re.compile(r"[+-]?\.?[0-9]")
@@ -90,8 +78,7 @@ class Line(NamedTuple):
 
     file: str  # The file's name as shown to the user
     text: str  # From the first character that is not blank
-    # Of each physical line: the position of its text, its number, and what a position in it lacks to its column
-    parts: tuple[tuple[int, int, int], ...]
+    parts: tuple[tuple[int, int, int], ...]  # Of each physical line: position of its text, number, column less position
 
     def where(self, position: int = 0) -> Where:
         """Place of one character of the text."""
@@ -142,9 +129,7 @@ class Group:
 
 def split_lines(text: str) -> list[str]:
     """Physical lines as an editor counts them, which only LF, CRLF and CR end."""
-    if "\r" in text:
-        text = text.replace("\r\n", "\n").replace("\r", "\n")
-    return text.split("\n")
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
 def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]:
@@ -160,8 +145,7 @@ def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]
             continue
         column = 1 + len(text) - len(bare)
         if bare[0] == "+":
-            if not texts:
-                raise InputError("'+' continues the line before, but there is none", Where(file, number, column))
+            refuse(not texts, "'+' continues the line before, but there is none", Where(file, number, column))
             column, bare = column + 1, bare[1:]
         elif texts:
             yield Line(file, " ".join(texts), tuple(parts))
@@ -173,21 +157,18 @@ def logical_lines(lines: list[str], file: str, first: int = 1) -> Iterator[Line]
 
 def lex(line: Line, start: int = 0) -> list[Lexeme]:
     """Lexemes of a line from a position on; blanks and commas separate them."""
-    text, position = line.text, start
-    lexemes: list[Lexeme] = []
+    text, position, lexemes = line.text, start, list[Lexeme]()
     while position < len(text):
         match = _LEX.match(text, position)
         if match is None:
             opening, depth = text[position], 0
-            if opening != "{":
-                problem = "'}' without an opening '{'" if opening == "}" else f"{opening} is never closed"
-                raise InputError(problem, line.where(position))
+            problem = "'}' without an opening '{'" if opening == "}" else f"{opening} is never closed"
+            refuse(opening != "{", problem, line.where(position))
             for brace in _BRACE.finditer(text, position):
                 depth += 1 if brace.group() == "{" else -1
                 if depth == 0:
                     break
-            if depth != 0:
-                raise InputError("'{' is never closed", line.where(position))
+            refuse(depth != 0, "'{' is never closed", line.where(position))
             lexemes.append(Lexeme("expression", text[position + 1 : brace.start()], position, line))
             position = brace.end()
             continue
@@ -217,7 +198,7 @@ def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Gro
             lexeme, after = _with_brackets(lexemes, index)
         following = lexemes[after].kind if after < count else ""
         probe = _probe(lexemes, index) if probes and following == "(" and not _NUMERIC.match(lexeme.text) else None
-        if probe is not None or (following == "=" and lexeme.kind not in _MARKS):
+        if probe is not None or (following == "=" and lexeme.kind not in ("(", ")", "=")):
             key, equals = probe or (lexeme, after)
             _assign(inside, key, lexemes[equals + 1 : equals + 3])
             index = equals + 2
@@ -227,14 +208,11 @@ def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Gro
         elif lexeme.kind == "=":
             raise InputError("the name before '=' is missing", lexeme.where)
         elif lexeme.kind == ")":
-            if not brackets:
-                raise InputError("')' without an opening '('", lexeme.where)
+            refuse(not brackets, "')' without an opening '('", lexeme.where)
             inside = brackets.pop()[1]
         elif following == "(" and lexeme.kind == "word" and not _NUMERIC.match(lexeme.text) and len(top.words) >= plain:
-            if inside is not top:
-                name = lexeme.text
-                problem = f"'{name}(' inside brackets: arithmetic goes in braces, as in {{{name}(...)}}"
-                raise InputError(problem, lexeme.where)
+            problem = f"'{lexeme.text}(' inside brackets: arithmetic goes in braces, as in {{{lexeme.text}(...)}}"
+            refuse(inside is not top, problem, lexeme.where)
             brackets.append((lexemes[after], inside))
             inside = Group(lexeme)
             top.words.append(inside)
@@ -278,17 +256,15 @@ def _probe(lexemes: list[Lexeme], index: int) -> tuple[Lexeme, int] | None:
 def _assign(inside: Group, key: Lexeme, following: list[Lexeme]) -> None:
     """Enter the pair `key = value`, given up to two of the lexemes after its `=`."""
     name, where, problem = key.text.lower(), key.where, ""
-    value = following[0] if following else None
-    after = following[1].kind if len(following) > 1 else ""
+    kinds = [lexeme.kind for lexeme in following]
     if key.kind not in ("word", "probe") or (key.kind == "word" and not _KEY.fullmatch(key.text)):
         problem = f"{key.written} cannot be a parameter's name: letters, digits and _ are allowed"
     elif name in inside.params:
         problem = f"'{key.text}' is given twice, first at {inside.params[name].key.where}"
-    elif value is not None and (value.kind == "(" or (after == "(" and value.kind == "word")):
+    elif kinds[:1] == ["("] or kinds == ["word", "("]:
         problem = f"the value of '{key.text}' holds brackets: arithmetic goes in braces, as in {{(a + b)*2}}"
-        where = value.where
-    elif value is None or value.kind in (")", "=") or (after == "=" and value.kind == "word"):
+        where = following[0].where
+    elif not kinds or kinds[0] in (")", "=") or kinds == ["word", "="]:
         problem = f"missing value of '{key.text}'"
-    if problem or value is None:
-        raise InputError(problem, where)
-    inside.params[name] = Assignment(key, value)
+    refuse(problem, problem, where)
+    inside.params[name] = Assignment(key, following[0])

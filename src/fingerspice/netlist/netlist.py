@@ -5,45 +5,39 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.units import exponent_and_scale, format_si
 from fingerspice.circuit.circuit import WORK_READINGS, AcSweep, Circuit, Element, Tran
 from fingerspice.circuit.devices import DEVICES, REST_AREA, ParameterSpec, mega_note, unit_trap, unusual
 from fingerspice.circuit.network import checked
-from fingerspice.netlist.deck import parse_deck, read_deck, with_comma
-from fingerspice.netlist.expressions import Call, Number, Token, Value
+from fingerspice.netlist.deck import parse_deck, with_comma
+from fingerspice.netlist.expressions import Call, Number, Token, Value, number
 from fingerspice.netlist.lexer import decimal_comma, is_unit, nearest
-from fingerspice.netlist.reader import MAX_WARNINGS, Deck, Directive, SourceFiles, Statement
-from fingerspice.netlist.sources import Context, Source, read_source
-from fingerspice.waveforms.waveform import DC, Waveform, check_range
+from fingerspice.netlist.reader import MAX_WARNINGS, Context, Deck, Directive, Statement, text_of
+from fingerspice.netlist.sources import read_source
+from fingerspice.waveforms.waveform import DC, Waveform, check_range, refuse
 
-#: The parameter that gives the number of equal parts in parallel.
-_COPIES = "m"
-#: Number of outputs of a run whose .tran has no TSTEP.
-LTSPICE_OUTPUTS = 10_000
+_COPIES = "m"  #: The parameter that gives the number of equal parts in parallel.
+LTSPICE_OUTPUTS = 10_000  #: Number of outputs of a run whose .tran has no TSTEP.
 _LTSPICE_START = {
     "startup": "sources are not ramped up here; allowed: a source that rises by itself, such as PWL(0 0 20u 5)",
     "steady": "no run stops by itself here; allowed: fs.steady_state(circuit), which finds the periodic state",
     "nodiscard": "outputs begin at TSTART here; allowed: TSTART left out",
     "step": "loads are not stepped here; allowed: a source with steps, PULSE or PWL",
 }
-_NGSPICE_OPTIONS = frozenset(
-    """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5 itl6 keepopinfo
-    klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter numdgt opts
-    pivrel pivtol ramptime reltol rshunt savecurrents seed seedinfo sparse srcsteps temp tnom trtol trytocompact
-    vntol warn xmu""".split()  # noqa: SIM905
-)
-_LTSPICE_OPTIONS = frozenset(
-    """baudrate cshunt delay fastaccess flagloads gfloat gshunt measdgt meascplxfmt minclockguide mindeltagmin nomarch
-    noopiter plotabstol plotreltol plotvntol plotwinsize ptranmax ptrantau srcstepmethod sstol thev_induc
-    topologycheck""".split()  # noqa: SIM905
-)
+_NGSPICE_OPTIONS = """abstol acct bypass chgtol defad defas defl defw gmin gminsteps interp itl1 itl2 itl3 itl4 itl5
+    itl6 keepopinfo klu list maxevtiter maxopalter maxord method minbreak noacct noinit nomod nopage node noopalter
+    numdgt opts pivrel pivtol ramptime reltol rshunt savecurrents seed seedinfo sparse srcsteps temp tnom trtol
+    trytocompact vntol warn xmu""".split()  # noqa: SIM905
+_LTSPICE_OPTIONS = """baudrate cshunt delay fastaccess flagloads gfloat gshunt measdgt meascplxfmt minclockguide
+    mindeltagmin nomarch noopiter plotabstol plotreltol plotvntol plotwinsize ptranmax ptrantau srcstepmethod sstol
+    thev_induc topologycheck""".split()  # noqa: SIM905
 
 
 def read_netlist(path: str | Path) -> Circuit:
@@ -59,9 +53,9 @@ def read_netlist(path: str | Path) -> Circuit:
     InputError
         If the file cannot be read or has an error; the message gives its place and the allowed alternatives.
     """
-    if not isinstance(path, str | os.PathLike):
-        raise InputError(f"read_netlist is given {path!r}; allowed: the path of a netlist, such as 'deck.cir'")
-    return _circuit(read_deck(path))
+    problem = f"read_netlist is given {path!r}; allowed: the path of a netlist, such as 'deck.cir'"
+    refuse(not isinstance(path, str | os.PathLike), problem)
+    return _circuit(parse_deck(*text_of(Path(path))))
 
 
 def parse_netlist(text: str, path: str | Path | None = None) -> Circuit:
@@ -101,25 +95,22 @@ def _circuit(deck: Deck) -> Circuit:
 
 def _read(deck: Deck, notes: list[str]) -> Circuit:
     tran = next((read_tran(directive, notes) for directive in deck.named(".tran")), None)
-    context = Context(tran, SourceFiles(None if deck.path is None else deck.path.parent))
+    context = Context(tran, None if deck.path is None else deck.path.parent)
     elements = tuple(e for statement in deck.statements for e in read_elements(statement, context, notes))
     work, unused = read_options(deck.named(".options"))
-    initial, unused_starts = read_initial(deck.named(".ic"), elements, tran is None or tran.uic)
+    initial, unused_starts = read_start(deck.named(".ic"), elements, tran is None or tran.uic)
     notes.extend(_unusual(deck, elements, tran, initial))
     more = len(notes) - MAX_WARNINGS
     if more > 1:
         notes[MAX_WARNINGS:] = [f"{more} more warnings are not shown"]
     laws = {"mobile" if "mobile" in name.lower() else "local" for name in deck.libraries}
     ac = next(map(read_ac, deck.named(".ac")), None)
-    if len(laws) > 1:
-        raise InputError("both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
+    refuse(len(laws) > 1, "both fingerspice.lib (local law) and fingerspice_mobile.lib (mobile law) are included")
     law, said, effectless = next(iter(laws), None), tuple(notes), (*deck.unused, *unused, *unused_starts)
     return checked(Circuit(deck.title, elements, tran, ac, initial, law, work, said, effectless, deck.text, deck.path))
 
 
-def _unusual(
-    deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initial: Mapping[str, float]
-) -> Iterator[str]:
+def _unusual(deck: Deck, elements: tuple[Element, ...], tran: Tran | None, initial: dict[str, float]) -> Iterator[str]:
     """Warnings about unusual areas given by start values or sources, and outputs too far apart for a source."""
     nodes = {e.nodes[2] for e in elements if e.spec.is_layer}
     areas = [("", f".ic v({node})", value) for node, value in initial.items() if node in nodes]
@@ -134,10 +125,9 @@ def _unusual(
         # A source whose frequency is unusual has a warning already.
         if tran is not None and period is not None and tran.step > period * (1.0 + 1e-9) and not any(unusual(e)):
             step, longest = format_si(tran.step, "s"), format_si(period, "s")
-            yield (
-                f"{deck.named('.tran')[0].where}: {e.name}: TSTEP is {step}, longer than this source's period of "
-                f"{longest}: the outputs do not show its course, and the figures of a run still do"
-            )
+            place = str(deck.named(".tran")[0].where)
+            note = f"{place}: {e.name}: TSTEP is {step}, longer than this source's period of {longest}"
+            yield f"{note}: the outputs do not show its course, and the figures of a run still do"
 
 
 def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Waveform:
@@ -148,60 +138,49 @@ def source_from_text(text: str, circuit: Circuit, *, files: bool = True) -> Wave
     """
     tran = circuit.tran
     line = f".tran {tran.step!r} {tran.stop!r}\n" if tran else ""
-    context = Context(tran, SourceFiles(anywhere=files), in_deck=False)
+    context, notes = Context(tran, in_deck=False, anywhere=files), list[str]()
     try:
         deck = parse_deck(f"source\nVsource a 0 {text}\n{line}")
-        if len(deck.statements) != 1:
-            raise InputError("not one source; allowed: such as SQUARE(200 100)")
-        source = source_of(deck.statements[0]._replace(name="source"), context)
-        if source.ac is not None:
-            raise InputError("AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
+        refuse(len(deck.statements) != 1, "not one source; allowed: such as SQUARE(200 100)")
+        waveform, ac = read_source(deck.statements[0]._replace(name="source"), context, notes)
+        refuse(ac is not None, "AC belongs into the deck; allowed: the source function alone, whose fundamental drives")
     except InputError as error:
         comma = decimal_comma(f"V1 a 0 {text}")
         raise InputError(f"{text!r}: {error.message}" + (f"; note {comma}" if comma else "")) from None
-    for note in (*deck.warnings, *source.notes):
+    for note in (*deck.warnings, *notes):
         # A note begins with a place in the one-source deck made here, which the user does not know: cut it off.
         warnings.warn(f"{text!r}: {note.partition(': ')[2]}", FingerspiceWarning, stacklevel=2)
-    return source.waveform
+    return waveform
 
 
 def sweep_from_text(text: str) -> AcSweep:
     """A sweep from text such as ``dec 10 10 100k``."""
     try:
         sweeps = parse_deck(f"sweep\n.ac {text}\n").named(".ac")
-        if not sweeps:
-            raise InputError("not a sweep")
+        refuse(not sweeps, "not a sweep")
         return read_ac(sweeps[0])
     except InputError as error:
         raise InputError(f"{text!r}: {error.message}") from None
 
 
-# Elements
-
-
 def read_elements(statement: Statement, context: Context, notes: list[str]) -> list[Element]:
-    """The element of a statement, and the elements for LTspice's ``Rser``, ``Rpar`` and ``Cpar``.
-
-    Warnings are added to `notes`.
-    """
+    """The element of a statement, and those for LTspice's ``Rser``, ``Rpar`` and ``Cpar``; `notes` gets warnings."""
     name, device, nodes, names, _, params, where = statement
     beside = {key: params[key] for key in DEVICES[device].beside if key in params}
     own = statement._replace(params={k: v for k, v in params.items() if k not in beside})
     read: dict[str, Any] = {}
     values: dict[str, float] = {}
     if device in "VI":
-        read["waveform"], read["ac"], differences = source_of(own, context)
-        notes.extend(differences)
+        read["waveform"], read["ac"] = read_source(own, context, notes)
     elif device in "RC":
         values, read["initial"] = _read_passive(own, notes)
     else:
         values = _device_values(own, notes)
     element = Element(name, device, nodes, names, MappingProxyType(values), where=where, **read)
     for parameter, text in unusual(element):
-        named = params.get(parameter)
-        given = statement.body[0] if parameter == "value" and statement.body else named
+        given = statement.body[0] if parameter == "value" and statement.body else params.get(parameter)
         # One warning per number is enough.
-        if not (isinstance(given, Number) and _doubts(given, element.spec.parameter(parameter))):
+        if not (isinstance(given, Number) and any(_doubts(given, element.spec.parameter(parameter)))):
             notes.append(f"{where if given is None else given.where}: {text}")
     out = [element]
     for key, part in beside.items():
@@ -218,42 +197,15 @@ def read_elements(statement: Statement, context: Context, notes: list[str]) -> l
     return out
 
 
-def source_of(statement: Statement, context: Context) -> Source:
-    """The source that a V or I element's statement describes."""
-    name, body, params = statement.name, list(statement.body), statement.params
-    last = body[-1] if body else None
-    if "wavefile" in params and not any(isinstance(word, Call) for word in body):
-        # LTspice's `wavefile=path [chan=n]`: 1 V at full scale, and the first channel if none is chosen.
-        path = params["wavefile"]
-        where = path.key or path.where
-        for key, value in params.items():
-            if key not in ("wavefile", "chan"):
-                raise InputError(f"{name} takes no parameter {key!r} beside wavefile=; allowed: chan=", value.key)
-        channel = params.get("chan", Number(0.0, "0", where))
-        body.append(Call("wavefile", (path, Number(1.0, "1", where), channel), {}, where))
-    elif params:
-        # ngspice takes PWL(...) r=10m as well as PWL(... r=10m), and the brackets of PWL(file=...) may be left out.
-        inner = last.params if isinstance(last, Call) else {}
-        if not isinstance(last, Call | Token) or last.text.lower() != "pwl" or set(inner) & set(params):
-            key = next(iter(params))
-            takes = ", ".join(p.capitalize() for p in DEVICES[statement.device].beside)
-            hint = f"; allowed: {takes}, besides its value" if takes else ""
-            raise InputError(f"{name} takes no parameter {key!r}{hint}", params[key].key)
-        body[-1] = Call(last.text, last.args if isinstance(last, Call) else (), {**inner, **params}, last.where)
-    return read_source(name, body, context, statement.where)
-
-
 def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
-    name, device, params = statement.name, statement.device, statement.params
-    if statement.nodes[2] == "0":
-        raise InputError(f"{name} has ground as its area; allowed: the area node of a GAP", statement.where)
+    name, device, params, where = statement.name, statement.device, statement.params, statement.where
+    refuse(statement.nodes[2] == "0", f"{name} has ground as its area; allowed: the area node of a GAP", where)
     known = {p.name: p for p in DEVICES[device].parameters}
     for key, given in params.items():
         if key not in known:
             # On an X line m=... is ngspice's number of copies.
             hint = "; the exponent is m_exp" if key == _COPIES and "m_exp" in known else nearest(key, known)
-            problem = f"{name}: {device} has no parameter {key!r}{hint}; allowed: {', '.join(known)}"
-            raise InputError(problem, given.key)
+            raise InputError(f"{name}: {device} has no parameter {key!r}{hint}; allowed: {', '.join(known)}", given.key)
     values = {}
     for key, spec in known.items():
         if key in params:
@@ -262,7 +214,7 @@ def _device_values(statement: Statement, notes: list[str]) -> dict[str, float]:
             values[key] = spec.default
         else:
             unit = f" ({spec.unit})" if spec.unit else ""
-            raise InputError(f"{name}: {device} needs {key}{unit}, missing here", statement.where)
+            raise InputError(f"{name}: {device} needs {key}{unit}, missing here", where)
     return values
 
 
@@ -277,21 +229,14 @@ def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, flo
             reason = ", there are no inductors here" if key == "lser" else ""
             raise InputError(f"{name} takes no parameter {key!r}{reason}; allowed: {shown}", part.key)
     given = [*statement.body, *(params[key] for key in kind.aliases if key in params)]
-    if len(given) != 1:
-        raise InputError(f"{name} needs one value in {spec.unit}, {len(given)} are given", statement.where)
-    word = given[0]
-    if not isinstance(word, Number):
-        raise InputError(f"{name} value is {word.text!r}; allowed: a number {spec.unit}", word.where)
-    value = _value(name, spec, word, notes)
+    refuse(len(given) != 1, f"{name} needs one value in {spec.unit}, {len(given)} are given", statement.where)
+    value = _value(name, spec, number(given[0], f"{name} value", f"a number {spec.unit}"), notes)
     copies = params.get(_COPIES)
     if copies is not None:
         if not isinstance(copies, Number) or not 1e-6 <= copies.value <= 1e6:
             raise InputError(f"{name} m is {copies.text!r}; allowed: a number of parts side by side", copies.where)
         value = value / copies.value if device == "R" else value * copies.value
-    initial = params.get("ic")
-    if isinstance(initial, Token):
-        raise InputError(f"{name} IC is {initial.text!r}; allowed: a number V", initial.where)
-    return {"value": value}, None if initial is None else start_volts(f"{name} IC", initial)
+    return {"value": value}, start_volts(f"{name} IC", params["ic"]) if "ic" in params else None
 
 
 def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> float:
@@ -303,8 +248,7 @@ def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> fl
         allowed = f"a number{unit}, or the name of a .param"
         raise InputError(f"{name} {spec.name} is {given.text!r}; allowed: {allowed}", given.where)
     trap = unit_trap(spec, given.text)
-    if trap:
-        raise InputError(f"{name} {spec.name} {trap}", given.where)
+    refuse(trap, f"{name} {spec.name} {trap}", given.where)
     notes.extend(f"{place}: {name} {spec.name}: {doubt}" for place, doubt in _doubts(given, spec))
     if not spec.accepts(given.value):
         plain = f"{given.value:g}{unit}"
@@ -313,24 +257,18 @@ def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> fl
     return given.value
 
 
-def _doubts(given: Number, spec: ParameterSpec) -> list[tuple[Where, str]]:
+def _doubts(given: Number, spec: ParameterSpec) -> Iterator[tuple[Where, str]]:
     """Warnings about the notation of a number, each with the place that it is about."""
-    found = []
     if given.mega is not None and (note := mega_note(given.mega.text, given.value, spec)):
-        found.append((given.mega.where, note))
+        yield given.mega.where, note
     if exponent_and_scale(given.text):
-        found.append((given.where, f"{given.text} is {given.value:g}: exponent and scale both count"))
-    return found
-
-
-# Directives
+        yield given.where, f"{given.text} is {given.value:g}: exponent and scale both count"
 
 
 def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]:
     """The numbers and the other words of a directive's line."""
     for arg in directive.args:
-        if isinstance(arg, Call):
-            raise InputError(f"{directive.name}: {arg.text!r} is not understood; allowed: {usage}", arg.where)
+        refuse(isinstance(arg, Call), f"{directive.name}: {arg.text!r} is not understood; allowed: {usage}", arg.where)
     for key, value in directive.params.items():
         raise InputError(f"{directive.name} takes no {key!r}; allowed: {usage}", value.key)
     numbers = [arg for arg in directive.args if isinstance(arg, Number)]
@@ -338,32 +276,27 @@ def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]
 
 
 def read_tran(directive: Directive, notes: list[str]) -> Tran:
-    """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``, and LTspice's ``.tran TSTOP`` and ``.tran 0 TSTOP [TSTART [TMAX]]``.
-
-    If no TSTEP is given, a warning with the TSTEP that is used is added to `notes`.
-    """
+    """``.tran TSTEP TSTOP [TSTART [TMAX]] [uic]``; LTspice's may lack TSTEP, of which `notes` gets a warning."""
     usage = ".tran TSTEP TSTOP [TSTART [TMAX]] [uic]"
     numbers, words = _numbers(directive, usage)
     for word in words:
         if word in _LTSPICE_START:
             raise InputError(f".tran {word}: {_LTSPICE_START[word]}", directive.where)
-    if any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4:
-        apart = "; a unit joins its number, such as 20m" if any(is_unit(w) for w in words) else ""
-        raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}{apart}", directive.where)
+    apart = "; a unit joins its number, such as 20m" if any(is_unit(w) for w in words) else ""
+    problem = f"{directive.text.strip()!r} is not understood; allowed: {usage}{apart}"
+    refuse(any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4, problem, directive.where)
     step, stop, start, longest = [None, numbers[0], None, None] if len(numbers) == 1 else [*numbers, None, None][:4]
     assert stop is not None
     _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")
-    for what, number in (("TSTOP", stop), ("TMAX", longest)):
-        _require(number is None or 1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 s")
+    for what, given in (("TSTOP", stop), ("TMAX", longest)):
+        _require(given is None or 1e-30 <= given.value <= 1e30, what, given, "1e-30 to 1e30 s")
     if step is None or step.value == 0.0:
         step = longest
     if step is None:
         every = stop.value / LTSPICE_OUTPUTS
         step = Number(every, f"{every:g}", directive.where)
-        notes.append(
-            f"{directive.where}: {directive.text.strip()!r} has no TSTEP, which LTspice does not need: "
-            f"{LTSPICE_OUTPUTS:,} outputs, one every {every:g} s"
-        )
+        note = f"{directive.where}: {directive.text.strip()!r} has no TSTEP, which LTspice does not need"
+        notes.append(f"{note}: {LTSPICE_OUTPUTS:,} outputs, one every {every:g} s")
     _require(step.value > 0.0, "TSTEP", step, "more than 0 s")
     _require(1e-30 <= step.value <= 1e30, "TSTEP", step, "1e-30 to 1e30 s")
     _require(step.value <= stop.value, "TSTEP", step, f"at most TSTOP = {stop.text} (the output step comes first)")
@@ -385,21 +318,18 @@ def read_ac(directive: Directive) -> AcSweep:
     numbers, words = _numbers(directive, usage)
     if len(words) != 1 or words[0] not in ("dec", "oct", "lin") or len(numbers) != 3:
         raise InputError(f"{directive.text.strip()!r} is not understood; allowed: {usage}", directive.where)
-    n, low, high = numbers
+    scale, (n, low, high) = words[0], numbers
     _require(n.value >= 1 and n.value == int(n.value) and n.value <= 1e6, "N", n, "a whole number, 1 to 1e6")
     _require(low.value > 0.0, "FSTART", low, "more than 0 Hz")
     _require(high.value >= low.value, "FSTOP", high, f"at least FSTART = {low.text}")
-    for what, number in (("FSTART", low), ("FSTOP", high)):
-        _require(1e-30 <= number.value <= 1e30, what, number, "1e-30 to 1e30 Hz")
-    scale: Literal["dec", "oct", "lin"] = words[0]  # type: ignore[assignment]
+    for what, given in (("FSTART", low), ("FSTOP", high)):
+        _require(1e-30 <= given.value <= 1e30, what, given, "1e-30 to 1e30 Hz")
     spans = 1.0 if scale == "lin" else math.log(high.value / low.value, 10.0 if scale == "dec" else 2.0)
     _require(n.value * spans <= 1e6, "N", n, f"at most 1e6 frequencies in a sweep, here {n.value * spans:.3g}")
     return AcSweep(scale, int(n.value), low.value, high.value)
 
 
-def read_initial(
-    directives: list[Directive], elements: tuple[Element, ...], uic: bool
-) -> tuple[dict[str, float], tuple[str, ...]]:
+def read_start(given: list[Directive], elements: tuple[Element, ...], uic: bool) -> tuple[dict[str, float], list[str]]:
     """``.ic v(node)=value``: start values by canonical node, in V, or in mm^2 of an area node, and what has no effect.
 
     Without effect are with ``uic`` those where no layer or capacitor without ``IC=`` is, else every ``IC=``.
@@ -409,22 +339,18 @@ def read_initial(
     layers = [e for e in elements if e.spec.is_layer]
     area_nodes = {e.nodes[2] for e in layers}
     out: dict[str, float] = {}
-    for directive in directives:
-        if directive.args:
-            raise InputError(f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
+    for directive in given:
+        refuse(directive.args, f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
         for key, value in directive.params.items():
             place = value.key
-            if not (key.startswith("v(") and key.endswith(")")):
-                raise InputError(f".ic {key!r} is not understood; {usage}", place)
+            refuse(not (key.startswith("v(") and key.endswith(")")), f".ic {key!r} is not understood; {usage}", place)
             if not isinstance(value, Number):
                 raise InputError(f".ic {key} is {value.text!r}; allowed: a number V", place)
             node = key[2:-1]
             if node not in nodes:
                 raise InputError(f".ic names node {node!r}, which is not in the circuit{nearest(node, nodes)}", place)
-            if node in out:
-                raise InputError(f".ic gives node {node!r} twice", place)
-            if node == "0" and value.value != 0.0:
-                raise InputError(f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
+            refuse(node in out, f".ic gives node {node!r} twice", place)
+            refuse(node == "0" and value.value != 0.0, f".ic {key} is {value.text} V; allowed: 0, it is ground", place)
             if node in area_nodes and not 1e-30 <= value.value <= 1e30:
                 raise InputError(f".ic {key} is {value.text} mm^2; allowed: more than 0, from 1e-30 to 1e30", place)
             out[node] = value.value if node in area_nodes else start_volts(f".ic {key}", value)
@@ -433,16 +359,14 @@ def read_initial(
     used = {node for e in started for node in e.nodes[:2]} if uic else set(out)
     used = used - area_nodes | {e.nodes[2] for e in gaps if not uic or e.values["tau"] > 0.0}
     without = [f".ic v({node})" for node in out if node not in used]
-    return out, (*without, *(f"IC= of {e.name}" for e in elements if e.initial is not None and not uic))
+    return out, without + [f"IC= of {e.name}" for e in elements if e.initial is not None and not uic]
 
 
-def start_volts(what: str, number: Number) -> float:
+def start_volts(what: str, word: Value) -> float:
     """A start voltage (V), which must be within the range allowed for sources."""
-    try:
-        check_range(what, number.value, "V")
-    except InputError as error:
-        raise InputError(error.message, number.where) from None
-    return number.value
+    value = number(word, what, "a number V").value
+    check_range(what, value, "V", word.where)
+    return value
 
 
 def read_options(directives: list[Directive]) -> tuple[str, tuple[str, ...]]:
@@ -458,8 +382,7 @@ def read_options(directives: list[Directive]) -> tuple[str, tuple[str, ...]]:
             if key == "work":
                 if text not in WORK_READINGS:
                     raise InputError(f".options work is {text!r}; allowed: {' or '.join(WORK_READINGS)}", place)
-                if work not in (None, text):
-                    raise InputError(f".options work is given twice, first {work}, then {text}", place)
+                refuse(work not in (None, text), f".options work is given twice, first {work}, then {text}", place)
                 work = text
             elif key in _NGSPICE_OPTIONS or key in _LTSPICE_OPTIONS:
                 unused.append(f".options {key}")

@@ -17,6 +17,7 @@ from pathlib import Path, PurePath
 from typing import NamedTuple
 
 from fingerspice.base.errors import InputError, Where
+from fingerspice.circuit.circuit import Tran
 from fingerspice.circuit.devices import layer_devices
 from fingerspice.netlist.expressions import Value, Word, definitions
 from fingerspice.netlist.lexer import (
@@ -32,12 +33,13 @@ from fingerspice.netlist.lexer import (
     nearest,
     split_lines,
 )
+from fingerspice.waveforms.files import file_fault
+from fingerspice.waveforms.waveform import refuse
 
 #: Libraries with ngspice's subcircuits of the native devices; the included library determines the charge law.
 LIBRARIES = {"local": "fingerspice.lib", "mobile": "fingerspice_mobile.lib"}
 
-#: Largest size of a file, and of all the files that a deck's sources name, bytes.
-MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30
+MAX_BYTES, MAX_SOURCE_BYTES = 64 * 2**20, 2**30  #: Of a file, and of all the files that a deck's sources name.
 
 
 @cache
@@ -57,26 +59,10 @@ def read_text(path: Path, shown: str, where: Where | None = None, root: Path | N
 
     `shown` is the path as the user wrote it at the place `where`; files outside the folder `root` are not proposed.
     """
-    try:
-        if path.is_dir():
-            problem = "is a folder, not a file"
-        elif not path.exists():
-            problem = f"does not exist{_similar_file(path, shown, root)}"
-        elif not path.is_file():
-            problem = "is not an ordinary file"
-        elif path.stat().st_size > MAX_BYTES:
-            problem = f"is larger than {MAX_BYTES >> 20} MiB"
-        else:
-            return _decoded(path.read_bytes(), shown, where)
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        problem = f"cannot be read: {_reason(error)}"
-    raise InputError(f"'{shown}' {problem}", where)
-
-
-def _reason(error: Exception) -> str:
-    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    if not (fault := file_fault(path, MAX_BYTES)):
+        return _decoded(path.read_bytes(), shown, where)
+    hint = _similar_file(path, shown, root) if fault == "does not exist" else ""
+    raise InputError(f"'{shown}' {fault}{hint}", where)
 
 
 def text_of(path: Path) -> tuple[str, Path]:
@@ -90,25 +76,21 @@ def text_of(path: Path) -> tuple[str, Path]:
         with nullcontext(sys.stdin.buffer) if str(path) == "-" else path.open("rb") as source:
             data = source.read(MAX_BYTES + 1)
     except OSError as error:
-        raise InputError(f"'{path}' cannot be read: {_reason(error)}") from None
-    if len(data) > MAX_BYTES:
-        raise InputError(f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
+        raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from None
+    refuse(len(data) > MAX_BYTES, f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
     return _decoded(data, str(path), None), Path("stdin")
 
 
 def _decoded(data: bytes, shown: str, where: Where | None) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        # LTspice writes UTF-16 if a name has letters that Latin-1 lacks.
-        return data.decode("utf-16", "replace")
-    if b"\0" in data:
-        raise InputError(f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
+        return data.decode("utf-16", "replace")  # LTspice writes UTF-16 if a name has letters that Latin-1 lacks.
+    refuse(b"\0" in data, f"'{shown}' is not a text file (it holds NUL bytes): save it as UTF-8", where)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         broken = error.start
     try:
-        # LTspice writes its micro sign in the Latin-1 of Windows.
-        return cp1252.Codec().decode(data)[0]
+        return cp1252.Codec().decode(data)[0]  # LTspice writes its micro sign in the Latin-1 of Windows.
     except UnicodeDecodeError:
         number = data[:broken].count(b"\n") + 1
         problem = f"'{shown}' is neither UTF-8 nor Latin-1 text (byte 0x{data[broken]:02x} in line {number})"
@@ -116,12 +98,13 @@ def _decoded(data: bytes, shown: str, where: Where | None) -> str:
 
 
 @dataclass
-class SourceFiles:
-    """Finds the recordings and tables of sources: a deck's in its folder or below, a user's own anywhere."""
+class Context:
+    """What a source may refer to: the .tran line, and files, a deck's in its folder or below, a user's own anywhere."""
 
+    tran: Tran | None  # On whose times SPICE's defaults depend
     folder: Path | None = None  # Folder of the deck; None for a deck given as text
-    # Whether any file may be read, relative to the working directory: for sources given by the user, not by a deck
-    anywhere: bool = False
+    in_deck: bool = True  # Whether the source stands in a deck, which a SPICE may read, too
+    anywhere: bool = False  # Whether any file may be read, relative to the working directory: for a user's own sources
     size: int = 0  # Total size of the files named so far, bytes; a file counts each time that it is named
 
     def find(self, name: str, where: Where) -> Path:
@@ -140,7 +123,8 @@ class SourceFiles:
                 path = folder / name.replace("\\", "/")
             self.size += path.stat().st_size if path.is_file() else 0
         except (OSError, RuntimeError) as error:  # a name that is too long, or the folder of an unknown user
-            raise InputError(f"'{name}' cannot be read: {_reason(error)}", where) from None
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"'{name}' cannot be read: {reason}", where) from None
         if self.size > MAX_SOURCE_BYTES:
             raise InputError(f"the sources' files are larger than {MAX_SOURCE_BYTES >> 20:,} MiB in all", where)
         return path
@@ -153,22 +137,16 @@ def library_changed(root: Path, folder: Path, name: str) -> bool:
         if not path.is_relative_to(root) or not path.is_file():
             return False
         own = library_text(next(law for law, file in LIBRARIES.items() if file == path.name.lower()))
-        # A file of more than four bytes per character cannot be equal, and need not be read.
-        if path.stat().st_size > 4 * len(own):
-            return True
-        text = read_text(path, name)
-        read, shipped = ([line.rstrip() for line in split_lines(x.rstrip())] for x in (text, own))
+        read, shipped = ([line.rstrip() for line in split_lines(x.rstrip())] for x in (read_text(path, name), own))
         return read != shipped
     except (OSError, ValueError, RuntimeError):
-        # A file that cannot be read is not this version's library.
-        return True
+        return True  # A file that cannot be read is not this version's library.
 
 
 def _similar_file(path: Path, shown: str, root: Path | None) -> str:
-    """The clause ``; did you mean 'folder/file'?`` for a missing file, or an empty text.
+    """The clause ``; did you mean 'folder/file'?`` for a missing file, written as its name is, or an empty text.
 
-    The search goes through the file's folder or, if that is missing, the folder with the nearest name, and then through
-    the parent folder. The proposal is written relative to the same folder as the missing file's name.
+    The search goes through the file's folder, or else that with the nearest name, and then through the parent folder.
     """
     folder, below = path.parent, [path.name]
     while not folder.is_dir() and folder != folder.parent:
@@ -180,8 +158,7 @@ def _similar_file(path: Path, shown: str, root: Path | None) -> str:
     found = _nearest_path(folder, below) or _nearest_path(folder, below[-1:])
     # A library of native devices is built in and need not exist in the folder: propose it, too.
     names = [*([found[-1]] if found else []), *(LIBRARIES.values() if root is not None else ())]
-    name = closest(path.name, names)
-    if found is not None and name in (found[-1], None):
+    if found is not None and closest(path.name, names) in (found[-1], None):
         return f"; did you mean '{PurePath(*written, *found).as_posix()}'?"
     return nearest(path.name, names)
 
@@ -208,12 +185,9 @@ def inside(root: Path, folder: Path, name: str, where: Where) -> Path:
         allowed = path.is_relative_to(root)
     except (OSError, ValueError, RuntimeError):  # RuntimeError: a circle of links
         raise InputError(f"'{name}' is not a usable file name", where) from None
-    if not allowed:
-        raise InputError(f"'{name}' lies outside the netlist's folder, where nothing is read", where)
+    refuse(not allowed, f"'{name}' lies outside the netlist's folder, where nothing is read", where)
     return path
 
-
-# Lines
 
 _GREEK_MU = re.compile(r"(?<![\w.])([0-9.]+(?:e[+-]?[0-9]+)?)μ", re.IGNORECASE)
 #: Directives that only other simulators know, each with the alternative here.
@@ -238,10 +212,8 @@ ELSEWHERE = {
         (".savebias", ".loadbias"), "a run goes on from another in Python, fs.simulate(circuit, start=solution)"
     ),
 }
-#: Limits of a netlist with its included files: a word takes up to 500 bytes of memory, and a line 200.
-MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000
-#: Largest number of warnings that are shown.
-MAX_WARNINGS = 100
+MAX_WORDS, MAX_LINES = 1_000_000, 2_000_000  #: Of all files: a word takes up to 500 bytes of memory, and a line 200.
+MAX_WARNINGS = 100  #: Largest number of warnings that are shown.
 MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 32
 
@@ -256,8 +228,7 @@ class Directive(NamedTuple):
 
     name: str  # Name in lower case, with its dot
     args: tuple[Word, ...]
-    # Values of `key=value` pairs by key in lower case; `.ic v(area)=1` has the key ``v(area)`` of the flat circuit
-    params: dict[str, Value]
+    params: dict[str, Value]  # By key in lower case; `.ic v(area)=1` has the key ``v(area)`` of the flat circuit
     where: Where  # Place of the dot
     text: str  # The line as written, continuations joined
 
@@ -267,8 +238,7 @@ class Statement(NamedTuple):
 
     name: str  # Name as written, with the names of the enclosing calls in front: ``Xfinger.Xgap``
     device: str  # Entry of `DEVICES`
-    # Nodes in lower case, ground as ``0``; a node inside a subcircuit has the names of the enclosing calls in front
-    nodes: tuple[str, ...]
+    nodes: tuple[str, ...]  # In lower case, ground as ``0``; inside a subcircuit with the enclosing calls in front
     node_names: tuple[str, ...]  # The same nodes as written
     body: tuple[Word, ...]  # The words after the nodes; empty for an X
     params: dict[str, Value]  # Values of `key=value` pairs by key in lower case
@@ -334,9 +304,8 @@ class Reader:
     def split(self, text: str, where: Where | None = None) -> list[str]:
         """Physical lines of the deck or of an included file; refuses more than `MAX_LINES` lines in all."""
         self._lines += 1 + text.count("\n") + text.count("\r")
-        if self._lines > MAX_LINES:
-            problem = f"the netlist has {self._lines:,} lines; allowed: {MAX_LINES:,}, included files counted"
-            raise InputError(problem, where or self.root.where)
+        problem = f"the netlist has {self._lines:,} lines; allowed: {MAX_LINES:,}, included files counted"
+        refuse(self._lines > MAX_LINES, problem, where or self.root.where)
         return split_lines(text)
 
     def read_deck(self, lines: list[str]) -> None:
@@ -348,8 +317,7 @@ class Reader:
             self._take(line)
         if self._control is not None:
             raise InputError(".control without its .endc", self._control.where())
-        if len(self._open) > 1:
-            raise InputError(f".subckt {self._open[-1].name} without its .ends", self._open[-1].where)
+        refuse(len(self._open) > 1, f".subckt {self._open[-1].name} without its .ends", self._open[-1].where)
 
     def warn(self, message: str, where: Where) -> None:
         """Keep a warning with its place, unless there are many already."""
@@ -388,13 +356,11 @@ class Reader:
         here, place, text = self._open[-1], line.where(), line.text[rest:]
         match name:
             case ".tran" | ".ac" | ".option" | ".options" | ".ic":
-                if here is not self.root and name != ".ic":
-                    opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
-                    raise InputError(f"{name} does not belong inside {opened}?", place)
+                opened = f".subckt {here.name}, which begins at {here.where}; is its .ends missing"
+                refuse(here is not self.root and name != ".ic", f"{name} does not belong inside {opened}?", place)
                 if name in (".tran", ".ac"):
                     for other, first, _ in here.directives:
-                        if other == name:
-                            raise InputError(f"{name} is given twice, first at {first.where()}", place)
+                        refuse(other == name, f"{name} is given twice, first at {first.where()}", place)
                 here.directives.append((".options" if name == ".option" else name, line, rest))
             case ".param":
                 here.params += definitions(line, rest)
@@ -402,8 +368,7 @@ class Reader:
             case ".subckt":
                 self._open.append(self._subcircuit(line, rest))
             case ".ends":
-                if len(self._open) == 1:
-                    raise InputError(".ends without a .subckt before it", place)
+                refuse(len(self._open) == 1, ".ends without a .subckt before it", place)
                 closed = self._open.pop().name
                 if text.strip() and closed and text.strip().lower() != closed.lower():
                     raise InputError(f".ends {text.strip()} closes .subckt {closed}: the names differ", place)
@@ -413,8 +378,7 @@ class Reader:
                 self._control = line
                 self.deck.unused[name] = None
             case ".end":
-                if self._reading:
-                    raise InputError("only the netlist itself, not an included file, has .end", place)
+                refuse(self._reading, "only the netlist itself, not an included file, has .end", place)
                 self._ended = True
             case ".endc":
                 raise InputError(".endc without a .control before it", place)
@@ -446,17 +410,14 @@ class Reader:
             port = word.text.lower()
             if port in ("0", "gnd"):
                 raise InputError("ground is the same node everywhere and cannot be a subcircuit's node", word.where)
-            if port in ports:
-                raise InputError(f"node '{word.text}' is given twice", word.where)
+            refuse(port in ports, f"node '{word.text}' is given twice", word.where)
             ports[port] = None
         defaults = list(words.params.values())
         for _, value in defaults:
-            if value.kind == "string":
-                raise InputError("a number is needed, not a text", value.where)
+            refuse(value.kind == "string", "a number is needed, not a text", value.where)
         defined = Subcircuit(name, line.where(), tuple(ports), defaults, characters=len(line.text))
         first = around.inner.setdefault(name.lower(), defined)
-        if first is not defined:
-            raise InputError(f"subcircuit '{name}' is defined twice, first at {first.where}", defined.where)
+        refuse(first is not defined, f"subcircuit '{name}' is defined twice, first at {first.where}", defined.where)
         return defined
 
     def _include(self, directive: str, line: Line, rest: int) -> None:
@@ -465,16 +426,13 @@ class Reader:
         words = name.split()
         if name[:1] in ("'", '"') and name:
             inner, closed, after = name[1:].partition(name[0])
-            if not closed:
-                raise InputError(f"{name[0]} is never closed", where)
+            refuse(not closed, f"{name[0]} is never closed", where)
             name, words = inner, [inner, *after.split()]
-        if not name.strip():
-            raise InputError(f"{directive} needs a file name", line.where())
-        if len(words) > 1:
-            problem = "one file name is allowed; put a name with blanks in quotes"
-            if directive == ".lib":
-                problem = "sections of a library are not supported: put the section into a file and .include it"
-            raise InputError(problem, where)
+        refuse(not name.strip(), f"{directive} needs a file name", line.where())
+        problem = "one file name is allowed; put a name with blanks in quotes"
+        if directive == ".lib":
+            problem = "sections of a library are not supported: put the section into a file and .include it"
+        refuse(len(words) > 1, problem, where)
         folder = self._reading[-1].parent if self._reading else self._folder
         base = name.replace("\\", "/").rpartition("/")[2]
         if base.lower() in LIBRARIES.values():
@@ -486,16 +444,13 @@ class Reader:
         if folder is None or self._folder is None or self.deck.path is None:
             raise InputError(f"'{name}' cannot be included: a netlist given as text has no folder to look in", where)
         path = inside(self._folder, folder, name, where)
-        if path in (self.deck.path.resolve(), *self._reading):
-            raise InputError(f"'{name}' includes itself", where)
+        refuse(path in (self.deck.path.resolve(), *self._reading), f"'{name}' includes itself", where)
         self.deck.files.append(path)
-        if len(self.deck.files) > MAX_INCLUDES or len(self._reading) >= MAX_INCLUDE_DEPTH:
-            problem = f"too many included files: at most {MAX_INCLUDES}, nested {MAX_INCLUDE_DEPTH} deep"
-            raise InputError(problem, where)
+        problem = f"too many included files: at most {MAX_INCLUDES}, nested {MAX_INCLUDE_DEPTH} deep"
+        refuse(len(self.deck.files) > MAX_INCLUDES or len(self._reading) >= MAX_INCLUDE_DEPTH, problem, where)
         text = read_text(path, name, where, self._folder)
         self._size += len(text)
-        if self._size > MAX_BYTES:
-            raise InputError(f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
+        refuse(self._size > MAX_BYTES, f"the included files are larger than {MAX_BYTES >> 20} MiB in all", where)
         self._reading.append(path)
         shown = str(Path(self.deck.file).parent / path.relative_to(self._folder))
         for included in logical_lines(self.split(text, where), shown):

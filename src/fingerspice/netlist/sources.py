@@ -4,35 +4,22 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 from fingerspice.base.errors import InputError, Where
-from fingerspice.circuit.circuit import SmallSignal, Tran
-from fingerspice.netlist.expressions import Call, Number, Token, Word
+from fingerspice.circuit.circuit import SmallSignal
+from fingerspice.circuit.devices import DEVICES
+from fingerspice.netlist.expressions import Call, Number, Token, Word, number
 from fingerspice.netlist.lexer import is_unit, nearest
-from fingerspice.netlist.reader import SourceFiles
+from fingerspice.netlist.reader import Context, Statement
 from fingerspice.waveforms.files import read_table
 from fingerspice.waveforms.periodic import PWL, Burst, Pulse, Repeat, Sawtooth, Square, Triangle
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import AM, DC, Chirp, Exp, Sine, Waveform
+from fingerspice.waveforms.waveform import AM, DC, Chirp, Exp, Sine, Waveform, refuse
 
 _KEPT_BYTES = 2**25  # A larger WAV file is read in parts when needed: 32 MiB are six minutes of 16 bits at 48 kHz.
-
-
-class Context(NamedTuple):
-    """Data that the text of a source may refer to."""
-
-    tran: Tran | None  # The .tran line, on whose times SPICE's defaults depend
-    files: SourceFiles  # Finds recordings and tables
-    in_deck: bool = True  # Whether the text stands in a deck, which a SPICE may read, too
-
-
-def _number(word: Word, what: str) -> float:
-    if not isinstance(word, Number):
-        raise InputError(f"{what} is {word.text!r}; allowed: a number or {{expression}}", word.where)
-    return word.value
 
 
 class _Arguments:
@@ -47,8 +34,7 @@ class _Arguments:
             self.refuse(f"{self.name} needs {function.required} values, {given} given")
         if given > len(names) > 0:
             hint = "; Ncycles is not supported, a burst is BURST(amplitude frequency cycles), in Python fs.Burst"
-            # LTspice has one more argument.
-            self.usage += hint if function.counted and given == len(names) + 1 else ""
+            self.usage += hint if function.counted and given == len(names) + 1 else ""  # LTspice has one more argument.
             self.refuse(f"{self.name} takes at most {len(names)} values, {given} given")
         self.words: dict[str, Word] = dict(zip(names, call.args, strict=False))
         for key, value in call.params.items():
@@ -63,23 +49,21 @@ class _Arguments:
 
     def get(self, name: str, default: float = math.nan) -> float:
         """A number by its name."""
-        return _number(self.words[name], f"{self.name} {name}") if name in self.words else default
+        return number(self.words[name], f"{self.name} {name}").value if name in self.words else default
 
     def step_or(self, name: str) -> float:
         """An argument whose SPICE default is TSTEP."""
         tran = self.context.tran
-        if name not in self.words and tran is None:
-            default = "which defaults to TSTEP, and there is no .tran line"
-            raise InputError(f"{self.name} leaves out {name}, {default}; allowed: give {name}", self.call.where)
+        problem = f"{self.name} leaves out {name}, which defaults to TSTEP, and there is no .tran line"
+        refuse(name not in self.words and tran is None, f"{problem}; allowed: give {name}", self.call.where)
         return self.get(name, tran.step if tran else math.nan)
 
     def whole(self, name: str) -> int | None:
         """A whole number by its name; None if it is left out."""
         if name not in self.words:
             return None
-        value = _number(self.words[name], name)
-        if value != int(value):
-            raise InputError(f"{name} is {value:g}; allowed: a whole number", self.words[name].where)
+        value = number(self.words[name], name).value
+        refuse(value != int(value), f"{name} is {value:g}; allowed: a whole number", self.words[name].where)
         return int(value)
 
     def column(self, name: str) -> str | int | None:
@@ -87,12 +71,16 @@ class _Arguments:
         word = self.words.get(name)
         return word.text if isinstance(word, Token) else self.whole(name)
 
+    def upsampled(self, recording: Samples) -> Samples:
+        """The recording, upsampled by the factor that is given."""
+        factor = self.whole("upsample")
+        return recording if factor is None else recording.upsampled(factor)
+
     def file(self, name: str = "path") -> Path:
         """The file that a word names."""
         if name not in self.words:
             self.refuse(f"{self.name} names no file")
-        word = self.words[name]
-        return self.context.files.find(word.text, word.where)
+        return self.context.find(self.words[name].text, self.words[name].where)
 
 
 def _sin(a: _Arguments) -> Waveform:
@@ -118,12 +106,11 @@ def _exp(a: _Arguments) -> Waveform:
 def _pwl(a: _Arguments) -> Waveform:
     shift, repeat = a.get("td", 0.0), a.get("r", -1.0)
     if "file" in a.words:
-        if a.call.args:
-            raise InputError("PWL has points and file= too; allowed: one of them", a.call.where)
+        refuse(a.call.args, "PWL has points and file= too; allowed: one of them", a.call.where)
         points = PWL.from_table(a.file("file"), pairs=True)
         given, levels = points.times, points.values
     else:
-        numbers = [_number(arg, "PWL value") for arg in a.call.args]
+        numbers = [number(arg, "PWL value").value for arg in a.call.args]
         if len(numbers) < 2 or len(numbers) % 2:
             raise InputError(f"PWL needs pairs of time and value, {len(numbers)} numbers given", a.call.where)
         given, levels = tuple(numbers[0::2]), tuple(numbers[1::2])
@@ -138,22 +125,18 @@ def _wavefile(a: _Arguments) -> Waveform:
     path = a.file()
     if "gain" not in a.words:
         a.refuse(f"{a.name} has no gain, the V at full scale")
-    factor, small = a.whole("upsample"), not path.is_file() or path.stat().st_size <= _KEPT_BYTES
-    read = Samples.from_wav(path, _number(a.words["gain"], "gain"), a.whole("channel"), at_once=small)
-    return read if factor is None else read.upsampled(factor)
+    small = not path.is_file() or path.stat().st_size <= _KEPT_BYTES
+    gain = number(a.words["gain"], "gain").value
+    return a.upsampled(Samples.from_wav(path, gain, a.whole("channel"), at_once=small))
 
 
 def _table(a: _Arguments) -> Waveform:
-    path = a.file()
-    rate = _number(a.words["rate"], "TABLE rate") if "rate" in a.words else None
-    table = read_table(path, a.column("time"), a.column("value"), rate)
-    factor = a.whole("upsample")
-    if table.rate is not None:
-        recording = Samples(table.values, table.rate)
-        return recording if factor is None else recording.upsampled(factor)
-    if factor is not None:
-        raise InputError("TABLE upsample goes with a rate, and this table has times", a.call.where)
-    return PWL(table.times, table.values)  # type: ignore[arg-type]
+    path, given = a.file(), a.get("rate") if "rate" in a.words else None
+    values, rate, times = read_table(path, a.column("time"), a.column("value"), given)
+    if rate is not None:
+        return a.upsampled(Samples(values, rate))
+    refuse("upsample" in a.words, "TABLE upsample goes with a rate, and this table has times", a.call.where)
+    return PWL(times, values)  # type: ignore[arg-type]
 
 
 def _burst(a: _Arguments) -> Waveform:
@@ -179,6 +162,7 @@ class Function(NamedTuple):
     refused: str = ""  # Why it is refused in decks, which a SPICE may read, too; --source takes it
 
 
+_CHANGED = "changed its argument order between ngspice versions; write the waveform as PWL"
 #: Source functions by name; an entry is all that a new source function needs.
 SOURCES: Mapping[str, Function] = {
     "sin": Function(_sin, "VO VA FREQ TD THETA PHASE", 2, counted=True),
@@ -190,9 +174,7 @@ SOURCES: Mapping[str, Function] = {
     "sawtooth": Function(_plain(Sawtooth), "amplitude frequency", 2),
     "chirp": Function(_plain(Chirp), "amplitude f0 f1 duration", 4),
     "am": Function(
-        _plain(AM), "amplitude carrier envelope depth", 3,
-        refused="AM changed its argument order between ngspice versions; write the waveform as PWL, or give it by "
-        "--source",
+        _plain(AM), "amplitude carrier envelope depth", 3, refused=f"AM {_CHANGED}, or give it by --source",
     ),
     "burst": Function(_burst, "amplitude frequency cycles every", 3),
     "wavefile": Function(
@@ -205,46 +187,31 @@ SOURCES: Mapping[str, Function] = {
     ),
 }  # fmt: skip
 _KNOWN = ", ".join(name.upper() for name, function in SOURCES.items() if not function.refused)
-#: What is no source function, with what is allowed.
-_LEVELS = {"dc": "DC value", "ac": "AC [magnitude [phase]]"}
-_SFFM = "SFFM changed its argument order between ngspice versions; write the waveform as PWL"
-#: Names in LTspice, and a short one for the command line.
-_ALIASES = {"sine": "sin", "wav": "wavefile"}
+_LEVELS = {"dc": "DC value", "ac": "AC [magnitude [phase]]"}  #: What is no source function, with what is allowed.
+_ALIASES = {"sine": "sin", "wav": "wavefile"}  #: Names in LTspice, and a short one for the command line.
 
 
-class Source(NamedTuple):
-    """Waveform and small signal of a V or I element, from the words after its nodes."""
+def read_source(statement: Statement, context: Context, notes: list[str]) -> tuple[Waveform, SmallSignal | None]:
+    """Waveform and small signal of a V or I element; `notes` gets warnings about what ngspice reads differently.
 
-    waveform: Waveform
-    ac: SmallSignal | None
-    notes: tuple[str, ...]  # Warnings about words that ngspice reads differently
-
-
-def read_source(name: str, body: Sequence[Word], context: Context, where: Where) -> Source:
-    """Read the words after the nodes of the V or I element `name`, which stands at the place `where`.
-
-    They are ``[DC] value``, ``AC ...`` and at most one source function.
+    The words after its nodes are ``[DC] value``, ``AC ...`` and at most one source function.
     """
     level: float | None = None
     ac: SmallSignal | None = None
     waveform: Waveform | None = None
-    notes: tuple[str, ...] = ()
-    words = deque(body)
+    name, words = statement.name, deque(_words(statement))
     while words:
         word = words.popleft()
         if isinstance(word, Number):
-            if level is not None or waveform is not None:
-                allowed = "one value or source function, such as SIN(0 200 100)"
-                raise InputError(f"{name}: a second value {word.text!r}; allowed: {allowed}", word.where)
+            problem = f"{name}: a second value {word.text!r}; allowed: one value or source function"
+            refuse(level is not None or waveform is not None, f"{problem}, such as SIN(0 200 100)", word.where)
             level = word.value
             continue
         key = _ALIASES.get(word.text.lower(), word.text.lower())
-        if isinstance(word, Token) and is_unit(key) and (level is not None or waveform is not None):
-            problem = f"{name}: {word.text!r} stands apart; a unit joins its number, such as 5{word.text}"
-            raise InputError(problem, word.where)
+        apart = isinstance(word, Token) and is_unit(key) and (level is not None or waveform is not None)
+        refuse(apart, f"{name}: {word.text!r} stands apart; a unit joins its number, such as 5{word.text}", word.where)
         if isinstance(word, Token):
-            # A call may also be written without brackets: SIN 0 200 100.
-            numbers: list[Number] = []
+            numbers = list[Number]()  # A call may also be written without brackets: SIN 0 200 100.
             while words and isinstance(words[0], Number):
                 numbers.append(words[0])
                 words.popleft()
@@ -253,32 +220,53 @@ def read_source(name: str, body: Sequence[Word], context: Context, where: Where)
             problem = f"{name}: {key.upper()} has no parameter {next(iter(word.params))!r}; allowed: {_LEVELS[key]}"
             raise InputError(problem, next(iter(word.params.values())).key)
         if key == "dc":
-            if len(word.args) != 1:
-                raise InputError(f"{name}: DC needs one value", word.where)
-            level = _number(word.args[0], f"{name} DC")
+            refuse(len(word.args) != 1, f"{name}: DC needs one value", word.where)
+            level = number(word.args[0], f"{name} DC").value
         elif key == "ac":
-            if ac is not None:
-                raise InputError(f"{name} has AC twice; allowed: {_LEVELS[key]} once", word.where)
-            given = [_number(arg, f"{name} AC") for arg in word.args]
-            if len(given) > 2:
-                problem = f"{name}: AC takes at most 2 values, {len(given)} given; allowed: {_LEVELS[key]}"
-                raise InputError(problem, word.where)
+            refuse(ac is not None, f"{name} has AC twice; allowed: {_LEVELS[key]} once", word.where)
+            given = [number(arg, f"{name} AC").value for arg in word.args]
+            problem = f"{name}: AC takes at most 2 values, {len(given)} given; allowed: {_LEVELS[key]}"
+            refuse(len(given) > 2, problem, word.where)
             ac = SmallSignal(*given)
         elif waveform is not None:
             raise InputError(f"{name} has two source functions, the second is {key.upper()}", word.where)
         else:
             waveform = _read_call(name, key, word, context)
-            notes = tuple(f"{word.where}: {name}: {note}" for note in _differences(key, waveform, word))
+            notes.extend(f"{word.where}: {name}: {note}" for note in _differences(key, waveform, word))
     if waveform is None and level is None and ac is None:
-        raise InputError(f"{name} has no value; allowed: a number or one of {_KNOWN}", where)
-    return Source(waveform if waveform is not None else DC(level or 0.0), ac, notes)
+        raise InputError(f"{name} has no value; allowed: a number or one of {_KNOWN}", statement.where)
+    return waveform if waveform is not None else DC(level or 0.0), ac
+
+
+def _words(statement: Statement) -> list[Word]:
+    """The words after the nodes, with the `key=value` pairs behind them in the calls to which they belong."""
+    name, body, params = statement.name, list(statement.body), statement.params
+    last = body[-1] if body else None
+    if "wavefile" in params and not any(isinstance(word, Call) for word in body):
+        # LTspice's `wavefile=path [chan=n]`: 1 V at full scale, and the first channel if none is chosen.
+        path = params["wavefile"]
+        where = path.key or path.where
+        for key, value in params.items():
+            if key not in ("wavefile", "chan"):
+                raise InputError(f"{name} takes no parameter {key!r} beside wavefile=; allowed: chan=", value.key)
+        channel = params.get("chan", Number(0.0, "0", where))
+        body.append(Call("wavefile", (path, Number(1.0, "1", where), channel), {}, where))
+    elif params:
+        # ngspice takes PWL(...) r=10m as well as PWL(... r=10m), and the brackets of PWL(file=...) may be left out.
+        inner = last.params if isinstance(last, Call) else {}
+        if not isinstance(last, Call | Token) or last.text.lower() != "pwl" or set(inner) & set(params):
+            key = next(iter(params))
+            takes = ", ".join(p.capitalize() for p in DEVICES[statement.device].beside)
+            hint = f"; allowed: {takes}, besides its value" if takes else ""
+            raise InputError(f"{name} takes no parameter {key!r}{hint}", params[key].key)
+        body[-1] = Call(last.text, last.args if isinstance(last, Call) else (), {**inner, **params}, last.where)
+    return body
 
 
 def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
     function = SOURCES.get(key)
-    refused = _SFFM if key == "sffm" else function.refused if function and context.in_deck else ""
-    if refused:
-        raise InputError(f"{name}: {refused}", call.where)
+    refused = f"SFFM {_CHANGED}" if key == "sffm" else function.refused if function and context.in_deck else ""
+    refuse(refused, f"{name}: {refused}", call.where)
     if function is None:
         hint = nearest(key, SOURCES)
         raise InputError(f"{name}: unknown source {key.upper()!r}{hint}; allowed: {_KNOWN}", call.where)
@@ -288,20 +276,15 @@ def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
         raise error if error.where else InputError(f"{name}: {error.message}", call.where) from None
 
 
-def _differences(key: str, waveform: Waveform, call: Call) -> list[str]:
+def _differences(key: str, waveform: Waveform, call: Call) -> Iterator[str]:
     """Warnings about numbers that ngspice 39 or LTspice reads differently, or that were left out."""
     if isinstance(waveform, Exp) and 0.0 in (waveform.td1, waveform.td2):
         which = " and ".join(n for n, x in (("TD1", waveform.td1), ("TD2", waveform.td2)) if x == 0.0)
-        return [
-            f"{key.upper()} has {which} = 0, which is 0 s here and not in ngspice 39, which takes TSTEP for TD1 = 0 "
-            "and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once"
-        ]
+        note = f"{key.upper()} has {which} = 0, which is 0 s here and not in ngspice 39, which takes TSTEP for TD1 = 0"
+        yield f"{note} and TD1 + TSTEP for TD2 = 0; write 1f for both to start at once"
     if isinstance(waveform, Sine) and len(call.args) < 3:
-        return [
-            f"{call.text.upper()} leaves out FREQ, which is 1/TSTOP then, {waveform.frequency:g} Hz; its values are VO "
-            "VA FREQ"
-        ]
+        note = f"{call.text.upper()} leaves out FREQ, which is 1/TSTOP then, {waveform.frequency:g} Hz"
+        yield f"{note}; its values are VO VA FREQ"
     later = [arg.text for arg in call.args[2::2] if isinstance(arg, Number) and arg.text.startswith("+")]
     if key == "pwl" and later:
-        return [f"the time {later[0]} is counted from 0, as in ngspice; LTspice counts it from the point before"]
-    return []
+        yield f"the time {later[0]} is counted from 0, as in ngspice; LTspice counts it from the point before"

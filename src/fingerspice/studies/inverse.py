@@ -23,7 +23,7 @@ from fingerspice.plots import drawing
 from fingerspice.results.record import Sealed
 from fingerspice.solve.simulation import simulate
 from fingerspice.studies.finger import Finger
-from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_columns
+from fingerspice.waveforms.files import read_text_columns
 from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import Waveform, as_waveform, require
@@ -255,7 +255,6 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Wavef
     The header names a column ``force`` or ``friction`` (N or mN), and a column of times, ``t`` or ``time``, unless a
     `rate` (Hz) is given: ``time (ms), friction (N)``. Time 0 of the course is the first of the table's times.
     """
-    path = checked_file(path, MAX_TEXT_BYTES)
     found = read_text_columns(path)
     if not found.names:
         raise InputError(f"'{path}' has no header; allowed: a first line such as 'time (s), friction (N)'")

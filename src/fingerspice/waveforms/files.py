@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from fingerspice.base.arrays import FloatArray, positive_number
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number
+from fingerspice.waveforms.waveform import refuse
 
 _UNIT = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
 # Names that simulators give to a voltage between nodes or the current of an element: V(n001), I(R1), Ix(u1:in).
@@ -33,10 +34,8 @@ _COMMENTED = ("#", ";", "*")
 _COMMENT = re.compile(r"^(\s*[^\s;]+\s[^;]*\s);.*")
 # A line that begins with a number or NaN, in the first cell that is not empty, and so is no header.
 _FIRST_NUMBER = re.compile(r"[\s,;\"]*(?:[+-]?\.?\d|[+-]?(?:nan|inf)\b|$)", re.IGNORECASE)
-# Begins the line above each run in LTspice's export of a .step.
-_STEPPED = "Step Information:"
-# Largest number of column names shown in a message.
-_SHOWN = 8
+_STEPPED = "Step Information:"  # Begins the line above each run in LTspice's export of a .step.
+_SHOWN = 8  # Largest number of column names shown in a message.
 
 
 @dataclass(frozen=True)
@@ -73,18 +72,23 @@ class Columns:
         called = f"({shown})" if self.names else f"without a header (0 to {count - 1})"
         return f"{count} column{'s' if count > 1 else ''} {called}"
 
-    def index(self, column: str | int) -> int:
-        """Index of a column given by its name, of which there has to be one, or by its number."""
+    def index(self, column: str | int | None, role: str, most: int, default: int) -> int:
+        """Index of a column given by its name, of which there has to be one, or by its number; else the default.
+
+        A table of more than `most` columns has no default for the role.
+        """
         count = self.data.shape[1]
+        if column is None:
+            way = "name the column" if self.names else "the number of the column"
+            refuse(count > most, f"'{self.file}' has {self.listed()}; allowed: {way} of the {role}")
+            return default
         if isinstance(column, str):
-            if not self.names:
-                raise InputError(f"'{self.file}' has no header that names a column {column!r}; allowed: its number, "
-                                 f"0 to {count - 1}")  # fmt: skip
+            problem = f"'{self.file}' has no header that names a column {column!r}"
+            refuse(not self.names, f"{problem}; allowed: its number, 0 to {count - 1}")
             exact = [i for i, name in enumerate(self.names) if name == column]
             found = exact or [i for i, name in enumerate(self.names) if name.lower() == column.lower()]
-            if len(found) != 1:
-                what = "several columns" if found else "no column"
-                raise InputError(f"'{self.file}' has {what} {column!r}; it has {self.listed()}")
+            what = "several columns" if found else "no column"
+            refuse(len(found) != 1, f"'{self.file}' has {what} {column!r}; it has {self.listed()}")
             return found[0]
         if not (column == int(column) and 0 <= column < count):
             raise InputError(f"'{self.file}' has no column {column}; it has {self.listed()}")
@@ -106,24 +110,23 @@ class Columns:
         rows, columns = self.data.shape
         if self.names or (rows > 1 and columns > 1):
             return self
-        if self.data.size % 2:
-            raise InputError(f"'{self.file}' holds {self.data.size} numbers; allowed: pairs of time and value")
+        refuse(self.data.size % 2, f"'{self.file}' holds {self.data.size} numbers; allowed: pairs of time and value")
         for column in range(columns):
             self.numbers(column)
         lines = None if self.lines is None else np.resize(self.lines[::2], self.data.size // 2)
         return Columns(self.file, (), self.data.reshape(-1, 2), (), lines)
 
 
-def read_text_columns(path: Path, label: str | None = None) -> Columns:
+def read_text_columns(path: str | Path, label: str | None = None) -> Columns:
     """Columns of a text file, with one count of cells in all rows; the column `label` has words. Errors name lines."""
+    path = checked_file(path, MAX_TEXT_BYTES)
     numbered = _lines(path)
     rows = [(number, line) for number, line in numbered if not line.lstrip().startswith(_COMMENTED)]
     place = None
     if label is not None and rows:
         # The rows of such a table need not begin with a number: they are those below the first.
         named = [_unit(cell)[0].lower() for cell in _cells(rows[0][1], _separator(rows[0][1]))]
-        if label.lower() not in named:
-            raise InputError(f"'{path}' has no column {label!r} in its header; it has {', '.join(named)}")
+        refuse(label.lower() not in named, f"'{path}' has no column {label!r} in its header; it has {', '.join(named)}")
         place = named.index(label.lower())
     first = next((i for i, (_, line) in enumerate(rows) if (i if label else _FIRST_NUMBER.match(line))), None)
     if first is None:
@@ -138,9 +141,15 @@ def read_text_columns(path: Path, label: str | None = None) -> Columns:
         raise InputError(f"'{path}', line {begin}: {said}")
     separator = _separator(line)
     count = len(_cells(line, separator))
-    above = [one for one in numbered if one[0] < begin][-1:]
-    header = [_unit(name) for name in _header(path, *above[0], separator, count)] if above else []
-    names, units = zip(*header, strict=True) if header else ((), ())
+    # The line above the first numbers has the names, unless it is a comment or, here `;`, there is none.
+    number, text = [(0, ";"), *((one, above.strip()) for one, above in numbered if one < begin)][-1]
+    header = _cells(text.lstrip("#"), separator)
+    if len(header) != count or text[0] in ";*":
+        hint = ", or are its commas decimal commas" if separator == "," and count == 2 * len(header) else ""
+        problem = f"'{path}', line {number}: the header names {len(header)} columns, and the rows have {count}"
+        refuse(not text.startswith(_COMMENTED), f"{problem}: is a name missing{hint}?")
+        header = []
+    names, units = zip(*map(_unit, header), strict=True) if header else ((), ())
     table, faults, words = _numbers(path, rows[first:], separator, count, place)
     places = np.array([number for number, _ in rows[first:]])
     return Columns(path, names, table, units, places, faults, words)
@@ -150,8 +159,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     """The lines of a text file that are not empty, by their numbers from 1, without comments behind numbers."""
     data = path.read_bytes()
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    if b"\0" in data and not wide:
-        raise InputError(f"'{path}' is no text; allowed: a table as text, or an NPZ file")
+    refuse(b"\0" in data and not wide, f"'{path}' is no text; allowed: a table as text, or an NPZ file")
     try:
         lines = data.decode("utf-16" if wide else "utf-8-sig").splitlines()
     except UnicodeDecodeError:
@@ -190,19 +198,6 @@ def _refuse_semicolons(path: Path, number: int, line: str) -> None:
         raise InputError(f"{problem}; allowed: commas, tabs or blanks between numbers with points")
 
 
-def _header(path: Path, number: int, line: str, separator: str | None, count: int) -> list[str]:
-    """Column names from the line above the first numbers, which may be a comment; empty if it holds no names."""
-    text = line.strip()
-    names = _cells(text.lstrip("#"), separator)
-    if len(names) == count and text[0] not in ";*":
-        return names
-    if text.startswith(_COMMENTED):
-        return []
-    hint = ", or are its commas decimal commas" if separator == "," and count == 2 * len(names) else ""
-    raise InputError(f"'{path}', line {number}: the header names {len(names)} columns, and the rows have {count}: is "
-                     f"a name missing{hint}?")  # fmt: skip
-
-
 def _numbers(
     path: Path, rows: list[tuple[int, str]], separator: str | None, count: int, label: int | None
 ) -> tuple[FloatArray, dict[int, str], tuple[str, ...]]:
@@ -228,27 +223,20 @@ def _numbers(
 
 
 def _number(cell: str) -> float:
-    try:
+    with suppress(ValueError):
         return float(cell)
-    except ValueError:
-        return parse_number(cell)
+    return parse_number(cell)
 
 
-#: Largest size of a binary file and of a text file, bytes.
-MAX_BYTES, MAX_TEXT_BYTES = 2**30, 2**26
-#: Largest number of samples: an hour at 48 kHz has 1.7e8, which take 1.4 GB.
-MAX_SAMPLES = 200_000_000
-#: Largest size of a WAV file that is read piece by piece, bytes.
-LARGEST_STREAMED = 2**40
-# Largest deviation, in samples, of a file's times from those that its rate gives: the written times are rounded.
-_JITTER = 0.1
+MAX_BYTES, MAX_TEXT_BYTES = 2**30, 2**26  #: Largest size of a binary file and of a text file, bytes.
+MAX_SAMPLES = 200_000_000  #: Largest number of samples: an hour at 48 kHz has 1.7e8, which take 1.4 GB.
+LARGEST_STREAMED = 2**40  #: Largest size of a WAV file that is read piece by piece, bytes.
+_JITTER = 0.1  # Largest distance, in samples, of a file's times from those of its rate: written times are rounded.
 _RATE_NAMES = ("rate", "fs", "sample_rate")
 _TIME_NAMES = ("t", "time")
-# Sizes of samples that stand for an unknown one, in headers that were written before a live stream ended: the samples
-# go on to the end of the file. SoX writes the second one.
+# Sizes that stand for an unknown one in a live stream's header, the second by SoX: samples go on to the file's end.
 _UNKNOWN_SIZES = (0xFFFFFFFF, 0x7FFFF000)
-# Most chunks of a file that are looked at, so that a crafted one takes no minutes.
-_MOST_CHUNKS = 10_000
+_MOST_CHUNKS = 10_000  # Most chunks of a file that are looked at, so that a crafted one takes no minutes.
 # Names of number formats that are not read.
 _FORMATS = {2: "ADPCM", 6: "ALAW", 7: "MULAW", 17: "DVI_ADPCM", 85: "MPEGLAYER3"}
 # First bytes of other file formats, to name the format in the message.
@@ -256,15 +244,6 @@ _OTHERS = {
     b"ID3": "MP3", b"\xff\xfb": "MP3", b"\xff\xf3": "MP3", b"OggS": "Ogg", b"fLaC": "FLAC", b"FORM": "AIFF",
     b"caff": "CAF", b"PK": "ZIP or NPZ",
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Recording:
-    """Values against time, either at a rate or at times."""
-
-    values: FloatArray  # (n,): V, or A
-    rate: float | None = None  # Samples per second
-    times: FloatArray | None = None  # (n,): s, not decreasing
 
 
 @dataclass(frozen=True)
@@ -276,8 +255,7 @@ class WavLayout:
     channels: int
     channel: int  # The one that is read
     count: int  # Samples of each channel
-    # Number format as NumPy writes it, such as ``<i2``; NumPy itself does not know those of 3, 5, 6 or 7 bytes
-    kind: str
+    kind: str  # As NumPy writes it, such as ``<i2``; NumPy itself does not know those of 3, 5, 6 or 7 bytes
     offset: int  # Position of the first sample, bytes
 
     def read(self, first: int, last: int) -> FloatArray:
@@ -290,8 +268,7 @@ class WavLayout:
                 raw = file.read((last - first) * block)
         except OSError as error:
             raise InputError(f"'{self.path}' cannot be read: {error.strerror}") from None
-        if len(raw) < (last - first) * block:
-            raise InputError(f"'{self.path}' has become shorter while it was read")
+        refuse(len(raw) < (last - first) * block, f"'{self.path}' has become shorter while it was read")
         if width in (1, 2, 4, 8):
             stored = np.frombuffer(raw, self.kind).reshape(-1, self.channels)[:, self.channel]
         else:
@@ -322,21 +299,17 @@ def wav_layout(path: str | Path, channel: int | None = None, most: int = LARGEST
     width = block // max(channels, 1)
     whole = bits == 8 * width and width in (4, 8) if tag == 3 else 0 < bits <= 8 * width and (bits > 8 or width == 1)
     # Of floats, some programs write no number of bytes a second.
-    if not whole or width > 8 or block != channels * width or (tag == 1 and pace != rate * block):
-        problem = f"{channels} channels of {bits} bits take {block} bytes, at {rate} Hz {pace} bytes a second"
-        raise InputError(f"'{path}' is broken: its header says that {problem}")
-    if rate == 0:
-        raise InputError(f"'{path}' is broken: its header gives a rate of 0 Hz")
-    if length == 0:
-        raise InputError(f"'{path}' holds no samples")
-    if length % block:
-        raise InputError(f"'{path}' is cut short or broken: {length} bytes are no whole number of samples of {block}")
-    if channel is None and channels > 1:
-        raise InputError(f"'{path}' has {channels} channels and none is chosen; allowed: channel=0 to {channels - 1}")
+    said = f"{channels} channels of {bits} bits take {block} bytes, at {rate} Hz {pace} bytes a second"
+    wrong = not whole or width > 8 or block != channels * width or (tag == 1 and pace != rate * block)
+    refuse(wrong, f"'{path}' is broken: its header says that {said}")
+    refuse(rate == 0, f"'{path}' is broken: its header gives a rate of 0 Hz")
+    refuse(length == 0, f"'{path}' holds no samples")
+    refuse(length % block, f"'{path}' is cut short or broken: {length} bytes are no whole number of samples of {block}")
+    allowed = "channel=0, its only one" if channels == 1 else f"channel=0 to {channels - 1}"
+    refuse(channel is None and channels > 1, f"'{path}' has {channels} channels and none is chosen; allowed: {allowed}")
     number = 0 if channel is None else channel
-    if isinstance(number, bool | str) or number != int(number) or not 0 <= number < channels:
-        allowed = "channel=0, its only one" if channels == 1 else f"channel=0 to {channels - 1}"
-        raise InputError(f"'{path}' has no channel {number!r}; allowed: {allowed}")
+    wrong = isinstance(number, bool | str) or number != int(number) or not 0 <= number < channels
+    refuse(wrong, f"'{path}' has no channel {number!r}; allowed: {allowed}")
     kind = f"{order}{'f' if tag == 3 else 'u' if width == 1 else 'i'}{width}"
     return WavLayout(path, rate, channels, int(number), length // block, kind, offset)
 
@@ -382,8 +355,8 @@ def _wav_chunks(path: Path, file: BinaryIO) -> tuple[str, bytes, int, int]:
 def read_table(
     path: str | Path, time: str | int | None = None, value: str | int | None = None, rate: float | None = None, *,
     pairs: bool = False,
-) -> Recording:  # fmt: skip
-    """Columns of a table: a text file with one row per line, or an NPZ file of NumPy.
+) -> tuple[FloatArray, float | None, FloatArray | None]:  # fmt: skip
+    """Values (V or A) of a table with their rate (Hz) or their times (s): a text of one row a line, or NumPy's NPZ.
 
     Numbers in a text have decimal points and may have SPICE's scales (``1m``); commas, tabs or blanks separate them.
     Lines that begin with ``#``, ``;`` or ``*`` are comments, and so is what follows a blank and ``;`` behind numbers.
@@ -399,8 +372,6 @@ def read_table(
     path = checked_file(path, MAX_BYTES)
     with path.open("rb") as file:
         packed = file.read(4) == b"PK\x03\x04" or path.suffix.lower() == ".npz"
-    if not packed:
-        checked_file(path, MAX_TEXT_BYTES)
     found, own_rate = _npz_columns(path) if packed else (read_text_columns(path), None)
     found = found.paired() if pairs else found
     check_count(str(path), found.data.shape[0])
@@ -410,16 +381,17 @@ def read_table(
         raise InputError(f"'{path}': the rate given is {rate:g} Hz, and its own is {own_rate:g} Hz; allowed: one rate")
     rate = own_rate if rate is None else positive_number(f"'{path}': the rate", rate, "Hz")
     columns = found.data.shape[1]
-    if rate is None and columns == 1:
-        raise InputError(f"'{path}' has one column and no rate; allowed: a column of times too, or rate= in Hz; "
-                         "PWL FILE= takes alternating times and values")  # fmt: skip
+    allowed = "a column of times too, or rate= in Hz; PWL FILE= takes alternating times and values"
+    refuse(rate is None and columns == 1, f"'{path}' has one column and no rate; allowed: {allowed}")
     # A column that is named as times is one even beside a rate, which it may contradict.
     named = [i for i, name in enumerate(found.names) if name.lower() in _TIME_NAMES]
     if rate is not None and not (columns > 1 and (named or (columns == 2 and value is None))):
-        return Recording(found.scaled(_chosen(found, value, "value", 1, 0), "V"), rate)
-    at = named[0] if time is None and len(named) == 1 else _chosen(found, time, "time", 2, 0)
+        return found.scaled(found.index(value, "value", 1, 0), "V"), rate, None
+    at = named[0] if time is None and len(named) == 1 else found.index(time, "time", 2, 0)
     t = found.scaled(at, "s")
-    values = found.scaled(_chosen(found, value, "value", 2, 1 - at, other=at), "V")
+    chosen = found.index(value, "value", 2, 1 - at)
+    refuse(chosen == at, f"'{path}': the column {value!r} is both time and value; allowed: two columns")
+    values = found.scaled(chosen, "V")
     back = np.flatnonzero(t[1:] < t[:-1])
     if back.size:
         i = int(back[0])
@@ -427,54 +399,39 @@ def read_table(
         problem = f"{found.place(i + 1)}: the time {t[i + 1]:g} s follows {t[i]:g} s{taken}"
         raise InputError(f"{problem}; allowed: not decreasing")
     if rate is None:
-        return Recording(values, None, t)
+        return values, None, t
     late = np.abs((t - t[0]) * rate - np.arange(t.size)) > _JITTER
     if late.any():
         i = int(np.argmax(late))
         problem = f"the time {t[i]:g} s is not that of sample {i} at {rate:g} Hz, {t[0] + i / rate:g} s"
         raise InputError(f"{found.place(i)}: {problem}; allowed: times or a rate, or both that agree")
-    return Recording(values, rate)
+    return values, rate, None
 
 
 def checked_file(path: str | Path, most: int) -> Path:
     """The path, after a check that it is a readable ordinary file, not empty and not larger than `most` bytes."""
-    path, fault = Path(path), ""
-    try:
-        if not path.is_file():
-            there = "is not an ordinary file" if path.exists() else "does not exist"
-            fault = "is a folder, not a file" if path.is_dir() else there
-        else:
-            path.open("rb").close()
-            size = path.stat().st_size
-            fault = "is empty" if not size else ""
-            if size > most:
-                fault = f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB"
-    except (OSError, ValueError) as error:
-        fault = f"cannot be read: {getattr(error, 'strerror', None) or error}"
-    if fault:
+    path = Path(path)
+    if fault := file_fault(path, most) or ("" if path.stat().st_size else "is empty"):
         raise InputError(f"'{path}' {fault}")
     return path
 
 
+def file_fault(path: Path, most: int) -> str:
+    """Why an ordinary file of at most `most` bytes cannot be read; an empty text for one that can."""
+    try:
+        if not path.is_file():
+            there = "is not an ordinary file" if path.exists() else "does not exist"
+            return "is a folder, not a file" if path.is_dir() else there
+        path.open("rb").close()
+        size = path.stat().st_size
+        return f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB" if size > most else ""
+    except (OSError, ValueError) as error:
+        return f"cannot be read: {getattr(error, 'strerror', None) or error}"
+
+
 def check_count(what: str, count: int) -> None:
     """Refuse more than `MAX_SAMPLES` samples, the most that are kept in memory."""
-    if count > MAX_SAMPLES:
-        raise InputError(f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
-
-
-def _chosen(
-    found: Columns, column: str | int | None, role: str, most: int, default: int, other: int | None = None
-) -> int:  # fmt: skip
-    """Index of a column, which is not `other`; if none is given, the default in a table of at most `most` columns."""
-    if column is not None:
-        index = found.index(column)
-        if index == other:
-            raise InputError(f"'{found.file}': the column {column!r} is both time and value; allowed: two columns")
-        return index
-    if found.data.shape[1] > most:
-        way = "name the column" if found.names else "the number of the column"
-        raise InputError(f"'{found.file}' has {found.listed()}; allowed: {way} of the {role}")
-    return default
+    refuse(count > MAX_SAMPLES, f"'{what}' has {count:,} samples; allowed: at most {MAX_SAMPLES:,}")
 
 
 def _npz_columns(path: Path) -> tuple[Columns, float | None]:
@@ -489,12 +446,12 @@ def _npz_columns(path: Path) -> tuple[Columns, float | None]:
     # Exceptions of zipfile and NumPy for broken files, and for arrays of objects, which NumPy refuses to load.
     except (ValueError, OSError, zipfile.BadZipFile, EOFError, KeyError, MemoryError, NotImplementedError) as error:
         raise InputError(f"'{path}' cannot be read as NPZ: {str(error).partition('. ')[0]}") from None
-    if size > 8 * MAX_SAMPLES:
-        raise InputError(f"'{path}' unpacks to {size / 1e9:.3g} GB; allowed: at most {8e-9 * MAX_SAMPLES:g} GB")
+    most = 8 * MAX_SAMPLES
+    refuse(size > most, f"'{path}' unpacks to {size / 1e9:.3g} GB; allowed: at most {1e-9 * most:g} GB")
     for name, array in loaded.items():
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
-            kind = getattr(array, "dtype", "another kind")
-            raise InputError(f"'{path}': the array {name!r} is of {kind}; allowed: real numbers")
+        kind = getattr(array, "dtype", "another kind")
+        real = isinstance(array, np.ndarray) and array.dtype.kind in "iuf"
+        refuse(not real, f"'{path}': the array {name!r} is of {kind}; allowed: real numbers")
         if array.ndim == 0 and name.lower() in _RATE_NAMES:
             rate = float(array)
         elif array.ndim == 1:
@@ -503,9 +460,7 @@ def _npz_columns(path: Path) -> tuple[Columns, float | None]:
             problem = f"'{path}': the array {name!r} has shape {array.shape}"
             raise InputError(f"{problem}; allowed: one row a column, and one number named rate")
     lengths = {array.size for array in arrays.values()}
-    if len(lengths) > 1:
-        shown = ", ".join(f"{name} {array.size}" for name, array in arrays.items())
-        raise InputError(f"'{path}' has arrays of different length ({shown}); allowed: one length")
-    if not arrays or lengths == {0}:
-        raise InputError(f"'{path}' holds no numbers")
+    shown = ", ".join(f"{name} {array.size}" for name, array in arrays.items())
+    refuse(len(lengths) > 1, f"'{path}' has arrays of different length ({shown}); allowed: one length")
+    refuse(not arrays or lengths == {0}, f"'{path}' holds no numbers")
     return Columns(path, tuple(arrays), np.column_stack(list(arrays.values()))), rate

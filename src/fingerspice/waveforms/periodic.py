@@ -19,27 +19,28 @@ from numpy.typing import ArrayLike, NDArray
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.waveforms.files import read_table
-from fingerspice.waveforms.waveform import Waveform, as_waveform, check_range, require, terms_of
+from fingerspice.waveforms.waveform import OSCILLATION, Waveform, as_waveform, check_range, require, terms_of
 
-# A waveform with at most this many knots is not divided into windows, however close together its knots are.
-FEW_KNOTS = 1000
-# Most points that the text of a PWL shows.
-MOST_SHOWN = 10_000
-#: Largest number of breakpoints listed at once; each takes about 40 bytes, the arrays computed from it included.
-MOST_LISTED = 20_000_000
-#: Number of breakpoints in a window of time; the values at all times in one window are looked up together.
-_WINDOW = 1_000_000
+FEW_KNOTS = 1000  # With so many knots or less a waveform is not divided into windows, however close they are.
+MOST_SHOWN = 10_000  # Most points that the text of a PWL shows.
+MOST_LISTED = 20_000_000  #: Breakpoints listed at once; each takes about 40 bytes, with the arrays computed from it.
+_WINDOW = 1_000_000  #: Breakpoints in a window of time; the values at all times in one are looked up together.
 
 
-def runs_through(first: float, last: float, count: int, t0: float, t1: float) -> FloatArray:
-    """Indices of periods `first` to `last`, over t0 to t1 (s), of `count` breakpoints each; too many are refused."""
-    total = (last - first + 1.0) * count
+def runs_through(
+    period: float, count: int, t0: float, t1: float, first: float = 0.0, least: float = -math.inf
+) -> FloatArray:  # fmt: skip
+    """Numbers (n, 1) of the periods from `first` (s) on that touch t0 to t1 (s), and of one more on either side.
+
+    None is below `least`. Too many breakpoints, of which each period has `count`, are refused.
+    """
+    low = max(least, np.floor((t0 - first) / period) - 1.0)
+    high = max(low, np.ceil((t1 - first) / period) + 1.0)
+    total = (high - low + 1.0) * count
     if not total <= MOST_LISTED:
-        raise InputError(
-            f"the source has {total:.3g} breakpoints from {t0:g} s to {t1:g} s; allowed: at most {MOST_LISTED:.0e} at "
-            "once: a shorter run, or a longer period"
-        )
-    return np.arange(first, last + 1.0)
+        problem = f"the source has {total:.3g} breakpoints from {t0:g} s to {t1:g} s"
+        raise InputError(f"{problem}; allowed: at most {MOST_LISTED:.0e} at once: a shorter run, or a longer period")
+    return np.arange(low, high + 1.0)[:, None]
 
 
 def in_windows(t: FloatArray, rate: float) -> Iterator[slice | NDArray[np.intp]]:
@@ -61,9 +62,8 @@ class Ramps(Waveform):
     ever; earlier knots occur once.
     """
 
-    # Time (s) from which the waveform is periodic, and the time from which its knots' times are counted.
-    _first: float = 0.0
-    _origin: float = 0.0
+    _first: float = 0.0  # Time (s) from which the waveform is periodic
+    _origin: float = 0.0  # Time (s) from which the times of its knots are counted
 
     @cached_property
     def knots(self) -> tuple[FloatArray, FloatArray]:
@@ -80,10 +80,8 @@ class Ramps(Waveform):
         assert self.period is not None
         times = self.knots[0]
         body = times[times >= self._first - self._origin]
-        low = max(1.0, np.floor((t0 - self._first) / self.period) - 1.0)
-        high = max(low, np.ceil((t1 - self._first) / self.period) + 1.0)
-        starts = self._origin + runs_through(low, high, body.size, t0, t1) * self.period
-        return np.concatenate([self._origin + times, (starts[:, None] + body).ravel()])
+        starts = self._origin + runs_through(self.period, body.size, t0, t1, self._first, least=1.0) * self.period
+        return np.concatenate([self._origin + times, (starts + body).ravel()])
 
     def _edges(self, t0: float, t1: float) -> FloatArray:
         if self.period is None:
@@ -158,15 +156,13 @@ class Ramps(Waveform):
     def breakpoint_rate(self) -> float:
         times, _ = self.knots
         if self.period is None and times.size <= FEW_KNOTS:
-            # The rate is only used to divide time into windows; so few breakpoints need none.
-            return 0.0
+            return 0.0  # The rate is only used to divide time into windows; so few breakpoints need none.
         span = self.period or (times[-1] - times[0])
         return times.size / span if span > 0.0 else 0.0
 
 
 def _once(times: FloatArray) -> FloatArray:
-    """The times, ascending, each once; of those that differ only by rounding, as the end of a period and the start of
-    the next, the first."""
+    """The times, ascending, each once; of those that differ only by rounding, as two periods do, the first."""
     times = np.unique(times)
     return times[np.diff(times, prepend=-np.inf) > 1e-15 * np.abs(times)]
 
@@ -242,9 +238,9 @@ class PWL(Ramps):
         InputError
             If the file cannot be read (the message names the line), or has a rate and no times.
         """
-        table = read_table(path, time, value, pairs=pairs)
-        require(table.times is not None, f"'{path}'", "a table with a rate", "one with times; fs.Samples.from_table")
-        return cls(table.times, table.values)  # type: ignore[arg-type]
+        values, _, times = read_table(path, time, value, pairs=pairs)
+        require(times is not None, f"'{path}'", "a table with a rate", "one with times; fs.Samples.from_table")
+        return cls(times, values)  # type: ignore[arg-type]
 
     @cached_property
     def knots(self) -> tuple[FloatArray, FloatArray]:
@@ -261,12 +257,9 @@ class _Periodic(Ramps):
     phase_deg: float = 0.0
     delay: float = 0.0
     _shift: ClassVar[float]  # Time of the shape's start, s
-    # Times of the knots in periods, values over the offset in amplitudes, and whether half of it is the other half
-    # turned over
+    # Times of the knots in periods, values over the offset in amplitudes, whether one half is the other turned over
     _shape: ClassVar[tuple[tuple[float, ...], tuple[float, ...], bool]]
-    units: ClassVar[dict[str, str]] = {
-        "amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s"
-    }  # fmt: skip
+    units: ClassVar[dict[str, str]] = OSCILLATION
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -288,9 +281,8 @@ class _Periodic(Ramps):
     def _times(self, t0: float, t1: float) -> FloatArray:
         # Computed as (k + x) / f, an edge is rounded to the same double as the time that a user writes for it.
         x = self.knots[0] * self.frequency
-        low, high = (np.floor((t0 - self._shift) * self.frequency), np.ceil((t1 - self._shift) * self.frequency))
-        runs = runs_through(low - 1.0, high + 1.0, x.size, t0, t1)
-        return np.asarray(((runs[:, None] + x) / self.frequency + self._shift).ravel())
+        runs = runs_through(1.0 / self.frequency, x.size, t0, t1, self._shift)
+        return np.asarray(((runs + x) / self.frequency + self._shift).ravel())
 
     def breakpoint_rate(self) -> float:
         return 4.0 * self.frequency
@@ -304,7 +296,7 @@ class Square(_Periodic):
     """
 
     duty: float = 0.5
-    units: ClassVar[dict[str, str]] = {"amplitude": "V", "frequency": "Hz", "duty": "", **_Periodic.units}
+    units: ClassVar[dict[str, str]] = {"amplitude": "V", "frequency": "Hz", "duty": "", **OSCILLATION}
 
     # Beside the frequency the duty comes first, as in netlists; the fields that all shapes have precede it otherwise.
     def __init__(
@@ -383,14 +375,14 @@ class Pulse(Ramps):
         return np.array(t), np.array(v)
 
 
-# A time within this relative distance of a breakpoint differs from it only by rounding, and is replaced by it.
-_ROUNDING_OF_TIMES = 8e-16
+_ROUNDING_OF_TIMES = 8e-16  # A time so near a breakpoint, relatively, differs from it by rounding: it is replaced.
 
 
 class _Stretches(Waveform):
-    """The first stretch of another waveform, once or again and again; 0 V elsewhere."""
+    """The first stretch of another waveform, once from `delay` (s) on or, with a period, for ever; 0 V elsewhere."""
 
     waveform: Waveform
+    delay: float = 0.0
     _stretch: float  # Length of the stretch, s
 
     def __post_init__(self) -> None:
@@ -400,7 +392,16 @@ class _Stretches(Waveform):
 
     def _begin(self, t: FloatArray) -> FloatArray:
         """Start (s) of the stretch in which, or next to which, each time is."""
-        raise NotImplementedError
+        return np.full(t.shape, self.delay) if self.period is None else np.floor(t / self.period) * self.period
+
+    def _edges(self, t0: float, t1: float) -> FloatArray:
+        if self.period is None:
+            return np.asarray(self.delay + self._marks)
+        marks = self._marks[:-1]
+        return np.asarray((runs_through(self.period, marks.size, t0, t1) * self.period + marks).ravel())
+
+    def breakpoint_rate(self) -> float:
+        return self.waveform.breakpoint_rate() if self.period is None else self._marks.size / self.period
 
     @cached_property
     def _marks(self) -> FloatArray:
@@ -471,15 +472,6 @@ class Burst(_Stretches):
         require(self.delay >= 0.0, "burst delay", f"{self.delay:g} s", ">= 0")
         self._declare(_stretch=self.duration, course=(self.delay, self.delay + self.duration))
 
-    def _begin(self, t: FloatArray) -> FloatArray:
-        return np.full(t.shape, self.delay)
-
-    def _edges(self, t0: float, t1: float) -> FloatArray:
-        return np.asarray(self.delay + self._marks)
-
-    def breakpoint_rate(self) -> float:
-        return self.waveform.breakpoint_rate()
-
 
 @dataclass(frozen=True)
 class Repeat(_Stretches):
@@ -503,17 +495,6 @@ class Repeat(_Stretches):
         super().__post_init__()
         require(self.period > 0.0, "repeat period", f"{self.period:g} s", "> 0")
         self._declare(_stretch=self.period)
-
-    def _begin(self, t: FloatArray) -> FloatArray:
-        return np.floor(t / self.period) * self.period
-
-    def _edges(self, t0: float, t1: float) -> FloatArray:
-        marks = self._marks[:-1]
-        low, high = math.floor(t0 / self.period) - 1.0, math.ceil(t1 / self.period) + 1.0
-        return np.asarray((runs_through(low, high, marks.size, t0, t1)[:, None] * self.period + marks).ravel())
-
-    def breakpoint_rate(self) -> float:
-        return self._marks.size / self.period
 
     def tone(self) -> float | None:
         inside = self.waveform.waveform if isinstance(self.waveform, Burst) else self.waveform

@@ -17,15 +17,11 @@ from fingerspice.waveforms.files import LARGEST_STREAMED, MAX_BYTES, WavLayout, 
 from fingerspice.waveforms.periodic import FEW_KNOTS, PWL, Ramps
 from fingerspice.waveforms.waveform import DC, RANGES, Product, Sum, Waveform, check_range, require
 
-# Half-width of the filter, in samples, and beta of its Kaiser window. Measured on tones: the gain is 1 within 0.02 % up
-# to 0.46 of the rate.
+# Half-width of the filter in samples, beta of its Kaiser window: the gain is 1 within 0.02 % up to 0.46 of the rate.
 _WING, _BETA = 32, 8.0
-# Number of samples of a file that are read at once.
-AT_ONCE = 1 << 20
-# Largest distance of a time from the grid, relative to the spacing; rounding of the times themselves comes on top.
-ON_GRID, ROUNDING = 1e-9, 1e-15
-# Largest number of grid samples for each point of a PWL: beyond it, few long lines are faster taken one by one.
-MOST_PER_POINT = 8
+AT_ONCE = 1 << 20  # Number of samples of a file that are read at once.
+ON_GRID, ROUNDING = 1e-9, 1e-15  # Largest distance of a time from the grid, in spacings, and its own rounding.
+MOST_PER_POINT = 8  # Grid samples for each point of a PWL: beyond it, few long lines are faster taken one by one.
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +44,11 @@ class Samples(Ramps):
     units: ClassVar[dict[str, str]] = {"rate": "Hz", "start": "s"}
     # Number of the sample `values[0]` in the whole recording, whose sample number 0 is at `start`.
     _number: ClassVar[int] = 0
+    count: ClassVar[int]  #: Number of samples
 
     def __post_init__(self) -> None:
         values = read_only(real_numbers("the row of samples", self.values, "two or more numbers in V").copy())
-        self._declare(values=values)
+        self._declare(values=values, count=values.size)
         require(values.ndim == 1 and values.size >= 2, "samples", f"shape {values.shape}", "one row of two or more")
         _check_samples(values, 0)
         super().__post_init__()
@@ -109,9 +106,9 @@ class Samples(Ramps):
         InputError
             If the file cannot be read (the message names the line), or has times and no rate.
         """
-        table = read_table(path, None, value, rate)
-        require(table.rate is not None, f"'{path}'", "a table with times", "one with a rate; fs.PWL.from_table")
-        return cls(table.values, table.rate)  # type: ignore[arg-type]
+        values, rate, _ = read_table(path, None, value, rate)
+        require(rate is not None, f"'{path}'", "a table with times", "one with a rate; fs.PWL.from_table")
+        return cls(values, rate)  # type: ignore[arg-type]
 
     def upsampled(self, factor: int = 16) -> Samples:
         """The same recording at `factor` (2 to 64) times the rate, by band-limited interpolation.
@@ -141,13 +138,7 @@ class Samples(Ramps):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         if "values" in state:
-            # NumPy unpickles every array as writable.
-            self.values.flags.writeable = False
-
-    @property
-    def count(self) -> int:
-        """Number of samples."""
-        return self.values.size
+            self.values.flags.writeable = False  # NumPy unpickles every array as writable.
 
     def __repr__(self) -> str:
         return self._text
@@ -177,9 +168,8 @@ class Samples(Ramps):
         """The samples that determine the values between two times (s), as a waveform that needs no other samples."""
         low, high = self._around(t0, t1)
         out = object.__new__(Samples)
-        out._declare(
-            values=read_only(self.between(low, high)), rate=self.rate, start=self.start, _number=self._number + low
-        )
+        values = read_only(self.between(low, high))
+        out._declare(values=values, count=high - low, rate=self.rate, start=self.start, _number=self._number + low)
         return out
 
     def _number_of(self, t: float) -> float:
@@ -236,8 +226,7 @@ class Samples(Ramps):
 
 def _check_samples(values: FloatArray, first: int) -> None:
     """Refuse samples (V) that are not finite or too large; `first` is the number of the first of them."""
-    # An extreme value is NaN if any value is.
-    ends = [values.min(), values.max()]
+    ends = [values.min(), values.max()]  # An extreme value is NaN if any value is.
     if not np.all(np.isfinite(ends)):
         bad = np.flatnonzero(~np.isfinite(values))
         raise InputError(f"sample number {first + bad[0]} is {values[bad[0]]}; allowed: finite numbers")
@@ -251,10 +240,9 @@ class _WavFile(Samples):
     gain: float
 
     def __init__(self, layout: WavLayout, gain: float) -> None:
-        self._declare(layout=layout, gain=gain, rate=float(layout.rate), start=0.0)
+        self._declare(layout=layout, gain=gain, rate=float(layout.rate), start=0.0, count=layout.count)
         require(self.count >= 2, "samples", f"shape ({self.count},)", "one row of two or more")
-        # Integers are finite, and within full scale.
-        sure = layout.kind[1] != "f" and abs(gain) <= RANGES["V"][0]
+        sure = layout.kind[1] != "f" and abs(gain) <= RANGES["V"][0]  # Integers are finite, and within full scale.
         for first in range(0, 0 if sure else self.count, AT_ONCE):
             _check_samples(self.between(first, min(first + AT_ONCE, self.count)), first)
 
@@ -266,10 +254,6 @@ class _WavFile(Samples):
     @cached_property
     def values(self) -> FloatArray:
         return read_only(self.between(0, self.count))
-
-    @property
-    def count(self) -> int:
-        return int(self.layout.count)
 
     def digest(self) -> str:
         with self.layout.path.open("rb") as file:

@@ -23,14 +23,11 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.engine.collocation.readout import SAME_TIME
 from fingerspice.numerics import chebyshev
 from fingerspice.waveforms.periodic import Ramps, in_windows, runs_through
-from fingerspice.waveforms.waveform import DOUBLE, Waveform, require
+from fingerspice.waveforms.waveform import DOUBLE, Waveform, refuse, require
 
-#: Longest segment of an oscillation, in periods; longer ones are divided, since a phase's rounding error grows with it.
-_PERIODS_PER_SEGMENT = 64.0
-# Number of times compared between two looks whether one has missed.
-_AT_ONCE = 1024
-# Units in the last place of the time by which a function is looked at beside a break, for its limits there.
-_ASIDE = 8.0
+_PERIODS_PER_SEGMENT = 64.0  #: Longest segment of an oscillation: a phase's rounding error grows with it.
+_AT_ONCE = 1024  # Number of times compared between two looks whether one has missed.
+_ASIDE = 8.0  # Units in the last place of the time by which a function is looked at beside a break.
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +70,7 @@ class Function(Waveform):
         if t.ndim == 0:
             return np.asarray(self._scalar(np.float64(t)))
         try:
-            # A function may work in place: it gets times of its own.
-            out = self._taken(self.function(t.copy()))
+            out = self._taken(self.function(t.copy()))  # A function may work in place: it gets times of its own.
             # A function written for one number may give wrong values for an array without raising: compare one value.
             if out.shape == t.shape and (
                 t.size == 0 or np.array_equal(out.flat[t.size // 2], self._scalar(t.flat[t.size // 2]), True)
@@ -89,8 +85,7 @@ class Function(Waveform):
         try:
             value = self.function(t)
         except (TypeError, IndexError):
-            # A function of arrays only.
-            value = self.function(np.array([t]))
+            value = self.function(np.array([t]))  # A function of arrays only.
         try:
             return float(self._taken(value).item())
         except ValueError:  # InputError is one
@@ -106,8 +101,7 @@ class Function(Waveform):
     def _edges(self, t0: float, t1: float) -> FloatArray:
         if self.repeat is None or not self.breaks:
             return np.array(self.breaks)
-        runs = runs_through(np.floor(t0 / self.repeat) - 1.0, np.ceil(t1 / self.repeat), len(self.breaks), t0, t1)
-        return np.unique((runs[:, None] * self.repeat + np.array(self.breaks)).ravel())
+        return np.unique(runs_through(self.repeat, len(self.breaks), t0, t1) * self.repeat + np.array(self.breaks))
 
     def breakpoint_rate(self) -> float:
         return len(self.breaks) / self.repeat if self.repeat else 0.0
@@ -119,12 +113,10 @@ class SourceTable:
 
     edges: FloatArray  # (m + 1,): Segment edges, s
     terms: FloatArray  # (m, k, 6)
-    # (m, l): Chebyshev coefficients of each segment's series, which is added to its terms; l = 0 without series
-    series: FloatArray
+    series: FloatArray  # (m, l): Chebyshev coefficients of each segment, added to its terms; l = 0 without series
     scale: float = 0.0  # Largest |U| (V) at the points where the series were fitted and checked; 0 without series
     not_finite: float | None = None  # Time (s) of the first NaN or inf; the table then ends just before it
-    # Largest misfit (V) that finer series do not reduce, because it is round-off of the function's own values
-    rough: float = 0.0
+    rough: float = 0.0  # Largest misfit (V) that finer series do not reduce: round-off of the function's own values
 
     def values(self, t: FloatArray) -> FloatArray:
         """Values (V) of the series at times (s) within the table."""
@@ -210,12 +202,10 @@ def source_table(
         between = np.concatenate([*cuts, edges[-1:]])
     terms = waveform.terms(between[:-1], between[1:])
     if terms is not None:
-        edges = between
-        if no_chirps and np.any(terms[:, :, 5] != 0.0):
-            # The output step is not used here, so that no result depends on the outputs asked for.
-            step = 0.1 * waveform.shortest_time()
-        else:
-            return SourceTable(edges, np.ascontiguousarray(terms), np.zeros((edges.size - 1, 0)))
+        if not (no_chirps and np.any(terms[:, :, 5] != 0.0)):
+            return SourceTable(between, np.ascontiguousarray(terms), np.zeros((between.size - 1, 0)))
+        # The output step is not used here, so that no result depends on the outputs asked for.
+        edges, step = between, 0.1 * waveform.shortest_time()
     pieces = Refiner(waveform, tol, step, [float(t0)], shortest, scale)
     for a, b in itertools.pairwise(edges):
         if not pieces.cover(float(a), float(b)):
@@ -223,13 +213,11 @@ def source_table(
     if terms is None:
         pieces.warn()
     found, series = np.array(pieces.edges), np.array(pieces.series).reshape(-1, POINTS)
-    nothing = np.zeros((len(series), 1, 6))
-    return SourceTable(found, nothing, series, pieces.scale, pieces.not_finite, pieces.rough)
+    return SourceTable(found, np.zeros((len(series), 1, 6)), series, pieces.scale, pieces.not_finite, pieces.rough)
 
 
 POINTS = 20
-# The points `_PROOF` between the nodes, at which a series is compared with the function, are irregular: so no periodic
-# function can agree with its series at all of them and differ elsewhere.
+# Between the nodes a series is compared at irregular points: no periodic function agrees at all and differs elsewhere.
 _AT_START = (-1.0) ** np.arange(POINTS)
 _PROOF = 2.0 * np.modf(np.arange(1, 28) * 0.6180339887498949)[0] - 1.0
 _PLACES = np.concatenate([chebyshev.nodes(POINTS, -1.0, 1.0), _PROOF])
@@ -241,10 +229,8 @@ WIDEST = 0.5 * _LONGEST * float(np.diff(np.sort(_PLACES)).max())
 # After `_IDLE` halvings in a row that do not reduce the misfit, a misfit below `_ROUGHEST` (relative to the largest
 # |U|, for values in doubles) is taken for round-off of the function's values.
 _IDLE, _ROUGHEST = 3, 1e-8
-# Smallest change over short series, relative to the largest |U|, that is reported as an edge; at a kink it is smaller.
-_STEEP = 0.05
-# Smallest tolerance, V: below it doubles are nearly denormal and lose digits, so that no function appears smooth.
-_NOTHING = 1e-290
+_STEEP = 0.05  # Least change over short series, relative to the largest |U|, that is told as an edge; a kink has less.
+_NOTHING = 1e-290  # Smallest tolerance, V: below it doubles are nearly denormal, and no function appears smooth.
 # An interval halved more than `_DEEP` times lies at a jump or a kink, around which some 60 such intervals are needed. A
 # table may have `_MOST_DEEP` of them, and `_MOST_DEEP_EACH` more for each of its initial intervals.
 _DEEP, _MOST_DEEP, _MOST_DEEP_EACH = 12, 10_000, 100
@@ -282,11 +268,9 @@ class Refiner:
     scale: float = 0.0  # Largest |U| (V) seen
     steepest: float = 0.0  # Largest |dU/dt| (V/s) seen
     series: list[FloatArray] = field(default_factory=list)  # (POINTS,): Chebyshev coefficients on each interval
-    # Times (s) at which neighbouring series differ, and the difference (V)
-    jumps: list[tuple[float, float]] = field(default_factory=list)
-    # located, narrow: Times (s) of the jumps found by bisection, and of intervals much shorter than the output step
-    located: list[float] = field(default_factory=list)
-    narrow: list[float] = field(default_factory=list)
+    # Times (s) at which neighbouring series differ, the difference (V), and whether bisection found the jump
+    jumps: list[tuple[float, float, bool]] = field(default_factory=list)
+    narrow: list[float] = field(default_factory=list)  # Times (s) of intervals much shorter than the output step
     # Start (s) of each short interval, and the change (V) over it
     short: list[tuple[float, float]] = field(default_factory=list)
     not_finite: float | None = None  # Time (s) of the first NaN or inf
@@ -299,8 +283,7 @@ class Refiner:
         # The ends of a window are breakpoints, where the waveform may jump: series use interior points only.
         longest = min(_LONGEST * self.step, 2.0 * self.waveform.shortest_time())
         count = max(1, math.ceil((b - a) / longest))
-        cuts = np.linspace(a, b, count + 1).tolist()
-        waiting = [_Interval(lo, hi) for lo, hi in itertools.pairwise(cuts)][::-1]
+        waiting = [_Interval(lo, hi) for lo, hi in itertools.pairwise(np.linspace(a, b, count + 1).tolist())][::-1]
         self.allowed += _MOST_DEEP_EACH * count
         while waiting:
             piece = waiting.pop()
@@ -328,8 +311,7 @@ class Refiner:
                 waiting += piece.halves(misfit, misfit, idle)
             else:
                 # An interval of this width without a good series holds a jump (or a kink), which becomes an edge.
-                self.jumps.append((hi, float(values[-1] - values[0])))
-                self.located.append(hi)
+                self.jumps.append((hi, float(values[-1] - values[0]), True))
                 if self.series:
                     self.edges[-1] = hi
         return True
@@ -351,7 +333,7 @@ class Refiner:
                     del self.edges[-1], self.series[-1]
                     again += before.halves(largest=piece.largest)
                 return again
-            self.jumps.append((piece.lo, change))
+            self.jumps.append((piece.lo, change, False))
         self.edges.append(piece.hi)
         self.series.append(series)
         return []
@@ -393,17 +375,13 @@ class Refiner:
         i = int(np.argmax(np.abs(again - values)))
         remedy = "of noise draw the values once and give fs.Samples(values, rate)"
         # A function of arrays may sum in another order at the second call, so allow the last digits to differ.
-        if abs(again[i] - values[i]) > self._roughest:
-            raise InputError(
-                f"the source function gives {values[i]:.4g} V and then {again[i]:.4g} V at the same t = {t[i]:.9g} s; "
-                f"allowed: the same value at the same time; {remedy}"
-            )
-        if self.deep == self.allowed:
-            raise InputError(
-                f"the source function is too rough to be followed near t = {piece.lo:.9g} s: {self.deep} pieces as "
-                f"short as {piece.hi - piece.lo:.2g} s were not smooth; allowed: smooth between jumps that are few, or "
-                f"declared by Function(f, breaks=(...)); {remedy}"
-            )
+        said = f"gives {values[i]:.4g} V and then {again[i]:.4g} V at the same t = {t[i]:.9g} s"
+        problem = f"the source function {said}; allowed: the same value at the same time; {remedy}"
+        refuse(abs(again[i] - values[i]) > self._roughest, problem)
+        said = f"{self.deep} pieces as short as {piece.hi - piece.lo:.2g} s were not smooth"
+        problem = f"the source function is too rough to be followed near t = {piece.lo:.9g} s: {said}"
+        allowed = "smooth between jumps that are few, or declared by Function(f, breaks=(...))"
+        refuse(self.deep == self.allowed, f"{problem}; allowed: {allowed}; {remedy}")
 
     @property
     def _roughest(self) -> float:
@@ -417,9 +395,10 @@ class Refiner:
 
     def warn(self) -> None:
         """Warn once of jumps, and once of narrow features, that were found without having been declared."""
-        real = [(t, dv) for t, dv in self.jumps if abs(dv) > self._least]
+        real = [(t, dv) for t, dv, _ in self.jumps if abs(dv) > self._least]
         # Around a jump, a kink, or a NaN short series are expected; report only the short ones far from all of these.
-        known = [*self.located, *(t for t, _ in real), *([] if self.not_finite is None else [self.not_finite])]
+        known = [t for t, dv, located in self.jumps if located or abs(dv) > self._least]
+        known += [] if self.not_finite is None else [self.not_finite]
         apart = [t for t in self.narrow if all(abs(t - k) > 8.0 * self.step for k in known)]
         if self.short:
             # The first edge: short series whose change sums to more than `_STEEP` in a tenth of a step.
@@ -432,15 +411,11 @@ class Refiner:
         if real:
             t, dv = real[0]
             more = f" and {len(real) - 1} more times" if len(real) > 1 else ""
-            told.append(
-                f"the source function jumps by {dv:.4g} V at t = {t:.9g} s{more}; it was not declared: "
-                "give Function(f, breaks=(...)) the times for exact edges"
-            )
+            said = f"the source function jumps by {dv:.4g} V at t = {t:.9g} s{more}"
+            told.append(f"{said}; it was not declared: give Function(f, breaks=(...)) the times for exact edges")
         if apart:
-            told.append(
-                f"the source function has a feature narrower than the output step {self.step:.3g} s "
-                f"near t = {min(apart):.9g} s; it was resolved where it was seen, but others may be missed: "
-                "give Function(f, breaks=(...)) its edges"
-            )
+            said = f"has a feature narrower than the output step {self.step:.3g} s near t = {min(apart):.9g} s"
+            advice = "others may be missed: give Function(f, breaks=(...)) its edges"
+            told.append(f"the source function {said}; it was resolved where it was seen, but {advice}")
         for text in told:
             warnings.warn(text, FingerspiceWarning, stacklevel=2)

@@ -22,17 +22,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray, real_number, real_numbers
-from fingerspice.base.errors import InputError
+from fingerspice.base.errors import InputError, Where
 
-#: Largest and smallest absolute value allowed of a nonzero number, by unit (the entry V also serves A).
-RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}
-#: The same limits for all other units.
-ANY_RANGE = (1e30, 1e-30)
+RANGES = {"V": (1e12, 0.0), "deg": (1e9, 0.0)}  #: Largest and smallest size of a number other than 0; V serves A, too.
+ANY_RANGE = (1e30, 1e-30)  #: The same limits for all other units.
+#: Units of the numbers that every oscillation has.
+OSCILLATION = {"amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s"}
 TAU = 2.0 * math.pi
 # Places in [0, 1], both ends among them, one in each of 512 equal parts: so irregular that no carrier is 0 at all.
 _SPREAD = np.append((np.arange(512) + np.modf(np.arange(512) * 0.6180339887498949)[0]) / 512.0, 1.0)
-#: Distance of neighbouring doubles, relative to their size.
-DOUBLE = 2.0**-52
+DOUBLE = 2.0**-52  #: Distance of neighbouring doubles, relative to their size.
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(24)
 #: Most cycles of a part in a common period, and the largest relative rounding error of a ratio of two periods.
 MOST_CYCLES, _ROUNDING = 10**6, 2e-15
@@ -58,25 +57,20 @@ class Waveform:
     units: ClassVar[dict[str, str]] = {}  #: Unit of each numeric field
     period: float | None = None  #: Period in s after any delay, or None
     settled: float = 0.0  #: Time (s) from which the waveform is periodic
-    #: Distance of neighbouring numbers of the kind that the values are computed in, relative to their size
-    precision: float = DOUBLE
-    #: Times (s) before the first and after the second of which the waveform is constant
-    course: tuple[float, float] = (-math.inf, math.inf)
-    #: Whether each half period after `settled` is the negative of the half period before it
-    half_wave: bool = False
-    # Times (s, ascending) at which the waveform is not smooth, and the shortest time scale (s) between them.
-    _breaks: tuple[float, ...] = ()
-    _quick: float = math.inf
-    # Names of fields that may be infinite.
-    _endless: ClassVar[tuple[str, ...]] = ()
+    precision: float = DOUBLE  #: Distance of neighbouring numbers of the kind that the values are computed in
+    course: tuple[float, float] = (-math.inf, math.inf)  #: Before and after these times (s) it is constant
+    half_wave: bool = False  #: Whether each half period after `settled` is the negative of the half period before it
+    _breaks: tuple[float, ...] = ()  # Times (s, ascending) at which the waveform is not smooth
+    _quick: float = math.inf  # Shortest time scale (s) between them
+    _endless: ClassVar[tuple[str, ...]] = ()  # Names of fields that may be infinite.
 
     def __post_init__(self) -> None:
         """Make doubles of the fields that have a unit, and refuse what is no number of it."""
         for name, unit in self.units.items():
             what = f"{type(self).__name__} {name}"
             value = real_number(what, getattr(self, name), f"a number of {unit}" if unit else "a number")
-            if not (math.isfinite(value) or (value == math.inf and name in self._endless)):
-                raise InputError(f"{what} is {value}; allowed: a finite number")
+            fine = math.isfinite(value) or (value == math.inf and name in self._endless)
+            require(fine, what, value, "a finite number")
             largest, smallest = RANGES.get(unit, ANY_RANGE)
             if value != 0.0 and not smallest <= abs(value) <= largest:
                 check_range(what, value, unit)
@@ -87,8 +81,7 @@ class Waveform:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is computed when it is first asked for."""
-        found = {name: getattr(type(self), name, None) for name in vars(self)}
-        return {name: value for name, value in vars(self).items() if not isinstance(found[name], cached_property)}
+        return {k: v for k, v in vars(self).items() if not isinstance(getattr(type(self), k, None), cached_property)}
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
@@ -158,8 +151,7 @@ class Waveform:
             half = 0.5 * np.diff(cuts)[:, None]
             t = 0.5 * (cuts[1:] + cuts[:-1])[:, None] + half * _GAUSS_X
             total += complex(np.sum(half * _GAUSS_W * self.value(t) * np.exp(-1j * TAU * frequency * t)))
-        # The phase refers to a sine: U ~ Im(P exp(i Omega t)).
-        p = 2j * total / length
+        p = 2j * total / length  # The phase refers to a sine: U ~ Im(P exp(i Omega t)).
         if abs(p) <= 1e-12 * self.peak(start, stop):
             return None
         return Fundamental(frequency, abs(p), math.atan2(p.imag, p.real))
@@ -183,10 +175,7 @@ class Waveform:
         return float(np.max([size.max(), *at_breakpoints]))
 
     def cancelling(self, t0: float, t1: float) -> float:
-        """Sum of the peaks (V) over [t0, t1] of parts that may cancel in U; 0 for a waveform of one part.
-
-        Rounding errors of U are relative to this sum.
-        """
+        """Sum of the peaks (V) over [t0, t1] of parts that may cancel in U, for rounding errors; 0 of one part."""
         return 0.0
 
     def __add__(self, other: Waveform | float) -> Waveform:
@@ -223,7 +212,7 @@ def as_waveform(value: Waveform | float | Callable[[float], float]) -> Waveform:
     return DC(real_number("a source", value, allowed))
 
 
-def check_range(what: str, values: ArrayLike, unit: str) -> None:
+def check_range(what: str, values: ArrayLike, unit: str, where: Where | None = None) -> None:
     """Refuse finite numbers so large or so small that their products and quotients would overflow or underflow."""
     largest, smallest = RANGES.get(unit, ANY_RANGE)
     size = np.abs(values)
@@ -231,13 +220,19 @@ def check_range(what: str, values: ArrayLike, unit: str) -> None:
     if bad.size:
         given = float(np.ravel(values)[bad[0]])
         allowed = f"0, or a size from {smallest:g} to {largest:g}" if smallest else f"a size up to {largest:g}"
-        raise InputError(f"{what} is {given:g} {unit}".rstrip() + f"; allowed: {allowed}")
+        raise InputError(f"{what} is {given:g} {unit}".rstrip() + f"; allowed: {allowed}", where)
 
 
 def require(condition: bool, what: str, given: Any, allowed: str) -> None:
     """Refuse an argument that does not meet a condition: the message names the given value and the allowed ones."""
     if not condition:
         raise InputError(f"{what} is {given}; allowed: {allowed}")
+
+
+def refuse(wrong: object, problem: str, where: Where | None = None) -> None:
+    """Refuse what is wrong, at its place in a netlist if it has one."""
+    if wrong:
+        raise InputError(problem, where)
 
 
 def terms_of(m: int, *terms: tuple[FloatArray | float, ...]) -> FloatArray:
@@ -290,9 +285,7 @@ class Sine(Waveform):
     phase_deg: float = 0.0
     delay: float = 0.0
     damping: float = 0.0
-    units: ClassVar[dict[str, str]] = {
-        "amplitude": "V", "frequency": "Hz", "offset": "V", "phase_deg": "deg", "delay": "s", "damping": "1/s"
-    }  # fmt: skip
+    units: ClassVar[dict[str, str]] = {**OSCILLATION, "damping": "1/s"}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -327,8 +320,7 @@ class Sine(Waveform):
         phase = math.radians(self.phase_deg)
         level = np.where(on, self.offset, self.offset + self.amplitude * math.sin(phase))
         decay = np.exp(-self.damping * np.maximum(start - self.delay, 0.0))
-        # Terms are cosines: sin(x) = cos(x - pi/2).
-        angle = TAU * self._turns(start) + phase - 0.5 * math.pi
+        angle = TAU * self._turns(start) + phase - 0.5 * math.pi  # Terms are cosines: sin(x) = cos(x - pi/2).
         wave = np.where(on, self.amplitude * decay, 0.0), 0.0, -self.damping, TAU * self.frequency, angle
         return terms_of(start.size, (level,), wave)
 
@@ -441,8 +433,10 @@ class _Combination(Waveform):
     def __post_init__(self) -> None:
         super().__post_init__()
         rate = sum(1.0 / part.shortest_time() for part in self.parts)
-        settled = max(part.settled for part in self.parts)
-        self._declare(period=_common_period(self.parts), settled=settled, _quick=1.0 / rate if rate else math.inf)
+        quick, settled = 1.0 / rate if rate else math.inf, max(part.settled for part in self.parts)
+        first, last = zip(*(part.course for part in self.parts), strict=True)
+        course, period = (min(first), max(last)), _common_period(self.parts)
+        self._declare(period=period, settled=settled, course=course, _quick=quick)
 
     def value(self, t: ArrayLike, side: str = "right") -> FloatArray:
         return np.asarray(self._joined(part.value(t, side) for part in self.parts))
@@ -463,11 +457,6 @@ class _Combination(Waveform):
     @property
     def precision(self) -> float:  # type: ignore[override]
         return max(part.precision for part in self.parts)
-
-    @property
-    def course(self) -> tuple[float, float]:  # type: ignore[override]
-        first, last = zip(*(part.course for part in self.parts), strict=True)
-        return min(first), max(last)
 
     def _tones(self) -> list[float]:
         return [tone for part in self.parts if (tone := part.tone()) is not None]

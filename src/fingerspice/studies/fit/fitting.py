@@ -21,7 +21,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.numerics.modes import AT, derivative
 from fingerspice.results.outcome import SolveError
-from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_columns
+from fingerspice.waveforms.files import read_text_columns
 
 if TYPE_CHECKING:
     from fingerspice.plots.picture import Drawn, Picture
@@ -72,7 +72,7 @@ def measured_of(
 
 
 def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> Measured:
-    table = read_text_columns(checked_file(path, MAX_TEXT_BYTES), by)
+    table = read_text_columns(path, by)
     if not table.names:
         raise InputError(f"'{path}' has no header; allowed: names with units, such as {example}")
     found, units, of_share = dict[str, FloatArray](), dict[str, str](), dict[str, str]()
