@@ -1,7 +1,4 @@
-"""Data about perception: the skin's mechanics and thresholds of perception, each with its source and caveat.
-
-Perception of a run: the skin's motion under the friction's spectrum, and its level above a threshold.
-"""
+"""Perception of a run: the skin's motion under the friction, and thresholds of perception, with their sources."""
 
 from __future__ import annotations
 
@@ -97,21 +94,16 @@ class SkinMechanics:
 
 
 FINGERPAD = SkinMechanics(
-    "fingerpad, sideways",
-    mass=1e-4,
-    damping=1.0,
-    stiffness=1e3,
-    source="Table 1 of 'Friction perception resulting from laterally vibrotactile stimuli', ROBOMECH Journal 2017, "
+    "fingerpad, sideways", 1e-4, 1.0, 1e3,
+    "Table 1 of 'Friction perception resulting from laterally vibrotactile stimuli', ROBOMECH Journal 2017, "
     "doi:10.1186/s40648-017-0080-8, values of a simulation; those of a person differ, and change with load and speed",
-)
-"""The fingerpad moved sideways: 0.1 g, 1 N s/m, 1 N/mm.
+)  # fmt: skip
+"""The fingerpad moved sideways: 0.1 g, 1 N s/m, 1 N/mm; `source` says whence.
 
-Source: values of a simulation, Table 1 of "Friction perception resulting from laterally vibrotactile stimuli", ROBOMECH
-Journal (2017), doi:10.1186/s40648-017-0080-8. Caveat: one mass stands for a pad whose parts move differently. Stiffness
-and moving mass rise with the sliding speed (Balasubramanian et al. 2025, arXiv:2505.11162: 4 N/m and 0.03 g per mm/s)
-and differ between people. Measurements that are often quoted (Nakazawa, Ikeura and Inooka, "Characteristics of human
-fingertips in the shearing direction", 2000) are said to lie at 1 to 2 N/mm, 1 to 3 N s/m and 0.1 to 0.2 g; these could
-not be checked.
+Caveat: one mass stands for a pad whose parts move differently. Stiffness and moving mass rise with the sliding speed
+(Balasubramanian et al. 2025, arXiv:2505.11162: 4 N/m and 0.03 g per mm/s) and differ between people. Measurements that
+are often quoted (Nakazawa, Ikeura and Inooka, "Characteristics of human fingertips in the shearing direction", 2000)
+are said to lie at 1 to 2 N/mm, 1 to 3 N s/m and 0.1 to 0.2 g; these could not be checked.
 """
 
 
@@ -192,11 +184,9 @@ _EDGE, _FEWEST = 2.0 ** (1.0 / 6.0), 2
 _NOTHING = 1e-9
 #: Largest number of rows in a report, and of lines whose level is written in the picture.
 _SHOWN, _NAMED = 10, 6
-_MARKERS = "osD^vP"
 #: Units of the columns of lines or bands, beside the level.
 _UNITS = {"frequency": "Hz", "force": "N", "displacement": "m", "acceleration": "m/s^2"}
-#: In the picture the vertical axis reaches down to the threshold, but spans at most the factor _DEPTH. The frequency
-#: axis ends at _BEYOND times the threshold's highest frequency.
+#: Largest span of the picture's vertical axis; and end of its frequency axis over the threshold's highest frequency.
 _DEPTH, _BEYOND = 1e7, 5.0
 
 
@@ -263,7 +253,7 @@ class Feel(Sealed, Shown):
     @property
     def highest(self) -> float | None:
         """The highest level, dB; None if no line or band is within the threshold's frequencies."""
-        return None if self.strongest is None else float(self.level[self.strongest])
+        return None if (place := self.strongest) is None else float(self.level[place])
 
     @property
     def felt(self) -> bool | None:
@@ -304,8 +294,7 @@ class Feel(Sealed, Shown):
         }  # fmt: skip
 
     def _page(self) -> Page:
-        what = "line" if self.kind == "lines" else "band around"
-        blocks: list[str | Table] = [self.verdict()]
+        what, blocks = "line" if self.kind == "lines" else "band around", list[str | Table]([self.verdict()])
         judged = np.flatnonzero(np.isfinite(self.level))
         if judged.size:
             shown = np.sort(judged[np.argsort(self.level[judged])[::-1][:_SHOWN]])
@@ -313,21 +302,16 @@ class Feel(Sealed, Shown):
             rows = list(zip(*texts, [f"{x:+.1f} dB" for x in self.level[shown]], strict=True))
             blocks += ["", Table((what, "friction", "skin moves", "accelerates", "above threshold"), rows), ""]
         change = f"friction changes by {100.0 * self.change:.3g} % within these frequencies"
-        return Page([
-            *blocks,
-            f"{change}; {100.0 * WEBER_FRICTION:g} % are noticed as a transient reduction",
-            f"threshold: {self.threshold.name} ({self.threshold.source})",
-            f"skin: {self.mechanics.name}: {self.mechanics.said}",
-        ])  # fmt: skip
+        blocks.append(f"{change}; {100.0 * WEBER_FRICTION:g} % are noticed as a transient reduction")
+        blocks.append(f"threshold: {self.threshold.name} ({self.threshold.source})")
+        return Page([*blocks, f"skin: {self.mechanics.name}: {self.mechanics.said}"])
 
     def verdict(self) -> str:
         """A sentence: whether it is felt, at which frequency most, the level, and friction that cannot be judged."""
         finger = f"finger {self.signal.partition(':')[2]}: " if ":" in self.signal else ""
-        place = self.strongest
         low, high = self.threshold.frequency[[0, -1]]
-        if place is None:
-            said = f"no part of the friction lies between {low:g} and {high:g} Hz"
-        else:
+        said = f"no part of the friction lies between {low:g} and {high:g} Hz"
+        if (place := self.strongest) is not None:
             at = format_si(float(self.frequency[place]), "Hz")
             where = f"at {at}" if self.kind == "lines" else f"in the third octave around {at}"
             steps = "" if self.steps is None else f" ({self.steps:.0f} noticeable steps)"
@@ -360,7 +344,7 @@ class Feel(Sealed, Shown):
         ax.fill_between(f, bottom, curve, color=drawing.GREY, alpha=0.15, linewidth=0.0)
         ax.plot(f, curve, color=drawing.BLACK, linewidth=1.4, label=table.name)
         for number, (one, some) in enumerate(zip(fingers, drawn, strict=True)):
-            color, marker = drawing.CYCLE[number % 6], _MARKERS[number % 6]
+            color, marker = drawing.CYCLE[number % 6], "osD^vP"[number % 6]
             name = f"skin, {one.kind} {one.signal.partition(':')[2]}".rstrip()
             stems(ax, one.frequency[some], one.acceleration[some], bottom, label=name, color=color, marker=marker)
             loud = np.flatnonzero(one.level >= 0.0)
@@ -373,11 +357,9 @@ class Feel(Sealed, Shown):
         drawing.dress(ax, "Acceleration amplitude [m/s²]", "Frequency [Hz]")
         drawing.legend_above(ax, 3)
         said = "; ".join(one.verdict() for one in fingers)
-        drawing.caption(
-            figure,
-            f"{said} · numbers: dB above the threshold; grey: not felt; nothing is known beyond {low:g} to {high:g} Hz "
-            f"· threshold: {table.source} · skin: {m.name}, {m.said}",
-        )
+        said += " · numbers: dB above the threshold; grey: not felt; nothing is known beyond "
+        said += f"{low:g} to {high:g} Hz · threshold: {table.source} · skin: {m.name}, {m.said}"
+        drawing.caption(figure, said)
         return figure
 
 

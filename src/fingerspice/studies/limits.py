@@ -25,8 +25,7 @@ from fingerspice.solve.closed_form import meets_fold
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.runs import Progress
 from fingerspice.solve.simulation import run_problem
-from fingerspice.studies.finger import Finger
-from fingerspice.studies.inverse import Task, on_carrier
+from fingerspice.studies.inverse import Finger, Task, on_carrier
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import Product, as_waveform, require
 
@@ -39,14 +38,10 @@ _PER_PERIOD, _PER_CARRIER, _LEAST_RATE = 64, 32, 8000.0
 _PERIODS, _LASTS = 3.0, 0.05
 # Relative accuracy of the amplitudes of a stack, and of the voltage of another network, whose drives are corrected this
 # many times at most.
-_EXACT = 1e-3
-_MOST = 8
+_EXACT, _MOST = 1e-3, 8
 # Range of voltages that is searched, V; factor between two voltages that are tried until the fold is between them;
 # relative accuracy of the voltage at the fold; relative error of each run.
-LOWEST, HIGHEST = 1e-3, 1e5
-STEP = 0.7
-EXACT = 1e-3
-RTOL = 1e-5
+LOWEST, HIGHEST, STEP, EXACT, RTOL = 1e-3, 1e5, 0.7, 1e-3, 1e-5
 
 
 @dataclass(frozen=True, repr=False)
@@ -101,9 +96,8 @@ class Capability(Shown):
     def _page(self) -> Page:
         columns = (self.frequency, "Hz"), (self.largest, "N"), (self.best_mean, "N")
         rows = list(zip(*([format_si(x, unit) for x in values.tolist()] for values, unit in columns), strict=True))
-        said = (
-            f"up to {format_si(self.limit, 'V')} {on_carrier(self.carrier)} the friction's mean is from {self._range()}"
-        )
+        limit = f"up to {format_si(self.limit, 'V')} {on_carrier(self.carrier)}"
+        said = f"{limit} the friction's mean is from {self._range()}"
         return Page([heading(self.circuit), said, "", Table(("modulation", "largest amplitude", "at mean"), rows)])
 
     def _range(self) -> str:
@@ -182,9 +176,8 @@ def capability(
     own = np.geomspace(min(5.0, 0.1 * top), top, 13)
     f = positive_row("frequency", own if frequency is None else frequency, "Hz")
     if carrier is not None and f.max() > carrier / 4.0:
-        raise InputError(
-            f"frequency reaches {f.max():g} Hz; allowed: at most a quarter of the carrier's {carrier:g} Hz"
-        )
+        allowed = f"at most a quarter of the carrier's {carrier:g} Hz"
+        raise InputError(f"frequency reaches {f.max():g} Hz; allowed: {allowed}")
     finger = Finger(circuit, charge_law)
     mu = finger.contact.mu
     if mu == 0.0:
@@ -206,9 +199,8 @@ def capability(
 class _Search:
     """Search for the largest forces, of up to `most` (N), whose inverse drive stays within the voltage limit.
 
-    For a series stack the inverter's drive is exact. For another network it is that of the linear response, whose peak
-    is off by `ratio`: this changes little from a force to the next, so that few drives have to be corrected by forward
-    runs.
+    For a series stack the inverter's drive is exact. The peak of another network's is off by `ratio`, which changes
+    little from a force to the next, so that few drives have to be corrected by forward runs.
     """
 
     def __init__(self, finger: Finger, limit: float, carrier: float | None, most: float) -> None:
@@ -329,13 +321,6 @@ class FoldLimits(Shown):
         return write_csv(path, ("parameter", "value [SI]", "unit", "fold [V]"), rows)
 
 
-def grid_of(points: int, span: float) -> tuple[int, float]:
-    """Values of each parameter, and the factor to either side; those that `fold_limits` takes."""
-    points, span = whole_number("points", points, 3, 1000), real_number("span", span, "more than 1, at most 1e6")
-    require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
-    return points, span
-
-
 def fold_limits(
     circuit: Circuit, *, points: int = 9, span: float = 10.0, progress: Progress | None = None
 ) -> FoldLimits:
@@ -364,15 +349,15 @@ def fold_limits(
         If a run fails for another reason than a fold.
     """
     require_circuit(circuit)
-    points, span = grid_of(points, span)
+    points, span = whole_number("points", points, 3, 1000), real_number("span", span, "more than 1, at most 1e6")
+    require(1.0 < span <= 1e6, "span", span, "more than 1, at most 1e6")
     gaps = circuit.by_device("GAP")
     if len(gaps) != 1:
         found = ", ".join(g.name for g in gaps) or "none"
         raise InputError(f"a map of the fold needs one GAP whose area follows it; this circuit has {found}")
     if circuit.tran is None:
         raise InputError("a map of the fold needs a .tran line that says how long a run is")
-    sources = circuit.by_device("V")
-    t_stop = circuit.tran.stop
+    sources, t_stop = circuit.by_device("V"), circuit.tran.stop
     peak = max((e.waveform.peak(0.0, t_stop) for e in sources if e.waveform is not None), default=0.0)
     if not 0.0 < peak < math.inf:
         raise InputError("a map of the fold needs a V element with a voltage to raise; this circuit has none")
@@ -388,12 +373,11 @@ def fold_limits(
         own, voltages, guess = float(circuit.parameters[paths[0]].value), np.zeros(points), peak
         for i, x in enumerate(factors):
             told((1 + i + points * len(sweeps)) / (1 + points * len(varied)))
-            voltages[i] = around
+            stop, fold = t_stop / x if name == "frequency" else t_stop, around
             if abs(x - 1.0) > 1e-12:
-                changed = circuit.varied(dict.fromkeys(paths, own * x))
-                voltages[i] = fold_voltage(changed, peak, t_stop / x if name == "frequency" else t_stop, guess)
+                fold = fold_voltage(circuit.varied(dict.fromkeys(paths, own * x)), peak, stop, guess)
             # The next search starts at this voltage.
-            guess = voltages[i] if math.isfinite(voltages[i]) else HIGHEST
+            voltages[i], guess = fold, fold if math.isfinite(fold) else HIGHEST
         sweeps.append(FoldSweep(name, unit, own, own * factors, voltages))
     told(1.0)
     return FoldLimits(circuit, peak, around, tuple(sweeps))
@@ -402,15 +386,13 @@ def fold_limits(
 def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | None = None) -> float:
     """Peak source voltage (V) at which a run up to `t_stop` (s) reaches the fold; NaN for no fold up to `HIGHEST`.
 
-    It is found by bisection to a relative 1e-3. The run starts as the deck's run does. `peak` is the present peak
-    voltage of the circuit's sources (V), and `guess` the voltage where the search starts (V).
+    `peak` is the present peak voltage of the circuit's sources (V), and `guess` the voltage where the search starts.
     """
+    waves = {e.name: e.waveform for e in circuit.by_device("V") if e.waveform is not None}
 
     def folds(voltage: float) -> bool:
         by = as_waveform(voltage / peak)
-        raised = circuit.varied(
-            {e.name: Product((by, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
-        )
+        raised = circuit.varied({name: Product((by, wave)) for name, wave in waves.items()})
         try:
             problem = prepare(
                 raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck", charge=False,
@@ -421,8 +403,8 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
             # Not by `simulate`, which would warn about voltages that the user did not ask for.
             run = run_problem(problem, np.array([0.0, problem.t_stop]), RTOL)
         except InputError as error:
-            # An operating point depends on the raised source, and may itself be past the fold, which counts as a fold.
-            # A start given by .ic does not depend on the source: report the error.
+            # An operating point of the raised source may itself be past the fold, which counts; a start given by .ic
+            # does not depend on the source: report the error.
             if circuit.initial or "past the fold" not in str(error):
                 raise
             return True
@@ -437,12 +419,10 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
                 return low
             high = low
     else:
-        while high < HIGHEST:
+        while low == high or not folds(high):
+            if high >= HIGHEST:
+                return math.nan
             low, high = high, min(high / STEP, HIGHEST)
-            if folds(high):
-                break
-        else:
-            return math.nan
     while high > low * (1.0 + EXACT):
         middle = math.sqrt(low * high)
         low, high = (low, middle) if folds(middle) else (middle, high)

@@ -8,6 +8,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,15 +47,14 @@ IMPEDANCE, PHASE = "impedance", "impedance_phase"
 _MEANS = ("f_el", "f_t", "friction", "area")
 _TIME = "t"
 _UNITS = MEASURED | {f"{signal}_mean": unit for signal, unit in MEASURED.items()} | {_TIME: "s", PHASE: "deg"}
-# Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's.
-_SLOPES = 1e-6
+# Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's; and of the
+# means by which starts are compared.
+_SLOPES, _ROUGH = 1e-6, 1e-5
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
 _SPREAD, _FOLLOWED = 4.0, 3
 # Errors of unknown size are equal shares of the data unless errors equal for all are likelier by this logarithm. The
 # choice takes a degree of freedom, and is made where so many are there; else errors are taken as equal.
 _CLEARLY, _CHOOSING = 2.0, 4
-# Error of the means by which starts are compared.
-_ROUGH = 1e-5
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,12 @@ class Data:
     signal: str  # A key of `MEASURED`
     values: FloatArray  # (n,): Measured values in SI units: means, or, with `t`, values over time
     sigma: FloatArray | None  # (n,): Standard deviation of every value; None where it is not known
-    # (n,): Path to the values that a parameter had in the measurements, in the unit of the netlist
-    conditions: dict[str, FloatArray]
+    conditions: dict[str, FloatArray]  # (n,): Values of parameters by path, in the unit of the netlist
     t: FloatArray | None = None  # (n,): Times, s
     phase: FloatArray | None = None  # (n,): Phase of an impedance, deg
-    #: Which measurements belong together, such as those of one finger: the name of each one's group (n,), by column
-    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    groups: dict[str, tuple[str, ...]] = field(
+        default_factory=dict
+    )  # (n,): Each one's group, such as a finger, by column
 
     @property
     def name(self) -> str:
@@ -126,12 +126,11 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
     measured = [name for name in columns if name in names]
     if len(measured) != 1:
         what = f"several measured columns ({', '.join(measured)})" if measured else "no measured column"
-        raise InputError(
-            f"{place} have {what}, and the columns {', '.join(columns)}; allowed: one of {', '.join(names)}"
-        )
+        what += f", and the columns {', '.join(columns)}"
+        raise InputError(f"{place} have {what}; allowed: one of {', '.join(names)}")
     (name,) = measured
-    values = columns.pop(name)
-    sigma, t, phase = (columns.pop(key, None) for key in (SIGMA, _TIME, PHASE))
+    values, sigma, t, phase = (columns.pop(key, None) for key in (name, SIGMA, _TIME, PHASE))
+    assert values is not None
     if phase is not None and name != IMPEDANCE:
         raise InputError(f"{place} have the column {PHASE} beside {name}; allowed: beside {IMPEDANCE}")
     # A signal over time may be below 0 now and then, by noise, but not on average; magnitudes never are 0.
@@ -166,22 +165,14 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
 def _path(circuit: Circuit, name: str) -> str:
     """A condition's path; ``source.`` stands for the only source, and ``frequency`` for its frequency."""
     name = "source.frequency" if name.lower() == "frequency" else name
-    element, _, parameter = name.partition(".")
-    if element.lower() == "source":
-        driving = driving_sources(circuit)
-        if len(driving) != 1:
-            raise InputError(f"{name} is the only source's, and the circuit has {len(driving)}; allowed: its name")
-        name = f"{driving[0].name}.{parameter}"
-    known = {path.lower(): path for path in circuit.parameters}
-    if name.lower() not in known:
-        near = nearest(name, [*known.values()])
-        hint = "" if near is None else f", such as {near}"
-        allowed = ", ".join((*(f"{signal}_mean" for signal in _MEANS), IMPEDANCE, PHASE, SIGMA, _TIME))
-        raise InputError(
-            f"the data have a column {name!r}, which is no parameter of the circuit; allowed: {allowed} with a signal, "
-            f"and conditions{hint}"
-        )
-    return known[name.lower()]
+    if name.lower().startswith("source.") and (count := len(driving_sources(circuit))) != 1:
+        raise InputError(f"{name} is the only source's, and the circuit has {count}; allowed: its name")
+    with suppress(InputError):
+        return own_path(circuit, name)
+    near = nearest(name, [*circuit.parameters])
+    allowed = ", ".join((*(f"{signal}_mean" for signal in _MEANS), IMPEDANCE, PHASE, SIGMA, _TIME))
+    allowed += f" with a signal, and conditions{'' if near is None else f', such as {near}'}"
+    raise InputError(f"the data have a column {name!r}, which is no parameter of the circuit; allowed: {allowed}")
 
 
 @dataclass(frozen=True)
@@ -250,9 +241,8 @@ class Task(Problem):
         """The predicted signal over time (n,), and its derivatives by the parameters (n, n_parameter)."""
         circuit = self.scene(values, 0, self.data.conditions)
         waves = network_of(circuit).waveforms
-        fundamental = waves[0].fundamental if self.skin == "follow" and len(waves) == 1 else None
-        if fundamental is not None:
-            circuit = circuit.varied({f"{e.name}.f": fundamental.frequency for e in circuit.by_device("SKIN")})
+        if self.skin == "follow" and len(waves) == 1 and (sine := waves[0].fundamental) is not None:
+            circuit = circuit.varied({f"{e.name}.f": sine.frequency for e in circuit.by_device("SKIN")})
         run = simulate(
             circuit, t_eval=self.data.t, rtol=self.rtol, charge_law=self.charge_law, charge=False,
             sensitivities=self.paths,
@@ -362,18 +352,14 @@ class Fit(FitResult):
         keys = [[f"{column} = {one}" for one in of] for column, of in groups]
         keys += [[f"{name} = {y:g} {unit}".rstrip() for y in values] for name, unit, values in others]
         names = list(map(", ".join, zip(*keys, strict=True))) or ["measured and fitted"] * data.values.size
-        label = f"{label} [{unit}]" if unit else label
-        return [(names, (x, data.values, self.predicted, self.sigma), label, signal, MEASURED[data.signal])]
+        columns = x, data.values, self.predicted, self.sigma
+        return [(names, columns, f"{label} [{unit}]" if unit else label, signal, MEASURED[data.signal])]
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            **super().to_dict(),
-            "groups": list(self.circuits),
-            "signal": self.data.signal,
-            "count": int(self.data.values.size),
-            "residual_rms": self._rms,
-            "objectives": list(self.objectives),
-        }
+        return super().to_dict() | {
+            "groups": list(self.circuits), "signal": self.data.signal, "count": int(self.data.values.size),
+            "residual_rms": self._rms, "objectives": list(self.objectives),
+        }  # fmt: skip
 
     def _columns(self) -> dict[str, Any]:
         data, time = self.data, {} if self.data.t is None else {"t": self.data.t}
@@ -430,10 +416,6 @@ def fit(
     profiles : bool or sequence of str
         Paths whose profile likelihood is wanted, or True for all: the data are fitted again and again with the
         parameter held at values ever farther away, until the fit is too bad.
-
-    Returns
-    -------
-    Fit
 
     Raises
     ------
@@ -492,7 +474,7 @@ def _request(
         raise InputError(f"groups names {lost[0]!r}, which is not fitted; allowed: {', '.join(fitted)}")
     data = _data_of(circuit, given, by)
     names, paths, places = list[str](), list[str](), dict[str, IntArray]()
-    of = data.groups[by] if by is not None else ()
+    of = data.groups.get(by or "", ())
     every = list(dict.fromkeys(of))
     for path in fitted:
         value = circuit.parameters[path].value
@@ -518,10 +500,8 @@ def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
     ends = [followed(task.residuals, task.box, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
     if best.objective >= fitting.NOT_FOUND:
-        raise InputError(
-            "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
-            "circuit that runs under the conditions of the data"
-        )
+        said = "none of the starts can be run: there is no contact, no solution, or a value out of range"
+        raise InputError(f"{said}; allowed: a circuit that runs under the conditions of the data")
     freedom = best.residual.size - len(task.names)
     if data.sigma is None and data.t is None and data.signal != IMPEDANCE and freedom >= _CHOOSING:
         task, ends = _with_likelier_noise(task, ends, best)
@@ -575,9 +555,8 @@ def _starts(task: Task, count: int) -> list[FloatArray]:
     high = np.minimum(task.box[:, 1], initial * _SPREAD)
     share = qmc.Sobol(initial.size, scramble=False).random_base2(math.ceil(math.log2(count)))[1:count]
     tried = np.vstack([initial, np.exp(np.log(low) + share * np.log(high / low))])
-    with warnings.catch_warnings():
-        # What there is to say of the data has been said.
-        warnings.simplefilter("ignore", FingerspiceWarning)
+    # What there is to say of the data has been said.
+    with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
         tests = task.scenes(tried, _ROUGH)
     found = tests[task.data.name].to_numpy().reshape(len(tried), -1)
     off = (((found - task.data.values) / task.scale) ** 2).sum(axis=1)

@@ -37,12 +37,9 @@ NAMES = {
     "area_sliding": "ridge area while sliding", "f_t": "friction force",
 }  # fmt: skip
 PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
-# Misfit (rms, relative) of a relation from which on it is warned about.
-_TOO_MUCH = 0.2
-# The share of its value that a measured value without sigma is off by, at first.
-_SHARE = 0.1
-# The share of an error's variance below which a relation has no part in it.
-_NO_PART = 1e-9
+# Misfit (rms, relative) of a relation from which on it is warned about; the share of its value that a measured value
+# without sigma is off by, at first; and the share of an error's variance below which a relation has no part in it.
+_TOO_MUCH, _SHARE, _NO_PART = 0.2, 0.1, 1e-9
 # Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
 # this; they are no smaller than the last, as are singular values that count, relative to the largest.
 _ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
@@ -55,15 +52,14 @@ Pool = tuple[str, IntArray, float]
 
 
 class Relation(NamedTuple):
-    """Measured values of one kind with their conditions, in SI units."""
+    """Measured values of one kind with their conditions, in SI units, each of shape (n,)."""
 
     kind: str  # A key of `NAMES`
-    values: FloatArray  # (n,)
-    sigma: FloatArray | None  # (n,): Standard deviation of every value; None where it is not known
-    # fn, u_gap, indentation (n,): Normal load, gap voltage and indentation; the last is 0 where it has no meaning
-    fn: FloatArray
+    values: FloatArray
+    sigma: FloatArray | None  # Standard deviation of every value; None where it is not known
+    fn: FloatArray  # Normal load
     u_gap: FloatArray
-    indentation: FloatArray
+    indentation: FloatArray  # 0 where it has no meaning
 
     @property
     def name(self) -> str:
@@ -124,8 +120,7 @@ def _relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, 
 
 
 def _meaning(name: str, names: Sequence[str]) -> tuple[str, str, str | None]:
-    key, lower = name.lower(), [one.lower() for one in names]
-    measured = [own for own in MEASURED if own in lower]
+    key, measured = name.lower(), [own for own in MEASURED if own in map(str.lower, names)]
     values = measured[0] if key == SIGMA and len(measured) == 1 else key.removesuffix(f"_{SIGMA}")
     return key, values, (MEASURED | CONDITIONS).get(values)
 
@@ -157,17 +152,14 @@ class Task(Problem):
         return np.concatenate(parts) / self.scale
 
     def remedy(self, names: tuple[str, ...]) -> str:
-        bare = {name.rpartition(".")[2] for name in names}
-        kinds = {one.kind for one in self.relations}
-        loads = [one.fn for one in self.relations if one.kind != "indentation"]
+        bare, kinds = {name.rpartition(".")[2] for name in names}, {one.kind for one in self.relations}
+        loads = {fn for one in self.relations if one.kind != "indentation" for fn in one.fn.tolist()}
         what = "over a wider range of loads"
         if bare <= {"alpha", "m_exp"}:
-            alike = not loads or float(np.ptp(np.concatenate(loads))) == 0.0
-            what = "the area at a second load as well" if alike else f"the area {what}"
-        elif bare <= {"beta", "n_exp"} and "indentation" in kinds:
-            what = "the area over a wider range of indentations"
+            what = f"the area {what if len(loads) > 1 else 'at a second load as well'}"
         elif bare <= {"beta", "n_exp"}:
-            what = "the area against the indentation as well"
+            known = "indentation" in kinds
+            what = f"the area {'over a wider range of indentations' if known else 'against the indentation as well'}"
         elif "area" not in kinds and "c2" in bare:
             what = "the area at rest as well"
         elif bare & {"beta", "n_exp"}:
@@ -244,11 +236,9 @@ class ContactFit(FitResult):
         return panels
 
     def to_dict(self) -> dict[str, Any]:
-        relations = [
-            {"kind": one.kind, "count": int(one.values.size), "misfit": misfit}
-            for one, misfit in zip(self.relations, self.misfits, strict=True)
-        ]
-        return {"gap": self.gap, **super().to_dict(), "relations": relations}
+        pairs = zip(self.relations, self.misfits, strict=True)
+        rows = [{"kind": one.kind, "count": int(one.values.size), "misfit": misfit} for one, misfit in pairs]
+        return {"gap": self.gap, **super().to_dict(), "relations": rows}
 
     def _columns(self) -> dict[str, Any]:
         rows = zip(*((one.fn, one.u_gap, one.indentation, one.values) for one in self.relations), strict=True)
@@ -289,10 +279,6 @@ def fit_contact(
     profiles : bool or sequence of str
         Parameters whose profile likelihood is wanted, or True for all.
 
-    Returns
-    -------
-    ContactFit
-
     Raises
     ------
     InputError
@@ -312,13 +298,13 @@ def fit_contact(
         return name if "." in name else f"{gap}.{name}"
 
     relations = _relations_of(data, own["fn"])
-    largest = max(float(relation.fn.max()) for relation in relations)
-    heavy = DEVICES["GAP"].parameter("fn").unusual("the data's largest", largest)
+    loads = np.concatenate([relation.fn for relation in relations])
+    heavy = DEVICES["GAP"].parameter("fn").unusual("the data's largest", float(loads.max()))
     if heavy is not None:
         warnings.warn(heavy, FingerspiceWarning, stacklevel=2)
     names = _wanted(parameters, relations)
     # The smallest load lets any contact be that is one under some load; at rest friction takes nothing off it.
-    begin = {f"{gap}.fn": min(float(relation.fn.min()) for relation in relations)}
+    begin = {f"{gap}.fn": float(loads.min())}
     begin |= {f"{gap}.c2": 0.0} if {one.kind for one in relations} <= {"area", "indentation"} else {}
     # What is fitted in its logarithm cannot start at 0.
     begin |= {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default or 0.0 for name in names if own[name] == 0.0}
@@ -330,10 +316,8 @@ def fit_contact(
     )
     task, best, pools = _solved(task)
     if best.objective >= fitting.NOT_FOUND:
-        raise InputError(
-            f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data; "
-            "allowed: values nearer to the data, such as a smaller c2 or a larger alpha"
-        )
+        said = f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data"
+        raise InputError(f"{said}; allowed: values nearer to the data, such as a smaller c2 or a larger alpha")
     # With the warnings that a user who writes these values would get.
     try:
         fitted = circuit.replace(dict(zip(paths, best.values.tolist(), strict=True)))
@@ -376,9 +360,8 @@ def _gap(circuit: Circuit, finger: str | None) -> str:
 def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple[str, ...]:
     """The parameters to fit, in the order of the netlist."""
     if given is None:
-        kinds, voltage = {one.kind for one in relations}, any(np.any(one.u_gap != 0.0) for one in relations)
-        loaded = bool(kinds & {"area", "area_sliding"})
-        pressed = "indentation" in kinds or (loaded and voltage)
+        kinds, loaded = {one.kind for one in relations}, any(one.kind.startswith("area") for one in relations)
+        pressed = "indentation" in kinds or (loaded and any(np.any(one.u_gap != 0.0) for one in relations))
         return tuple(compress(PARAMETERS, (loaded, loaded, pressed, pressed, "f_t" in kinds, "area_sliding" in kinds)))
     if isinstance(given, str) or not given:
         raise InputError(f"parameters is {given!r}; allowed: a sequence of {', '.join(PARAMETERS)}")
@@ -390,10 +373,9 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
 
 
 def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
-    """Least squares, with the standard deviation of every pool that has none from its own residuals.
+    """Least squares, with the standard deviation of every pool that has none from its own residuals, found in rounds.
 
-    Returns the task with the standard deviations found, the fit, and the pools: ridge areas against the load come from
-    one set of images. What the parameters take up of values is the sum of their leverages.
+    Ridge areas against the load are a pool, from one set of images. Parameters take up of values their leverages.
     """
     from scipy.linalg import orth
 
@@ -441,16 +423,12 @@ def _further_notes(task: Task, best: Fitted, pools: Sequence[Pool]) -> list[str]
     found = []
     for name, at, freedom in pools:
         if freedom < _FEWEST:
-            found.append(
-                f"Of the {name} there are hardly more values ({at.size}) than parameters, which leaves no measure of "
-                "their errors: measure more of them, or give sigma."
-            )
+            few = f"Of the {name} there are hardly more values ({at.size}) than parameters"
+            found.append(f"{few}, which leaves no measure of their errors: measure more of them, or give sigma.")
         if math.isinf(freedom):
             found += best.beyond_sigma(at, at.size, f" of the {name}")
-    fitted = {path.rpartition(".")[2] for path in task.names}
+    fitted, mu = {path.rpartition(".")[2] for path in task.names}, task.circuit[task.gap].values["mu"]
     if "c2" in fitted and "mu" not in fitted:
-        mu = task.circuit[task.gap].values["mu"]
-        found.append(
-            f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
-        )
+        told = f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
+        found.append(told)
     return found

@@ -32,7 +32,7 @@ Given = Mapping[str, ArrayLike] | str | Path
 #: unit it has (of a standard deviation that of the values, else its own), and this unit, or None where none is known.
 Meaning = Callable[[str, Sequence[str]], tuple[str, str, str | None]]
 SIGMA = "sigma"
-_PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
+PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
 #: Columns (n,) in SI units or, of a circuit's parameters, those of the netlist; where they come from, as subject of a
 #: message; and the name of every measurement's group, by the column that tells it.
 Measured = tuple[dict[str, FloatArray], str, dict[str, tuple[str, ...]]]
@@ -88,7 +88,7 @@ def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> M
             of_share[key], base = values, ""
         # The prefix of an area is squared with its unit.
         power = 2 if base == "m^2" else 1
-        known = {prefix + base: factor**power for prefix, factor in _PREFIXES.items()} if base else {"%": 0.01}
+        known = {prefix + base: factor**power for prefix, factor in PREFIXES.items()} if base else {"%": 0.01}
         known |= {"": 1.0} | (dict.fromkeys(("mm2", "mm²"), 1e-6) if power == 2 else {})
         if base is not None and unit not in known:
             scaled = ", with k, m, u or n before it where need be" if base else ""
@@ -103,20 +103,17 @@ def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> M
 
 # Least squares
 
-#: What data that cannot be predicted are off by, over their scale.
-REFUSED = 1e6
-#: An objective from here on is of such data.
-NOT_FOUND = 0.5 * REFUSED**2
+#: What data that cannot be predicted are off by, over their scale; an objective from the latter on is of such data.
+REFUSED, NOT_FOUND = 1e6, 0.5e12
 # Error of the least squares' last step, relative; and the largest number of evaluations, and of refused ones.
 _CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
 # Step of the differences in a parameter's logarithm, at which those of fourth order are exact to rounding.
 _STEP = 1e-3
 #: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
 FARTHEST = 1e3
-# Singular values of the derivatives below this share of the largest are rounding.
-_LEAST = 1e-9
-# Residuals this unlikely by noise of the given sigma are named.
-_UNLIKELY = 1e-3
+# Singular values of the derivatives below this share of the largest are rounding; residuals this unlikely by noise of
+# the given sigma are named.
+_LEAST, _UNLIKELY = 1e-9, 1e-3
 
 
 @dataclass(frozen=True)
@@ -157,9 +154,8 @@ class Problem:
     def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `compared`; `REFUSED` for all where the circuit with these values cannot be run."""
         try:
-            with warnings.catch_warnings():
-                # Of values that no user has written.
-                warnings.simplefilter("ignore", FingerspiceWarning)
+            # Of values that no user has written.
+            with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
                 return self.compared(values)
         except (InputError, SolveError):
             return np.full(self.scale.size, REFUSED), np.zeros((self.scale.size, values.size))
@@ -220,11 +216,9 @@ class Fitted(NamedTuple):
         square = float(np.sum(self.residual[at] ** 2))
         if freedom < 1 or chi2.sf(square, freedom) > _UNLIKELY:
             return []
-        return [
-            f"The residuals{of} are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains in "
-            "less than one of a thousand cases: the circuit does not describe these data, or sigma is too small, and "
-            "so are the intervals."
-        ]
+        said = f"The residuals{of} are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains "
+        said += "in less than one of a thousand cases: the circuit does not describe these data, or sigma is too small"
+        return [f"{said}, and so are the intervals."]
 
 
 def followed(
@@ -264,10 +258,8 @@ def followed(
 # Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
 # the error of a parameter, in its logarithm, from which on nothing is known of it.
 _TOGETHER, _NOTABLE, _UNKNOWN = 0.98, 0.05, 0.7
-# A value this close to a bound, relative, is at it.
-_AT_BOUND = 1e-6
-# An interval that reaches farther than this, in the logarithm, has no ends.
-_NO_END = 50.0
+# A value this close to a bound, relative, is at it; an interval that reaches farther, in the logarithm, has no ends.
+_AT_BOUND, _NO_END = 1e-6, 50.0
 # Of profiles: growth of the distance from the value, in its logarithm, and error of an interval's end over that
 # distance; error of the other parameters on the way; ratio of the interval's parts from which on it is called skewed.
 _GROWTH, _END, _ROUGHLY, _SKEWED = 1.6, 0.01, 1e-4, 1.2
@@ -282,38 +274,22 @@ class Estimate:
     value: float
     initial: float
     error: float  # Standard error
-    # low, high: 95 % interval, symmetric in the logarithm
-    low: float
+    low: float  # Of the 95 % interval, which is symmetric in the logarithm
     high: float
     at_bound: bool
 
 
 @dataclass(frozen=True)
 class Profile:
-    """The best fits with one parameter held at each of several values.
-
-    Attributes
-    ----------
-    path : str
-    values : ndarray, shape (n,)
-        Values of the parameter, ascending.
-    objective : ndarray, shape (n,)
-        Sum of the squared residuals at each, as `Fit.objective`.
-    limit : float
-        The objective at the ends of the 95 % interval.
-    low, high : float
-        The interval; 0 or a bound, and infinity or a bound, where the data set no end.
-    shape : str
-        ``"symmetric"`` (in the logarithm), ``"skewed"``, ``"open below"``, ``"open above"`` or ``"open"``.
-    """
+    """The best fits with one parameter held at each of several values."""
 
     path: str
-    values: FloatArray
-    objective: FloatArray
-    limit: float
-    low: float
-    high: float
-    shape: str
+    values: FloatArray  # (n,): Values of the parameter, ascending
+    objective: FloatArray  # (n,): Sum of the squared residuals at each, as `Fit.objective`
+    limit: float  # The objective at the ends of the 95 % interval
+    low: float  # Of the interval; 0 or a bound where the data set no end
+    high: float  # Of the interval; infinity or a bound where the data set no end
+    shape: str  # "symmetric" (in the logarithm), "skewed", "open below", "open above" or "open"
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -403,9 +379,9 @@ class FitResult(Shown):
 
     @property
     def _pairs(self) -> list[tuple[str, str, float]]:
-        """Every two parameters, and the correlation of their errors."""
+        """Every two parameters, and the correlation of their errors where it is 0.1 or more."""
         named = itertools.combinations(enumerate(self.estimates), 2)
-        return [(a, b, float(self.correlation[i, j])) for (i, a), (j, b) in named]
+        return [(a, b, both) for (i, a), (j, b) in named if abs(both := float(self.correlation[i, j])) >= 0.1]
 
     def _paged(self, head: str, about: Sequence[str], *end: str) -> Page:
         """A page of what was fitted to what (`head`), the residuals (`about`), and everything else."""
@@ -419,8 +395,7 @@ class FitResult(Shown):
         table = Table(("parameter", "value", "error", "", "95 % interval", "unit", "started at", ""), rows)
         effort = f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
         lines: list[str | Table] = [f"{head}, {effort}", *about, "", table]
-        pairs = [f"{a}, {b}: {both:+.3f}" for a, b, both in self._pairs if abs(both) > 0.1]
-        if pairs:
+        if pairs := [f"{a}, {b}: {both:+.3f}" for a, b, both in self._pairs]:
             lines += ["", "correlations beyond 0.1: " + "; ".join(pairs)]
         for one in self.profiles.values():
             ends = f"{one.low:.4g} to {one.high:.4g} {self.estimates[one.path].unit}, {one.shape}"
@@ -451,21 +426,17 @@ class FitResult(Shown):
         for name, e in estimates.items():
             share = f"({100.0 * e.error / e.value:.2f}%) (init = {e.initial:.7g})"
             lines.append(f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} {share}")
-        pairs = sorted((pair for pair in self._pairs if abs(pair[2]) >= 0.1), key=lambda pair: -abs(pair[2]))
-        if pairs:
+        if pairs := sorted(self._pairs, key=lambda pair: -abs(pair[2])):
             lines.append("[[Correlations]] (unreported correlations are < 0.100)")
         return "\n".join([*lines, *(f"    C({a}, {b}) = {both:+.4f}" for a, b, both in pairs)])
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as plain numbers and texts; `parameters` has a row for each."""
-        profiles = [{name: np.asarray(x).tolist() for name, x in vars(one).items()} for one in self.profiles.values()]
         return {
-            "parameters": [vars(e) for e in self.estimates.values()],
-            "correlation": self.correlation.tolist(),
-            "objective": self.objective,
-            "notes": list(self.notes),
-            "profiles": profiles,
-        }
+            "parameters": [vars(e) for e in self.estimates.values()], "correlation": self.correlation.tolist(),
+            "objective": self.objective, "notes": list(self.notes),
+            "profiles": [{key: np.asarray(x).tolist() for key, x in vars(p).items()} for p in self.profiles.values()],
+        }  # fmt: skip
 
 
 def _profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profile:

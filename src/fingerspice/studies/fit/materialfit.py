@@ -19,6 +19,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.netlist.reader import read_text
 from fingerspice.physics.materials import EPS0, Ladder
+from fingerspice.studies.fit.fitting import PREFIXES
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -28,8 +29,7 @@ if TYPE_CHECKING:
 COLUMNS = ("frequency", "resistivity", "permittivity")
 ALLOWED = "frequency (Hz), resistivity (ohm m), relative permittivity"
 MOST_POLES = 12
-# The densely placed poles that stand for any causal and passive material: number per decade, and decades beyond the
-# band.
+# Densely placed poles stand for any causal and passive material: number per decade, and decades beyond the band.
 _DENSE, _BEYOND = 8, 2.0
 # Misfit (rms), of a fit or of the data to any material, above which a warning is given, and above which it is refused.
 NOTABLE, TOO_MUCH = 0.1, 0.3
@@ -38,9 +38,7 @@ NOTABLE, TOO_MUCH = 0.1, 0.3
 _SMALL, _FEWEST, _COURSE = 0.03, 10, 0.5
 # Range allowed of data in Hz, ohm m and 1: wide enough for any material, and narrow enough to avoid overflow.
 _LEAST, _MOST = 1e-20, 1e20
-_PREFIXES = {
-    "": 1.0, "G": 1e9, "M": 1e6, "k": 1e3, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9, "p": 1e-12
-}  # fmt: skip
+_PREFIXES = PREFIXES | {"G": 1e9, "p": 1e-12}
 _PREFIX, _METRES = f"(?P<prefix>[{''.join(_PREFIXES)}]?)", {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _METRE = "(?P<metre>cm|mm|m)"
 _FREQUENCY = "f|freq|frequency|frequenz|hz"
@@ -49,8 +47,7 @@ _PERMITTIVITY = (
     "relative_permittivity|dielectric constant|dk"
 )
 # What a column may hold by its name and unit, of which several with a name the first is that without a unit: the one of
-# `COLUMNS` that it tells, patterns of its names and units, and the power and factor that make of its values in SI units
-# those of the column.
+# `COLUMNS` that it tells, patterns of names and units, and power and factor from SI units to those of the column.
 _KINDS = (
     ("frequency", _FREQUENCY, f"{_PREFIX}[Hh]z|1/s", 1.0, 1.0),
     ("frequency", _FREQUENCY, "rad/s", 1.0, 0.5 / np.pi),
@@ -183,21 +180,15 @@ class ColeCole:
 class Consistency:
     """Distance of data from the nearest causal and passive material (relations of Kramers and Kronig).
 
-    Attributes
-    ----------
-    rms, largest : float
-        Misfit ``|y_fit / y - 1|`` of the best sum of Debye terms with densely placed poles.
-    frequency, misfit : ndarray, shape (n,)
-        The misfit at each frequency (Hz).
-    systematic : float
-        Correlation of the complex misfits of neighbouring frequencies: about 0 for noise, near 1 for a drift or a wrong
-        scale of a column.
+    The misfit is ``|y_fit / y - 1|`` of the best sum of Debye terms with densely placed poles.
     """
 
     rms: float
     largest: float
-    frequency: FloatArray
-    misfit: FloatArray
+    frequency: FloatArray  # (n,): Hz
+    misfit: FloatArray  # (n,): At each frequency
+    # Correlation of the complex misfits of neighbouring frequencies: about 0 for noise, near 1 for a drift or a wrong
+    # scale of a column
     systematic: float
 
 
@@ -233,14 +224,14 @@ class MaterialFit(Shown):
         poles = [format_si(p / (2.0 * math.pi), "Hz") for p in ladder.poles]
         rows = list(zip(poles, (f"{k:.4g} S/m" for k in ladder.weights), strict=True))
         low, high = (format_si(float(x), "Hz") for x in f[[0, -1]])
-        blocks = [
+        return Page([
             f"material fitted at {f.size} frequencies from {low} to {high}",
             f"misfit of the admittivity: {100.0 * self.rms:.2g} % rms, {100.0 * self.largest:.2g} % at most",
             f"no causal and passive material comes nearer than {100.0 * self.kramers_kronig.rms:.2g} % rms",
             "",
             f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and",
-        ]
-        return Page([*blocks, Table(("pole", "weight"), rows)])
+            Table(("pole", "weight"), rows),
+        ])  # fmt: skip
 
     def to_netlist(self, name: str) -> str:
         """A subcircuit of slabs in series with the thickness as parameter, for decks here and in ngspice.
@@ -302,10 +293,6 @@ def fit_material(
     error : float, optional
         Take the fewest branches whose rms misfit is at most `error`, or at most 1.05 times the misfit of the data to
         any material. The default, if `poles` is not given either, is 0.02.
-
-    Returns
-    -------
-    MaterialFit
 
     Raises
     ------
