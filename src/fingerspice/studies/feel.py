@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray, positive_number, real_number, real_numbers
+from fingerspice.base.arrays import ComplexArray, FloatArray, positive_number, real_number, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
     from fingerspice.results.solution import Solution
     from fingerspice.results.spectrum import Spectrum
-
 
 #: Standard gravity, m/s^2.
 GRAVITY = 9.80665
@@ -83,12 +81,12 @@ class SkinMechanics:
         """The three values in words."""
         return f"{1e3 * self.mass:g} g, {self.damping:g} N s/m, {1e-3 * self.stiffness:g} N/mm"
 
-    def displacement(self, frequency: FloatArray) -> NDArray[np.complex128]:
+    def displacement(self, frequency: FloatArray) -> ComplexArray:
         """Displacement per force at frequencies (Hz), m/N, same shape."""
         omega = 2.0 * np.pi * np.asarray(frequency)
         return np.asarray(1.0 / (self.stiffness - self.mass * omega**2 + 1j * self.damping * omega))
 
-    def acceleration(self, frequency: FloatArray) -> NDArray[np.complex128]:
+    def acceleration(self, frequency: FloatArray) -> ComplexArray:
         """Acceleration per force at frequencies (Hz), 1/kg, same shape."""
         return np.asarray(-((2.0 * np.pi * np.asarray(frequency)) ** 2) * self.displacement(frequency))
 
@@ -139,10 +137,8 @@ class Threshold(Sealed):
         require(good, "threshold", f"shapes {f.shape} and {level.shape}", "two rows of equal length, two or more")
         bad = np.flatnonzero(~(np.isfinite(f) & np.isfinite(level)) | (f < 0.0) | np.append(False, np.diff(f) <= 0.0))
         if bad.size:
-            raise InputError(
-                f"threshold {self.name!r}: point {bad[0] + 1} is {f[bad[0]]} Hz, {level[bad[0]]} dB; allowed: finite "
-                "numbers, with frequencies ascending from 0 or more"
-            )
+            said = f"threshold {self.name!r}: point {bad[0] + 1} is {f[bad[0]]} Hz, {level[bad[0]]} dB"
+            raise InputError(f"{said}; allowed: finite numbers, with frequencies ascending from 0 or more")
         object.__setattr__(self, "reference", positive_number("reference", self.reference, "m/s^2"))
 
     def acceleration(self, frequency: FloatArray) -> FloatArray:
@@ -279,15 +275,10 @@ class Feel(Sealed, Shown):
         place = self.strongest
         columns = {**{name: getattr(self, name) for name in _UNITS}, "level_db": self.level}
         return {
-            "element": self.signal.partition(":")[2] or None,
-            "felt": self.felt,
-            "kind": self.kind,
-            "strongest": None if place is None else float(self.frequency[place]),
-            "level_db": self.highest,
-            "unjudged": None if self.unjudged is None else self.unjudged._asdict(),
-            "difference_steps": self.steps,
-            "friction_change": self.change,
-            "friction_change_felt": self.change_felt,
+            "element": self.signal.partition(":")[2] or None, "felt": self.felt, "kind": self.kind,
+            "strongest": None if place is None else float(self.frequency[place]), "level_db": self.highest,
+            "unjudged": None if self.unjudged is None else self.unjudged._asdict(), "difference_steps": self.steps,
+            "friction_change": self.change, "friction_change_felt": self.change_felt,
             "mechanics": dict(vars(self.mechanics)),
             "threshold": {"name": self.threshold.name, "source": self.threshold.source},
             "lines": [{k: float(x[i]) for k, x in columns.items()} for i in np.flatnonzero(np.isfinite(self.level))],
@@ -323,20 +314,13 @@ class Feel(Sealed, Shown):
         return f"{finger}{verdict}: {said}"
 
     def plot(self, others: Sequence[Feel] = ()) -> Figure:
-        """Draw the acceleration, also that of other fingers, and the threshold against frequency.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            ``savefig("x.pdf")`` saves it, ``show()`` shows it.
-        """
+        """Draw the acceleration, also that of other fingers, and the threshold against frequency."""
         fingers = [self, *others]
         figure, (ax,) = drawing.new_figure(1, height=4.0)
         table, m = self.threshold, self.mechanics
-        low, high = map(float, table.frequency[[0, -1]])
+        low, high = table.frequency[[0, -1]].tolist()
         ends = max(low, 1e-3), _BEYOND * high
-        f = np.geomspace(ends[0], high, 400)
-        curve = table.acceleration(f)
+        curve = table.acceleration(f := np.geomspace(ends[0], high, 400))
         drawn = [(one.frequency >= ends[0]) & (one.frequency <= ends[1]) for one in fingers]
         peaks = [drawing.peak_of(one.acceleration[some]) for one, some in zip(fingers, drawn, strict=True)]
         top = 3.0 * max(float(curve.max()), *peaks)
@@ -397,7 +381,7 @@ def feel(
     if not solution.gaps:
         raise InputError("the circuit has no GAP, so there is no friction to feel; allowed: a circuit with a GAP")
     spectrum = solution.spectrum(signal)
-    end = math.inf if spectrum.amplitude is None else float(spectrum.frequency[-1])
+    end = math.inf if spectrum.amplitude is None else spectrum.frequency[-1]
     if end < max(table.frequency[-1], 0.1 * FASTEST_FELT):
         # A long period has so many lines that the spectrum ends below the threshold's highest frequency, and they are
         # too close to be felt separately: use the spectral density.
@@ -430,10 +414,7 @@ def feel(
 
 
 def _bands(spectrum: Spectrum) -> tuple[FloatArray, FloatArray, float]:
-    """Middles (Hz) of the third-octave bands that the density resolves, and amplitudes of sines with the bands' rms.
-
-    The last value is the amplitude for all that is slower than the lowest band.
-    """
+    """Middles (Hz) of the bands that the density resolves; amplitudes of sines of their rms, and of all below them."""
     assert spectrum.density is not None
     width = spectrum.resolution
     # A bin belongs to the band that contains its middle; the lowest band is at least _FEWEST bins wide.

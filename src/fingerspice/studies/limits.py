@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 _PER_PERIOD, _PER_CARRIER, _LEAST_RATE = 64, 32, 8000.0
 # Duration of a force: this many periods of the modulation, and at least this many seconds.
 _PERIODS, _LASTS = 3.0, 0.05
-# Relative accuracy of the amplitudes of a stack, and of the voltage of another network, whose drives are corrected this
-# many times at most.
-_EXACT, _MOST = 1e-3, 8
-# Range of voltages that is searched, V; factor between two voltages that are tried until the fold is between them;
-# relative accuracy of the voltage at the fold; relative error of each run.
-LOWEST, HIGHEST, STEP, EXACT, RTOL = 1e-3, 1e5, 0.7, 1e-3, 1e-5
+# Relative accuracy of a stack's amplitudes, and of voltages at the fold or of another network, whose drives are
+# corrected this many times at most.
+EXACT, MOST = 1e-3, 8
+# Range of voltages that is searched for the fold, V; factor between two voltages that are tried until it is between
+# them; relative error of each run.
+LOWEST, HIGHEST, STEP, RTOL = 1e-3, 1e5, 0.7, 1e-5
 
 
 @dataclass(frozen=True, repr=False)
@@ -218,11 +218,11 @@ class _Search:
     def largest(self, wanted: Callable[[float], Samples], most: float) -> float:
         """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit.
 
-        By bisection, to `_EXACT` times itself or 1e-3 `_EXACT` times `most`.
+        By bisection, to `EXACT` times itself or 1e-3 `EXACT` times `most`.
         """
-        for _ in range(_MOST):
+        for _ in range(MOST):
             found, high, middle = 0.0, most, most
-            while high - found > _EXACT * max(found, 1e-3 * most):
+            while high - found > EXACT * max(found, 1e-3 * most):
                 within = self.ratio * self._peak(wanted(middle)) <= self.limit
                 found, high = (middle, high) if within else (found, middle)
                 middle = 0.5 * (found + high)
@@ -231,9 +231,9 @@ class _Search:
             force = wanted(found)
             end = (force.values.size - 1) / force.rate
             task = Task(self.finger, "force", force, end, force.rate, self.carrier, self.finger.lead)
-            peak = task.solve(close=0.3 * _EXACT).peak
+            peak = task.solve(close=0.3 * EXACT).peak
             before, self.ratio = self.ratio, peak / self._peak(force)
-            if abs(self.ratio / before - 1.0) < 0.5 * _EXACT or (found == most and peak <= self.limit):
+            if abs(self.ratio / before - 1.0) < 0.5 * EXACT or (found == most and peak <= self.limit):
                 break
         return found
 
@@ -305,8 +305,8 @@ class FoldLimits(Shown):
             dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
         shown = np.concatenate([s.voltages[np.isfinite(s.voltages)] for s in self.sweeps] + [[self.peak]])
         axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper left", ncols=3, fontsize=FONT - 0.5, frameon=False)
+        known = axes[0].get_legend_handles_labels()
+        figure.legend(*known, loc="outside upper left", ncols=3, fontsize=FONT - 0.5, frameon=False)
         caption(figure, f"{heading(self.circuit)} · charge law mobile; the other parameters as in the deck")
         return figure
 

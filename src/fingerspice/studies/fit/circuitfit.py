@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,8 +37,6 @@ from fingerspice.waveforms.waveform import Sine, require
 if TYPE_CHECKING:
     from xarray import Dataset
 
-    from fingerspice.plots.picture import Drawn
-
 #: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
 MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V", "impedance": "ohm"}
 #: The one measured quantity that is no mean, and the column that may stand beside it.
@@ -67,9 +64,7 @@ class Data:
     conditions: dict[str, FloatArray]  # (n,): Values of parameters by path, in the unit of the netlist
     t: FloatArray | None = None  # (n,): Times, s
     phase: FloatArray | None = None  # (n,): Phase of an impedance, deg
-    groups: dict[str, tuple[str, ...]] = field(
-        default_factory=dict
-    )  # (n,): Each one's group, such as a finger, by column
+    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)  # (n,): The group of each, by column
 
     @property
     def name(self) -> str:
@@ -268,7 +263,7 @@ class Task(Problem):
         table |= {path: values[:, at].ravel() for path, at in self.places.items()}
         law, circuit = self.charge_law, self.circuit
         return batch(
-            circuit if law is None else dataclasses.replace(circuit, charge_law=law), table, outputs=(self.data.name,),
+            circuit if law is None else replace(circuit, charge_law=law), table, outputs=(self.data.name,),
             rtol=rtol, periodic=self.average == "periodic", skin=self.skin, gradients=gradients,
         )  # fmt: skip
 
@@ -337,7 +332,7 @@ class Fit(FitResult):
         groups = [f"groups by {column}: {', '.join(dict.fromkeys(of))}" for column, of in data.groups.items()]
         return self._paged(head, [f"residual {size}; sigma {known}", *groups])
 
-    def _panels(self) -> list[Drawn]:
+    def _panels(self) -> list[Any]:
         data, circuit = self.data, self.circuit
         signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal
         signal = f"mean {signal}" if data.name.endswith("_mean") else signal
@@ -535,7 +530,7 @@ def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[
     predicted = np.abs(task.data.values + best.residual * task.scale)
     if not np.all(predicted > 0.0) or best.objective == 0.0:
         return task, ends
-    shares = dataclasses.replace(task, scale=predicted)
+    shares = replace(task, scale=predicted)
     others = [followed(shares.residuals, shares.box, end.values) for end in ends]
     least, n = min(end.objective for end in others), predicted.size
     equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())

@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
@@ -24,9 +23,6 @@ from fingerspice.physics.contact import Contact, ridge_area
 from fingerspice.studies.fit import fitting
 from fingerspice.studies.fit.fitting import SIGMA, FitResult, Fitted, Given, Problem
 from fingerspice.waveforms.waveform import require
-
-if TYPE_CHECKING:
-    from fingerspice.plots.picture import Drawn
 
 #: Measured columns and conditions, with their units.
 MEASURED = {"area": "m^2", "area_sliding": "m^2", "f_t": "N"}
@@ -132,7 +128,7 @@ class Task(Problem):
     gap: str  # Name of the GAP
     relations: tuple[Relation, ...]
 
-    def split(self, x: NDArray[Any]) -> list[NDArray[Any]]:
+    def split(self, x: Any) -> list[Any]:
         """Each relation's part of a row over all data."""
         return np.split(x, np.cumsum([one.values.size for one in self.relations])[:-1])
 
@@ -220,8 +216,8 @@ class ContactFit(FitResult):
         head = f"contact of {self.gap}: {len(self.estimates)} parameters fitted to {self.count} values"
         return self._paged(head, about, "", f"in the deck: {self.gap} ... {self.line}")
 
-    def _panels(self) -> list[Drawn]:
-        panels: list[Drawn] = []
+    def _panels(self) -> list[Any]:
+        panels = []
         for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True):
             # The condition along the axis, and another, of which every value has a curve.
             x, label, others, name = one.fn, "normal load [N]", one.u_gap, "gap voltage = {:g} V"
@@ -428,7 +424,5 @@ def _further_notes(task: Task, best: Fitted, pools: Sequence[Pool]) -> list[str]
         if math.isinf(freedom):
             found += best.beyond_sigma(at, at.size, f" of the {name}")
     fitted, mu = {path.rpartition(".")[2] for path in task.names}, task.circuit[task.gap].values["mu"]
-    if "c2" in fitted and "mu" not in fitted:
-        told = f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
-        found.append(told)
-    return found
+    told = f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
+    return [*found, told] if "c2" in fitted and "mu" not in fitted else found

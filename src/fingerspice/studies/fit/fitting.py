@@ -24,7 +24,7 @@ from fingerspice.results.outcome import SolveError
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_columns
 
 if TYPE_CHECKING:
-    from fingerspice.plots.picture import Drawn, Picture
+    from fingerspice.plots.picture import Picture
 
 #: One set of measured columns, or the path of a table.
 Given = Mapping[str, ArrayLike] | str | Path
@@ -33,17 +33,18 @@ Given = Mapping[str, ArrayLike] | str | Path
 Meaning = Callable[[str, Sequence[str]], tuple[str, str, str | None]]
 SIGMA = "sigma"
 PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
-#: Columns (n,) in SI units or, of a circuit's parameters, those of the netlist; where they come from, as subject of a
-#: message; and the name of every measurement's group, by the column that tells it.
-Measured = tuple[dict[str, FloatArray], str, dict[str, tuple[str, ...]]]
 
 
 def measured_of(
     given: Given, meaning: Meaning, example: str, by: str | None = None, place: str = "the data"
-) -> Measured:
-    """The columns that a caller gave, of which `by` tells groups; `example` is a header, `place` names no table."""
+) -> tuple[dict[str, FloatArray], str, dict[str, tuple[str, ...]]]:
+    """The columns (n,) that a caller gave, in SI units or, of a circuit's parameters, in those of the netlist.
+
+    With them, where they come from, as subject of a message, which is `place` where there is no table; and the name of
+    every measurement's group, by the column `by` that tells it. `example` is a header.
+    """
     if isinstance(given, (str, Path)):
-        return _from_table(Path(given), meaning, example, by)
+        place, given = f"the data in '{Path(given)}'", _from_table(Path(given), meaning, example, by)
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
     if by is not None and by not in given:
@@ -52,10 +53,8 @@ def measured_of(
     size = max((x.size for x in columns.values()), default=0)
     for name, x in columns.items():
         if x.shape not in ((), (size,)):
-            raise InputError(
-                f"data column {name!r} has the shape {x.shape}, others have {size} rows; allowed: as many, or one "
-                "number for all"
-            )
+            said = f"data column {name!r} has the shape {x.shape}, others have {size} rows"
+            raise InputError(f"{said}; allowed: as many, or one number for all")
         bad = np.flatnonzero(~np.isfinite(x))
         if bad.size:
             raise InputError(f"data column {name!r} is {x.flat[bad[0]]} in row {bad[0]}; allowed: finite numbers")
@@ -71,15 +70,14 @@ def measured_of(
     return columns, place, {by: tuple(x if isinstance(x, str) else f"{x:g}" for x in cells.tolist())}
 
 
-def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> Measured:
+def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> dict[str, ArrayLike]:
     table = read_text_columns(checked_file(path, MAX_TEXT_BYTES), by)
     if not table.names:
         raise InputError(f"'{path}' has no header; allowed: names with units, such as {example}")
-    found, units, of_share = dict[str, FloatArray](), dict[str, str](), dict[str, str]()
-    groups = dict[str, tuple[str, ...]]()
+    found, units, of_share = dict[str, Any](), dict[str, str](), dict[str, str]()
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
         if by is not None and name.lower() == by.lower():
-            groups[by] = tuple(table.words[int(number)] for number in table.numbers(i))
+            found[by] = [table.words[int(number)] for number in table.numbers(i)]
             continue
         key, values, base = meaning(name, table.names)
         if key in found:
@@ -98,7 +96,7 @@ def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> M
         # Beside values in % (a friction coefficient), a standard deviation in % is of their unit, and no share of them.
         if units.get(values, "%") != "%":
             found[key] = found[key] * np.abs(found[values])
-    return found, f"the data in '{path}'", groups
+    return found
 
 
 # Least squares
@@ -164,9 +162,8 @@ class Problem:
         self, bounds: Mapping[str, tuple[float, float]], profiles: bool | Sequence[str]
     ) -> tuple[Self, Sequence[str]]:
         """With bounds as given, and a start moved into them; and the names whose profiles are wanted, as they are."""
-        if self.scale.size < len(self.paths):
-            allowed = "at least as many data"
-            raise InputError(f"{self.scale.size} data cannot tell {len(self.paths)} parameters; allowed: {allowed}")
+        if (n := self.scale.size) < (count := len(self.paths)):
+            raise InputError(f"{n} data cannot tell {count} parameters; allowed: at least as many data")
         lower, circuit, box = {path.lower(): tuple(pair) for path, pair in bounds.items()}, self.circuit, []
         for path in bounds:
             if path.lower() not in map(str.lower, self.paths):
@@ -186,8 +183,8 @@ class Problem:
         wanted = ([*known] if profiles else []) if isinstance(profiles, bool) else profiles
         for name in wanted:
             if not isinstance(name, str) or name.lower() not in known:
-                allowed = ", ".join(self.names)
-                raise InputError(f"profiles names {name!r}, which is not fitted; allowed: True, or {allowed}")
+                said = f"profiles names {name!r}, which is not fitted"
+                raise InputError(f"{said}; allowed: True, or {', '.join(self.names)}")
         return replace(self, circuit=circuit, bounds=np.array(box, float)), [known[name.lower()] for name in wanted]
 
 
@@ -312,10 +309,10 @@ class FitResult(Shown):
         cls, task: Problem, best: Fitted, variance: Any, half: Any, more: Sequence[str], profiles: Sequence[str],
         **own: Any,
     ) -> Self:  # fmt: skip
-        """What the best fit tells, with what is a kind's `own`.
+        """What the best fit tells, with further notes (`more`) and what is a kind's `own`.
 
         `variance` is that of the residuals over their scale, and `half` half an interval over a standard error of the
-        logarithm, for all parameters or each; `more` are further notes.
+        logarithm, for all parameters or each.
         """
         covariance, estimates, notes, rooms = best.covariance, dict[str, Estimate](), list[str](), dict[str, float]()
         spread = np.sqrt(np.diag(covariance))
@@ -336,11 +333,11 @@ class FitResult(Shown):
                 told = f"{value:g} {unit}".rstrip()
                 notes.append(f"{name} is at its bound, {told}: its interval is not that of a free parameter.")
         for (i, a), (j, b) in itertools.combinations(enumerate(task.names), 2):
-            if abs(correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
-                notes.append(
-                    f"{a} and {b} are not told apart (correlation {correlation[i, j]:+.4f}): they change these data in "
-                    f"almost the same way, and only a combination of both is known. {task.remedy((a, b))}"
+            if abs(both := correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
+                said = (
+                    f"{a} and {b} are not told apart (correlation {both:+.4f}): they change these data in almost the "
                 )
+                notes.append(f"{said}same way, and only a combination of both is known. {task.remedy((a, b))}")
         named = " ".join(notes)
         notes += [
             f"Of {name} these data tell next to nothing: its error is larger than itself. {task.remedy((name,))}"
@@ -353,7 +350,7 @@ class FitResult(Shown):
             profiles={name: _profile_of(task, best, estimates[name], rooms[name]) for name in profiles}, **own,
         )  # fmt: skip
 
-    def _panels(self) -> list[Drawn]:
+    def _panels(self) -> list[Any]:
         raise NotImplementedError
 
     def _columns(self) -> dict[str, Any]:
@@ -367,13 +364,7 @@ class FitResult(Shown):
         return plot_panels(self._panels())
 
     def to_csv(self, path: str | Path) -> Path:
-        """Write conditions (in the units of the netlist; of a contact in SI units), data, prediction and sigma as CSV.
-
-        Raises
-        ------
-        InputError
-            If the folder cannot be written.
-        """
+        """Write conditions (in units of the netlist; of a contact in SI units), data, prediction and sigma as CSV."""
         columns = self._columns()
         return write_csv(path, columns, zip(*columns.values(), strict=True))
 
@@ -405,8 +396,7 @@ class FitResult(Shown):
     def report(self) -> str:
         """Statistics, parameters and correlations in the layout of lmfit's ``fit_report``.
 
-        As there, the criteria of Akaike and Bayes are n log(chi-square / n) + 2 k, and + k log(n), of n data and k
-        parameters.
+        As there, the criteria of Akaike and Bayes are n log(chi-square / n) + 2 k, and + k log(n), of n data.
         """
         estimates, square, count, k = self.estimates, self.objective, self.count, len(self.estimates)
         level = count * math.log(max(square, 1e-300) / count)
@@ -483,9 +473,8 @@ def _profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Prof
             away = brentq(beyond, near, far, args=(sign,), xtol=_END * far, rtol=1e-6)
             ends.append(math.exp(here + sign * away))
     low, high = ends
-    if opened:
-        shape = "open" + ("" if len(opened) == 2 else opened[0])
-    else:
+    shape = "open" + ("" if len(opened) == 2 else "".join(opened))
+    if not opened:
         reach = here - math.log(low), math.log(high) - here
         shape = "skewed" if max(reach) > _SKEWED * min(reach) else "symmetric"
     at = sorted(known)

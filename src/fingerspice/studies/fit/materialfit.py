@@ -201,10 +201,8 @@ class MaterialFit(Shown):
     ladder : Ladder
     rms, largest : float
         Misfit ``|y_fit / y - 1|`` over the data.
-    frequency : ndarray, shape (n,)
-        Frequencies of the data, Hz.
-    misfit : ndarray, shape (n,)
-        Misfit at each frequency.
+    frequency, misfit : ndarray, shape (n,)
+        Frequencies of the data, Hz, and the misfit at each.
     kramers_kronig : Consistency
         Smallest misfit that any ladder can have.
     data : ndarray of complex, shape (n,)
@@ -325,12 +323,10 @@ def fit_material(
         y = data.admittivity(f)
         consistency, doubt = _consistency(f, y), ""
     else:
-        # Rows of frequency (Hz, ascending), resistivity (ohm m) and relative permittivity.
         data = read_table(Path(data)) if isinstance(data, (str, Path)) else data
-        table = real_numbers("material data", data, f"rows of {ALLOWED}, or a file")
-        allowed = "rows of f, rho, eps_r"
-        require(table.ndim == 2 and table.shape[1] == 3, "material data", f"of shape {table.shape}", allowed)
-        require(table.shape[0] >= 3, "material data", f"{table.shape[0]} rows", "three frequencies or more")
+        table, what = real_numbers("material data", data, f"rows of {ALLOWED}, or a file"), "material data"
+        require(table.ndim == 2 and table.shape[1] == 3, what, f"of shape {table.shape}", "rows of f, rho, eps_r")
+        require(table.shape[0] >= 3, what, f"{table.shape[0]} rows", "three frequencies or more")
         bad = np.argwhere(~((table.T >= _LEAST) & (table.T <= _MOST)))
         if bad.size:
             (column, row), allowed = bad[0], f"more than 0, from {_LEAST:g} to {_MOST:g}"
@@ -338,8 +334,7 @@ def fit_material(
         table = table[np.argsort(table[:, 0])]
         require(bool(np.all(np.diff(table[:, 0]) > 0.0)), "frequencies", "repeated", "each once")
         f, y = _admittivity(table)
-        consistency = _consistency(f, y)
-        doubt = _doubt(table, consistency)
+        doubt = _doubt(table, consistency := _consistency(f, y))
     ladder, refused, enough = None, "", max(error, 1.05 * consistency.rms)
     for count in range(1, MOST_POLES + 1) if poles is None else [poles]:
         try:
@@ -379,8 +374,7 @@ def _doubt(table: FloatArray, found: Consistency) -> str:
         if np.all(np.diff(other[:, 0]) > 0.0):
             slips.append((_consistency(*_admittivity(other)).rms, text))
     best = min((rms for rms, _ in slips), default=np.inf)
-    # Two at most, that reduce the misfit to less than a third: those with the same factor, such as kHz and kohm m,
-    # cannot be distinguished.
+    # Those that reduce the misfit to less than a third; of the same factor there are two, such as kHz and kohm m.
     likely = [text for rms, text in slips if rms <= min(1.1 * best, found.rms / 3.0)][:2]
     said = f"the data are {100.0 * found.rms:.2g} % (rms) from any causal and passive material (Kramers-Kronig)"
     if likely:
