@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -40,8 +40,7 @@ Xskin   skin  0    area  SKIN  d=350u f=100
 
 
 #: Source amplitudes of Fig. 3, and of Figs. 4 and 5, V; and the frequencies of the latter, Hz.
-U0_FORCE, U0_TIME = 140.0, 200.0
-FREQUENCIES = (100.0, 5000.0)
+U0_FORCE, U0_TIME, FREQUENCIES = 140.0, 200.0, (100.0, 5000.0)
 # Letters of units in a data file.
 _ASCII = str.maketrans({"µ": "u", "²": "^2", "Ω": "ohm"})
 
@@ -145,9 +144,8 @@ def figure_3(points: int = 46) -> Drawn:
         other_scale = variation.name == "d_a"
         ax.set_title(variation.title + " (other scale)" * other_scale, fontsize=drawing.FONT, loc="left")
         ax.set(xlim=(f[0], f[-1]), ylim=(0.0, 0.25 if other_scale else 0.125))
-        # The legend stands in the corner that the panel's curves leave free.
-        corner: Any = "lower right" if variation.name == "r_a" else "upper left"
-        ax.legend(loc=corner, fontsize=drawing.FONT - 1.0, frameon=False)
+        # In the corner that the panel's curves leave free.
+        ax.legend(loc=4 if variation.name == "r_a" else 2, fontsize=drawing.FONT - 1.0, frameon=False)
     for ax in axes[::2]:
         drawing.dress(ax, r"Mean force $F_\mathrm{el}$ [N]")
     for ax in axes[2:]:
@@ -215,9 +213,6 @@ def _time_figure(shape: type[Sine] | type[Square]) -> Drawn:
 
 
 FIGURES: dict[int, Callable[[], Drawn]] = {
-    2: figure_2,
-    3: figure_3,
-    4: partial(_time_figure, Sine),
-    5: partial(_time_figure, Square),
-}
+    2: figure_2, 3: figure_3, 4: partial(_time_figure, Sine), 5: partial(_time_figure, Square)
+}  # fmt: skip
 """The function that makes each figure of the paper."""

@@ -216,10 +216,9 @@ class InverseDrive(Sealed, Shown):
         Frequency of the carrier, Hz.
     limit, slew : float
         Largest voltage (V) and slew rate (V/s) of the source; inf for no limit.
-    lead : float
-        Time in which the drive rises to the first wanted value, s; it is left out of the comparison.
-    at_limit : float
-        Fraction of the samples at which a limit holds the drive.
+    lead, at_limit : float
+        Time in which the drive rises to the first wanted value, s, left out of the comparison; and the fraction of the
+        samples at which a limit holds the drive.
     corrections : int
         Number of forward runs after the first.
     """
@@ -450,10 +449,8 @@ def inverse_drive(
     carrier : float, optional
         Hz: the gap voltage is then an envelope times a sine, such that the mean force over each period of the sine is
         the wanted one. Without a carrier the gap voltage does not change its sign.
-    limit : float, optional
-        Largest voltage of the source, V.
-    slew : float, optional
-        Largest slew rate of the source, V/s.
+    limit, slew : float, optional
+        Largest voltage (V) and slew rate (V/s) of the source.
     duration : float, optional
         Length of a waveform or function without an end, s.
     lead : float, optional

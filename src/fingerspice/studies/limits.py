@@ -267,10 +267,8 @@ class FoldLimits(Shown):
     Attributes
     ----------
     circuit : Circuit
-    peak : float
-        The deck's own source voltage, V.
-    voltage : float
-        Peak source voltage at the fold with the deck's values, V; NaN if there is no fold up to `HIGHEST`.
+    peak, voltage : float
+        The deck's own source voltage, and that at the fold with the deck's values, V; NaN for none up to `HIGHEST`.
     sweeps : tuple of FoldSweep
         Sweeps of load, gap, and frequency if the source has one.
     """

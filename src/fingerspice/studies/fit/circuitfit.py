@@ -270,31 +270,25 @@ class Task(Problem):
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Fit(FitResult):
-    """A fit of parameters to data; `circuit` is ready to run.
+    """A fit of parameters to data; `circuit` has the fitted values, and is ready to run.
 
     Attributes
     ----------
     circuit : Circuit
-        With the fitted values.
     estimates : dict of str to Estimate
         By path; that of a group's parameter is followed by the group in brackets: ``Xgap.d[left]``.
     correlation : ndarray, shape (n_parameter, n_parameter)
         Of the errors of the logarithms.
     data : Data
-    predicted : ndarray, shape (n,)
-        The data as the fitted circuit gives them.
-    sigma : ndarray, shape (n,)
-        Standard deviation of every value: as given, or as the residuals have it.
+    predicted, sigma : ndarray, shape (n,)
+        The data as the fitted circuit gives them; standard deviation of each: as given, or as the residuals have it.
     objective : float
         Sum of the squared residuals over sigma as given, or over the largest value of the data, or, where errors are
         likelier equal shares of the values, over these.
     objectives : tuple of float
         That reached from every start that was followed.
-    count : int
-        Number of residuals.
-    freedom : int
-        Data less parameters, and less one where the residuals say whether errors are equal or shares.
-    evaluations : int
+    count, freedom, evaluations : int
+        Number of residuals; data less parameters, and less one where residuals say if errors are equal or shares.
     closed : bool
         Whether the iteration closed.
     notes : tuple of str

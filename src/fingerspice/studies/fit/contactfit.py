@@ -177,10 +177,8 @@ class ContactFit(FitResult):
         The data, by kind.
     predicted, sigma : tuple of ndarray
         Values and standard deviations of every relation, as the fit has them.
-    objective : float
-        Sum of the squared residuals over sigma.
-    freedom : int
-        Data less parameters.
+    objective, freedom : float, int
+        Sum of the squared residuals over sigma; data less parameters.
     reach : dict of str to float
         Half of each interval in the logarithm over the standard error: Student's t, with the degrees of freedom of the
         relations that the parameter is known from.

@@ -314,8 +314,7 @@ def fit_material(
     """
     if poles is not None and error is not None:
         raise InputError("poles and error are both given; allowed: one of them")
-    if poles is not None:
-        poles = whole_number("poles", poles, 1, MOST_POLES)
+    counts = range(1, MOST_POLES + 1) if poles is None else [whole_number("poles", poles, 1, MOST_POLES)]
     error = 0.02 if error is None else positive_number("error", error)
     if isinstance(data, ColeCole):
         low, high = data.band
@@ -336,7 +335,7 @@ def fit_material(
         f, y = _admittivity(table)
         doubt = _doubt(table, consistency := _consistency(f, y))
     ladder, refused, enough = None, "", max(error, 1.05 * consistency.rms)
-    for count in range(1, MOST_POLES + 1) if poles is None else [poles]:
+    for count in counts:
         try:
             ladder, misfit = _fit(f, y, count)
         except InputError as problem:
