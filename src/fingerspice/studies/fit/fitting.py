@@ -334,10 +334,8 @@ class FitResult(Shown):
                 notes.append(f"{name} is at its bound, {told}: its interval is not that of a free parameter.")
         for (i, a), (j, b) in itertools.combinations(enumerate(task.names), 2):
             if abs(both := correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
-                said = (
-                    f"{a} and {b} are not told apart (correlation {both:+.4f}): they change these data in almost the "
-                )
-                notes.append(f"{said}same way, and only a combination of both is known. {task.remedy((a, b))}")
+                said = f"{a} and {b} are not told apart (correlation {both:+.4f}): they change these data in almost"
+                notes.append(f"{said} the same way, and only a combination of both is known. {task.remedy((a, b))}")
         named = " ".join(notes)
         notes += [
             f"Of {name} these data tell next to nothing: its error is larger than itself. {task.remedy((name,))}"
