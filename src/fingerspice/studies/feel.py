@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,13 +18,9 @@ from fingerspice.base.units import format_si
 from fingerspice.plots import drawing
 from fingerspice.plots.traces import stems
 from fingerspice.results.record import Sealed, sealed
+from fingerspice.results.solution import Solution
+from fingerspice.results.spectrum import Spectrum
 from fingerspice.waveforms.waveform import require
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from fingerspice.results.solution import Solution
-    from fingerspice.results.spectrum import Spectrum
 
 #: Standard gravity, m/s^2.
 GRAVITY = 9.80665
@@ -313,7 +309,7 @@ class Feel(Sealed, Shown):
         verdict = {True: "felt", False: "not felt", None: "not known whether felt"}[self.felt]
         return f"{finger}{verdict}: {said}"
 
-    def plot(self, others: Sequence[Feel] = ()) -> Figure:
+    def plot(self, others: Sequence[Feel] = ()) -> drawing.Picture:
         """Draw the acceleration, also that of other fingers, and the threshold against frequency."""
         fingers = [self, *others]
         figure, (ax,) = drawing.new_figure(1, height=4.0)

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from fingerspice.solve.runs import Progress
 from fingerspice.studies.steady import phasor, steady_state
 from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import Sine, Waveform, require
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 TABLE1_DECK = """\
 Fingerpad on a 3M-coated touchscreen, Table 1
@@ -104,7 +101,7 @@ def make_figures(
 
 
 #: A picture, and its data: columns by their names with units.
-Drawn = tuple["Figure", dict[str, FloatArray]]
+Drawn = tuple["drawing.Picture", dict[str, FloatArray]]
 
 
 def figure_2() -> Drawn:

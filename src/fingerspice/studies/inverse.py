@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,9 +31,6 @@ from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_
 from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import Waveform, as_waveform, require
-
-if TYPE_CHECKING:
-    from fingerspice.plots.picture import Picture
 
 #: Types that may be given as a wanted force.
 Wanted = ArrayLike | Waveform | Callable[[float], float]
@@ -301,7 +298,7 @@ class InverseDrive(Sealed, Shown):
         worst, rms = format_si(self.worst, "N"), format_si(self.rms, "N")
         return f"the limits ({', '.join(limits)}) cost {worst} at worst, {rms} rms"
 
-    def plot(self) -> Picture:
+    def plot(self) -> drawing.Picture:
         """Picture of the wanted and the reached quantity, their difference, and the drive, against time."""
         figure, (top, middle, bottom) = drawing.new_figure(3, height=5.2, sharex=True, height_ratios=(3, 1.4, 2))
         (wanted, reached, miss), volts = self._asked, self.drive.values

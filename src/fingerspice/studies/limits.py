@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import head_lines, heading, require_circuit
-from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
+from fingerspice.plots import drawing
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.solve.closed_form import meets_fold
 from fingerspice.solve.problem import prepare
@@ -28,9 +28,6 @@ from fingerspice.solve.simulation import run_problem
 from fingerspice.studies.inverse import Finger, Task, on_carrier
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import Product, as_waveform, require
-
-if TYPE_CHECKING:
-    from fingerspice.plots.picture import Picture
 
 # Samples per period of the modulation and of the carrier, and the lowest sample rate, Hz.
 _PER_PERIOD, _PER_CARRIER, _LEAST_RATE = 64, 32, 8000.0
@@ -103,10 +100,10 @@ class Capability(Shown):
     def _range(self) -> str:
         return f"{format_si(self.smallest_mean, 'N')} to {format_si(self.largest_mean, 'N')}"
 
-    def plot(self) -> Picture:
+    def plot(self) -> drawing.Picture:
         """Picture with a map of the amplitude over frequency and mean, and the largest amplitude over frequency."""
-        figure, (left, right) = new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))
-        factor, unit = engineering(self.largest_mean, "N")
+        figure, (left, right) = drawing.new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))
+        factor, unit = drawing.engineering(self.largest_mean, "N")
         f, amplitude = self.frequency, factor * self.amplitude
         if f.size == 1:
             # A map needs two frequencies: a single one is drawn as a band around it, with room for the axis to be read.
@@ -115,14 +112,14 @@ class Capability(Shown):
         bar = figure.colorbar(mesh, ax=left, pad=0.02)
         bar.set_label(f"Largest amplitude [{unit}]", fontsize=8)
         bar.ax.tick_params(labelsize=8)
-        right.plot(self.frequency, factor * self.largest, color=BLUE, marker="o", markersize=3)
+        right.plot(self.frequency, factor * self.largest, color=drawing.BLUE, marker="o", markersize=3)
         right.set_ylim(bottom=0.0)
         for ax, label in ((left, f"Mean friction [{unit}]"), (right, f"Largest amplitude, best mean [{unit}]")):
             ax.set_xscale("log")
-            dress(ax, label, "Modulation frequency [Hz]")
+            drawing.dress(ax, label, "Modulation frequency [Hz]")
         wave = "unipolar drive" if self.carrier is None else f"carrier {format_si(self.carrier, 'Hz')}"
         drive = f"at most {format_si(self.limit, 'V')}, {wave}"
-        caption(figure, f"{heading(self.circuit)} · {drive} · mean friction {self._range()}")
+        drawing.caption(figure, f"{heading(self.circuit)} · {drive} · mean friction {self._range()}")
         return figure
 
     def to_csv(self, path: str | Path) -> Path:
@@ -290,22 +287,22 @@ class FoldLimits(Shown):
             lines += ["", Table((sweep.name, "folds at"), rows)]
         return Page(lines)
 
-    def plot(self) -> Picture:
+    def plot(self) -> drawing.Picture:
         """Picture of the fold's voltage against every parameter, with a mark at the deck's own point."""
-        figure, axes = new_figure(1, len(self.sweeps), height=3.2, sharey=True)
+        figure, axes = drawing.new_figure(1, len(self.sweeps), height=3.2, sharey=True)
         for ax, sweep in zip(axes, self.sweeps, strict=True):
-            factor, unit = engineering(sweep.own, sweep.unit)
+            factor, unit = drawing.engineering(sweep.own, sweep.unit)
             x, own = factor * sweep.values, factor * sweep.own
-            ax.plot(x, sweep.voltages, color=BLUE, marker="o", markersize=3, label="fold of the mobile law")
-            ax.fill_between(x, sweep.voltages, 1e6, color=GREY, alpha=0.2, linewidth=0, label="no solution")
-            ax.plot([own], [self.peak], color=VERMILION, marker="D", linestyle="none", label="this deck")
+            ax.plot(x, sweep.voltages, color=drawing.BLUE, marker="o", markersize=3, label="fold of the mobile law")
+            ax.fill_between(x, sweep.voltages, 1e6, color=drawing.GREY, alpha=0.2, linewidth=0, label="no solution")
+            ax.plot([own], [self.peak], color=drawing.VERMILION, marker="D", linestyle="none", label="this deck")
             ax.set(xscale="log", yscale="log")
-            dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
+            drawing.dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
         shown = np.concatenate([s.voltages[np.isfinite(s.voltages)] for s in self.sweeps] + [[self.peak]])
         axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
         known = axes[0].get_legend_handles_labels()
-        figure.legend(*known, loc="outside upper left", ncols=3, fontsize=FONT - 0.5, frameon=False)
-        caption(figure, f"{heading(self.circuit)} · charge law mobile; the other parameters as in the deck")
+        figure.legend(*known, loc="outside upper left", ncols=3, fontsize=drawing.FONT - 0.5, frameon=False)
+        drawing.caption(figure, f"{heading(self.circuit)} · charge law mobile; the other parameters as in the deck")
         return figure
 
     def to_dict(self) -> dict[str, Any]:

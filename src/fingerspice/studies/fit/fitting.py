@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,11 +20,9 @@ from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.numerics.modes import AT, derivative
+from fingerspice.plots import drawing
 from fingerspice.results.outcome import SolveError
 from fingerspice.waveforms.files import MAX_TEXT_BYTES, checked_file, read_text_columns
-
-if TYPE_CHECKING:
-    from fingerspice.plots.picture import Picture
 
 #: One set of measured columns, or the path of a table.
 Given = Mapping[str, ArrayLike] | str | Path
@@ -355,7 +353,7 @@ class FitResult(Shown):
         """Columns of the table, by their heads."""
         raise NotImplementedError
 
-    def plot(self) -> Picture:
+    def plot(self) -> drawing.Picture:
         """Data and fit, of contacts of every relation, with the residuals below."""
         from fingerspice.plots.picture import plot_panels
 

@@ -8,7 +8,6 @@ import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,11 +18,9 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.netlist.reader import read_text
 from fingerspice.physics.materials import EPS0, Ladder
+from fingerspice.plots import drawing
 from fingerspice.studies.fit.fitting import PREFIXES
 from fingerspice.waveforms.waveform import require
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: Columns of measured materials, and what they may be in words.
 COLUMNS = ("frequency", "resistivity", "permittivity")
@@ -251,10 +248,8 @@ class MaterialFit(Shown):
         ]
         return "\n".join([f".subckt {name} p n area params: d=350u", *lines, ".ends", ""])
 
-    def plot(self) -> Figure:
+    def plot(self) -> drawing.Picture:
         """Resistivity and permittivity of the data and of the ladder, and the misfit, against frequency."""
-        from fingerspice.plots import drawing
-
         figure, axes = drawing.new_figure(1, 3, height=2.7)
         f = np.geomspace(self.frequency[0], self.frequency[-1], 400)
         measured = 1.0 / self.data.real, self.data.imag / (2.0 * np.pi * self.frequency * EPS0)
