@@ -476,8 +476,7 @@ def inverse_drive(
     """
     require_circuit(circuit)
     asked = [(kind, wanted) for kind, wanted in (("force", force), ("friction", friction)) if wanted is not None]
-    if len(asked) != 1:
-        raise InputError(f"of force and friction {'both' if asked else 'neither'} is given; allowed: one of them")
+    require(len(asked) == 1, f"of force and friction {'both' if asked else 'neither'}", "given", "one of them")
     ((kind, wanted),) = asked
     given = ("rate", rate, "Hz"), ("carrier", carrier, "Hz"), ("limit", limit, "V"), ("slew", slew, "V/s")
     rate, carrier, limit, slew = (None if x is None else positive_number(name, x, unit) for name, x, unit in given)
@@ -503,10 +502,7 @@ def inverse_drive(
 
 
 class Task:
-    """The gap voltage for a wanted force or friction (`kind`) until `end` (s), and the iteration for its drive.
-
-    The force first rises for `lead` (s). `rate` and `carrier` (Hz) are those of `inverse_drive`.
-    """
+    """The gap voltage for a wanted force or friction (`kind`) until `end` (s), after a `lead` (s), and its drive."""
 
     def __init__(
         self, finger: Finger, kind: str, wave: Waveform, end: float, rate: float, carrier: float | None, lead: float
@@ -575,10 +571,7 @@ class Task:
         )  # fmt: skip
 
     def _compared(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Times after the lead (s), and the wanted and the reached force there (N), from the force at the fine times.
-
-        With a carrier they are means over its whole periods, by Simpson's rule.
-        """
+        """Times after the lead (s), and the forces wanted and reached (N): means over the periods of a carrier."""
         reached = force[self.lead * self.fine :]
         if self.carrier is None:
             return np.arange(reached.size) / self.rate, self.wanted, reached

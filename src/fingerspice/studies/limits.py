@@ -52,8 +52,8 @@ class Capability(Shown):
     Attributes
     ----------
     circuit : Circuit
-    limit : float
-        V.
+    limit, smallest_mean, largest_mean : float
+        Largest voltage, V; smallest and largest constant friction, N.
     carrier : float or None
         Frequency of the carrier, Hz.
     frequency : ndarray, shape (n_f,)
@@ -62,8 +62,6 @@ class Capability(Shown):
         Mean friction, N.
     amplitude : ndarray, shape (n_m, n_f)
         Largest amplitude of the friction, N.
-    smallest_mean, largest_mean : float
-        Smallest and largest constant friction, N.
     """
 
     circuit: Circuit
@@ -213,10 +211,7 @@ class _Search:
         return Samples(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0), rate)
 
     def largest(self, wanted: Callable[[float], Samples], most: float) -> float:
-        """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit.
-
-        By bisection, to `EXACT` times itself or 1e-3 `EXACT` times `most`.
-        """
+        """Largest number up to `most` (N) of which a force's drive is within the limit, by bisection to `EXACT`."""
         for _ in range(MOST):
             found, high, middle = 0.0, most, most
             while high - found > EXACT * max(found, 1e-3 * most):

@@ -98,8 +98,7 @@ class Data:
 def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
     """The checked data that a caller gave; the column `by` tells which group a measurement belongs to."""
     if isinstance(given, Mapping) and np.iscomplexobj(given.get(IMPEDANCE, 0.0)):
-        if PHASE in given:
-            raise InputError(f"{IMPEDANCE} is complex, and {PHASE} is given; allowed: one of them")
+        require(PHASE not in given, IMPEDANCE, f"complex, and {PHASE} is given", "one of them")
         z = np.asanyarray(given[IMPEDANCE])
         given = {**given, IMPEDANCE: np.abs(z), PHASE: np.angle(z, deg=True)}
 
@@ -454,8 +453,9 @@ def _request(
     if groups is not None:
         wanted = "a mapping of a column of the data to the parameters of each group, such as {'finger': ['Xgap.d']}"
         ((by, separate),) = groups.items() if isinstance(groups, Mapping) and len(groups) == 1 else (("", ""),)
-        if not isinstance(by, str) or isinstance(separate, str) or not separate:
-            raise InputError(f"groups is {groups!r}; allowed: {wanted}")
+        require(
+            isinstance(by, str) and not isinstance(separate, str) and bool(separate), "groups", repr(groups), wanted
+        )
         if by.lower() in map(str.lower, circuit.parameters):
             raise InputError(f"groups names the column {by!r}, which is a parameter; allowed: {wanted}")
     lost = [path for path in separate if path.lower() not in map(str.lower, fitted)]
@@ -468,10 +468,9 @@ def _request(
     for path in fitted:
         value = circuit.parameters[path].value
         require(fitted.count(path) == 1, path, "named twice", "once")
-        if path in data.conditions:
-            raise InputError(f"{path} is to be fitted, and is a condition of the data; allowed: one of both")
-        if not (math.isfinite(value) and value > 0.0):
-            raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
+        require(path not in data.conditions, path, "to be fitted, and is a condition of the data", "one of both")
+        logarithm = f"{value:g}, and is fitted in its logarithm"
+        require(0.0 < value < math.inf, path, logarithm, "finite and more than 0")
         places[path], labels = np.full(data.values.size, len(names)), [path]
         if path.lower() in map(str.lower, separate):
             places[path] += [every.index(label) for label in of]

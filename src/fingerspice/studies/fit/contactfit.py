@@ -37,13 +37,11 @@ PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
 # without sigma is off by, at first; and the share of an error's variance below which a relation has no part in it.
 _TOO_MUCH, _SHARE, _NO_PART = 0.2, 0.1, 1e-9
 # Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
-# this; they are no smaller than the last, as are singular values that count, relative to the largest.
-_ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
-# Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
-_FEWEST = 0.5
-#: Relations whose values have one standard deviation, as they come from the same instrument: what was measured, in
-#: words; places among the residuals; and number of values less what the parameters take up of them, which is infinite
-#: where the standard deviation is given.
+# this; they are no smaller than the next, as are singular values that count, relative to the largest; fewer data than
+# the last beyond those that the parameters take up tell nothing of them.
+_ROUNDS, _SETTLED, _LEAST, _FEWEST = 30, 1e-4, 1e-9, 0.5
+#: Relations of one standard deviation, from the same instrument: what was measured, in words; places among the
+#: residuals; and values less what the parameters take up of them, infinite where the standard deviation is given.
 Pool = tuple[str, IntArray, float]
 
 
@@ -344,8 +342,7 @@ def _gap(circuit: Circuit, finger: str | None) -> str:
     if finger is None and len(gaps) > 1:
         raise InputError(f"this circuit has several GAPs; allowed: finger= one of {', '.join(gaps.values())}")
     name = next(iter(gaps.values())) if finger is None else gaps.get(finger.lower(), "")
-    if not name:
-        raise InputError(f"finger is {finger!r}; allowed: the name of a GAP, {', '.join(gaps.values())}")
+    require(bool(name), "finger", repr(finger), f"the name of a GAP, {', '.join(gaps.values())}")
     fixed = circuit[name].values["a_fix"]
     require(fixed == 0.0, f"{name}.a_fix", f"{fixed:g} mm^2", "0, as a given area follows no contact")
     return name
@@ -357,11 +354,11 @@ def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple
         kinds, loaded = {one.kind for one in relations}, any(one.kind.startswith("area") for one in relations)
         pressed = "indentation" in kinds or (loaded and any(np.any(one.u_gap != 0.0) for one in relations))
         return tuple(compress(PARAMETERS, (loaded, loaded, pressed, pressed, "f_t" in kinds, "area_sliding" in kinds)))
-    if isinstance(given, str) or not given:
-        raise InputError(f"parameters is {given!r}; allowed: a sequence of {', '.join(PARAMETERS)}")
+    known = ", ".join(PARAMETERS)
+    require(bool(given) and not isinstance(given, str), "parameters", repr(given), f"a sequence of {known}")
     bare = [name.rpartition(".")[2].lower() for name in given]
     for name in bare:
-        require(name in PARAMETERS, "parameters", repr(name), ", ".join(PARAMETERS))
+        require(name in PARAMETERS, "parameters", repr(name), known)
         require(bare.count(name) == 1, name, "named twice", "once")
     return tuple(name for name in PARAMETERS if name in bare)
 

@@ -129,9 +129,8 @@ def _converted(name: str, x: FloatArray, file: str) -> tuple[str, FloatArray]:
             metre = _METRES[parts.get("metre") or "m"] ** (-1 if "/" in unit else 1)
             with np.errstate(divide="ignore"):
                 return column, (_PREFIXES[parts.get("prefix") or ""] * metre * x) ** power * factor
-    if kinds:
-        allowed = "Hz, rad/s, ohm m, S/m, and 1 or F/m"
-        raise InputError(f"{file}: the unit of column {name.strip()!r} is not known; allowed: {allowed}")
+    of = f"{file}: the unit of column {name.strip()!r}"
+    require(not kinds, of, "not known", "Hz, rad/s, ohm m, S/m, and 1 or F/m")
     return "", x
 
 
