@@ -96,13 +96,15 @@ def limits(
 
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.studies.limits import fold_limits
+    from fingerspice.studies.limits import fold_limits, grid_of
 
     job.charge_law = None if capability else "mobile"
     job.answer.update(charge_law=job.charge_law)
     circuit = job.read()
-    if not capability and (limit is not None or carrier is not None):
-        raise InputError("--limit and --carrier belong to --capability")
+    if not capability:
+        if limit is not None or carrier is not None:
+            raise InputError("--limit and --carrier belong to --capability")
+        grid_of(points, span)
     largest, tone = number("--limit", limit), number("--carrier", carrier)
     results = Results(job, circuit)
     end = "_capability" if capability else "_limits"
