@@ -75,7 +75,7 @@ class Finger:
         assert contact is not None
         self.contact = contact
         self.area = self.network.areas[place].given  # Fixed by the deck, m^2, or None
-        # Default time in which the force rises to its first value, s: a stack's gap voltage jumps with the source.
+        # Time in which the force rises to its first value, s: by default none in a stack, which jumps with the source.
         self.lead = 2e-3 if stack is None else 0.0
         # Sign of the GAP's voltage, from p to n, relative to the voltage along the source.
         self.sign = 1.0 if stack is None else float(stack.sign[stack.gap]) * stack.sources[0][1]
@@ -492,9 +492,9 @@ def inverse_drive(
     rate = rate or (wave.rate if isinstance(wave, Samples) else RATE)
     count, allowed = end * rate, f"2 to {MOST_SAMPLES:,} samples"
     require(1.0 <= count <= MOST_SAMPLES - 1, "the drive", f"{count:,.0f} samples long", allowed)
-    begin = finger.lead if lead is None else real_number("lead", lead, "a number in s")
-    require(0.0 <= begin < 1e3, "lead", f"{begin:g} s", "0 or more, less than 1000")
-    found = Task(finger, kind, wave, end, rate, carrier, begin).solve(limit or math.inf, slew or math.inf)
+    finger.lead = finger.lead if lead is None else real_number("lead", lead, "a number in s")
+    require(0.0 <= finger.lead < 1e3, "lead", f"{finger.lead:g} s", "0 or more, less than 1000")
+    found = Task(finger, kind, wave, end, rate, carrier).solve(limit or math.inf, slew or math.inf)
     if limit is None and found.peak > HUGE:
         kept = "limit= (V) keeps it within what the amplifier gives, and says what that costs"
         warnings.warn(f"the drive reaches {found.peak:.0f} V; {kept}", FingerspiceWarning, stacklevel=2)
@@ -502,14 +502,14 @@ def inverse_drive(
 
 
 class Task:
-    """The gap voltage for a wanted force or friction (`kind`) until `end` (s), after a `lead` (s), and its drive."""
+    """The gap voltage for a wanted force or friction (`kind`) until `end` (s), after the lead, and its drive."""
 
     def __init__(
-        self, finger: Finger, kind: str, wave: Waveform, end: float, rate: float, carrier: float | None, lead: float
+        self, finger: Finger, kind: str, wave: Waveform, end: float, rate: float, carrier: float | None
     ) -> None:
-        self.finger, self.kind, self.rate, self.carrier, self.lead = finger, kind, rate, carrier, round(lead * rate)
+        self.finger, self.kind, self.rate, self.carrier = finger, kind, rate, carrier
         # With a carrier the force is also evaluated midway between samples, as Simpson's rule for its mean needs it.
-        self.fine = 1 if carrier is None else 2
+        self.lead, self.fine = round(finger.lead * rate), 1 if carrier is None else 2
         t = np.arange(self.fine * math.floor(end * rate * (1.0 + 1e-12)) + 1) / (self.fine * rate)
         contact, force, least, scale, rest = finger.contact, wave.value(t), "0 N", 1.0, 0.0
         if kind == "friction":

@@ -29,10 +29,9 @@ from fingerspice.studies.inverse import Finger, Task, on_carrier
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import Product, as_waveform, require
 
-# Samples per period of the modulation and of the carrier, and the lowest sample rate, Hz.
-_PER_PERIOD, _PER_CARRIER, _LEAST_RATE = 64, 32, 8000.0
-# Duration of a force: this many periods of the modulation, and at least this many seconds.
-_PERIODS, _LASTS = 3.0, 0.05
+# Samples per period of the modulation and of the carrier, and the lowest sample rate, Hz; duration of a force in
+# periods of the modulation, and the least, s.
+_PER_PERIOD, _PER_CARRIER, _LEAST_RATE, _PERIODS, _LASTS = 64, 32, 8000.0, 3.0, 0.05
 # Relative accuracy of a stack's amplitudes, and of voltages at the fold or of another network, whose drives are
 # corrected this many times at most.
 EXACT, MOST = 1e-3, 8
@@ -222,7 +221,7 @@ class _Search:
                 break
             force = wanted(found)
             end = (force.values.size - 1) / force.rate
-            task = Task(self.finger, "force", force, end, force.rate, self.carrier, self.finger.lead)
+            task = Task(self.finger, "force", force, end, force.rate, self.carrier)
             peak = task.solve(close=0.3 * EXACT).peak
             before, self.ratio = self.ratio, peak / self._peak(force)
             if abs(self.ratio / before - 1.0) < 0.5 * EXACT or (found == most and peak <= self.limit):

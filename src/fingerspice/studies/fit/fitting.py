@@ -97,8 +97,6 @@ def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> d
     return found
 
 
-# Least squares
-
 #: What data that cannot be predicted are off by, over their scale; an objective from the latter on is of such data.
 REFUSED, NOT_FOUND = 1e6, 0.5e12
 # Error of the least squares' last step, relative; and the largest number of evaluations, and of refused ones.
@@ -247,8 +245,6 @@ def followed(
     residual, by = known(found.x.tobytes()) if ended else residuals(values)
     return Fitted(values, residual, by, float(residual @ residual), int(found.nfev), found.status > 0 and ended)
 
-
-# Results
 
 # Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
 # the error of a parameter, in its logarithm, from which on nothing is known of it.
