@@ -19,10 +19,9 @@ from fingerspice.base.announcing import Bar
 from fingerspice.base.arrays import FloatArray, IntArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page
+from fingerspice.circuit import devices
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
 from fingerspice.circuit.describe import meaning_of, require_circuit, scenes_warnings
-from fingerspice.circuit.devices import MEASURED as USUAL
-from fingerspice.circuit.devices import MEASURING
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import driving_sources
 from fingerspice.results.record import SIGNALS
@@ -83,11 +82,11 @@ class Data:
     def unusual(self) -> Iterator[str | None]:
         """Warnings about measured values and amplitudes that are probably in another unit."""
         said = "the data's largest"
-        if self.signal in USUAL:
-            yield USUAL[self.signal].warning(f"{said} {self.name}", np.abs(self.values).max(), MEASURED[self.signal])
+        if (usual := devices.MEASURED.get(self.signal)) is not None:
+            yield usual.warning(f"{said} {self.name}", np.abs(self.values).max(), MEASURED[self.signal])
         for path, x in self.conditions.items():
             if self.signal in _MEANS and path.endswith(".amplitude"):
-                yield MEASURING.warning(f"{said} {path}", float(x[np.abs(x).argmax()]), "V")
+                yield devices.MEASURING.warning(f"{said} {path}", float(x[np.abs(x).argmax()]), "V")
 
     @property
     def varying(self) -> dict[str, FloatArray]:

@@ -20,8 +20,7 @@ from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
 from fingerspice.physics.contact import Contact, ridge_area
-from fingerspice.studies.fit import fitting
-from fingerspice.studies.fit.fitting import SIGMA, FitResult, Fitted, Given, Problem
+from fingerspice.studies.fit.fitting import NOT_FOUND, SIGMA, FitResult, Fitted, Given, Problem, followed, measured_of
 from fingerspice.waveforms.waveform import require
 
 #: Measured columns and conditions, with their units.
@@ -82,7 +81,7 @@ def _relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, 
     found: dict[tuple[str, bool], list[Any]] = {}
     for number, one in enumerate(several, 1):
         place = "the data" if len(several) == 1 else f"data {number}"
-        columns, place, _ = fitting.measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
+        columns, place, _ = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
         measured = [name for name in MEASURED if name in columns]
         if not measured:
             raise InputError(f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
@@ -307,7 +306,7 @@ def fit_contact(
         profiles if isinstance(profiles, bool) else [named(path) for path in profiles],
     )
     task, best, pools = _solved(task)
-    if best.objective >= fitting.NOT_FOUND:
+    if best.objective >= NOT_FOUND:
         said = f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data"
         raise InputError(f"{said}; allowed: values nearer to the data, such as a smaller c2 or a larger alpha")
     # With the warnings that a user who writes these values would get.
@@ -376,7 +375,7 @@ def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
         members.setdefault(key, []).append((relation.name, at))
     begin = task.initial
     for _ in range(_ROUNDS):
-        best, pools = fitting.followed(task.residuals, task.box, begin), list[Pool]()
+        best, pools = followed(task.residuals, task.box, begin), list[Pool]()
         leverage, scale = np.sum(orth(best.by_log, _LEAST) ** 2, axis=1), task.scale.copy()
         for (_, unknown), own in members.items():
             at = np.concatenate([at for _, at in own])
