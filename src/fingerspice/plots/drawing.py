@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from fingerspice.plots.picture import Picture
+    from fingerspice.plots.picture import Picture as Picture
 
 
 # The palette of Okabe and Ito, whose colours people with the common colour blindnesses can distinguish.

@@ -1,7 +1,4 @@
-"""Data about perception: the skin's mechanics and thresholds of perception, each with its source and caveat.
-
-Perception of a run: the skin's motion under the friction's spectrum, and its level above a threshold.
-"""
+"""Perception of a run: the skin's motion under the friction, and thresholds of perception, with their sources."""
 
 from __future__ import annotations
 
@@ -10,26 +7,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fingerspice.base.arrays import FloatArray, positive_number, real_number, real_numbers
+from fingerspice.base.arrays import ComplexArray, FloatArray, positive_number, real_number, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.plots import drawing
 from fingerspice.plots.traces import stems
 from fingerspice.results.record import Sealed, sealed
+from fingerspice.results.solution import Solution
+from fingerspice.results.spectrum import Spectrum
 from fingerspice.waveforms.waveform import require
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from fingerspice.results.solution import Solution
-    from fingerspice.results.spectrum import Spectrum
-
 
 #: Standard gravity, m/s^2.
 GRAVITY = 9.80665
@@ -86,32 +77,27 @@ class SkinMechanics:
         """The three values in words."""
         return f"{1e3 * self.mass:g} g, {self.damping:g} N s/m, {1e-3 * self.stiffness:g} N/mm"
 
-    def displacement(self, frequency: FloatArray) -> NDArray[np.complex128]:
+    def displacement(self, frequency: FloatArray) -> ComplexArray:
         """Displacement per force at frequencies (Hz), m/N, same shape."""
         omega = 2.0 * np.pi * np.asarray(frequency)
         return np.asarray(1.0 / (self.stiffness - self.mass * omega**2 + 1j * self.damping * omega))
 
-    def acceleration(self, frequency: FloatArray) -> NDArray[np.complex128]:
+    def acceleration(self, frequency: FloatArray) -> ComplexArray:
         """Acceleration per force at frequencies (Hz), 1/kg, same shape."""
         return np.asarray(-((2.0 * np.pi * np.asarray(frequency)) ** 2) * self.displacement(frequency))
 
 
 FINGERPAD = SkinMechanics(
-    "fingerpad, sideways",
-    mass=1e-4,
-    damping=1.0,
-    stiffness=1e3,
-    source="Table 1 of 'Friction perception resulting from laterally vibrotactile stimuli', ROBOMECH Journal 2017, "
+    "fingerpad, sideways", 1e-4, 1.0, 1e3,
+    "Table 1 of 'Friction perception resulting from laterally vibrotactile stimuli', ROBOMECH Journal 2017, "
     "doi:10.1186/s40648-017-0080-8, values of a simulation; those of a person differ, and change with load and speed",
-)
-"""The fingerpad moved sideways: 0.1 g, 1 N s/m, 1 N/mm.
+)  # fmt: skip
+"""The fingerpad moved sideways: 0.1 g, 1 N s/m, 1 N/mm; `source` says whence.
 
-Source: values of a simulation, Table 1 of "Friction perception resulting from laterally vibrotactile stimuli", ROBOMECH
-Journal (2017), doi:10.1186/s40648-017-0080-8. Caveat: one mass stands for a pad whose parts move differently. Stiffness
-and moving mass rise with the sliding speed (Balasubramanian et al. 2025, arXiv:2505.11162: 4 N/m and 0.03 g per mm/s)
-and differ between people. Measurements that are often quoted (Nakazawa, Ikeura and Inooka, "Characteristics of human
-fingertips in the shearing direction", 2000) are said to lie at 1 to 2 N/mm, 1 to 3 N s/m and 0.1 to 0.2 g; these could
-not be checked.
+Caveat: one mass stands for a pad whose parts move differently. Stiffness and moving mass rise with the sliding speed
+(Balasubramanian et al. 2025, arXiv:2505.11162: 4 N/m and 0.03 g per mm/s) and differ between people. Measurements that
+are often quoted (Nakazawa, Ikeura and Inooka, "Characteristics of human fingertips in the shearing direction", 2000)
+are said to lie at 1 to 2 N/mm, 1 to 3 N s/m and 0.1 to 0.2 g; these could not be checked.
 """
 
 
@@ -147,10 +133,8 @@ class Threshold(Sealed):
         require(good, "threshold", f"shapes {f.shape} and {level.shape}", "two rows of equal length, two or more")
         bad = np.flatnonzero(~(np.isfinite(f) & np.isfinite(level)) | (f < 0.0) | np.append(False, np.diff(f) <= 0.0))
         if bad.size:
-            raise InputError(
-                f"threshold {self.name!r}: point {bad[0] + 1} is {f[bad[0]]} Hz, {level[bad[0]]} dB; allowed: finite "
-                "numbers, with frequencies ascending from 0 or more"
-            )
+            said = f"threshold {self.name!r}: point {bad[0] + 1} is {f[bad[0]]} Hz, {level[bad[0]]} dB"
+            raise InputError(f"{said}; allowed: finite numbers, with frequencies ascending from 0 or more")
         object.__setattr__(self, "reference", positive_number("reference", self.reference, "m/s^2"))
 
     def acceleration(self, frequency: FloatArray) -> FloatArray:
@@ -192,11 +176,9 @@ _EDGE, _FEWEST = 2.0 ** (1.0 / 6.0), 2
 _NOTHING = 1e-9
 #: Largest number of rows in a report, and of lines whose level is written in the picture.
 _SHOWN, _NAMED = 10, 6
-_MARKERS = "osD^vP"
 #: Units of the columns of lines or bands, beside the level.
 _UNITS = {"frequency": "Hz", "force": "N", "displacement": "m", "acceleration": "m/s^2"}
-#: In the picture the vertical axis reaches down to the threshold, but spans at most the factor _DEPTH. The frequency
-#: axis ends at _BEYOND times the threshold's highest frequency.
+#: Largest span of the picture's vertical axis; and end of its frequency axis over the threshold's highest frequency.
 _DEPTH, _BEYOND = 1e7, 5.0
 
 
@@ -263,7 +245,7 @@ class Feel(Sealed, Shown):
     @property
     def highest(self) -> float | None:
         """The highest level, dB; None if no line or band is within the threshold's frequencies."""
-        return None if self.strongest is None else float(self.level[self.strongest])
+        return None if (place := self.strongest) is None else float(self.level[place])
 
     @property
     def felt(self) -> bool | None:
@@ -289,23 +271,17 @@ class Feel(Sealed, Shown):
         place = self.strongest
         columns = {**{name: getattr(self, name) for name in _UNITS}, "level_db": self.level}
         return {
-            "element": self.signal.partition(":")[2] or None,
-            "felt": self.felt,
-            "kind": self.kind,
-            "strongest": None if place is None else float(self.frequency[place]),
-            "level_db": self.highest,
-            "unjudged": None if self.unjudged is None else self.unjudged._asdict(),
-            "difference_steps": self.steps,
-            "friction_change": self.change,
-            "friction_change_felt": self.change_felt,
+            "element": self.signal.partition(":")[2] or None, "felt": self.felt, "kind": self.kind,
+            "strongest": None if place is None else float(self.frequency[place]), "level_db": self.highest,
+            "unjudged": None if self.unjudged is None else self.unjudged._asdict(), "difference_steps": self.steps,
+            "friction_change": self.change, "friction_change_felt": self.change_felt,
             "mechanics": dict(vars(self.mechanics)),
             "threshold": {"name": self.threshold.name, "source": self.threshold.source},
             "lines": [{k: float(x[i]) for k, x in columns.items()} for i in np.flatnonzero(np.isfinite(self.level))],
         }  # fmt: skip
 
     def _page(self) -> Page:
-        what = "line" if self.kind == "lines" else "band around"
-        blocks: list[str | Table] = [self.verdict()]
+        what, blocks = "line" if self.kind == "lines" else "band around", list[str | Table]([self.verdict()])
         judged = np.flatnonzero(np.isfinite(self.level))
         if judged.size:
             shown = np.sort(judged[np.argsort(self.level[judged])[::-1][:_SHOWN]])
@@ -313,21 +289,16 @@ class Feel(Sealed, Shown):
             rows = list(zip(*texts, [f"{x:+.1f} dB" for x in self.level[shown]], strict=True))
             blocks += ["", Table((what, "friction", "skin moves", "accelerates", "above threshold"), rows), ""]
         change = f"friction changes by {100.0 * self.change:.3g} % within these frequencies"
-        return Page([
-            *blocks,
-            f"{change}; {100.0 * WEBER_FRICTION:g} % are noticed as a transient reduction",
-            f"threshold: {self.threshold.name} ({self.threshold.source})",
-            f"skin: {self.mechanics.name}: {self.mechanics.said}",
-        ])  # fmt: skip
+        blocks.append(f"{change}; {100.0 * WEBER_FRICTION:g} % are noticed as a transient reduction")
+        blocks.append(f"threshold: {self.threshold.name} ({self.threshold.source})")
+        return Page([*blocks, f"skin: {self.mechanics.name}: {self.mechanics.said}"])
 
     def verdict(self) -> str:
         """A sentence: whether it is felt, at which frequency most, the level, and friction that cannot be judged."""
         finger = f"finger {self.signal.partition(':')[2]}: " if ":" in self.signal else ""
-        place = self.strongest
         low, high = self.threshold.frequency[[0, -1]]
-        if place is None:
-            said = f"no part of the friction lies between {low:g} and {high:g} Hz"
-        else:
+        said = f"no part of the friction lies between {low:g} and {high:g} Hz"
+        if (place := self.strongest) is not None:
             at = format_si(float(self.frequency[place]), "Hz")
             where = f"at {at}" if self.kind == "lines" else f"in the third octave around {at}"
             steps = "" if self.steps is None else f" ({self.steps:.0f} noticeable steps)"
@@ -338,21 +309,14 @@ class Feel(Sealed, Shown):
         verdict = {True: "felt", False: "not felt", None: "not known whether felt"}[self.felt]
         return f"{finger}{verdict}: {said}"
 
-    def plot(self, others: Sequence[Feel] = ()) -> Figure:
-        """Draw the acceleration, also that of other fingers, and the threshold against frequency.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            ``savefig("x.pdf")`` saves it, ``show()`` shows it.
-        """
+    def plot(self, others: Sequence[Feel] = ()) -> drawing.Picture:
+        """Draw the acceleration, also that of other fingers, and the threshold against frequency."""
         fingers = [self, *others]
         figure, (ax,) = drawing.new_figure(1, height=4.0)
         table, m = self.threshold, self.mechanics
-        low, high = map(float, table.frequency[[0, -1]])
+        low, high = table.frequency[[0, -1]].tolist()
         ends = max(low, 1e-3), _BEYOND * high
-        f = np.geomspace(ends[0], high, 400)
-        curve = table.acceleration(f)
+        curve = table.acceleration(f := np.geomspace(ends[0], high, 400))
         drawn = [(one.frequency >= ends[0]) & (one.frequency <= ends[1]) for one in fingers]
         peaks = [drawing.peak_of(one.acceleration[some]) for one, some in zip(fingers, drawn, strict=True)]
         top = 3.0 * max(float(curve.max()), *peaks)
@@ -360,7 +324,7 @@ class Feel(Sealed, Shown):
         ax.fill_between(f, bottom, curve, color=drawing.GREY, alpha=0.15, linewidth=0.0)
         ax.plot(f, curve, color=drawing.BLACK, linewidth=1.4, label=table.name)
         for number, (one, some) in enumerate(zip(fingers, drawn, strict=True)):
-            color, marker = drawing.CYCLE[number % 6], _MARKERS[number % 6]
+            color, marker = drawing.CYCLE[number % 6], "osD^vP"[number % 6]
             name = f"skin, {one.kind} {one.signal.partition(':')[2]}".rstrip()
             stems(ax, one.frequency[some], one.acceleration[some], bottom, label=name, color=color, marker=marker)
             loud = np.flatnonzero(one.level >= 0.0)
@@ -373,11 +337,9 @@ class Feel(Sealed, Shown):
         drawing.dress(ax, "Acceleration amplitude [m/s²]", "Frequency [Hz]")
         drawing.legend_above(ax, 3)
         said = "; ".join(one.verdict() for one in fingers)
-        drawing.caption(
-            figure,
-            f"{said} · numbers: dB above the threshold; grey: not felt; nothing is known beyond {low:g} to {high:g} Hz "
-            f"· threshold: {table.source} · skin: {m.name}, {m.said}",
-        )
+        said += " · numbers: dB above the threshold; grey: not felt; nothing is known beyond "
+        said += f"{low:g} to {high:g} Hz · threshold: {table.source} · skin: {m.name}, {m.said}"
+        drawing.caption(figure, said)
         return figure
 
 
@@ -415,7 +377,7 @@ def feel(
     if not solution.gaps:
         raise InputError("the circuit has no GAP, so there is no friction to feel; allowed: a circuit with a GAP")
     spectrum = solution.spectrum(signal)
-    end = math.inf if spectrum.amplitude is None else float(spectrum.frequency[-1])
+    end = math.inf if spectrum.amplitude is None else spectrum.frequency[-1]
     if end < max(table.frequency[-1], 0.1 * FASTEST_FELT):
         # A long period has so many lines that the spectrum ends below the threshold's highest frequency, and they are
         # too close to be felt separately: use the spectral density.
@@ -448,10 +410,7 @@ def feel(
 
 
 def _bands(spectrum: Spectrum) -> tuple[FloatArray, FloatArray, float]:
-    """Middles (Hz) of the third-octave bands that the density resolves, and amplitudes of sines with the bands' rms.
-
-    The last value is the amplitude for all that is slower than the lowest band.
-    """
+    """Middles (Hz) of the bands that the density resolves; amplitudes of sines of their rms, and of all below them."""
     assert spectrum.density is not None
     width = spectrum.resolution
     # A bin belongs to the band that contains its middle; the lowest band is at least _FEWEST bins wide.

@@ -1,8 +1,4 @@
-"""The paper's Figs. 2 to 5, each as a picture with its data, and the numbers that the paper's text claims.
-
-Every curve is computed by this package: Fig. 2 from Eqs. 18 (read as a cubic) and 19, Fig. 3 by phasors, Figs. 4 and 5
-as periodic states of the transient. The measured points that the paper shows in grey are not reproduced.
-"""
+"""The paper's Figs. 2 to 5, each as a picture with its data, without the measured points that it shows in grey."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,9 +23,6 @@ from fingerspice.studies.steady import phasor, steady_state
 from fingerspice.waveforms.periodic import Square
 from fingerspice.waveforms.waveform import Sine, Waveform, require
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 TABLE1_DECK = """\
 Fingerpad on a 3M-coated touchscreen, Table 1
 Vdrive  drive 0          SIN(0 200 100)
@@ -44,8 +37,7 @@ Xskin   skin  0    area  SKIN  d=350u f=100
 
 
 #: Source amplitudes of Fig. 3, and of Figs. 4 and 5, V; and the frequencies of the latter, Hz.
-U0_FORCE, U0_TIME = 140.0, 200.0
-FREQUENCIES = (100.0, 5000.0)
+U0_FORCE, U0_TIME, FREQUENCIES = 140.0, 200.0, (100.0, 5000.0)
 # Letters of units in a data file.
 _ASCII = str.maketrans({"µ": "u", "²": "^2", "Ω": "ohm"})
 
@@ -94,13 +86,13 @@ def make_figures(
 
     `only` names the wanted figures, from 2 to 5; all by default. A folder that does not exist is created.
     """
-    wanted = list(FIGURES) if only is None else [only] if isinstance(only, int) else list(only)
+    wanted = sorted({only} if isinstance(only, int) else set(FIGURES if only is None else only))
     for number in wanted:
         require(number in FIGURES, "figure", f"{number}", ", ".join(map(str, FIGURES)))
     written = []
-    for place, number in enumerate(sorted(set(wanted))):
+    for place, number in enumerate(wanted):
         if progress is not None:
-            progress(place / len(set(wanted)))
+            progress(place / len(wanted))
         figure, columns = FIGURES[number]()
         rows = ([f"{x:.10g}" for x in row] for row in zip(*columns.values(), strict=True))
         written.append(drawing.save(figure, Path(folder) / f"fig{number}.png"))
@@ -109,7 +101,7 @@ def make_figures(
 
 
 #: A picture, and its data: columns by their names with units.
-Drawn = tuple["Figure", dict[str, FloatArray]]
+Drawn = tuple["drawing.Picture", dict[str, FloatArray]]
 
 
 def figure_2() -> Drawn:
@@ -138,21 +130,19 @@ def figure_3(points: int = 46) -> Drawn:
     columns = {"frequency [Hz]": f, "f_el_mean [N] Table 1": base}
     for ax, variation in zip(axes, variations(), strict=True):
         # Table 1 is black, and the others have colours and dashes.
-        others = zip((drawing.BLUE, drawing.VERMILION, drawing.GREEN), drawing.DASHES[1:], strict=True)
+        styles = zip(drawing.CYCLE[:3], drawing.DASHES[1:], strict=True)
         for value in variation.values:
-            force, style = base, {"color": drawing.BLACK, "linewidth": 1.8}
+            force, color, dash, width = base, drawing.BLACK, "-", 1.8
             if value != variation.base:
-                force = phasor(variation.apply(circuit, value), f).f_el_mean
+                force, (color, dash), width = phasor(variation.apply(circuit, value), f).f_el_mean, next(styles), 1.5
                 columns[f"f_el_mean [N] {variation.name}={value:g} {variation.unit.translate(_ASCII)}"] = force
-                color, dash = next(others)
-                style = {"color": color, "linestyle": dash, "linewidth": 1.5}
-            ax.semilogx(f, force, label=f"${variation.symbol}$ = {value:.3g} {variation.unit}", **style)
+            label = f"${variation.symbol}$ = {value:.3g} {variation.unit}"
+            ax.semilogx(f, force, label=label, color=color, linestyle=dash, linewidth=width)
         other_scale = variation.name == "d_a"
         ax.set_title(variation.title + " (other scale)" * other_scale, fontsize=drawing.FONT, loc="left")
         ax.set(xlim=(f[0], f[-1]), ylim=(0.0, 0.25 if other_scale else 0.125))
-        # The legend stands in the corner that the panel's curves leave free.
-        corner: Any = "lower right" if variation.name == "r_a" else "upper left"
-        ax.legend(loc=corner, fontsize=drawing.FONT - 1.0, frameon=False)
+        # In the corner that the panel's curves leave free.
+        ax.legend(loc=4 if variation.name == "r_a" else 2, fontsize=drawing.FONT - 1.0, frameon=False)
     for ax in axes[::2]:
         drawing.dress(ax, r"Mean force $F_\mathrm{el}$ [N]")
     for ax in axes[2:]:
@@ -165,17 +155,13 @@ def time_response(shape: type[Sine] | type[Square], frequency: float, *, dispers
     changes: dict[str, float | Waveform] = {"Vdrive": shape(U0_TIME, frequency)}
     if not dispersive:
         changes["Xskin.f"] = frequency
-    with warnings.catch_warnings():
-        # 2 % of a square wave's energy lies above the skin's data, in the paper as here: no warning is needed.
-        warnings.simplefilter("ignore", FingerspiceWarning)
+    # 2 % of a square wave's energy lies above the skin's data, in the paper as here: no warning is needed.
+    with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
         return steady_state(table1_circuit(dispersive=dispersive).replace(changes), points=1000).solution
 
 
 def two_periods(solution: Solution) -> dict[str, FloatArray]:
-    """Columns ``t``, ``u_source``, ``u_gap``, ``f_el``, ``area`` of one period, repeated twice from t = 0.
-
-    The last row of the first copy is left out if it repeats the first row of the second copy.
-    """
+    """Columns ``t``, ``u_source``, ``u_gap``, ``f_el``, ``area`` of one period, twice from t = 0, each row once."""
     assert solution.period is not None
     t, end = solution.t - solution.t[0], solution.t.size - 1
     # A period that ends at a jump ends with a left-hand row and the right-hand row that begins the next period.
@@ -186,11 +172,9 @@ def two_periods(solution: Solution) -> dict[str, FloatArray]:
 
 
 def _time_figure(shape: type[Sine] | type[Square]) -> Drawn:
-    """Gap voltage and force over two periods of the periodic state, 100 Hz left, 5000 Hz right.
-
-    A square wave has many harmonics, so a dispersive skin is shown as well.
-    """
+    """Gap voltage and force over two periods of the periodic state; of a square wave with a dispersive skin, too."""
     header = ["frequency [Hz]", "t [s]", "u_source [V]", "u_gap [V]", "f_el [N]", "area [m^2]"]
+    header += ["u_gap_dispersive [V]", "f_el_dispersive [N]"] if shape is Square else []
     figure, axes = drawing.new_figure(2, 2, height=4.3, sharex="col", sharey="row")
     parts, dash = [], drawing.DASHES[1]
     for frequency, upper, lower in zip(FREQUENCIES, axes[:2], axes[2:], strict=True):
@@ -207,8 +191,8 @@ def _time_figure(shape: type[Sine] | type[Square]) -> Drawn:
             # The name appears only in the legend of the force, which has room for it.
             for ax, name, label in ((upper, "u_gap", "_"), (lower, "f_el", "dispersive")):
                 data[f"{name}_dispersive"] = x = broad[name]
-                style: dict[str, Any] = {"color": drawing.BLACK, "linewidth": 0.9, "linestyle": drawing.DASHES[3]}
-                ax.plot(t, np.append(x[-1], x), label=label, **style)
+                dots = drawing.DASHES[3]
+                ax.plot(t, np.append(x[-1], x), label=label, color=drawing.BLACK, linewidth=0.9, linestyle=dots)
         mean = float(np.trapezoid(data["f_el"], data["t"]) / data["t"][-1])
         lower.axhline(mean, color=drawing.BLACK, linewidth=1.0, linestyle=dash, label=f"mean {mean:.3f} N")
         for ax in (upper, lower):
@@ -222,14 +206,10 @@ def _time_figure(shape: type[Sine] | type[Square]) -> Drawn:
     drawing.dress(axes[2], r"Force $F_\mathrm{el}$ [N]")
     for ax in axes[2:]:
         ax.set_ylim(0.0, None)
-    header += ["u_gap_dispersive [V]", "f_el_dispersive [N]"] if shape is Square else []
     return figure, {name: np.concatenate(c) for name, c in zip(header, zip(*parts, strict=True), strict=True)}
 
 
 FIGURES: dict[int, Callable[[], Drawn]] = {
-    2: figure_2,
-    3: figure_3,
-    4: partial(_time_figure, Sine),
-    5: partial(_time_figure, Square),
-}
+    2: figure_2, 3: figure_3, 4: partial(_time_figure, Sine), 5: partial(_time_figure, Square)
+}  # fmt: skip
 """The function that makes each figure of the paper."""

@@ -1,4 +1,4 @@
-"""The drive that produces a wanted electroadhesive force or friction, checked and corrected by forward runs."""
+"""The drive that produces a wanted electroadhesive force or friction of one finger, corrected by forward runs."""
 
 from __future__ import annotations
 
@@ -6,44 +6,184 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fingerspice.base.arrays import FloatArray, positive_number, real_number, real_numbers
+from fingerspice.base.arrays import BoolArray, ComplexArray, FloatArray, positive_number, real_number, real_numbers
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.files import write_aside, write_csv
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import Circuit
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import head_lines, heading, require_circuit
+from fingerspice.circuit.network import Network, network_of
+from fingerspice.circuit.statespace import find_branches
+from fingerspice.engine.inverse import drive_stack, hold
+from fingerspice.physics.contact import fixed_area_curve
 from fingerspice.plots import drawing
 from fingerspice.results.record import Sealed
 from fingerspice.solve.simulation import simulate
-from fingerspice.studies.finger import Finger
 from fingerspice.waveforms.files import read_text_columns
 from fingerspice.waveforms.periodic import PWL
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import Waveform, as_waveform, require
 
-if TYPE_CHECKING:
-    from fingerspice.plots.picture import Picture
-
 #: Types that may be given as a wanted force.
 Wanted = ArrayLike | Waveform | Callable[[float], float]
 # Default rate of a drive, Hz; default and smallest number of samples in a period of the carrier.
 RATE, PER_PERIOD, FEWEST = 48_000.0, 128, 20
-# Largest number of samples of a drive: its Fourier transform and its run then need less than a gigabyte.
-MOST_SAMPLES = 5_000_000
-# Relative error of the forward run; relative error of the gap voltage at which the corrections end; largest number of
-# corrections. A correction that leaves more than the fraction STALLED of the smallest error so far is the last one.
+# Largest number of samples of a drive, whose Fourier transform and run then need less than a gigabyte; largest voltage
+# without a warning where no limit is given, V: usual amplifiers end below it.
+MOST_SAMPLES, HUGE = 5_000_000, 1000.0
+# Relative errors of the forward run, and of the gap voltage at which the corrections end; largest number of these. One
+# that leaves more than the fraction STALLED of the smallest error so far is the last.
 RTOL, CLOSE, CORRECTIONS, STALLED = 1e-6, 1e-5, 25, 0.7
-# Largest voltage of a drive without a warning where no limit is given, V: usual amplifiers end below it.
-HUGE = 1000.0
-# Full scale of a WAV file's integers.
-_FULL = 2.0**31
+# Over the length of the Fourier transform a signal is damped by exp(-_DAMPING), so that its end does not wrap round to
+# its beginning; as the signal fills at most half of it, round-off grows by the square root of that factor.
+_DAMPING = 14.0
+# Response of the gap voltage to the source, relative to the largest over all frequencies, that counts as none.
+_DEAF = 1e-9
+# Number of amplitudes of the carrier between which the mean force is interpolated.
+_GRID = 80
+
+
+class Finger:
+    """The one finger of a circuit with one V source, under a charge law; others, and a delayed area, are refused."""
+
+    def __init__(self, circuit: Circuit, charge_law: str | None) -> None:
+        self.circuit, self.law = circuit, charge_law or circuit.charge_law or "local"
+        require(self.law in CHARGE_LAWS, "charge_law", repr(self.law), " or ".join(map(repr, CHARGE_LAWS)))
+        gaps, sources = circuit.by_device("GAP"), [e for e in find_branches(circuit)[1] if e.device in "VI"]
+        for what, found, device, allowed in (
+            ("one finger; this circuit has the GAPs", gaps, "GAP", "one GAP"),
+            ("one V source; this circuit has", sources, "V", "one V element"),
+        ):
+            if [e.device for e in found] != [device]:
+                names = ", ".join(e.name for e in found) or "none"
+                raise InputError(f"an inverse drive is that of {what} {names}; allowed: {allowed}")
+        (self.gap,), (self.source,) = gaps, sources
+        tau = self.gap.values["tau"]
+        if tau > 0.0:
+            raise InputError(f"{self.gap.name} has tau={tau:g} s: its area follows with a delay; allowed here: tau=0")
+        self.network = network_of(circuit)
+        (place,), stack = self.network.fingers, self.network.stack
+        contact = self.network.contacts[place]
+        assert contact is not None
+        self.contact = contact
+        self.area = self.network.areas[place].given  # Fixed by the deck, m^2, or None
+        # Time in which the force rises to its first value, s: by default none in a stack, which jumps with the source.
+        self.lead = 2e-3 if stack is None else 0.0
+        # Sign of the GAP's voltage, from p to n, relative to the voltage along the source.
+        self.sign = 1.0 if stack is None else float(stack.sign[stack.gap]) * stack.sources[0][1]
+
+    def force(self, u: FloatArray | float) -> FloatArray:
+        """Electroadhesive force (N) at gap voltages (V), same shape."""
+        return np.asarray(self.contact.stress(u) * (self.contact.area(u) if self.area is None else self.area))
+
+    def voltages(self, most: float, rate: float, carrier: float | None) -> Callable[[FloatArray, int], FloatArray]:
+        """What computes gap voltages (V) for forces of up to `most` (N), after a rise in some steps.
+
+        The forces are means over each period of a carrier (Hz); between samples, at `rate` (Hz), the voltage is linear.
+        """
+        from scipy.interpolate import CubicSpline
+
+        shape, weight = np.ones(1), np.ones(1)
+        if carrier is not None:
+            points = rate / carrier
+            count = round(points) if abs(points - round(points)) < 1e-9 else round(8 * points)
+            at = np.sin(2.0 * np.pi * np.arange(count + 1) / points)
+            shape = np.abs(np.concatenate([at[:-1], 0.5 * (at[1:] + at[:-1])]))
+            # Simpson's rule between samples: of a linear voltage the force is a parabola but for the area's change.
+            weight = np.repeat([1.0 / 3.0, 2.0 / 3.0], count) / count
+
+        def mean(amplitude: FloatArray) -> FloatArray:
+            return np.asarray(self.force(amplitude[:, None] * shape) @ weight)
+
+        top = 1.0
+        while top <= 1e6 and mean(np.array([top]))[0] < 1.01 * most:
+            top *= 1.4
+        amplitude = top * np.arange(1, _GRID + 1) / _GRID
+        force = mean(amplitude)
+        rising = np.append(np.diff(force) > 0.0, False)
+        amplitude, root = amplitude[: rising.argmin() + 1], np.sqrt(force[: rising.argmin() + 1])
+        if (best := root[-1] ** 2) < most:
+            raise InputError(f"the force wanted, {most:g} N, is reached by no voltage; allowed: at most {best:.3g} N")
+        # The voltage over the root of the force, which at 0 V is that of a small voltage.
+        at_zero = math.sqrt(1.0 / float(weight @ shape**2) / (float(self.force(1e-3)) / 1e-3**2))
+        spline = CubicSpline(np.append(0.0, root), np.append(at_zero, amplitude / root))
+
+        def voltages(force: FloatArray, lead: int) -> FloatArray:
+            u = np.sqrt(force) * spline(np.sqrt(force))
+            # The rise has zero first and second derivative at both ends.
+            x = np.arange(lead) / max(lead, 1)
+            u = np.append(u[0] * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x)), u)
+            if carrier is not None:
+                u *= np.sin(2.0 * np.pi * carrier / rate * (np.arange(u.size) - lead))
+            return u
+
+        return voltages
+
+    def inverter(self, u_max: float) -> Callable[[FloatArray, float, float, float], tuple[FloatArray, BoolArray]]:
+        """What computes source voltages (V), and which a limit holds, for gap voltages of up to `u_max` (V).
+
+        It takes the gap voltages in the direction of the source, their interval (s), and the source's largest voltage
+        (V) and slew rate (V/s). A stack is inverted step by step: where a limit holds, its layers' state follows.
+        """
+        stack = self.network.stack
+        if stack is None:
+            wish = _linear_inverse(self.network)
+        else:
+            assert stack.gap is not None
+            gap, cells = stack.gap, np.column_stack([stack.c, stack.g_total, stack.g_area])
+            curve = fixed_area_curve(self.area) if self.area is not None else self.contact.curve(1.2 * max(u_max, 1.0))
+
+        def drive(u: FloatArray, h: float, limit: float, slew: float) -> tuple[FloatArray, BoolArray]:
+            out, held = np.empty(u.size), np.empty(u.size, np.bool_)
+            if stack is None:
+                hold(wish(u, h), limit, slew * h, out, held)
+            else:
+                drive_stack(u, h, curve, cells, gap, self.law == "mobile", limit, slew * h, out, held)
+            return out, held
+
+        return drive
+
+
+def _linear_inverse(net: Network) -> Callable[[FloatArray, float], FloatArray]:
+    """Inverts the linear response of a network at its areas at rest: source voltages from gap voltages and interval.
+
+    The signals are damped by exp(-a t), so that the response, at s = a + i omega, has no zero (a floating body passes
+    no direct voltage, a zero at s = 0).
+    """
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    leak, c = net.leak(net.areas_at_rest), net.capacitance(net.areas_at_rest)
+    gap = next(g for g in net.gaps if g is not None)
+
+    # It takes longer than the transforms, and is asked for again and again for drives of one length.
+    @lru_cache(maxsize=1)
+    def response(m: int, h: float) -> ComplexArray:
+        s = _DAMPING / (m * h) + 2j * np.pi * np.arange(m // 2 + 1) / (m * h)
+        y = leak + s[:, None] * c
+        kernel = net.k + np.einsum("ci,fc,cj->fij", net.p, y, net.p, optimize=True)
+        right = net.b[:, 0] + np.einsum("ci,fc,c->fi", net.p, y, net.q[:, 0], optimize=True)
+        x = np.linalg.solve(kernel, -right[:, :, None])[:, :, 0]
+        gain = x @ net.p[gap] + net.q[gap, 0]
+        if not np.all(np.abs(gain) > _DEAF * np.abs(gain).max(initial=0.0)):
+            deaf = f"{net.sources[0].name} does not drive the gap at every frequency of the drive"
+            raise InputError(f"{deaf}; allowed: a source with a path to the GAP, and a lower rate")
+        return np.asarray(gain)
+
+    def wish(u: FloatArray, h: float) -> FloatArray:
+        n, m = u.size, next_fast_len(2 * u.size, real=True)
+        damp = np.exp(-_DAMPING / (m * h) * h * np.arange(m))
+        spectrum = rfft(np.append(u, np.full(m - n, u[-1])) * damp)
+        return np.asarray(irfft(spectrum / response(m, h), m)[:n] / damp[:n])
+
+    return wish
 
 
 def on_carrier(carrier: float | None) -> str:
@@ -73,10 +213,9 @@ class InverseDrive(Sealed, Shown):
         Frequency of the carrier, Hz.
     limit, slew : float
         Largest voltage (V) and slew rate (V/s) of the source; inf for no limit.
-    lead : float
-        Time in which the drive rises to the first wanted value, s; it is left out of the comparison.
-    at_limit : float
-        Fraction of the samples at which a limit holds the drive.
+    lead, at_limit : float
+        Time in which the drive rises to the first wanted value, s, left out of the comparison; and the fraction of the
+        samples at which a limit holds the drive.
     corrections : int
         Number of forward runs after the first.
     """
@@ -99,9 +238,7 @@ class InverseDrive(Sealed, Shown):
     @property
     def _asked(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The quantity asked for, as wanted and as reached, and the difference, N."""
-        wanted, reached = self.wanted_friction, self.friction
-        if self.kind == "force":
-            wanted, reached = self.wanted, self.force
+        wanted, reached = (self.wanted, self.force) if self.kind == "force" else (self.wanted_friction, self.friction)
         return wanted, reached, reached - wanted
 
     @property
@@ -149,9 +286,8 @@ class InverseDrive(Sealed, Shown):
             ("worst miss", f"{format_si(self.worst, 'N')}, {100.0 * self.worst_share:.2g} %"),
             ("rms miss", f"{format_si(self.rms, 'N')}, {100.0 * self.rms_share:.2g} %"),
             ("time at a limit", f"{100.0 * self.at_limit:.3g} %"),
+            *([("rise before it", format_si(self.lead, "s"))] if self.lead > 0.0 else []),
         ]
-        if self.lead > 0.0:
-            rows.append(("rise before it", format_si(self.lead, "s")))
         said = f"drive for a wanted {self.kind}, {on_carrier(self.carrier)}: {self._verdict()}"
         return Page([*head_lines(self.circuit), said, "", Table(("", ""), rows)])
 
@@ -162,7 +298,7 @@ class InverseDrive(Sealed, Shown):
         worst, rms = format_si(self.worst, "N"), format_si(self.rms, "N")
         return f"the limits ({', '.join(limits)}) cost {worst} at worst, {rms} rms"
 
-    def plot(self) -> Picture:
+    def plot(self) -> drawing.Picture:
         """Picture of the wanted and the reached quantity, their difference, and the drive, against time."""
         figure, (top, middle, bottom) = drawing.new_figure(3, height=5.2, sharex=True, height_ratios=(3, 1.4, 2))
         (wanted, reached, miss), volts = self._asked, self.drive.values
@@ -170,11 +306,13 @@ class InverseDrive(Sealed, Shown):
         scale, unit = drawing.engineering(float(at[-1]), "s")
         force, newton = drawing.engineering(float(wanted.max(initial=0.0)) or 1.0, "N")
         small, milli = drawing.engineering(max(self.worst, 1e-12), "N")
-        dashes, t = (0, (4, 1.5)), scale * self.times
-        top.plot(*drawing.thin(t, force * wanted), color=drawing.BLACK, linewidth=2.2, label="wanted")
-        top.plot(*drawing.thin(t, force * reached), color=drawing.ORANGE, linewidth=1.2, ls=dashes, label="reached")
-        middle.plot(*drawing.thin(t, small * miss), color=drawing.VERMILION, linewidth=1.0)
-        bottom.plot(*drawing.thin(scale * at, volts), color=drawing.BLUE, linewidth=0.9)
+        for ax, t, y, color, linewidth, ls, label in (
+            (top, self.times, force * wanted, drawing.BLACK, 2.2, "-", "wanted"),
+            (top, self.times, force * reached, drawing.ORANGE, 1.2, (0, (4, 1.5)), "reached"),
+            (middle, self.times, small * miss, drawing.VERMILION, 1.0, "-", None),
+            (bottom, at, volts, drawing.BLUE, 0.9, "-", None),
+        ):
+            ax.plot(*drawing.thin(scale * t, y), color=color, linewidth=linewidth, ls=ls, label=label)
         drawing.dress(top, f"{self.kind.capitalize()} [{newton}]")
         drawing.legend_above(top, 2)
         drawing.dress(middle, f"Miss [{milli}]")
@@ -206,11 +344,11 @@ class InverseDrive(Sealed, Shown):
 
         rate, peak = self.drive.rate, self.peak
         if abs(rate - round(rate)) > 1e-9 * rate or not 1.0 <= rate < 2**32:
-            raise InputError(f"a WAV file has a whole number of samples a second, and the drive has {rate:g}; allowed: "
-                             "rate= a whole number of Hz")  # fmt: skip
-        full = (peak or 1.0) if gain is None else gain
+            said = f"a WAV file has a whole number of samples a second, and the drive has {rate:g}"
+            raise InputError(f"{said}; allowed: rate= a whole number of Hz")
+        full, most = (peak or 1.0) if gain is None else gain, 2.0**31
         require(full >= peak, "gain", f"{full:g} V at full scale", f"the drive's peak, {peak:.6g} V, or more")
-        data = np.clip(np.rint(_FULL / full * self.drive.values), -_FULL, _FULL - 1.0).astype("<i4")
+        data = np.clip(np.rint(most / full * self.drive.values), -most, most - 1.0).astype("<i4")
         return write_aside(Path(path), lambda target: wavfile.write(target, round(rate), data))
 
     def to_csv(self, path: str | Path) -> Path:
@@ -226,18 +364,12 @@ class InverseDrive(Sealed, Shown):
 
 
 def _wave_of(given: Wanted, what: str, rate: float | None, duration: float | None) -> tuple[Waveform, float]:
-    """What a caller wants (N) against time, and until when (s).
-
-    An array needs its `rate`, and a waveform without an end a `duration`.
-    """
+    """What a caller wants (N), an array at a `rate` or a waveform until a `duration`, and until when (s)."""
     if isinstance(given, Waveform) or callable(given):
         wave, end = as_waveform(given), duration
-        if end is None and isinstance(wave, Samples):
-            end = wave.start + (wave.values.size - 1) / wave.rate
-        elif end is None and isinstance(wave, PWL) and wave.period is None:
-            end = float(np.asarray(wave.times)[-1])
-        if end is None:
-            raise InputError(f"{what} is a waveform without an end; allowed: with duration= in s")
+        if end is None and (isinstance(wave, Samples) or (isinstance(wave, PWL) and wave.period is None)):
+            end = float(wave.knots[0][-1])
+        require(end is not None, what, "a waveform without an end", "with duration= in s")
         return wave, positive_number("duration", end, "s")
     values = real_numbers(what, given, "numbers in N, a waveform or a function")
     if rate is None:
@@ -279,15 +411,11 @@ def read_wanted(path: str | Path, rate: float | None = None) -> tuple[str, Wavef
     t = t - t[0]
     end = float(t[-1])
     own = (t.size - 1) / end
-    if not np.all(np.abs(t * own - np.arange(t.size)) < 1e-3):
-        if rate is not None:
-            raise InputError(f"'{path}': its times are uneven, and a rate is given; allowed: one of them")
-        return named[0], PWL(tuple(t.tolist()), tuple(values.tolist())), end
-    if rate is not None and abs(rate - own) > 1e-3 * own:
-        raise InputError(
-            f"'{path}': its times are at {own:g} Hz, and the rate given is {rate:g} Hz; allowed: one of them"
-        )
-    return named[0], Samples(values, own), end
+    even = bool(np.all(np.abs(t * own - np.arange(t.size)) < 1e-3))
+    if rate is not None and not (even and abs(rate - own) <= 1e-3 * own):
+        said = f"at {own:g} Hz, and the rate given is {rate:g} Hz" if even else "uneven, and a rate is given"
+        raise InputError(f"'{path}': its times are {said}; allowed: one of them")
+    return named[0], Samples(values, own) if even else PWL(tuple(t.tolist()), tuple(values.tolist())), end
 
 
 def inverse_drive(
@@ -318,10 +446,8 @@ def inverse_drive(
     carrier : float, optional
         Hz: the gap voltage is then an envelope times a sine, such that the mean force over each period of the sine is
         the wanted one. Without a carrier the gap voltage does not change its sign.
-    limit : float, optional
-        Largest voltage of the source, V.
-    slew : float, optional
-        Largest slew rate of the source, V/s.
+    limit, slew : float, optional
+        Largest voltage (V) and slew rate (V/s) of the source.
     duration : float, optional
         Length of a waveform or function without an end, s.
     lead : float, optional
@@ -329,10 +455,6 @@ def inverse_drive(
         jumps with the source, and 2 ms for another network.
     charge_law : str, optional
         As in `simulate`.
-
-    Returns
-    -------
-    InverseDrive
 
     Raises
     ------
@@ -354,70 +476,54 @@ def inverse_drive(
     """
     require_circuit(circuit)
     asked = [(kind, wanted) for kind, wanted in (("force", force), ("friction", friction)) if wanted is not None]
-    if len(asked) != 1:
-        raise InputError(f"of force and friction {'both' if asked else 'neither'} is given; allowed: one of them")
+    require(len(asked) == 1, f"of force and friction {'both' if asked else 'neither'}", "given", "one of them")
     ((kind, wanted),) = asked
-    rate, carrier, limit, slew = (
-        None if number is None else positive_number(name, number, unit)
-        for name, number, unit in (
-            ("rate", rate, "Hz"), ("carrier", carrier, "Hz"), ("limit", limit, "V"), ("slew", slew, "V/s")
-        )
-    )  # fmt: skip
+    given = ("rate", rate, "Hz"), ("carrier", carrier, "Hz"), ("limit", limit, "V"), ("slew", slew, "V/s")
+    rate, carrier, limit, slew = (None if x is None else positive_number(name, x, unit) for name, x, unit in given)
     finger = Finger(circuit, charge_law)
     wave, end = _wave_of(wanted, kind, rate, duration)
     if carrier is not None:
         if rate is not None and rate < FEWEST * carrier:
-            raise InputError(
-                f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: at most a {FEWEST}th of "
-                f"it, {rate / FEWEST:g} Hz, or a higher rate"
-            )
+            allowed = f"at most a {FEWEST}th of it, {rate / FEWEST:g} Hz, or a higher rate"
+            raise InputError(f"a carrier of {carrier:g} Hz is too fast for a rate of {rate:g} Hz; allowed: {allowed}")
         rate = rate or PER_PERIOD * carrier
         if end * carrier < 1.0:
             raise InputError(f"{end:g} s hold no period of the carrier; allowed: 1 or more")
     rate = rate or (wave.rate if isinstance(wave, Samples) else RATE)
     count, allowed = end * rate, f"2 to {MOST_SAMPLES:,} samples"
     require(1.0 <= count <= MOST_SAMPLES - 1, "the drive", f"{count:,.0f} samples long", allowed)
-    begin = finger.lead if lead is None else real_number("lead", lead, "a number in s")
-    require(0.0 <= begin < 1e3, "lead", f"{begin:g} s", "0 or more, less than 1000")
-    found = Task(finger, kind, wave, end, rate, carrier, begin).solve(limit or math.inf, slew or math.inf)
+    finger.lead = finger.lead if lead is None else real_number("lead", lead, "a number in s")
+    require(0.0 <= finger.lead < 1e3, "lead", f"{finger.lead:g} s", "0 or more, less than 1000")
+    found = Task(finger, kind, wave, end, rate, carrier).solve(limit or math.inf, slew or math.inf)
     if limit is None and found.peak > HUGE:
-        text = (
-            f"the drive reaches {found.peak:.0f} V; limit= (V) keeps it within what the amplifier gives, and says what "
-            "that costs"
-        )
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+        kept = "limit= (V) keeps it within what the amplifier gives, and says what that costs"
+        warnings.warn(f"the drive reaches {found.peak:.0f} V; {kept}", FingerspiceWarning, stacklevel=2)
     return found
 
 
 class Task:
-    """The gap voltage for a wanted force or friction (`kind`) until `end` (s), and the iteration for its drive.
-
-    The force first rises for `lead` (s). `rate` and `carrier` (Hz) are those of `inverse_drive`.
-    """
+    """The gap voltage for a wanted force or friction (`kind`) until `end` (s), after the lead, and its drive."""
 
     def __init__(
-        self, finger: Finger, kind: str, wave: Waveform, end: float, rate: float, carrier: float | None, lead: float
+        self, finger: Finger, kind: str, wave: Waveform, end: float, rate: float, carrier: float | None
     ) -> None:
-        self.finger, self.kind, self.rate, self.carrier, self.lead = finger, kind, rate, carrier, round(lead * rate)
+        self.finger, self.kind, self.rate, self.carrier = finger, kind, rate, carrier
         # With a carrier the force is also evaluated midway between samples, as Simpson's rule for its mean needs it.
-        self.fine = 1 if carrier is None else 2
+        self.lead, self.fine = round(finger.lead * rate), 1 if carrier is None else 2
         t = np.arange(self.fine * math.floor(end * rate * (1.0 + 1e-12)) + 1) / (self.fine * rate)
         contact, force, least, scale, rest = finger.contact, wave.value(t), "0 N", 1.0, 0.0
         if kind == "friction":
-            if contact.mu == 0.0:
-                raise InputError(
-                    "the GAP has mu=0, so that no voltage makes friction; allowed: mu > 0, or a wanted force"
-                )
-            # F_el = F_T / mu - F_N (Eq. 1 with full slip).
-            force = force / contact.mu - contact.f_n
             scale, rest = contact.mu, contact.f_n
-            least = f"{contact.mu * contact.f_n:g} N, the friction without a voltage"
+            if scale == 0.0:
+                said = "the GAP has mu=0, so that no voltage makes friction"
+                raise InputError(f"{said}; allowed: mu > 0, or a wanted force")
+            # F_el = F_T / mu - F_N (Eq. 1 with full slip).
+            force, least = force / scale - rest, f"{scale * rest:g} N, the friction without a voltage"
         bad = np.flatnonzero(~(force >= -1e-12 * max(1.0, float(np.abs(force).max()))))
         if bad.size:
-            raise InputError(
-                f"{kind}: {scale * (float(force[bad[0]]) + rest):g} N at {t[bad[0]]:g} s is reached by no voltage, "
-                f"which only attracts; allowed: from {least}"
-            )
+            value = scale * (float(force[bad[0]]) + rest)
+            said = f"{kind}: {value:g} N at {t[bad[0]]:g} s is reached by no voltage, which only attracts"
+            raise InputError(f"{said}; allowed: from {least}")
         # Negative round-off becomes 0.
         self.wanted = np.maximum(force, 0.0)
         self.target = finger.voltages(float(self.wanted.max()), rate, carrier)(self.wanted[:: self.fine], self.lead)
@@ -433,9 +539,8 @@ class Task:
             values, held = inverter(wish, 1.0 / self.rate, limit, slew)
             drive = Samples(values, self.rate)
             circuit = finger.circuit.varied({finger.source.name: drive})
-            with warnings.catch_warnings():
-                # The reader has given the deck's warnings, and those of an uncorrected drive do not concern the user.
-                warnings.simplefilter("ignore", FingerspiceWarning)
+            # The reader has given the deck's warnings, and those of an uncorrected drive do not concern the user.
+            with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
                 run = simulate(
                     circuit, t_stop=float(t[-1]), t_eval=t, charge_law=finger.law, rtol=close * RTOL / CLOSE,
                     start="uncharged", charge=False,
@@ -466,10 +571,7 @@ class Task:
         )  # fmt: skip
 
     def _compared(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Times after the lead (s), and the wanted and the reached force there (N), from the force at the fine times.
-
-        With a carrier they are means over its whole periods, by Simpson's rule.
-        """
+        """Times after the lead (s), and the forces wanted and reached (N): means over the periods of a carrier."""
         reached = force[self.lead * self.fine :]
         if self.carrier is None:
             return np.arange(reached.size) / self.rate, self.wanted, reached

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,34 +19,25 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import head_lines, heading, require_circuit
-from fingerspice.plots.drawing import BLUE, FONT, GREY, VERMILION, caption, dress, engineering, new_figure
+from fingerspice.plots import drawing
 from fingerspice.results.outcome import SolveError, Status
 from fingerspice.solve.closed_form import meets_fold
 from fingerspice.solve.problem import prepare
 from fingerspice.solve.runs import Progress
 from fingerspice.solve.simulation import run_problem
-from fingerspice.studies.finger import Finger
-from fingerspice.studies.inverse import Task, on_carrier
+from fingerspice.studies.inverse import Finger, Task, on_carrier
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import Product, as_waveform, require
 
-if TYPE_CHECKING:
-    from fingerspice.plots.picture import Picture
-
-# Samples per period of the modulation and of the carrier, and the lowest sample rate, Hz.
-_PER_PERIOD, _PER_CARRIER, _LEAST_RATE = 64, 32, 8000.0
-# Duration of a force: this many periods of the modulation, and at least this many seconds.
-_PERIODS, _LASTS = 3.0, 0.05
-# Relative accuracy of the amplitudes of a stack, and of the voltage of another network, whose drives are corrected this
-# many times at most.
-_EXACT = 1e-3
-_MOST = 8
-# Range of voltages that is searched, V; factor between two voltages that are tried until the fold is between them;
-# relative accuracy of the voltage at the fold; relative error of each run.
-LOWEST, HIGHEST = 1e-3, 1e5
-STEP = 0.7
-EXACT = 1e-3
-RTOL = 1e-5
+# Samples per period of the modulation and of the carrier, and the lowest sample rate, Hz; duration of a force in
+# periods of the modulation, and the least, s.
+_PER_PERIOD, _PER_CARRIER, _LEAST_RATE, _PERIODS, _LASTS = 64, 32, 8000.0, 3.0, 0.05
+# Relative accuracy of a stack's amplitudes, and of voltages at the fold or of another network, whose drives are
+# corrected this many times at most.
+EXACT, MOST = 1e-3, 8
+# Range of voltages that is searched for the fold, V; factor between two voltages that are tried until it is between
+# them; relative error of each run.
+LOWEST, HIGHEST, STEP, RTOL = 1e-3, 1e5, 0.7, 1e-5
 
 
 @dataclass(frozen=True, repr=False)
@@ -60,8 +51,8 @@ class Capability(Shown):
     Attributes
     ----------
     circuit : Circuit
-    limit : float
-        V.
+    limit, smallest_mean, largest_mean : float
+        Largest voltage, V; smallest and largest constant friction, N.
     carrier : float or None
         Frequency of the carrier, Hz.
     frequency : ndarray, shape (n_f,)
@@ -70,8 +61,6 @@ class Capability(Shown):
         Mean friction, N.
     amplitude : ndarray, shape (n_m, n_f)
         Largest amplitude of the friction, N.
-    smallest_mean, largest_mean : float
-        Smallest and largest constant friction, N.
     """
 
     circuit: Circuit
@@ -101,18 +90,17 @@ class Capability(Shown):
     def _page(self) -> Page:
         columns = (self.frequency, "Hz"), (self.largest, "N"), (self.best_mean, "N")
         rows = list(zip(*([format_si(x, unit) for x in values.tolist()] for values, unit in columns), strict=True))
-        said = (
-            f"up to {format_si(self.limit, 'V')} {on_carrier(self.carrier)} the friction's mean is from {self._range()}"
-        )
+        limit = f"up to {format_si(self.limit, 'V')} {on_carrier(self.carrier)}"
+        said = f"{limit} the friction's mean is from {self._range()}"
         return Page([heading(self.circuit), said, "", Table(("modulation", "largest amplitude", "at mean"), rows)])
 
     def _range(self) -> str:
         return f"{format_si(self.smallest_mean, 'N')} to {format_si(self.largest_mean, 'N')}"
 
-    def plot(self) -> Picture:
+    def plot(self) -> drawing.Picture:
         """Picture with a map of the amplitude over frequency and mean, and the largest amplitude over frequency."""
-        figure, (left, right) = new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))
-        factor, unit = engineering(self.largest_mean, "N")
+        figure, (left, right) = drawing.new_figure(1, 2, height=3.4, width_ratios=(1.25, 1))
+        factor, unit = drawing.engineering(self.largest_mean, "N")
         f, amplitude = self.frequency, factor * self.amplitude
         if f.size == 1:
             # A map needs two frequencies: a single one is drawn as a band around it, with room for the axis to be read.
@@ -121,14 +109,14 @@ class Capability(Shown):
         bar = figure.colorbar(mesh, ax=left, pad=0.02)
         bar.set_label(f"Largest amplitude [{unit}]", fontsize=8)
         bar.ax.tick_params(labelsize=8)
-        right.plot(self.frequency, factor * self.largest, color=BLUE, marker="o", markersize=3)
+        right.plot(self.frequency, factor * self.largest, color=drawing.BLUE, marker="o", markersize=3)
         right.set_ylim(bottom=0.0)
         for ax, label in ((left, f"Mean friction [{unit}]"), (right, f"Largest amplitude, best mean [{unit}]")):
             ax.set_xscale("log")
-            dress(ax, label, "Modulation frequency [Hz]")
+            drawing.dress(ax, label, "Modulation frequency [Hz]")
         wave = "unipolar drive" if self.carrier is None else f"carrier {format_si(self.carrier, 'Hz')}"
         drive = f"at most {format_si(self.limit, 'V')}, {wave}"
-        caption(figure, f"{heading(self.circuit)} · {drive} · mean friction {self._range()}")
+        drawing.caption(figure, f"{heading(self.circuit)} · {drive} · mean friction {self._range()}")
         return figure
 
     def to_csv(self, path: str | Path) -> Path:
@@ -182,9 +170,8 @@ def capability(
     own = np.geomspace(min(5.0, 0.1 * top), top, 13)
     f = positive_row("frequency", own if frequency is None else frequency, "Hz")
     if carrier is not None and f.max() > carrier / 4.0:
-        raise InputError(
-            f"frequency reaches {f.max():g} Hz; allowed: at most a quarter of the carrier's {carrier:g} Hz"
-        )
+        allowed = f"at most a quarter of the carrier's {carrier:g} Hz"
+        raise InputError(f"frequency reaches {f.max():g} Hz; allowed: {allowed}")
     finger = Finger(circuit, charge_law)
     mu = finger.contact.mu
     if mu == 0.0:
@@ -206,9 +193,8 @@ def capability(
 class _Search:
     """Search for the largest forces, of up to `most` (N), whose inverse drive stays within the voltage limit.
 
-    For a series stack the inverter's drive is exact. For another network it is that of the linear response, whose peak
-    is off by `ratio`: this changes little from a force to the next, so that few drives have to be corrected by forward
-    runs.
+    For a series stack the inverter's drive is exact. The peak of another network's is off by `ratio`, which changes
+    little from a force to the next, so that few drives have to be corrected by forward runs.
     """
 
     def __init__(self, finger: Finger, limit: float, carrier: float | None, most: float) -> None:
@@ -224,13 +210,10 @@ class _Search:
         return Samples(np.maximum(mean + amplitude * np.sin(2.0 * np.pi * frequency * t), 0.0), rate)
 
     def largest(self, wanted: Callable[[float], Samples], most: float) -> float:
-        """Largest number up to `most` (N) for which the drive of the wanted force stays within the limit.
-
-        By bisection, to `_EXACT` times itself or 1e-3 `_EXACT` times `most`.
-        """
-        for _ in range(_MOST):
+        """Largest number up to `most` (N) of which a force's drive is within the limit, by bisection to `EXACT`."""
+        for _ in range(MOST):
             found, high, middle = 0.0, most, most
-            while high - found > _EXACT * max(found, 1e-3 * most):
+            while high - found > EXACT * max(found, 1e-3 * most):
                 within = self.ratio * self._peak(wanted(middle)) <= self.limit
                 found, high = (middle, high) if within else (found, middle)
                 middle = 0.5 * (found + high)
@@ -238,10 +221,10 @@ class _Search:
                 break
             force = wanted(found)
             end = (force.values.size - 1) / force.rate
-            task = Task(self.finger, "force", force, end, force.rate, self.carrier, self.finger.lead)
-            peak = task.solve(close=0.3 * _EXACT).peak
+            task = Task(self.finger, "force", force, end, force.rate, self.carrier)
+            peak = task.solve(close=0.3 * EXACT).peak
             before, self.ratio = self.ratio, peak / self._peak(force)
-            if abs(self.ratio / before - 1.0) < 0.5 * _EXACT or (found == most and peak <= self.limit):
+            if abs(self.ratio / before - 1.0) < 0.5 * EXACT or (found == most and peak <= self.limit):
                 break
         return found
 
@@ -275,10 +258,8 @@ class FoldLimits(Shown):
     Attributes
     ----------
     circuit : Circuit
-    peak : float
-        The deck's own source voltage, V.
-    voltage : float
-        Peak source voltage at the fold with the deck's values, V; NaN if there is no fold up to `HIGHEST`.
+    peak, voltage : float
+        The deck's own source voltage, and that at the fold with the deck's values, V; NaN for none up to `HIGHEST`.
     sweeps : tuple of FoldSweep
         Sweeps of load, gap, and frequency if the source has one.
     """
@@ -300,22 +281,22 @@ class FoldLimits(Shown):
             lines += ["", Table((sweep.name, "folds at"), rows)]
         return Page(lines)
 
-    def plot(self) -> Picture:
+    def plot(self) -> drawing.Picture:
         """Picture of the fold's voltage against every parameter, with a mark at the deck's own point."""
-        figure, axes = new_figure(1, len(self.sweeps), height=3.2, sharey=True)
+        figure, axes = drawing.new_figure(1, len(self.sweeps), height=3.2, sharey=True)
         for ax, sweep in zip(axes, self.sweeps, strict=True):
-            factor, unit = engineering(sweep.own, sweep.unit)
+            factor, unit = drawing.engineering(sweep.own, sweep.unit)
             x, own = factor * sweep.values, factor * sweep.own
-            ax.plot(x, sweep.voltages, color=BLUE, marker="o", markersize=3, label="fold of the mobile law")
-            ax.fill_between(x, sweep.voltages, 1e6, color=GREY, alpha=0.2, linewidth=0, label="no solution")
-            ax.plot([own], [self.peak], color=VERMILION, marker="D", linestyle="none", label="this deck")
+            ax.plot(x, sweep.voltages, color=drawing.BLUE, marker="o", markersize=3, label="fold of the mobile law")
+            ax.fill_between(x, sweep.voltages, 1e6, color=drawing.GREY, alpha=0.2, linewidth=0, label="no solution")
+            ax.plot([own], [self.peak], color=drawing.VERMILION, marker="D", linestyle="none", label="this deck")
             ax.set(xscale="log", yscale="log")
-            dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
+            drawing.dress(ax, "Peak source voltage [V]" if ax is axes[0] else "", f"{sweep.name.capitalize()} [{unit}]")
         shown = np.concatenate([s.voltages[np.isfinite(s.voltages)] for s in self.sweeps] + [[self.peak]])
         axes[0].set_ylim(0.5 * shown.min(), 2.0 * shown.max())
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper left", ncols=3, fontsize=FONT - 0.5, frameon=False)
-        caption(figure, f"{heading(self.circuit)} · charge law mobile; the other parameters as in the deck")
+        known = axes[0].get_legend_handles_labels()
+        figure.legend(*known, loc="outside upper left", ncols=3, fontsize=drawing.FONT - 0.5, frameon=False)
+        drawing.caption(figure, f"{heading(self.circuit)} · charge law mobile; the other parameters as in the deck")
         return figure
 
     def to_dict(self) -> dict[str, Any]:
@@ -371,8 +352,7 @@ def fold_limits(
         raise InputError(f"a map of the fold needs one GAP whose area follows it; this circuit has {found}")
     if circuit.tran is None:
         raise InputError("a map of the fold needs a .tran line that says how long a run is")
-    sources = circuit.by_device("V")
-    t_stop = circuit.tran.stop
+    sources, t_stop = circuit.by_device("V"), circuit.tran.stop
     peak = max((e.waveform.peak(0.0, t_stop) for e in sources if e.waveform is not None), default=0.0)
     if not 0.0 < peak < math.inf:
         raise InputError("a map of the fold needs a V element with a voltage to raise; this circuit has none")
@@ -388,12 +368,11 @@ def fold_limits(
         own, voltages, guess = float(circuit.parameters[paths[0]].value), np.zeros(points), peak
         for i, x in enumerate(factors):
             told((1 + i + points * len(sweeps)) / (1 + points * len(varied)))
-            voltages[i] = around
+            stop, fold = t_stop / x if name == "frequency" else t_stop, around
             if abs(x - 1.0) > 1e-12:
-                changed = circuit.varied(dict.fromkeys(paths, own * x))
-                voltages[i] = fold_voltage(changed, peak, t_stop / x if name == "frequency" else t_stop, guess)
+                fold = fold_voltage(circuit.varied(dict.fromkeys(paths, own * x)), peak, stop, guess)
             # The next search starts at this voltage.
-            guess = voltages[i] if math.isfinite(voltages[i]) else HIGHEST
+            voltages[i], guess = fold, fold if math.isfinite(fold) else HIGHEST
         sweeps.append(FoldSweep(name, unit, own, own * factors, voltages))
     told(1.0)
     return FoldLimits(circuit, peak, around, tuple(sweeps))
@@ -402,15 +381,13 @@ def fold_limits(
 def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | None = None) -> float:
     """Peak source voltage (V) at which a run up to `t_stop` (s) reaches the fold; NaN for no fold up to `HIGHEST`.
 
-    It is found by bisection to a relative 1e-3. The run starts as the deck's run does. `peak` is the present peak
-    voltage of the circuit's sources (V), and `guess` the voltage where the search starts (V).
+    `peak` is the present peak voltage of the circuit's sources (V), and `guess` the voltage where the search starts.
     """
+    waves = {e.name: e.waveform for e in circuit.by_device("V") if e.waveform is not None}
 
     def folds(voltage: float) -> bool:
         by = as_waveform(voltage / peak)
-        raised = circuit.varied(
-            {e.name: Product((by, e.waveform)) for e in circuit.by_device("V") if e.waveform is not None}
-        )
+        raised = circuit.varied({name: Product((by, wave)) for name, wave in waves.items()})
         try:
             problem = prepare(
                 raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck", charge=False,
@@ -421,8 +398,8 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
             # Not by `simulate`, which would warn about voltages that the user did not ask for.
             run = run_problem(problem, np.array([0.0, problem.t_stop]), RTOL)
         except InputError as error:
-            # An operating point depends on the raised source, and may itself be past the fold, which counts as a fold.
-            # A start given by .ic does not depend on the source: report the error.
+            # An operating point of the raised source may itself be past the fold, which counts; a start given by .ic
+            # does not depend on the source: report the error.
             if circuit.initial or "past the fold" not in str(error):
                 raise
             return True
@@ -437,12 +414,10 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
                 return low
             high = low
     else:
-        while high < HIGHEST:
+        while low == high or not folds(high):
+            if high >= HIGHEST:
+                return math.nan
             low, high = high, min(high / STEP, HIGHEST)
-            if folds(high):
-                break
-        else:
-            return math.nan
     while high > low * (1.0 + EXACT):
         middle = math.sqrt(low * high)
         low, high = (low, middle) if folds(middle) else (middle, high)

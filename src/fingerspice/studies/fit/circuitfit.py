@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +19,9 @@ from fingerspice.base.announcing import Bar
 from fingerspice.base.arrays import FloatArray, IntArray, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page
+from fingerspice.circuit import devices
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
 from fingerspice.circuit.describe import meaning_of, require_circuit, scenes_warnings
-from fingerspice.circuit.devices import MEASURED as USUAL
-from fingerspice.circuit.devices import MEASURING
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import driving_sources
 from fingerspice.results.record import SIGNALS
@@ -37,8 +36,6 @@ from fingerspice.waveforms.waveform import Sine, require
 if TYPE_CHECKING:
     from xarray import Dataset
 
-    from fingerspice.plots.picture import Drawn
-
 #: Signals that can be fitted, over time or (with ``_mean``) as means, and their units.
 MEASURED = {"f_el": "N", "f_t": "N", "friction": "", "area": "m^2", "u_gap": "V", "impedance": "ohm"}
 #: The one measured quantity that is no mean, and the column that may stand beside it.
@@ -46,15 +43,14 @@ IMPEDANCE, PHASE = "impedance", "impedance_phase"
 _MEANS = ("f_el", "f_t", "friction", "area")
 _TIME = "t"
 _UNITS = MEASURED | {f"{signal}_mean": unit for signal, unit in MEASURED.items()} | {_TIME: "s", PHASE: "deg"}
-# Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's.
-_SLOPES = 1e-6
+# Error of the runs whose derivatives a batch gives: ten times this, relative, which is far below any data's; and of the
+# means by which starts are compared.
+_SLOPES, _ROUGH = 1e-6, 1e-5
 # Starts lie within this factor of the parameters given, where no bounds are; and how many of them are followed.
 _SPREAD, _FOLLOWED = 4.0, 3
 # Errors of unknown size are equal shares of the data unless errors equal for all are likelier by this logarithm. The
 # choice takes a degree of freedom, and is made where so many are there; else errors are taken as equal.
 _CLEARLY, _CHOOSING = 2.0, 4
-# Error of the means by which starts are compared.
-_ROUGH = 1e-5
 
 
 @dataclass(frozen=True)
@@ -64,12 +60,10 @@ class Data:
     signal: str  # A key of `MEASURED`
     values: FloatArray  # (n,): Measured values in SI units: means, or, with `t`, values over time
     sigma: FloatArray | None  # (n,): Standard deviation of every value; None where it is not known
-    # (n,): Path to the values that a parameter had in the measurements, in the unit of the netlist
-    conditions: dict[str, FloatArray]
+    conditions: dict[str, FloatArray]  # (n,): Values of parameters by path, in the unit of the netlist
     t: FloatArray | None = None  # (n,): Times, s
     phase: FloatArray | None = None  # (n,): Phase of an impedance, deg
-    #: Which measurements belong together, such as those of one finger: the name of each one's group (n,), by column
-    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)  # (n,): The group of each, by column
 
     @property
     def name(self) -> str:
@@ -88,11 +82,11 @@ class Data:
     def unusual(self) -> Iterator[str | None]:
         """Warnings about measured values and amplitudes that are probably in another unit."""
         said = "the data's largest"
-        if self.signal in USUAL:
-            yield USUAL[self.signal].warning(f"{said} {self.name}", np.abs(self.values).max(), MEASURED[self.signal])
+        if (usual := devices.MEASURED.get(self.signal)) is not None:
+            yield usual.warning(f"{said} {self.name}", np.abs(self.values).max(), MEASURED[self.signal])
         for path, x in self.conditions.items():
             if self.signal in _MEANS and path.endswith(".amplitude"):
-                yield MEASURING.warning(f"{said} {path}", float(x[np.abs(x).argmax()]), "V")
+                yield devices.MEASURING.warning(f"{said} {path}", float(x[np.abs(x).argmax()]), "V")
 
     @property
     def varying(self) -> dict[str, FloatArray]:
@@ -103,8 +97,7 @@ class Data:
 def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
     """The checked data that a caller gave; the column `by` tells which group a measurement belongs to."""
     if isinstance(given, Mapping) and np.iscomplexobj(given.get(IMPEDANCE, 0.0)):
-        if PHASE in given:
-            raise InputError(f"{IMPEDANCE} is complex, and {PHASE} is given; allowed: one of them")
+        require(PHASE not in given, IMPEDANCE, f"complex, and {PHASE} is given", "one of them")
         z = np.asanyarray(given[IMPEDANCE])
         given = {**given, IMPEDANCE: np.abs(z), PHASE: np.angle(z, deg=True)}
 
@@ -126,12 +119,11 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
     measured = [name for name in columns if name in names]
     if len(measured) != 1:
         what = f"several measured columns ({', '.join(measured)})" if measured else "no measured column"
-        raise InputError(
-            f"{place} have {what}, and the columns {', '.join(columns)}; allowed: one of {', '.join(names)}"
-        )
+        what += f", and the columns {', '.join(columns)}"
+        raise InputError(f"{place} have {what}; allowed: one of {', '.join(names)}")
     (name,) = measured
-    values = columns.pop(name)
-    sigma, t, phase = (columns.pop(key, None) for key in (SIGMA, _TIME, PHASE))
+    values, sigma, t, phase = (columns.pop(key, None) for key in (name, SIGMA, _TIME, PHASE))
+    assert values is not None
     if phase is not None and name != IMPEDANCE:
         raise InputError(f"{place} have the column {PHASE} beside {name}; allowed: beside {IMPEDANCE}")
     # A signal over time may be below 0 now and then, by noise, but not on average; magnitudes never are 0.
@@ -166,22 +158,14 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
 def _path(circuit: Circuit, name: str) -> str:
     """A condition's path; ``source.`` stands for the only source, and ``frequency`` for its frequency."""
     name = "source.frequency" if name.lower() == "frequency" else name
-    element, _, parameter = name.partition(".")
-    if element.lower() == "source":
-        driving = driving_sources(circuit)
-        if len(driving) != 1:
-            raise InputError(f"{name} is the only source's, and the circuit has {len(driving)}; allowed: its name")
-        name = f"{driving[0].name}.{parameter}"
-    known = {path.lower(): path for path in circuit.parameters}
-    if name.lower() not in known:
-        near = nearest(name, [*known.values()])
-        hint = "" if near is None else f", such as {near}"
-        allowed = ", ".join((*(f"{signal}_mean" for signal in _MEANS), IMPEDANCE, PHASE, SIGMA, _TIME))
-        raise InputError(
-            f"the data have a column {name!r}, which is no parameter of the circuit; allowed: {allowed} with a signal, "
-            f"and conditions{hint}"
-        )
-    return known[name.lower()]
+    if name.lower().startswith("source.") and (count := len(driving_sources(circuit))) != 1:
+        raise InputError(f"{name} is the only source's, and the circuit has {count}; allowed: its name")
+    with suppress(InputError):
+        return own_path(circuit, name)
+    near = nearest(name, [*circuit.parameters])
+    allowed = ", ".join((*(f"{signal}_mean" for signal in _MEANS), IMPEDANCE, PHASE, SIGMA, _TIME))
+    allowed += f" with a signal, and conditions{'' if near is None else f', such as {near}'}"
+    raise InputError(f"the data have a column {name!r}, which is no parameter of the circuit; allowed: {allowed}")
 
 
 @dataclass(frozen=True)
@@ -250,9 +234,8 @@ class Task(Problem):
         """The predicted signal over time (n,), and its derivatives by the parameters (n, n_parameter)."""
         circuit = self.scene(values, 0, self.data.conditions)
         waves = network_of(circuit).waveforms
-        fundamental = waves[0].fundamental if self.skin == "follow" and len(waves) == 1 else None
-        if fundamental is not None:
-            circuit = circuit.varied({f"{e.name}.f": fundamental.frequency for e in circuit.by_device("SKIN")})
+        if self.skin == "follow" and len(waves) == 1 and (sine := waves[0].fundamental) is not None:
+            circuit = circuit.varied({f"{e.name}.f": sine.frequency for e in circuit.by_device("SKIN")})
         run = simulate(
             circuit, t_eval=self.data.t, rtol=self.rtol, charge_law=self.charge_law, charge=False,
             sensitivities=self.paths,
@@ -278,38 +261,32 @@ class Task(Problem):
         table |= {path: values[:, at].ravel() for path, at in self.places.items()}
         law, circuit = self.charge_law, self.circuit
         return batch(
-            circuit if law is None else dataclasses.replace(circuit, charge_law=law), table, outputs=(self.data.name,),
+            circuit if law is None else replace(circuit, charge_law=law), table, outputs=(self.data.name,),
             rtol=rtol, periodic=self.average == "periodic", skin=self.skin, gradients=gradients,
         )  # fmt: skip
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Fit(FitResult):
-    """A fit of parameters to data; `circuit` is ready to run.
+    """A fit of parameters to data; `circuit` has the fitted values, and is ready to run.
 
     Attributes
     ----------
     circuit : Circuit
-        With the fitted values.
     estimates : dict of str to Estimate
         By path; that of a group's parameter is followed by the group in brackets: ``Xgap.d[left]``.
     correlation : ndarray, shape (n_parameter, n_parameter)
         Of the errors of the logarithms.
     data : Data
-    predicted : ndarray, shape (n,)
-        The data as the fitted circuit gives them.
-    sigma : ndarray, shape (n,)
-        Standard deviation of every value: as given, or as the residuals have it.
+    predicted, sigma : ndarray, shape (n,)
+        The data as the fitted circuit gives them; standard deviation of each: as given, or as the residuals have it.
     objective : float
         Sum of the squared residuals over sigma as given, or over the largest value of the data, or, where errors are
         likelier equal shares of the values, over these.
     objectives : tuple of float
         That reached from every start that was followed.
-    count : int
-        Number of residuals.
-    freedom : int
-        Data less parameters, and less one where the residuals say whether errors are equal or shares.
-    evaluations : int
+    count, freedom, evaluations : int
+        Number of residuals; data less parameters, and less one where residuals say if errors are equal or shares.
     closed : bool
         Whether the iteration closed.
     notes : tuple of str
@@ -347,7 +324,7 @@ class Fit(FitResult):
         groups = [f"groups by {column}: {', '.join(dict.fromkeys(of))}" for column, of in data.groups.items()]
         return self._paged(head, [f"residual {size}; sigma {known}", *groups])
 
-    def _panels(self) -> list[Drawn]:
+    def _panels(self) -> list[Any]:
         data, circuit = self.data, self.circuit
         signal = SIGNALS[data.signal][1] if data.signal in SIGNALS else data.signal
         signal = f"mean {signal}" if data.name.endswith("_mean") else signal
@@ -362,18 +339,14 @@ class Fit(FitResult):
         keys = [[f"{column} = {one}" for one in of] for column, of in groups]
         keys += [[f"{name} = {y:g} {unit}".rstrip() for y in values] for name, unit, values in others]
         names = list(map(", ".join, zip(*keys, strict=True))) or ["measured and fitted"] * data.values.size
-        label = f"{label} [{unit}]" if unit else label
-        return [(names, (x, data.values, self.predicted, self.sigma), label, signal, MEASURED[data.signal])]
+        columns = x, data.values, self.predicted, self.sigma
+        return [(names, columns, f"{label} [{unit}]" if unit else label, signal, MEASURED[data.signal])]
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            **super().to_dict(),
-            "groups": list(self.circuits),
-            "signal": self.data.signal,
-            "count": int(self.data.values.size),
-            "residual_rms": self._rms,
-            "objectives": list(self.objectives),
-        }
+        return super().to_dict() | {
+            "groups": list(self.circuits), "signal": self.data.signal, "count": int(self.data.values.size),
+            "residual_rms": self._rms, "objectives": list(self.objectives),
+        }  # fmt: skip
 
     def _columns(self) -> dict[str, Any]:
         data, time = self.data, {} if self.data.t is None else {"t": self.data.t}
@@ -431,10 +404,6 @@ def fit(
         Paths whose profile likelihood is wanted, or True for all: the data are fitted again and again with the
         parameter held at values ever farther away, until the fit is too bad.
 
-    Returns
-    -------
-    Fit
-
     Raises
     ------
     InputError
@@ -483,8 +452,9 @@ def _request(
     if groups is not None:
         wanted = "a mapping of a column of the data to the parameters of each group, such as {'finger': ['Xgap.d']}"
         ((by, separate),) = groups.items() if isinstance(groups, Mapping) and len(groups) == 1 else (("", ""),)
-        if not isinstance(by, str) or isinstance(separate, str) or not separate:
-            raise InputError(f"groups is {groups!r}; allowed: {wanted}")
+        require(
+            isinstance(by, str) and not isinstance(separate, str) and bool(separate), "groups", repr(groups), wanted
+        )
         if by.lower() in map(str.lower, circuit.parameters):
             raise InputError(f"groups names the column {by!r}, which is a parameter; allowed: {wanted}")
     lost = [path for path in separate if path.lower() not in map(str.lower, fitted)]
@@ -492,15 +462,14 @@ def _request(
         raise InputError(f"groups names {lost[0]!r}, which is not fitted; allowed: {', '.join(fitted)}")
     data = _data_of(circuit, given, by)
     names, paths, places = list[str](), list[str](), dict[str, IntArray]()
-    of = data.groups[by] if by is not None else ()
+    of = data.groups.get(by or "", ())
     every = list(dict.fromkeys(of))
     for path in fitted:
         value = circuit.parameters[path].value
         require(fitted.count(path) == 1, path, "named twice", "once")
-        if path in data.conditions:
-            raise InputError(f"{path} is to be fitted, and is a condition of the data; allowed: one of both")
-        if not (math.isfinite(value) and value > 0.0):
-            raise InputError(f"{path} is {value:g}, and is fitted in its logarithm; allowed: finite and more than 0")
+        require(path not in data.conditions, path, "to be fitted, and is a condition of the data", "one of both")
+        logarithm = f"{value:g}, and is fitted in its logarithm"
+        require(0.0 < value < math.inf, path, logarithm, "finite and more than 0")
         places[path], labels = np.full(data.values.size, len(names)), [path]
         if path.lower() in map(str.lower, separate):
             places[path] += [every.index(label) for label in of]
@@ -518,10 +487,8 @@ def _fitted(task: Task, starts: int, profiles: Sequence[str]) -> Fit:
     ends = [followed(task.residuals, task.box, begin) for begin in _starts(task, starts)]
     best = min(ends, key=lambda end: end.objective)
     if best.objective >= fitting.NOT_FOUND:
-        raise InputError(
-            "none of the starts can be run: there is no contact, no solution, or a value out of range; allowed: a "
-            "circuit that runs under the conditions of the data"
-        )
+        said = "none of the starts can be run: there is no contact, no solution, or a value out of range"
+        raise InputError(f"{said}; allowed: a circuit that runs under the conditions of the data")
     freedom = best.residual.size - len(task.names)
     if data.sigma is None and data.t is None and data.signal != IMPEDANCE and freedom >= _CHOOSING:
         task, ends = _with_likelier_noise(task, ends, best)
@@ -555,7 +522,7 @@ def _with_likelier_noise(task: Task, ends: list[Fitted], best: Fitted) -> tuple[
     predicted = np.abs(task.data.values + best.residual * task.scale)
     if not np.all(predicted > 0.0) or best.objective == 0.0:
         return task, ends
-    shares = dataclasses.replace(task, scale=predicted)
+    shares = replace(task, scale=predicted)
     others = [followed(shares.residuals, shares.box, end.values) for end in ends]
     least, n = min(end.objective for end in others), predicted.size
     equal = 0.5 * n * math.log(best.objective) + float(np.log(task.scale).sum())
@@ -575,9 +542,8 @@ def _starts(task: Task, count: int) -> list[FloatArray]:
     high = np.minimum(task.box[:, 1], initial * _SPREAD)
     share = qmc.Sobol(initial.size, scramble=False).random_base2(math.ceil(math.log2(count)))[1:count]
     tried = np.vstack([initial, np.exp(np.log(low) + share * np.log(high / low))])
-    with warnings.catch_warnings():
-        # What there is to say of the data has been said.
-        warnings.simplefilter("ignore", FingerspiceWarning)
+    # What there is to say of the data has been said.
+    with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
         tests = task.scenes(tried, _ROUGH)
     found = tests[task.data.name].to_numpy().reshape(len(tried), -1)
     off = (((found - task.data.values) / task.scale) ** 2).sum(axis=1)

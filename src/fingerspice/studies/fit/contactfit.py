@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fingerspice.base.arrays import FloatArray, IntArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
@@ -21,12 +20,8 @@ from fingerspice.circuit.describe import require_circuit
 from fingerspice.circuit.devices import DEVICES
 from fingerspice.circuit.statespace import build_stack, contact_of, is_stack
 from fingerspice.physics.contact import Contact, ridge_area
-from fingerspice.studies.fit import fitting
-from fingerspice.studies.fit.fitting import SIGMA, FitResult, Fitted, Given, Problem
+from fingerspice.studies.fit.fitting import NOT_FOUND, SIGMA, FitResult, Fitted, Given, Problem, followed, measured_of
 from fingerspice.waveforms.waveform import require
-
-if TYPE_CHECKING:
-    from fingerspice.plots.picture import Drawn
 
 #: Measured columns and conditions, with their units.
 MEASURED = {"area": "m^2", "area_sliding": "m^2", "f_t": "N"}
@@ -37,33 +32,27 @@ NAMES = {
     "area_sliding": "ridge area while sliding", "f_t": "friction force",
 }  # fmt: skip
 PARAMETERS = ("alpha", "m_exp", "beta", "n_exp", "mu", "c2")
-# Misfit (rms, relative) of a relation from which on it is warned about.
-_TOO_MUCH = 0.2
-# The share of its value that a measured value without sigma is off by, at first.
-_SHARE = 0.1
-# The share of an error's variance below which a relation has no part in it.
-_NO_PART = 1e-9
+# Misfit (rms, relative) of a relation from which on it is warned about; the share of its value that a measured value
+# without sigma is off by, at first; and the share of an error's variance below which a relation has no part in it.
+_TOO_MUCH, _SHARE, _NO_PART = 0.2, 0.1, 1e-9
 # Standard deviations of relations that have none are found in at most so many rounds, until they change by less than
-# this; they are no smaller than the last, as are singular values that count, relative to the largest.
-_ROUNDS, _SETTLED, _LEAST = 30, 1e-4, 1e-9
-# Fewer data than this beyond those that the parameters take up tell nothing of a standard deviation.
-_FEWEST = 0.5
-#: Relations whose values have one standard deviation, as they come from the same instrument: what was measured, in
-#: words; places among the residuals; and number of values less what the parameters take up of them, which is infinite
-#: where the standard deviation is given.
+# this; they are no smaller than the next, as are singular values that count, relative to the largest; fewer data than
+# the last beyond those that the parameters take up tell nothing of them.
+_ROUNDS, _SETTLED, _LEAST, _FEWEST = 30, 1e-4, 1e-9, 0.5
+#: Relations of one standard deviation, from the same instrument: what was measured, in words; places among the
+#: residuals; and values less what the parameters take up of them, infinite where the standard deviation is given.
 Pool = tuple[str, IntArray, float]
 
 
 class Relation(NamedTuple):
-    """Measured values of one kind with their conditions, in SI units."""
+    """Measured values of one kind with their conditions, in SI units, each of shape (n,)."""
 
     kind: str  # A key of `NAMES`
-    values: FloatArray  # (n,)
-    sigma: FloatArray | None  # (n,): Standard deviation of every value; None where it is not known
-    # fn, u_gap, indentation (n,): Normal load, gap voltage and indentation; the last is 0 where it has no meaning
-    fn: FloatArray
+    values: FloatArray
+    sigma: FloatArray | None  # Standard deviation of every value; None where it is not known
+    fn: FloatArray  # Normal load
     u_gap: FloatArray
-    indentation: FloatArray
+    indentation: FloatArray  # 0 where it has no meaning
 
     @property
     def name(self) -> str:
@@ -92,7 +81,7 @@ def _relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, 
     found: dict[tuple[str, bool], list[Any]] = {}
     for number, one in enumerate(several, 1):
         place = "the data" if len(several) == 1 else f"data {number}"
-        columns, place, _ = fitting.measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
+        columns, place, _ = measured_of(one, _meaning, "fn (N), area (mm^2)", place=place)
         measured = [name for name in MEASURED if name in columns]
         if not measured:
             raise InputError(f"{place} have the columns {', '.join(columns)}; allowed: one of {', '.join(MEASURED)}")
@@ -124,8 +113,7 @@ def _relations_of(given: Given | Sequence[Given], fn: float) -> tuple[Relation, 
 
 
 def _meaning(name: str, names: Sequence[str]) -> tuple[str, str, str | None]:
-    key, lower = name.lower(), [one.lower() for one in names]
-    measured = [own for own in MEASURED if own in lower]
+    key, measured = name.lower(), [own for own in MEASURED if own in map(str.lower, names)]
     values = measured[0] if key == SIGMA and len(measured) == 1 else key.removesuffix(f"_{SIGMA}")
     return key, values, (MEASURED | CONDITIONS).get(values)
 
@@ -137,7 +125,7 @@ class Task(Problem):
     gap: str  # Name of the GAP
     relations: tuple[Relation, ...]
 
-    def split(self, x: NDArray[Any]) -> list[NDArray[Any]]:
+    def split(self, x: Any) -> list[Any]:
         """Each relation's part of a row over all data."""
         return np.split(x, np.cumsum([one.values.size for one in self.relations])[:-1])
 
@@ -157,17 +145,14 @@ class Task(Problem):
         return np.concatenate(parts) / self.scale
 
     def remedy(self, names: tuple[str, ...]) -> str:
-        bare = {name.rpartition(".")[2] for name in names}
-        kinds = {one.kind for one in self.relations}
-        loads = [one.fn for one in self.relations if one.kind != "indentation"]
+        bare, kinds = {name.rpartition(".")[2] for name in names}, {one.kind for one in self.relations}
+        loads = {fn for one in self.relations if one.kind != "indentation" for fn in one.fn.tolist()}
         what = "over a wider range of loads"
         if bare <= {"alpha", "m_exp"}:
-            alike = not loads or float(np.ptp(np.concatenate(loads))) == 0.0
-            what = "the area at a second load as well" if alike else f"the area {what}"
-        elif bare <= {"beta", "n_exp"} and "indentation" in kinds:
-            what = "the area over a wider range of indentations"
+            what = f"the area {what if len(loads) > 1 else 'at a second load as well'}"
         elif bare <= {"beta", "n_exp"}:
-            what = "the area against the indentation as well"
+            known = "indentation" in kinds
+            what = f"the area {'over a wider range of indentations' if known else 'against the indentation as well'}"
         elif "area" not in kinds and "c2" in bare:
             what = "the area at rest as well"
         elif bare & {"beta", "n_exp"}:
@@ -189,10 +174,8 @@ class ContactFit(FitResult):
         The data, by kind.
     predicted, sigma : tuple of ndarray
         Values and standard deviations of every relation, as the fit has them.
-    objective : float
-        Sum of the squared residuals over sigma.
-    freedom : int
-        Data less parameters.
+    objective, freedom : float, int
+        Sum of the squared residuals over sigma; data less parameters.
     reach : dict of str to float
         Half of each interval in the logarithm over the standard error: Student's t, with the degrees of freedom of the
         relations that the parameter is known from.
@@ -228,8 +211,8 @@ class ContactFit(FitResult):
         head = f"contact of {self.gap}: {len(self.estimates)} parameters fitted to {self.count} values"
         return self._paged(head, about, "", f"in the deck: {self.gap} ... {self.line}")
 
-    def _panels(self) -> list[Drawn]:
-        panels: list[Drawn] = []
+    def _panels(self) -> list[Any]:
+        panels = []
         for one, fitted, sigma in zip(self.relations, self.predicted, self.sigma, strict=True):
             # The condition along the axis, and another, of which every value has a curve.
             x, label, others, name = one.fn, "normal load [N]", one.u_gap, "gap voltage = {:g} V"
@@ -244,11 +227,9 @@ class ContactFit(FitResult):
         return panels
 
     def to_dict(self) -> dict[str, Any]:
-        relations = [
-            {"kind": one.kind, "count": int(one.values.size), "misfit": misfit}
-            for one, misfit in zip(self.relations, self.misfits, strict=True)
-        ]
-        return {"gap": self.gap, **super().to_dict(), "relations": relations}
+        pairs = zip(self.relations, self.misfits, strict=True)
+        rows = [{"kind": one.kind, "count": int(one.values.size), "misfit": misfit} for one, misfit in pairs]
+        return {"gap": self.gap, **super().to_dict(), "relations": rows}
 
     def _columns(self) -> dict[str, Any]:
         rows = zip(*((one.fn, one.u_gap, one.indentation, one.values) for one in self.relations), strict=True)
@@ -289,10 +270,6 @@ def fit_contact(
     profiles : bool or sequence of str
         Parameters whose profile likelihood is wanted, or True for all.
 
-    Returns
-    -------
-    ContactFit
-
     Raises
     ------
     InputError
@@ -312,13 +289,13 @@ def fit_contact(
         return name if "." in name else f"{gap}.{name}"
 
     relations = _relations_of(data, own["fn"])
-    largest = max(float(relation.fn.max()) for relation in relations)
-    heavy = DEVICES["GAP"].parameter("fn").unusual("the data's largest", largest)
+    loads = np.concatenate([relation.fn for relation in relations])
+    heavy = DEVICES["GAP"].parameter("fn").unusual("the data's largest", float(loads.max()))
     if heavy is not None:
         warnings.warn(heavy, FingerspiceWarning, stacklevel=2)
     names = _wanted(parameters, relations)
     # The smallest load lets any contact be that is one under some load; at rest friction takes nothing off it.
-    begin = {f"{gap}.fn": min(float(relation.fn.min()) for relation in relations)}
+    begin = {f"{gap}.fn": float(loads.min())}
     begin |= {f"{gap}.c2": 0.0} if {one.kind for one in relations} <= {"area", "indentation"} else {}
     # What is fitted in its logarithm cannot start at 0.
     begin |= {f"{gap}.{name}": DEVICES["GAP"].parameter(name).default or 0.0 for name in names if own[name] == 0.0}
@@ -329,11 +306,9 @@ def fit_contact(
         profiles if isinstance(profiles, bool) else [named(path) for path in profiles],
     )
     task, best, pools = _solved(task)
-    if best.objective >= fitting.NOT_FOUND:
-        raise InputError(
-            f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data; "
-            "allowed: values nearer to the data, such as a smaller c2 or a larger alpha"
-        )
+    if best.objective >= NOT_FOUND:
+        said = f"the contact of {gap} cannot be started from: friction leaves no area under the loads of the data"
+        raise InputError(f"{said}; allowed: values nearer to the data, such as a smaller c2 or a larger alpha")
     # With the warnings that a user who writes these values would get.
     try:
         fitted = circuit.replace(dict(zip(paths, best.values.tolist(), strict=True)))
@@ -366,8 +341,7 @@ def _gap(circuit: Circuit, finger: str | None) -> str:
     if finger is None and len(gaps) > 1:
         raise InputError(f"this circuit has several GAPs; allowed: finger= one of {', '.join(gaps.values())}")
     name = next(iter(gaps.values())) if finger is None else gaps.get(finger.lower(), "")
-    if not name:
-        raise InputError(f"finger is {finger!r}; allowed: the name of a GAP, {', '.join(gaps.values())}")
+    require(bool(name), "finger", repr(finger), f"the name of a GAP, {', '.join(gaps.values())}")
     fixed = circuit[name].values["a_fix"]
     require(fixed == 0.0, f"{name}.a_fix", f"{fixed:g} mm^2", "0, as a given area follows no contact")
     return name
@@ -376,24 +350,22 @@ def _gap(circuit: Circuit, finger: str | None) -> str:
 def _wanted(given: Sequence[str] | None, relations: Sequence[Relation]) -> tuple[str, ...]:
     """The parameters to fit, in the order of the netlist."""
     if given is None:
-        kinds, voltage = {one.kind for one in relations}, any(np.any(one.u_gap != 0.0) for one in relations)
-        loaded = bool(kinds & {"area", "area_sliding"})
-        pressed = "indentation" in kinds or (loaded and voltage)
+        kinds, loaded = {one.kind for one in relations}, any(one.kind.startswith("area") for one in relations)
+        pressed = "indentation" in kinds or (loaded and any(np.any(one.u_gap != 0.0) for one in relations))
         return tuple(compress(PARAMETERS, (loaded, loaded, pressed, pressed, "f_t" in kinds, "area_sliding" in kinds)))
-    if isinstance(given, str) or not given:
-        raise InputError(f"parameters is {given!r}; allowed: a sequence of {', '.join(PARAMETERS)}")
+    known = ", ".join(PARAMETERS)
+    require(bool(given) and not isinstance(given, str), "parameters", repr(given), f"a sequence of {known}")
     bare = [name.rpartition(".")[2].lower() for name in given]
     for name in bare:
-        require(name in PARAMETERS, "parameters", repr(name), ", ".join(PARAMETERS))
+        require(name in PARAMETERS, "parameters", repr(name), known)
         require(bare.count(name) == 1, name, "named twice", "once")
     return tuple(name for name in PARAMETERS if name in bare)
 
 
 def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
-    """Least squares, with the standard deviation of every pool that has none from its own residuals.
+    """Least squares, with the standard deviation of every pool that has none from its own residuals, found in rounds.
 
-    Returns the task with the standard deviations found, the fit, and the pools: ridge areas against the load come from
-    one set of images. What the parameters take up of values is the sum of their leverages.
+    Ridge areas against the load are a pool, from one set of images. Parameters take up of values their leverages.
     """
     from scipy.linalg import orth
 
@@ -403,7 +375,7 @@ def _solved(task: Task) -> tuple[Task, Fitted, list[Pool]]:
         members.setdefault(key, []).append((relation.name, at))
     begin = task.initial
     for _ in range(_ROUNDS):
-        best, pools = fitting.followed(task.residuals, task.box, begin), list[Pool]()
+        best, pools = followed(task.residuals, task.box, begin), list[Pool]()
         leverage, scale = np.sum(orth(best.by_log, _LEAST) ** 2, axis=1), task.scale.copy()
         for (_, unknown), own in members.items():
             at = np.concatenate([at for _, at in own])
@@ -441,16 +413,10 @@ def _further_notes(task: Task, best: Fitted, pools: Sequence[Pool]) -> list[str]
     found = []
     for name, at, freedom in pools:
         if freedom < _FEWEST:
-            found.append(
-                f"Of the {name} there are hardly more values ({at.size}) than parameters, which leaves no measure of "
-                "their errors: measure more of them, or give sigma."
-            )
+            few = f"Of the {name} there are hardly more values ({at.size}) than parameters"
+            found.append(f"{few}, which leaves no measure of their errors: measure more of them, or give sigma.")
         if math.isinf(freedom):
             found += best.beyond_sigma(at, at.size, f" of the {name}")
-    fitted = {path.rpartition(".")[2] for path in task.names}
-    if "c2" in fitted and "mu" not in fitted:
-        mu = task.circuit[task.gap].values["mu"]
-        found.append(
-            f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
-        )
-    return found
+    fitted, mu = {path.rpartition(".")[2] for path in task.names}, task.circuit[task.gap].values["mu"]
+    told = f"c2 holds for the circuit's mu = {mu:g}: these data tell only c2 mu^2. Measure the friction force."
+    return [*found, told] if "c2" in fitted and "mu" not in fitted else found

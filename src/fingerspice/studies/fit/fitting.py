@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,11 +20,9 @@ from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.numerics.modes import AT, derivative
+from fingerspice.plots import drawing
 from fingerspice.results.outcome import SolveError
 from fingerspice.waveforms.files import read_text_columns
-
-if TYPE_CHECKING:
-    from fingerspice.plots.picture import Drawn, Picture
 
 #: One set of measured columns, or the path of a table.
 Given = Mapping[str, ArrayLike] | str | Path
@@ -32,18 +30,19 @@ Given = Mapping[str, ArrayLike] | str | Path
 #: unit it has (of a standard deviation that of the values, else its own), and this unit, or None where none is known.
 Meaning = Callable[[str, Sequence[str]], tuple[str, str, str | None]]
 SIGMA = "sigma"
-_PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
-#: Columns (n,) in SI units or, of a circuit's parameters, those of the netlist; where they come from, as subject of a
-#: message; and the name of every measurement's group, by the column that tells it.
-Measured = tuple[dict[str, FloatArray], str, dict[str, tuple[str, ...]]]
+PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
 
 
 def measured_of(
     given: Given, meaning: Meaning, example: str, by: str | None = None, place: str = "the data"
-) -> Measured:
-    """The columns that a caller gave, of which `by` tells groups; `example` is a header, `place` names no table."""
+) -> tuple[dict[str, FloatArray], str, dict[str, tuple[str, ...]]]:
+    """The columns (n,) that a caller gave, in SI units or, of a circuit's parameters, in those of the netlist.
+
+    With them, where they come from, as subject of a message, which is `place` where there is no table; and the name of
+    every measurement's group, by the column `by` that tells it. `example` is a header.
+    """
     if isinstance(given, (str, Path)):
-        return _from_table(Path(given), meaning, example, by)
+        place, given = f"the data in '{Path(given)}'", _from_table(Path(given), meaning, example, by)
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         raise InputError(f"data is a {type(given).__name__}; allowed: a mapping of columns, or the path of a table")
     if by is not None and by not in given:
@@ -52,10 +51,8 @@ def measured_of(
     size = max((x.size for x in columns.values()), default=0)
     for name, x in columns.items():
         if x.shape not in ((), (size,)):
-            raise InputError(
-                f"data column {name!r} has the shape {x.shape}, others have {size} rows; allowed: as many, or one "
-                "number for all"
-            )
+            said = f"data column {name!r} has the shape {x.shape}, others have {size} rows"
+            raise InputError(f"{said}; allowed: as many, or one number for all")
         bad = np.flatnonzero(~np.isfinite(x))
         if bad.size:
             raise InputError(f"data column {name!r} is {x.flat[bad[0]]} in row {bad[0]}; allowed: finite numbers")
@@ -71,15 +68,14 @@ def measured_of(
     return columns, place, {by: tuple(x if isinstance(x, str) else f"{x:g}" for x in cells.tolist())}
 
 
-def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> Measured:
+def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> dict[str, ArrayLike]:
     table = read_text_columns(path, by)
     if not table.names:
         raise InputError(f"'{path}' has no header; allowed: names with units, such as {example}")
-    found, units, of_share = dict[str, FloatArray](), dict[str, str](), dict[str, str]()
-    groups = dict[str, tuple[str, ...]]()
+    found, units, of_share = dict[str, Any](), dict[str, str](), dict[str, str]()
     for i, (name, unit) in enumerate(zip(table.names, table.units, strict=True)):
         if by is not None and name.lower() == by.lower():
-            groups[by] = tuple(table.words[int(number)] for number in table.numbers(i))
+            found[by] = [table.words[int(number)] for number in table.numbers(i)]
             continue
         key, values, base = meaning(name, table.names)
         if key in found:
@@ -88,7 +84,7 @@ def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> M
             of_share[key], base = values, ""
         # The prefix of an area is squared with its unit.
         power = 2 if base == "m^2" else 1
-        known = {prefix + base: factor**power for prefix, factor in _PREFIXES.items()} if base else {"%": 0.01}
+        known = {prefix + base: factor**power for prefix, factor in PREFIXES.items()} if base else {"%": 0.01}
         known |= {"": 1.0} | (dict.fromkeys(("mm2", "mm²"), 1e-6) if power == 2 else {})
         if base is not None and unit not in known:
             scaled = ", with k, m, u or n before it where need be" if base else ""
@@ -98,25 +94,20 @@ def _from_table(path: Path, meaning: Meaning, example: str, by: str | None) -> M
         # Beside values in % (a friction coefficient), a standard deviation in % is of their unit, and no share of them.
         if units.get(values, "%") != "%":
             found[key] = found[key] * np.abs(found[values])
-    return found, f"the data in '{path}'", groups
+    return found
 
 
-# Least squares
-
-#: What data that cannot be predicted are off by, over their scale.
-REFUSED = 1e6
-#: An objective from here on is of such data.
-NOT_FOUND = 0.5 * REFUSED**2
+#: What data that cannot be predicted are off by, over their scale; an objective from the latter on is of such data.
+REFUSED, NOT_FOUND = 1e6, 0.5e12
 # Error of the least squares' last step, relative; and the largest number of evaluations, and of refused ones.
 _CLOSE, _MOST, _MOST_REFUSALS = 1e-8, 40, 6
 # Step of the differences in a parameter's logarithm, at which those of fourth order are exact to rounding.
 _STEP = 1e-3
 #: A parameter is looked for up to this factor from its start, and a profile is followed so far, where no bounds are.
 FARTHEST = 1e3
-# Singular values of the derivatives below this share of the largest are rounding.
-_LEAST = 1e-9
-# Residuals this unlikely by noise of the given sigma are named.
-_UNLIKELY = 1e-3
+# Singular values of the derivatives below this share of the largest are rounding; residuals this unlikely by noise of
+# the given sigma are named.
+_LEAST, _UNLIKELY = 1e-9, 1e-3
 
 
 @dataclass(frozen=True)
@@ -157,9 +148,8 @@ class Problem:
     def residuals(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `compared`; `REFUSED` for all where the circuit with these values cannot be run."""
         try:
-            with warnings.catch_warnings():
-                # Of values that no user has written.
-                warnings.simplefilter("ignore", FingerspiceWarning)
+            # Of values that no user has written.
+            with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
                 return self.compared(values)
         except (InputError, SolveError):
             return np.full(self.scale.size, REFUSED), np.zeros((self.scale.size, values.size))
@@ -168,9 +158,8 @@ class Problem:
         self, bounds: Mapping[str, tuple[float, float]], profiles: bool | Sequence[str]
     ) -> tuple[Self, Sequence[str]]:
         """With bounds as given, and a start moved into them; and the names whose profiles are wanted, as they are."""
-        if self.scale.size < len(self.paths):
-            allowed = "at least as many data"
-            raise InputError(f"{self.scale.size} data cannot tell {len(self.paths)} parameters; allowed: {allowed}")
+        if (n := self.scale.size) < (count := len(self.paths)):
+            raise InputError(f"{n} data cannot tell {count} parameters; allowed: at least as many data")
         lower, circuit, box = {path.lower(): tuple(pair) for path, pair in bounds.items()}, self.circuit, []
         for path in bounds:
             if path.lower() not in map(str.lower, self.paths):
@@ -190,8 +179,8 @@ class Problem:
         wanted = ([*known] if profiles else []) if isinstance(profiles, bool) else profiles
         for name in wanted:
             if not isinstance(name, str) or name.lower() not in known:
-                allowed = ", ".join(self.names)
-                raise InputError(f"profiles names {name!r}, which is not fitted; allowed: True, or {allowed}")
+                said = f"profiles names {name!r}, which is not fitted"
+                raise InputError(f"{said}; allowed: True, or {', '.join(self.names)}")
         return replace(self, circuit=circuit, bounds=np.array(box, float)), [known[name.lower()] for name in wanted]
 
 
@@ -220,11 +209,9 @@ class Fitted(NamedTuple):
         square = float(np.sum(self.residual[at] ** 2))
         if freedom < 1 or chi2.sf(square, freedom) > _UNLIKELY:
             return []
-        return [
-            f"The residuals{of} are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains in "
-            "less than one of a thousand cases: the circuit does not describe these data, or sigma is too small, and "
-            "so are the intervals."
-        ]
+        said = f"The residuals{of} are {math.sqrt(square / freedom):.2g} times as large as sigma, which noise explains "
+        said += "in less than one of a thousand cases: the circuit does not describe these data, or sigma is too small"
+        return [f"{said}, and so are the intervals."]
 
 
 def followed(
@@ -259,15 +246,11 @@ def followed(
     return Fitted(values, residual, by, float(residual @ residual), int(found.nfev), found.status > 0 and ended)
 
 
-# Results
-
 # Two parameters are not told apart if their errors are correlated beyond this and one of them is larger than that; and
 # the error of a parameter, in its logarithm, from which on nothing is known of it.
 _TOGETHER, _NOTABLE, _UNKNOWN = 0.98, 0.05, 0.7
-# A value this close to a bound, relative, is at it.
-_AT_BOUND = 1e-6
-# An interval that reaches farther than this, in the logarithm, has no ends.
-_NO_END = 50.0
+# A value this close to a bound, relative, is at it; an interval that reaches farther, in the logarithm, has no ends.
+_AT_BOUND, _NO_END = 1e-6, 50.0
 # Of profiles: growth of the distance from the value, in its logarithm, and error of an interval's end over that
 # distance; error of the other parameters on the way; ratio of the interval's parts from which on it is called skewed.
 _GROWTH, _END, _ROUGHLY, _SKEWED = 1.6, 0.01, 1e-4, 1.2
@@ -282,38 +265,22 @@ class Estimate:
     value: float
     initial: float
     error: float  # Standard error
-    # low, high: 95 % interval, symmetric in the logarithm
-    low: float
+    low: float  # Of the 95 % interval, which is symmetric in the logarithm
     high: float
     at_bound: bool
 
 
 @dataclass(frozen=True)
 class Profile:
-    """The best fits with one parameter held at each of several values.
-
-    Attributes
-    ----------
-    path : str
-    values : ndarray, shape (n,)
-        Values of the parameter, ascending.
-    objective : ndarray, shape (n,)
-        Sum of the squared residuals at each, as `Fit.objective`.
-    limit : float
-        The objective at the ends of the 95 % interval.
-    low, high : float
-        The interval; 0 or a bound, and infinity or a bound, where the data set no end.
-    shape : str
-        ``"symmetric"`` (in the logarithm), ``"skewed"``, ``"open below"``, ``"open above"`` or ``"open"``.
-    """
+    """The best fits with one parameter held at each of several values."""
 
     path: str
-    values: FloatArray
-    objective: FloatArray
-    limit: float
-    low: float
-    high: float
-    shape: str
+    values: FloatArray  # (n,): Values of the parameter, ascending
+    objective: FloatArray  # (n,): Sum of the squared residuals at each, as `Fit.objective`
+    limit: float  # The objective at the ends of the 95 % interval
+    low: float  # Of the interval; 0 or a bound where the data set no end
+    high: float  # Of the interval; infinity or a bound where the data set no end
+    shape: str  # "symmetric" (in the logarithm), "skewed", "open below", "open above" or "open"
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -336,10 +303,10 @@ class FitResult(Shown):
         cls, task: Problem, best: Fitted, variance: Any, half: Any, more: Sequence[str], profiles: Sequence[str],
         **own: Any,
     ) -> Self:  # fmt: skip
-        """What the best fit tells, with what is a kind's `own`.
+        """What the best fit tells, with further notes (`more`) and what is a kind's `own`.
 
         `variance` is that of the residuals over their scale, and `half` half an interval over a standard error of the
-        logarithm, for all parameters or each; `more` are further notes.
+        logarithm, for all parameters or each.
         """
         covariance, estimates, notes, rooms = best.covariance, dict[str, Estimate](), list[str](), dict[str, float]()
         spread = np.sqrt(np.diag(covariance))
@@ -360,11 +327,9 @@ class FitResult(Shown):
                 told = f"{value:g} {unit}".rstrip()
                 notes.append(f"{name} is at its bound, {told}: its interval is not that of a free parameter.")
         for (i, a), (j, b) in itertools.combinations(enumerate(task.names), 2):
-            if abs(correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
-                notes.append(
-                    f"{a} and {b} are not told apart (correlation {correlation[i, j]:+.4f}): they change these data in "
-                    f"almost the same way, and only a combination of both is known. {task.remedy((a, b))}"
-                )
+            if abs(both := correlation[i, j]) > _TOGETHER and max(error[i], error[j]) > _NOTABLE:
+                said = f"{a} and {b} are not told apart (correlation {both:+.4f}): they change these data in almost"
+                notes.append(f"{said} the same way, and only a combination of both is known. {task.remedy((a, b))}")
         named = " ".join(notes)
         notes += [
             f"Of {name} these data tell next to nothing: its error is larger than itself. {task.remedy((name,))}"
@@ -377,35 +342,29 @@ class FitResult(Shown):
             profiles={name: _profile_of(task, best, estimates[name], rooms[name]) for name in profiles}, **own,
         )  # fmt: skip
 
-    def _panels(self) -> list[Drawn]:
+    def _panels(self) -> list[Any]:
         raise NotImplementedError
 
     def _columns(self) -> dict[str, Any]:
         """Columns of the table, by their heads."""
         raise NotImplementedError
 
-    def plot(self) -> Picture:
+    def plot(self) -> drawing.Picture:
         """Data and fit, of contacts of every relation, with the residuals below."""
         from fingerspice.plots.picture import plot_panels
 
         return plot_panels(self._panels())
 
     def to_csv(self, path: str | Path) -> Path:
-        """Write conditions (in the units of the netlist; of a contact in SI units), data, prediction and sigma as CSV.
-
-        Raises
-        ------
-        InputError
-            If the folder cannot be written.
-        """
+        """Write conditions (in units of the netlist; of a contact in SI units), data, prediction and sigma as CSV."""
         columns = self._columns()
         return write_csv(path, columns, zip(*columns.values(), strict=True))
 
     @property
     def _pairs(self) -> list[tuple[str, str, float]]:
-        """Every two parameters, and the correlation of their errors."""
+        """Every two parameters, and the correlation of their errors where it is 0.1 or more."""
         named = itertools.combinations(enumerate(self.estimates), 2)
-        return [(a, b, float(self.correlation[i, j])) for (i, a), (j, b) in named]
+        return [(a, b, both) for (i, a), (j, b) in named if abs(both := float(self.correlation[i, j])) >= 0.1]
 
     def _paged(self, head: str, about: Sequence[str], *end: str) -> Page:
         """A page of what was fitted to what (`head`), the residuals (`about`), and everything else."""
@@ -419,8 +378,7 @@ class FitResult(Shown):
         table = Table(("parameter", "value", "error", "", "95 % interval", "unit", "started at", ""), rows)
         effort = f"{self.evaluations} evaluations{'' if self.closed else ', the iteration did not close'}"
         lines: list[str | Table] = [f"{head}, {effort}", *about, "", table]
-        pairs = [f"{a}, {b}: {both:+.3f}" for a, b, both in self._pairs if abs(both) > 0.1]
-        if pairs:
+        if pairs := [f"{a}, {b}: {both:+.3f}" for a, b, both in self._pairs]:
             lines += ["", "correlations beyond 0.1: " + "; ".join(pairs)]
         for one in self.profiles.values():
             ends = f"{one.low:.4g} to {one.high:.4g} {self.estimates[one.path].unit}, {one.shape}"
@@ -430,8 +388,7 @@ class FitResult(Shown):
     def report(self) -> str:
         """Statistics, parameters and correlations in the layout of lmfit's ``fit_report``.
 
-        As there, the criteria of Akaike and Bayes are n log(chi-square / n) + 2 k, and + k log(n), of n data and k
-        parameters.
+        As there, the criteria of Akaike and Bayes are n log(chi-square / n) + 2 k, and + k log(n), of n data.
         """
         estimates, square, count, k = self.estimates, self.objective, self.count, len(self.estimates)
         level = count * math.log(max(square, 1e-300) / count)
@@ -451,21 +408,17 @@ class FitResult(Shown):
         for name, e in estimates.items():
             share = f"({100.0 * e.error / e.value:.2f}%) (init = {e.initial:.7g})"
             lines.append(f"    {name + ':':<{wide}} {e.value: .8g} +/- {e.error:.8g} {share}")
-        pairs = sorted((pair for pair in self._pairs if abs(pair[2]) >= 0.1), key=lambda pair: -abs(pair[2]))
-        if pairs:
+        if pairs := sorted(self._pairs, key=lambda pair: -abs(pair[2])):
             lines.append("[[Correlations]] (unreported correlations are < 0.100)")
         return "\n".join([*lines, *(f"    C({a}, {b}) = {both:+.4f}" for a, b, both in pairs)])
 
     def to_dict(self) -> dict[str, Any]:
         """The fit as plain numbers and texts; `parameters` has a row for each."""
-        profiles = [{name: np.asarray(x).tolist() for name, x in vars(one).items()} for one in self.profiles.values()]
         return {
-            "parameters": [vars(e) for e in self.estimates.values()],
-            "correlation": self.correlation.tolist(),
-            "objective": self.objective,
-            "notes": list(self.notes),
-            "profiles": profiles,
-        }
+            "parameters": [vars(e) for e in self.estimates.values()], "correlation": self.correlation.tolist(),
+            "objective": self.objective, "notes": list(self.notes),
+            "profiles": [{key: np.asarray(x).tolist() for key, x in vars(p).items()} for p in self.profiles.values()],
+        }  # fmt: skip
 
 
 def _profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Profile:
@@ -512,9 +465,8 @@ def _profile_of(task: Problem, best: Fitted, one: Estimate, room: float) -> Prof
             away = brentq(beyond, near, far, args=(sign,), xtol=_END * far, rtol=1e-6)
             ends.append(math.exp(here + sign * away))
     low, high = ends
-    if opened:
-        shape = "open" + ("" if len(opened) == 2 else opened[0])
-    else:
+    shape = "open" + ("" if len(opened) == 2 else "".join(opened))
+    if not opened:
         reach = here - math.log(low), math.log(high) - here
         shape = "skewed" if max(reach) > _SKEWED * min(reach) else "symmetric"
     at = sorted(known)

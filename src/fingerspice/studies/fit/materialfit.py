@@ -8,7 +8,6 @@ import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,17 +18,15 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.netlist.reader import read_text
 from fingerspice.physics.materials import EPS0, Ladder
+from fingerspice.plots import drawing
+from fingerspice.studies.fit.fitting import PREFIXES
 from fingerspice.waveforms.waveform import require
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: Columns of measured materials, and what they may be in words.
 COLUMNS = ("frequency", "resistivity", "permittivity")
 ALLOWED = "frequency (Hz), resistivity (ohm m), relative permittivity"
 MOST_POLES = 12
-# The densely placed poles that stand for any causal and passive material: number per decade, and decades beyond the
-# band.
+# Densely placed poles stand for any causal and passive material: number per decade, and decades beyond the band.
 _DENSE, _BEYOND = 8, 2.0
 # Misfit (rms), of a fit or of the data to any material, above which a warning is given, and above which it is refused.
 NOTABLE, TOO_MUCH = 0.1, 0.3
@@ -38,9 +35,7 @@ NOTABLE, TOO_MUCH = 0.1, 0.3
 _SMALL, _FEWEST, _COURSE = 0.03, 10, 0.5
 # Range allowed of data in Hz, ohm m and 1: wide enough for any material, and narrow enough to avoid overflow.
 _LEAST, _MOST = 1e-20, 1e20
-_PREFIXES = {
-    "": 1.0, "G": 1e9, "M": 1e6, "k": 1e3, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9, "p": 1e-12
-}  # fmt: skip
+_PREFIXES = PREFIXES | {"G": 1e9, "p": 1e-12}
 _PREFIX, _METRES = f"(?P<prefix>[{''.join(_PREFIXES)}]?)", {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _METRE = "(?P<metre>cm|mm|m)"
 _FREQUENCY = "f|freq|frequency|frequenz|hz"
@@ -49,8 +44,7 @@ _PERMITTIVITY = (
     "relative_permittivity|dielectric constant|dk"
 )
 # What a column may hold by its name and unit, of which several with a name the first is that without a unit: the one of
-# `COLUMNS` that it tells, patterns of its names and units, and the power and factor that make of its values in SI units
-# those of the column.
+# `COLUMNS` that it tells, patterns of names and units, and power and factor from SI units to those of the column.
 _KINDS = (
     ("frequency", _FREQUENCY, f"{_PREFIX}[Hh]z|1/s", 1.0, 1.0),
     ("frequency", _FREQUENCY, "rad/s", 1.0, 0.5 / np.pi),
@@ -135,9 +129,8 @@ def _converted(name: str, x: FloatArray, file: str) -> tuple[str, FloatArray]:
             metre = _METRES[parts.get("metre") or "m"] ** (-1 if "/" in unit else 1)
             with np.errstate(divide="ignore"):
                 return column, (_PREFIXES[parts.get("prefix") or ""] * metre * x) ** power * factor
-    if kinds:
-        allowed = "Hz, rad/s, ohm m, S/m, and 1 or F/m"
-        raise InputError(f"{file}: the unit of column {name.strip()!r} is not known; allowed: {allowed}")
+    of = f"{file}: the unit of column {name.strip()!r}"
+    require(not kinds, of, "not known", "Hz, rad/s, ohm m, S/m, and 1 or F/m")
     return "", x
 
 
@@ -183,21 +176,15 @@ class ColeCole:
 class Consistency:
     """Distance of data from the nearest causal and passive material (relations of Kramers and Kronig).
 
-    Attributes
-    ----------
-    rms, largest : float
-        Misfit ``|y_fit / y - 1|`` of the best sum of Debye terms with densely placed poles.
-    frequency, misfit : ndarray, shape (n,)
-        The misfit at each frequency (Hz).
-    systematic : float
-        Correlation of the complex misfits of neighbouring frequencies: about 0 for noise, near 1 for a drift or a wrong
-        scale of a column.
+    The misfit is ``|y_fit / y - 1|`` of the best sum of Debye terms with densely placed poles.
     """
 
     rms: float
     largest: float
-    frequency: FloatArray
-    misfit: FloatArray
+    frequency: FloatArray  # (n,): Hz
+    misfit: FloatArray  # (n,): At each frequency
+    # Correlation of the complex misfits of neighbouring frequencies: about 0 for noise, near 1 for a drift or a wrong
+    # scale of a column
     systematic: float
 
 
@@ -210,10 +197,8 @@ class MaterialFit(Shown):
     ladder : Ladder
     rms, largest : float
         Misfit ``|y_fit / y - 1|`` over the data.
-    frequency : ndarray, shape (n,)
-        Frequencies of the data, Hz.
-    misfit : ndarray, shape (n,)
-        Misfit at each frequency.
+    frequency, misfit : ndarray, shape (n,)
+        Frequencies of the data, Hz, and the misfit at each.
     kramers_kronig : Consistency
         Smallest misfit that any ladder can have.
     data : ndarray of complex, shape (n,)
@@ -233,14 +218,14 @@ class MaterialFit(Shown):
         poles = [format_si(p / (2.0 * math.pi), "Hz") for p in ladder.poles]
         rows = list(zip(poles, (f"{k:.4g} S/m" for k in ladder.weights), strict=True))
         low, high = (format_si(float(x), "Hz") for x in f[[0, -1]])
-        blocks = [
+        return Page([
             f"material fitted at {f.size} frequencies from {low} to {high}",
             f"misfit of the admittivity: {100.0 * self.rms:.2g} % rms, {100.0 * self.largest:.2g} % at most",
             f"no causal and passive material comes nearer than {100.0 * self.kramers_kronig.rms:.2g} % rms",
             "",
             f"{ladder.conductivity:.4g} S/m at zero frequency, eps_r = {ladder.eps_inf:.4g} above all poles, and",
-        ]
-        return Page([*blocks, Table(("pole", "weight"), rows)])
+            Table(("pole", "weight"), rows),
+        ])  # fmt: skip
 
     def to_netlist(self, name: str) -> str:
         """A subcircuit of slabs in series with the thickness as parameter, for decks here and in ngspice.
@@ -262,10 +247,8 @@ class MaterialFit(Shown):
         ]
         return "\n".join([f".subckt {name} p n area params: d=350u", *lines, ".ends", ""])
 
-    def plot(self) -> Figure:
+    def plot(self) -> drawing.Picture:
         """Resistivity and permittivity of the data and of the ladder, and the misfit, against frequency."""
-        from fingerspice.plots import drawing
-
         figure, axes = drawing.new_figure(1, 3, height=2.7)
         f = np.geomspace(self.frequency[0], self.frequency[-1], 400)
         measured = 1.0 / self.data.real, self.data.imag / (2.0 * np.pi * self.frequency * EPS0)
@@ -303,10 +286,6 @@ def fit_material(
         Take the fewest branches whose rms misfit is at most `error`, or at most 1.05 times the misfit of the data to
         any material. The default, if `poles` is not given either, is 0.02.
 
-    Returns
-    -------
-    MaterialFit
-
     Raises
     ------
     InputError
@@ -329,8 +308,7 @@ def fit_material(
     """
     if poles is not None and error is not None:
         raise InputError("poles and error are both given; allowed: one of them")
-    if poles is not None:
-        poles = whole_number("poles", poles, 1, MOST_POLES)
+    counts = range(1, MOST_POLES + 1) if poles is None else [whole_number("poles", poles, 1, MOST_POLES)]
     error = 0.02 if error is None else positive_number("error", error)
     if isinstance(data, ColeCole):
         low, high = data.band
@@ -338,12 +316,10 @@ def fit_material(
         y = data.admittivity(f)
         consistency, doubt = _consistency(f, y), ""
     else:
-        # Rows of frequency (Hz, ascending), resistivity (ohm m) and relative permittivity.
         data = read_table(Path(data)) if isinstance(data, (str, Path)) else data
-        table = real_numbers("material data", data, f"rows of {ALLOWED}, or a file")
-        allowed = "rows of f, rho, eps_r"
-        require(table.ndim == 2 and table.shape[1] == 3, "material data", f"of shape {table.shape}", allowed)
-        require(table.shape[0] >= 3, "material data", f"{table.shape[0]} rows", "three frequencies or more")
+        table, what = real_numbers("material data", data, f"rows of {ALLOWED}, or a file"), "material data"
+        require(table.ndim == 2 and table.shape[1] == 3, what, f"of shape {table.shape}", "rows of f, rho, eps_r")
+        require(table.shape[0] >= 3, what, f"{table.shape[0]} rows", "three frequencies or more")
         bad = np.argwhere(~((table.T >= _LEAST) & (table.T <= _MOST)))
         if bad.size:
             (column, row), allowed = bad[0], f"more than 0, from {_LEAST:g} to {_MOST:g}"
@@ -351,10 +327,9 @@ def fit_material(
         table = table[np.argsort(table[:, 0])]
         require(bool(np.all(np.diff(table[:, 0]) > 0.0)), "frequencies", "repeated", "each once")
         f, y = _admittivity(table)
-        consistency = _consistency(f, y)
-        doubt = _doubt(table, consistency)
+        doubt = _doubt(table, consistency := _consistency(f, y))
     ladder, refused, enough = None, "", max(error, 1.05 * consistency.rms)
-    for count in range(1, MOST_POLES + 1) if poles is None else [poles]:
+    for count in counts:
         try:
             ladder, misfit = _fit(f, y, count)
         except InputError as problem:
@@ -392,8 +367,7 @@ def _doubt(table: FloatArray, found: Consistency) -> str:
         if np.all(np.diff(other[:, 0]) > 0.0):
             slips.append((_consistency(*_admittivity(other)).rms, text))
     best = min((rms for rms, _ in slips), default=np.inf)
-    # Two at most, that reduce the misfit to less than a third: those with the same factor, such as kHz and kohm m,
-    # cannot be distinguished.
+    # Those that reduce the misfit to less than a third; of the same factor there are two, such as kHz and kohm m.
     likely = [text for rms, text in slips if rms <= min(1.1 * best, found.rms / 3.0)][:2]
     said = f"the data are {100.0 * found.rms:.2g} % (rms) from any causal and passive material (Kramers-Kronig)"
     if likely:
