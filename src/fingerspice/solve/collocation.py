@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray, views_of
+from fingerspice.circuit.network import Modes, Network
 from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
 from fingerspice.engine.collocation.exponential import forget, new_tables
@@ -59,18 +60,16 @@ class _Scratch(threading.local):
     """
 
     def __init__(self) -> None:
-        self.by_size: dict[int, tuple[StepTables, Work]] = {}
-        self.system: dict[int, System] = {}
+        self.by_size: dict[int, tuple[StepTables, Work, System]] = {}
 
     def of(self, system: System) -> tuple[StepTables, Work]:
         """Tables and arrays for the next call of a compiled loop: another system's run may use them after that."""
         n = system.model.gap.size
-        if n not in self.by_size:
-            self.by_size[n] = new_tables(n), new_stack_work(n)
-        if self.system.get(n) is not system:
-            self.system[n] = system
-            forget(self.by_size[n][0])
-        return self.by_size[n]
+        tables, work, before = self.by_size.get(n) or (new_tables(n), new_stack_work(n), None)
+        if before is not system:
+            self.by_size[n] = tables, work, system
+            forget(tables)
+        return tables, work
 
 
 SCRATCH = _Scratch()
@@ -114,21 +113,19 @@ class Track(Stepping):
     and the outputs have the form used for all circuits.
     """
 
-    def __init__(
-        self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True, h_fixed: float = 0.0
-    ) -> None:
+    def __init__(self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True) -> None:
         scene = problem.scene
         self.system, self.area_error = _prepared(scene, rtol, top)
         model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
         # Of the layer through which the charge is computed.
         self.capacitance = float(model.slow[-3]) * model.area0
-        super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown, h_fixed)
+        super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown)
         self.error = np.zeros(n + 1)
         self.control["branch_length"] = np.inf
         self.control["margin"] = 1.0
         self._start_from(problem.inner)
-        self.look_for_period(self.system.rates, np.ones(n), repeat and h_fixed == 0.0)
+        self.look_for_period(self.system.rates, np.ones(n), repeat)
 
     def _start_from(self, start: StackState) -> None:
         self.start, self.y[:], self.control["u_before"] = start, start.y, start.u_before
@@ -148,13 +145,13 @@ class Track(Stepping):
     def circuit(self, sources: Sources) -> OneArea:
         return OneArea(self.system, *SCRATCH.of(self.system), integral_table(), sources)
 
-    def _failed(self, code: int, sources: Sources) -> Status:
+    def failed(self, code: int, sources: Sources) -> Status:
         if code == readout.OUT_OF_RANGE:
             raise OutOfRangeError(self.system.u_top)
         if self.t > sources.edges[0]:
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
             self.control["u_before"], _ = source(*segment_of(sources, self.t, "left"))
-        return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
+        return super().failed(code, sources)
 
     def state(self) -> State:
         c = self.control
@@ -184,9 +181,7 @@ class Track(Stepping):
         segment, tau = segment_of(sources, self.t, side)
         row = np.empty(row_width(self.problem.scene))
         u, du = source(segment, tau)
-        found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c["sign"], c["u_gap"])
-        # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
-        write_row_at(model, u, du, self.y, c["sign"], found if found == found else c["u_gap"], row)
+        write_row_at(model, u, du, self.y, c["sign"], _gap_at(model, self.y, u, c["sign"], c["u_gap"]), row)
         return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
 
 
@@ -194,10 +189,14 @@ def on_branch(model: Model, state: StackState, sign: float) -> StackState:
     """The state with its gap voltage computed anew from the area equation, on the branch with this sign."""
     if not model.mobile:
         return state
-    x_gap = dot(model.gap, state.y)
-    found = float(gap_voltage(model, model.k_gap * state.u_before, x_gap, sign or 1.0, state.u_gap))
+    return state._replace(u_gap=_gap_at(model, state.y, state.u_before, sign or 1.0, state.u_gap))
+
+
+def _gap_at(model: Model, y: FloatArray, u: float, sign: float, last: float) -> float:
+    """Gap voltage (V) at a state under a source of u (V), on the branch with this sign and near its `last` value."""
+    found = float(gap_voltage(model, model.k_gap * u, dot(model.gap, y), sign, last))
     # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
-    return state if found != found else state._replace(u_gap=found)
+    return last if math.isnan(found) else found
 
 
 def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray) -> FloatArray:
@@ -254,10 +253,8 @@ class Known:
         """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
         arrays, one = self.arrays, self.count
         if one == len(arrays.levels):
-            more = np.zeros_like(arrays.levels), np.zeros_like(arrays.numbers)
-            self.arrays = arrays = arrays._replace(
-                levels=np.vstack([arrays.levels, more[0]]), numbers=np.vstack([arrays.numbers, more[1]])
-            )
+            more = {"levels": np.zeros_like(arrays.levels), "numbers": np.zeros_like(arrays.numbers)}
+            self.arrays = arrays = arrays._replace(**{k: np.append(getattr(arrays, k), x, 0) for k, x in more.items()})
         area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
         arrays.numbers[one], magnified, _ = _referred(scene, area)
         arrays.levels[one] = levels
@@ -293,11 +290,7 @@ def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
     network, net = scene.network, scene.net
     n, n_area = net.k.shape[0], net.gap.size
     slow, fed = net.slow >= 0, _fed(scene)
-    stress = np.zeros(n_area)
-    for i in network.fingers:
-        contact = network.contacts[i]
-        assert contact is not None
-        stress[i] = float(contact.stress(1.0))
+    stress = np.array([0.0 if contact is None else float(contact.stress(1.0)) for contact in network.contacts])
     powers, slopes, lo, scale = area_polynomials(net.curves, net.gap >= 0, area_error(decade))
     return {
         "mobile": net.mobile,
@@ -325,23 +318,35 @@ def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, l
     return kept_with(scene.network.kept, key, MOST_KEPT, lambda: _refer(scene, area))
 
 
+def by_modes(network: Network, modes: Modes, area: FloatArray) -> dict[str, FloatArray]:
+    """What the modes at these areas, and the sources, do: arrays with the names in `Form`, the taps of all cells."""
+    n, n_s = modes.gains.shape
+    tap, tap_s = network.p @ modes.shape, network.q - network.p @ modes.follow
+    capacitance, leak = network.capacitance(area)[:, None], network.leak(area)[:, None]
+    at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
+    return {
+        "tap": tap,
+        "tap_s": tap_s,
+        "node": network.nodes[:, :n] @ modes.shape,
+        "node_s": network.nodes[:, n : n + n_s] - network.nodes[:, :n] @ modes.follow,
+        "stored": network.through @ (capacitance * tap),
+        "stored_s": network.through @ (capacitance * tap_s),
+        "lost": network.through @ (leak * tap) + at_x @ modes.shape,
+        "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
+    }
+
+
 def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
     network, net = scene.network, scene.net
     modes = scene.modes_at(area) if area is not scene.area0 else scene.modes
     n, n_s = modes.gains.shape
-    slow, fed = net.slow >= 0, _fed(scene)
-    n_slow = int(np.count_nonzero(slow))
-    tap, tap_s = network.p @ modes.shape, network.q - network.p @ modes.follow
+    slow, fed, fingers = net.slow >= 0, _fed(scene), list(network.fingers)
+    n_slow, cells = int(np.count_nonzero(slow)), np.array([network.gaps[i] for i in fingers], int)
+    parts = by_modes(network, modes, area)
+    tap, tap_s = parts["tap"], parts["tap_s"]
     gap, gap_s = np.zeros((area.size, n)), np.zeros((area.size, n_s))
-    for i in network.fingers:
-        cell = network.gaps[i]
-        assert cell is not None
-        gap[i], gap_s[i] = tap[cell], tap_s[cell]
-    capacitance, leak = network.capacitance(area)[:, None], network.leak(area)[:, None]
-    node = network.nodes[:, :n] @ modes.shape
-    node_s = network.nodes[:, n : n + n_s] - network.nodes[:, :n] @ modes.follow
-    at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
-    parts = {
+    gap[fingers], gap_s[fingers] = tap[cells], tap_s[cells]
+    parts |= {
         "rates": np.append(modes.rates, 1.0 / net.tau[slow]),
         "gain": np.vstack([modes.gains, np.zeros((n_slow, n_s))]),
         "shape": modes.shape,
@@ -353,13 +358,7 @@ def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list
         "area0": area,
         "gap": gap,
         "gap_s": gap_s,
-        "node": node,
-        "node_s": node_s,
         "size": np.linalg.norm(modes.shape, axis=0),
-        "stored": network.through @ (capacitance * tap),
-        "stored_s": network.through @ (capacitance * tap_s),
-        "lost": network.through @ (leak * tap) + at_x @ modes.shape,
-        "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
     }
     live = modes.rates[modes.rates > 0.0]
     # The eigenvectors of the slowest mode contain the round-off of the fastest one.
@@ -368,8 +367,7 @@ def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list
     every = (np.abs(modes.shape) @ inverse).sum(axis=1).max(initial=1.0)
     # A voltage is a sum over modes and sources: the sum of the moduli of its terms measures the cancellation.
     of_gaps, of_nodes = (
-        (np.abs(by_mode) @ inverse).sum(axis=1) + np.abs(by_source).sum(axis=1)
-        for by_mode, by_source in ((gap, gap_s), (node, node_s))
+        (np.abs(parts[name]) @ inverse).sum(axis=1) + np.abs(parts[f"{name}_s"]).sum(axis=1) for name in ("gap", "node")
     )
     own = np.append(of_gaps, of_nodes.max(initial=0.0))
     magnified = np.asarray((every + spread) * np.minimum(own / every, 1.0))
@@ -431,9 +429,6 @@ class March(Stepping):
         while (code := super().march(sources, t_end, looks)) == readout.REFERENCE:
             self._add_reference()
         return code
-
-    def _failed(self, code: int, sources: Sources) -> Status:
-        return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
         # With sources that stay at these values.

@@ -132,7 +132,7 @@ def check_request(problem: Problem, paths: Sequence[str], method: str, start: st
                 "the methods 'auto' and 'exponential'"
             )
     # A recording, or a PWL with many points, is otherwise followed point by point, to no error as small as needed here.
-    return method if driving(problem) is None else "exponential"
+    return method if driving(problem)[1] is None else "exponential"
 
 
 def sensitivities_of(
@@ -213,8 +213,7 @@ def _source_of(problem: Problem) -> tuple[str, float, Samples]:
     sources = [(e, 1.0) for e in problem.network.sources] if stack is None else stack.sources
     waves = [(e.name, float(sign), None if e.waveform is None else as_samples(e.waveform)) for e, sign in sources]
     known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
-    _, wave = driving(problem) or (0, None)
-    if len(known) != 1 or not isinstance(wave, Samples):
+    if len(known) != 1 or not isinstance(driving(problem)[1], Samples):
         others = "sources of 0" if stack is None else "constant ones"
         raise InputError(
             f"{_ASKED}of the circuit's {len(waves)} sources {len(known)} are recordings; allowed: one, such as "

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -22,36 +21,23 @@ from fingerspice.circuit.network import Modes
 from fingerspice.engine.collocation import readout
 from fingerspice.numerics import linear
 from fingerspice.physics.contact import inverse_area
-from fingerspice.results.outcome import SolveError, State, Status
+from fingerspice.results.outcome import State, Status
 from fingerspice.solve.collocation import GUESS, March, Track, stepping
 from fingerspice.solve.nodal import pass_through
 from fingerspice.solve.problem import Problem, joined
-from fingerspice.solve.runs import period_failure
+from fingerspice.solve.runs import no_period
+from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
-from fingerspice.waveforms.sampling import SourceTable, source_table
+from fingerspice.waveforms.sampling import source_table
 from fingerspice.waveforms.waveform import DC
 
 # Number of equidistant times of a period from which the mean of an area with a time constant is computed.
 SAMPLES = 64
+# Number of periods whose tables of the sources are cached with a scene.
+MOST_PERIODS = 16
 # Nodes and weights of Gauss-Legendre quadrature on [0, 1], for integrals over a voltage from 0 V to its value.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
-
-
-class Stopped(Exception):
-    """A period that could not be integrated, or that leads to no periodic state, with the time (s) or the cause."""
-
-    def __init__(self, status: Status, t: float | None = None, cause: str = "") -> None:
-        self.status, self.t, self.cause = status, t, cause
-
-
-@contextmanager
-def stops_told(problem: Problem) -> Iterator[None]:
-    """A search that is stopped ends in a `SolveError` that says why."""
-    try:
-        yield
-    except Stopped as stopped:
-        raise SolveError(period_failure(problem, stopped.status, stopped.t, stopped.cause)) from None
 
 
 class Period:
@@ -79,15 +65,13 @@ class Period:
         self.parts = 2 if _turns(problem) and not pushed and not np.any(self.kept) else 1
         self.span = waveform.period / self.parts
         # A function's table depends on the output step as well.
-        key = "period", self.begin, self.span, problem.step if scene.is_sampled else 0.0
-        self.tables: list[SourceTable] = scene.prepared.get(key, [])
-        if not self.tables:
-            end = self.begin + self.span
-            self.tables = [source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.waveforms]
-            scene.prepared[key] = self.tables
+        key, end = ("period", self.begin, self.span, problem.step if scene.is_sampled else 0.0), self.begin + self.span
+        self.tables = kept_with(scene.prepared, key, MOST_PERIODS, lambda: [
+            source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.waveforms
+        ])  # fmt: skip
         broken = [table.not_finite for table in self.tables if table.not_finite is not None]
         if broken:
-            raise Stopped(Status.SOURCE_NOT_FINITE, min(broken))
+            raise no_period(problem, Status.SOURCE_NOT_FINITE, min(broken))
         self.sources = joined(self.tables)
         self.end = float(min(table.edges[-1] for table in self.tables))
         if pushed and self.begin > problem.t_start:
@@ -147,7 +131,7 @@ class Period:
             rows, last = linear.respond(rates, gains, *given, v, times)
             start, end, along = start + v, end + last, along + rows
         if not np.all(np.isfinite(start)):
-            raise Stopped(Status.NOT_PERIODIC, cause=CHARGING)
+            raise no_period(self.problem, Status.NOT_PERIODIC, cause=CHARGING)
         return start, end, along
 
 
@@ -314,7 +298,7 @@ class Search:
         scene, network = problem.scene, problem.network
         status, one, error = pass_through(problem, self.period.sources, tol, self.scale)
         if status is not Status.SUCCESS:
-            raise Stopped(status, one.t)
+            raise no_period(problem, status, one.t)
         met = np.zeros((one.peaks.size, 4))
         for i in network.fingers:
             peak, contact = float(one.peaks[i]), network.contacts[i]
@@ -346,8 +330,7 @@ class Search:
         return Found(start, period.parts * defect, self._map_slope, self._memory(), errors, self.passes / period.parts)
 
     def _map_slope(self) -> FloatArray:
-        with stops_told(self.period.problem):
-            slope = self._slope()
+        slope = self._slope()
         return slope @ slope if self.period.parts == 2 else slope
 
     def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
@@ -391,7 +374,7 @@ class Search:
                 self._mind_wandering(last, change, tol)
                 return last, step, defect
         cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
-        raise Stopped(Status.NOT_PERIODIC, cause=cause)
+        raise no_period(self.period.problem, Status.NOT_PERIODIC, cause=cause)
 
     def _memory(self) -> float:
         """Largest ratio of the periodic state's error to an error of the voltages made in every period; 1 or more."""
@@ -409,7 +392,7 @@ class Search:
         moved = self._largest(np.where(held, change, 0.0))
         if moved > allowed:
             cause = f"a charge that nothing drains moves by {moved:.3g} V in every period"
-            raise Stopped(Status.NOT_PERIODIC, cause=cause)
+            raise no_period(self.period.problem, Status.NOT_PERIODIC, cause=cause)
 
     def _holding(self, z: FloatArray) -> FloatArray:
         """z with its neutral modes adjusted so that the conserved charges have their initial values.
@@ -484,9 +467,8 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
     """
     if problem.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
-    with stops_told(problem):
-        period = Period(problem)
-        found = Search(period, rtol).close() if problem.scene.coupled else _closed_form(period)
+    period = Period(problem)
+    found = Search(period, rtol).close() if problem.scene.coupled else _closed_form(period)
     y = np.append(found.start, np.zeros(period.before.size))
     initial = State(period.begin, y, period.before, np.zeros(problem.scene.net.gap.size), problem.scene.charge_law)
     moved = period.begin - problem.t_start

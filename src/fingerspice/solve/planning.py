@@ -151,15 +151,19 @@ def _of_stack(problem: Problem, model: Model, rtol: float) -> _Choice:
     if not model.coupled:
         return ("linear", f"the area is {scene.area_mode}, so the circuit is linear", changed, area)
     free, little = not np.any(model.rate0 > 0.0), changed <= 0.2 * rtol
-    reason = f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
-    if not model.mobile and (free or little):
-        reason = "only the charge needs the area at every instant; charge=False leaves it out"
-        if not problem.charge and free:
-            reason = "every leak scales with the area, so under the local law no voltage feels it"
-        elif not problem.charge:
-            reason = f"the area changes the leaks by {changed:.2g} at most, against rtol = {rtol:g}"
-    tier = "linear" if not (model.mobile or problem.charge) and (free or little) else "coupled"
-    return (tier, reason, changed, area)
+    if model.mobile or not (free or little):
+        return (
+            "coupled",
+            f"the area follows the voltage and moves the leaks by up to {_percent(changed)}",
+            changed,
+            area,
+        )
+    if problem.charge:
+        return ("coupled", "only the charge needs the area at every instant; charge=False leaves it out", changed, area)
+    reason = "every leak scales with the area, so under the local law no voltage feels it"
+    if not free:
+        reason = f"the area changes the leaks by {changed:.2g} at most, against rtol = {rtol:g}"
+    return ("linear", reason, changed, area)
 
 
 def _percent(share: float) -> str:

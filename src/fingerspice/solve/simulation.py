@@ -25,6 +25,7 @@ from fingerspice.solve.derivatives import check_request, sensitivities_of
 from fingerspice.solve.nodal import solve_coupled, solve_foreign
 from fingerspice.solve.planning import asked, make_plan, run_warnings
 from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare
+from fingerspice.solve.recordings.run import solve as solve_recording
 from fingerspice.solve.runs import ROUGH, Progress, Run, excess_of, run_failure
 from fingerspice.waveforms.waveform import DOUBLE, require
 
@@ -275,8 +276,6 @@ def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | No
     if ":" in method:
         return solve_foreign(problem, method, rtol, progress), method
     if method == "auto":
-        from fingerspice.solve.recordings.run import solve as solve_recording
-
         recorded = solve_recording(problem, rtol, progress)
         if recorded is not None:
             return recorded, "relaxation"

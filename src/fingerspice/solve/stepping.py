@@ -56,10 +56,7 @@ class OutOfRangeError(Exception):
 
 
 class Stepping(Integration):
-    """One integration by exponential steps, with an error of at most `tol` (V) in each step.
-
-    Steps are as long as that allows, or all of the length `h_fixed` (s).
-    """
+    """One integration by exponential steps, with an error of at most `tol` (V) in each step."""
 
     error: FloatArray  # As in `LoopState`, as `peaks` and `collected`
     gaps: list[int]  # Rows of `peaks` of the gaps whose errors are stated
@@ -73,14 +70,14 @@ class Stepping(Integration):
     # is repeated.
     asked = math.inf
 
-    def __init__(self, problem: Problem, tol: float, shown: int, width: int, h_fixed: float = 0.0) -> None:
+    def __init__(self, problem: Problem, tol: float, shown: int, width: int) -> None:
         self.controls = np.zeros(1, readout.CONTROL)
         self.control = self.controls[0]
         self.control["t"] = problem.t_start
         super().__init__(problem)
         span, self.period = problem.t_stop - problem.t_start, problem.waveform.period or math.inf
-        longest = h_fixed or min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
-        self.pace = Pace(tol, longest, h_fixed == 0.0, problem.charge)
+        longest = min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
+        self.pace = Pace(tol, longest, True, problem.charge)
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.step = np.zeros(1, readout.STEP)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
@@ -152,9 +149,9 @@ class Stepping(Integration):
         """Smallest distance to a fold so far."""
         return float(self.control["margin"])
 
-    @abstractmethod
-    def _failed(self, code: int, sources: Sources) -> Status:
+    def failed(self, code: int, sources: Sources) -> Status:
         """Status of a run whose loop ended with a code other than DONE."""
+        return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
 
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `loopstate`."""
@@ -204,7 +201,7 @@ class Stepping(Integration):
                 if excess_of(self.stated_peaks()[self.gaps], self.problem.rounding) > self.asked:
                     return Status.ERROR_NOT_MET
             elif code != readout.DONE:
-                return self._failed(code, sources)
+                return self.failed(code, sources)
         return Status.SUCCESS
 
     def _settle(self) -> None:

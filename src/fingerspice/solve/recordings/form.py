@@ -53,7 +53,7 @@ from fingerspice.engine.one_area.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
-from fingerspice.solve.collocation import as_recorded, on_branch, system_of
+from fingerspice.solve.collocation import as_recorded, by_modes, on_branch, system_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK, Scene
 from fingerspice.solve.starting import StackState, from_stack
@@ -400,8 +400,15 @@ class Reduced:
         self.gap, self.q0, self.modes = int(net.gap[self.moving]), 1.0 / float(area0[self.moving]), modes
         n, n_s = modes.rates.size, modes.gains.shape[1] if charge else 0
         none = np.zeros((n, n_s))
-        # Voltages of all cells from v, and from the sources.
-        tap, tap_s = network.p @ modes.shape, network.q - network.p @ modes.follow
+        # Voltages of all cells, and what the sources deliver, from v and from the sources.
+        by = by_modes(network, modes, area0)
+        tap, tap_s, lost, lost_s, stored = (
+            by["tap"],
+            by["tap_s"],
+            by["lost"][:n_s],
+            by["lost_s"][:n_s],
+            by["stored"][:n_s],
+        )
         # The cells whose area moves, and the direction of each along their path, relative to that of the gap.
         fed = np.flatnonzero(net.place == self.moving)
         turn = _turns([network.cells[i].nodes for i in fed], int(np.flatnonzero(fed == self.gap)[0]))
@@ -420,14 +427,10 @@ class Reduced:
 
         # A charge is z = stored v + stored_s s + passed c_gap N + y, where y' = lost v + lost_s s and the change of the
         # leaks. One more mode is y + sum over k of lost_k / rate_k w_k, which no other mode drives.
-        capacitance, leak = network.capacitance(area0)[:, None], network.leak(area0)[:, None]
-        through, at_x, at_s = network.through[:n_s], network.delivered[:n_s, :n], network.delivered[:n_s, n:]
-        lost = through @ (leak * tap) + at_x @ modes.shape
-        lost_s = through @ (leak * tap_s) - at_x @ modes.follow + at_s
+        through = network.through[:n_s]
         # Whether no mode that does not decay takes part in a current; else there is no such mode.
         self.decays = not np.any(lost[:, modes.rates == 0.0])
         over = np.divide(lost, modes.rates, out=np.zeros_like(lost), where=modes.rates > 0.0)
-        stored, stored_s = through @ (capacitance * tap), through @ (capacitance * tap_s)
         # w' = -rates w + gain s + feed g, by (q - q0) times each tap, and last by N, which cancels in the charges.
         self.rates, gain = np.append(modes.rates, np.zeros(n_s)), modes.gains[:, source]
         by_leaks = leaks(-modes.take[:, fed])
@@ -439,12 +442,12 @@ class Reduced:
         moved = stored @ self.absorbed + through[:, fed] @ turn * net.c[self.gap]
         self.rows = Shown(
             np.block([[modes.shape, none], [stored - over, np.eye(n_s)]]),
-            np.append(-modes.follow[:, source], stored_s[:, source]),
+            np.append(-modes.follow[:, source], by["stored_s"][:n_s, source]),
             np.append(modes.shape @ self.absorbed, moved), np.zeros(n + n_s, bool),
         )  # fmt: skip
-        nodes = network.nodes[:, :n] @ modes.shape
-        still = np.zeros(len(nodes))
-        self.nodes = Shown(np.pad(nodes, ((0, 0), (0, n_s))), still, nodes @ self.absorbed, still > 0.0)
+        still = np.zeros(len(by["node"]))
+        columns = np.pad(by["node"], ((0, 0), (0, n_s)))
+        self.nodes = Shown(columns, still, by["node"] @ self.absorbed, still > 0.0)
 
 
 def _turns(nodes: list[tuple[str, str]], first: int) -> FloatArray:
