@@ -75,18 +75,6 @@ class _Scratch(threading.local):
 SCRATCH = _Scratch()
 
 
-def _prepared(scene: Scene, rtol: float, u_top: float) -> tuple[System, float]:
-    """The modal system of a scene, made on first use, and the relative error of its area's polynomial."""
-    # The cache distinguishes tolerances by their decade, so that similar runs share a system.
-    decade = int(np.floor(np.log10(rtol)))
-
-    def make() -> tuple[System, float]:
-        system = system_of(scene, decade, u_top)
-        return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
-
-    return kept_with(scene.prepared, ("system", decade, u_top), MOST_SYSTEMS, make)
-
-
 def system_of(
     scene: Scene, decade: int, u_top: float = 0.0, ratio: float = LEVEL_RATIO, u_peak: float = 0.0
 ) -> System:  # fmt: skip
@@ -114,8 +102,14 @@ class Track(Stepping):
     """
 
     def __init__(self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True) -> None:
-        scene = problem.scene
-        self.system, self.area_error = _prepared(scene, rtol, top)
+        scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
+
+        def make() -> tuple[System, float]:
+            system = system_of(scene, decade, top)
+            return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
+
+        # Similar runs share a system: there is one for each decade of tolerances.
+        self.system, self.area_error = kept_with(scene.prepared, ("system", decade, top), MOST_SYSTEMS, make)
         model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
         # Of the layer through which the charge is computed.
@@ -211,13 +205,6 @@ def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray)
     return rows
 
 
-def scale_of(problem: Problem, peak: float) -> float:
-    """Largest gap voltage to expect under a source with this peak, V."""
-    start = problem.inner
-    share = peak * model_of(problem.scene).k_gap if np.isfinite(peak) else 0.0
-    return max(share, float(np.abs(start.y[:-1]).max(initial=0.0))) or 1.0
-
-
 # Number of sets of references cached with a scene: one for each thread and decade of tolerances.
 MOST_SETS = 16
 # Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
@@ -234,8 +221,7 @@ class Known:
     """
 
     def __init__(self, scene: Scene, decade: int) -> None:
-        numbers, magnified, self.shapes = _referred(scene, scene.area0)
-        n_area = scene.area0.size
+        n_area, (numbers, magnified, self.shapes) = scene.area0.size, self._referred(scene, scene.area0)
         counts = np.zeros(1, np.int64), np.zeros(n_area, np.int64)
         self.arrays = References(np.zeros((2, n_area), np.int64), np.zeros((2, numbers.size)), *counts)
         self.tables = new_tables(self.shapes[0][0])
@@ -256,10 +242,15 @@ class Known:
             more = {"levels": np.zeros_like(arrays.levels), "numbers": np.zeros_like(arrays.numbers)}
             self.arrays = arrays = arrays._replace(**{k: np.append(getattr(arrays, k), x, 0) for k, x in more.items()})
         area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
-        arrays.numbers[one], magnified, _ = _referred(scene, area)
+        arrays.numbers[one], magnified, _ = self._referred(scene, area)
         arrays.levels[one] = levels
         arrays.used[0] += 1
         np.maximum(self.magnified, magnified, out=self.magnified)
+
+    @staticmethod
+    def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
+        key = ("referred", scene.fixed, area.tobytes())
+        return kept_with(scene.network.kept, key, MOST_KEPT, lambda: _refer(scene, area))
 
     def form(self) -> Form:
         """A form for the areas at 0 V, with its own copy of the numbers: compiled code overwrites them."""
@@ -312,12 +303,6 @@ def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
     }
 
 
-def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
-    """The arrays in `REFERRED` for reference areas (m^2) in one row, the round-off as in `Known`, and their shapes."""
-    key = ("referred", scene.fixed, area.tobytes())
-    return kept_with(scene.network.kept, key, MOST_KEPT, lambda: _refer(scene, area))
-
-
 def by_modes(network: Network, modes: Modes, area: FloatArray) -> dict[str, FloatArray]:
     """What the modes at these areas, and the sources, do: arrays with the names in `Form`, the taps of all cells."""
     n, n_s = modes.gains.shape
@@ -337,6 +322,7 @@ def by_modes(network: Network, modes: Modes, area: FloatArray) -> dict[str, Floa
 
 
 def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
+    """The arrays in `REFERRED` for reference areas (m^2) in one row, the round-off as in `Known`, and their shapes."""
     network, net = scene.network, scene.net
     modes = scene.modes_at(area) if area is not scene.area0 else scene.modes
     n, n_s = modes.gains.shape
@@ -473,7 +459,12 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
     tables = Tables(problem, LOCAL_SHARE * rtol)
     is_stack = problem.scene.stack is not None
     met = tables.peak() if is_stack or problem.scene.is_sampled else 0.0
-    u_scale = scale_of(problem, met) if is_stack else max(problem.largest, met) or GUESS
+    if is_stack:
+        # The largest gap voltage to expect.
+        share = met * model_of(problem.scene).k_gap if np.isfinite(met) else 0.0
+        u_scale = max(share, float(np.abs(problem.inner.y[:-1]).max(initial=0.0))) or GUESS
+    else:
+        u_scale = max(problem.largest, met) or GUESS
     tol, top, nfev, attempts, tries_out = LOCAL_SHARE * rtol, 0.0, 0, 0, True
     # What is left of sources that cancel has fewer digits than these; what a gap takes of a source has as many as that.
     finest = FINEST * max(1.0, problem.scene.u_size / (met or u_scale))

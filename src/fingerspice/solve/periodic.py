@@ -1,4 +1,4 @@
-"""The periodic state of any circuit, by Newton's method on the map of one period (`Search` on `Period`).
+"""The periodic state of any circuit, by Newton's method on the map of one period (`Search`).
 
 The unknown z consists of the modes of the live voltages, for the areas at 0 V, and of the areas with a time constant,
 relative to their values at 0 V. The first guess, and the first derivative of the map, are those of the linear circuit
@@ -79,9 +79,8 @@ class Period:
             for j, wave in enumerate(scene.waveforms):
                 table = source_table(wave, problem.t_start, self.begin, 1e-13, problem.step)
                 gains, still = np.where(self.neutral[:n], self.modes.gains[:, j], 0.0), np.zeros(n)
-                self.kept = (
-                    self.kept + linear.respond(still, gains, table.edges, table.terms, table.series, still, [])[1]
-                )
+                _, moved = linear.respond(still, gains, table.edges, table.terms, table.series, still, [])
+                self.kept = self.kept + moved
         # (n + n_slow,): Sign of each entry of a periodic state at the end of the span, relative to its start.
         self.turned = np.where(np.arange(self.rates.size) < n, 1.0 if self.parts == 1 else -1.0, 1.0)
         # The problem restricted to the span, without charge.
@@ -99,8 +98,7 @@ class Period:
 
         Under `local` a capacitor holds the integral of C dU from 0 V to its voltage U; under `mobile` it holds C U.
         """
-        scene = self.problem.scene
-        network, net = scene.network, scene.net
+        scene, network, net = self.problem.scene, self.problem.network, self.problem.scene.net
         u = net.p @ self.voltages(z) + net.q @ self.before
         along, weight = (np.ones(1), np.ones(1)) if net.mobile else _GAUSS
         area, charge = scene.area0.copy(), np.zeros(u.size)
@@ -133,6 +131,15 @@ class Period:
         if not np.all(np.isfinite(start)):
             raise no_period(self.problem, Status.NOT_PERIODIC, cause=CHARGING)
         return start, end, along
+
+    def close(self) -> Found:
+        """The periodic state of a circuit with fixed areas."""
+        start, end, _ = self.linear_state([])
+        defect = float(np.abs(self.modes.shape @ (self.turned[: self.n] * end - start)).max(initial=0.0))
+        slope = np.diag(np.exp(-self.rates * self.span * self.parts))
+        # The only error of the closed form is round-off, which the run adds to its stated error itself.
+        none = np.zeros((len(self.problem.network.fingers), 2))
+        return Found(self.voltages(start + self.kept), self.parts * defect, slope.copy, 1.0, none, 1)
 
 
 def _turns(problem: Problem) -> bool:
@@ -195,42 +202,41 @@ class _Pass(NamedTuple):
     end: FloatArray
     sources: FloatArray
     error: FloatArray
-    met: FloatArray  # (n_area, 4): Columns of `LoopState.peaks`
+    met: FloatArray  # (n_gap, 4): Columns of `LoopState.peaks`
     magnified: float
-    # (n_area,): Round-off of the gap voltages in units of the machine precision times the largest voltage
+    # (n_gap,): Round-off of the gap voltages in units of the machine precision times the largest voltage
     rounding: FloatArray
 
 
-class Search:
+class Search(Period):
     """Newton's method on the map of a period."""
 
-    def __init__(self, period: Period, rtol: float) -> None:
-        self.period, self.rtol, self.passes = period, rtol, 0
-        self.implicit = False
+    def __init__(self, problem: Problem, rtol: float) -> None:
+        super().__init__(problem)
+        problem, self.rtol, self.passes, self.implicit = self.problem, rtol, 0, False
         self.one: Track | March | None = None  # Integrates every pass by exponential steps
         # The gap voltage that a stack's area curve reaches, V; 0: that of its scene.
         self.top = 0.0
         # A conserved charge is no unknown. If half a period is used, all voltages change sign: such a charge is 0.
-        self.free = ~period.neutral if period.parts == 1 else np.ones(period.rates.size, bool)
-        self.slow = np.arange(period.rates.size) >= period.n
-        problem = period.problem
+        self.free = ~self.neutral if self.parts == 1 else np.ones(self.rates.size, bool)
+        self.slow = np.arange(self.rates.size) >= self.n
         self.fingers = list(problem.network.fingers)
         self.z = self._guess()
-        largest = float(np.abs(period.voltages(self.z)).max(initial=0.0))
+        largest = float(np.abs(self.voltages(self.z)).max(initial=0.0))
         self.scale = max(problem.scene.u_peak, largest) or GUESS
-        self.solver = self._inverse(np.diag(period.turned * np.exp(-period.rates * period.span)))
+        self.solver = self._inverse(np.diag(self.turned * np.exp(-self.rates * self.span)))
         self.z = self._holding(self.z)
         cells = [problem.network.gaps[i] for i in self.fingers]
-        gap = problem.network.p[np.array(cells, int)] @ period.modes.shape
+        gap = problem.network.p[np.array(cells, int)] @ self.modes.shape
         # Derivative of every gap's voltage by z; its columns for areas with a time constant are 0.
         self.gap = np.hstack([gap, np.zeros((gap.shape[0], int(self.slow.sum())))])
 
     def _guess(self) -> FloatArray:
         """The periodic state with every area held at its value at 0 V; areas with a time constant at their mean."""
-        period, problem = self.period, self.period.problem
-        net, modes, slow = problem.scene.net, period.modes, np.flatnonzero(problem.scene.net.slow >= 0)
-        times = period.begin + period.span * (np.arange(SAMPLES if slow.size else 0) + 0.5) / SAMPLES
-        start, _, along = period.linear_state(times)
+        problem = self.problem
+        net, modes, slow = problem.scene.net, self.modes, np.flatnonzero(problem.scene.net.slow >= 0)
+        times = self.begin + self.span * (np.arange(SAMPLES if slow.size else 0) + 0.5) / SAMPLES
+        start, _, along = self.linear_state(times)
         relative = np.ones(slow.size)
         if slow.size:
             s = np.column_stack([wave.value(times) for wave in problem.waveforms])
@@ -240,7 +246,7 @@ class Search:
                 assert contact is not None
                 u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
                 relative[k] = float(np.mean(contact.area(np.abs(u)))) / problem.scene.area0[i]
-        return np.append(np.where(period.neutral[: period.n], period.kept, start), relative)
+        return np.append(np.where(self.neutral[: self.n], self.kept, start), relative)
 
     def _inverse(self, slope: FloatArray) -> FloatArray:
         """Inverse of 1 - slope for the entries of z that decay, and zero for the neutral modes."""
@@ -251,67 +257,65 @@ class Search:
 
     def _largest(self, z: FloatArray) -> float:
         """Largest voltage in a change of z, V; the relative change of an area counts as that share of the scale."""
-        x = float(np.abs(self.period.modes.shape @ z[~self.slow]).max(initial=0.0))
+        x = float(np.abs(self.modes.shape @ z[~self.slow]).max(initial=0.0))
         return max(x, self.scale * float(np.abs(z[self.slow]).max(initial=0.0)))
 
     def passed(self, z: FloatArray, tol: float) -> _Pass:
         """One pass over the period from z, with an error of `tol` times the voltage scale in every step."""
-        period, n = self.period, self.period.n
-        y = np.concatenate([period.voltages(z), z[n:], np.zeros(period.before.size)])
-        initial = dataclasses.replace(period.problem.initial, y=y)
-        self.passes += 1
+        n, self.passes = self.n, self.passes + 1
+        y = np.concatenate([self.voltages(z), z[n:], np.zeros(self.before.size)])
+        initial = dataclasses.replace(self.problem.initial, y=y)
         made = None if self.implicit else self._stepped(initial, max(tol, FINEST))
         if made is None:
             # The exponential steps failed: the implicit method either succeeds or tells that no solution exists.
-            self.implicit, made = True, self._collocated(dataclasses.replace(period.problem, initial=initial), tol)
+            self.implicit, made = True, self._collocated(dataclasses.replace(self.problem, initial=initial), tol)
         # Use the sources at the end of the pass: they equal those at the start only up to the sign and round-off.
-        x = period.modes.inverse @ (made.end[:n] + period.modes.follow @ made.sources)
-        error = np.append(period.modes.inverse @ made.error[:n], made.error[n : z.size])
-        return made._replace(end=period.turned * np.append(x, made.end[n : z.size]), error=error)
+        x = self.modes.inverse @ (made.end[:n] + self.modes.follow @ made.sources)
+        error = np.append(self.modes.inverse @ made.error[:n], made.error[n : z.size])
+        return made._replace(end=self.turned * np.append(x, made.end[n : z.size]), error=error)
 
     def _stepped(self, initial: State, tol: float) -> _Pass | None:
         """One pass by exponential steps; None where they fail before the end."""
-        period, scene = self.period, self.period.problem.scene
         while True:
             if self.one is None:
-                self.one = stepping(period.problem, self.rtol, tol, self.scale, self.top, False)
+                self.one = stepping(self.problem, self.rtol, tol, self.scale, self.top, False)
             one = self.one
             one.again(initial, tol * self.scale)
             try:
-                if one.through(period.sources, period.end) is not Status.SUCCESS:
+                if one.through(self.sources, self.end) is not Status.SUCCESS:
                     return None
                 break
             except OutOfRangeError as left:
                 self.top, self.one = 1.5 * left.top, None
-        magnified = max(1.0, float(one.control["magnified"]))
+        n, magnified = self.n, max(1.0, float(one.control["magnified"]))
         if isinstance(one, March):
-            error = np.append(one.form.shape @ one.error[: period.n], one.error[period.n :])
-            return _Pass(one.y, one.s_before, error, one.peaks.copy(), magnified, one.references.magnified)
-        end, system = one.state(), one.system
-        model, error = system.model, system.live[int(one.error[period.n])] @ one.error[: period.n]
-        if model.mobile:
-            error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
-        return _Pass(end.y, end.s_before, scene.turn * error, one.peaks.copy(), magnified, np.array([model.k_gap]))
+            error, rounding = np.append(one.form.shape @ one.error[:n], one.error[n:]), one.references.magnified
+        else:
+            system, model = one.system, one.system.model
+            error, rounding = system.live[int(one.error[n])] @ one.error[:n], np.array([model.k_gap])
+            if model.mobile:
+                error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
+            error = self.problem.scene.turn * error
+        end = one.state()
+        return _Pass(end.y, end.s_before, error, one.peaks[self.fingers], magnified, rounding[self.fingers])
 
     def _collocated(self, problem: Problem, tol: float) -> _Pass:
         """One pass by the implicit method, with its error from a coarser pass."""
         scene, network = problem.scene, problem.network
-        status, one, error = pass_through(problem, self.period.sources, tol, self.scale)
+        status, one, error = pass_through(problem, self.sources, tol, self.scale)
         if status is not Status.SUCCESS:
             raise no_period(problem, status, one.t)
-        met = np.zeros((one.peaks.size, 4))
-        for i in network.fingers:
+        met = np.zeros((len(self.fingers), 4))
+        for row, i in zip(met, self.fingers, strict=True):
             peak, contact = float(one.peaks[i]), network.contacts[i]
             assert contact is not None
             area = float(contact.area(peak)) if scene.net.gap[i] >= 0 else float(scene.area0[i])
-            met[i, :2] = peak, float(contact.stress(peak)) * area
-        gap = np.array([network.p[0 if cell is None else cell] for cell in network.gaps]) @ self.period.modes.shape
-        rounding = (np.abs(gap) @ np.abs(self.period.modes.inverse)).sum(axis=1)
+            row[:2] = peak, float(contact.stress(peak)) * area
+        rounding = (np.abs(self.gap[:, : self.n]) @ np.abs(self.modes.inverse)).sum(axis=1)
         return _Pass(one.y, one.s_before, error, met, 1.0, 10.0 + rounding)
 
     def close(self) -> Found:
         """The periodic state, to `rtol` or as far as round-off permits."""
-        period = self.period
         tol = LOCAL_SHARE * self.rtol
         while True:
             last, step, defect = self._newton(tol)
@@ -326,12 +330,12 @@ class Search:
             else:
                 break
         # Its records are views of its arrays, which a copy of what is found would separate.
-        self.one, start = None, np.append(period.voltages(self.z), self.z[period.n :])
-        return Found(start, period.parts * defect, self._map_slope, self._memory(), errors, self.passes / period.parts)
+        self.one, start = None, np.append(self.voltages(self.z), self.z[self.n :])
+        return Found(start, self.parts * defect, self._map_slope, self._memory(), errors, self.passes / self.parts)
 
     def _map_slope(self) -> FloatArray:
         slope = self._slope()
-        return slope @ slope if self.period.parts == 2 else slope
+        return slope @ slope if self.parts == 2 else slope
 
     def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
         """Solve for the periodic z; returns the last pass, the last step of z, and the defect of that pass, V."""
@@ -374,11 +378,11 @@ class Search:
                 self._mind_wandering(last, change, tol)
                 return last, step, defect
         cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
-        raise no_period(self.period.problem, Status.NOT_PERIODIC, cause=cause)
+        raise no_period(self.problem, Status.NOT_PERIODIC, cause=cause)
 
     def _memory(self) -> float:
         """Largest ratio of the periodic state's error to an error of the voltages made in every period; 1 or more."""
-        n, modes = self.period.n, self.period.modes
+        n, modes = self.n, self.modes
         grown = modes.shape @ self.solver[:n, :n] @ modes.inverse
         return max(1.0, float(np.abs(grown).sum(axis=1).max(initial=0.0)))
 
@@ -392,7 +396,7 @@ class Search:
         moved = self._largest(np.where(held, change, 0.0))
         if moved > allowed:
             cause = f"a charge that nothing drains moves by {moved:.3g} V in every period"
-            raise no_period(self.period.problem, Status.NOT_PERIODIC, cause=cause)
+            raise no_period(self.problem, Status.NOT_PERIODIC, cause=cause)
 
     def _holding(self, z: FloatArray) -> FloatArray:
         """z with its neutral modes adjusted so that the conserved charges have their initial values.
@@ -404,7 +408,7 @@ class Search:
             return z
         z = z.copy()
         for _ in range(_MOST):
-            missing = self.period.charges(z, held) - self.period.kept[held]
+            missing = self.charges(z, held) - self.kept[held]
             z[held] -= missing
             if np.abs(missing).max() <= 1e-15 * np.abs(z).max():
                 break
@@ -412,14 +416,13 @@ class Search:
 
     def _slope(self) -> FloatArray:
         """Derivative of the map by z, to about 1e-5, from one pass for every mode that does not decay in a period."""
-        period = self.period
-        decaying = period.rates[~period.neutral]
+        decaying = self.rates[~self.neutral]
         # A slow mode's 1 - slope is about its rate times the period: the passes' errors must be smaller than that.
-        forgets = min(1.0, float(decaying.min(initial=math.inf)) * period.span)
+        forgets = min(1.0, float(decaying.min(initial=math.inf)) * self.span)
         tol = max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL)
         base = self.passed(self.z, tol).end
-        slope = np.diag(period.turned * np.exp(-period.rates * period.span))
-        for k in np.flatnonzero(period.rates * period.span < _FORGOTTEN):
+        slope = np.diag(self.turned * np.exp(-self.rates * self.span))
+        for k in np.flatnonzero(self.rates * self.span < _FORGOTTEN):
             if not self.free[k]:
                 continue
             unit = np.zeros(self.z.size)
@@ -433,22 +436,21 @@ class Search:
 
         An error made in every period leads to an error of the periodic state equal to the solver times it.
         """
-        period, solver = self.period, np.abs(self.solver)
+        solver = np.abs(self.solver)
         grown = solver @ np.abs(last.error)
-        met = last.met[self.fingers]
-        peak, force = met[:, readout.PEAK_U], met[:, readout.PEAK_F]
+        peak, force = last.met[:, readout.PEAK_U], last.met[:, readout.PEAK_F]
         gap = np.abs(self.gap)
         # Add round-off, and the last Newton step as a bound of the error that remains after it.
-        once = np.abs(period.modes.inverse).sum(axis=1)
-        often = solver[: period.n, : period.n] @ once
-        grows = np.maximum(1.0, (gap[:, : period.n] @ often) / (gap[:, : period.n] @ once))
+        once = np.abs(self.modes.inverse).sum(axis=1)
+        often = solver[: self.n, : self.n] @ once
+        grows = np.maximum(1.0, (gap[:, : self.n] @ often) / (gap[:, : self.n] @ once))
         largest = float(peak.max(initial=0.0)) + self.scale
-        floor = 4e-16 * grows * (last.rounding[self.fingers] * largest + peak)
+        floor = 4e-16 * grows * (last.rounding * largest + peak)
         u_error = last.magnified * (SAFETY * (gap @ grown) + gap @ np.abs(step)) + floor
         f_error = 2.0 * force / np.where(peak > 0.0, peak, math.inf) * u_error
-        slow = period.problem.scene.net.slow[self.fingers]
+        slow = self.problem.scene.net.slow[self.fingers]
         # An area without a time constant has the place -1, the 0 at the end.
-        share = np.append((SAFETY * grown + np.abs(step))[period.n :], 0.0)[slow]
+        share = np.append((SAFETY * grown + np.abs(step))[self.n :], 0.0)[slow]
         u_error, f_error = u_error + peak * share, f_error + 3.0 * force * share
         live = peak > 4e-15 * self.scale
         over = np.append((u_error / np.where(live, peak, 1.0))[live], (f_error / np.where(live, force, 1.0))[live])
@@ -467,24 +469,11 @@ def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
     """
     if problem.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
-    period = Period(problem)
-    found = Search(period, rtol).close() if problem.scene.coupled else _closed_form(period)
+    period = Search(problem, rtol) if problem.scene.coupled else Period(problem)
+    found, moved = period.close(), period.begin - problem.t_start
     y = np.append(found.start, np.zeros(period.before.size))
-    initial = State(period.begin, y, period.before, np.zeros(problem.scene.net.gap.size), problem.scene.charge_law)
-    moved = period.begin - problem.t_start
     started = dataclasses.replace(
-        problem, t_start=period.begin, t_stop=problem.t_stop + moved, first=problem.first + moved, initial=initial,
-        begun=found.gap_errors,
+        problem, t_start=period.begin, t_stop=problem.t_stop + moved, first=problem.first + moved,
+        initial=dataclasses.replace(period.problem.initial, y=y), begun=found.gap_errors,
     )  # fmt: skip
     return started, found
-
-
-def _closed_form(period: Period) -> Found:
-    """The periodic state of a circuit with fixed areas."""
-    start, end, _ = period.linear_state([])
-    sign = 1.0 if period.parts == 1 else -1.0
-    defect = float(np.abs(period.modes.shape @ (sign * end - start)).max(initial=0.0))
-    slope = np.diag(np.exp(-period.rates * period.span * period.parts))
-    # The only error of the closed form is round-off, which the run adds to its stated error itself.
-    none = np.zeros((len(period.problem.network.fingers), 2))
-    return Found(period.voltages(start + period.kept), period.parts * defect, slope.copy, 1.0, none, 1)
