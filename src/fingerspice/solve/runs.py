@@ -248,8 +248,7 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         i = int(np.argmin(shrunk))
         signals = record.finger_voltage(i), record.finger_area(i), record.fold_margin
         element, (u_gap, area, margin) = names[i], (float(x[-1]) for x in signals)
-    detail = run.detail or (ROUGH.format(run.rough) if run.rough > 0.0 else "")
-    if detail:
+    if detail := run.detail or (ROUGH.format(run.rough) if run.rough > 0.0 else ""):
         cause += f" ({detail})"
     if status is Status.ERROR_NOT_MET and len(run.gaps):
         peaks = run.gaps[:, 0]
@@ -257,11 +256,8 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         element = names[worst] if names else element
         cause += f" (estimate {run.gaps[worst, 2]:.3g} V of {peaks[worst]:.3g} V peak"
         largest = max(problem.scene.u_peak, float(peaks.max()))
-        if peaks[worst] < 1e-4 * largest:
-            cause += (
-                f"; the gap takes almost nothing of the {largest:.3g} V of the source, and rounding of these limits it"
-            )
-        cause += ")"
+        little = f"; the gap takes almost nothing of the {largest:.3g} V of the source, and rounding of these limits it"
+        cause += f"{little if peaks[worst] < 1e-4 * largest else ''})"
     return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, last_tried(run.tried))
 
 

@@ -222,11 +222,11 @@ def integrated(
     problem: Problem, plan: Plan, rtol: float, method: str, progress: Progress | None = None
 ) -> tuple[Run, str]:
     """A run as planned, with its stated error compared with `rtol`, and the name of its method."""
-    if plan.tier == "algebraic":
-        run, name = solve_algebraic(problem), plan.tier
-    elif plan.tier == "linear":
-        area = np.array([plan.area]) if problem.scene.stack is not None else None
-        run, name = solve_linear(problem, area, plan.error_bound), plan.tier
+    name = plan.tier
+    if name == "algebraic":
+        run = solve_algebraic(problem)
+    elif name == "linear":
+        run = solve_linear(problem, None if problem.scene.stack is None else np.array([plan.area]), plan.error_bound)
     else:
         run, name = _stepped(problem, method, own_rtol(problem, plan, rtol), progress)
         if plan.error_bound > 0.0:
@@ -275,19 +275,15 @@ def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | No
     """A run of the coupled tier, and the name of its method."""
     if ":" in method:
         return solve_foreign(problem, method, rtol, progress), method
-    if method == "auto":
-        recorded = solve_recording(problem, rtol, progress)
-        if recorded is not None:
-            return recorded, "relaxation"
+    if method == "auto" and (recorded := solve_recording(problem, rtol, progress)) is not None:
+        return recorded, "relaxation"
     is_stack, reason = problem.scene.stack is not None, ""
     if method != "radau" and (is_stack or problem.scene.coupled):
         run = solve_exponential(problem, rtol, progress, repeat=method == "auto")
         if run.status not in (BEYOND_STACKS if is_stack else BEYOND_NETWORKS) or (is_stack and method == "exponential"):
             return run, "exponential"
-        if is_stack and run.status is Status.FOLD:
-            folded = run_to_fold(problem)
-            if folded is not None:
-                return folded, "exponential"
+        if is_stack and run.status is Status.FOLD and (folded := run_to_fold(problem)) is not None:
+            return folded, "exponential"
         cause = "a fold is near" if run.status is Status.FOLD else run.status.cause
         reason = f"exponential steps gave up at t = {run.state.t:.4g} s, because {cause}"
     # The implicit method is the last resort: its step length does not depend on fast modes.

@@ -23,7 +23,6 @@ from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.planning import asked, make_plan
 from fingerspice.solve.problem import Problem, at_breakpoints, check_length, check_outputs
-from fingerspice.solve.recordings.block import Piece
 from fingerspice.solve.recordings.run import LaneMarch, LostError, prepared
 from fingerspice.solve.runs import Run
 from fingerspice.solve.simulation import check_arguments, integrated, own_rtol, solution_of, state_error
@@ -92,17 +91,15 @@ class Stream:
         # Outputs integrated so far; those that no chunk has contained yet: the mark before each piece, times (s), rows.
         self._written = 0
         self._ready: list[tuple[Mark, FloatArray, FloatArray]] = []
-        # Of a run in windows: the method asked for and the one used, and state, peaks and run of the last window.
-        self._asked = self._method = method
+        # Of a recording that is followed sample by sample: its pieces, the number of the next one, and its march.
+        own, by_samples = own_rtol(problem, plan, rtol), method == "auto" and plan.tier == "coupled"
+        self._pieces, form = (prepared(problem, own) if by_samples else None) or ([], None)
+        self._place, self._march = 0, None if form is None else LaneMarch(problem, form, own)
+        # Of a run in windows, such as what the method for recordings fails on: the method asked for and, of the last
+        # window, the one used, state, peaks and run.
+        self._asked, self._method = (method, method) if form is None else ("exponential", "relaxation")
         self._state, self._gaps = problem.initial, np.zeros((0, 4))
         self._last: Run | None = None
-        # Of a recording that is followed sample by sample: its march, pieces, and the number of the next one.
-        self._march: LaneMarch | None = None
-        self._pieces: list[Piece] = []
-        self._place, own = 0, own_rtol(problem, plan, rtol)
-        if method == "auto" and plan.tier == "coupled" and (found := prepared(problem, own)) is not None:
-            self._pieces, form = found
-            self._march, self._method = LaneMarch(problem, form, own), "relaxation"
 
     def __iter__(self) -> Iterator[Solution]:
         return self
@@ -145,20 +142,13 @@ class Stream:
     def _stand(self, mark: Mark) -> None:
         """Restore the state of a mark."""
         self._written = mark["written"]
-        if "state" not in mark:
-            assert self._march is not None
+        if self._march is not None and "march" in mark:
             self._place = mark["place"]
             self._march.stand(mark["march"])
             return
         kept: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in mark["state"].items()}
-        self._go_on_in_windows(State(**kept))
+        self._state, self._march = State(**kept), None
         self._gaps = np.array(mark["gaps"], float).reshape(-1, 4)
-
-    def _go_on_in_windows(self, state: State) -> None:
-        """From this state on, integrate by exponential steps what the method for recordings fails on."""
-        if self._march is not None:
-            self._march, self._asked = None, "exponential"
-        self._state = state
 
     @property
     def _over(self) -> bool:
@@ -171,15 +161,15 @@ class Stream:
     def _reach(self, written: int) -> None:
         """Integrate pieces until so many outputs are there, or the run ends."""
         while self._written < written and not self._over:
-            mark = self._here()
+            mark, march = self._here(), self._march
+            if march is None:
+                self._ready.append((mark, *self._window()))
+                continue
             try:
-                found = self._window() if self._march is None else self._piece(self._march)
+                self._ready.append((mark, *self._piece(march)))
             except LostError:
                 self._stand(mark)
-                assert self._march is not None
-                self._go_on_in_windows(self._march.state)
-            else:
-                self._ready.append((mark, *found))
+                self._state, self._march = march.state, None
 
     def _piece(self, march: LaneMarch) -> tuple[FloatArray, FloatArray]:
         """Times (s) and rows of the next piece of a recording."""
@@ -232,21 +222,17 @@ class Stream:
         width = max(self.problem.initial.y.size, 1)
         return np.concatenate(times), np.concatenate(rows) if rows else np.empty((0, width))
 
-    def _run(self) -> Run:
-        """The run so far, without outputs."""
-        none = np.empty(0), np.empty(0, bool), np.empty((0, 0))
-        if self._march is None:
-            assert self._last is not None
-            return replace(self._last, t=none[0], left=none[1], rows=none[2], continuous=None)
-        run = self._march.run(*none)
-        if self.plan.error_bound > 0.0:
-            run.add_error(self.plan.error_bound * run.gaps[:, 0])
-        if self._over:
-            state_error(self.problem, run, self.plan, self.rtol)
-        return run
-
     def _solution(self, t: FloatArray, rows: FloatArray) -> Solution:
-        problem, run = self.problem, self._run()
+        problem, none = self.problem, (np.empty(0), np.empty(0, bool), np.empty((0, 0)))
+        if self._march is not None:
+            run = self._march.run(*none)
+            if self.plan.error_bound > 0.0:
+                run.add_error(self.plan.error_bound * run.gaps[:, 0])
+            if self._over:
+                state_error(problem, run, self.plan, self.rtol)
+        else:
+            assert self._last is not None
+            run = replace(self._last, t=none[0], left=none[1], rows=none[2], continuous=None)
         if self._ready:
             # A failure concerns a later chunk if outputs before it are still waiting for their chunk.
             run.status, run.t_failed = Status.SUCCESS, None
