@@ -23,18 +23,11 @@ from fingerspice.engine.collocation.step_control import end_row
 from fingerspice.engine.many_areas.form import REFERRED, Form, new_network_work
 from fingerspice.engine.many_areas.step import ManyAreas, References
 from fingerspice.engine.network import Sources, source
+from fingerspice.engine.one_area import system as systems
 from fingerspice.engine.one_area.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.one_area.rows import Work, new_stack_work
 from fingerspice.engine.one_area.step import OneArea
-from fingerspice.engine.one_area.system import (
-    LEVEL_RATIO,
-    System,
-    area_error,
-    area_missed,
-    area_polynomials,
-    area_range,
-    build_system,
-)
+from fingerspice.engine.one_area.system import LEVEL_RATIO, System, area_error, area_missed
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import State, Status
@@ -84,14 +77,13 @@ def system_of(
     """
     model, (contact,) = model_of(scene), scene.network.contacts
     assert scene.stack is not None
-    if u_top > 0.0:
-        assert contact is not None
+    if u_top > 0.0 and contact is not None:
         model = model._replace(curve=contact.curve(u_top))
     stress = 0.0 if contact is None else float(contact.stress(1.0))
     u_max, n = u_peak or max(scene.u_peak, u_top), model.gap.size
     nodes = scene.network.nodes[:, : n + 1] * np.append(scene.turn, 1.0)
-    u_range = area_range(model, u_max)
-    return build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress, ratio)
+    u_range = systems.area_range(model, u_max)
+    return systems.build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress, ratio)
 
 
 class Track(Stepping):
@@ -153,11 +145,15 @@ class Track(Stepping):
         return from_stack(self.problem.scene, on_branch(self.system.model, found, float(c["sign"])))
 
     def written(self) -> FloatArray:
-        n_out = int(self.counters[readout.OUTPUT])
-        model = self.system.model
-        wanted = self.pace.charge and model.mobile
-        u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out]) if wanted else np.empty(0)
-        return as_recorded(self.problem, model, self.out[:, :n_out].T, u)
+        n_out, model, shown = int(self.counters[readout.OUTPUT]), self.system.model, self.problem.scene.shown
+        rows, n = self.out[:, :n_out].T, shown.turn.size
+        rows[:, :n] *= shown.turn
+        if self.pace.charge and model.mobile:
+            (cell,), network = shown.measured, shown.network
+            u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out])
+            u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
+            rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - self.problem.inner.offset
+        return rows
 
     def finish(self, sources: Sources, after: Sources | None) -> None:
         first = int(self.counters[readout.OUTPUT])
@@ -193,18 +189,6 @@ def _gap_at(model: Model, y: FloatArray, u: float, sign: float, last: float) -> 
     return last if math.isnan(found) else found
 
 
-def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray) -> FloatArray:
-    """Convert rows of the compiled loops to rows of `Record`, in place; `mobile` needs the source u (V) for charge."""
-    shown = problem.scene.shown
-    n = int(shown.turn.size)
-    rows[:, :n] *= shown.turn
-    if problem.charge and model.mobile:
-        (cell,), network = shown.measured, shown.network
-        u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
-        rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - problem.inner.offset
-    return rows
-
-
 # Number of sets of references cached with a scene: one for each thread and decade of tolerances.
 MOST_SETS = 16
 # Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
@@ -228,7 +212,20 @@ class Known:
         # (n_area + 1,): Round-off of each gap's voltage, and last of the nodes' voltages, relative to the rounding of
         # the largest voltage; the maximum over all references
         self.magnified = np.zeros(magnified.size)
-        self.fixed = _fixed(scene, decade)  # The fields of a `Form` that are the same for all references
+        network, net, n = scene.network, scene.net, scene.net.k.shape[0]
+        slow, fed = net.slow >= 0, _fed(scene)
+        cell = [int(np.flatnonzero(fed == i)[0]) if i >= 0 else -1 for i in net.gap]
+        stress = np.array([0.0 if contact is None else float(contact.stress(1.0)) for contact in network.contacts])
+        powers, slopes, lo, scale = systems.area_polynomials(net.curves, net.gap >= 0, area_error(decade))
+        # The fields of a `Form` that are the same for all references
+        self.fixed: dict[str, Any] = {
+            "mobile": net.mobile, "c": net.c[fed], "g": net.g_area[fed], "home": net.place[fed],
+            "first": np.searchsorted(net.place[fed], np.arange(n_area + 1)), "cell": np.array(cell, np.int64),
+            "unit": scene.area0.copy(), "slow": np.where(slow, n + net.slow, -1),
+            "pace": np.where(slow, 1.0 / np.where(slow, net.tau, 1.0), 0.0), "stress": stress,
+            "powers": powers, "slopes": slopes, "lo": lo, "scale": scale, "curves": net.curves,
+            "through": np.ascontiguousarray(network.through[:, fed]),
+        }  # fmt: skip
         self.add(scene, (0,) * n_area)
 
     @property
@@ -276,33 +273,6 @@ def _fed(scene: Scene) -> IntArray:
     return fed[np.argsort(net.place[fed], kind="stable")]
 
 
-def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
-    """The fields of a form that are the same for all references."""
-    network, net = scene.network, scene.net
-    n, n_area = net.k.shape[0], net.gap.size
-    slow, fed = net.slow >= 0, _fed(scene)
-    stress = np.array([0.0 if contact is None else float(contact.stress(1.0)) for contact in network.contacts])
-    powers, slopes, lo, scale = area_polynomials(net.curves, net.gap >= 0, area_error(decade))
-    return {
-        "mobile": net.mobile,
-        "c": net.c[fed],
-        "g": net.g_area[fed],
-        "home": net.place[fed],
-        "first": np.searchsorted(net.place[fed], np.arange(n_area + 1)),
-        "cell": np.array([int(np.flatnonzero(fed == i)[0]) if i >= 0 else -1 for i in net.gap], np.int64),
-        "unit": scene.area0.copy(),
-        "slow": np.where(slow, n + net.slow, -1),
-        "pace": np.where(slow, 1.0 / np.where(slow, net.tau, 1.0), 0.0),
-        "stress": stress,
-        "powers": powers,
-        "slopes": slopes,
-        "lo": lo,
-        "scale": scale,
-        "curves": net.curves,
-        "through": np.ascontiguousarray(network.through[:, fed]),
-    }
-
-
 def by_modes(network: Network, modes: Modes, area: FloatArray) -> dict[str, FloatArray]:
     """What the modes at these areas, and the sources, do: arrays with the names in `Form`, the taps of all cells."""
     n, n_s = modes.gains.shape
@@ -310,15 +280,12 @@ def by_modes(network: Network, modes: Modes, area: FloatArray) -> dict[str, Floa
     capacitance, leak = network.capacitance(area)[:, None], network.leak(area)[:, None]
     at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
     return {
-        "tap": tap,
-        "tap_s": tap_s,
-        "node": network.nodes[:, :n] @ modes.shape,
+        "tap": tap, "tap_s": tap_s, "node": network.nodes[:, :n] @ modes.shape,
         "node_s": network.nodes[:, n : n + n_s] - network.nodes[:, :n] @ modes.follow,
-        "stored": network.through @ (capacitance * tap),
-        "stored_s": network.through @ (capacitance * tap_s),
+        "stored": network.through @ (capacitance * tap), "stored_s": network.through @ (capacitance * tap_s),
         "lost": network.through @ (leak * tap) + at_x @ modes.shape,
         "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
-    }
+    }  # fmt: skip
 
 
 def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
@@ -333,19 +300,11 @@ def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list
     gap, gap_s = np.zeros((area.size, n)), np.zeros((area.size, n_s))
     gap[fingers], gap_s[fingers] = tap[cells], tap_s[cells]
     parts |= {
-        "rates": np.append(modes.rates, 1.0 / net.tau[slow]),
-        "gain": np.vstack([modes.gains, np.zeros((n_slow, n_s))]),
-        "shape": modes.shape,
-        "inverse": modes.inverse,
-        "follow": modes.follow,
-        "feed": np.vstack([-modes.take[:, fed], np.zeros((n_slow, fed.size))]),
-        "tap": tap[fed],
-        "tap_s": tap_s[fed],
-        "area0": area,
-        "gap": gap,
-        "gap_s": gap_s,
-        "size": np.linalg.norm(modes.shape, axis=0),
-    }
+        "rates": np.append(modes.rates, 1.0 / net.tau[slow]), "gain": np.vstack([modes.gains, np.zeros((n_slow, n_s))]),
+        "shape": modes.shape, "inverse": modes.inverse, "follow": modes.follow, "tap": tap[fed], "tap_s": tap_s[fed],
+        "feed": np.vstack([-modes.take[:, fed], np.zeros((n_slow, fed.size))]), "area0": area,
+        "gap": gap, "gap_s": gap_s, "size": np.linalg.norm(modes.shape, axis=0),
+    }  # fmt: skip
     live = modes.rates[modes.rates > 0.0]
     # The eigenvectors of the slowest mode contain the round-off of the fastest one.
     spread = math.sqrt(float(live.max() / live.min())) if live.size else 0.0
@@ -475,7 +434,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
         try:
             run = integrate(one, tables, progress)
         except OutOfRangeError as error:
-            top = 1.5 * error.top
+            top = 1.5 * error.args[0]
             continue
         run.by_layer = True
         run.end_where_it_stopped()

@@ -117,13 +117,13 @@ def period_of(circuit: Circuit) -> float | None:
     return (waves[0] if len(waves) == 1 else Sum(waves)).period
 
 
-def check_request(problem: Problem, paths: Sequence[str], method: str, start: str) -> str:
+def check_request(problem: Problem, paths: Sequence[str], method: str) -> str:
     """Refuse a run that has no sensitivities; the method of the runs that are compared."""
     if isinstance(paths, str) or not all(isinstance(path, str) for path in paths):
         raise InputError(f"sensitivities is {paths!r}; allowed: a sequence of paths such as ('Xgap.d',)")
     for what, refused in (
         ("the circuit has no GAP", not problem.network.fingers),
-        ("the run goes on from another one", start == "given"),
+        ("the run goes on from another one", problem.start == "given"),
         (f"the method is {method!r}", method not in ("auto", "exponential")),
     ):
         if refused:

@@ -286,7 +286,7 @@ class Search(Period):
                     return None
                 break
             except OutOfRangeError as left:
-                self.top, self.one = 1.5 * left.top, None
+                self.top, self.one = 1.5 * left.args[0], None
         n, magnified = self.n, max(1.0, float(one.control["magnified"]))
         if isinstance(one, March):
             error, rounding = np.append(one.form.shape @ one.error[:n], one.error[n:]), one.references.magnified

@@ -119,7 +119,7 @@ def simulate(
     circuit = overridden(circuit, sources, parameters)
     wanted: dict[str, Any] = {"t_stop": t_stop, "charge_law": charge_law, "area": area, "start": start}
     problem = asked(circuit, t_eval=times, charge=charge, rtol=rtol, **wanted)
-    compared = check_request(problem, sensitivities, method, problem.start) if sensitivities else method
+    compared = check_request(problem, sensitivities, method) if sensitivities else method
     solution = run_problem(problem, times, rtol, method, progress, tier, jumps)
 
     def run(other: Circuit, finer: float) -> Solution:
@@ -245,30 +245,16 @@ def solution_of(
 ) -> Solution:  # fmt: skip
     """The solution made of a run and its record, with output times `t` (s); `name` is the method."""
     scene = problem.scene
+    failure = None if run.status is Status.SUCCESS else run_failure(problem, run, record)
+    fundamental = scene.waveform.fundamental if len(scene.waveforms) == 1 else None
     return Solution(
-        t=t,
-        record=record,
-        status=run.status,
-        failure=None if run.status is Status.SUCCESS else run_failure(problem, run, record),
-        nfev=run.nfev,
-        stats=dict(run.stats),
-        error=run.error,
-        rtol=rtol,
-        charge_law=scene.charge_law,
-        area_mode=scene.area_mode,
-        method=name,
-        plan=plan,
-        circuit=problem.circuit,
-        state=run.state,
-        fold_margin_min=run.margin,
-        fundamental=scene.waveform.fundamental if len(scene.waveforms) == 1 else None,
-        period=scene.waveform.period,
-        warnings=tuple(run_warnings(problem, run, record)),
-        first=max(problem.first, problem.t_start),
-        t_stop=problem.t_stop,
-        start=problem.start,
+        t=t, record=record, status=run.status, failure=failure, nfev=run.nfev, stats=dict(run.stats), error=run.error,
+        rtol=rtol, charge_law=scene.charge_law, area_mode=scene.area_mode, method=name, plan=plan,
+        circuit=problem.circuit, state=run.state, fold_margin_min=run.margin, fundamental=fundamental,
+        period=scene.waveform.period, warnings=tuple(run_warnings(problem, run, record)),
+        first=max(problem.first, problem.t_start), t_stop=problem.t_stop, start=problem.start,
         continuous=run.continuous if run.t_failed is None else None,
-    )
+    )  # fmt: skip
 
 
 def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | None) -> tuple[Run, str]:

@@ -49,10 +49,7 @@ KEPT_STEPS = 2000
 
 
 class OutOfRangeError(Exception):
-    """A gap voltage left the range of its area's curve, which ends at `top` (V)."""
-
-    def __init__(self, top: float) -> None:
-        self.top = top
+    """A gap voltage left the range of its area's curve: the argument, V."""
 
 
 class Stepping(Integration):
@@ -121,13 +118,6 @@ class Stepping(Integration):
     def t(self) -> float:
         return float(self.control["t"])
 
-    def loop_state(self) -> LoopState:
-        """The integration as the compiled loop takes and updates it."""
-        return LoopState(
-            self.y, self.error, self.controls, self.counters, self.step, self.peaks, self.collected, self.outputs,
-            self.kept, self.recorder.room, self.tried,
-        )  # fmt: skip
-
     def try_out(self, asked: float) -> None:
         """Compare the stated error with `asked` after a few periods, if many are left."""
         self.asked, values = asked, self.looks.values
@@ -156,7 +146,11 @@ class Stepping(Integration):
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `loopstate`."""
         while True:
-            code = int(loop.march_on(self.circuit(sources), self.pace, self.loop_state(), looks, t_end))
+            state = LoopState(
+                self.y, self.error, self.controls, self.counters, self.step, self.peaks, self.collected, self.outputs,
+                self.kept, self.recorder.room, self.tried,
+            )  # fmt: skip
+            code = int(loop.march_on(self.circuit(sources), self.pace, state, looks, t_end))
             if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
                 self.recorder.drain(self.counters)
             if code != readout.PAUSED:

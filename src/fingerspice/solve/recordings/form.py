@@ -24,7 +24,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, cast
 
@@ -36,24 +36,15 @@ from fingerspice.base.arrays import BoolArray, FloatArray, aligned
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.network import network_modes
 from fingerspice.circuit.statespace import Stack
+from fingerspice.engine.lanes import rows as of_lanes
 from fingerspice.engine.lanes.loops import polynomial_of
-from fingerspice.engine.lanes.rows import (
-    FADED,
-    Lanes,
-    Marks,
-    MobileMarks,
-    NetworkMarks,
-    StackMarks,
-    rows_of,
-    weigh,
-    weighed,
-)
+from fingerspice.engine.lanes.rows import FADED, Lanes, Marks
 from fingerspice.engine.one_area.model import dot, ramp
 from fingerspice.engine.one_area.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
-from fingerspice.solve.collocation import as_recorded, by_modes, on_branch, system_of
+from fingerspice.solve.collocation import by_modes, on_branch, system_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK, Scene
 from fingerspice.solve.starting import StackState, from_stack
@@ -124,7 +115,8 @@ class LaneForm(ABC):
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
-        leaks, kind = self.lanes.tap_s.size, MobileMarks if self.mobile else NetworkMarks if self.bent else StackMarks
+        leaks = self.lanes.tap_s.size
+        kind = of_lanes.MobileMarks if self.mobile else of_lanes.NetworkMarks if self.bent else of_lanes.StackMarks
         sizes = self.lanes.rates.size, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks
         return kind(*((0,) * size for size in (*sizes, int(self.mobile), PIECES, int(own))))
 
@@ -139,13 +131,14 @@ class LaneForm(ABC):
         Those of steps of length 0 are there, for the others see `weigh`.
         """
         marks, wide = self.marks(own), PIECES if own else 1
-        state, weights = aligned([(rows_of(marks).end * PIECES,), (2, weighed(*map(len, marks[:5])).end, wide)])
+        count = of_lanes.weighed(*map(len, marks[:5])).end
+        state, weights = aligned([(of_lanes.rows_of(marks).end * PIECES,), (2, count, wide)])
         self.weigh(np.zeros(wide), weights[0])
         return state, weights
 
     def weigh(self, h: FloatArray, out: FloatArray) -> None:
         """Weights of steps of the lengths h (s), shape (n,), into `out` (rows, n)."""
-        weigh(self.lanes, self.active, self.inner, h, out)
+        of_lanes.weigh(self.lanes, self.active, self.inner, h, out)
 
     def _polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
         c, flat, out = self.lanes, np.ravel(xi), np.empty(np.size(xi))
@@ -292,10 +285,11 @@ class StackForm(LaneForm):
         return from_stack(problem.scene, on_branch(self.system.model, found, math.copysign(1.0, u_gap)))
 
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        rows = as_recorded(replace(problem, charge=False), self.system.model, out.T, np.empty(0))
+        turn = problem.scene.shown.turn
+        out[: turn.size] *= turn[:, None]
         if self.flows and self.mobile:
-            rows[:, self.rows.k.size - 1] -= problem.inner.offset
-        return rows
+            out[self.rows.k.size - 1] -= problem.inner.offset
+        return out.T
 
 
 def rounded_peak(peak: float) -> float:
@@ -504,8 +498,7 @@ class NetworkForm(LaneForm):
             xi -= step
             if abs(step) <= 1e-15 * abs(xi):
                 break
-        bend = float(self.bend(np.array(xi)))
-        z = np.zeros(self.lanes.rates.size)
+        bend, z = float(self.bend(np.array(xi))), np.zeros(c.rates.size)
         z[:n] = reduced.modes.inverse @ (x + reduced.modes.follow @ s) - reduced.absorbed * bend
         held = self.rows.columns @ z + self.rows.bends * bend + self.rows.k * s[reduced.source]
         z[active:] = start.y[n : n + self.flows] - held[n:]
@@ -514,10 +507,8 @@ class NetworkForm(LaneForm):
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
         shown, xi, y = self.rows, self.xi_at(z, u_last), problem.initial.y.copy()
         y[: shown.k.size] = shown.columns @ z + shown.bends * float(self.bend(np.array(xi))) + shown.k * u_last
-        s = np.zeros(len(problem.waveforms))
-        s[self.reduced.source] = u_last
-        sign = np.ones(problem.scene.net.gap.size)
-        sign[self.reduced.moving] = 1.0 if xi >= 0.0 else -1.0
+        s, sign = np.zeros(len(problem.waveforms)), np.ones(problem.scene.net.gap.size)
+        s[self.reduced.source], sign[self.reduced.moving] = u_last, 1.0 if xi >= 0.0 else -1.0
         return State(t, y, s, sign, problem.scene.charge_law)
 
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
