@@ -44,6 +44,19 @@ MOST_SYSTEMS = 16
 # reference, the errors of gap voltage and charge were 1.5 times the estimates, because they peak between the points of
 # the estimate; and from scene 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
 CHARGE_SAFETY = 1.75
+# Number of sets of references cached with a scene: one for each thread and decade of tolerances.
+MOST_SETS = 16
+# Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
+MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
+# Number of references cached with the network, for runs with other sources.
+MOST_KEPT = 16
+# Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method. Where
+# an area strongly affects the charge of a stiff mode, the fixed-point iteration converges only with steps of the
+# mode's own time constant.
+MOST_STEPS = 100
+ATTEMPTS = 6
+# Voltage scale of a circuit whose sources give none, before any voltage has been computed, V.
+GUESS = 1.0
 
 
 class _Scratch(threading.local):
@@ -87,10 +100,9 @@ def system_of(
 
 
 class Track(Stepping):
-    """One integration in progress, with an error of the gap voltage of at most `tol` (V) in every step.
+    """One integration of a stack: the loop's state is that of `engine.one_area.model`.
 
-    The area's curve reaches `top` (V) if that is above 0. The loop's state is that of `engine.one_area.model`; `state`
-    and the outputs have the form used for all circuits.
+    The error of the gap voltage is at most `tol` (V) in every step; its area's curve reaches `top` (V) if not 0.
     """
 
     def __init__(self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True) -> None:
@@ -187,14 +199,6 @@ def _gap_at(model: Model, y: FloatArray, u: float, sign: float, last: float) -> 
     found = float(gap_voltage(model, model.k_gap * u, dot(model.gap, y), sign, last))
     # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
     return last if math.isnan(found) else found
-
-
-# Number of sets of references cached with a scene: one for each thread and decade of tolerances.
-MOST_SETS = 16
-# Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
-MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
-# Number of references cached with the network, for runs with other sources.
-MOST_KEPT = 16
 
 
 class Known:
@@ -320,14 +324,8 @@ def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list
     return numbers, magnified, [parts[name].shape for name in REFERRED]
 
 
-# Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method. Where
-# an area strongly affects the charge of a stiff mode, the fixed-point iteration converges only with steps of the
-# mode's own time constant.
-MOST_STEPS = 100
-
-
 class March(Stepping):
-    """One integration in progress, with an error of at most `tol` times `u_scale` (V) in every step."""
+    """One integration of a network, with an error of at most `tol` times `u_scale` (V) in every step."""
 
     def __init__(self, problem: Problem, rtol: float, tol: float, u_scale: float, repeat: bool) -> None:
         scene, size = problem.scene, problem.initial.y.size
@@ -394,16 +392,8 @@ class March(Stepping):
         known.add(self.problem.scene, wanted)
 
 
-ATTEMPTS = 6
-# Voltage scale of a circuit whose sources give none, before any voltage has been computed, V.
-GUESS = 1.0
-
-
 def stepping(problem: Problem, rtol: float, tol: float, u_scale: float, top: float, repeat: bool) -> Track | March:
-    """An integration with an error of `tol` times `u_scale` (V) in every step, in a run that is asked for `rtol`.
-
-    A stack's area curve reaches `top` (V) if that is above 0.
-    """
+    """An integration with an error of `tol` times `u_scale` (V) in every step; for `top` see `Track`."""
     if problem.scene.stack is None:
         return March(problem, rtol, tol, u_scale, repeat)
     return Track(problem, rtol, tol * u_scale, top, repeat)

@@ -40,6 +40,16 @@ _SHARE, _FINEST, _KNOWN = 1e-3, 3e-13, 1e-2
 # Step relative to a parameter, at which what the runs' errors and the difference's truncation do are about the same;
 # and shares of it for outputs at which the gap voltage changes its sign in a step.
 _STEP, _CLOSER = 5e-4, (0.03, 1e-3)
+# Steps of an interval between samples: of the first two numbers, or below this `rtol` of the second and third, and twice as many while
+# these differ; and the error wanted, relative to the largest derivative, over `rtol`.
+_STEPS, _COARSE, _ALLOWED = (1, 2, 4, 8, 16, 32, 64), 1e-7, 10.0
+# Distance of the differences, over the largest voltage.
+_APART = 1e-5
+# Intervals whose derivatives are held at once.
+_AT_ONCE = 1 << 13
+# Change of starts that is left, over the largest voltage; errors of the polynomials, over that asked for.
+_CLOSED, _OF_AREA = 1e-14, 1e-2
+_ASKED = "derivatives by samples are asked for, and "
 
 # The same run of another circuit, with another `rtol`.
 Runner = Callable[[Circuit, float], Solution]
@@ -138,10 +148,7 @@ def check_request(problem: Problem, paths: Sequence[str], method: str) -> str:
 def sensitivities_of(
     problem: Problem, solution: Solution, paths: Sequence[str], run: Runner, over_period: bool = False
 ) -> dict[str, Sensitivity]:
-    """Derivatives of a run's signals and means; `over_period`: of means over a period, which a parameter may change.
-
-    A run with a parameter near its value that fails is a `SolveError`.
-    """
+    """Derivatives of a run's signals and means; `over_period`: of means over a period, which a parameter may change."""
     found = {}
     for one in [_Parameter(problem, path) for path in paths]:
         longer = one.longer() if problem.begun is not None else 0.0
@@ -167,18 +174,6 @@ def sensitivities_of(
             by[name] = by[name] + longer * (at_end - getattr(solution, name))
         found[one.path] = Sensitivity(one.path, one.unit, one.value, **by)
     return found
-
-
-# Steps of an interval: of the first two numbers, or below this `rtol` of the second and third, and twice as many while
-# these differ; and the error wanted, relative to the largest derivative, over `rtol`.
-_STEPS, _COARSE, _ALLOWED = (1, 2, 4, 8, 16, 32, 64), 1e-7, 10.0
-# Distance of the differences, over the largest voltage.
-_APART = 1e-5
-# Intervals whose derivatives are held at once.
-_AT_ONCE = 1 << 13
-# Change of starts that is left, over the largest voltage; errors of the polynomials, over that asked for.
-_CLOSED, _OF_AREA = 1e-14, 1e-2
-_ASKED = "derivatives by samples are asked for, and "
 
 
 def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:

@@ -38,6 +38,23 @@ MOST_PERIODS = 16
 # Nodes and weights of Gauss-Legendre quadrature on [0, 1], for integrals over a voltage from 0 V to its value.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
+# Tolerance of the early passes: relative to the last Newton step, and at most, relative to the voltage scale.
+_CRUDE, _FIRST = 1e-3, 1e-4
+# Finite differences of the map: perturbation relative to the voltage scale, and the tolerance of their passes, usual
+# and least.
+_SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 5e-4, 1e-9, 1e-11
+# A mode that decays by more powers of e than this in a period is not measured: its column is exp(-40) at most.
+_FORGOTTEN = 40.0
+# Passes after which the derivative is measured by finite differences, and after which the search fails.
+_PATIENCE, _MOST = 14, 60
+# The search has stagnated after so many passes in which no step was less than half of the smallest one before.
+# Round-off is accepted as the cause if the steps are below _NOISE times the voltage scale.
+_HELD_UP, _NOISE = 5, 1e-8
+# If the first step is longer than this times the voltage scale, the linear circuit's derivative is not good enough.
+_LONG = 0.1
+# A step longer than this times the voltage scale means that the search diverges.
+_ASTRAY = 1e3
+CHARGING = "a current source charges, from period to period, what nothing drains"
 
 
 class Period:
@@ -157,25 +174,6 @@ def _turns(problem: Problem) -> bool:
         if round(ratio) % 2 == 0 or abs(ratio - round(ratio)) > 1e-9:
             return False
     return True
-
-
-# Tolerance of the early passes: relative to the last Newton step, and at most, relative to the voltage scale.
-_CRUDE, _FIRST = 1e-3, 1e-4
-# Finite differences of the map: perturbation relative to the voltage scale, and the tolerance of their passes, usual
-# and least.
-_SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 5e-4, 1e-9, 1e-11
-# A mode that decays by more powers of e than this in a period is not measured: its column is exp(-40) at most.
-_FORGOTTEN = 40.0
-# Passes after which the derivative is measured by finite differences, and after which the search fails.
-_PATIENCE, _MOST = 14, 60
-# The search has stagnated after so many passes in which no step was less than half of the smallest one before.
-# Round-off is accepted as the cause if the steps are below _NOISE times the voltage scale.
-_HELD_UP, _NOISE = 5, 1e-8
-# If the first step is longer than this times the voltage scale, the linear circuit's derivative is not good enough.
-_LONG = 0.1
-# A step longer than this times the voltage scale means that the search diverges.
-_ASTRAY = 1e3
-CHARGING = "a current source charges, from period to period, what nothing drains"
 
 
 class Found(NamedTuple):
@@ -461,11 +459,9 @@ class Search(Period):
 def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
     """A problem, with its length, that starts from its periodic state, when the source has become periodic.
 
-    `rtol` bounds the error of the state alone, relative to the peaks over the period. Where round-off exceeds it, the
-    stated error is larger than `rtol`, and no error is raised.
-
-    Sources without a common period are refused; a period that cannot be integrated, or that leads to no
-    periodic state, is a `SolveError`.
+    `rtol` bounds the error of the state alone, relative to the peaks over the period; where round-off exceeds it, the
+    stated error is larger. Sources without a common period are refused; a period that cannot be integrated, or that
+    leads to no periodic state, is a `SolveError`.
     """
     if problem.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")

@@ -25,6 +25,7 @@ Progress = Callable[[float], None]
 PAST_FOLD = -0.01
 # Smallest force (N) whose error is judged; the error of a smaller one may be a denormal number with too few digits.
 LEAST_FORCE = 1e-290
+ROUGH = "the source function itself is rough by {:.2g} V"
 
 
 @dataclass
@@ -226,9 +227,6 @@ def apart(one: FloatArray, other: FloatArray) -> float:
 def nodes_apart(one: Record, other: Record) -> float:
     """As `apart`, of all nodes' voltages, V."""
     return max(map(apart, one.node_voltages.values(), other.node_voltages.values()), default=0.0)
-
-
-ROUGH = "the source function itself is rough by {:.2g} V"
 
 
 def run_failure(problem: Problem, run: Run, record: Record) -> Failure:

@@ -86,11 +86,7 @@ class Stepping(Integration):
         self.keep(0)
 
     def look_for_period(self, rates: FloatArray, scale: FloatArray, repeat: bool) -> None:
-        """Prepare the looks of the run, none where it is not to `repeat` a period.
-
-        `rates` (1/s) are those of the modes with the area frozen, and `scale` (n,) converts the first n entries of the
-        integration's state to volts.
-        """
+        """Prepare the looks of the run, none unless it is to `repeat` a period; `rates` (1/s) are those at 0 V."""
         problem, values = self.problem, np.zeros(loop.N_VALUES)
         start, live = max(problem.t_start, problem.waveform.settled), rates[rates > 0.0]
         values[loop.START], values[loop.STOP], values[loop.PERIOD] = start, problem.t_stop, self.period

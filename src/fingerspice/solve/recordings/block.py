@@ -43,6 +43,14 @@ OF_FORCE = 1.75
 LUCK = 2.0
 # Arrays of the present thread, which its next block overwrites: memory that is new to a process costs time.
 _OF_THREAD = threading.local()
+# Fewest samples for which this method pays, and the samples of a piece; pieces begin at multiples of that number.
+LEAST_SAMPLES, PIECE = 64, 1 << 18
+# Fewest points of a PWL at uneven times for which its own steps pay, whose loop has to be compiled once.
+LEAST_POINTS = 1000
+# Longest step on a line between two points, over their median distance.
+LONGEST = 4.0
+# Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, peak and thread.
+MOST_FORMS = 16
 
 
 def _scratch(name: str, *shape: int) -> FloatArray:
@@ -174,10 +182,7 @@ class Block:
         return np.array(self.kept[:, lane, self.n - lane * self.count])
 
     def judge(self, parts: int, peak: float, alike: FloatArray, chance: FloatArray) -> Judged:
-        """Errors of the block that has been followed in `parts` steps a sample.
-
-        The largest |xi| so far is `peak` (V); `alike` (m,) and `chance` (m, m) are those at the start, as in `Judged`.
-        """
+        """Errors of the block, followed in `parts` steps a sample, with those at its start; `peak` is of |xi|, V."""
         form, c, window, active, m = self.form, self.form.lanes, self._check(parts), self.active, self.m
         y, of_window = (self.rates[:, None] * took for took in (self.lengths, np.maximum(window.took, 1e-30)))
         # What a piece adds over what its window does, if all errors are alike, and of products of two, if they come by
@@ -217,8 +222,7 @@ class Block:
     def _hand_on(self, added: FloatArray, before: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Errors at the start of each piece (*kinds, pieces), and at the end of the block.
 
-        Pieces add `added` (*kinds, pieces), and `before` (*kinds,) is there at the start. Of one error for each mode,
-        or of the products of two.
+        Pieces add `added` (*kinds, pieces), and `before` (*kinds,) is there at the start: of modes, or products of two.
         """
         handed, lane = self.handed, (self.n - 1) // self.count
         left = np.exp(-self.rates * self.lengths[lane])
@@ -326,14 +330,6 @@ class Block:
         return to, out[0, : len(z)]
 
 
-# Fewest samples for which this method pays, and the samples of a piece; pieces begin at multiples of that number.
-LEAST_SAMPLES, PIECE = 64, 1 << 18
-# Fewest points of a PWL at uneven times for which its own steps pay, whose loop has to be compiled once.
-LEAST_POINTS = 1000
-# Longest step on a line between two points, over their median distance.
-LONGEST = 4.0
-
-
 @dataclass(frozen=True)
 class Piece:
     """A part of a run with evenly spaced samples, or with the points of a PWL."""
@@ -378,15 +374,8 @@ def driving(problem: Problem) -> tuple[int, Samples | PWL | None]:
     return on[0] if len(on) == 1 else (0, None)
 
 
-# Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, peak and thread.
-MOST_FORMS = 16
-
-
 def ready(problem: Problem, rtol: float) -> LaneForm | None:
-    """The scene under a recording (`driving`) prepared for a decade of errors; None where lanes do not apply to it.
-
-    It is cached with the scene, or with a stack for all sources of about its peak.
-    """
+    """The scene prepared for recordings, and cached; None where lanes do not apply to it."""
     scene, decade = problem.scene, float(10.0 ** np.floor(np.log10(rtol)))
     key: tuple[Any, ...] = "followed", decade, problem.charge, threading.get_ident()
     if scene.stack is not None:

@@ -64,6 +64,17 @@ MOST_DEGREE = 28
 _AREA_SHARE, _COARSEST = 0.003, 1e-5
 # Number of Chebyshev points for the area over the gap voltage.
 _POINTS = 64
+# Ratio of reference areas, so large that there is one.
+_ONE_REFERENCE = 1e12
+# Number of frequencies at which the gap's share is looked at.
+_FREQUENCIES = 65
+# Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
+# what they leave together is known but for about 1e-8.
+OF_MANY, ACTING = 1e-7, 0.05
+# Fewest active modes that code is compiled for.
+LEAST_MODES = 4
+# Reference area: that at this share of the largest gap voltage to expect.
+_TYPICAL = 0.5
 
 
 class Shown(NamedTuple):
@@ -126,10 +137,7 @@ class LaneForm(ABC):
         return not self.mobile and self.lanes.feed.shape[1] > self.lanes.tap_s.size
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
-        """Arrays for the state of the lanes, and for weights of steps (2, rows, 1 or lanes), each lane's `own` or not.
-
-        Those of steps of length 0 are there, for the others see `weigh`.
-        """
+        """Arrays for the lanes' state, and for weights of steps (2, rows, 1 or lanes): of length 0, and by `weigh`."""
         marks, wide = self.marks(own), PIECES if own else 1
         count = of_lanes.weighed(*map(len, marks[:5])).end
         state, weights = aligned([(of_lanes.rows_of(marks).end * PIECES,), (2, count, wide)])
@@ -196,10 +204,8 @@ def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
     for degree in range(4, MOST_DEGREE + 1, 4):
         off = float(np.abs(series[degree + 1 :]).sum())
         if off <= tol:
-            kept = np.zeros(degree + 1)
-            kept[: min(series.size, degree + 1)] = series[: degree + 1]
             out = np.empty(degree + 1)
-            chebyshev.to_powers(kept, out)
+            chebyshev.to_powers(series[: degree + 1], out)
             return out, off
     return np.empty(0), 0.0
 
@@ -246,10 +252,6 @@ def curves(
 def _chebyshev(x: FloatArray, count: int) -> FloatArray:
     """The first Chebyshev polynomials at x (n,) from -1 to 1, shape (n, count)."""
     return np.asarray(np.cos(np.arange(count) * np.arccos(np.clip(x, -1.0, 1.0))[:, None]))
-
-
-# Ratio of reference areas, so large that there is one.
-_ONE_REFERENCE = 1e12
 
 
 @dataclass(frozen=True)
@@ -450,17 +452,6 @@ def _turns(nodes: list[tuple[str, str]], first: int) -> FloatArray:
     inner = [[(a == node) - (b == node) for a, b in nodes] for node, count in ends.items() if count == 2]
     current = np.linalg.svd(np.array(inner, float).reshape(-1, len(nodes)))[2][-1]
     return np.asarray(np.round(current / current[first]))
-
-
-# Number of frequencies at which the gap's share is looked at.
-_FREQUENCIES = 65
-# Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
-# what they leave together is known but for about 1e-8.
-OF_MANY, ACTING = 1e-7, 0.05
-# Fewest active modes that code is compiled for.
-LEAST_MODES = 4
-# Reference area: that at this share of the largest gap voltage to expect.
-_TYPICAL = 0.5
 
 
 def is_followed(scene: Scene, circuit: Circuit) -> bool:

@@ -51,6 +51,9 @@ _ONE_ROW = np.zeros(1, np.int64)
 LEAST_PEAK = 1e-3
 # In the first sample of a network it is this share, as the errors of the polynomials stand beside a small peak there.
 LEAST_AT_START = 0.1
+# Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
+# and add up, a later piece cannot make up for errors of the earlier ones.
+BEGINNINGS = (1.0, 0.03)
 
 
 class LostError(Exception):
@@ -254,11 +257,6 @@ class LaneMarch:
         run.gaps, run.node_error, run.charge_error = self._stated(self.errors, self.peak)
         run.margin, run.by_layer = self.margin, self.problem.scene.stack is not None
         return run
-
-
-# Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
-# and add up, a later piece cannot make up for errors of the earlier ones.
-BEGINNINGS = (1.0, 0.03)
 
 
 def prepared(problem: Problem, rtol: float) -> tuple[list[Piece], LaneForm] | None:
