@@ -154,7 +154,7 @@ class Track(Stepping):
     def state(self) -> State:
         c = self.control
         found = StackState(self.t, self.y.copy(), float(c["u_before"]), float(c["u_gap"]), self.start.offset)
-        return from_stack(self.problem.scene, on_branch(self.system.model, found, float(c["sign"])))
+        return on_branch(self.problem.scene, self.system.model, found, float(c["sign"]))
 
     def written(self) -> FloatArray:
         n_out, model, shown = int(self.counters[readout.OUTPUT]), self.system.model, self.problem.scene.shown
@@ -187,11 +187,11 @@ class Track(Stepping):
         return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
 
 
-def on_branch(model: Model, state: StackState, sign: float) -> StackState:
+def on_branch(scene: Scene, model: Model, state: StackState, sign: float) -> State:
     """The state with its gap voltage computed anew from the area equation, on the branch with this sign."""
-    if not model.mobile:
-        return state
-    return state._replace(u_gap=_gap_at(model, state.y, state.u_before, sign or 1.0, state.u_gap))
+    if model.mobile:
+        state = state._replace(u_gap=_gap_at(model, state.y, state.u_before, sign or 1.0, state.u_gap))
+    return from_stack(scene, state)
 
 
 def _gap_at(model: Model, y: FloatArray, u: float, sign: float, last: float) -> float:

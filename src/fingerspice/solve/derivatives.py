@@ -40,8 +40,8 @@ _SHARE, _FINEST, _KNOWN = 1e-3, 3e-13, 1e-2
 # Step relative to a parameter, at which what the runs' errors and the difference's truncation do are about the same;
 # and shares of it for outputs at which the gap voltage changes its sign in a step.
 _STEP, _CLOSER = 5e-4, (0.03, 1e-3)
-# Steps of an interval between samples: of the first two numbers, or below this `rtol` of the second and third, and twice as many while
-# these differ; and the error wanted, relative to the largest derivative, over `rtol`.
+# Steps between two samples: of the first two numbers, or below this `rtol` of the second and third, and twice as many
+# while these differ; and the error wanted, relative to the largest derivative, over `rtol`.
 _STEPS, _COARSE, _ALLOWED = (1, 2, 4, 8, 16, 32, 64), 1e-7, 10.0
 # Distance of the differences, over the largest voltage.
 _APART = 1e-5
@@ -243,20 +243,6 @@ class _Intervals:
         # Lengths of the intervals (n,), or their common one (1,), s
         self.h = h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
 
-    def follow(self) -> None:
-        """Find the modes at the starts of all intervals (m, n), and the distances of their differences (m + 1,)."""
-        form, n = self.form, self.t.size - 1
-        block, start = Block(form, self.x, self.h, True), form.start(self.problem)[0][: self.m]
-        peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
-        solved = block.solve(start, _STEPS[self.first + 2], _CLOSED * peak) and block.on_one_branch
-        if not solved or float(np.abs(form.gap(block.xi)).max()) > form.u_top:
-            cause = "the run is not followed sample by sample, for its derivatives by samples"
-            at = float(self.t[0])
-            raise SolveError(Failure(Status.STEP_UNDERFLOW, cause, "a higher sample rate takes shorter steps", at))
-        self.z = block.kept[: self.m, :, :-1].reshape(self.m, -1)[:, :n]
-        sizes = np.append(np.abs(self.z).max(axis=1), np.abs(self.x).max())
-        self.delta = _APART * np.where(sizes > 0.0, sizes, peak)
-
     def _slopes(self, at: IntArray, to: FloatArray, length: FloatArray, parts: int) -> FloatArray:
         """Derivatives of what intervals lead to as `sum_back` takes them, by central differences."""
         form, own, m = self.form, length.size > 1, self.m
@@ -326,8 +312,18 @@ class _Intervals:
 
     def swept(self, by: Mapping[str, Any]) -> FloatArray:
         """Derivatives of a number by the samples, with half the steps and with all, shape (2, n_sample)."""
-        self.follow()
-        t, m, wave, ((_, contact),) = self.t, self.m, self.wave, self.run.record.fingers
+        t, m, wave, form, ((_, contact),) = self.t, self.m, self.wave, self.form, self.run.record.fingers
+        block, start = Block(form, self.x, self.h, True), form.start(self.problem)[0][:m]
+        peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
+        solved = block.solve(start, _STEPS[self.first + 2], _CLOSED * peak) and block.on_one_branch
+        if not solved or float(np.abs(form.gap(block.xi)).max()) > form.u_top:
+            cause = "the run is not followed sample by sample, for its derivatives by samples"
+            action = "a higher sample rate takes shorter steps"
+            raise SolveError(Failure(Status.STEP_UNDERFLOW, cause, action, float(t[0])))
+        # The modes at the starts of all intervals (m, n), and the distances of their differences (m + 1,).
+        self.z = block.kept[:m, :, :-1].reshape(m, -1)[:, : t.size - 1]
+        sizes = np.append(np.abs(self.z).max(axis=1), np.abs(self.x).max())
+        self.delta = _APART * np.where(sizes > 0.0, sizes, peak)
         of_modes, of_source = self.outputs(by)
         n, after, means = t.size - 1, np.zeros((2, m)), np.zeros((MORE, t.size - 1))
         means[SQUARES], means[AREAS] = by["f_el_mean"] * contact.stress(1.0), by["area_mean"]
@@ -343,7 +339,7 @@ class _Intervals:
             # The modes at the start follow the source there.
             step = STEP * self.problem.scene.u_peak
             moved = [Sum((wave, DC(self.sign * at * step))) for at in AT]
-            starts = [self.form.start(_problem(self.run, {self.name: one})) for one in moved]
+            starts = [form.start(_problem(self.run, {self.name: one})) for one in moved]
             of_source[:, 0] += after @ derivative([start[:m] for start, _ in starts], step)
         # Samples before the times, and how far these are beyond, in samples.
         out, place = np.zeros((2, wave.count)), np.clip((t - wave.start) * wave.rate, 0.0, wave.count - 1.0)

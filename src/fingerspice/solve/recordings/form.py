@@ -47,7 +47,7 @@ from fingerspice.results.outcome import State
 from fingerspice.solve.collocation import by_modes, on_branch, system_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK, Scene
-from fingerspice.solve.starting import StackState, from_stack
+from fingerspice.solve.starting import StackState
 from fingerspice.waveforms.samples import Samples
 
 # Number of lanes, each with a piece of a recording.
@@ -284,7 +284,7 @@ class StackForm(LaneForm):
         charge = z[self.active] + self._rest(z, u_gap, u_last) if self.flows else start.y[-1]
         y = np.append(self.system.live[0] @ z[: start.y.size - 1], charge)
         found = StackState(t, y, u_last, u_gap, start.offset)
-        return from_stack(problem.scene, on_branch(self.system.model, found, math.copysign(1.0, u_gap)))
+        return on_branch(problem.scene, self.system.model, found, math.copysign(1.0, u_gap))
 
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
         turn = problem.scene.shown.turn
