@@ -23,7 +23,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, cast
@@ -325,28 +324,23 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
         columns, shape = np.vstack([columns, np.append(column, 1.0)]), np.append(shape, 0.0)
         k, moves = np.append(k, stored), np.append(moves, moved)
     own = rates, gain, shape, float(model.k_gap), taps, tap_s, np.zeros(tap_s.size), feed
-    lanes, active, wide = roomy(Lanes(*own, kinks=kinks, fast=0, **curve), n)
-    voltages = np.arange(k.size) < system.k_shown.size
+    shown = Shown(columns, k, moves, (np.arange(k.size) < system.k_shown.size) & model.mobile)
+    of_nodes = Shown(nodes, system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile))
+    lanes, active, shown, of_nodes = roomy(Lanes(*own, kinks=kinks, fast=0, **curve), n, shown, of_nodes)
     return StackForm(
-        lanes, active, 1 if rtol >= BY_SIMPSON else 2, model.mobile,
-        Shown(wide(columns), k, moves, voltages & model.mobile),
-        Shown(wide(nodes), system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile)),
-        int(problem.charge), system.stress, float(model.k_gap), system.u_top, missed, missed_bend,
-        float(model.slow[-3]) * area0, system,
+        lanes, active, 1 if rtol >= BY_SIMPSON else 2, model.mobile, shown, of_nodes, int(problem.charge),
+        system.stress, float(model.k_gap), system.u_top, missed, missed_bend, float(model.slow[-3]) * area0, system,
     )  # fmt: skip
 
 
-def roomy(lanes: Lanes, n: int, least: int = 1) -> tuple[Lanes, int, Callable[[FloatArray], FloatArray]]:
-    """The constants of n active modes and the others with as many modes and leaks as code is compiled for.
-
-    Also the number of active modes, and what makes room for them in rows (..., m).
-    """
+def roomy(lanes: Lanes, n: int, rows: Shown, nodes: Shown, least: int = 1) -> tuple[Lanes, int, Shown, Shown]:
+    """Constants of n active modes and the others, for as many modes and leaks as code is compiled for; their number."""
     active, leaks = next((size for size in SIZES if size >= max(n, least)), n), lanes.tap_s.size
     more = [leaks] * max(LEAST_LEAKS - leaks, 0)
 
-    def wide(rows: FloatArray) -> FloatArray:
-        still = np.zeros((*rows.shape[:-1], active - n))
-        return np.concatenate([rows[..., :n], still, rows[..., n:]], axis=-1)
+    def wide(x: FloatArray) -> FloatArray:
+        still = np.zeros((*x.shape[:-1], active - n))
+        return np.concatenate([x[..., :n], still, x[..., n:]], axis=-1)
 
     lanes = lanes._replace(
         rates=wide(lanes.rates), gain=wide(lanes.gain), shape=wide(lanes.shape),
@@ -354,7 +348,7 @@ def roomy(lanes: Lanes, n: int, least: int = 1) -> tuple[Lanes, int, Callable[[F
         bent=np.insert(lanes.bent, more, 0.0), kinks=np.insert(lanes.kinks, more, 0.0),
         feed=wide(np.insert(lanes.feed, more, 0.0, axis=1).T).T.copy(),
     )  # fmt: skip
-    return lanes, active, wide
+    return lanes, active, rows._replace(columns=wide(rows.columns)), nodes._replace(columns=wide(nodes.columns))
 
 
 def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:
@@ -537,8 +531,8 @@ def finger(problem: Problem, rtol: float, source: int, wave: Samples) -> Network
     kinks[-1] = 0.5 * curve["scale"] ** 2 * polyval(-1.0, polyder(curve["bend"], 2))
     fast = int(np.argmax(shares * one.modes.rates))
     own = one.rates, one.gain, one.shape, one.k, one.taps, one.tap_s, one.bent, one.feed
-    lanes, active, wide = roomy(Lanes(*own, kinks=kinks, fast=fast, **curve), one.absorbed.size, LEAST_MODES)
-    rows, nodes = (shown._replace(columns=wide(shown.columns)) for shown in (one.rows, one.nodes))
+    lanes = Lanes(*own, kinks=kinks, fast=fast, **curve)
+    lanes, active, rows, nodes = roomy(lanes, one.absorbed.size, one.rows, one.nodes, LEAST_MODES)
     return NetworkForm(
         lanes, active, 2, False, rows, nodes, one.rates.size - one.absorbed.size, float(contact.stress(1.0)), share,
         scene.u_top, missed, missed_bend, float(problem.network.capacitance(area0).sum()), one,
