@@ -168,7 +168,7 @@ class Stream:
             try:
                 self._ready.append((mark, *self._piece(march)))
             except LostError:
-                self._stand(mark)
+                # The state before this piece.
                 self._state, self._march = march.state, None
 
     def _piece(self, march: LaneMarch) -> tuple[FloatArray, FloatArray]:
