@@ -65,6 +65,7 @@ class Period:
         assert waveform.period is not None
         # The first whole period after the sources have become periodic, and not before the run's start, s.
         self.begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
+        self.contacts = {i: one for i, one in enumerate(scene.network.contacts) if one is not None}
         # Modes of the circuit with its areas at 0 V, and their number.
         self.modes: Modes = scene.modes
         n = self.n = self.modes.rates.size
@@ -121,9 +122,7 @@ class Period:
         area, charge = scene.area0.copy(), np.zeros(u.size)
         for share, part in zip(along, weight, strict=True):
             for i in np.flatnonzero(net.gap >= 0):
-                slow, contact = net.slow[i], network.contacts[i]
-                assert contact is not None
-                following = float(contact.area(share * abs(u[net.gap[i]])))
+                slow, following = net.slow[i], float(self.contacts[i].area(share * abs(u[net.gap[i]])))
                 area[i] = following if slow < 0 else net.area0[i] * z[self.n + slow]
             charge += part * network.capacitance(area) * u
         return np.asarray(self.modes.shape[:, held].T @ (net.p.T @ charge))
@@ -240,10 +239,8 @@ class Search(Period):
             s = np.column_stack([wave.value(times) for wave in problem.waveforms])
             x = along @ modes.shape.T - s @ modes.follow.T
             for k, i in enumerate(slow):
-                contact = problem.network.contacts[i]
-                assert contact is not None
                 u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
-                relative[k] = float(np.mean(contact.area(np.abs(u)))) / problem.scene.area0[i]
+                relative[k] = float(np.mean(self.contacts[i].area(np.abs(u)))) / problem.scene.area0[i]
         return np.append(np.where(self.neutral[: self.n], self.kept, start), relative)
 
     def _inverse(self, slope: FloatArray) -> FloatArray:
@@ -299,14 +296,13 @@ class Search(Period):
 
     def _collocated(self, problem: Problem, tol: float) -> _Pass:
         """One pass by the implicit method, with its error from a coarser pass."""
-        scene, network = problem.scene, problem.network
+        scene = problem.scene
         status, one, error = pass_through(problem, self.sources, tol, self.scale)
         if status is not Status.SUCCESS:
             raise no_period(problem, status, one.t)
         met = np.zeros((len(self.fingers), 4))
         for row, i in zip(met, self.fingers, strict=True):
-            peak, contact = float(one.peaks[i]), network.contacts[i]
-            assert contact is not None
+            peak, contact = float(one.peaks[i]), self.contacts[i]
             area = float(contact.area(peak)) if scene.net.gap[i] >= 0 else float(scene.area0[i])
             row[:2] = peak, float(contact.stress(peak)) * area
         rounding = (np.abs(self.gap[:, : self.n]) @ np.abs(self.modes.inverse)).sum(axis=1)
