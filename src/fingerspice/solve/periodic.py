@@ -121,7 +121,7 @@ class Period:
         along, weight = (np.ones(1), np.ones(1)) if net.mobile else _GAUSS
         area, charge = scene.area0.copy(), np.zeros(u.size)
         for share, part in zip(along, weight, strict=True):
-            for i in np.flatnonzero(net.gap >= 0):
+            for i in np.flatnonzero(net.gap >= 0).tolist():
                 slow, following = net.slow[i], float(self.contacts[i].area(share * abs(u[net.gap[i]])))
                 area[i] = following if slow < 0 else net.area0[i] * z[self.n + slow]
             charge += part * network.capacitance(area) * u
@@ -238,7 +238,7 @@ class Search(Period):
         if slow.size:
             s = np.column_stack([wave.value(times) for wave in problem.waveforms])
             x = along @ modes.shape.T - s @ modes.follow.T
-            for k, i in enumerate(slow):
+            for k, i in enumerate(slow.tolist()):
                 u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
                 relative[k] = float(np.mean(self.contacts[i].area(np.abs(u)))) / problem.scene.area0[i]
         return np.append(np.where(self.neutral[: self.n], self.kept, start), relative)
