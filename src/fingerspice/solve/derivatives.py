@@ -200,31 +200,25 @@ def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
     return by
 
 
-def _source_of(problem: Problem) -> tuple[str, float, Samples]:
-    """Name, sign along the loop and samples of the only source that is a recording, beside constant ones."""
-    scene, stack = problem.scene, problem.scene.stack
-    if len(problem.network.fingers) != 1 or not scene.coupled:
-        raise InputError(f"{_ASKED}the circuit has no single GAP whose area is coupled; allowed: one")
-    sources = [(e, 1.0) for e in problem.network.sources] if stack is None else stack.sources
-    waves = [(e.name, float(sign), None if e.waveform is None else as_samples(e.waveform)) for e, sign in sources]
-    known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
-    if len(known) != 1 or not isinstance(driving(problem)[1], Samples):
-        others = "sources of 0" if stack is None else "constant ones"
-        raise InputError(
-            f"{_ASKED}of the circuit's {len(waves)} sources {len(known)} are recordings; allowed: one, such as "
-            f"fs.Samples, or a PWL on an even grid, beside {others}"
-        )
-    return known[0]
-
-
 class _Intervals:
     """The intervals of a run between the samples of its source."""
 
     def __init__(self, run: Solution) -> None:
         self.run, self.problem = run, _problem(run, {})
-        problem, rtol = self.problem, run.rtol
-        # Of the source: its name, its sign along the loop, and its samples.
-        self.name, self.sign, wave = _source_of(problem)
+        problem, stack, rtol = self.problem, self.problem.scene.stack, run.rtol
+        if len(problem.network.fingers) != 1 or not problem.scene.coupled:
+            raise InputError(f"{_ASKED}the circuit has no single GAP whose area is coupled; allowed: one")
+        # Of each source: its name, its sign along the loop, and its samples.
+        sources = [(e, 1.0) for e in problem.network.sources] if stack is None else stack.sources
+        waves = [(e.name, float(sign), None if e.waveform is None else as_samples(e.waveform)) for e, sign in sources]
+        known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
+        if len(known) != 1 or not isinstance(driving(problem)[1], Samples):
+            others = "sources of 0" if stack is None else "constant ones"
+            raise InputError(
+                f"{_ASKED}of the circuit's {len(waves)} sources {len(known)} are recordings; allowed: one, such as "
+                f"fs.Samples, or a PWL on an even grid, beside {others}"
+            )
+        ((self.name, self.sign, wave),) = known
         form = ready(problem, max(_OF_AREA * rtol, 1e-13)) or ready(problem, rtol)
         if form is None:
             raise InputError(
