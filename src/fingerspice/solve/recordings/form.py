@@ -384,7 +384,7 @@ class Reduced:
 
     def __init__(self, scene: Scene, source: int, area0: FloatArray, charge: bool) -> None:
         net, network = scene.net, scene.network
-        self.scene, self.source, self.area0, modes = scene, source, area0, network_modes(network, area0)
+        self.source, modes = source, network_modes(network, area0)
         # The area that moves, and the cell whose voltage it follows.
         self.moving = int(np.flatnonzero(net.gap >= 0)[0])
         self.gap, self.q0, self.modes = int(net.gap[self.moving]), 1.0 / float(area0[self.moving]), modes
@@ -392,13 +392,8 @@ class Reduced:
         none = np.zeros((n, n_s))
         # Voltages of all cells, and what the sources deliver, from v and from the sources.
         by = by_modes(network, modes, area0)
-        tap, tap_s, lost, lost_s, stored = (
-            by["tap"],
-            by["tap_s"],
-            by["lost"][:n_s],
-            by["lost_s"][:n_s],
-            by["stored"][:n_s],
-        )
+        tap, tap_s = by["tap"], by["tap_s"]
+        lost, lost_s, stored, stored_s = (by[name][:n_s] for name in ("lost", "lost_s", "stored", "stored_s"))
         # The cells whose area moves, and the direction of each along their path, relative to that of the gap.
         fed = np.flatnonzero(net.place == self.moving)
         turn = _turns([network.cells[i].nodes for i in fed], int(np.flatnonzero(fed == self.gap)[0]))
@@ -432,12 +427,11 @@ class Reduced:
         moved = stored @ self.absorbed + through[:, fed] @ turn * net.c[self.gap]
         self.rows = Shown(
             np.block([[modes.shape, none], [stored - over, np.eye(n_s)]]),
-            np.append(-modes.follow[:, source], by["stored_s"][:n_s, source]),
+            np.append(-modes.follow[:, source], stored_s[:, source]),
             np.append(modes.shape @ self.absorbed, moved), np.zeros(n + n_s, bool),
         )  # fmt: skip
-        still = np.zeros(len(by["node"]))
-        columns = np.pad(by["node"], ((0, 0), (0, n_s)))
-        self.nodes = Shown(columns, still, by["node"] @ self.absorbed, still > 0.0)
+        nodes, still = by["node"], np.zeros(len(by["node"]))
+        self.nodes = Shown(np.pad(nodes, ((0, 0), (0, n_s))), still, nodes @ self.absorbed, still > 0.0)
 
 
 def _turns(nodes: list[tuple[str, str]], first: int) -> FloatArray:
@@ -474,7 +468,7 @@ class NetworkForm(LaneForm):
     def start(self, problem: Problem) -> tuple[FloatArray, float]:
         start, reduced, active, c = problem.initial, self.reduced, self.active, self.lanes
         n = reduced.absorbed.size
-        x, s, net = start.y[:n], start.s_before, reduced.scene.net
+        x, s, net = start.y[:n], start.s_before, problem.scene.net
         u = xi = float(net.p[reduced.gap] @ x + net.q[reduced.gap] @ s)
         # Newton's method from the gap voltage to xi.
         for _ in range(50):
