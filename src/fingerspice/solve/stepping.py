@@ -90,9 +90,8 @@ class Stepping(Integration):
         problem, values = self.problem, np.zeros(loop.N_VALUES)
         start, live = max(problem.t_start, problem.waveform.settled), rates[rates > 0.0]
         values[loop.START], values[loop.STOP], values[loop.PERIOD] = start, problem.t_stop, self.period
-        values[loop.ALLOWED], values[loop.HAS_CHARGE], values[loop.LOOKED] = (
-            _SHARE * self.pace.tol, problem.charge, -1.0,
-        )  # fmt: skip
+        values[loop.ALLOWED], values[loop.HAS_CHARGE] = _SHARE * self.pace.tol, problem.charge
+        values[loop.LOOKED] = -1.0
         # A mode with rate 0 keeps its charge for ever, so that it does not limit the time to the periodic state.
         values[loop.RATE] = loop.RATE_SHARE * float(live.min()) if live.size else math.inf
         values[loop.DISTANCE] = values[loop.REMAINING] = values[loop.TRIAL] = math.inf
