@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import mpmath
@@ -53,6 +54,13 @@ def test_samples_are_followed_as_the_reference_follows_them(law: str) -> None:
         run = follow(fs.Samples(values, RATE), float(knots[-2]), t_eval=t, charge_law=law, rtol=rtol)
         assert_met(run, exact.u_gap, exact.force, rtol)
         assert np.abs(run.q_source - exact.q).max() <= run.error.q_source + 1e-12 * np.abs(exact.q).max()
+
+
+def test_a_run_along_a_recording_is_pickled() -> None:
+    run = follow(fs.Samples(recording(), RATE), 0.01)
+    copied = pickle.loads(pickle.dumps(run))
+    assert copied.method == "relaxation"
+    assert copied.summary() == run.summary()
 
 
 @pytest.mark.parametrize(("rtol", "rate"), [(1e-4, 8e3), (1e-6, 48e3)])

@@ -22,8 +22,8 @@ import pytest
 import fingerspice as fs
 import recording_errors
 from commands import Command, tree
+from fingerspice.solve import streaming
 from fingerspice.solve.recordings import block as pieces
-from fingerspice.solve.recordings import run as recordings
 from fingerspice.waveforms import samples
 from processes import forked, no_room_here
 from scenes import cases, dispersive_deck, every_law, table1, table1_deck
@@ -120,7 +120,7 @@ def test_a_quiet_beginning_is_followed_to_its_own_scale() -> None:
 
 @pytest.mark.parametrize("name", ["two_fingers", "amplifier", "fingerpad_square", "texture_recording"])
 def test_any_circuit_is_streamed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recordings, "WINDOW", 400)
+    monkeypatch.setattr(streaming, "WINDOW", 400)
     circuit = fs.read_netlist(Path(__file__).parents[1] / "circuits" / f"{name}.cir")
     how = {"rtol": 1e-6, "t_stop": 0.03}
     one, other = (list(fs.stream(circuit, count=count, **how)) for count in (251, 10**6))

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray, IntArray, views_of
+from fingerspice.circuit.network import Modes, Network
 from fingerspice.engine.collocation import readout
 from fingerspice.engine.collocation.exponential import Tables as StepTables
 from fingerspice.engine.collocation.exponential import forget, new_tables
@@ -22,18 +23,11 @@ from fingerspice.engine.collocation.step_control import end_row
 from fingerspice.engine.many_areas.form import REFERRED, Form, new_network_work
 from fingerspice.engine.many_areas.step import ManyAreas, References
 from fingerspice.engine.network import Sources, source
+from fingerspice.engine.one_area import system as systems
 from fingerspice.engine.one_area.model import Model, dot, gap_voltage, write_row_at
 from fingerspice.engine.one_area.rows import Work, new_stack_work
 from fingerspice.engine.one_area.step import OneArea
-from fingerspice.engine.one_area.system import (
-    LEVEL_RATIO,
-    System,
-    area_error,
-    area_missed,
-    area_polynomials,
-    area_range,
-    build_system,
-)
+from fingerspice.engine.one_area.system import LEVEL_RATIO, System, area_error, area_missed
 from fingerspice.numerics.lobatto import integral_table
 from fingerspice.physics.contact import inverse_areas
 from fingerspice.results.outcome import State, Status
@@ -50,6 +44,19 @@ MOST_SYSTEMS = 16
 # reference, the errors of gap voltage and charge were 1.5 times the estimates, because they peak between the points of
 # the estimate; and from scene 7710 of tests/stress.py, whose area grows by a factor of 5e5 after every jump: 1.6 times.
 CHARGE_SAFETY = 1.75
+# Number of sets of references cached with a scene: one for each thread and decade of tolerances.
+MOST_SETS = 16
+# Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
+MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
+# Number of references cached with the network, for runs with other sources.
+MOST_KEPT = 16
+# Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method. Where
+# an area strongly affects the charge of a stiff mode, the fixed-point iteration converges only with steps of the
+# mode's own time constant.
+MOST_STEPS = 100
+ATTEMPTS = 6
+# Voltage scale of a circuit whose sources give none, before any voltage has been computed, V.
+GUESS = 1.0
 
 
 class _Scratch(threading.local):
@@ -59,33 +66,19 @@ class _Scratch(threading.local):
     """
 
     def __init__(self) -> None:
-        self.by_size: dict[int, tuple[StepTables, Work]] = {}
-        self.system: dict[int, System] = {}
+        self.by_size: dict[int, tuple[StepTables, Work, System]] = {}
 
     def of(self, system: System) -> tuple[StepTables, Work]:
         """Tables and arrays for the next call of a compiled loop: another system's run may use them after that."""
         n = system.model.gap.size
-        if n not in self.by_size:
-            self.by_size[n] = new_tables(n), new_stack_work(n)
-        if self.system.get(n) is not system:
-            self.system[n] = system
-            forget(self.by_size[n][0])
-        return self.by_size[n]
+        tables, work, before = self.by_size.get(n) or (new_tables(n), new_stack_work(n), None)
+        if before is not system:
+            self.by_size[n] = tables, work, system
+            forget(tables)
+        return tables, work
 
 
 SCRATCH = _Scratch()
-
-
-def _prepared(scene: Scene, rtol: float, u_top: float) -> tuple[System, float]:
-    """The modal system of a scene, made on first use, and the relative error of its area's polynomial."""
-    # The cache distinguishes tolerances by their decade, so that similar runs share a system.
-    decade = int(np.floor(np.log10(rtol)))
-
-    def make() -> tuple[System, float]:
-        system = system_of(scene, decade, u_top)
-        return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
-
-    return kept_with(scene.prepared, ("system", decade, u_top), MOST_SYSTEMS, make)
 
 
 def system_of(
@@ -97,38 +90,40 @@ def system_of(
     """
     model, (contact,) = model_of(scene), scene.network.contacts
     assert scene.stack is not None
-    if u_top > 0.0:
-        assert contact is not None
+    if u_top > 0.0 and contact is not None:
         model = model._replace(curve=contact.curve(u_top))
     stress = 0.0 if contact is None else float(contact.stress(1.0))
     u_max, n = u_peak or max(scene.u_peak, u_top), model.gap.size
     nodes = scene.network.nodes[:, : n + 1] * np.append(scene.turn, 1.0)
-    u_range = area_range(model, u_max)
-    return build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress, ratio)
+    u_range = systems.area_range(model, u_max)
+    return systems.build_system(model, area_error(decade), u_range, scene.stack.grouping, nodes, stress, ratio)
 
 
 class Track(Stepping):
-    """One integration in progress, with an error of the gap voltage of at most `tol` (V) in every step.
+    """One integration of a stack: the loop's state is that of `engine.one_area.model`.
 
-    The area's curve reaches `top` (V) if that is above 0. The loop's state is that of `engine.one_area.model`; `state`
-    and the outputs have the form used for all circuits.
+    The error of the gap voltage is at most `tol` (V) in every step; its area's curve reaches `top` (V) if not 0.
     """
 
-    def __init__(
-        self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True, h_fixed: float = 0.0
-    ) -> None:
-        scene = problem.scene
-        self.system, self.area_error = _prepared(scene, rtol, top)
+    def __init__(self, problem: Problem, rtol: float, tol: float, top: float = 0.0, repeat: bool = True) -> None:
+        scene, decade = problem.scene, int(np.floor(np.log10(rtol)))
+
+        def make() -> tuple[System, float]:
+            system = system_of(scene, decade, top)
+            return system, area_missed(system.model.curve, decade) if system.model.coupled else 0.0
+
+        # Similar runs share a system: there is one for each decade of tolerances.
+        self.system, self.area_error = kept_with(scene.prepared, ("system", decade, top), MOST_SYSTEMS, make)
         model, n, shown = self.system.model, problem.initial.y.size - 1, scene.shown.turn.size
         self.gaps, self.largest, self.charge_safety = [0], scene.u_size, CHARGE_SAFETY
         # Of the layer through which the charge is computed.
         self.capacitance = float(model.slow[-3]) * model.area0
-        super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown, h_fixed)
+        super().__init__(problem, tol, shown, shown + 2 if problem.charge else shown)
         self.error = np.zeros(n + 1)
         self.control["branch_length"] = np.inf
         self.control["margin"] = 1.0
         self._start_from(problem.inner)
-        self.look_for_period(self.system.rates, np.ones(n), repeat and h_fixed == 0.0)
+        self.look_for_period(self.system.rates, np.ones(n), repeat)
 
     def _start_from(self, start: StackState) -> None:
         self.start, self.y[:], self.control["u_before"] = start, start.y, start.u_before
@@ -148,25 +143,29 @@ class Track(Stepping):
     def circuit(self, sources: Sources) -> OneArea:
         return OneArea(self.system, *SCRATCH.of(self.system), integral_table(), sources)
 
-    def _failed(self, code: int, sources: Sources) -> Status:
+    def failed(self, code: int, sources: Sources) -> Status:
         if code == readout.OUT_OF_RANGE:
             raise OutOfRangeError(self.system.u_top)
         if self.t > sources.edges[0]:
             # The loop updates the source's value at edges and at `t_end` only: a failed call leaves an old value.
             self.control["u_before"], _ = source(*segment_of(sources, self.t, "left"))
-        return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
+        return super().failed(code, sources)
 
     def state(self) -> State:
         c = self.control
         found = StackState(self.t, self.y.copy(), float(c["u_before"]), float(c["u_gap"]), self.start.offset)
-        return from_stack(self.problem.scene, on_branch(self.system.model, found, float(c["sign"])))
+        return on_branch(self.problem.scene, self.system.model, found, float(c["sign"]))
 
     def written(self) -> FloatArray:
-        n_out = int(self.counters[readout.OUTPUT])
-        model = self.system.model
-        wanted = self.pace.charge and model.mobile
-        u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out]) if wanted else np.empty(0)
-        return as_recorded(self.problem, model, self.out[:, :n_out].T, u)
+        n_out, model, shown = int(self.counters[readout.OUTPUT]), self.system.model, self.problem.scene.shown
+        rows, n = self.out[:, :n_out].T, shown.turn.size
+        rows[:, :n] *= shown.turn
+        if self.pace.charge and model.mobile:
+            (cell,), network = shown.measured, shown.network
+            u = sided(self.problem.waveform, self.t_out[:n_out], self.left[:n_out])
+            u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
+            rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - self.problem.inner.offset
+        return rows
 
     def finish(self, sources: Sources, after: Sources | None) -> None:
         first = int(self.counters[readout.OUTPUT])
@@ -184,47 +183,22 @@ class Track(Stepping):
         segment, tau = segment_of(sources, self.t, side)
         row = np.empty(row_width(self.problem.scene))
         u, du = source(segment, tau)
-        found = gap_voltage(model, model.k_gap * u, dot(model.gap, self.y), c["sign"], c["u_gap"])
-        # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
-        write_row_at(model, u, du, self.y, c["sign"], found if found == found else c["u_gap"], row)
+        write_row_at(model, u, du, self.y, c["sign"], _gap_at(model, self.y, u, c["sign"], c["u_gap"]), row)
         return from_written(self.problem.scene, row[None, :], self.start.offset, by_layer=True)[0, : len(self.out)]
 
 
-def on_branch(model: Model, state: StackState, sign: float) -> StackState:
+def on_branch(scene: Scene, model: Model, state: StackState, sign: float) -> State:
     """The state with its gap voltage computed anew from the area equation, on the branch with this sign."""
-    if not model.mobile:
-        return state
-    x_gap = dot(model.gap, state.y)
-    found = float(gap_voltage(model, model.k_gap * state.u_before, x_gap, sign or 1.0, state.u_gap))
+    if model.mobile:
+        state = state._replace(u_gap=_gap_at(model, state.y, state.u_before, sign or 1.0, state.u_gap))
+    return from_stack(scene, state)
+
+
+def _gap_at(model: Model, y: FloatArray, u: float, sign: float, last: float) -> float:
+    """Gap voltage (V) at a state under a source of u (V), on the branch with this sign and near its `last` value."""
+    found = float(gap_voltage(model, model.k_gap * u, dot(model.gap, y), sign, last))
     # At a fold, the round-off of the time alone may leave the area equation without a solution: keep the last one.
-    return state if found != found else state._replace(u_gap=found)
-
-
-def as_recorded(problem: Problem, model: Model, rows: FloatArray, u: FloatArray) -> FloatArray:
-    """Convert rows of the compiled loops to rows of `Record`, in place; `mobile` needs the source u (V) for charge."""
-    shown = problem.scene.shown
-    n = int(shown.turn.size)
-    rows[:, :n] *= shown.turn
-    if problem.charge and model.mobile:
-        (cell,), network = shown.measured, shown.network
-        u_gap = np.einsum("tk,k->t", rows[:, :n], network.p[cell]) + network.q[cell, 0] * u
-        rows[:, n] += u / inverse_areas(u_gap, model.curve) / model.s - problem.inner.offset
-    return rows
-
-
-def scale_of(problem: Problem, peak: float) -> float:
-    """Largest gap voltage to expect under a source with this peak, V."""
-    start = problem.inner
-    share = peak * model_of(problem.scene).k_gap if np.isfinite(peak) else 0.0
-    return max(share, float(np.abs(start.y[:-1]).max(initial=0.0))) or 1.0
-
-
-# Number of sets of references cached with a scene: one for each thread and decade of tolerances.
-MOST_SETS = 16
-# Most references in a set, and most numbers in all of them (64 MB); a full set is replaced by a new one.
-MOST_REFERENCES, MOST_NUMBERS = 256, 8_000_000
-# Number of references cached with the network, for runs with other sources.
-MOST_KEPT = 16
+    return last if math.isnan(found) else found
 
 
 class Known:
@@ -235,15 +209,27 @@ class Known:
     """
 
     def __init__(self, scene: Scene, decade: int) -> None:
-        numbers, magnified, self.shapes = _referred(scene, scene.area0)
-        n_area = scene.area0.size
+        n_area, (numbers, magnified, self.shapes) = scene.area0.size, self._referred(scene, scene.area0)
         counts = np.zeros(1, np.int64), np.zeros(n_area, np.int64)
         self.arrays = References(np.zeros((2, n_area), np.int64), np.zeros((2, numbers.size)), *counts)
         self.tables = new_tables(self.shapes[0][0])
         # (n_area + 1,): Round-off of each gap's voltage, and last of the nodes' voltages, relative to the rounding of
         # the largest voltage; the maximum over all references
         self.magnified = np.zeros(magnified.size)
-        self.fixed = _fixed(scene, decade)  # The fields of a `Form` that are the same for all references
+        network, net, n = scene.network, scene.net, scene.net.k.shape[0]
+        slow, fed = net.slow >= 0, _fed(scene)
+        cell = [int(np.flatnonzero(fed == i)[0]) if i >= 0 else -1 for i in net.gap]
+        stress = np.array([0.0 if contact is None else float(contact.stress(1.0)) for contact in network.contacts])
+        powers, slopes, lo, scale = systems.area_polynomials(net.curves, net.gap >= 0, area_error(decade))
+        # The fields of a `Form` that are the same for all references
+        self.fixed: dict[str, Any] = {
+            "mobile": net.mobile, "c": net.c[fed], "g": net.g_area[fed], "home": net.place[fed],
+            "first": np.searchsorted(net.place[fed], np.arange(n_area + 1)), "cell": np.array(cell, np.int64),
+            "unit": scene.area0.copy(), "slow": np.where(slow, n + net.slow, -1),
+            "pace": np.where(slow, 1.0 / np.where(slow, net.tau, 1.0), 0.0), "stress": stress,
+            "powers": powers, "slopes": slopes, "lo": lo, "scale": scale, "curves": net.curves,
+            "through": np.ascontiguousarray(network.through[:, fed]),
+        }  # fmt: skip
         self.add(scene, (0,) * n_area)
 
     @property
@@ -254,15 +240,18 @@ class Known:
         """Add the reference whose areas are the scene's areas (fixed, or at 0 V) times LEVEL_RATIO to these powers."""
         arrays, one = self.arrays, self.count
         if one == len(arrays.levels):
-            more = np.zeros_like(arrays.levels), np.zeros_like(arrays.numbers)
-            self.arrays = arrays = arrays._replace(
-                levels=np.vstack([arrays.levels, more[0]]), numbers=np.vstack([arrays.numbers, more[1]])
-            )
+            more = {"levels": np.zeros_like(arrays.levels), "numbers": np.zeros_like(arrays.numbers)}
+            self.arrays = arrays = arrays._replace(**{k: np.append(getattr(arrays, k), x, 0) for k, x in more.items()})
         area = scene.area0 * LEVEL_RATIO ** np.array(levels, float)
-        arrays.numbers[one], magnified, _ = _referred(scene, area)
+        arrays.numbers[one], magnified, _ = self._referred(scene, area)
         arrays.levels[one] = levels
         arrays.used[0] += 1
         np.maximum(self.magnified, magnified, out=self.magnified)
+
+    @staticmethod
+    def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
+        key = ("referred", scene.fixed, area.tobytes())
+        return kept_with(scene.network.kept, key, MOST_KEPT, lambda: _refer(scene, area))
 
     def form(self) -> Form:
         """A form for the areas at 0 V, with its own copy of the numbers: compiled code overwrites them."""
@@ -288,79 +277,38 @@ def _fed(scene: Scene) -> IntArray:
     return fed[np.argsort(net.place[fed], kind="stable")]
 
 
-def _fixed(scene: Scene, decade: int) -> dict[str, Any]:
-    """The fields of a form that are the same for all references."""
-    network, net = scene.network, scene.net
-    n, n_area = net.k.shape[0], net.gap.size
-    slow, fed = net.slow >= 0, _fed(scene)
-    stress = np.zeros(n_area)
-    for i in network.fingers:
-        contact = network.contacts[i]
-        assert contact is not None
-        stress[i] = float(contact.stress(1.0))
-    powers, slopes, lo, scale = area_polynomials(net.curves, net.gap >= 0, area_error(decade))
+def by_modes(network: Network, modes: Modes, area: FloatArray) -> dict[str, FloatArray]:
+    """What the modes at these areas, and the sources, do: arrays with the names in `Form`, the taps of all cells."""
+    n, n_s = modes.gains.shape
+    tap, tap_s = network.p @ modes.shape, network.q - network.p @ modes.follow
+    capacitance, leak = network.capacitance(area)[:, None], network.leak(area)[:, None]
+    at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
     return {
-        "mobile": net.mobile,
-        "c": net.c[fed],
-        "g": net.g_area[fed],
-        "home": net.place[fed],
-        "first": np.searchsorted(net.place[fed], np.arange(n_area + 1)),
-        "cell": np.array([int(np.flatnonzero(fed == i)[0]) if i >= 0 else -1 for i in net.gap], np.int64),
-        "unit": scene.area0.copy(),
-        "slow": np.where(slow, n + net.slow, -1),
-        "pace": np.where(slow, 1.0 / np.where(slow, net.tau, 1.0), 0.0),
-        "stress": stress,
-        "powers": powers,
-        "slopes": slopes,
-        "lo": lo,
-        "scale": scale,
-        "curves": net.curves,
-        "through": np.ascontiguousarray(network.through[:, fed]),
-    }
-
-
-def _referred(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
-    """The arrays in `REFERRED` for reference areas (m^2) in one row, the round-off as in `Known`, and their shapes."""
-    key = ("referred", scene.fixed, area.tobytes())
-    return kept_with(scene.network.kept, key, MOST_KEPT, lambda: _refer(scene, area))
+        "tap": tap, "tap_s": tap_s, "node": network.nodes[:, :n] @ modes.shape,
+        "node_s": network.nodes[:, n : n + n_s] - network.nodes[:, :n] @ modes.follow,
+        "stored": network.through @ (capacitance * tap), "stored_s": network.through @ (capacitance * tap_s),
+        "lost": network.through @ (leak * tap) + at_x @ modes.shape,
+        "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
+    }  # fmt: skip
 
 
 def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, ...]]]:
+    """The arrays in `REFERRED` for reference areas (m^2) in one row, the round-off as in `Known`, and their shapes."""
     network, net = scene.network, scene.net
     modes = scene.modes_at(area) if area is not scene.area0 else scene.modes
     n, n_s = modes.gains.shape
-    slow, fed = net.slow >= 0, _fed(scene)
-    n_slow = int(np.count_nonzero(slow))
-    tap, tap_s = network.p @ modes.shape, network.q - network.p @ modes.follow
+    slow, fed, fingers = net.slow >= 0, _fed(scene), list(network.fingers)
+    n_slow, cells = int(np.count_nonzero(slow)), np.array([network.gaps[i] for i in fingers], int)
+    parts = by_modes(network, modes, area)
+    tap, tap_s = parts["tap"], parts["tap_s"]
     gap, gap_s = np.zeros((area.size, n)), np.zeros((area.size, n_s))
-    for i in network.fingers:
-        cell = network.gaps[i]
-        assert cell is not None
-        gap[i], gap_s[i] = tap[cell], tap_s[cell]
-    capacitance, leak = network.capacitance(area)[:, None], network.leak(area)[:, None]
-    node = network.nodes[:, :n] @ modes.shape
-    node_s = network.nodes[:, n : n + n_s] - network.nodes[:, :n] @ modes.follow
-    at_x, at_s = network.delivered[:, :n], network.delivered[:, n:]
-    parts = {
-        "rates": np.append(modes.rates, 1.0 / net.tau[slow]),
-        "gain": np.vstack([modes.gains, np.zeros((n_slow, n_s))]),
-        "shape": modes.shape,
-        "inverse": modes.inverse,
-        "follow": modes.follow,
-        "feed": np.vstack([-modes.take[:, fed], np.zeros((n_slow, fed.size))]),
-        "tap": tap[fed],
-        "tap_s": tap_s[fed],
-        "area0": area,
-        "gap": gap,
-        "gap_s": gap_s,
-        "node": node,
-        "node_s": node_s,
-        "size": np.linalg.norm(modes.shape, axis=0),
-        "stored": network.through @ (capacitance * tap),
-        "stored_s": network.through @ (capacitance * tap_s),
-        "lost": network.through @ (leak * tap) + at_x @ modes.shape,
-        "lost_s": network.through @ (leak * tap_s) - at_x @ modes.follow + at_s,
-    }
+    gap[fingers], gap_s[fingers] = tap[cells], tap_s[cells]
+    parts |= {
+        "rates": np.append(modes.rates, 1.0 / net.tau[slow]), "gain": np.vstack([modes.gains, np.zeros((n_slow, n_s))]),
+        "shape": modes.shape, "inverse": modes.inverse, "follow": modes.follow, "tap": tap[fed], "tap_s": tap_s[fed],
+        "feed": np.vstack([-modes.take[:, fed], np.zeros((n_slow, fed.size))]), "area0": area,
+        "gap": gap, "gap_s": gap_s, "size": np.linalg.norm(modes.shape, axis=0),
+    }  # fmt: skip
     live = modes.rates[modes.rates > 0.0]
     # The eigenvectors of the slowest mode contain the round-off of the fastest one.
     spread = math.sqrt(float(live.max() / live.min())) if live.size else 0.0
@@ -368,8 +316,7 @@ def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list
     every = (np.abs(modes.shape) @ inverse).sum(axis=1).max(initial=1.0)
     # A voltage is a sum over modes and sources: the sum of the moduli of its terms measures the cancellation.
     of_gaps, of_nodes = (
-        (np.abs(by_mode) @ inverse).sum(axis=1) + np.abs(by_source).sum(axis=1)
-        for by_mode, by_source in ((gap, gap_s), (node, node_s))
+        (np.abs(parts[name]) @ inverse).sum(axis=1) + np.abs(parts[f"{name}_s"]).sum(axis=1) for name in ("gap", "node")
     )
     own = np.append(of_gaps, of_nodes.max(initial=0.0))
     magnified = np.asarray((every + spread) * np.minimum(own / every, 1.0))
@@ -377,14 +324,8 @@ def _refer(scene: Scene, area: FloatArray) -> tuple[FloatArray, FloatArray, list
     return numbers, magnified, [parts[name].shape for name in REFERRED]
 
 
-# Most steps for each edge and each shortest time of the sources; a run that needs more is left to another method. Where
-# an area strongly affects the charge of a stiff mode, the fixed-point iteration converges only with steps of the
-# mode's own time constant.
-MOST_STEPS = 100
-
-
 class March(Stepping):
-    """One integration in progress, with an error of at most `tol` times `u_scale` (V) in every step."""
+    """One integration of a network, with an error of at most `tol` times `u_scale` (V) in every step."""
 
     def __init__(self, problem: Problem, rtol: float, tol: float, u_scale: float, repeat: bool) -> None:
         scene, size = problem.scene, problem.initial.y.size
@@ -432,9 +373,6 @@ class March(Stepping):
             self._add_reference()
         return code
 
-    def _failed(self, code: int, sources: Sources) -> Status:
-        return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
-
     def jump(self, after: FloatArray) -> bool:
         # With sources that stay at these values.
         return self.march(ramp(after, after, self.t), self.t, no_looks()) == readout.DONE
@@ -454,16 +392,8 @@ class March(Stepping):
         known.add(self.problem.scene, wanted)
 
 
-ATTEMPTS = 6
-# Voltage scale of a circuit whose sources give none, before any voltage has been computed, V.
-GUESS = 1.0
-
-
 def stepping(problem: Problem, rtol: float, tol: float, u_scale: float, top: float, repeat: bool) -> Track | March:
-    """An integration with an error of `tol` times `u_scale` (V) in every step, in a run that is asked for `rtol`.
-
-    A stack's area curve reaches `top` (V) if that is above 0.
-    """
+    """An integration with an error of `tol` times `u_scale` (V) in every step; for `top` see `Track`."""
     if problem.scene.stack is None:
         return March(problem, rtol, tol, u_scale, repeat)
     return Track(problem, rtol, tol * u_scale, top, repeat)
@@ -478,7 +408,12 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
     tables = Tables(problem, LOCAL_SHARE * rtol)
     is_stack = problem.scene.stack is not None
     met = tables.peak() if is_stack or problem.scene.is_sampled else 0.0
-    u_scale = scale_of(problem, met) if is_stack else max(problem.largest, met) or GUESS
+    if is_stack:
+        # The largest gap voltage to expect.
+        share = met * model_of(problem.scene).k_gap if np.isfinite(met) else 0.0
+        u_scale = max(share, float(np.abs(problem.inner.y[:-1]).max(initial=0.0))) or GUESS
+    else:
+        u_scale = max(problem.largest, met) or GUESS
     tol, top, nfev, attempts, tries_out = LOCAL_SHARE * rtol, 0.0, 0, 0, True
     # What is left of sources that cancel has fewer digits than these; what a gap takes of a source has as many as that.
     finest = FINEST * max(1.0, problem.scene.u_size / (met or u_scale))
@@ -489,7 +424,7 @@ def solve(problem: Problem, rtol: float, progress: Progress | None = None, *, re
         try:
             run = integrate(one, tables, progress)
         except OutOfRangeError as error:
-            top = 1.5 * error.top
+            top = 1.5 * error.args[0]
             continue
         run.by_layer = True
         run.end_where_it_stopped()

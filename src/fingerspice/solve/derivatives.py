@@ -40,6 +40,16 @@ _SHARE, _FINEST, _KNOWN = 1e-3, 3e-13, 1e-2
 # Step relative to a parameter, at which what the runs' errors and the difference's truncation do are about the same;
 # and shares of it for outputs at which the gap voltage changes its sign in a step.
 _STEP, _CLOSER = 5e-4, (0.03, 1e-3)
+# Steps between two samples: of the first two numbers, or below this `rtol` of the second and third, and twice as many
+# while these differ; and the error wanted, relative to the largest derivative, over `rtol`.
+_STEPS, _COARSE, _ALLOWED = (1, 2, 4, 8, 16, 32, 64), 1e-7, 10.0
+# Distance of the differences, over the largest voltage.
+_APART = 1e-5
+# Intervals whose derivatives are held at once.
+_AT_ONCE = 1 << 13
+# Change of starts that is left, over the largest voltage; errors of the polynomials, over that asked for.
+_CLOSED, _OF_AREA = 1e-14, 1e-2
+_ASKED = "derivatives by samples are asked for, and "
 
 # The same run of another circuit, with another `rtol`.
 Runner = Callable[[Circuit, float], Solution]
@@ -117,13 +127,13 @@ def period_of(circuit: Circuit) -> float | None:
     return (waves[0] if len(waves) == 1 else Sum(waves)).period
 
 
-def check_request(problem: Problem, paths: Sequence[str], method: str, start: str) -> str:
+def check_request(problem: Problem, paths: Sequence[str], method: str) -> str:
     """Refuse a run that has no sensitivities; the method of the runs that are compared."""
     if isinstance(paths, str) or not all(isinstance(path, str) for path in paths):
         raise InputError(f"sensitivities is {paths!r}; allowed: a sequence of paths such as ('Xgap.d',)")
     for what, refused in (
         ("the circuit has no GAP", not problem.network.fingers),
-        ("the run goes on from another one", start == "given"),
+        ("the run goes on from another one", problem.start == "given"),
         (f"the method is {method!r}", method not in ("auto", "exponential")),
     ):
         if refused:
@@ -132,16 +142,13 @@ def check_request(problem: Problem, paths: Sequence[str], method: str, start: st
                 "the methods 'auto' and 'exponential'"
             )
     # A recording, or a PWL with many points, is otherwise followed point by point, to no error as small as needed here.
-    return method if driving(problem) is None else "exponential"
+    return method if driving(problem)[1] is None else "exponential"
 
 
 def sensitivities_of(
     problem: Problem, solution: Solution, paths: Sequence[str], run: Runner, over_period: bool = False
 ) -> dict[str, Sensitivity]:
-    """Derivatives of a run's signals and means; `over_period`: of means over a period, which a parameter may change.
-
-    A run with a parameter near its value that fails is a `SolveError`.
-    """
+    """Derivatives of a run's signals and means; `over_period`: of means over a period, which a parameter may change."""
     found = {}
     for one in [_Parameter(problem, path) for path in paths]:
         longer = one.longer() if problem.begun is not None else 0.0
@@ -169,18 +176,6 @@ def sensitivities_of(
     return found
 
 
-# Steps of an interval: of the first two numbers, or below this `rtol` of the second and third, and twice as many while
-# these differ; and the error wanted, relative to the largest derivative, over `rtol`.
-_STEPS, _COARSE, _ALLOWED = (1, 2, 4, 8, 16, 32, 64), 1e-7, 10.0
-# Distance of the differences, over the largest voltage.
-_APART = 1e-5
-# Intervals whose derivatives are held at once.
-_AT_ONCE = 1 << 13
-# Change of starts that is left, over the largest voltage; errors of the polynomials, over that asked for.
-_CLOSED, _OF_AREA = 1e-14, 1e-2
-_ASKED = "derivatives by samples are asked for, and "
-
-
 def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
     """The number's derivatives by u_gap, force and area at the outputs, shape (n_t,), and by the latter's means."""
     allowed = ", ".join((*SIGNALS, *MEANS))
@@ -205,32 +200,25 @@ def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
     return by
 
 
-def _source_of(problem: Problem) -> tuple[str, float, Samples]:
-    """Name, sign along the loop and samples of the only source that is a recording, beside constant ones."""
-    scene, stack = problem.scene, problem.scene.stack
-    if len(problem.network.fingers) != 1 or not scene.coupled:
-        raise InputError(f"{_ASKED}the circuit has no single GAP whose area is coupled; allowed: one")
-    sources = [(e, 1.0) for e in problem.network.sources] if stack is None else stack.sources
-    waves = [(e.name, float(sign), None if e.waveform is None else as_samples(e.waveform)) for e, sign in sources]
-    known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
-    _, wave = driving(problem) or (0, None)
-    if len(known) != 1 or not isinstance(wave, Samples):
-        others = "sources of 0" if stack is None else "constant ones"
-        raise InputError(
-            f"{_ASKED}of the circuit's {len(waves)} sources {len(known)} are recordings; allowed: one, such as "
-            f"fs.Samples, or a PWL on an even grid, beside {others}"
-        )
-    return known[0]
-
-
 class _Intervals:
     """The intervals of a run between the samples of its source."""
 
     def __init__(self, run: Solution) -> None:
         self.run, self.problem = run, _problem(run, {})
-        problem, rtol = self.problem, run.rtol
-        # Of the source: its name, its sign along the loop, and its samples.
-        self.name, self.sign, wave = _source_of(problem)
+        problem, stack, rtol = self.problem, self.problem.scene.stack, run.rtol
+        if len(problem.network.fingers) != 1 or not problem.scene.coupled:
+            raise InputError(f"{_ASKED}the circuit has no single GAP whose area is coupled; allowed: one")
+        # Of each source: its name, its sign along the loop, and its samples.
+        sources = [(e, 1.0) for e in problem.network.sources] if stack is None else stack.sources
+        waves = [(e.name, float(sign), None if e.waveform is None else as_samples(e.waveform)) for e, sign in sources]
+        known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
+        if len(known) != 1 or not isinstance(driving(problem)[1], Samples):
+            others = "sources of 0" if stack is None else "constant ones"
+            raise InputError(
+                f"{_ASKED}of the circuit's {len(waves)} sources {len(known)} are recordings; allowed: one, such as "
+                f"fs.Samples, or a PWL on an even grid, beside {others}"
+            )
+        ((self.name, self.sign, wave),) = known
         form = ready(problem, max(_OF_AREA * rtol, 1e-13)) or ready(problem, rtol)
         if form is None:
             raise InputError(
@@ -248,20 +236,6 @@ class _Intervals:
         self.x, h = np.ascontiguousarray(problem.waveform.value(self.t)), np.diff(self.t)
         # Lengths of the intervals (n,), or their common one (1,), s
         self.h = h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
-
-    def follow(self) -> None:
-        """Find the modes at the starts of all intervals (m, n), and the distances of their differences (m + 1,)."""
-        form, n = self.form, self.t.size - 1
-        block, start = Block(form, self.x, self.h, True), form.start(self.problem)[0][: self.m]
-        peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
-        solved = block.solve(start, _STEPS[self.first + 2], _CLOSED * peak) and block.on_one_branch
-        if not solved or float(np.abs(form.gap(block.xi)).max()) > form.u_top:
-            cause = "the run is not followed sample by sample, for its derivatives by samples"
-            at = float(self.t[0])
-            raise SolveError(Failure(Status.STEP_UNDERFLOW, cause, "a higher sample rate takes shorter steps", at))
-        self.z = block.kept[: self.m, :, :-1].reshape(self.m, -1)[:, :n]
-        sizes = np.append(np.abs(self.z).max(axis=1), np.abs(self.x).max())
-        self.delta = _APART * np.where(sizes > 0.0, sizes, peak)
 
     def _slopes(self, at: IntArray, to: FloatArray, length: FloatArray, parts: int) -> FloatArray:
         """Derivatives of what intervals lead to as `sum_back` takes them, by central differences."""
@@ -332,8 +306,18 @@ class _Intervals:
 
     def swept(self, by: Mapping[str, Any]) -> FloatArray:
         """Derivatives of a number by the samples, with half the steps and with all, shape (2, n_sample)."""
-        self.follow()
-        t, m, wave, ((_, contact),) = self.t, self.m, self.wave, self.run.record.fingers
+        t, m, wave, form, ((_, contact),) = self.t, self.m, self.wave, self.form, self.run.record.fingers
+        block, start = Block(form, self.x, self.h, True), form.start(self.problem)[0][:m]
+        peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
+        solved = block.solve(start, _STEPS[self.first + 2], _CLOSED * peak) and block.on_one_branch
+        if not solved or float(np.abs(form.gap(block.xi)).max()) > form.u_top:
+            cause = "the run is not followed sample by sample, for its derivatives by samples"
+            action = "a higher sample rate takes shorter steps"
+            raise SolveError(Failure(Status.STEP_UNDERFLOW, cause, action, float(t[0])))
+        # The modes at the starts of all intervals (m, n), and the distances of their differences (m + 1,).
+        self.z = block.kept[:m, :, :-1].reshape(m, -1)[:, : t.size - 1]
+        sizes = np.append(np.abs(self.z).max(axis=1), np.abs(self.x).max())
+        self.delta = _APART * np.where(sizes > 0.0, sizes, peak)
         of_modes, of_source = self.outputs(by)
         n, after, means = t.size - 1, np.zeros((2, m)), np.zeros((MORE, t.size - 1))
         means[SQUARES], means[AREAS] = by["f_el_mean"] * contact.stress(1.0), by["area_mean"]
@@ -349,7 +333,7 @@ class _Intervals:
             # The modes at the start follow the source there.
             step = STEP * self.problem.scene.u_peak
             moved = [Sum((wave, DC(self.sign * at * step))) for at in AT]
-            starts = [self.form.start(_problem(self.run, {self.name: one})) for one in moved]
+            starts = [form.start(_problem(self.run, {self.name: one})) for one in moved]
             of_source[:, 0] += after @ derivative([start[:m] for start, _ in starts], step)
         # Samples before the times, and how far these are beyond, in samples.
         out, place = np.zeros((2, wave.count)), np.clip((t - wave.start) * wave.rate, 0.0, wave.count - 1.0)

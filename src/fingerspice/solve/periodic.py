@@ -1,4 +1,4 @@
-"""The periodic state of any circuit, by Newton's method on the map of one period (`Search` on `Period`).
+"""The periodic state of any circuit, by Newton's method on the map of one period (`Search`).
 
 The unknown z consists of the modes of the live voltages, for the areas at 0 V, and of the areas with a time constant,
 relative to their values at 0 V. The first guess, and the first derivative of the map, are those of the linear circuit
@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -22,36 +21,40 @@ from fingerspice.circuit.network import Modes
 from fingerspice.engine.collocation import readout
 from fingerspice.numerics import linear
 from fingerspice.physics.contact import inverse_area
-from fingerspice.results.outcome import SolveError, State, Status
+from fingerspice.results.outcome import State, Status
 from fingerspice.solve.collocation import GUESS, March, Track, stepping
 from fingerspice.solve.nodal import pass_through
 from fingerspice.solve.problem import Problem, joined
-from fingerspice.solve.runs import period_failure
+from fingerspice.solve.runs import no_period
+from fingerspice.solve.scenes import kept_with
 from fingerspice.solve.stepping import FINEST, LOCAL_SHARE, SAFETY, OutOfRangeError
-from fingerspice.waveforms.sampling import SourceTable, source_table
+from fingerspice.waveforms.sampling import source_table
 from fingerspice.waveforms.waveform import DC
 
 # Number of equidistant times of a period from which the mean of an area with a time constant is computed.
 SAMPLES = 64
+# Number of periods whose tables of the sources are cached with a scene.
+MOST_PERIODS = 16
 # Nodes and weights of Gauss-Legendre quadrature on [0, 1], for integrals over a voltage from 0 V to its value.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _GAUSS = 0.5 + 0.5 * _NODES, 0.5 * _WEIGHTS
-
-
-class Stopped(Exception):
-    """A period that could not be integrated, or that leads to no periodic state, with the time (s) or the cause."""
-
-    def __init__(self, status: Status, t: float | None = None, cause: str = "") -> None:
-        self.status, self.t, self.cause = status, t, cause
-
-
-@contextmanager
-def stops_told(problem: Problem) -> Iterator[None]:
-    """A search that is stopped ends in a `SolveError` that says why."""
-    try:
-        yield
-    except Stopped as stopped:
-        raise SolveError(period_failure(problem, stopped.status, stopped.t, stopped.cause)) from None
+# Tolerance of the early passes: relative to the last Newton step, and at most, relative to the voltage scale.
+_CRUDE, _FIRST = 1e-3, 1e-4
+# Finite differences of the map: perturbation relative to the voltage scale, and the tolerance of their passes, usual
+# and least.
+_SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 5e-4, 1e-9, 1e-11
+# A mode that decays by more powers of e than this in a period is not measured: its column is exp(-40) at most.
+_FORGOTTEN = 40.0
+# Passes after which the derivative is measured by finite differences, and after which the search fails.
+_PATIENCE, _MOST = 14, 60
+# The search has stagnated after so many passes in which no step was less than half of the smallest one before.
+# Round-off is accepted as the cause if the steps are below _NOISE times the voltage scale.
+_HELD_UP, _NOISE = 5, 1e-8
+# If the first step is longer than this times the voltage scale, the linear circuit's derivative is not good enough.
+_LONG = 0.1
+# A step longer than this times the voltage scale means that the search diverges.
+_ASTRAY = 1e3
+CHARGING = "a current source charges, from period to period, what nothing drains"
 
 
 class Period:
@@ -62,6 +65,7 @@ class Period:
         assert waveform.period is not None
         # The first whole period after the sources have become periodic, and not before the run's start, s.
         self.begin = waveform.period * float(np.ceil(max(waveform.settled, problem.t_start) / waveform.period))
+        self.contacts = {i: one for i, one in enumerate(scene.network.contacts) if one is not None}
         # Modes of the circuit with its areas at 0 V, and their number.
         self.modes: Modes = scene.modes
         n = self.n = self.modes.rates.size
@@ -79,15 +83,13 @@ class Period:
         self.parts = 2 if _turns(problem) and not pushed and not np.any(self.kept) else 1
         self.span = waveform.period / self.parts
         # A function's table depends on the output step as well.
-        key = "period", self.begin, self.span, problem.step if scene.is_sampled else 0.0
-        self.tables: list[SourceTable] = scene.prepared.get(key, [])
-        if not self.tables:
-            end = self.begin + self.span
-            self.tables = [source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.waveforms]
-            scene.prepared[key] = self.tables
+        key, end = ("period", self.begin, self.span, problem.step if scene.is_sampled else 0.0), self.begin + self.span
+        self.tables = kept_with(scene.prepared, key, MOST_PERIODS, lambda: [
+            source_table(w, self.begin, end, 1e-13, problem.step) for w in scene.waveforms
+        ])  # fmt: skip
         broken = [table.not_finite for table in self.tables if table.not_finite is not None]
         if broken:
-            raise Stopped(Status.SOURCE_NOT_FINITE, min(broken))
+            raise no_period(problem, Status.SOURCE_NOT_FINITE, min(broken))
         self.sources = joined(self.tables)
         self.end = float(min(table.edges[-1] for table in self.tables))
         if pushed and self.begin > problem.t_start:
@@ -95,9 +97,8 @@ class Period:
             for j, wave in enumerate(scene.waveforms):
                 table = source_table(wave, problem.t_start, self.begin, 1e-13, problem.step)
                 gains, still = np.where(self.neutral[:n], self.modes.gains[:, j], 0.0), np.zeros(n)
-                self.kept = (
-                    self.kept + linear.respond(still, gains, table.edges, table.terms, table.series, still, [])[1]
-                )
+                _, moved = linear.respond(still, gains, table.edges, table.terms, table.series, still, [])
+                self.kept = self.kept + moved
         # (n + n_slow,): Sign of each entry of a periodic state at the end of the span, relative to its start.
         self.turned = np.where(np.arange(self.rates.size) < n, 1.0 if self.parts == 1 else -1.0, 1.0)
         # The problem restricted to the span, without charge.
@@ -115,16 +116,13 @@ class Period:
 
         Under `local` a capacitor holds the integral of C dU from 0 V to its voltage U; under `mobile` it holds C U.
         """
-        scene = self.problem.scene
-        network, net = scene.network, scene.net
+        scene, network, net = self.problem.scene, self.problem.network, self.problem.scene.net
         u = net.p @ self.voltages(z) + net.q @ self.before
         along, weight = (np.ones(1), np.ones(1)) if net.mobile else _GAUSS
         area, charge = scene.area0.copy(), np.zeros(u.size)
         for share, part in zip(along, weight, strict=True):
-            for i in np.flatnonzero(net.gap >= 0):
-                slow, contact = net.slow[i], network.contacts[i]
-                assert contact is not None
-                following = float(contact.area(share * abs(u[net.gap[i]])))
+            for i in np.flatnonzero(net.gap >= 0).tolist():
+                slow, following = net.slow[i], float(self.contacts[i].area(share * abs(u[net.gap[i]])))
                 area[i] = following if slow < 0 else net.area0[i] * z[self.n + slow]
             charge += part * network.capacitance(area) * u
         return np.asarray(self.modes.shape[:, held].T @ (net.p.T @ charge))
@@ -147,8 +145,17 @@ class Period:
             rows, last = linear.respond(rates, gains, *given, v, times)
             start, end, along = start + v, end + last, along + rows
         if not np.all(np.isfinite(start)):
-            raise Stopped(Status.NOT_PERIODIC, cause=CHARGING)
+            raise no_period(self.problem, Status.NOT_PERIODIC, cause=CHARGING)
         return start, end, along
+
+    def close(self) -> Found:
+        """The periodic state of a circuit with fixed areas."""
+        start, end, _ = self.linear_state([])
+        defect = float(np.abs(self.modes.shape @ (self.turned[: self.n] * end - start)).max(initial=0.0))
+        slope = np.diag(np.exp(-self.rates * self.span * self.parts))
+        # The only error of the closed form is round-off, which the run adds to its stated error itself.
+        none = np.zeros((len(self.problem.network.fingers), 2))
+        return Found(self.voltages(start + self.kept), self.parts * defect, slope.copy, 1.0, none, 1)
 
 
 def _turns(problem: Problem) -> bool:
@@ -166,25 +173,6 @@ def _turns(problem: Problem) -> bool:
         if round(ratio) % 2 == 0 or abs(ratio - round(ratio)) > 1e-9:
             return False
     return True
-
-
-# Tolerance of the early passes: relative to the last Newton step, and at most, relative to the voltage scale.
-_CRUDE, _FIRST = 1e-3, 1e-4
-# Finite differences of the map: perturbation relative to the voltage scale, and the tolerance of their passes, usual
-# and least.
-_SHIFT, _SLOPE_TOL, _LEAST_SLOPE_TOL = 5e-4, 1e-9, 1e-11
-# A mode that decays by more powers of e than this in a period is not measured: its column is exp(-40) at most.
-_FORGOTTEN = 40.0
-# Passes after which the derivative is measured by finite differences, and after which the search fails.
-_PATIENCE, _MOST = 14, 60
-# The search has stagnated after so many passes in which no step was less than half of the smallest one before.
-# Round-off is accepted as the cause if the steps are below _NOISE times the voltage scale.
-_HELD_UP, _NOISE = 5, 1e-8
-# If the first step is longer than this times the voltage scale, the linear circuit's derivative is not good enough.
-_LONG = 0.1
-# A step longer than this times the voltage scale means that the search diverges.
-_ASTRAY = 1e3
-CHARGING = "a current source charges, from period to period, what nothing drains"
 
 
 class Found(NamedTuple):
@@ -211,52 +199,49 @@ class _Pass(NamedTuple):
     end: FloatArray
     sources: FloatArray
     error: FloatArray
-    met: FloatArray  # (n_area, 4): Columns of `LoopState.peaks`
+    met: FloatArray  # (n_gap, 4): Columns of `LoopState.peaks`
     magnified: float
-    # (n_area,): Round-off of the gap voltages in units of the machine precision times the largest voltage
+    # (n_gap,): Round-off of the gap voltages in units of the machine precision times the largest voltage
     rounding: FloatArray
 
 
-class Search:
+class Search(Period):
     """Newton's method on the map of a period."""
 
-    def __init__(self, period: Period, rtol: float) -> None:
-        self.period, self.rtol, self.passes = period, rtol, 0
-        self.implicit = False
+    def __init__(self, problem: Problem, rtol: float) -> None:
+        super().__init__(problem)
+        problem, self.rtol, self.passes, self.implicit = self.problem, rtol, 0, False
         self.one: Track | March | None = None  # Integrates every pass by exponential steps
         # The gap voltage that a stack's area curve reaches, V; 0: that of its scene.
         self.top = 0.0
         # A conserved charge is no unknown. If half a period is used, all voltages change sign: such a charge is 0.
-        self.free = ~period.neutral if period.parts == 1 else np.ones(period.rates.size, bool)
-        self.slow = np.arange(period.rates.size) >= period.n
-        problem = period.problem
+        self.free = ~self.neutral if self.parts == 1 else np.ones(self.rates.size, bool)
+        self.slow = np.arange(self.rates.size) >= self.n
         self.fingers = list(problem.network.fingers)
         self.z = self._guess()
-        largest = float(np.abs(period.voltages(self.z)).max(initial=0.0))
+        largest = float(np.abs(self.voltages(self.z)).max(initial=0.0))
         self.scale = max(problem.scene.u_peak, largest) or GUESS
-        self.solver = self._inverse(np.diag(period.turned * np.exp(-period.rates * period.span)))
+        self.solver = self._inverse(np.diag(self.turned * np.exp(-self.rates * self.span)))
         self.z = self._holding(self.z)
         cells = [problem.network.gaps[i] for i in self.fingers]
-        gap = problem.network.p[np.array(cells, int)] @ period.modes.shape
+        gap = problem.network.p[np.array(cells, int)] @ self.modes.shape
         # Derivative of every gap's voltage by z; its columns for areas with a time constant are 0.
         self.gap = np.hstack([gap, np.zeros((gap.shape[0], int(self.slow.sum())))])
 
     def _guess(self) -> FloatArray:
         """The periodic state with every area held at its value at 0 V; areas with a time constant at their mean."""
-        period, problem = self.period, self.period.problem
-        net, modes, slow = problem.scene.net, period.modes, np.flatnonzero(problem.scene.net.slow >= 0)
-        times = period.begin + period.span * (np.arange(SAMPLES if slow.size else 0) + 0.5) / SAMPLES
-        start, _, along = period.linear_state(times)
+        problem = self.problem
+        net, modes, slow = problem.scene.net, self.modes, np.flatnonzero(problem.scene.net.slow >= 0)
+        times = self.begin + self.span * (np.arange(SAMPLES if slow.size else 0) + 0.5) / SAMPLES
+        start, _, along = self.linear_state(times)
         relative = np.ones(slow.size)
         if slow.size:
             s = np.column_stack([wave.value(times) for wave in problem.waveforms])
             x = along @ modes.shape.T - s @ modes.follow.T
-            for k, i in enumerate(slow):
-                contact = problem.network.contacts[i]
-                assert contact is not None
+            for k, i in enumerate(slow.tolist()):
                 u = x @ net.p[net.gap[i]] + s @ net.q[net.gap[i]]
-                relative[k] = float(np.mean(contact.area(np.abs(u)))) / problem.scene.area0[i]
-        return np.append(np.where(period.neutral[: period.n], period.kept, start), relative)
+                relative[k] = float(np.mean(self.contacts[i].area(np.abs(u)))) / problem.scene.area0[i]
+        return np.append(np.where(self.neutral[: self.n], self.kept, start), relative)
 
     def _inverse(self, slope: FloatArray) -> FloatArray:
         """Inverse of 1 - slope for the entries of z that decay, and zero for the neutral modes."""
@@ -267,67 +252,64 @@ class Search:
 
     def _largest(self, z: FloatArray) -> float:
         """Largest voltage in a change of z, V; the relative change of an area counts as that share of the scale."""
-        x = float(np.abs(self.period.modes.shape @ z[~self.slow]).max(initial=0.0))
+        x = float(np.abs(self.modes.shape @ z[~self.slow]).max(initial=0.0))
         return max(x, self.scale * float(np.abs(z[self.slow]).max(initial=0.0)))
 
     def passed(self, z: FloatArray, tol: float) -> _Pass:
         """One pass over the period from z, with an error of `tol` times the voltage scale in every step."""
-        period, n = self.period, self.period.n
-        y = np.concatenate([period.voltages(z), z[n:], np.zeros(period.before.size)])
-        initial = dataclasses.replace(period.problem.initial, y=y)
-        self.passes += 1
+        n, self.passes = self.n, self.passes + 1
+        y = np.concatenate([self.voltages(z), z[n:], np.zeros(self.before.size)])
+        initial = dataclasses.replace(self.problem.initial, y=y)
         made = None if self.implicit else self._stepped(initial, max(tol, FINEST))
         if made is None:
             # The exponential steps failed: the implicit method either succeeds or tells that no solution exists.
-            self.implicit, made = True, self._collocated(dataclasses.replace(period.problem, initial=initial), tol)
+            self.implicit, made = True, self._collocated(dataclasses.replace(self.problem, initial=initial), tol)
         # Use the sources at the end of the pass: they equal those at the start only up to the sign and round-off.
-        x = period.modes.inverse @ (made.end[:n] + period.modes.follow @ made.sources)
-        error = np.append(period.modes.inverse @ made.error[:n], made.error[n : z.size])
-        return made._replace(end=period.turned * np.append(x, made.end[n : z.size]), error=error)
+        x = self.modes.inverse @ (made.end[:n] + self.modes.follow @ made.sources)
+        error = np.append(self.modes.inverse @ made.error[:n], made.error[n : z.size])
+        return made._replace(end=self.turned * np.append(x, made.end[n : z.size]), error=error)
 
     def _stepped(self, initial: State, tol: float) -> _Pass | None:
         """One pass by exponential steps; None where they fail before the end."""
-        period, scene = self.period, self.period.problem.scene
         while True:
             if self.one is None:
-                self.one = stepping(period.problem, self.rtol, tol, self.scale, self.top, False)
+                self.one = stepping(self.problem, self.rtol, tol, self.scale, self.top, False)
             one = self.one
             one.again(initial, tol * self.scale)
             try:
-                if one.through(period.sources, period.end) is not Status.SUCCESS:
+                if one.through(self.sources, self.end) is not Status.SUCCESS:
                     return None
                 break
             except OutOfRangeError as left:
-                self.top, self.one = 1.5 * left.top, None
-        magnified = max(1.0, float(one.control["magnified"]))
+                self.top, self.one = 1.5 * left.args[0], None
+        n, magnified = self.n, max(1.0, float(one.control["magnified"]))
         if isinstance(one, March):
-            error = np.append(one.form.shape @ one.error[: period.n], one.error[period.n :])
-            return _Pass(one.y, one.s_before, error, one.peaks.copy(), magnified, one.references.magnified)
-        end, system = one.state(), one.system
-        model, error = system.model, system.live[int(one.error[period.n])] @ one.error[: period.n]
-        if model.mobile:
-            error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
-        return _Pass(end.y, end.s_before, scene.turn * error, one.peaks.copy(), magnified, np.array([model.k_gap]))
+            error, rounding = np.append(one.form.shape @ one.error[:n], one.error[n:]), one.references.magnified
+        else:
+            system, model = one.system, one.system.model
+            error, rounding = system.live[int(one.error[n])] @ one.error[:n], np.array([model.k_gap])
+            if model.mobile:
+                error *= model.area0 * inverse_area(abs(float(one.control["u_gap"])), model.curve)[0]
+            error = self.problem.scene.turn * error
+        end = one.state()
+        return _Pass(end.y, end.s_before, error, one.peaks[self.fingers], magnified, rounding[self.fingers])
 
     def _collocated(self, problem: Problem, tol: float) -> _Pass:
         """One pass by the implicit method, with its error from a coarser pass."""
-        scene, network = problem.scene, problem.network
-        status, one, error = pass_through(problem, self.period.sources, tol, self.scale)
+        scene = problem.scene
+        status, one, error = pass_through(problem, self.sources, tol, self.scale)
         if status is not Status.SUCCESS:
-            raise Stopped(status, one.t)
-        met = np.zeros((one.peaks.size, 4))
-        for i in network.fingers:
-            peak, contact = float(one.peaks[i]), network.contacts[i]
-            assert contact is not None
+            raise no_period(problem, status, one.t)
+        met = np.zeros((len(self.fingers), 4))
+        for row, i in zip(met, self.fingers, strict=True):
+            peak, contact = float(one.peaks[i]), self.contacts[i]
             area = float(contact.area(peak)) if scene.net.gap[i] >= 0 else float(scene.area0[i])
-            met[i, :2] = peak, float(contact.stress(peak)) * area
-        gap = np.array([network.p[0 if cell is None else cell] for cell in network.gaps]) @ self.period.modes.shape
-        rounding = (np.abs(gap) @ np.abs(self.period.modes.inverse)).sum(axis=1)
+            row[:2] = peak, float(contact.stress(peak)) * area
+        rounding = (np.abs(self.gap[:, : self.n]) @ np.abs(self.modes.inverse)).sum(axis=1)
         return _Pass(one.y, one.s_before, error, met, 1.0, 10.0 + rounding)
 
     def close(self) -> Found:
         """The periodic state, to `rtol` or as far as round-off permits."""
-        period = self.period
         tol = LOCAL_SHARE * self.rtol
         while True:
             last, step, defect = self._newton(tol)
@@ -342,13 +324,12 @@ class Search:
             else:
                 break
         # Its records are views of its arrays, which a copy of what is found would separate.
-        self.one, start = None, np.append(period.voltages(self.z), self.z[period.n :])
-        return Found(start, period.parts * defect, self._map_slope, self._memory(), errors, self.passes / period.parts)
+        self.one, start = None, np.append(self.voltages(self.z), self.z[self.n :])
+        return Found(start, self.parts * defect, self._map_slope, self._memory(), errors, self.passes / self.parts)
 
     def _map_slope(self) -> FloatArray:
-        with stops_told(self.period.problem):
-            slope = self._slope()
-        return slope @ slope if self.period.parts == 2 else slope
+        slope = self._slope()
+        return slope @ slope if self.parts == 2 else slope
 
     def _newton(self, tol: float) -> tuple[_Pass, FloatArray, float]:
         """Solve for the periodic z; returns the last pass, the last step of z, and the defect of that pass, V."""
@@ -391,11 +372,11 @@ class Search:
                 self._mind_wandering(last, change, tol)
                 return last, step, defect
         cause = f"{Status.NOT_PERIODIC.cause}: {defect:.3g} V are left after a period"
-        raise Stopped(Status.NOT_PERIODIC, cause=cause)
+        raise no_period(self.problem, Status.NOT_PERIODIC, cause=cause)
 
     def _memory(self) -> float:
         """Largest ratio of the periodic state's error to an error of the voltages made in every period; 1 or more."""
-        n, modes = self.period.n, self.period.modes
+        n, modes = self.n, self.modes
         grown = modes.shape @ self.solver[:n, :n] @ modes.inverse
         return max(1.0, float(np.abs(grown).sum(axis=1).max(initial=0.0)))
 
@@ -409,7 +390,7 @@ class Search:
         moved = self._largest(np.where(held, change, 0.0))
         if moved > allowed:
             cause = f"a charge that nothing drains moves by {moved:.3g} V in every period"
-            raise Stopped(Status.NOT_PERIODIC, cause=cause)
+            raise no_period(self.problem, Status.NOT_PERIODIC, cause=cause)
 
     def _holding(self, z: FloatArray) -> FloatArray:
         """z with its neutral modes adjusted so that the conserved charges have their initial values.
@@ -421,7 +402,7 @@ class Search:
             return z
         z = z.copy()
         for _ in range(_MOST):
-            missing = self.period.charges(z, held) - self.period.kept[held]
+            missing = self.charges(z, held) - self.kept[held]
             z[held] -= missing
             if np.abs(missing).max() <= 1e-15 * np.abs(z).max():
                 break
@@ -429,14 +410,13 @@ class Search:
 
     def _slope(self) -> FloatArray:
         """Derivative of the map by z, to about 1e-5, from one pass for every mode that does not decay in a period."""
-        period = self.period
-        decaying = period.rates[~period.neutral]
+        decaying = self.rates[~self.neutral]
         # A slow mode's 1 - slope is about its rate times the period: the passes' errors must be smaller than that.
-        forgets = min(1.0, float(decaying.min(initial=math.inf)) * period.span)
+        forgets = min(1.0, float(decaying.min(initial=math.inf)) * self.span)
         tol = max(_SLOPE_TOL * forgets, _LEAST_SLOPE_TOL)
         base = self.passed(self.z, tol).end
-        slope = np.diag(period.turned * np.exp(-period.rates * period.span))
-        for k in np.flatnonzero(period.rates * period.span < _FORGOTTEN):
+        slope = np.diag(self.turned * np.exp(-self.rates * self.span))
+        for k in np.flatnonzero(self.rates * self.span < _FORGOTTEN):
             if not self.free[k]:
                 continue
             unit = np.zeros(self.z.size)
@@ -450,22 +430,21 @@ class Search:
 
         An error made in every period leads to an error of the periodic state equal to the solver times it.
         """
-        period, solver = self.period, np.abs(self.solver)
+        solver = np.abs(self.solver)
         grown = solver @ np.abs(last.error)
-        met = last.met[self.fingers]
-        peak, force = met[:, readout.PEAK_U], met[:, readout.PEAK_F]
+        peak, force = last.met[:, readout.PEAK_U], last.met[:, readout.PEAK_F]
         gap = np.abs(self.gap)
         # Add round-off, and the last Newton step as a bound of the error that remains after it.
-        once = np.abs(period.modes.inverse).sum(axis=1)
-        often = solver[: period.n, : period.n] @ once
-        grows = np.maximum(1.0, (gap[:, : period.n] @ often) / (gap[:, : period.n] @ once))
+        once = np.abs(self.modes.inverse).sum(axis=1)
+        often = solver[: self.n, : self.n] @ once
+        grows = np.maximum(1.0, (gap[:, : self.n] @ often) / (gap[:, : self.n] @ once))
         largest = float(peak.max(initial=0.0)) + self.scale
-        floor = 4e-16 * grows * (last.rounding[self.fingers] * largest + peak)
+        floor = 4e-16 * grows * (last.rounding * largest + peak)
         u_error = last.magnified * (SAFETY * (gap @ grown) + gap @ np.abs(step)) + floor
         f_error = 2.0 * force / np.where(peak > 0.0, peak, math.inf) * u_error
-        slow = period.problem.scene.net.slow[self.fingers]
+        slow = self.problem.scene.net.slow[self.fingers]
         # An area without a time constant has the place -1, the 0 at the end.
-        share = np.append((SAFETY * grown + np.abs(step))[period.n :], 0.0)[slow]
+        share = np.append((SAFETY * grown + np.abs(step))[self.n :], 0.0)[slow]
         u_error, f_error = u_error + peak * share, f_error + 3.0 * force * share
         live = peak > 4e-15 * self.scale
         over = np.append((u_error / np.where(live, peak, 1.0))[live], (f_error / np.where(live, force, 1.0))[live])
@@ -476,33 +455,17 @@ class Search:
 def close_period(problem: Problem, rtol: float) -> tuple[Problem, Found]:
     """A problem, with its length, that starts from its periodic state, when the source has become periodic.
 
-    `rtol` bounds the error of the state alone, relative to the peaks over the period. Where round-off exceeds it, the
-    stated error is larger than `rtol`, and no error is raised.
-
-    Sources without a common period are refused; a period that cannot be integrated, or that leads to no
-    periodic state, is a `SolveError`.
+    `rtol` bounds the error of the state alone, relative to the peaks over the period; where round-off exceeds it, the
+    stated error is larger. Sources without a common period are refused; a period that cannot be integrated, or that
+    leads to no periodic state, is a `SolveError`.
     """
     if problem.waveform.period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
-    with stops_told(problem):
-        period = Period(problem)
-        found = Search(period, rtol).close() if problem.scene.coupled else _closed_form(period)
+    period = Search(problem, rtol) if problem.scene.coupled else Period(problem)
+    found, moved = period.close(), period.begin - problem.t_start
     y = np.append(found.start, np.zeros(period.before.size))
-    initial = State(period.begin, y, period.before, np.zeros(problem.scene.net.gap.size), problem.scene.charge_law)
-    moved = period.begin - problem.t_start
     started = dataclasses.replace(
-        problem, t_start=period.begin, t_stop=problem.t_stop + moved, first=problem.first + moved, initial=initial,
-        begun=found.gap_errors,
+        problem, t_start=period.begin, t_stop=problem.t_stop + moved, first=problem.first + moved,
+        initial=dataclasses.replace(period.problem.initial, y=y), begun=found.gap_errors,
     )  # fmt: skip
     return started, found
-
-
-def _closed_form(period: Period) -> Found:
-    """The periodic state of a circuit with fixed areas."""
-    start, end, _ = period.linear_state([])
-    sign = 1.0 if period.parts == 1 else -1.0
-    defect = float(np.abs(period.modes.shape @ (sign * end - start)).max(initial=0.0))
-    slope = np.diag(np.exp(-period.rates * period.span * period.parts))
-    # The only error of the closed form is round-off, which the run adds to its stated error itself.
-    none = np.zeros((len(period.problem.network.fingers), 2))
-    return Found(period.voltages(start + period.kept), period.parts * defect, slope.copy, 1.0, none, 1)

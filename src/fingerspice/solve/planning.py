@@ -65,14 +65,18 @@ def make_plan(problem: Problem, rtol: float, tier: str = "auto", method: str = "
     return kept_with(problem.scene.prepared, key, MOST_PLANS, lambda: _plan(problem, rtol, asked))
 
 
-# The lightest valid tier and its reason; the largest relative change of 1/A, and the area it refers to (m^2).
-_Choice = tuple[str, str, float, float]
-
-
 def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
-    scene, span = problem.scene, problem.t_stop - problem.t_start
-    lightest = _of_network(problem) if scene.model is None else _of_stack(problem, scene.model, rtol)
-    best, reason, changed, area = lightest
+    scene, model, span = problem.scene, problem.scene.model, problem.t_stop - problem.t_start
+    if model is None:
+        changed, area = math.nan, float(scene.area0[0]) if problem.network.areas else math.nan
+        if not scene.coupled:
+            changed = 0.0
+        elif len(problem.network.sources) == problem.network.n_voltage:
+            changed = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
+        best, reason = _of_network(problem, changed)
+    else:
+        changed, area = _change(model.curve, scene.u_peak) if model.coupled else (0.0, model.area0)
+        best, reason = _of_stack(problem, model, rtol, changed)
     chosen = best if tier == "auto" else tier
     if chosen != best:
         _refuse(problem, chosen, best)
@@ -84,7 +88,7 @@ def _plan(problem: Problem, rtol: float, tier: str) -> Plan:
         reasons.append(f"stiff: the fastest rate {fastest:.3g} 1/s against {1.0 / shortest:.3g} 1/s of the source")
     if chosen == "coupled" and scene.coupled and problem.waveform.period:
         reasons += [REPEATS] if span / problem.waveform.period >= FEWEST_PERIODS else []
-    if chosen == "linear" and scene.model is not None and scene.coupled and np.any(scene.model.rate0 > 0.0):
+    if chosen == "linear" and model is not None and scene.coupled and np.any(model.rate0 > 0.0):
         needed = changed
     if scene.skin is not None:
         f, error = scene.skin
@@ -119,47 +123,38 @@ def _stores(problem: Problem) -> bool:
     return problem.scene.stack is not None and bool(problem.inner.y[:-1].any())
 
 
-def _of_network(problem: Problem) -> _Choice:
-    """The tier of a network: linear where its areas are fixed, else coupled.
+def _of_network(problem: Problem, changed: float) -> tuple[str, str]:
+    """The tier of a network, and the reason: linear where its areas are fixed, else coupled.
 
     With capacitors outside the layers, a small change of an area may have a large effect on the voltages over many
     periods. No useful bound of that effect is known beforehand: a network is coupled however little its areas change.
     """
     scene, network = problem.scene, problem.network
-    area = float(scene.area0[0]) if network.areas else math.nan
     if not scene.coupled:
         which = f"the areas are {scene.area_mode}" if network.areas else "no element has an area"
-        return ("linear", f"{which}, so the circuit is linear", 0.0, area)
+        return "linear", f"{which}, so the circuit is linear"
     several = len(network.fingers) > 1
     follows = f"a network whose area{'s follow' if several else ' follows'} the gap voltage"
-    if len(network.sources) > network.n_voltage:
-        reason = f"{follows}; by how much is not known beforehand: a current source sets no bound"
-        return ("coupled", reason, math.nan, area)
-    largest = max(_change(curve, scene.u_peak)[0] for curve in scene.net.curves[scene.net.gap >= 0])
-    reason = f"{follows}, {'each ' if several else ''}by up to {_percent(largest)} of its middle"
-    return ("coupled", reason, largest, area)
+    if math.isnan(changed):
+        return "coupled", f"{follows}; by how much is not known beforehand: a current source sets no bound"
+    return "coupled", f"{follows}, {'each ' if several else ''}by up to {_percent(changed)} of its middle"
 
 
-def _of_stack(problem: Problem, model: Model, rtol: float) -> _Choice:
-    """The tier of a stack: the lightest of all three that is valid."""
-    scene = problem.scene
-    changed, area = _change(model.curve, scene.u_peak) if model.coupled else (0.0, model.area0)
-    if not np.any((model.rate > 0.0) | (model.rate0 > 0.0)) and not (
-        model.mobile and model.coupled and _stores(problem)
-    ):
-        return ("algebraic", "no layer leaks, so the voltages follow the source at once", changed, area)
+def _of_stack(problem: Problem, model: Model, rtol: float, changed: float) -> tuple[str, str]:
+    """The tier of a stack, the lightest of all three that is valid, and the reason."""
+    leaks = np.any((model.rate > 0.0) | (model.rate0 > 0.0))
+    if not leaks and not (model.mobile and model.coupled and _stores(problem)):
+        return "algebraic", "no layer leaks, so the voltages follow the source at once"
     if not model.coupled:
-        return ("linear", f"the area is {scene.area_mode}, so the circuit is linear", changed, area)
-    free, little = not np.any(model.rate0 > 0.0), changed <= 0.2 * rtol
-    reason = f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
-    if not model.mobile and (free or little):
-        reason = "only the charge needs the area at every instant; charge=False leaves it out"
-        if not problem.charge and free:
-            reason = "every leak scales with the area, so under the local law no voltage feels it"
-        elif not problem.charge:
-            reason = f"the area changes the leaks by {changed:.2g} at most, against rtol = {rtol:g}"
-    tier = "linear" if not (model.mobile or problem.charge) and (free or little) else "coupled"
-    return (tier, reason, changed, area)
+        return "linear", f"the area is {problem.scene.area_mode}, so the circuit is linear"
+    free = not np.any(model.rate0 > 0.0)
+    if model.mobile or not (free or changed <= 0.2 * rtol):
+        return "coupled", f"the area follows the voltage and moves the leaks by up to {_percent(changed)}"
+    if problem.charge:
+        return "coupled", "only the charge needs the area at every instant; charge=False leaves it out"
+    if free:
+        return "linear", "every leak scales with the area, so under the local law no voltage feels it"
+    return "linear", f"the area changes the leaks by {changed:.2g} at most, against rtol = {rtol:g}"
 
 
 def _percent(share: float) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray, read_only
 from fingerspice.engine.collocation.readout import ACCEPTED, NFEV, OUTPUT, REJECTED, TRIED, ZEROS
 from fingerspice.engine.network import Sources, at_sources, new_room, rates
-from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status, last_tried
+from fingerspice.results.outcome import ErrorEstimate, Failure, SolveError, State, Status, last_tried
 from fingerspice.results.record import Record
 from fingerspice.results.steps import ClosedForm, Recorded
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, values_at
@@ -25,6 +25,7 @@ Progress = Callable[[float], None]
 PAST_FOLD = -0.01
 # Smallest force (N) whose error is judged; the error of a smaller one may be a denormal number with too few digits.
 LEAST_FORCE = 1e-290
+ROUGH = "the source function itself is rough by {:.2g} V"
 
 
 @dataclass
@@ -228,15 +229,12 @@ def nodes_apart(one: Record, other: Record) -> float:
     return max(map(apart, one.node_voltages.values(), other.node_voltages.values()), default=0.0)
 
 
-ROUGH = "the source function itself is rough by {:.2g} V"
-
-
 def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
     """The failure of a run. At a fold, the gap with the smallest area relative to its area at 0 V is named."""
     status, cause, names = run.status, run.status.cause, _measured(problem)
     element, u_gap, area, margin = ", ".join(names), None, None, None
     if status is Status.SOURCE_NOT_FINITE and run.t_failed is not None:
-        element = _not_finite_at(problem, run.t_failed)
+        element = ", ".join(_not_finite_at(problem, run.t_failed))
     elif status is Status.SOURCE_UNSEEN and run.unseen is not None:
         _, off, place = run.unseen
         element, device = ", ".join(_written(problem, place)), problem.network.sources[place].device
@@ -248,8 +246,7 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         i = int(np.argmin(shrunk))
         signals = record.finger_voltage(i), record.finger_area(i), record.fold_margin
         element, (u_gap, area, margin) = names[i], (float(x[-1]) for x in signals)
-    detail = run.detail or (ROUGH.format(run.rough) if run.rough > 0.0 else "")
-    if detail:
+    if detail := run.detail or (ROUGH.format(run.rough) if run.rough > 0.0 else ""):
         cause += f" ({detail})"
     if status is Status.ERROR_NOT_MET and len(run.gaps):
         peaks = run.gaps[:, 0]
@@ -257,21 +254,16 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
         element = names[worst] if names else element
         cause += f" (estimate {run.gaps[worst, 2]:.3g} V of {peaks[worst]:.3g} V peak"
         largest = max(problem.scene.u_peak, float(peaks.max()))
-        if peaks[worst] < 1e-4 * largest:
-            cause += (
-                f"; the gap takes almost nothing of the {largest:.3g} V of the source, and rounding of these limits it"
-            )
-        cause += ")"
+        little = f"; the gap takes almost nothing of the {largest:.3g} V of the source, and rounding of these limits it"
+        cause += f"{little if peaks[worst] < 1e-4 * largest else ''})"
     return Failure(status, cause, status.action, run.t_failed, element, u_gap, area, margin, last_tried(run.tried))
 
 
-def period_failure(problem: Problem, status: Status, t: float | None = None, cause: str = "") -> Failure:
-    """The failure of a search for the periodic state."""
-    element = ", ".join(_measured(problem))
-    if status is Status.SOURCE_NOT_FINITE and t is not None:
-        element = _not_finite_at(problem, t)
-    why = cause or f"no periodic state was reached: {status.cause}"
-    return Failure(status, why, status.action, t, element)
+def no_period(problem: Problem, status: Status, t: float | None = None, cause: str = "") -> SolveError:
+    """The end of a search for the periodic state, which found none."""
+    names = _measured(problem) if status is not Status.SOURCE_NOT_FINITE or t is None else _not_finite_at(problem, t)
+    cause = cause or f"no periodic state was reached: {status.cause}"
+    return SolveError(Failure(status, cause, status.action, t, ", ".join(names)))
 
 
 def _measured(problem: Problem) -> list[str]:
@@ -285,7 +277,7 @@ def _written(problem: Problem, place: int) -> list[str]:
     return [problem.network.sources[place].name] if stack is None else [e.name for e, _ in stack.sources]
 
 
-def _not_finite_at(problem: Problem, t: float) -> str:
+def _not_finite_at(problem: Problem, t: float) -> list[str]:
     """Names of the sources without a finite value at time t, s."""
     broken = [i for i, wave in enumerate(problem.waveforms) if not np.isfinite(wave.value(t))]
-    return ", ".join(name for i in broken for name in _written(problem, i))
+    return [name for i in broken for name in _written(problem, i)]

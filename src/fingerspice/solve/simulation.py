@@ -25,6 +25,7 @@ from fingerspice.solve.derivatives import check_request, sensitivities_of
 from fingerspice.solve.nodal import solve_coupled, solve_foreign
 from fingerspice.solve.planning import asked, make_plan, run_warnings
 from fingerspice.solve.problem import Problem, asked_for, at_breakpoints, prepare
+from fingerspice.solve.recordings.run import solve as solve_recording
 from fingerspice.solve.runs import ROUGH, Progress, Run, excess_of, run_failure
 from fingerspice.waveforms.waveform import DOUBLE, require
 
@@ -118,7 +119,7 @@ def simulate(
     circuit = overridden(circuit, sources, parameters)
     wanted: dict[str, Any] = {"t_stop": t_stop, "charge_law": charge_law, "area": area, "start": start}
     problem = asked(circuit, t_eval=times, charge=charge, rtol=rtol, **wanted)
-    compared = check_request(problem, sensitivities, method, problem.start) if sensitivities else method
+    compared = check_request(problem, sensitivities, method) if sensitivities else method
     solution = run_problem(problem, times, rtol, method, progress, tier, jumps)
 
     def run(other: Circuit, finer: float) -> Solution:
@@ -221,11 +222,11 @@ def integrated(
     problem: Problem, plan: Plan, rtol: float, method: str, progress: Progress | None = None
 ) -> tuple[Run, str]:
     """A run as planned, with its stated error compared with `rtol`, and the name of its method."""
-    if plan.tier == "algebraic":
-        run, name = solve_algebraic(problem), plan.tier
-    elif plan.tier == "linear":
-        area = np.array([plan.area]) if problem.scene.stack is not None else None
-        run, name = solve_linear(problem, area, plan.error_bound), plan.tier
+    name = plan.tier
+    if name == "algebraic":
+        run = solve_algebraic(problem)
+    elif name == "linear":
+        run = solve_linear(problem, None if problem.scene.stack is None else np.array([plan.area]), plan.error_bound)
     else:
         run, name = _stepped(problem, method, own_rtol(problem, plan, rtol), progress)
         if plan.error_bound > 0.0:
@@ -244,51 +245,31 @@ def solution_of(
 ) -> Solution:  # fmt: skip
     """The solution made of a run and its record, with output times `t` (s); `name` is the method."""
     scene = problem.scene
+    failure = None if run.status is Status.SUCCESS else run_failure(problem, run, record)
+    fundamental = scene.waveform.fundamental if len(scene.waveforms) == 1 else None
     return Solution(
-        t=t,
-        record=record,
-        status=run.status,
-        failure=None if run.status is Status.SUCCESS else run_failure(problem, run, record),
-        nfev=run.nfev,
-        stats=dict(run.stats),
-        error=run.error,
-        rtol=rtol,
-        charge_law=scene.charge_law,
-        area_mode=scene.area_mode,
-        method=name,
-        plan=plan,
-        circuit=problem.circuit,
-        state=run.state,
-        fold_margin_min=run.margin,
-        fundamental=scene.waveform.fundamental if len(scene.waveforms) == 1 else None,
-        period=scene.waveform.period,
-        warnings=tuple(run_warnings(problem, run, record)),
-        first=max(problem.first, problem.t_start),
-        t_stop=problem.t_stop,
-        start=problem.start,
+        t=t, record=record, status=run.status, failure=failure, nfev=run.nfev, stats=dict(run.stats), error=run.error,
+        rtol=rtol, charge_law=scene.charge_law, area_mode=scene.area_mode, method=name, plan=plan,
+        circuit=problem.circuit, state=run.state, fold_margin_min=run.margin, fundamental=fundamental,
+        period=scene.waveform.period, warnings=tuple(run_warnings(problem, run, record)),
+        first=max(problem.first, problem.t_start), t_stop=problem.t_stop, start=problem.start,
         continuous=run.continuous if run.t_failed is None else None,
-    )
+    )  # fmt: skip
 
 
 def _stepped(problem: Problem, method: str, rtol: float, progress: Progress | None) -> tuple[Run, str]:
     """A run of the coupled tier, and the name of its method."""
     if ":" in method:
         return solve_foreign(problem, method, rtol, progress), method
-    if method == "auto":
-        from fingerspice.solve.recordings.run import solve as solve_recording
-
-        recorded = solve_recording(problem, rtol, progress)
-        if recorded is not None:
-            return recorded, "relaxation"
+    if method == "auto" and (recorded := solve_recording(problem, rtol, progress)) is not None:
+        return recorded, "relaxation"
     is_stack, reason = problem.scene.stack is not None, ""
     if method != "radau" and (is_stack or problem.scene.coupled):
         run = solve_exponential(problem, rtol, progress, repeat=method == "auto")
         if run.status not in (BEYOND_STACKS if is_stack else BEYOND_NETWORKS) or (is_stack and method == "exponential"):
             return run, "exponential"
-        if is_stack and run.status is Status.FOLD:
-            folded = run_to_fold(problem)
-            if folded is not None:
-                return folded, "exponential"
+        if is_stack and run.status is Status.FOLD and (folded := run_to_fold(problem)) is not None:
+            return folded, "exponential"
         cause = "a fold is near" if run.status is Status.FOLD else run.status.cause
         reason = f"exponential steps gave up at t = {run.state.t:.4g} s, because {cause}"
     # The implicit method is the last resort: its step length does not depend on fast modes.

@@ -49,17 +49,11 @@ KEPT_STEPS = 2000
 
 
 class OutOfRangeError(Exception):
-    """A gap voltage left the range of its area's curve, which ends at `top` (V)."""
-
-    def __init__(self, top: float) -> None:
-        self.top = top
+    """A gap voltage left the range of its area's curve: the argument, V."""
 
 
 class Stepping(Integration):
-    """One integration by exponential steps, with an error of at most `tol` (V) in each step.
-
-    Steps are as long as that allows, or all of the length `h_fixed` (s).
-    """
+    """One integration by exponential steps, with an error of at most `tol` (V) in each step."""
 
     error: FloatArray  # As in `LoopState`, as `peaks` and `collected`
     gaps: list[int]  # Rows of `peaks` of the gaps whose errors are stated
@@ -73,14 +67,14 @@ class Stepping(Integration):
     # is repeated.
     asked = math.inf
 
-    def __init__(self, problem: Problem, tol: float, shown: int, width: int, h_fixed: float = 0.0) -> None:
+    def __init__(self, problem: Problem, tol: float, shown: int, width: int) -> None:
         self.controls = np.zeros(1, readout.CONTROL)
         self.control = self.controls[0]
         self.control["t"] = problem.t_start
         super().__init__(problem)
         span, self.period = problem.t_stop - problem.t_start, problem.waveform.period or math.inf
-        longest = h_fixed or min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
-        self.pace = Pace(tol, longest, h_fixed == 0.0, problem.charge)
+        longest = min(LONGEST_STEP * problem.waveform.shortest_time(), span, problem.max_step)
+        self.pace = Pace(tol, longest, True, problem.charge)
         self.counters = np.zeros(readout.N_COUNTERS, np.int64)
         self.step = np.zeros(1, readout.STEP)
         self.peaks, self.collected = np.zeros((self.net.gap.size + 1, 4)), np.zeros((2, self.s_before.size))
@@ -92,17 +86,12 @@ class Stepping(Integration):
         self.keep(0)
 
     def look_for_period(self, rates: FloatArray, scale: FloatArray, repeat: bool) -> None:
-        """Prepare the looks of the run, none where it is not to `repeat` a period.
-
-        `rates` (1/s) are those of the modes with the area frozen, and `scale` (n,) converts the first n entries of the
-        integration's state to volts.
-        """
+        """Prepare the looks of the run, none unless it is to `repeat` a period; `rates` (1/s) are those at 0 V."""
         problem, values = self.problem, np.zeros(loop.N_VALUES)
         start, live = max(problem.t_start, problem.waveform.settled), rates[rates > 0.0]
         values[loop.START], values[loop.STOP], values[loop.PERIOD] = start, problem.t_stop, self.period
-        values[loop.ALLOWED], values[loop.HAS_CHARGE], values[loop.LOOKED] = (
-            _SHARE * self.pace.tol, problem.charge, -1.0,
-        )  # fmt: skip
+        values[loop.ALLOWED], values[loop.HAS_CHARGE] = _SHARE * self.pace.tol, problem.charge
+        values[loop.LOOKED] = -1.0
         # A mode with rate 0 keeps its charge for ever, so that it does not limit the time to the periodic state.
         values[loop.RATE] = loop.RATE_SHARE * float(live.min()) if live.size else math.inf
         values[loop.DISTANCE] = values[loop.REMAINING] = values[loop.TRIAL] = math.inf
@@ -123,13 +112,6 @@ class Stepping(Integration):
     @property
     def t(self) -> float:
         return float(self.control["t"])
-
-    def loop_state(self) -> LoopState:
-        """The integration as the compiled loop takes and updates it."""
-        return LoopState(
-            self.y, self.error, self.controls, self.counters, self.step, self.peaks, self.collected, self.outputs,
-            self.kept, self.recorder.room, self.tried,
-        )  # fmt: skip
 
     def try_out(self, asked: float) -> None:
         """Compare the stated error with `asked` after a few periods, if many are left."""
@@ -152,14 +134,18 @@ class Stepping(Integration):
         """Smallest distance to a fold so far."""
         return float(self.control["margin"])
 
-    @abstractmethod
-    def _failed(self, code: int, sources: Sources) -> Status:
+    def failed(self, code: int, sources: Sources) -> Status:
         """Status of a run whose loop ended with a code other than DONE."""
+        return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
 
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
         """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `loopstate`."""
         while True:
-            code = int(loop.march_on(self.circuit(sources), self.pace, self.loop_state(), looks, t_end))
+            state = LoopState(
+                self.y, self.error, self.controls, self.counters, self.step, self.peaks, self.collected, self.outputs,
+                self.kept, self.recorder.room, self.tried,
+            )  # fmt: skip
+            code = int(loop.march_on(self.circuit(sources), self.pace, state, looks, t_end))
             if self.counters[readout.RECORDED] >= len(self.recorder.room.times):
                 self.recorder.drain(self.counters)
             if code != readout.PAUSED:
@@ -204,7 +190,7 @@ class Stepping(Integration):
                 if excess_of(self.stated_peaks()[self.gaps], self.problem.rounding) > self.asked:
                     return Status.ERROR_NOT_MET
             elif code != readout.DONE:
-                return self._failed(code, sources)
+                return self.failed(code, sources)
         return Status.SUCCESS
 
     def _settle(self) -> None:

@@ -7,8 +7,9 @@ window before. Chunks are cut from the outputs of the pieces, so that no bit dep
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,17 +17,58 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray, positive_number, whole_number
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import Parameters, Sources, overridden
-from fingerspice.results.outcome import Plan, SolveError, Status
+from fingerspice.circuit.network import Network
+from fingerspice.results.outcome import Plan, SolveError, State, Status
 from fingerspice.results.record import Record
 from fingerspice.results.solution import Solution
 from fingerspice.solve.planning import asked, make_plan
-from fingerspice.solve.problem import Problem, check_length, check_outputs
-from fingerspice.solve.recordings.run import BySamples, ByWindows, Mark, Outputs, outputs_of, within
-from fingerspice.solve.simulation import check_arguments, solution_of
+from fingerspice.solve.problem import Problem, at_breakpoints, check_length, check_outputs
+from fingerspice.solve.recordings.run import LaneMarch, LostError, prepared
+from fingerspice.solve.runs import Run
+from fingerspice.solve.simulation import check_arguments, integrated, own_rtol, solution_of, state_error
+from fingerspice.waveforms.samples import Samples
+from fingerspice.waveforms.sampling import on_breakpoint
 from fingerspice.waveforms.waveform import require
 
-# Default length of a chunk, s.
-CHUNK = 10.0
+# Default length of a chunk, s; number of outputs in a window of a run that is not integrated sample by sample.
+CHUNK, WINDOW = 10.0, 1 << 14
+#: State of a stream before a piece, as plain data: another stream continues from it with the same bytes.
+Mark = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Output times, evenly spaced."""
+
+    # start, over: Time of output number 0, s, and spacing, s; if `rated`, `over` is the rate of a recording, Hz
+    start: float
+    over: float
+    rated: bool  # Whether the outputs are at the samples of a recording
+    # low, total: Number of the first output, and how many outputs there are
+    low: int
+    total: int
+    stop: float  # End of the run, s
+
+    def times(self, i: int, j: int) -> FloatArray:
+        """Times of outputs i to j - 1, s, rounded as ``start + arange / rate`` or ``start + step * arange`` are."""
+        number = np.arange(self.low + i, self.low + min(j, self.total))
+        t = self.start + (number / self.over if self.rated else self.over * number)
+        return np.asarray(np.minimum(t, self.stop))
+
+
+def outputs_of(problem: Problem, step: float | None) -> Outputs:
+    """The outputs at the samples of a recording, or every `step` (s); the deck's TSTEP where there is no recording."""
+    wave, first, stop = problem.waveform, max(problem.first, problem.t_start), problem.t_stop
+    if step is None and isinstance(wave, Samples):
+        low = math.ceil((first - wave.start) * wave.rate - 1e-6)
+        total = math.floor((stop - wave.start) * wave.rate + 1e-6) - low + 1
+        found = Outputs(wave.start, wave.rate, True, low, total, stop)
+    else:
+        step = problem.step if step is None else step
+        total = math.floor((stop - first) / step * (1.0 + 1e-12) + 1e-9) + 1
+        found = Outputs(first, step, False, 0, total, stop)
+    require(found.total >= 1, "the run", f"one of {stop - first:g} s without any output", "a longer one")
+    return found
 
 
 class Stream:
@@ -46,10 +88,18 @@ class Stream:
     def __init__(self, problem: Problem, plan: Plan, outputs: Outputs, count: int, rtol: float, method: str) -> None:
         self.problem, self.plan, self.outputs, self.count, self.rtol = problem, plan, outputs, count, rtol
         self.done = 0
-        by_samples = BySamples.of(problem, outputs, plan, rtol) if method == "auto" else None
-        self._source: BySamples | ByWindows = by_samples or ByWindows(problem, outputs, plan, rtol, method)
-        # Integrated pieces whose outputs no chunk has contained yet: the mark before each, times (s) and rows.
+        # Outputs integrated so far; those that no chunk has contained yet: the mark before each piece, times (s), rows.
+        self._written = 0
         self._ready: list[tuple[Mark, FloatArray, FloatArray]] = []
+        # Of a recording that is followed sample by sample: its pieces, the number of the next one, and its march.
+        own, by_samples = own_rtol(problem, plan, rtol), method == "auto" and plan.tier == "coupled"
+        self._pieces, form = (prepared(problem, own) if by_samples else None) or ([], None)
+        self._place, self._march = 0, None if form is None else LaneMarch(problem, form, own)
+        # Of a run in windows, such as what the method for recordings fails on: the method asked for and, of the last
+        # window, the one used, state, peaks and run.
+        self._asked, self._method = (method, method) if form is None else ("exponential", "relaxation")
+        self._state, self._gaps = problem.initial, np.zeros((0, 4))
+        self._last: Run | None = None
 
     def __iter__(self) -> Iterator[Solution]:
         return self
@@ -72,36 +122,92 @@ class Stream:
 
     def mark(self) -> Mark:
         """The state before the piece that contains the next chunk's first output, as plain data; see `go_to`."""
-        marks = [*(mark for mark, _, _ in self._ready), self._source.mark()]
+        marks = [*(mark for mark, _, _ in self._ready), self._here()]
         return [mark for mark in marks if mark["written"] <= self.done][-1]
 
     def go_to(self, mark: Mark, done: int) -> None:
         """Continue a stream from its mark, after `done` outputs; allowed before this stream's first chunk only."""
-        if "state" in mark and isinstance(self._source, BySamples):
-            self._source = self._stepped()
-        self._source.go_to(mark)
+        self._stand(mark)
         self.done = done
         self._reach(done + 1)
         self._take(done - (self._ready[0][0]["written"] if self._ready else done))
 
-    def _stepped(self) -> ByWindows:
-        """The method for a recording that the one for recordings fails on."""
-        return ByWindows(self.problem, self.outputs, self.plan, self.rtol, "exponential")
+    def _here(self) -> Mark:
+        """The mark of the state reached."""
+        if self._march is not None:
+            return {"written": self._written, "place": self._place, "march": self._march.mark()}
+        state = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self._state).items()}
+        return {"written": self._written, "state": state, "gaps": self._gaps.tolist()}
+
+    def _stand(self, mark: Mark) -> None:
+        """Restore the state of a mark."""
+        self._written = mark["written"]
+        if self._march is not None and "march" in mark:
+            self._place = mark["place"]
+            self._march.stand(mark["march"])
+            return
+        kept: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in mark["state"].items()}
+        self._state, self._march = State(**kept), None
+        self._gaps = np.array(mark["gaps"], float).reshape(-1, 4)
+
+    @property
+    def _over(self) -> bool:
+        """Whether the run has reached its end, or failed."""
+        if self._march is not None:
+            return self._place == len(self._pieces)
+        failed = self._last is not None and self._last.status is not Status.SUCCESS
+        return failed or self._written == self.outputs.total
 
     def _reach(self, written: int) -> None:
         """Integrate pieces until so many outputs are there, or the run ends."""
-        while self._source.written < written and not self._source.over:
-            mark = self._source.mark()
-            found = self._source.advance()
-            if found is None:
-                # Integrate this piece, and the rest, by exponential steps.
-                assert isinstance(self._source, BySamples)
-                self._source.go_to(mark)
-                other = self._stepped()
-                other.written, other.state = mark["written"], self._source.march.state
-                self._source = other
-                mark, found = other.mark(), other.advance()
-            self._ready.append((mark, *found))
+        while self._written < written and not self._over:
+            mark, march = self._here(), self._march
+            if march is None:
+                self._ready.append((mark, *self._window()))
+                continue
+            try:
+                self._ready.append((mark, *self._piece(march)))
+            except LostError:
+                # The state before this piece.
+                self._state, self._march = march.state, None
+
+    def _piece(self, march: LaneMarch) -> tuple[FloatArray, FloatArray]:
+        """Times (s) and rows of the next piece of a recording."""
+        piece, o, last = self._pieces[self._place], self.outputs, self._place + 1 == len(self._pieces)
+        # All outputs up to the end of the piece, and a few more.
+        number = (piece.stop - o.start) * o.over if o.rated else (piece.stop - o.start) / o.over
+        end = o.total if last else min(max(math.ceil(number) - o.low + 2, self._written), o.total)
+        t = o.times(self._written, end)
+        run_at = t if o.rated else at_breakpoints(_between(self.problem, piece.start, piece.stop), t)
+        out = march.outputs_at(run_at)
+        march.follow(piece, run_at, out)
+        if last:
+            march.finish(run_at, out)
+        count = march.outputs
+        self._written, self._place = self._written + count, self._place + 1
+        return t[:count], march.form.recorded(self.problem, out[:, :count])
+
+    def _window(self) -> tuple[FloatArray, FloatArray]:
+        """Times (s) and rows of the next window."""
+        end = min(self._written + WINDOW, self.outputs.total)
+        t, whole = self.outputs.times(self._written, end), self.problem
+        stop = whole.t_stop if end == self.outputs.total else on_breakpoint(whole.waveform, float(t[-1]))
+        problem = _between(whole, self._state.t, stop)
+        scene = replace(whole.scene, network=within(whole.network, self._state.t, stop + whole.step))
+        problem = replace(problem, scene=scene, initial=self._state)
+        problem = problem.at(at_breakpoints(problem, t), np.zeros(t.size, bool))
+        run, self._method = integrated(problem, self.plan, self.rtol, self._asked)
+        if run.gaps.shape == self._gaps.shape:
+            run.gaps = np.maximum(run.gaps, self._gaps)
+        self._last, self._gaps, self._state = run, run.gaps, run.state
+        self._written += run.t.size
+        record = run.record(problem)
+        shown, n = whole.scene.shown.network, record.network.k.shape[0]
+        if len(shown.cells) == len(record.network.cells):
+            return t[: run.t.size], record.rows
+        # In the form of exponential steps, whichever method has computed them.
+        place = [shown.layers.index(shown.cells[i].element) for i in shown.live]
+        return t[: run.t.size], np.column_stack([record.u_layer[:, place], record.rows[:, n:]])
 
     def _take(self, count: int) -> tuple[FloatArray, FloatArray]:
         """Take the next `count` outputs, or all if there are fewer: times (s) and rows."""
@@ -117,7 +223,16 @@ class Stream:
         return np.concatenate(times), np.concatenate(rows) if rows else np.empty((0, width))
 
     def _solution(self, t: FloatArray, rows: FloatArray) -> Solution:
-        problem, run = self.problem, self._source.run()
+        problem, none = self.problem, (np.empty(0), np.empty(0, bool), np.empty((0, 0)))
+        if self._march is not None:
+            run = self._march.run(*none)
+            if self.plan.error_bound > 0.0:
+                run.add_error(self.plan.error_bound * run.gaps[:, 0])
+            if self._over:
+                state_error(problem, run, self.plan, self.rtol)
+        else:
+            assert self._last is not None
+            run = replace(self._last, t=none[0], left=none[1], rows=none[2], continuous=None)
         if self._ready:
             # A failure concerns a later chunk if outputs before it are still waiting for their chunk.
             run.status, run.t_failed = Status.SUCCESS, None
@@ -125,8 +240,21 @@ class Stream:
         span = (float(t[0]), float(t[-1])) if t.size else (problem.t_start, problem.t_start)
         network = within(shown.network, *span)
         record = Record(network, shown.net, t, np.zeros(t.size, bool), np.ascontiguousarray(rows), problem.charge)
-        found = solution_of(problem, self.plan, run, record, t, self.rtol, self._source.method)
+        found = solution_of(problem, self.plan, run, record, t, self.rtol, self._method)
         return replace(found, first=span[0], t_stop=span[1])
+
+
+def _between(problem: Problem, t0: float, t1: float) -> Problem:
+    """The problem restricted to the times from t0 to t1, s."""
+    return replace(problem, t_start=t0, t_stop=t1, first=t0)
+
+
+def within(network: Network, t0: float, t1: float) -> Network:
+    """The network with its recordings cut to the samples needed from t0 to t1, s."""
+    cut = [
+        replace(e, waveform=e.waveform.part(t0, t1)) if isinstance(e.waveform, Samples) else e for e in network.sources
+    ]
+    return replace(network, sources=tuple(cut))
 
 
 def stream(

@@ -360,7 +360,7 @@ def steady_state(
         circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="periodic", charge=charge
     )
     if sensitivities:
-        check_request(problem, sensitivities, "auto", "periodic")
+        check_request(problem, sensitivities, "auto")
     problem, found = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)
     error = ErrorEstimate(*map(float, found.gap_errors.max(axis=0, initial=0.0)))
     return SteadyState(

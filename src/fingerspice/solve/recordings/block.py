@@ -43,6 +43,14 @@ OF_FORCE = 1.75
 LUCK = 2.0
 # Arrays of the present thread, which its next block overwrites: memory that is new to a process costs time.
 _OF_THREAD = threading.local()
+# Fewest samples for which this method pays, and the samples of a piece; pieces begin at multiples of that number.
+LEAST_SAMPLES, PIECE = 64, 1 << 18
+# Fewest points of a PWL at uneven times for which its own steps pay, whose loop has to be compiled once.
+LEAST_POINTS = 1000
+# Longest step on a line between two points, over their median distance.
+LONGEST = 4.0
+# Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, peak and thread.
+MOST_FORMS = 16
 
 
 def _scratch(name: str, *shape: int) -> FloatArray:
@@ -174,10 +182,7 @@ class Block:
         return np.array(self.kept[:, lane, self.n - lane * self.count])
 
     def judge(self, parts: int, peak: float, alike: FloatArray, chance: FloatArray) -> Judged:
-        """Errors of the block that has been followed in `parts` steps a sample.
-
-        The largest |xi| so far is `peak` (V); `alike` (m,) and `chance` (m, m) are those at the start, as in `Judged`.
-        """
+        """Errors of the block, followed in `parts` steps a sample, with those at its start; `peak` is of |xi|, V."""
         form, c, window, active, m = self.form, self.form.lanes, self._check(parts), self.active, self.m
         y, of_window = (self.rates[:, None] * took for took in (self.lengths, np.maximum(window.took, 1e-30)))
         # What a piece adds over what its window does, if all errors are alike, and of products of two, if they come by
@@ -217,8 +222,7 @@ class Block:
     def _hand_on(self, added: FloatArray, before: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Errors at the start of each piece (*kinds, pieces), and at the end of the block.
 
-        Pieces add `added` (*kinds, pieces), and `before` (*kinds,) is there at the start. Of one error for each mode,
-        or of the products of two.
+        Pieces add `added` (*kinds, pieces), and `before` (*kinds,) is there at the start: of modes, or products of two.
         """
         handed, lane = self.handed, (self.n - 1) // self.count
         left = np.exp(-self.rates * self.lengths[lane])
@@ -326,14 +330,6 @@ class Block:
         return to, out[0, : len(z)]
 
 
-# Fewest samples for which this method pays, and the samples of a piece; pieces begin at multiples of that number.
-LEAST_SAMPLES, PIECE = 64, 1 << 18
-# Fewest points of a PWL at uneven times for which its own steps pay, whose loop has to be compiled once.
-LEAST_POINTS = 1000
-# Longest step on a line between two points, over their median distance.
-LONGEST = 4.0
-
-
 @dataclass(frozen=True)
 class Piece:
     """A part of a run with evenly spaced samples, or with the points of a PWL."""
@@ -366,56 +362,45 @@ class Piece:
         return wave.between(self.first, self.last + 1)
 
 
-def driving(problem: Problem) -> tuple[int, Samples | PWL] | None:
+def driving(problem: Problem) -> tuple[int, Samples | PWL | None]:
     """Number and waveform of the one source that is a recording, where all others are at 0; else None.
 
     For a stack it may also be a PWL with many points, without jump in the run.
     """
     wave = problem.waveform
     if problem.scene.stack is not None and isinstance(wave, PWL) and wave.repeat is None and as_samples(wave) is None:
-        return None if _points(problem, wave) is None else (0, wave)
+        return 0, wave if _points(problem, wave).size else None
     on = [(i, as_samples(w)) for i, w in enumerate(problem.waveforms) if not (isinstance(w, DC) and w.level == 0.0)]
-    return (on[0][0], on[0][1]) if len(on) == 1 and on[0][1] is not None else None
-
-
-# Number of forms cached with a scene or a stack, of up to 0.2 MB each: one for each tolerance, peak and thread.
-MOST_FORMS = 16
+    return on[0] if len(on) == 1 else (0, None)
 
 
 def ready(problem: Problem, rtol: float) -> LaneForm | None:
-    """The scene under a recording (`driving`) prepared for a decade of errors; None where lanes do not apply to it.
-
-    It is cached with the scene, or with a stack for all sources of about its peak.
-    """
-    scene, decade, found = problem.scene, float(10.0 ** np.floor(np.log10(rtol))), driving(problem)
+    """The scene prepared for recordings, and cached; None where lanes do not apply to it."""
+    scene, decade = problem.scene, float(10.0 ** np.floor(np.log10(rtol)))
     key: tuple[Any, ...] = "followed", decade, problem.charge, threading.get_ident()
     if scene.stack is not None:
         key = *key, scene.charge_law, rounded_peak(scene.u_peak)
         return kept_with(scene.stack.kept, key, MOST_FORMS, lambda: stack(problem, decade))
-    source, wave = found or (0, None)
+    source, wave = driving(problem)
     assert isinstance(wave, Samples)
     return kept_with(scene.prepared, key, MOST_FORMS, partial(finger, problem, decade, source, wave))
 
 
-def _points(problem: Problem, wave: PWL) -> FloatArray | None:
-    """Times (s) of a run's points and ends, and more on long lines, kept for the last run; None if not dense."""
-    key = problem.t_start, problem.t_stop
-    found: FloatArray | None
-    of, found = wave.kept.get("points", (None, None))
-    if of != key:
-        _, found = wave.kept["points"] = key, _dense(wave.knots[0], *key)
-    return found
+def _points(problem: Problem, wave: PWL) -> FloatArray:
+    """Times (s) of a run's points and ends, and more on long lines, kept for the last run; empty if not dense."""
+    t0, t1 = problem.t_start, problem.t_stop
+    return kept_with(wave.kept, ("points", t0, t1), 1, lambda: _dense(wave.knots[0], t0, t1))
 
 
-def _dense(t: FloatArray, t0: float, t1: float) -> FloatArray | None:
+def _dense(t: FloatArray, t0: float, t1: float) -> FloatArray:
     slack = 1e-6 * (t1 - t0) / t.size
     inside = np.concatenate([[t0], t[(t > t0 + slack) & (t < t1 - slack)], [t1]])
     intervals = np.diff(inside)
     if inside.size < LEAST_POINTS or not np.all(intervals > 0.0):
-        return None
+        return np.empty(0)
     parts = np.ceil(intervals / (LONGEST * np.median(intervals))).astype(int)
     if parts.sum() > 2 * inside.size:
-        return None
+        return np.empty(0)
     if parts.sum() == parts.size:
         return inside
     before = np.repeat(np.concatenate([[0], np.cumsum(parts)[:-1]]), parts)
@@ -428,27 +413,21 @@ def spacing_of(wave: Samples | PWL) -> float:
     return 1.0 / wave.rate if isinstance(wave, Samples) else (wave.times[-1] - wave.times[0]) / (len(wave.times) - 1)
 
 
-def pieces_of(problem: Problem) -> list[Piece] | None:
-    """The pieces of a run with a moving area that is driven by a recording of enough samples; else None."""
-    found = driving(problem) if problem.scene.coupled else None
-    if found is None:
-        return None
-    _, wave = found
+def pieces_of(problem: Problem) -> list[Piece]:
+    """The pieces of a run with a moving area that is driven by a recording of enough samples; else none."""
+    _, wave = driving(problem) if problem.scene.coupled else (0, None)
+    if wave is None:
+        return []
     if isinstance(wave, PWL):
         points, spacing = _points(problem, wave), spacing_of(wave)
-        assert points is not None
         edges = [*range(0, points.size - 1, PIECE), points.size - 1]
         return [Piece(float(points[a]), spacing, times=points[a : b + 1]) for a, b in itertools.pairwise(edges)]
     spacing, t0, t1 = 1.0 / wave.rate, problem.t_start, problem.t_stop
     first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
-    if last - first < LEAST_SAMPLES:
-        return None
-    if (
-        not any(isinstance(one, Samples) for one in problem.waveforms)
-        and last - first > MOST_PER_POINT * problem.breakpoints().size
-    ):
-        # In most of the run the source is one long line, of which the other methods need few steps.
-        return None
+    of_samples = any(isinstance(one, Samples) for one in problem.waveforms)
+    # In a PWL with few points the source is one long line in most of the run, of which other methods need few steps.
+    if last - first < LEAST_SAMPLES or not (of_samples or last - first <= MOST_PER_POINT * problem.breakpoints().size):
+        return []
     grows, begin, end = problem.scene.stack is None, wave.start + first * spacing, wave.start + last * spacing
     early = begin - t0 > 1e-6 * spacing
     edges = [first, *range((first // PIECE + 1) * PIECE, last, PIECE), last]

@@ -23,8 +23,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, cast
 
@@ -36,27 +35,18 @@ from fingerspice.base.arrays import BoolArray, FloatArray, aligned
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.network import network_modes
 from fingerspice.circuit.statespace import Stack
+from fingerspice.engine.lanes import rows as of_lanes
 from fingerspice.engine.lanes.loops import polynomial_of
-from fingerspice.engine.lanes.rows import (
-    FADED,
-    Lanes,
-    Marks,
-    MobileMarks,
-    NetworkMarks,
-    StackMarks,
-    rows_of,
-    weigh,
-    weighed,
-)
+from fingerspice.engine.lanes.rows import FADED, Lanes, Marks
 from fingerspice.engine.one_area.model import dot, ramp
 from fingerspice.engine.one_area.system import System
 from fingerspice.numerics import chebyshev
 from fingerspice.physics.contact import inverse_area, inverse_area_array
 from fingerspice.results.outcome import State
-from fingerspice.solve.collocation import as_recorded, on_branch, system_of
+from fingerspice.solve.collocation import by_modes, on_branch, system_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.scenes import BEYOND_PEAK, Scene
-from fingerspice.solve.starting import StackState, from_stack
+from fingerspice.solve.starting import StackState
 from fingerspice.waveforms.samples import Samples
 
 # Number of lanes, each with a piece of a recording.
@@ -73,6 +63,17 @@ MOST_DEGREE = 28
 _AREA_SHARE, _COARSEST = 0.003, 1e-5
 # Number of Chebyshev points for the area over the gap voltage.
 _POINTS = 64
+# Ratio of reference areas, so large that there is one.
+_ONE_REFERENCE = 1e12
+# Number of frequencies at which the gap's share is looked at.
+_FREQUENCIES = 65
+# Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
+# what they leave together is known but for about 1e-8.
+OF_MANY, ACTING = 1e-7, 0.05
+# Fewest active modes that code is compiled for.
+LEAST_MODES = 4
+# Reference area: that at this share of the largest gap voltage to expect.
+_TYPICAL = 0.5
 
 
 class Shown(NamedTuple):
@@ -124,7 +125,8 @@ class LaneForm(ABC):
 
     def marks(self, own: bool) -> Marks:
         """The lengths that the compiled code knows; `own` weights are those of each lane."""
-        leaks, kind = self.lanes.tap_s.size, MobileMarks if self.mobile else NetworkMarks if self.bent else StackMarks
+        leaks = self.lanes.tap_s.size
+        kind = of_lanes.MobileMarks if self.mobile else of_lanes.NetworkMarks if self.bent else of_lanes.StackMarks
         sizes = self.lanes.rates.size, self.active, self.inner, leaks, self.lanes.feed.shape[1] - leaks
         return kind(*((0,) * size for size in (*sizes, int(self.mobile), PIECES, int(own))))
 
@@ -134,18 +136,16 @@ class LaneForm(ABC):
         return not self.mobile and self.lanes.feed.shape[1] > self.lanes.tap_s.size
 
     def room(self, own: bool) -> tuple[FloatArray, FloatArray]:
-        """Arrays for the state of the lanes, and for weights of steps (2, rows, 1 or lanes), each lane's `own` or not.
-
-        Those of steps of length 0 are there, for the others see `weigh`.
-        """
+        """Arrays for the lanes' state, and for weights of steps (2, rows, 1 or lanes): of length 0, and by `weigh`."""
         marks, wide = self.marks(own), PIECES if own else 1
-        state, weights = aligned([(rows_of(marks).end * PIECES,), (2, weighed(*map(len, marks[:5])).end, wide)])
+        count = of_lanes.weighed(*map(len, marks[:5])).end
+        state, weights = aligned([(of_lanes.rows_of(marks).end * PIECES,), (2, count, wide)])
         self.weigh(np.zeros(wide), weights[0])
         return state, weights
 
     def weigh(self, h: FloatArray, out: FloatArray) -> None:
         """Weights of steps of the lengths h (s), shape (n,), into `out` (rows, n)."""
-        weigh(self.lanes, self.active, self.inner, h, out)
+        of_lanes.weigh(self.lanes, self.active, self.inner, h, out)
 
     def _polynomial(self, powers: FloatArray, xi: FloatArray) -> FloatArray:
         c, flat, out = self.lanes, np.ravel(xi), np.empty(np.size(xi))
@@ -203,10 +203,8 @@ def as_powers(series: FloatArray, tol: float) -> tuple[FloatArray, float]:
     for degree in range(4, MOST_DEGREE + 1, 4):
         off = float(np.abs(series[degree + 1 :]).sum())
         if off <= tol:
-            kept = np.zeros(degree + 1)
-            kept[: min(series.size, degree + 1)] = series[: degree + 1]
             out = np.empty(degree + 1)
-            chebyshev.to_powers(kept, out)
+            chebyshev.to_powers(series[: degree + 1], out)
             return out, off
     return np.empty(0), 0.0
 
@@ -255,10 +253,6 @@ def _chebyshev(x: FloatArray, count: int) -> FloatArray:
     return np.asarray(np.cos(np.arange(count) * np.arccos(np.clip(x, -1.0, 1.0))[:, None]))
 
 
-# Ratio of reference areas, so large that there is one.
-_ONE_REFERENCE = 1e12
-
-
 @dataclass(frozen=True)
 class StackForm(LaneForm):
     """A stack prepared for recordings; the charge is its last mode, where it is wanted."""
@@ -289,13 +283,14 @@ class StackForm(LaneForm):
         charge = z[self.active] + self._rest(z, u_gap, u_last) if self.flows else start.y[-1]
         y = np.append(self.system.live[0] @ z[: start.y.size - 1], charge)
         found = StackState(t, y, u_last, u_gap, start.offset)
-        return from_stack(problem.scene, on_branch(self.system.model, found, math.copysign(1.0, u_gap)))
+        return on_branch(problem.scene, self.system.model, found, math.copysign(1.0, u_gap))
 
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        rows = as_recorded(replace(problem, charge=False), self.system.model, out.T, np.empty(0))
+        turn = problem.scene.shown.turn
+        out[: turn.size] *= turn[:, None]
         if self.flows and self.mobile:
-            rows[:, self.rows.k.size - 1] -= problem.inner.offset
-        return rows
+            out[self.rows.k.size - 1] -= problem.inner.offset
+        return out.T
 
 
 def rounded_peak(peak: float) -> float:
@@ -329,28 +324,23 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
         columns, shape = np.vstack([columns, np.append(column, 1.0)]), np.append(shape, 0.0)
         k, moves = np.append(k, stored), np.append(moves, moved)
     own = rates, gain, shape, float(model.k_gap), taps, tap_s, np.zeros(tap_s.size), feed
-    lanes, active, wide = roomy(Lanes(*own, kinks=kinks, fast=0, **curve), n)
-    voltages = np.arange(k.size) < system.k_shown.size
+    shown = Shown(columns, k, moves, (np.arange(k.size) < system.k_shown.size) & model.mobile)
+    of_nodes = Shown(nodes, system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile))
+    lanes, active, shown, of_nodes = roomy(Lanes(*own, kinks=kinks, fast=0, **curve), n, shown, of_nodes)
     return StackForm(
-        lanes, active, 1 if rtol >= BY_SIMPSON else 2, model.mobile,
-        Shown(wide(columns), k, moves, voltages & model.mobile),
-        Shown(wide(nodes), system.k_node, 0.0 * system.k_node, np.full(system.k_node.size, model.mobile)),
-        int(problem.charge), system.stress, float(model.k_gap), system.u_top, missed, missed_bend,
-        float(model.slow[-3]) * area0, system,
+        lanes, active, 1 if rtol >= BY_SIMPSON else 2, model.mobile, shown, of_nodes, int(problem.charge),
+        system.stress, float(model.k_gap), system.u_top, missed, missed_bend, float(model.slow[-3]) * area0, system,
     )  # fmt: skip
 
 
-def roomy(lanes: Lanes, n: int, least: int = 1) -> tuple[Lanes, int, Callable[[FloatArray], FloatArray]]:
-    """The constants of n active modes and the others with as many modes and leaks as code is compiled for.
-
-    Also the number of active modes, and what makes room for them in rows (..., m).
-    """
+def roomy(lanes: Lanes, n: int, rows: Shown, nodes: Shown, least: int = 1) -> tuple[Lanes, int, Shown, Shown]:
+    """Constants of n active modes and the others, for as many modes and leaks as code is compiled for; their number."""
     active, leaks = next((size for size in SIZES if size >= max(n, least)), n), lanes.tap_s.size
     more = [leaks] * max(LEAST_LEAKS - leaks, 0)
 
-    def wide(rows: FloatArray) -> FloatArray:
-        still = np.zeros((*rows.shape[:-1], active - n))
-        return np.concatenate([rows[..., :n], still, rows[..., n:]], axis=-1)
+    def wide(x: FloatArray) -> FloatArray:
+        still = np.zeros((*x.shape[:-1], active - n))
+        return np.concatenate([x[..., :n], still, x[..., n:]], axis=-1)
 
     lanes = lanes._replace(
         rates=wide(lanes.rates), gain=wide(lanes.gain), shape=wide(lanes.shape),
@@ -358,7 +348,7 @@ def roomy(lanes: Lanes, n: int, least: int = 1) -> tuple[Lanes, int, Callable[[F
         bent=np.insert(lanes.bent, more, 0.0), kinks=np.insert(lanes.kinks, more, 0.0),
         feed=wide(np.insert(lanes.feed, more, 0.0, axis=1).T).T.copy(),
     )  # fmt: skip
-    return lanes, active, wide
+    return lanes, active, rows._replace(columns=wide(rows.columns)), nodes._replace(columns=wide(nodes.columns))
 
 
 def _charge(system: System, stack: Stack) -> tuple[FloatArray, float, float, FloatArray, float]:
@@ -394,14 +384,16 @@ class Reduced:
 
     def __init__(self, scene: Scene, source: int, area0: FloatArray, charge: bool) -> None:
         net, network = scene.net, scene.network
-        self.scene, self.source, self.area0, modes = scene, source, area0, network_modes(network, area0)
+        self.source, modes = source, network_modes(network, area0)
         # The area that moves, and the cell whose voltage it follows.
         self.moving = int(np.flatnonzero(net.gap >= 0)[0])
         self.gap, self.q0, self.modes = int(net.gap[self.moving]), 1.0 / float(area0[self.moving]), modes
         n, n_s = modes.rates.size, modes.gains.shape[1] if charge else 0
         none = np.zeros((n, n_s))
-        # Voltages of all cells from v, and from the sources.
-        tap, tap_s = network.p @ modes.shape, network.q - network.p @ modes.follow
+        # Voltages of all cells, and what the sources deliver, from v and from the sources.
+        by = by_modes(network, modes, area0)
+        tap, tap_s = by["tap"], by["tap_s"]
+        lost, lost_s, stored, stored_s = (by[name][:n_s] for name in ("lost", "lost_s", "stored", "stored_s"))
         # The cells whose area moves, and the direction of each along their path, relative to that of the gap.
         fed = np.flatnonzero(net.place == self.moving)
         turn = _turns([network.cells[i].nodes for i in fed], int(np.flatnonzero(fed == self.gap)[0]))
@@ -420,14 +412,10 @@ class Reduced:
 
         # A charge is z = stored v + stored_s s + passed c_gap N + y, where y' = lost v + lost_s s and the change of the
         # leaks. One more mode is y + sum over k of lost_k / rate_k w_k, which no other mode drives.
-        capacitance, leak = network.capacitance(area0)[:, None], network.leak(area0)[:, None]
-        through, at_x, at_s = network.through[:n_s], network.delivered[:n_s, :n], network.delivered[:n_s, n:]
-        lost = through @ (leak * tap) + at_x @ modes.shape
-        lost_s = through @ (leak * tap_s) - at_x @ modes.follow + at_s
+        through = network.through[:n_s]
         # Whether no mode that does not decay takes part in a current; else there is no such mode.
         self.decays = not np.any(lost[:, modes.rates == 0.0])
         over = np.divide(lost, modes.rates, out=np.zeros_like(lost), where=modes.rates > 0.0)
-        stored, stored_s = through @ (capacitance * tap), through @ (capacitance * tap_s)
         # w' = -rates w + gain s + feed g, by (q - q0) times each tap, and last by N, which cancels in the charges.
         self.rates, gain = np.append(modes.rates, np.zeros(n_s)), modes.gains[:, source]
         by_leaks = leaks(-modes.take[:, fed])
@@ -442,8 +430,7 @@ class Reduced:
             np.append(-modes.follow[:, source], stored_s[:, source]),
             np.append(modes.shape @ self.absorbed, moved), np.zeros(n + n_s, bool),
         )  # fmt: skip
-        nodes = network.nodes[:, :n] @ modes.shape
-        still = np.zeros(len(nodes))
+        nodes, still = by["node"], np.zeros(len(by["node"]))
         self.nodes = Shown(np.pad(nodes, ((0, 0), (0, n_s))), still, nodes @ self.absorbed, still > 0.0)
 
 
@@ -453,17 +440,6 @@ def _turns(nodes: list[tuple[str, str]], first: int) -> FloatArray:
     inner = [[(a == node) - (b == node) for a, b in nodes] for node, count in ends.items() if count == 2]
     current = np.linalg.svd(np.array(inner, float).reshape(-1, len(nodes)))[2][-1]
     return np.asarray(np.round(current / current[first]))
-
-
-# Number of frequencies at which the gap's share is looked at.
-_FREQUENCIES = 65
-# Least error that is followed where several modes fade in a sample, and the share in kappa from which on they count:
-# what they leave together is known but for about 1e-8.
-OF_MANY, ACTING = 1e-7, 0.05
-# Fewest active modes that code is compiled for.
-LEAST_MODES = 4
-# Reference area: that at this share of the largest gap voltage to expect.
-_TYPICAL = 0.5
 
 
 def is_followed(scene: Scene, circuit: Circuit) -> bool:
@@ -492,7 +468,7 @@ class NetworkForm(LaneForm):
     def start(self, problem: Problem) -> tuple[FloatArray, float]:
         start, reduced, active, c = problem.initial, self.reduced, self.active, self.lanes
         n = reduced.absorbed.size
-        x, s, net = start.y[:n], start.s_before, reduced.scene.net
+        x, s, net = start.y[:n], start.s_before, problem.scene.net
         u = xi = float(net.p[reduced.gap] @ x + net.q[reduced.gap] @ s)
         # Newton's method from the gap voltage to xi.
         for _ in range(50):
@@ -501,8 +477,7 @@ class NetworkForm(LaneForm):
             xi -= step
             if abs(step) <= 1e-15 * abs(xi):
                 break
-        bend = float(self.bend(np.array(xi)))
-        z = np.zeros(self.lanes.rates.size)
+        bend, z = float(self.bend(np.array(xi))), np.zeros(c.rates.size)
         z[:n] = reduced.modes.inverse @ (x + reduced.modes.follow @ s) - reduced.absorbed * bend
         held = self.rows.columns @ z + self.rows.bends * bend + self.rows.k * s[reduced.source]
         z[active:] = start.y[n : n + self.flows] - held[n:]
@@ -511,10 +486,8 @@ class NetworkForm(LaneForm):
     def state(self, problem: Problem, z: FloatArray, t: float, u_last: float) -> State:
         shown, xi, y = self.rows, self.xi_at(z, u_last), problem.initial.y.copy()
         y[: shown.k.size] = shown.columns @ z + shown.bends * float(self.bend(np.array(xi))) + shown.k * u_last
-        s = np.zeros(len(problem.waveforms))
-        s[self.reduced.source] = u_last
-        sign = np.ones(problem.scene.net.gap.size)
-        sign[self.reduced.moving] = 1.0 if xi >= 0.0 else -1.0
+        s, sign = np.zeros(len(problem.waveforms)), np.ones(problem.scene.net.gap.size)
+        s[self.reduced.source], sign[self.reduced.moving] = u_last, 1.0 if xi >= 0.0 else -1.0
         return State(t, y, s, sign, problem.scene.charge_law)
 
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
@@ -552,8 +525,8 @@ def finger(problem: Problem, rtol: float, source: int, wave: Samples) -> Network
     kinks[-1] = 0.5 * curve["scale"] ** 2 * polyval(-1.0, polyder(curve["bend"], 2))
     fast = int(np.argmax(shares * one.modes.rates))
     own = one.rates, one.gain, one.shape, one.k, one.taps, one.tap_s, one.bent, one.feed
-    lanes, active, wide = roomy(Lanes(*own, kinks=kinks, fast=fast, **curve), one.absorbed.size, LEAST_MODES)
-    rows, nodes = (shown._replace(columns=wide(shown.columns)) for shown in (one.rows, one.nodes))
+    lanes = Lanes(*own, kinks=kinks, fast=fast, **curve)
+    lanes, active, rows, nodes = roomy(lanes, one.absorbed.size, one.rows, one.nodes, LEAST_MODES)
     return NetworkForm(
         lanes, active, 2, False, rows, nodes, one.rates.size - one.absorbed.size, float(contact.stress(1.0)), share,
         scene.u_top, missed, missed_bend, float(problem.network.capacitance(area0).sum()), one,

@@ -9,23 +9,21 @@ long the run is, and whether all outputs are held in one array or streamed in ch
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
-from fingerspice.circuit.network import Network
 from fingerspice.engine.lanes.loops import flow, show
-from fingerspice.results.outcome import Plan, State, Status
-from fingerspice.solve.problem import Problem, at_breakpoints
+from fingerspice.results.outcome import State, Status
+from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.block import OF_FORCE, Block, Judged, Piece, driving, pieces_of, ready, spacing_of
 from fingerspice.solve.recordings.form import PIECES, LaneForm
 from fingerspice.solve.runs import Progress, Run, closed_form, excess_of
-from fingerspice.solve.simulation import integrated, own_rtol, state_error
-from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.sampling import on_breakpoint, on_grid
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.sampling import on_grid
 
 # Stated over seen errors, of voltages and of charges: as seen in recordings of tests/recording_errors.py.
 SAFETY, OF_CHARGE = 2.25, 2.5
@@ -53,10 +51,17 @@ _ONE_ROW = np.zeros(1, np.int64)
 LEAST_PEAK = 1e-3
 # In the first sample of a network it is this share, as the errors of the polynomials stand beside a small peak there.
 LEAST_AT_START = 0.1
+# Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
+# and add up, a later piece cannot make up for errors of the earlier ones.
+BEGINNINGS = (1.0, 0.03)
 
 
 class LostError(Exception):
     """A piece cannot be followed in lanes, however short their steps are."""
+
+
+class NotMetError(LostError):
+    """The error of a piece is not met: with less error from the pieces before it, it may be."""
 
 
 class LaneMarch:
@@ -71,9 +76,8 @@ class LaneMarch:
     def __init__(self, problem: Problem, form: LaneForm, rtol: float, share: float = 1.0) -> None:
         # The error allowed is reduced to a `share` where errors of earlier pieces add up.
         self.problem, self.form, self.rtol, self.share = problem, form, rtol, share
-        found = driving(problem)
-        assert found is not None
-        _, wave = found
+        _, wave = driving(problem)
+        assert wave is not None
         # Time reached (s), and largest |U| of the source so far, V.
         self.wave, self.usual, self.t, self.loudest = wave, spacing_of(wave), problem.t_start, 0.0
         # Of a source of current the scene knows no peak.
@@ -99,8 +103,8 @@ class LaneMarch:
         self.outputs = 0
         return np.empty((self.form.rows.k.size + self.form.flows, t_out.size))
 
-    def follow(self, piece: Piece, t_out: FloatArray, out: FloatArray) -> bool:
-        """Integrate a piece, and write the outputs before its end as rows of `out`; False where its error is not met.
+    def follow(self, piece: Piece, t_out: FloatArray, out: FloatArray) -> None:
+        """Integrate a piece, and write the outputs before its end as rows of `out`; a `LostError` where it cannot.
 
         Of a piece that grows, all steps lie on one line of the source, and become longer from a part of the shortest
         time constant on.
@@ -120,9 +124,6 @@ class LaneMarch:
         for size in (FIRST, values.size - 1)[0 if tries else 1 :]:
             block = Block(self.form, values[: size + 1], h[:size], self.steps == 0)
             seen, excess = self._climb(block, starts_at, LEAST_AT_START if piece.grows else LEAST_PEAK)
-            if not excess <= 1.0:
-                return False
-        assert seen is not None
         parts, self.peak = PARTS[self.level], max(float(block.peaks.max()), self.peak)
         self.errors = np.maximum(seen.errors, self.errors)
         self.alike, self.chance, self.margin = seen.alike, seen.chance, min(self.margin, block.margin)
@@ -133,11 +134,10 @@ class LaneMarch:
             self.level = 0
         elif excess < COARSER and self.level > 0:
             self.level -= 1
-        return True
 
-    def _climb(self, block: Block, starts_at: float, share: float) -> tuple[Judged | None, float]:
-        """Solve a block, with ever more steps until its error is met; the errors, and their excess, else above 1."""
-        form, seen = self.form, None
+    def _climb(self, block: Block, starts_at: float, share: float) -> tuple[Judged, float]:
+        """Solve a block, with ever more steps until its error is met; the errors, and the excess of those stated."""
+        form = self.form
         while True:
             parts, excess = PARTS[self.level], math.inf
             # Another sweep over short pieces costs little.
@@ -159,11 +159,11 @@ class LaneMarch:
                 excess = excess_of(gaps, self.problem.rounding) / self.rtol
                 if self.share < 1.0:
                     excess = max(excess, SAFETY * seen.alone / (self.share * self.rtol * max(peak, self.least)))
-            if excess <= 1.0:
-                return seen, excess
+                if excess <= 1.0:
+                    return seen, excess
             self.refused += parts * block.n
             if self.level + 1 == len(PARTS):
-                return seen, excess
+                raise NotMetError
             finer = math.ceil(math.log(excess) / math.log(FINER[form.bent])) if excess < math.inf else 1
             self.level = min(self.level + max(1, finer), len(PARTS) - 1)
 
@@ -259,215 +259,38 @@ class LaneMarch:
         return run
 
 
-# Share of the blocks' allowed error in the first and in the second attempt at the whole run: where errors decay slowly
-# and add up, a later piece cannot make up for errors of the earlier ones.
-BEGINNINGS = (1.0, 0.03)
-
-
-def _prepared(problem: Problem, rtol: float) -> tuple[list[Piece], LaneForm] | None:
+def prepared(problem: Problem, rtol: float) -> tuple[list[Piece], LaneForm] | None:
     """The pieces of a run and the scene prepared for them; None where this method does not apply."""
     pieces = pieces_of(problem)
-    one = None if pieces is None else ready(problem, rtol)
-    return None if pieces is None or one is None else (pieces, one)
+    form = ready(problem, rtol) if pieces else None
+    return (pieces, form) if pieces and form else None
 
 
 def solve(problem: Problem, rtol: float, progress: Progress | None = None) -> Run | None:
     """A run sample by sample; None where this method does not apply (no recording) or does not meet the error."""
-    found, refused, t_out = _prepared(problem, rtol), 0, problem.t_out
+    found, refused, t_out = prepared(problem, rtol), 0, problem.t_out
     if found is None:
         return None
-    pieces, one = found
-
-    def again(other: Problem) -> Run:
-        run = solve(other, rtol)
-        assert run is not None
-        return run
-
+    pieces, form = found
     for share in BEGINNINGS:
-        march = LaneMarch(problem, one, rtol, share)
+        march = LaneMarch(problem, form, rtol, share)
         out = march.outputs_at(t_out)
-        for piece in pieces:
-            try:
-                met = march.follow(piece, t_out, out)
-            except LostError:
-                return None
-            if not met:
-                refused += march.refused
-                break
-            if progress is not None:
-                progress(problem.done(march.t))
-        else:
-            march.finish(t_out, out)
-            run = march.run(t_out, problem.left, one.recorded(problem, out))
-            run.stats["rejected"] += refused
-            # Else the peaks stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
-            if excess_of(run.gaps, problem.rounding) <= rtol:
-                run.continuous = closed_form(replace(problem, charge=False), again, rtol)
-                return run
-    return None
-
-
-# Number of outputs in a window of a run that is not integrated sample by sample.
-WINDOW = 1 << 14
-
-#: State of a stream before a piece, as plain data: another stream continues from it with the same bytes.
-Mark = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """Output times, evenly spaced."""
-
-    # start, over: Time of output number 0, s, and spacing, s; if `rated`, `over` is the rate of a recording, Hz
-    start: float
-    over: float
-    rated: bool  # Whether the outputs are at the samples of a recording
-    # low, total: Number of the first output, and how many outputs there are
-    low: int
-    total: int
-    stop: float  # End of the run, s
-
-    def times(self, i: int, j: int) -> FloatArray:
-        """Times of outputs i to j - 1, s, rounded as ``start + arange / rate`` or ``start + step * arange`` are."""
-        number = np.arange(self.low + i, self.low + min(j, self.total))
-        t = self.start + (number / self.over if self.rated else self.over * number)
-        return np.asarray(np.minimum(t, self.stop))
-
-
-def outputs_of(problem: Problem, step: float | None) -> Outputs:
-    """The outputs at the samples of a recording, or every `step` (s); the deck's TSTEP where there is no recording."""
-    wave, first, stop = problem.waveform, max(problem.first, problem.t_start), problem.t_stop
-    if step is None and isinstance(wave, Samples):
-        low = math.ceil((first - wave.start) * wave.rate - 1e-6)
-        total = math.floor((stop - wave.start) * wave.rate + 1e-6) - low + 1
-        found = Outputs(wave.start, wave.rate, True, low, total, stop)
-    else:
-        step = problem.step if step is None else step
-        total = math.floor((stop - first) / step * (1.0 + 1e-12) + 1e-9) + 1
-        found = Outputs(first, step, False, 0, total, stop)
-    require(found.total >= 1, "the run", f"one of {stop - first:g} s without any output", "a longer one")
-    return found
-
-
-class BySamples:
-    """A recording integrated sample by sample, in the pieces of `solve.recordings.run`."""
-
-    method = "relaxation"
-
-    def __init__(
-        self, problem: Problem, outputs: Outputs, plan: Plan, rtol: float, pieces: list[Piece], march: LaneMarch
-    ) -> None:
-        self.problem, self.outputs, self.plan, self.rtol = problem, outputs, plan, rtol
-        self.pieces, self.march, self.place, self.written = pieces, march, 0, 0
-
-    @staticmethod
-    def of(problem: Problem, outputs: Outputs, plan: Plan, rtol: float) -> BySamples | None:
-        """A run that can be integrated this way, or None."""
-        own = own_rtol(problem, plan, rtol)
-        found = _prepared(problem, own) if plan.tier == "coupled" else None
-        return found and BySamples(problem, outputs, plan, rtol, found[0], LaneMarch(problem, found[1], own))
-
-    @property
-    def over(self) -> bool:
-        return self.place == len(self.pieces)
-
-    def mark(self) -> Mark:
-        return {"written": self.written, "place": self.place, "march": self.march.mark()}
-
-    def go_to(self, mark: Mark) -> None:
-        self.written, self.place = mark["written"], mark["place"]
-        self.march.stand(mark["march"])
-
-    def advance(self) -> tuple[FloatArray, FloatArray] | None:
-        """Times (s) and rows of the next piece; None where the method for recordings fails on it."""
-        piece, march, o, last = self.pieces[self.place], self.march, self.outputs, self.place + 1 == len(self.pieces)
-        # All outputs up to the end of the piece, and a few more.
-        number = (piece.stop - o.start) * o.over if o.rated else (piece.stop - o.start) / o.over
-        end = o.total if last else min(max(math.ceil(number) - o.low + 2, self.written), o.total)
-        t = o.times(self.written, end)
-        run_at = t if o.rated else at_breakpoints(_between(self.problem, piece.start, piece.stop), t)
-        out = march.outputs_at(run_at)
         try:
-            if not march.follow(piece, run_at, out):
-                return None
+            for piece in pieces:
+                march.follow(piece, t_out, out)
+                if progress is not None:
+                    progress(problem.done(march.t))
+        except NotMetError:
+            refused += march.refused
+            continue
         except LostError:
             return None
-        if last:
-            march.finish(run_at, out)
-        count = march.outputs
-        self.written, self.place = self.written + count, self.place + 1
-        return t[:count], march.form.recorded(self.problem, out[:, :count])
-
-    def run(self) -> Run:
-        """The run so far, without outputs."""
-        run = self.march.run(np.empty(0), np.empty(0, bool), np.empty((0, 0)))
-        if self.plan.error_bound > 0.0:
-            run.add_error(self.plan.error_bound * run.gaps[:, 0])
-        if self.over:
-            state_error(self.problem, run, self.plan, self.rtol)
-        return run
-
-
-class ByWindows:
-    """Any run, in windows of a fixed number of outputs."""
-
-    def __init__(
-        self, problem: Problem, outputs: Outputs, plan: Plan, rtol: float, method: str,
-    ) -> None:  # fmt: skip
-        self.problem, self.outputs, self.plan, self.rtol, self.asked = problem, outputs, plan, rtol, method
-        self.written, self.state, self.method = 0, problem.initial, method
-        self.last: Run | None = None
-        self.gaps = np.zeros((0, 4))
-
-    @property
-    def over(self) -> bool:
-        return self.written == self.outputs.total or (self.last is not None and self.last.status is not Status.SUCCESS)
-
-    def mark(self) -> Mark:
-        state = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self.state).items()}
-        return {"written": self.written, "state": state, "gaps": self.gaps.tolist()}
-
-    def go_to(self, mark: Mark) -> None:
-        self.written = mark["written"]
-        self.gaps = np.array(mark["gaps"], float).reshape(-1, 4)
-        kept: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in mark["state"].items()}
-        self.state = State(**kept)
-
-    def advance(self) -> tuple[FloatArray, FloatArray]:
-        end = min(self.written + WINDOW, self.outputs.total)
-        t, whole = self.outputs.times(self.written, end), self.problem
-        stop = whole.t_stop if end == self.outputs.total else on_breakpoint(whole.waveform, float(t[-1]))
-        problem = _between(whole, self.state.t, stop)
-        scene = replace(whole.scene, network=within(whole.network, self.state.t, stop + whole.step))
-        problem = replace(problem, scene=scene, initial=self.state)
-        problem = problem.at(at_breakpoints(problem, t), np.zeros(t.size, bool))
-        run, self.method = integrated(problem, self.plan, self.rtol, self.asked)
-        if run.gaps.shape == self.gaps.shape:
-            run.gaps = np.maximum(run.gaps, self.gaps)
-        self.last, self.gaps, self.state = run, run.gaps, run.state
-        self.written += run.t.size
-        record = run.record(problem)
-        shown, n = whole.scene.shown.network, record.network.k.shape[0]
-        if len(shown.cells) == len(record.network.cells):
-            return t[: run.t.size], record.rows
-        # In the form of exponential steps, whichever method has computed them.
-        place = [shown.layers.index(shown.cells[i].element) for i in shown.live]
-        return t[: run.t.size], np.column_stack([record.u_layer[:, place], record.rows[:, n:]])
-
-    def run(self) -> Run:
-        assert self.last is not None
-        empty = np.empty(0)
-        return replace(self.last, t=empty, left=np.empty(0, bool), rows=np.empty((0, 0)), continuous=None)
-
-
-def _between(problem: Problem, t0: float, t1: float) -> Problem:
-    """The problem restricted to the times from t0 to t1, s."""
-    return replace(problem, t_start=t0, t_stop=t1, first=t0)
-
-
-def within(network: Network, t0: float, t1: float) -> Network:
-    """The network with its recordings cut to the samples needed from t0 to t1, s."""
-    cut = [
-        replace(e, waveform=e.waveform.part(t0, t1)) if isinstance(e.waveform, Samples) else e for e in network.sources
-    ]
-    return replace(network, sources=tuple(cut))
+        march.finish(t_out, out)
+        run = march.run(t_out, problem.left, form.recorded(problem, out))
+        run.stats["rejected"] += refused
+        # Else the peaks stayed below LEAST_PEAK of the expected one, to which the pieces' errors related.
+        if excess_of(run.gaps, problem.rounding) <= rtol:
+            again = cast("Callable[[Problem], Run]", partial(solve, rtol=rtol))
+            run.continuous = closed_form(replace(problem, charge=False), again, rtol)
+            return run
+    return None
