@@ -151,6 +151,7 @@ def from_zero(ax: Axes) -> None:
 
 
 def flat(ax: Axes, values: FloatArray) -> None:
-    """Widen the scale of a constant signal, which would otherwise show round-off."""
+    """Plain numbers on the scale of a signal, and a wider one of a constant signal, which would show round-off."""
+    ax.ticklabel_format(axis="y", useOffset=False)
     if values.any() and np.ptp(values) <= 1e-6 * peak_of(values):
         ax.set_ylim(0.95 * values.flat[0], 1.05 * values.flat[0])

@@ -35,11 +35,10 @@ _GROUND = "0"
 
 
 class Place(NamedTuple):
-    """Where one element stands."""
+    """Where one element stands: its column, and the rows of its upper and its lower node."""
 
     element: Element
     column: int
-    # top, bottom: Rows of its upper and its lower node
     top: int
     bottom: int
     upright: bool  # Whether its first node is the upper one
@@ -64,9 +63,7 @@ def place(circuit: Circuit) -> Placement:
     order = list(_in_order(circuit, level))
     # Nodes that cannot share a row get one each, and then every element has room in a new column.
     single = {node: row for row, node in enumerate(sorted(level, key=level.__getitem__))}
-    found = _place_columns(order, level) or _place_columns(order, single)
-    assert found is not None
-    return found
+    return next(found for rows in (level, single) if (found := _place_columns(order, rows)) is not None)
 
 
 def _levels(circuit: Circuit) -> dict[str, int]:
@@ -79,19 +76,13 @@ def _levels(circuit: Circuit) -> dict[str, int]:
         p, n = number[e.nodes[0]], number[e.nodes[1]]
         matrix[[p, n], [p, n]] += 1.0
         matrix[[p, n], [n, p]] -= 1.0
-        sign = {"V": 1.0, "I": -1.0}.get(e.device, 0.0)
-        driven[p] += sign
-        driven[n] -= sign
+        driven[[p, n]] += np.array([1.0, -1.0]) * {"V": 1.0, "I": -1.0}.get(e.device, 0.0)
     potential = np.linalg.lstsq(matrix, driven, rcond=None)[0].round(9)
     falling = sorted(nodes, key=lambda node: (node == _GROUND, -potential[number[node]], number[node]))
-    rank = {node: k for k, node in enumerate(falling)}
-    above: dict[str, set[str]] = {node: set() for node in nodes}
-    for e in circuit.elements:
-        upper, lower = sorted(e.nodes[:2], key=rank.__getitem__)
-        above[lower].add(upper)
     level: dict[str, int] = {}
     for node in falling:
-        level[node] = max((level[other] + 1 for other in above[node]), default=0)
+        ends = (end for e in circuit.elements if node in e.nodes[:2] for end in e.nodes[:2])
+        level[node] = 1 + max((level[end] for end in ends if end in level), default=-1)
     # `falling` has ground last, so that no other node's level depends on it.
     level[_GROUND] = 1 + max(level[node] for node in nodes if node != _GROUND)
     return level
@@ -119,14 +110,13 @@ def _in_order(circuit: Circuit, level: Mapping[str, int]) -> Iterator[tuple[Elem
 def _place_columns(order: Sequence[tuple[Element, Element | None]], rows: Mapping[str, int]) -> Placement | None:
     """Each element in the first column with room for it; None if nodes of one row would meet."""
     places: dict[str, Place] = {}
-    taken: list[list[Place]] = []
     extents: dict[str, tuple[int, int]] = {}
     for element, before in order:
         ends = element.nodes[:2]
         top, bottom = sorted(rows[node] for node in ends)
         preferred = [places[before.name].column] if before is not None else []
-        for column in (*preferred, *range(len(taken) + 1)):
-            room = column == len(taken) or all(p.bottom <= top or p.top >= bottom for p in taken[column])
+        for column in (*preferred, *range(len({p.column for p in places.values()}) + 1)):
+            room = all(p.column != column or p.bottom <= top or p.top >= bottom for p in places.values())
             so_far = {node: extents.get(node, (column, column)) for node in ends}
             wider = {node: (min(lo, column), max(hi, column)) for node, (lo, hi) in so_far.items()}
             after = {**extents, **wider}
@@ -138,10 +128,7 @@ def _place_columns(order: Sequence[tuple[Element, Element | None]], rows: Mappin
                 break
         else:
             return None
-        if column == len(taken):
-            taken.append([])
         places[element.name] = Place(element, column, top, bottom, rows[ends[0]] < rows[ends[1]])
-        taken[column].append(places[element.name])
         extents = after
     return Placement(list(places.values()), rows, extents)
 
@@ -163,21 +150,18 @@ _PLUS_MINUS: list[Stroke] = [
     [(-0.045, 0.085), (0.045, 0.085)], [(0.0, 0.04), (0.0, 0.13)], [(-0.045, -0.085), (0.045, -0.085)]
 ]  # fmt: skip
 _ARROW: list[Stroke] = [[(0.0, 0.11), (0.0, -0.11)], [(-0.045, -0.05), (0.0, -0.11), (0.045, -0.05)]]
-#: Strokes of the parts, and half their width. The arrow of a current points from the first node to the second.
-_PARTS = {
-    "R": (_RESISTOR, 0.08), "C": (_CAPACITOR, 0.12),
-    "V": (_CIRCLE + _PLUS_MINUS, _RADIUS), "I": (_CIRCLE + _ARROW, _RADIUS),
-}  # fmt: skip
-
-
-#: Strokes of an element's symbol, half its height, and half its width.
+#: Strokes of a symbol, half its height, and half its width.
 Symbol = tuple[list[Stroke], float, float]
+#: Symbols of the parts. The arrow of a current points from the first node to the second.
+_PARTS: dict[str, Symbol] = {
+    "R": (_RESISTOR, _HALF, 0.08), "C": (_CAPACITOR, _HALF, 0.12),
+    "V": (_CIRCLE + _PLUS_MINUS, _HALF, _RADIUS), "I": (_CIRCLE + _ARROW, _HALF, _RADIUS),
+}  # fmt: skip
 
 
 def _symbol(element: Element) -> Symbol:
     if element.device in _PARTS:
-        strokes, wide = _PARTS[element.device]
-        return strokes, _HALF, wide
+        return _PARTS[element.device]
     if element.device == "SKIN_DISPERSIVE":
         # Two cells stand for the many of the ladder, with dots in between.
         away = _HALF + 0.1
@@ -325,7 +309,6 @@ def _sheet(
     renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
 
     def size(text: str, *, bold: bool = False) -> float:
-        """The width of a text, inches."""
         font = FontProperties(size=drawing.FONT, weight="bold" if bold else "normal")
         return float(renderer.get_text_width_height_descent(text, font, False)[0]) / float(figure.dpi)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
@@ -248,30 +249,29 @@ def _traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
     above = 0
     # If the source is the same in all runs, it is drawn once, without the name of a run.
     shared = len({run.solution.u_source.tobytes() for run in runs}) == 1
-    for number, run in enumerate(runs):
-        for key in keys:
-            found = _columns_of(run.solution, key)
-            for place, (name, x) in enumerate(found.items()):
-                kind, _, element = name.partition(":")
-                source = kind == "u_source"
-                if source and shared and number > 0:
-                    continue
-                label = element if kind == "v" else f"{SIGNALS[kind].short} {element}".rstrip()
-                if len(gaps) > 1 and element in gaps:
-                    color = drawing.CYCLE[gaps.index(element) % len(drawing.CYCLE)]
-                elif len(runs) > 1 and not (source and shared):
-                    color = drawing.CYCLE[number % len(drawing.CYCLE)]
-                elif source:
-                    color = (drawing.GREY, *drawing.CYCLE[::-1])[place % (len(drawing.CYCLE) + 1)]
-                elif len(found) == 1 and len(keys) <= 2:
-                    color = COLORS[SIGNALS[kind].axis]
-                else:
-                    color = drawing.CYCLE[above % len(drawing.CYCLE)]
-                style = _PALE if source else {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
-                above += not source
-                if run.label and not (source and shared):
-                    label = f"{label}, {run.label}"
-                out.append(Trace(run.solution, label, x, {"color": color, **style}))
+    for (number, run), key in itertools.product(enumerate(runs), keys):
+        found = _columns_of(run.solution, key)
+        for place, (name, x) in enumerate(found.items()):
+            kind, _, element = name.partition(":")
+            source = kind == "u_source"
+            alone = source and shared
+            if alone and number > 0:
+                continue
+            label = element if kind == "v" else f"{SIGNALS[kind].short} {element}".rstrip()
+            if len(gaps) > 1 and element in gaps:
+                color = drawing.CYCLE[gaps.index(element) % len(drawing.CYCLE)]
+            elif len(runs) > 1 and not alone:
+                color = drawing.CYCLE[number % len(drawing.CYCLE)]
+            elif source:
+                color = (drawing.GREY, *drawing.CYCLE[::-1])[place % (len(drawing.CYCLE) + 1)]
+            elif len(found) == 1 and len(keys) <= 2:
+                color = COLORS[SIGNALS[kind].axis]
+            else:
+                color = drawing.CYCLE[above % len(drawing.CYCLE)]
+            style = _PALE if source else {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
+            above += not source
+            label += f", {run.label}" if run.label and not alone else ""
+            out.append(Trace(run.solution, label, x, {"color": color, **style}))
     return out
 
 
@@ -335,7 +335,6 @@ def finish_panel(
     if signal.from_zero:
         drawing.from_zero(ax)
     else:
-        ax.ticklabel_format(axis="y", useOffset=False)
         drawing.flat(ax, np.concatenate([np.zeros(0), *(factor * trace.x for trace in traces)]))
     drawing.legend_within(ax, room)
 
@@ -449,9 +448,33 @@ def stems(
 
 def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     """Gain, phase, mean force and area against frequency, with a line per amplitude; without a GAP the nodes."""
+    figure, axes = drawing.new_figure(2, 1 if results[0].nodes else 2, height=4.6, sharex=True)
     if results[0].nodes:
-        return _plot_nodes(results[0], circuit)
-    figure, axes = drawing.new_figure(2, 2, height=4.6, sharex=True)
+        v = np.asarray(results[0].v_nodes)
+        _against_frequency(axes[0], results[0], np.abs(v), "Node voltage [V]", label=results[0].nodes)
+        _against_frequency(axes[1], results[0], np.degrees(np.angle(v)), "Phase [°]")
+        if np.all(np.abs(v).max(axis=0) > 0.0):
+            axes[0].set_yscale("log")
+        axes[0].legend(fontsize=drawing.FONT, frameon=False)
+        how = results[0].drive
+    else:
+        how = _plot_gains(axes, results)
+    f = results[0].frequency
+    low, high = f.min(), f.max()
+    outside = ((low, min(high, SKIN_BAND[0])), (max(low, SKIN_BAND[1]), high)) if circuit.by_device("SKIN") else ()
+    spans = [(a, b) for a, b in outside if b > a]
+    for ax in axes:
+        for a, b in spans:
+            ax.axvspan(a, b, color="#EEEEEE", zorder=0.5)
+    for ax in axes[-len(axes) // 2 :]:
+        ax.set_xlabel("Frequency [Hz]", fontsize=drawing.FONT)
+    shaded = "shaded: outside the skin data of Eqs. 18 and 19" if spans else ""
+    drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, shaded) if p))
+    return figure
+
+
+def _plot_gains(axes: Sequence[Axes], results: Sequence[PhasorSolution]) -> str:
+    """The four panels of a circuit with a GAP; gives the drive in words."""
     forces = np.concatenate([r.f_el_mean for r in results])
     factor, unit = drawing.engineering(drawing.peak_of(forces[np.isfinite(forces)]), "N", 0.05)
     for number, result in enumerate(results):
@@ -466,8 +489,8 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
             _against_frequency(ax, result, values, label, color=color, linestyle=dashes, label=name, markersize=3.5)
             ax.set_xlim(*((f[0], f[-1]) if f[0] < f[-1] else (0.1 * f[0], 10.0 * f[0])))
             ax.ticklabel_format(axis="y", useOffset=False)
-    for ax in (axes[0], axes[2]):
-        drawing.from_zero(ax)
+    drawing.from_zero(axes[0])
+    drawing.from_zero(axes[2])
     amplitude = results[0].amplitude
     if not np.isfinite(amplitude):
         told = "the source has no fundamental"
@@ -475,21 +498,9 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     if len(results) > 1:
         axes[0].legend(fontsize=drawing.FONT, frameon=False, loc="lower right", handlelength=3.0)
     drawing.flat(axes[3], 1e6 * np.concatenate([r.area for r in results]))
-    drive = f"{amplitude:.4g} V" if np.isfinite(amplitude) else "no fundamental"
-    how = f"source amplitude {drive}" if len(results) == 1 else "several source amplitudes"
-    return _finished(figure, axes, 2, results[0], circuit, how)
-
-
-def _plot_nodes(result: PhasorSolution, circuit: Circuit) -> Picture:
-    """Amplitude and phase of every node's voltage against frequency."""
-    v = np.asarray(result.v_nodes)
-    figure, axes = drawing.new_figure(2, 1, height=4.6, sharex=True)
-    _against_frequency(axes[0], result, np.abs(v), "Node voltage [V]", label=result.nodes)
-    _against_frequency(axes[1], result, np.degrees(np.angle(v)), "Phase [°]")
-    if np.all(np.abs(v).max(axis=0) > 0.0):
-        axes[0].set_yscale("log")
-    axes[0].legend(fontsize=drawing.FONT, frameon=False)
-    return _finished(figure, axes, 1, result, circuit, result.drive)
+    if len(results) > 1:
+        return "several source amplitudes"
+    return f"source amplitude {f'{amplitude:.4g} V' if np.isfinite(amplitude) else 'no fundamental'}"
 
 
 def _against_frequency(ax: Axes, result: PhasorSolution, values: FloatArray, y_label: str, **style: Any) -> None:
@@ -498,21 +509,3 @@ def _against_frequency(ax: Axes, result: PhasorSolution, values: FloatArray, y_l
     ax.plot(result.frequency[order], values[order], linewidth=1.5, marker=marker, **style)
     drawing.dress(ax, y_label)
     ax.set_xscale("log")
-
-
-def _finished(
-    figure: Picture, axes: Sequence[Axes], columns: int, result: PhasorSolution, circuit: Circuit, how: str
-) -> Picture:
-    """The picture with its caption, the lowest row's label, and frequencies outside the data of SKIN shaded."""
-    f = result.frequency
-    low, high = f.min(), f.max()
-    outside = ((low, min(high, SKIN_BAND[0])), (max(low, SKIN_BAND[1]), high)) if circuit.by_device("SKIN") else ()
-    spans = [(a, b) for a, b in outside if b > a]
-    for ax in axes:
-        for a, b in spans:
-            ax.axvspan(a, b, color="#EEEEEE", zorder=0.5)
-    for ax in axes[-columns:]:
-        ax.set_xlabel("Frequency [Hz]", fontsize=drawing.FONT)
-    shaded = "shaded: outside the skin data of Eqs. 18 and 19" if spans else ""
-    drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, shaded) if p))
-    return figure

@@ -29,10 +29,7 @@ class Status(Enum):
         "the source function has a feature at this output that its samples missed",
         "nothing from this time on is a result: give Function(f, breaks=(...)) the times of its edges",
     )
-    STEP_UNDERFLOW = (
-        "no step is small enough for the error asked for",
-        "ask for a larger rtol, or check the source",
-    )
+    STEP_UNDERFLOW = ("no step is small enough for the error asked for", "ask for a larger rtol, or check the source")
     TOO_MANY_STEPS = (
         "the run took more steps than any that was well posed has needed",
         "ask for a larger rtol, or a shorter run",

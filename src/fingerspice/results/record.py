@@ -116,13 +116,17 @@ class Signals(Sealed):
         if signal.of == "gap" and key != "area" and not self.fingers:
             return None
         if signal.make is not None and key not in vars(self):
-            base = self.value(signal.base)
-            assert base is not None
-            columns = [base] if len(self.fingers) == 1 else base.T
-            made = [signal.make(contact, x) for (_, contact), x in zip(self.fingers, columns, strict=True)]
-            vars(self)[key] = side_by_side(made)
+            pairs = zip(self.fingers, self.each(signal.base), strict=True)
+            vars(self)[key] = side_by_side([signal.make(contact, x) for (_, contact), x in pairs])
         found: FloatArray | None = getattr(self, key, None)
         return found
+
+    def each(self, key: str) -> Sequence[FloatArray]:
+        """A signal of each of its elements, shape (n_t,); none where the run has no such signal."""
+        if key == "v":
+            return tuple(self.node_voltages.values())
+        value = self.value(key)
+        return () if value is None else (value,) if value.ndim == 1 else tuple(value.T)
 
     def columns(self, key: str) -> tuple[str, ...]:
         """Names of the layers, gaps, sources or nodes to which the columns of a signal belong."""
@@ -148,11 +152,7 @@ class Signals(Sealed):
     def one(self, name: str) -> FloatArray:
         """The signal of one of the `names`, shape (n_t,)."""
         key, colon, element = name.partition(":")
-        if key == "v":
-            return self.node_voltages[element]
-        value = self.value(key)
-        assert value is not None
-        return value[:, self.columns(key).index(element)] if colon else value
+        return self.each(key)[self.columns(key).index(element) if colon else 0]
 
 
 class StoredRecord(Signals):
@@ -179,8 +179,8 @@ def attribute(get: Callable[[Any], Any], doc: str) -> Any:
 
 
 def _given(key: str, doc: str) -> Any:
-    """A property: a signal; None where the run has no such signal."""
-    return attribute(lambda result: result.record.value(key), doc)
+    """A property: a signal, None where the run has no such signal; or what else its record has."""
+    return attribute(lambda r: r.record.value(key) if key in SIGNALS else getattr(r.record, key), doc)
 
 
 class Signalled:
@@ -189,15 +189,12 @@ class Signalled:
     t: FloatArray
     record: Signals
 
-    layers: tuple[str, ...] = attribute(lambda result: result.record.layers, "Names of the columns of `u_layer`.")
-    gaps: tuple[str, ...] = attribute(lambda result: result.record.gaps, "Names of the GAPs.")
-    sources: tuple[str, ...] = attribute(
-        lambda result: result.record.sources,
-        "Names of the sources of a network; of a series stack there is one, its loop.",
+    layers: tuple[str, ...] = _given("layers", "Names of the columns of `u_layer`.")
+    gaps: tuple[str, ...] = _given("gaps", "Names of the GAPs.")
+    sources: tuple[str, ...] = _given(
+        "sources", "Names of the sources of a network; of a series stack there is one, its loop."
     )
-    node_voltages: dict[str, FloatArray] = attribute(
-        lambda result: result.record.node_voltages, "Node name to its voltage, V, shape (n_t,)."
-    )
+    node_voltages: dict[str, FloatArray] = _given("node_voltages", "Node name to its voltage, V, shape (n_t,).")
     u_source: FloatArray = _given(
         "u_source", "Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,)."
     )
@@ -245,13 +242,12 @@ class Signalled:
     @property
     def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
         """Every signal by name, with its values (n_t,), unit and long name."""
-        out: dict[str, tuple[FloatArray, str, str]] = {}
-        for key, signal in SIGNALS.items():
-            for name, value in self.by_name(key).items():
-                element = name.partition(":")[2]
-                said = {"u_layer": f"voltage of {element}", "v": f"voltage of node {element}"}.get(key, signal.text)
-                out[name] = value, signal.unit, said
-        return out
+        named = {"u_layer": "voltage of {}", "v": "voltage of node {}"}
+        return {
+            name: (value, signal.unit, named.get(key, signal.text).format(name.partition(":")[2]))
+            for key, signal in SIGNALS.items()
+            for name, value in self.by_name(key).items()
+        }
 
 
 #: Dimensions, values and attributes of a variable, as xarray and NetCDF take them.
@@ -288,8 +284,7 @@ def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
     out = np.array(waveform.value(t), float)
     if left.any():
         out[left] = waveform.value(t[left], "left")
-    lost = ~np.isfinite(out)
-    if lost.any():
+    if (lost := ~np.isfinite(out)).any():
         # A run ends where the source stops being finite, at a time known to 1e-12: use the finite value just before.
         out[lost] = waveform.value(t[lost] * (1.0 - 4e-12))
     return sealed(out)
@@ -350,12 +345,6 @@ class Record(Signals):
         """Voltage of a cell from p to n, V, shape (n_t,)."""
         return self._voltage(self.network.p[cell], self.network.q[cell])
 
-    def finger_voltage(self, finger: int) -> FloatArray:
-        """Gap voltage of a finger, V, shape (n_t,)."""
-        gap = self.network.gaps[self.network.fingers[finger]]
-        assert gap is not None
-        return self.cell_voltage(gap)
-
     def _area_of(self, i: int) -> FloatArray:
         if self.net.slow[i] >= 0:
             return np.asarray(self.rows[:, self._x.shape[1] + int(self.net.slow[i])] * self.net.area0[i])
@@ -363,29 +352,15 @@ class Record(Signals):
             return np.full(self.t.size, self.net.area0[i])
         return areas(self.cell_voltage(int(self.net.gap[i])), self.net.curves[i])
 
-    def finger_area(self, finger: int) -> FloatArray:
-        """Contact area of a finger, m^2, shape (n_t,)."""
-        return self._area_of(self.network.fingers[finger])
-
-    def finger_force(self, finger: int) -> FloatArray:
-        """Electroadhesive force (Eq. 2 times A_R) of a finger, N, shape (n_t,)."""
-        _, contact = self.fingers[finger]
-        i, u = self.network.fingers[finger], self.finger_voltage(finger)
-        if self.net.gap[i] >= 0 and self.net.slow[i] < 0:
-            return forces(u, self.net.curves[i], float(contact.stress(1.0)))
-        return np.asarray(contact.stress(u) * self.finger_area(finger))
-
     @cached_property
     def u_source(self) -> FloatArray:
         """Voltage of each source, V: from p to n of a V, and from n to p of an I, the direction in which it drives."""
-        n_v = self.network.n_voltage
-        out = self._s[:, : len(self.network.sources)].copy()
-        if n_v < out.shape[1]:
+        out, zero = list(self._s.T[: len(self.network.sources)]), np.zeros(self.t.size)
+        for j, element in enumerate(self.network.sources[self.network.n_voltage :], self.network.n_voltage):
             at = {name.lower(): u for name, u in self.node_voltages.items()}
-            for j, element in enumerate(self.network.sources[n_v:]):
-                p, n = (at.get(node, 0.0) for node in element.nodes[:2])
-                out[:, n_v + j] = n - p
-        return side_by_side(out.T)
+            p, n = (at.get(node, zero) for node in element.nodes[:2])
+            out[j] = n - p
+        return side_by_side(out)
 
     @cached_property
     def u_layer(self) -> FloatArray:
@@ -398,7 +373,7 @@ class Record(Signals):
     @cached_property
     def u_gap(self) -> FloatArray:
         """Gap voltage, V."""
-        return side_by_side([self.finger_voltage(i) for i in range(len(self.fingers))])
+        return side_by_side([self.cell_voltage(gap) for gap in self.network.gaps if gap is not None])
 
     @cached_property
     def area(self) -> FloatArray | None:
@@ -408,8 +383,14 @@ class Record(Signals):
 
     @cached_property
     def f_el(self) -> FloatArray:
-        """Electroadhesive force, N."""
-        return side_by_side([self.finger_force(i) for i in range(len(self.fingers))])
+        """Electroadhesive force (Eq. 2 times A_R), N."""
+        out = []
+        for i, (_, contact), u in zip(self.network.fingers, self.fingers, self.each("u_gap"), strict=True):
+            if self.net.gap[i] >= 0 and self.net.slow[i] < 0:
+                out.append(forces(u, self.net.curves[i], float(contact.stress(1.0))))
+            else:
+                out.append(np.asarray(contact.stress(u) * self._area_of(i)))
+        return side_by_side(out)
 
     @cached_property
     def q_source(self) -> FloatArray | None:
