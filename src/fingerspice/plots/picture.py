@@ -102,8 +102,7 @@ def _show_waiting() -> None:
         picture.show()
 
 
-# Ratio of the largest to the smallest abscissa from which on the axis is logarithmic.
-_WIDE = 20.0
+_WIDE = 20.0  # Ratio of the largest to the smallest abscissa from which on the axis is logarithmic
 
 
 def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> Picture:
@@ -208,8 +207,7 @@ def _shares(ax: Axes, indices: Dataset, output: str, x: FloatArray | None) -> No
         drawing.legend_within(ax, 44)
 
 
-# Letters of a legend across the page; beside other panels one curve needs none.
-_ROOM = 90
+_ROOM = 90  # Letters of a legend across the page; beside other panels one curve needs none
 #: A panel of measured and fitted values: to which curve each row belongs, by name; columns (n,) of the abscissa, the
 #: measured and fitted values and the standard deviations; what the abscissa is, the quantity, and its unit.
 Drawn = tuple[Sequence[str], Sequence[FloatArray], str, str, str]

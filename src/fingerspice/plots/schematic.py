@@ -150,8 +150,7 @@ _PLUS_MINUS: list[Stroke] = [
     [(-0.045, 0.085), (0.045, 0.085)], [(0.0, 0.04), (0.0, 0.13)], [(-0.045, -0.085), (0.045, -0.085)]
 ]  # fmt: skip
 _ARROW: list[Stroke] = [[(0.0, 0.11), (0.0, -0.11)], [(-0.045, -0.05), (0.0, -0.11), (0.045, -0.05)]]
-#: Strokes of a symbol, half its height, and half its width.
-Symbol = tuple[list[Stroke], float, float]
+Symbol = tuple[list[Stroke], float, float]  # Strokes of a symbol, half its height, and half its width
 #: Symbols of the parts. The arrow of a current points from the first node to the second.
 _PARTS: dict[str, Symbol] = {
     "R": (_RESISTOR, _HALF, 0.08), "C": (_CAPACITOR, _HALF, 0.12),
@@ -182,10 +181,8 @@ def _moved(strokes: Sequence[Stroke], x: float, y: float, up: float = 1.0) -> li
     return [[(x + dx, y + up * dy) for dx, dy in stroke] for stroke in strokes]
 
 
-#: Largest number of elements that a picture can show.
-MOST_ELEMENTS = 200
-#: Letters in a line of values and in a name, and lines of values at most.
-_LETTERS, _LONGEST, _LINES = 34, 40, 7
+MOST_ELEMENTS = 200  # Largest number of elements that a picture can show
+_LETTERS, _LONGEST, _LINES = 34, 40, 7  # Letters in a line of values and in a name, and lines of values at most
 #: Inches: height of a line of text, from a symbol to its label, around everything, and around a label in its row.
 _LINE, _BESIDE, _MARGIN, _ROOM = 0.135, 0.08, 0.15, 0.1
 #: Largest size of a schematic beside a run's picture, over its own, and its resolution there, dots per inch of its own

@@ -30,10 +30,8 @@ if TYPE_CHECKING:
 #: Up to MOST_DRAWN oscillations are drawn as lines. More are drawn as an envelope, with an enlargement of the last
 #: ZOOMED oscillations whose swing is at least the fraction _LOUD of the largest swing.
 MOST_DRAWN, ZOOMED, _LOUD = 30, 4, 0.7
-#: Smallest number of outputs in an oscillation for which its shape is visible.
-_FEWEST = 12
-#: An envelope divides the window into at most this many parts, each at least one oscillation long.
-_PARTS = 240
+_FEWEST = 12  # Smallest number of outputs in an oscillation for which its shape is visible
+_PARTS = 240  # An envelope divides the window into at most this many parts, each at least one oscillation long
 #: Number of letters for which a legend has room: across the page, and over the left one of two columns.
 _PAGE, _HALF = 90, 50
 #: Line widths (points) in one panel: later lines are narrower and dashed, so that all stay visible where they coincide.
@@ -108,15 +106,11 @@ def plot_solution(
         part = f"the last {ZOOMED}" if dense and marks[-1] <= zoomed[1] else "enlarged"
         left[-1].set_xlabel(f"{left[-1].get_xlabel()}: {whole}", fontsize=drawing.FONT)
         right[-1].set_xlabel(f"{right[-1].get_xlabel()}: {part}", fontsize=drawing.FONT)
-        t = solution.t
-        if dense and np.count_nonzero((t >= zoomed[0]) & (t <= zoomed[1])) < _FEWEST * ZOOMED:
+        if dense and np.count_nonzero((solution.t >= zoomed[0]) & (solution.t <= zoomed[1])) < _FEWEST * ZOOMED:
             small += f" · fewer than {_FEWEST} outputs an oscillation: their shape needs a shorter TSTEP"
     drawing.caption(figure, small, drawing.GREY if all(run.solution.success for run in runs) else drawing.VERMILION)
     figure.align_ylabels(left)
     return figure
-
-
-# What is drawn: runs, panels, interval
 
 
 def _runs(solution: Solution, others: Any) -> list[Drawn]:
@@ -124,10 +118,9 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     from fingerspice.results.solution import Solution
 
     named = isinstance(others, Mapping)
-    rest = [*(others.values() if named else others if isinstance(others, Sequence) else [others])]
-    for other in rest:
+    every = [solution, *(others.values() if named else others if isinstance(others, Sequence) else [others])]
+    for other in every:
         require(isinstance(other, Solution), "others", repr(other), "Solutions, or a mapping of names to Solutions")
-    every = [solution, *rest]
     if len(every) == 1:
         return [Drawn(solution, "")]
     facts = [
@@ -147,8 +140,7 @@ def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[list
     every = [run.solution.record for run in runs]
     if signals is None:
         inside = "u_layer" if any(s.layers for s in every) else "v"
-        contact = any(s.gaps for s in every)
-        signals = ["u_source", *(("u_gap", "f_el", "area", "f_t") if contact else (inside,))]
+        signals = ["u_source", *(("u_gap", "f_el", "area", "f_t") if any(s.gaps for s in every) else (inside,))]
     known = {name: None for s in every for key in SIGNALS for name in (key, *s.names(key)) if s.names(key)}
     panels: dict[str, list[str]] = {}
     for name in [signals] if isinstance(signals, str) else signals:
@@ -179,17 +171,16 @@ def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[floa
 def _turns(runs: list[Drawn], keys: Sequence[str], start: float, stop: float) -> tuple[FloatArray, FloatArray]:
     """Times (s) and values of the turning points, two per oscillation, of a panel's most oscillating signal."""
     best = np.zeros(0), np.zeros(0)
-    for run in runs:
+    for run, key in itertools.product(runs, keys):
         t = run.solution.t
         kept = (t >= start) & (t <= stop)
-        for key in keys:
-            for x in _columns_of(run.solution, key).values():
-                step = np.diff(x[kept])
-                # Turning points of round-off are not counted.
-                steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
-                turns = steep[1:][np.signbit(step[steep[1:]]) != np.signbit(step[steep[:-1]])]
-                if turns.size > best[0].size:
-                    best = t[kept][turns], x[kept][turns]
+        for x in _columns_of(run.solution, key).values():
+            step = np.diff(x[kept])
+            # Turning points of round-off are not counted.
+            steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
+            turns = steep[1:][np.signbit(step[steep[1:]]) != np.signbit(step[steep[:-1]])]
+            if turns.size > best[0].size:
+                best = t[kept][turns], x[kept][turns]
     return best
 
 
@@ -199,16 +190,14 @@ def _zoom(marks: FloatArray, heights: FloatArray, start: float, stop: float) -> 
     With many oscillations, the interval holds the last ones that are not small. With few oscillations in a small part
     of the time, such as a click, it holds all of them.
     """
-    length = 2 * ZOOMED
     if marks.size > 2 * MOST_DRAWN:
-        swing = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(heights)), length).max(axis=1)
+        swing = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(heights)), 2 * ZOOMED).max(axis=1)
         place = int(np.flatnonzero(swing >= _LOUD * swing.max())[-1])
-        first, last = float(marks[place]), float(marks[place + length])
+        first, last = float(marks[place]), float(marks[place + 2 * ZOOMED])
         # Leave out a constant part that may follow the oscillations.
         return first, min(stop, last + 0.1 * (last - first))
-    if marks.size < 2 or marks[-1] - marks[0] > (stop - start) / MOST_DRAWN:
+    if marks.size < 2 or (around := float(marks[-1] - marks[0])) > (stop - start) / MOST_DRAWN:
         return None
-    around = float(marks[-1] - marks[0])
     return max(start, float(marks[0]) - around), min(stop, float(marks[-1]) + around)
 
 
@@ -221,9 +210,6 @@ def _columns_of(solution: Solution, key: str) -> dict[str, FloatArray]:
     """A signal by name; empty if this run lacks the element, which another run of the picture may have."""
     kind, colon, _ = key.partition(":")
     return solution.by_name(key) if not colon or key in solution.record.names(kind) else {}
-
-
-# Panels and their lines
 
 
 def draw_panel(
@@ -318,12 +304,11 @@ def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray)
 
 def _draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:
     """Draw the mean force as a horizontal line; with `told` the legend names it."""
-    summary = trace.solution.summary()
-    means = {"of the last period": summary.get("f_el_mean_periodic"), "of the run": summary.get("f_el_mean")}
-    known = [(of, factor * mean) for of, mean in means.items() if mean is not None]
-    if known:
-        label = f"mean {known[0][0]}, {known[0][1]:.4g} {unit}" if told else "_"
-        ax.axhline(known[0][1], color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
+    for kind, of in (("f_el_mean_periodic", "of the last period"), ("f_el_mean", "of the run")):
+        if (mean := trace.solution.summary().get(kind)) is not None:
+            label = f"mean {of}, {factor * mean:.4g} {unit}" if told else "_"
+            ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
+            break
 
 
 def finish_panel(
@@ -389,15 +374,15 @@ def about_all(runs: Sequence[Drawn]) -> str:
     if len(runs) == 1:
         end = [] if runs[0].solution.success else [runs[0].solution.message]
         return " · ".join([fact for fact in facts[0] if fact] + end)
-    shared = [f for i, f in enumerate(facts[0]) if f and all(other[i] == f for other in facts)]
+    alike = [len(set(same)) == 1 for same in zip(*facts, strict=True)]
+    shared = [f for f, same in zip(facts[0], alike, strict=True) if f and same]
     own = []
     for run, fact in zip(runs, facts, strict=True):
         # Leave out the first fact (title and changed parameters), because the run's label has the changes.
-        differs = [f for i, f in enumerate(fact[1:], 1) if f and any(other[i] != f for other in facts)]
+        differs = [f for f, same in zip(fact[1:], alike[1:], strict=True) if f and not same]
         own.append(f"{run.label}: {', '.join(differs)}" if differs else run.label)
-    title = runs[0].solution.circuit.title
-    alike = all(run.solution.circuit.title == title for run in runs)
-    return " · ".join([*([title] if alike and title not in shared else []), *shared, *own])
+    titles = {run.solution.circuit.title for run in runs}
+    return " · ".join([*(titles - set(shared) if len(titles) == 1 else ()), *shared, *own])
 
 
 #: Amplitudes below this fraction of the largest are not drawn: they are mostly numerical errors of the run.

@@ -32,9 +32,6 @@ class Signal(NamedTuple):
     from_zero: bool = False  # Whether the scale of a panel starts at 0
     of: str = ""  # "source", "layer", "gap" or "node" where each of these has a column
     ripple: bool = False  # Whether its summary has a ripple instead of an rms
-    # Other signals follow from the record itself: this one from another signal, with the contact of the gap
-    base: str = ""
-    make: Callable[[Contact, FloatArray], FloatArray] | None = None
 
 
 #: Signals in the order of tables and files; those of layers and nodes are ``u_layer:NAME`` and ``v:NAME``.
@@ -43,18 +40,11 @@ SIGNALS = {
     "u_layer": Signal("V", "layer voltage", "layer", "Voltage", 2.0, of="layer"),
     "u_gap": Signal("V", "gap voltage", "gap", "Voltage", 2.0, of="gap"),
     "area": Signal("m^2", "ridge contact area", "area", "Ridge area", of="gap", ripple=True),
-    "sigma_el": Signal(
-        "Pa", "electroadhesive stress", "electroadhesive stress", "Stress", 2.0, True, "gap", False, "u_gap",
-        Contact.stress,
-    ),
+    "sigma_el": Signal("Pa", "electroadhesive stress", "electroadhesive stress", "Stress", 2.0, True, "gap"),
     "f_el": Signal("N", "electroadhesive force", "electroadhesive force", "Force", 0.05, True, "gap", True),
-    "f_t": Signal(
-        "N", "friction force", "friction", "Friction", 0.05, True, "gap", True, "f_el",
-        lambda contact, f: contact.mu * (contact.f_n + f),
-    ),
+    "f_t": Signal("N", "friction force", "friction", "Friction", 0.05, True, "gap", True),
     "friction": Signal(
-        "1", "friction coefficient f_t / f_n", "coefficient", "Friction coefficient", 1.0, True, "gap", True, "f_t",
-        lambda contact, f: f / contact.f_n,
+        "1", "friction coefficient f_t / f_n", "coefficient", "Friction coefficient", 1.0, True, "gap", True
     ),
     "q_source": Signal("C", "charge delivered by the source", "charge", "Charge", 2.0, of="source"),
     "i_source": Signal("A", "source current, regular part", "current", "Current", 2.0, of="source"),
@@ -62,7 +52,13 @@ SIGNALS = {
         "1", "distance to the fold of the mobile law", "distance to the fold", "Distance to the fold", from_zero=True
     ),
     "v": Signal("V", "node voltage", "node", "Voltage", 2.0, of="node"),
-}  # fmt: skip
+}
+#: Signals that follow from another one of the same gap, with its contact.
+_FOLLOWING: dict[str, tuple[str, Callable[[Contact, FloatArray], FloatArray]]] = {
+    "sigma_el": ("u_gap", Contact.stress),
+    "f_t": ("f_el", lambda contact, f: contact.mu * (contact.f_n + f)),
+    "friction": ("f_t", lambda contact, f: f / contact.f_n),
+}
 
 
 def signal_of(name: str) -> Signal:
@@ -112,12 +108,12 @@ class Signals(Sealed):
 
     def value(self, key: str) -> FloatArray | None:
         """A signal, shape (n_t,), or (n_t, n) where n elements have it; None where the run has no such signal."""
-        signal = SIGNALS[key]
-        if signal.of == "gap" and key != "area" and not self.fingers:
+        if SIGNALS[key].of == "gap" and key != "area" and not self.fingers:
             return None
-        if signal.make is not None and key not in vars(self):
-            pairs = zip(self.fingers, self.each(signal.base), strict=True)
-            vars(self)[key] = side_by_side([signal.make(contact, x) for (_, contact), x in pairs])
+        if key in _FOLLOWING and key not in vars(self):
+            base, make = _FOLLOWING[key]
+            pairs = zip(self.fingers, self.each(base), strict=True)
+            vars(self)[key] = side_by_side([make(contact, x) for (_, contact), x in pairs])
         found: FloatArray | None = getattr(self, key, None)
         return found
 
@@ -169,7 +165,7 @@ class StoredRecord(Signals):
         self.t, self.sources, self.fingers = t, sources, fingers
         self.node_voltages, layers = own.pop("v"), own.pop("u_layer")
         self.layers, self.u_layer = tuple(layers), np.column_stack([np.zeros((t.size, 0)), *layers.values()])
-        vars(self).update({k: side_by_side([*x.values()]) for k, x in own.items() if x and not SIGNALS[k].base})
+        vars(self).update({k: side_by_side([*x.values()]) for k, x in own.items() if x and k not in _FOLLOWING})
         self.__post_init__()
 
 
@@ -266,11 +262,10 @@ def variables(
     """Variables and coordinates of the data files, with the rows in `keep` and those signals that are wanted."""
     data: dict[str, Variable] = {}
     coords: dict[str, Variable] = {"time": (("time",), solution.t[keep], {"units": "s", "long_name": "time"})}
-    for key, signal in SIGNALS.items():
-        columns = [x[keep] for x in solution.by_name(key).values()] if key in wanted else []
-        several = key in ("u_layer", "v")
+    for key, signal in ((key, signal) for key, signal in SIGNALS.items() if key in wanted):
+        columns = [x[keep] for x in solution.by_name(key).values()]
         about = {"units": signal.unit, "long_name": signal.text}
-        if len(columns) > 1 or (several and key in wanted):
+        if len(columns) > 1 or key in ("u_layer", "v"):
             coords[signal.of] = ((signal.of,), np.array(solution.record.columns(key), dtype=object), {})
             table = np.column_stack([np.zeros((int(keep.sum()), 0)), *columns])
             data[key] = (("time", signal.of), table, about)
@@ -322,24 +317,20 @@ class Record(Signals):
     @cached_property
     def _s(self) -> FloatArray:
         """Values of the sources, and of those within a loop, V or A, shape (n_t, n_s + n_inner)."""
-        elements = (*self.network.sources, *self.network.inner)
-        return np.column_stack([sided(e.waveform, self.t, self.left) for e in elements if e.waveform is not None])
+        waveforms = (e.waveform for e in (*self.network.sources, *self.network.inner))
+        return np.column_stack([sided(w, self.t, self.left) for w in waveforms if w is not None])
 
     def _voltage(self, by_x: FloatArray, by_s: FloatArray) -> FloatArray:
         """A voltage (V), shape (n_t,), as a weighted sum of the live voltages and the sources."""
-        weights = (*by_x.tolist(), *by_s.tolist())
-        some = [i for i, weight in enumerate(weights) if weight != 0.0]
-        n = by_x.size
+        some = [(weight, self._s[:, i]) for i, weight in reversed([*enumerate(by_s.tolist())]) if weight != 0.0]
+        some += [(weight, self.rows[:, i]) for i, weight in reversed([*enumerate(by_x.tolist())]) if weight != 0.0]
         if len(some) >= 8:
             # Without BLAS, whose threads may round differently.
             return np.asarray((self._x * by_x).sum(1) + (self._s[:, : by_s.size] * by_s).sum(1))
-        columns = [self.rows[:, i] if i < n else self._s[:, i - n] for i in reversed(some)]
-        if len(some) == 1 and weights[some[0]] == 1.0:
-            return np.ascontiguousarray(columns[0])
-        out = weights[some[-1]] * columns[0] if some else np.zeros(self.t.size)
-        for i, column in zip(some[-2::-1], columns[1:], strict=True):
-            out += weights[i] * column
-        return out
+        if len(some) == 1 and some[0][0] == 1.0:
+            return np.ascontiguousarray(some[0][1])
+        terms = [weight * column for weight, column in some] or [np.zeros(self.t.size)]
+        return np.asarray(sum(terms[1:], terms[0]))
 
     def cell_voltage(self, cell: int) -> FloatArray:
         """Voltage of a cell from p to n, V, shape (n_t,)."""
@@ -365,10 +356,9 @@ class Record(Signals):
     @cached_property
     def u_layer(self) -> FloatArray:
         """Layer voltages from p to n, V, shape (n_t, n_layer)."""
-        cells = np.column_stack(
-            [np.zeros((self.t.size, 0)), *(self.cell_voltage(i) for i in range(len(self.network.cells)))]
-        )
-        return sealed(np.einsum("tc,lc->tl", cells, self.network.grouping))
+        cells = map(self.cell_voltage, range(len(self.network.cells)))
+        table = np.column_stack([np.zeros((self.t.size, 0)), *cells])
+        return sealed(np.einsum("tc,lc->tl", table, self.network.grouping))
 
     @cached_property
     def u_gap(self) -> FloatArray:

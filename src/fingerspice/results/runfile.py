@@ -171,8 +171,7 @@ def check_store(path: Path) -> dict[str, int]:
     found = {name: [file for file in (path / name / "c").rglob("*") if file.is_file()] for name in about}
     bad = [f"{path / 'zarr.json'} has changed"] if head.get(SIGNATURE, "") not in ("", signature(head)) else []
     for name, chunks in found.items():
-        told = [(file, _fault(file, sizes[name])) for file in sorted(chunks)]
-        bad += [f"{file} {what}" for file, what in told if what is not None]
+        bad += [f"{file} {what}" for file in sorted(chunks) if (what := _fault(file, sizes[name])) is not None]
     # A run names how many chunks are done; of a sweep those are done that have a status.
     done = head.get("chunks_done", len(found.get("status", ())))
     dims = about["status"]["dimension_names"] if "status" in about else []
@@ -201,8 +200,7 @@ def _fault(file: Path, size: int) -> str | None:
 #: Name of the NetCDF group with what `load` needs besides the variables, and the number of its format.
 GROUP, FORMAT = "fingerspice", 1
 _ALLOWED = "allowed: a NetCDF file that to_netcdf or the command wrote"
-#: Largest number of a circuit's samples, points and coefficients that a file keeps (64 MB).
-MOST_NUMBERS = 8_000_000
+MOST_NUMBERS = 8_000_000  # Largest number of a circuit's samples, points and coefficients that a file keeps (64 MB)
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
@@ -216,9 +214,8 @@ _OF_CIRCUIT = ("title", "charge_law", "work", "warnings", "unused", "overrides",
 
 
 def _failure(plain: dict[str, Any]) -> Failure:
-    tried = tuple(Attempt(**a) for a in plain["tried"])
-    own = {key: x for key, x in plain.items() if key != "step"}
-    return Failure(**{**own, "status": Status[plain["status"]], "tried": tried})
+    own = {**plain, "status": Status[plain["status"]], "tried": tuple(Attempt(**a) for a in plain["tried"])}
+    return Failure(**{key: x for key, x in own.items() if key != "step"})
 
 
 def _state(plain: dict[str, Any]) -> State:
@@ -269,8 +266,7 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             for name, (dimensions, values, attributes) in {**coords, **data}.items():
                 kind = h5py.string_dtype() if values.dtype == object else values.dtype
                 file.create_variable(name, dimensions, dtype=kind, data=values).attrs.update(attributes)
-            for key, text in solution.provenance().items():
-                file.attrs[key] = text
+            file.attrs.update(solution.provenance())
             group = file.create_group(GROUP)
             circuit, arrays = stored_circuit(solution.circuit, solution.t_stop, solution.rtol)
             between = solution._figures.between()
@@ -283,16 +279,17 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             }  # fmt: skip
             group.attrs["run"] = json.dumps(run, default=float)
             tables = {f"circuit{k}": array for k, array in enumerate(arrays)}
-            for name, table in (tables | ({} if between is None else {"between": between[1]})).items():
-                dimensions = tuple(f"{name}_{axis}" for axis in range(table.ndim))
-                group.dimensions.update(zip(dimensions, table.shape, strict=True))
-                group.create_variable(name, dimensions, dtype=float, data=table)
+            if between is not None:
+                tables["between"] = between[1]
             if not keep.all():
                 # Only `load` uses the left-hand rows of jumps; they form one table, because each variable takes time.
-                group.dimensions["jump"] = int(np.count_nonzero(~keep))
-                group.dimensions["signal"] = 1 + len(solution.signals)
                 rows = [np.flatnonzero(~keep), *(x[~keep] for x, _, _ in solution.signals.values())]
-                group.create_variable("before", ("jump", "signal"), dtype=float, data=np.column_stack(rows))
+                tables["before"] = np.column_stack(rows)
+            for name, table in tables.items():
+                own = ("jump", "signal") if name == "before" else (f"{name}_{axis}" for axis in range(table.ndim))
+                dimensions = tuple(own)
+                group.dimensions.update(zip(dimensions, table.shape, strict=True))
+                group.create_variable(name, dimensions, dtype=float, data=table)
         files.write_pieces(target, content.getbuffer())
 
     return files.write_aside(path, write)
@@ -327,9 +324,7 @@ def load(path: str | Path) -> Solution:
     try:
         with h5netcdf.File(path, "r") as file:
             if GROUP not in file.groups:
-                raise InputError(
-                    f"{path} is no run of fingerspice; allowed: a file that to_netcdf or the command wrote"
-                )
+                raise InputError(f"{path} is no run of fingerspice; {_ALLOWED}")
             return _solution(file)
     except InputError:
         raise
