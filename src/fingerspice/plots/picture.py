@@ -181,8 +181,7 @@ def _alone(ax: Axes, x: FloatArray, values: FloatArray, indices: Dataset, j: int
     """Curves (n_x, n_quantile) where parameter `j` takes the quantiles of its distribution."""
     at, unit = indices["at"].values[j], str(indices["unit"].values[j])
     factor, unit = drawing.engineering(float(np.abs(at).max()), unit)
-    if unit.strip() == "1":
-        unit = "times"
+    unit = "times" if unit.strip() == "1" else unit
     told = f"{indices.parameter.values[j]}: {', '.join(f'{factor * one:.3g}' for one in at)} {unit}"
     ax.set_title(drawing.drawable(told, 60), fontsize=drawing.FONT, loc="left", parse_math=False)
     for k, colour in enumerate((drawing.BLUE, drawing.BLACK, drawing.VERMILION)):

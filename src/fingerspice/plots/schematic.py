@@ -97,13 +97,14 @@ def _in_order(circuit: Circuit, level: Mapping[str, int]) -> Iterator[tuple[Elem
     for e in circuit.elements:
         if e.device not in "VI":
             below.setdefault(min(e.nodes[:2], key=level.__getitem__), []).append(e)
-    for node in sorted(below, key=level.__getitem__):
-        waiting: list[tuple[Element, Element | None]] = [(e, None) for e in reversed(below.pop(node, []))]
-        while waiting:
-            e, before = waiting.pop()
+
+    def chains(node: str, before: Element | None) -> Iterator[tuple[Element, Element | None]]:
+        for e in below.pop(node, []):
             yield e, before
-            lower = max(e.nodes[:2], key=level.__getitem__)
-            waiting += [(other, e) for other in reversed(below.pop(lower, []))]
+            yield from chains(max(e.nodes[:2], key=level.__getitem__), e)
+
+    for node in sorted(below, key=level.__getitem__):
+        yield from chains(node, None)
     yield from ((e, None) for e in fixing)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray, IntArray, real_numbers
+from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.describe import changes_text, drive_text, heading
 from fingerspice.physics.materials import SKIN_BAND
@@ -62,12 +62,7 @@ class Trace(NamedTuple):
     style: dict[str, Any]
 
 
-def plot_solution(
-    solution: Solution,
-    signals: str | Sequence[str] | None = None,
-    window: tuple[float, float] | None = None,
-    others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
-) -> Picture:
+def plot_solution(solution: Solution, signals: Any = None, window: Any = None, others: Any = ()) -> Picture:
     """Signals over one time axis; arguments as in `Solution.plot`."""
     runs = _runs(solution, others)
     panels = _panels(runs, signals)
@@ -135,7 +130,7 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     return [Drawn(s, label) for s, label in zip(every, labels, strict=True)]
 
 
-def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[list[str]]:
+def _panels(runs: list[Drawn], signals: Any) -> list[list[str]]:
     """Names of the signals of each panel, from top to bottom: those of one quantity share one."""
     every = [run.solution.record for run in runs]
     if signals is None:
@@ -153,7 +148,7 @@ def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[list
     return list(panels.values())
 
 
-def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[float, float]:
+def _window(runs: list[Drawn], window: Any) -> tuple[float, float]:
     """Start and end of the drawn interval, s."""
     times = [run.solution.t for run in runs if run.solution.t.size]
     first, last = min((float(t[0]) for t in times), default=0.0), max(_end_of(run.solution) for run in runs)
@@ -264,7 +259,7 @@ def _traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
 def _draw_line(
     ax: Axes, trace: Trace, factor: float, start: float, stop: float, scale: float, envelope: FloatArray | None = None
 ) -> None:
-    """Draw a line, or its envelope, of times multiplied by `scale`."""
+    """Draw a line, or from the times (s) of its turning points its envelope, of times multiplied by `scale`."""
     t = trace.solution.t
     # One output beyond each end of the window is drawn too, so that the line reaches the edges of the picture.
     first, last = max(int(np.searchsorted(t, start)) - 1, 0), int(np.searchsorted(t, stop, side="right")) + 1
@@ -273,18 +268,7 @@ def _draw_line(
         t, x = drawing.thin(t, x)
         ax.plot(scale * t, x, label=trace.label, **{"solid_joinstyle": "round", **trace.style})
         return
-    middle, spans = _envelope_spans(t, start, stop, envelope)
-    low, high = np.minimum.reduceat(x, spans)[::2], np.maximum.reduceat(x, spans)[::2]
-    pale = "alpha" in trace.style
-    ax.fill_between(scale * middle, low, high, color=trace.style["color"], alpha=0.3 if pale else 0.2, linewidth=0.0)
-    edge = {**trace.style, "linewidth": 1.6 if pale else 0.7 * trace.style["linewidth"]}
-    ax.plot(scale * middle, low, **edge)
-    ax.plot(scale * middle, high, **edge, label=trace.label)
-
-
-def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The middles (s) of an envelope's parts, and the first output and the one after the last of each part's span."""
-    lengths = np.diff(turns)
+    lengths = np.diff(envelope)
     parts = (stop - start) / (2.0 * float(np.median(lengths)))
     edges = np.linspace(start, stop, max(1, int(min(parts, _PARTS))) + 1)
     middle = 0.5 * (edges[:-1] + edges[1:])
@@ -292,14 +276,19 @@ def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray)
     # at the beginning of a chirp. A pause between bursts is no oscillation: what is beside it is much shorter.
     beside = np.pad(lengths, 1, mode="edge")
     oscillation = 2.0 * np.median([beside[:-2], lengths, beside[2:]], axis=0)
-    here = np.clip(np.searchsorted(turns, middle) - 1, 0, lengths.size - 1)
+    here = np.clip(np.searchsorted(envelope, middle) - 1, 0, lengths.size - 1)
     whole = np.maximum(edges[1] - edges[0], oscillation[here])
     # At the ends of the window a span is one-sided, and as long as any other.
     begin = np.maximum(np.minimum(middle - 0.5 * whole, stop - whole), start)
-    first = np.searchsorted(t, begin)
-    after = np.minimum(np.searchsorted(t, np.minimum(begin + whole, stop)), t.size - 1)
-    kept = after > first
-    return middle[kept], np.column_stack([first, after])[kept].ravel()
+    spans = np.searchsorted(t, [begin, np.minimum(begin + whole, stop)]).clip(max=t.size - 1)
+    kept = spans[1] > spans[0]
+    t, spans = scale * middle[kept], spans[:, kept].T.ravel()
+    low, high = np.minimum.reduceat(x, spans)[::2], np.maximum.reduceat(x, spans)[::2]
+    pale = "alpha" in trace.style
+    ax.fill_between(t, low, high, color=trace.style["color"], alpha=0.3 if pale else 0.2, linewidth=0.0)
+    edge = {**trace.style, "linewidth": 1.6 if pale else 0.7 * trace.style["linewidth"]}
+    ax.plot(t, low, **edge)
+    ax.plot(t, high, **edge, label=trace.label)
 
 
 def _draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:
@@ -326,8 +315,7 @@ def finish_panel(
 
 def _coefficient_axis(ax: Axes, solution: Solution, factor: float) -> None:
     """Add a second scale to the friction panel: friction force divided by the normal load."""
-    ((_, contact),) = solution.record.fingers
-    load = factor * contact.f_n
+    load = factor * solution.record.fingers[0][1].f_n
     right = ax.secondary_yaxis("right", functions=(partial(np.multiply, 1.0 / load), partial(np.multiply, load)))
     right.set_ylabel("coefficient", fontsize=drawing.FONT, color=drawing.GREY)
     right.tick_params(labelsize=drawing.FONT - 0.5, color="#999999", labelcolor=drawing.GREY)

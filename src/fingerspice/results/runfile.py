@@ -99,11 +99,8 @@ class Array:
 
     def put(self, place: tuple[int, ...], values: NDArray[Any]) -> None:
         """Write a chunk, which may be smaller at the array's edge, durably but for its name, which a crash may lose."""
-        if values.shape != self.chunk:
-            whole = np.full(self.chunk, self.fill, self.kind)
-            whole[tuple(map(slice, values.shape))] = values
-            values = whole
-        content = np.ascontiguousarray(values, self.kind).tobytes()
+        missing = [(0, size - own) for size, own in zip(self.chunk, values.shape, strict=True)]
+        content = np.pad(np.asarray(values, self.kind), missing, constant_values=self.fill).tobytes()
         temporary = self.path / f"{UNFINISHED}{os.urandom(6).hex()}"
         temporary.write_bytes(content + _checksum(content))
         settle_on_disk(temporary)
@@ -384,15 +381,10 @@ def _circuit(file: Any, run: dict[str, Any]) -> Circuit:
         made = made_again(kept, [np.asarray(group.variables[name][...], float) for name in names])
         return made._with(text=_text(file.attrs["deck"]))
     except (InputError, ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError) as error:
-        warnings.warn(
-            f"the circuit of this run cannot be made again from its file ({error}); its elements are left out",
-            FingerspiceWarning,
-            stacklevel=4,
-        )
-        sets = json.loads(_text(file.attrs["sets"])) if "sets" in file.attrs else {}
-        return Circuit(
-            _text(file.attrs["title"]), (), text=_text(file.attrs["deck"]), overrides=dict(run["overrides"]), sets=sets
-        )
+        told = f"the circuit of this run cannot be made again from its file ({error}); its elements are left out"
+        warnings.warn(told, FingerspiceWarning, stacklevel=4)
+        title, deck, sets = map(_text, (file.attrs["title"], file.attrs["deck"], file.attrs.get("sets", "{}")))
+        return Circuit(title, (), text=deck, overrides=dict(run["overrides"]), sets=json.loads(sets))
 
 
 def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str, Any] | str, list[FloatArray]]:
@@ -411,9 +403,10 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
             else:
                 own = _tabulated(value, stop, rtol, circuit.tran.step if circuit.tran else 1e-3 * stop)
             return {name: plain(x) for name, x in own.items()}
-        waves = isinstance(value, tuple) and any(isinstance(x, Waveform) for x in value)
-        if waves or not isinstance(value, (tuple, np.ndarray)):
-            return [plain(part) for part in value] if waves else value
+        if isinstance(value, tuple) and any(isinstance(x, Waveform) for x in value):
+            return [plain(part) for part in value]
+        if not isinstance(value, (tuple, np.ndarray)):
+            return value
         arrays.append(np.asarray(value, float))
         return {"array": len(arrays) - 1}
 
@@ -434,9 +427,8 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
 def _tabulated(wave: Waveform, stop: float, rtol: float, step: float) -> dict[str, Any]:
     """A function as the Chebyshev series by which a run represents it."""
     end = wave.settled + wave.period if wave.period is not None else stop
-    with warnings.catch_warnings():
-        # The run has warned of edges.
-        warnings.simplefilter("ignore")
+    # The run has warned of edges.
+    with warnings.catch_warnings(action="ignore"):
         table = source_table(wave, 0.0, end, min(1e-3, max(0.05 * rtol, 1e-14)), step)
     breaks = wave.breakpoints(0.0, end)
     return {

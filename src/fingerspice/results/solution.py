@@ -96,10 +96,8 @@ class SampleGradient(Sealed):
     error: float
 
     def __repr__(self) -> str:
-        largest = float(np.abs(self.values).max(initial=0.0))
-        return (
-            f"SampleGradient({self.source}: {self.values.size} samples, largest {largest:.4g}, error {self.error:.1g})"
-        )
+        told = f"{self.values.size} samples, largest {np.abs(self.values).max(initial=0.0):.4g}, error {self.error:.1g}"
+        return f"SampleGradient({self.source}: {told})"
 
 
 @dataclass(frozen=True, repr=False)

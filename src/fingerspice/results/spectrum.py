@@ -193,13 +193,12 @@ def _density(
     # finds energy that the first one's own sampling would alias.
     share = max((energy_outside(w, solution.t_stop, (0.0, f))[1] for w in waves for f in (half, 8.0 * half)), default=0)
     if share > NOTABLE:
-        warnings.warn(
+        told = (
             f"{name} has frequencies beyond half the rate of the outputs, {0.5 * rate:g} Hz, which are folded into its "
             f"spectrum ({100.0 * share:.0f} % of the source's energy lie above {half:g} Hz); a shorter step of the "
-            "outputs, at most half a period of the highest frequency, keeps them apart",
-            FingerspiceWarning,
-            stacklevel=4,
+            "outputs, at most half a period of the highest frequency, keeps them apart"
         )
+        warnings.warn(told, FingerspiceWarning, stacklevel=4)
     kept = slice(None) if highest is None else f <= highest
     require(bool(np.any(f[kept])), "highest", f"{highest} Hz", f"{f[1]:.4g} Hz or more")
     return Spectrum(

@@ -7,6 +7,7 @@ Means, extremes and amplitudes of a run's signals, as integrals over its steps o
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -82,9 +83,7 @@ class Recorded:
     first: float
     make: Make
     # Records at places that were asked for, as signals are mostly asked for at the same places one after another
-    _known: dict[tuple[bytes, bytes], tuple[FloatArray, Signals]] = field(
-        default_factory=dict, repr=False, compare=False
-    )
+    _known: dict[object, tuple[FloatArray, Signals]] = field(default_factory=dict, repr=False, compare=False)
 
     def run(self, names: Sequence[str], since: float, until: float) -> Recorded | None:
         """These steps; None where they begin after `since` (s)."""
@@ -404,11 +403,9 @@ def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:
     nodes = t[index]
     half, middle = 0.5 * (t[i + 1] - t[i]), 0.5 * (t[i + 1] + t[i])
     # Two Gauss points integrate a cubic exactly; it is evaluated there in Lagrange's form.
-    for at in (middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)):
-        for j in range(4):
-            share = half.copy()
-            for m in range(4):
-                if m != j:
-                    share *= (at - nodes[:, m]) / (nodes[:, j] - nodes[:, m])
-            weight += np.bincount(index[:, j], share, t.size)
+    for at, j in itertools.product((middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)), range(4)):
+        share = half
+        for m in (m for m in range(4) if m != j):
+            share = share * ((at - nodes[:, m]) / (nodes[:, j] - nodes[:, m]))
+        weight += np.bincount(index[:, j], share, t.size)
     return Weighed(t, weight / weight.sum(), x)
