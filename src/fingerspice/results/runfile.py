@@ -9,7 +9,6 @@ The NetCDF file of a run, written and read back, with its circuit as plain data 
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import math
@@ -17,7 +16,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -26,10 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fingerspice.base import files
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.files import UNFINISHED, settle_on_disk
+from fingerspice.base.files import UNFINISHED, settle_on_disk, write_aside, write_pieces
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran
 from fingerspice.circuit.network import checked
 from fingerspice.numerics.lobatto import NODES
@@ -38,8 +36,7 @@ from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, S
 from fingerspice.results.record import StoredRecord, kept_rows, variables
 from fingerspice.results.solution import Solution
 from fingerspice.results.steps import Recorded, whole_steps
-from fingerspice.waveforms import periodic, samples
-from fingerspice.waveforms import waveform as waveforms
+from fingerspice.waveforms import periodic, samples, waveform
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
 from fingerspice.waveforms.waveform import Fundamental, Waveform
 
@@ -201,8 +198,8 @@ MOST_NUMBERS = 8_000_000  # Largest number of a circuit's samples, points and co
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
-        waveforms.DC, waveforms.Sine, waveforms.Chirp, waveforms.Exp, periodic.PWL, periodic.Pulse, periodic.Square,
-        periodic.Triangle, periodic.Sawtooth, waveforms.Sum, waveforms.Product, waveforms.AM, periodic.Burst,
+        waveform.DC, waveform.Sine, waveform.Chirp, waveform.Exp, periodic.PWL, periodic.Pulse, periodic.Square,
+        periodic.Triangle, periodic.Sawtooth, waveform.Sum, waveform.Product, waveform.AM, periodic.Burst,
         periodic.Repeat, samples.Samples,
     )
 }  # fmt: skip
@@ -270,7 +267,7 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             run = {"format": FORMAT, **{name: plain(getattr(solution, name)) for name, (plain, _) in _PLAIN.items()}}
             run |= {
                 "sources": list(solution.sources), "signals": list(solution.signals),
-                "contacts": [[name, dataclasses.asdict(contact)] for name, contact in solution.record.fingers],
+                "contacts": [[name, asdict(contact)] for name, contact in solution.record.fingers],
                 "overrides": dict(solution.circuit.overrides), "summary": solution.summary(), "circuit": circuit,
                 "arrays": len(arrays), "between": between and between[0],
             }  # fmt: skip
@@ -287,9 +284,9 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
                 dimensions = tuple(own)
                 group.dimensions.update(zip(dimensions, table.shape, strict=True))
                 group.create_variable(name, dimensions, dtype=float, data=table)
-        files.write_pieces(target, content.getbuffer())
+        write_pieces(target, content.getbuffer())
 
-    return files.write_aside(path, write)
+    return write_aside(path, write)
 
 
 def load(path: str | Path) -> Solution:
@@ -399,7 +396,7 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
         if isinstance(value, Waveform):
             kind: Any = samples.Samples if isinstance(value, samples.Samples) else type(value)
             if kind in _WAVEFORMS.values():
-                own = {"kind": kind.__name__} | {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}
+                own = {"kind": kind.__name__} | {f.name: getattr(value, f.name) for f in fields(kind)}
             else:
                 own = _tabulated(value, stop, rtol, circuit.tran.step if circuit.tran else 1e-3 * stop)
             return {name: plain(x) for name, x in own.items()}
@@ -411,7 +408,7 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
         return {"array": len(arrays) - 1}
 
     elements = [
-        {f.name: getattr(e, f.name) for f in dataclasses.fields(Element) if f.name != "where"}
+        {f.name: getattr(e, f.name) for f in fields(Element) if f.name != "where"}
         | {"waveform": plain(e.waveform), "values": dict(e.values), "ac": e.ac and vars(e.ac)}
         for e in circuit.elements
     ]

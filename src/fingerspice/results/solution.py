@@ -14,7 +14,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown
-from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status
+from fingerspice.results.outcome import ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.record import Sealed, Signalled, Signals, kept_rows, variables
 from fingerspice.results.summary import Figured, Figures
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.outcome import Plan
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import ClosedForm, Recorded
     from fingerspice.sets.parameters import Citation
