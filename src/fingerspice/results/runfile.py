@@ -219,28 +219,18 @@ def _state(plain: dict[str, Any]) -> State:
 
 #: Attributes of a solution that its file holds as plain data, how each is made plain, and how it is made again.
 _PLAIN: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
-    "nfev": (int, int),
-    "error": (vars, lambda plain: ErrorEstimate(**plain)),
-    "rtol": (float, float),
+    "nfev": (int, int), "error": (vars, lambda plain: ErrorEstimate(**plain)), "rtol": (float, float),
     # Without the wall time, so that the same run gives the same file.
     "stats": (lambda x: {k: v for k, v in x.items() if isinstance(v, (int, float, str)) and k != "wall_s"}, dict),
-    "charge_law": (str, str),
-    "area_mode": (str, str),
-    "method": (str, str),
-    "plan": (
-        Plan.to_dict,
-        lambda plain: Plan(**{**plain, "reasons": tuple(plain["reasons"]), "rates": tuple(plain["rates"])}),
-    ),
+    "charge_law": (str, str), "area_mode": (str, str), "method": (str, str),
+    "plan": (Plan.to_dict, lambda x: Plan(**{**x, "reasons": tuple(x["reasons"]), "rates": tuple(x["rates"])})),
     "status": (lambda status: status.name, lambda name: Status[name]),
     "failure": (lambda failure: failure and failure.to_dict(), lambda plain: plain and _failure(plain)),
     "fundamental": (lambda x: x and vars(x), lambda plain: plain and Fundamental(**plain)),
-    "period": (lambda x: x, lambda x: x),
-    "fold_margin_min": (float, float),
-    "warnings": (list, lambda plain: tuple(map(str, plain))),
-    "first": (float, float),
-    "t_stop": (float, float),
+    "period": (lambda x: x, lambda x: x), "fold_margin_min": (float, float),
+    "warnings": (list, lambda plain: tuple(map(str, plain))), "first": (float, float), "t_stop": (float, float),
     "state": (lambda x: {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(x).items()}, _state),
-}
+}  # fmt: skip
 
 
 def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
@@ -355,13 +345,10 @@ def _solution(file: Any) -> Solution:
         make = partial(StoredRecord, tuple(map(str, run["between"])), sources, fingers)
         continuous = Recorded(whole_steps(begin, end), values, float(run["t_stop"]) - float(run["period"]), make)
     return Solution(
-        t=t,
-        record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:]),
-        circuit=_circuit(file, run),
-        continuous=continuous,
-        stored=dict(run["summary"]),
+        t=t, record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:]), circuit=_circuit(file, run),
+        continuous=continuous, stored=dict(run["summary"]),
         **{name: make(run[name]) for name, (_, make) in _PLAIN.items()},
-    )
+    )  # fmt: skip
 
 
 def _text(value: Any) -> str:

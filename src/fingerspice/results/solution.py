@@ -205,24 +205,16 @@ class Solution(Sealed, Shown, Signalled, Figured):
         """The data needed to repeat the run, as text."""
         from fingerspice import __version__
 
+        circuit, error = self.circuit, self.error
         return {
-            "program": f"fingerspice {__version__}",
-            "title": self.circuit.title,
-            "file": str(self.circuit.path or ""),
-            "deck": self.circuit.text,
-            "overrides": json.dumps(dict(self.circuit.overrides)),
-            "sets": json.dumps({n: {path: repr(x) for path, x in s.items()} for n, s in self.circuit.sets.items()}),
-            "charge_law": self.charge_law,
-            "area": self.area_mode,
-            "method": self.method,
-            "rtol": repr(self.rtol),
-            "error_u_gap_V": repr(self.error.u_gap),
-            "error_f_el_N": repr(self.error.f_el),
-            "error_q_source_C": repr(self.error.q_source),
-            "error_v_nodes_V": repr(self.error.v_nodes),
-            "status": self.status.name,
-            "message": self.message,
-        }
+            "program": f"fingerspice {__version__}", "title": circuit.title, "file": str(circuit.path or ""),
+            "deck": circuit.text, "overrides": json.dumps(dict(circuit.overrides)),
+            "sets": json.dumps({n: {path: repr(x) for path, x in s.items()} for n, s in circuit.sets.items()}),
+            "charge_law": self.charge_law, "area": self.area_mode, "method": self.method, "rtol": repr(self.rtol),
+            "error_u_gap_V": repr(error.u_gap), "error_f_el_N": repr(error.f_el),
+            "error_q_source_C": repr(error.q_source), "error_v_nodes_V": repr(error.v_nodes),
+            "status": self.status.name, "message": self.message,
+        }  # fmt: skip
 
     def to_csv(self, path: str | Path) -> Path:
         """Write every signal as CSV with names and units in the header; a jump has both its rows.
@@ -293,14 +285,9 @@ class Solution(Sealed, Shown, Signalled, Figured):
         return write_netcdf(self, Path(path), jumps)
 
     def spectrum(
-        self,
-        signal: str = "f_t",
-        *,
-        method: str = "auto",
-        highest: float | None = None,
-        resolution: float | None = None,
-        since: float | None = None,
-    ) -> Spectrum:
+        self, signal: str = "f_t", *, method: str = "auto", highest: float | None = None,
+        resolution: float | None = None, since: float | None = None,
+    ) -> Spectrum:  # fmt: skip
         """Spectrum of a signal: lines where the source is periodic, else a density by Welch's method.
 
         The lines are Fourier integrals over the last period of the source, whatever outputs were asked for; the density
@@ -330,12 +317,9 @@ class Solution(Sealed, Shown, Signalled, Figured):
         return spectrum_of(self, signal, method, highest, resolution, since)
 
     def plot(
-        self,
-        signals: str | Sequence[str] | None = None,
-        *,
-        window: tuple[float, float] | None = None,
+        self, signals: str | Sequence[str] | None = None, *, window: tuple[float, float] | None = None,
         others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
-    ) -> Figure:
+    ) -> Figure:  # fmt: skip
         """Draw signals against time: a notebook shows the figure, and from a script ``plot().show()`` opens a window.
 
         More than about 30 oscillations are drawn as envelopes, and a second column shows the last few of them enlarged;
