@@ -223,10 +223,6 @@ class Figured:
     Figures are integrals and extremes of the run itself, not of its outputs.
     """
 
-    @property
-    def _figures(self) -> Figures:
-        raise NotImplementedError
-
     f_el_mean = figure("f_el", "mean", "Mean electroadhesive force over the run, N.")
     f_el_mean_periodic = figure(
         "f_el", "mean_periodic",
