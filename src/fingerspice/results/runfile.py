@@ -25,9 +25,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fingerspice.base import files
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.files import UNFINISHED, settle_on_disk, write_aside, write_pieces
+from fingerspice.base.files import UNFINISHED, settle_on_disk, write_pieces
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran
 from fingerspice.circuit.network import checked
 from fingerspice.numerics.lobatto import NODES
@@ -276,7 +277,7 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
                 group.create_variable(name, dimensions, dtype=float, data=table)
         write_pieces(target, content.getbuffer())
 
-    return write_aside(path, write)
+    return files.write_aside(path, write)
 
 
 def load(path: str | Path) -> Solution:
