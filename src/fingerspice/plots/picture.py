@@ -1,7 +1,4 @@
-"""The class of this package's figures, which appear in notebooks and can be shown in a window.
-
-Pictures of sweeps (percentile bands or a histogram, and what is behind the variance) and of fits.
-"""
+"""The class of this package's figures, which notebooks and windows show; and pictures of sweeps and of fits."""
 
 from __future__ import annotations
 

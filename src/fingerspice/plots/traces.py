@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
     from fingerspice.results.spectrum import PhasorSolution, Spectrum
 
-#: Up to MOST_DRAWN oscillations are drawn as lines. More are drawn as an envelope, with an enlargement of the last
-#: ZOOMED oscillations whose swing is at least the fraction _LOUD of the largest swing.
+#: More than MOST_DRAWN oscillations are drawn as an envelope, with an enlargement of the last ZOOMED ones with a swing
+#: of at least the fraction _LOUD of the largest.
 MOST_DRAWN, ZOOMED, _LOUD = 30, 4, 0.7
 _FEWEST = 12  # Smallest number of outputs in an oscillation for which its shape is visible
 _PARTS = 240  # An envelope divides the window into at most this many parts, each at least one oscillation long
@@ -330,17 +330,16 @@ def time_unit(runs: Sequence[Drawn]) -> tuple[float, str]:
 def time_axis(axes: Sequence[Axes], runs: Sequence[Drawn], start: float, stop: float) -> None:
     """Set limits (s) and label of the time axis, and mark where a run stopped early."""
     factor, unit = time_unit(runs)
-    span = (stop - start) or 1.0
     stopped = [r.solution for r in runs if r.solution.status not in (Status.SUCCESS, Status.ERROR_NOT_MET)]
     early = [end for end in map(_end_of, stopped) if start <= end <= stop]
     # Extend the axis to the right of the end, to show that the run stopped early.
-    wide = 1.08 if early else 1.0
+    edge = factor * (start + ((stop - start) or 1.0) * (1.08 if early else 1.0))
     for ax in axes:
-        ax.set_xlim(factor * start, factor * (start + span * wide))
+        ax.set_xlim(factor * start, edge)
         ax.ticklabel_format(axis="x", useOffset=False)
         for end in early:
             if len(runs) == 1:
-                ax.axvspan(factor * end, factor * (start + wide * span), color="#EEEEEE", zorder=0.5)
+                ax.axvspan(factor * end, edge, color="#EEEEEE", zorder=0.5)
             ax.axvline(factor * end, color=drawing.VERMILION, linewidth=1.2, linestyle=drawing.DASHES[3])
     if early:
         axes[0].text(

@@ -1,7 +1,4 @@
-"""Signals of a run: what is fixed about each, and their values by name from a record or from a file.
-
-Outputs of a run, and every signal that follows from them, each computed when it is first asked for.
-"""
+"""Signals of a run: what is fixed about each, and values by name, from a file or computed when first asked for."""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
-"""Zarr stores: arrays that are created whole and filled chunk by chunk, with the checksums of their chunks.
+"""The NetCDF file of a run, written and read back; and Zarr stores, created whole and filled chunk by chunk.
 
 A chunk's file is its bytes and their CRC-32C, as Zarr's codec of that name has it, so that every program that reads a
 store through Zarr refuses a chunk whose bytes have changed. Which chunks are done is known to the stores themselves:
 those of runs are in `cli/store.py`, and those of sweeps in `studies/sweep/chunks.py`.
-
-The NetCDF file of a run, written and read back, with its circuit as plain data and arrays.
 """
 
 from __future__ import annotations

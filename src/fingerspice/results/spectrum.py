@@ -1,7 +1,4 @@
-"""Spectrum of a signal: the lines of its last period as Fourier integrals, or a density by Welch's method.
-
-The result of a phasor sweep, with its columns, from which its table, file and plain data follow.
-"""
+"""Spectrum of a signal: lines of its last period, or a density by Welch's method; and the result of a phasor sweep."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""A run between its outputs: steps with polynomials through their nodes, and the periods that each stands for.
+"""A run between its outputs: steps with polynomials through their nodes, and means and extremes of its signals on them.
 
 Steps are recorded as the run is made, or chosen for a run that can be computed at any times, or read from a file.
-
-Means, extremes and amplitudes of a run's signals, as integrals over its steps or its outputs.
 """
 
 from __future__ import annotations
@@ -179,8 +177,7 @@ _MISSED = 1e-11  # Largest interpolation error of a panel between its nodes, rel
 #: Largest number of panels, beyond which figures are computed from the outputs; and of halvings of one panel.
 MOST_PANELS, _MOST_ROUNDS = 20_000, 60
 _ROUNDINGS = 32.0  # Length of a panel that is a straight line at all events, in units of the last place of the time
-#: Largest number of the source's segments that an evaluation may pass; length of the first panels relative to the
-#: source's shortest time.
+#: Most segments of the source that an evaluation may pass; length of the first panels in the source's shortest times.
 _MOST_PASSED, _LONGEST = 200_000, 0.5
 
 
@@ -315,9 +312,8 @@ class Stretch:
         t, x = self.run.at_points(name, panels)
         error = missed(x) / (float(np.abs(x).max(initial=0.0)) or 1.0)
         share = panels[3] / panels[3].sum()
-        # Gauss-Lobatto weights integrate polynomials up to twice the degree of the interpolant exactly. If the terms of
-        # the series fall geometrically, the quadrature error is about the interpolation error to the power 1.85; 1.5 is
-        # on the safe side.
+        # Gauss-Lobatto weights are exact up to twice the degree of the interpolant: if the terms of the series fall
+        # geometrically, the quadrature error is about the interpolation error to the power 1.85, and 1.5 is safe.
         if float((share * error**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
             return Weighed(t[:, :NODES], share[:, None] * _WEIGHTS, x[:, :NODES])
         return self._cut(name, _FINEST, panels)[0]
@@ -401,7 +397,7 @@ def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:
     first = np.clip(i - 1, begin[i], begin[i] + size[i] - 4)
     index = first[:, None] + np.arange(4)
     nodes = t[index]
-    half, middle = 0.5 * (t[i + 1] - t[i]), 0.5 * (t[i + 1] + t[i])
+    half, middle = 0.5 * step[i], 0.5 * (t[i + 1] + t[i])
     # Two Gauss points integrate a cubic exactly; it is evaluated there in Lagrange's form.
     for at, j in itertools.product((middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)), range(4)):
         share = half
