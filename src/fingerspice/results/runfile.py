@@ -95,8 +95,9 @@ class Array:
 
     def put(self, place: tuple[int, ...], values: NDArray[Any]) -> None:
         """Write a chunk, which may be smaller at the array's edge, durably but for its name, which a crash may lose."""
-        missing = [(0, size - own) for size, own in zip(self.chunk, values.shape, strict=True)]
-        content = np.pad(np.asarray(values, self.kind), missing, constant_values=self.fill).tobytes()
+        whole = np.full(self.chunk, self.fill, self.kind)
+        whole[tuple(map(slice, values.shape))] = values
+        content = whole.tobytes()
         temporary = self.path / f"{UNFINISHED}{os.urandom(6).hex()}"
         temporary.write_bytes(content + _checksum(content))
         settle_on_disk(temporary)
