@@ -180,11 +180,7 @@ def _turns(runs: list[Drawn], keys: Sequence[str], start: float, stop: float) ->
 
 
 def _zoom(marks: FloatArray, heights: FloatArray, start: float, stop: float) -> tuple[float, float] | None:
-    """Start and end (s) of the interval that is enlarged in a second column; None if no enlargement is needed.
-
-    With many oscillations, the interval holds the last ones that are not small. With few oscillations in a small part
-    of the time, such as a click, it holds all of them.
-    """
+    """Start and end (s) of what is enlarged: the last of many oscillations that are not small, or few as of a click."""
     if marks.size > 2 * MOST_DRAWN:
         swing = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(heights)), 2 * ZOOMED).max(axis=1)
         place = int(np.flatnonzero(swing >= _LOUD * swing.max())[-1])
@@ -210,10 +206,7 @@ def _columns_of(solution: Solution, key: str) -> dict[str, FloatArray]:
 def draw_panel(
     ax: Axes, runs: Sequence[Drawn], keys: Sequence[str], start: float, stop: float, envelope: FloatArray | None = None
 ) -> tuple[list[Trace], float, str]:
-    """Draw signals of one quantity from `start` to `stop` (s), and give the lines with factor and unit of the panel.
-
-    With the times (s) of their turning points `envelope` it is their envelopes.
-    """
+    """Draw signals of one quantity, or with the times (s) of turning points envelopes; gives lines, factor and unit."""
     traces, signal, factor, unit = _traces_of(runs, keys), signal_of(keys[0]), 1.0, ""
     if signal.unit != "1":
         peaks = [drawing.peak_of(t.x[(t.solution.t >= start) & (t.solution.t <= stop)]) for t in traces]

@@ -284,10 +284,7 @@ def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Record(Signals):
-    """Outputs of a run as they were computed, and the signals that follow from them.
-
-    Signals of gaps and of sources have the shape (n_t,) where there is one of them, else (n_t, n).
-    """
+    """Outputs of a run as they were computed, and the signals that follow from them."""
 
     network: Network
     net: Net

@@ -169,17 +169,12 @@ class Figures:
             names = [name for key in _ROWS for name in self.signals.names(key) if f"{name}_max" in s]
             out.append(Table(("", *_COLUMNS), [_row(name, s) for name in names]))
             if any(s.get(f"{name}_mean_periodic") is not None for name in ("u_source", "f_el")):
-                out.append(
-                    "last period: the mean over it; rms and ripple (max - min) are those of the last period, too"
-                )
+                out += ["last period: the mean over it; rms and ripple (max - min) are those of the last period, too"]
             if "u_gap_amplitude" in s:
                 lead = (s["u_gap_phase_deg"] - s["u_source_phase_deg"] + 180.0) % 360.0 - 180.0
                 share = s["u_gap_amplitude"] / s["u_source_amplitude"] if s["u_source_amplitude"] else math.nan
-                out += [
-                    "",
-                    f"at {format_si(s['fundamental'], 'Hz')}: gap voltage {format_si(s['u_gap_amplitude'], 'V')}, "
-                    f"{100.0 * share:.2f} % of the source, leading by {lead:.2f} deg",
-                ]
+                told = f"at {format_si(s['fundamental'], 'Hz')}: gap voltage {format_si(s['u_gap_amplitude'], 'V')}"
+                out += ["", f"{told}, {100.0 * share:.2f} % of the source, leading by {lead:.2f} deg"]
         of = "gap" if run.gaps else "layer" if run.layers else "capacitor"
         told = f"estimated error: {of} voltage {error.u_gap:.2g} V"
         told = f"{told}, force {error.f_el:.2g} N" if run.gaps else f"no GAP, no forces; {told}"
