@@ -44,13 +44,7 @@ COLORS = {
     "Friction": drawing.PURPLE, "Friction coefficient": drawing.PURPLE, "Distance to the fold": drawing.BLACK,
     "Force": drawing.VERMILION, "Stress": drawing.VERMILION,
 }  # fmt: skip
-
-
-class Drawn(NamedTuple):
-    """A run in a picture, with its name in the legend."""
-
-    solution: Solution
-    label: str
+Drawn = tuple["Solution", str]  # A run in a picture, with its name in the legend
 
 
 class Trace(NamedTuple):
@@ -103,7 +97,7 @@ def plot_solution(solution: Solution, signals: Any = None, window: Any = None, o
         right[-1].set_xlabel(f"{right[-1].get_xlabel()}: {part}", fontsize=drawing.FONT)
         if dense and np.count_nonzero((solution.t >= zoomed[0]) & (solution.t <= zoomed[1])) < _FEWEST * ZOOMED:
             small += f" · fewer than {_FEWEST} outputs an oscillation: their shape needs a shorter TSTEP"
-    drawing.caption(figure, small, drawing.GREY if all(run.solution.success for run in runs) else drawing.VERMILION)
+    drawing.caption(figure, small, drawing.GREY if all(run.success for run, _ in runs) else drawing.VERMILION)
     figure.align_ylabels(left)
     return figure
 
@@ -117,7 +111,7 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     for other in every:
         require(isinstance(other, Solution), "others", repr(other), "Solutions, or a mapping of names to Solutions")
     if len(every) == 1:
-        return [Drawn(solution, "")]
+        return [(solution, "")]
     facts = [
         (s.circuit.title, changes_text(s.circuit), f"{s.charge_law} law", f"area {s.area_mode}", s.method,
          f"rtol {s.rtol:g}")
@@ -127,12 +121,12 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     labels = [", ".join(fact[i] or "the deck as it is" for i in told) or f"run {n}" for n, fact in enumerate(facts, 1)]
     if named:
         labels[1:] = map(str, others)
-    return [Drawn(s, label) for s, label in zip(every, labels, strict=True)]
+    return list(zip(every, labels, strict=True))
 
 
 def _panels(runs: list[Drawn], signals: Any) -> list[list[str]]:
     """Names of the signals of each panel, from top to bottom: those of one quantity share one."""
-    every = [run.solution.record for run in runs]
+    every = [run.record for run, _ in runs]
     if signals is None:
         inside = "u_layer" if any(s.layers for s in every) else "v"
         signals = ["u_source", *(("u_gap", "f_el", "area", "f_t") if any(s.gaps for s in every) else (inside,))]
@@ -150,8 +144,8 @@ def _panels(runs: list[Drawn], signals: Any) -> list[list[str]]:
 
 def _window(runs: list[Drawn], window: Any) -> tuple[float, float]:
     """Start and end of the drawn interval, s."""
-    times = [run.solution.t for run in runs if run.solution.t.size]
-    first, last = min((float(t[0]) for t in times), default=0.0), max(_end_of(run.solution) for run in runs)
+    times = [run.t for run, _ in runs if run.t.size]
+    first, last = min((float(t[0]) for t in times), default=0.0), max(_end_of(run) for run, _ in runs)
     if window is None:
         return first, last
     ends = real_numbers("window", window, "two times in s, (start, stop)")
@@ -166,10 +160,10 @@ def _window(runs: list[Drawn], window: Any) -> tuple[float, float]:
 def _turns(runs: list[Drawn], keys: Sequence[str], start: float, stop: float) -> tuple[FloatArray, FloatArray]:
     """Times (s) and values of the turning points, two per oscillation, of a panel's most oscillating signal."""
     best = np.zeros(0), np.zeros(0)
-    for run, key in itertools.product(runs, keys):
-        t = run.solution.t
+    for (run, _), key in itertools.product(runs, keys):
+        t = run.t
         kept = (t >= start) & (t <= stop)
-        for x in _columns_of(run.solution, key).values():
+        for x in _columns_of(run, key).values():
             step = np.diff(x[kept])
             # Turning points of round-off are not counted.
             steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
@@ -219,12 +213,12 @@ def draw_panel(
 def _traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
     """The lines of one panel; the colour of a finger, or of a run among several, is the same in every panel."""
     out: list[Trace] = []
-    gaps = list(dict.fromkeys(gap for run in runs for gap in run.solution.gaps))
+    gaps = list(dict.fromkeys(gap for run, _ in runs for gap in run.gaps))
     above = 0
     # If the source is the same in all runs, it is drawn once, without the name of a run.
-    shared = len({run.solution.u_source.tobytes() for run in runs}) == 1
-    for (number, run), key in itertools.product(enumerate(runs), keys):
-        found = _columns_of(run.solution, key)
+    shared = len({run.u_source.tobytes() for run, _ in runs}) == 1
+    for (number, (run, run_name)), key in itertools.product(enumerate(runs), keys):
+        found = _columns_of(run, key)
         for place, (name, x) in enumerate(found.items()):
             kind, _, element = name.partition(":")
             source = kind == "u_source"
@@ -244,8 +238,8 @@ def _traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
                 color = drawing.CYCLE[above % len(drawing.CYCLE)]
             style = _PALE if source else {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
             above += not source
-            label += f", {run.label}" if run.label and not alone else ""
-            out.append(Trace(run.solution, label, x, {"color": color, **style}))
+            label += f", {run_name}" if run_name and not alone else ""
+            out.append(Trace(run, label, x, {"color": color, **style}))
     return out
 
 
@@ -317,13 +311,13 @@ def _coefficient_axis(ax: Axes, solution: Solution, factor: float) -> None:
 
 def time_unit(runs: Sequence[Drawn]) -> tuple[float, str]:
     """Factor and unit of the time axis."""
-    return drawing.engineering(max(max(_end_of(run.solution), drawing.peak_of(run.solution.t)) for run in runs), "s")
+    return drawing.engineering(max(max(_end_of(run), drawing.peak_of(run.t)) for run, _ in runs), "s")
 
 
 def time_axis(axes: Sequence[Axes], runs: Sequence[Drawn], start: float, stop: float) -> None:
     """Set limits (s) and label of the time axis, and mark where a run stopped early."""
     factor, unit = time_unit(runs)
-    stopped = [r.solution for r in runs if r.solution.status not in (Status.SUCCESS, Status.ERROR_NOT_MET)]
+    stopped = [run for run, _ in runs if run.status not in (Status.SUCCESS, Status.ERROR_NOT_MET)]
     early = [end for end in map(_end_of, stopped) if start <= end <= stop]
     # Extend the axis to the right of the end, to show that the run stopped early.
     edge = factor * (start + ((stop - start) or 1.0) * (1.08 if early else 1.0))
@@ -352,16 +346,16 @@ def about_all(runs: Sequence[Drawn]) -> str:
             f"method {s.method}, rtol {s.rtol:.2g}", f"error estimate {s.error.u_gap:.2g} V{force}",
         ))  # fmt: skip
     if len(runs) == 1:
-        end = [] if runs[0].solution.success else [runs[0].solution.message]
+        end = [] if runs[0][0].success else [runs[0][0].message]
         return " · ".join([fact for fact in facts[0] if fact] + end)
     alike = [len(set(same)) == 1 for same in zip(*facts, strict=True)]
     shared = [f for f, same in zip(facts[0], alike, strict=True) if f and same]
     own = []
-    for run, fact in zip(runs, facts, strict=True):
+    for (_, name), fact in zip(runs, facts, strict=True):
         # Leave out the first fact (title and changed parameters), because the run's label has the changes.
         differs = [f for f, same in zip(fact[1:], alike[1:], strict=True) if f and not same]
-        own.append(f"{run.label}: {', '.join(differs)}" if differs else run.label)
-    titles = {run.solution.circuit.title for run in runs}
+        own.append(f"{name}: {', '.join(differs)}" if differs else name)
+    titles = {run.circuit.title for run, _ in runs}
     return " · ".join([*(titles - set(shared) if len(titles) == 1 else ()), *shared, *own])
 
 
