@@ -6,7 +6,6 @@ first figure is made.
 
 from __future__ import annotations
 
-import itertools
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,12 +28,9 @@ if TYPE_CHECKING:
 BLACK, GREY, BLUE, VERMILION = "#000000", "#777777", "#0072B2", "#D55E00"
 GREEN, PURPLE, ORANGE, SKY = "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 
-#: Font sizes (points) and width (inches) of a figure across a page.
-FONT, SMALL, WIDTH = 8.5, 7.0, 7.0
-#: Number of bins into which long curves are divided: larger than the number of dots across the page.
-MAX_BINS = 4000
-#: Largest number of characters of a name in a legend.
-LONGEST_LABEL = 60
+FONT, SMALL, WIDTH = 8.5, 7.0, 7.0  # Font sizes (points) and width (inches) of a figure across a page
+MAX_BINS = 4000  # Number of bins into which long curves are divided: larger than the number of dots across the page
+LONGEST_LABEL = 60  # Largest number of characters of a name in a legend
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (1, 1.2)))
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
@@ -78,15 +74,12 @@ def legend_above(ax: Axes, columns: int = 4, *, right: bool = False, math: bool 
 def legend_within(ax: Axes, room: int) -> None:
     """Put a legend above the panel, with as many columns as fit into a width of `room` letters."""
     names = ax.get_legend_handles_labels()[1]
-    columns = next(n for n in range(len(names), 0, -1) if n == 1 or sum(_columns(names, n)) <= room)
-    legend_above(ax, columns)
 
+    def width(columns: int) -> int:
+        # Entries fill column by column, and the first ones may hold one more.
+        return sum(max(map(len, column)) + 6 for column in np.array_split(names, columns))
 
-def _columns(names: list[str], columns: int) -> list[int]:
-    """Widths (letters) of a legend's columns; entries fill column by column, and the first ones may hold one more."""
-    rows, longer = divmod(len(names), columns)
-    begins = [place * rows + min(place, longer) for place in range(columns + 1)]
-    return [max(map(len, names[a:b])) + 6 for a, b in itertools.pairwise(begins)]
+    legend_above(ax, next(n for n in range(len(names), 0, -1) if n == 1 or width(n) <= room))
 
 
 def drawable(text: str, longest: int = 1000) -> str:
@@ -103,8 +96,7 @@ def drawable(text: str, longest: int = 1000) -> str:
 def caption(figure: Figure, text: str, color: str = GREY) -> None:
     """Put small print under the figure, wrapped to its width."""
     lines = textwrap.fill(drawable(text), 120, break_on_hyphens=False)
-    small = figure.supxlabel(lines, x=0.012, ha="left", fontsize=SMALL, color=color)
-    small.set_parse_math(False)
+    figure.supxlabel(lines, x=0.012, ha="left", fontsize=SMALL, color=color, parse_math=False)
 
 
 def save(figure: Figure, path: str | Path, *, about: Mapping[str, str] | None = None, dpi: float = 160.0) -> Path:
@@ -151,6 +143,7 @@ def from_zero(ax: Axes) -> None:
 
 
 def flat(ax: Axes, values: FloatArray) -> None:
-    """Widen the scale of a constant signal, which would otherwise show round-off."""
+    """Plain numbers on the scale of a signal, and a wider one of a constant signal, which would show round-off."""
+    ax.ticklabel_format(axis="y", useOffset=False)
     if values.any() and np.ptp(values) <= 1e-6 * peak_of(values):
         ax.set_ylim(0.95 * values.flat[0], 1.05 * values.flat[0])

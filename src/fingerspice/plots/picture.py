@@ -1,7 +1,4 @@
-"""The class of this package's figures, which appear in notebooks and can be shown in a window.
-
-Pictures of sweeps (percentile bands or a histogram, and what is behind the variance) and of fits.
-"""
+"""The class of this package's figures, which notebooks and windows show; and pictures of sweeps and of fits."""
 
 from __future__ import annotations
 
@@ -102,8 +99,7 @@ def _show_waiting() -> None:
         picture.show()
 
 
-# Ratio of the largest to the smallest abscissa from which on the axis is logarithmic.
-_WIDE = 20.0
+_WIDE = 20.0  # Ratio of the largest to the smallest abscissa from which on the axis is logarithmic
 
 
 def plot_sweep(found: Dataset, output: str, indices: Dataset | None = None) -> Picture:
@@ -182,8 +178,7 @@ def _alone(ax: Axes, x: FloatArray, values: FloatArray, indices: Dataset, j: int
     """Curves (n_x, n_quantile) where parameter `j` takes the quantiles of its distribution."""
     at, unit = indices["at"].values[j], str(indices["unit"].values[j])
     factor, unit = drawing.engineering(float(np.abs(at).max()), unit)
-    if unit.strip() == "1":
-        unit = "times"
+    unit = "times" if unit.strip() == "1" else unit
     told = f"{indices.parameter.values[j]}: {', '.join(f'{factor * one:.3g}' for one in at)} {unit}"
     ax.set_title(drawing.drawable(told, 60), fontsize=drawing.FONT, loc="left", parse_math=False)
     for k, colour in enumerate((drawing.BLUE, drawing.BLACK, drawing.VERMILION)):
@@ -208,8 +203,7 @@ def _shares(ax: Axes, indices: Dataset, output: str, x: FloatArray | None) -> No
         drawing.legend_within(ax, 44)
 
 
-# Letters of a legend across the page; beside other panels one curve needs none.
-_ROOM = 90
+_ROOM = 90  # Letters of a legend across the page; beside other panels one curve needs none
 #: A panel of measured and fitted values: to which curve each row belongs, by name; columns (n,) of the abscissa, the
 #: measured and fitted values and the standard deviations; what the abscissa is, the quantity, and its unit.
 Drawn = tuple[Sequence[str], Sequence[FloatArray], str, str, str]

@@ -12,6 +12,7 @@ import math
 import operator
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence, Set
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,18 +29,16 @@ from fingerspice.plots import drawing
 from fingerspice.plots.picture import Picture
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _GROUND = "0"
 
 
 class Place(NamedTuple):
-    """Where one element stands."""
+    """Where one element stands: its column, and the rows of its upper and its lower node."""
 
     element: Element
     column: int
-    # top, bottom: Rows of its upper and its lower node
     top: int
     bottom: int
     upright: bool  # Whether its first node is the upper one
@@ -64,9 +63,7 @@ def place(circuit: Circuit) -> Placement:
     order = list(_in_order(circuit, level))
     # Nodes that cannot share a row get one each, and then every element has room in a new column.
     single = {node: row for row, node in enumerate(sorted(level, key=level.__getitem__))}
-    found = _place_columns(order, level) or _place_columns(order, single)
-    assert found is not None
-    return found
+    return next(found for rows in (level, single) if (found := _place_columns(order, rows)) is not None)
 
 
 def _levels(circuit: Circuit) -> dict[str, int]:
@@ -79,19 +76,13 @@ def _levels(circuit: Circuit) -> dict[str, int]:
         p, n = number[e.nodes[0]], number[e.nodes[1]]
         matrix[[p, n], [p, n]] += 1.0
         matrix[[p, n], [n, p]] -= 1.0
-        sign = {"V": 1.0, "I": -1.0}.get(e.device, 0.0)
-        driven[p] += sign
-        driven[n] -= sign
+        driven[[p, n]] += np.array([1.0, -1.0]) * {"V": 1.0, "I": -1.0}.get(e.device, 0.0)
     potential = np.linalg.lstsq(matrix, driven, rcond=None)[0].round(9)
     falling = sorted(nodes, key=lambda node: (node == _GROUND, -potential[number[node]], number[node]))
-    rank = {node: k for k, node in enumerate(falling)}
-    above: dict[str, set[str]] = {node: set() for node in nodes}
-    for e in circuit.elements:
-        upper, lower = sorted(e.nodes[:2], key=rank.__getitem__)
-        above[lower].add(upper)
     level: dict[str, int] = {}
     for node in falling:
-        level[node] = max((level[other] + 1 for other in above[node]), default=0)
+        ends = (end for e in circuit.elements if node in e.nodes[:2] for end in e.nodes[:2])
+        level[node] = 1 + max((level[end] for end in ends if end in level), default=-1)
     # `falling` has ground last, so that no other node's level depends on it.
     level[_GROUND] = 1 + max(level[node] for node in nodes if node != _GROUND)
     return level
@@ -106,27 +97,27 @@ def _in_order(circuit: Circuit, level: Mapping[str, int]) -> Iterator[tuple[Elem
     for e in circuit.elements:
         if e.device not in "VI":
             below.setdefault(min(e.nodes[:2], key=level.__getitem__), []).append(e)
-    for node in sorted(below, key=level.__getitem__):
-        waiting: list[tuple[Element, Element | None]] = [(e, None) for e in reversed(below.pop(node, []))]
-        while waiting:
-            e, before = waiting.pop()
+
+    def chains(node: str, before: Element | None) -> Iterator[tuple[Element, Element | None]]:
+        for e in below.pop(node, []):
             yield e, before
-            lower = max(e.nodes[:2], key=level.__getitem__)
-            waiting += [(other, e) for other in reversed(below.pop(lower, []))]
+            yield from chains(max(e.nodes[:2], key=level.__getitem__), e)
+
+    for node in sorted(below, key=level.__getitem__):
+        yield from chains(node, None)
     yield from ((e, None) for e in fixing)
 
 
 def _place_columns(order: Sequence[tuple[Element, Element | None]], rows: Mapping[str, int]) -> Placement | None:
     """Each element in the first column with room for it; None if nodes of one row would meet."""
     places: dict[str, Place] = {}
-    taken: list[list[Place]] = []
     extents: dict[str, tuple[int, int]] = {}
     for element, before in order:
         ends = element.nodes[:2]
         top, bottom = sorted(rows[node] for node in ends)
         preferred = [places[before.name].column] if before is not None else []
-        for column in (*preferred, *range(len(taken) + 1)):
-            room = column == len(taken) or all(p.bottom <= top or p.top >= bottom for p in taken[column])
+        for column in (*preferred, *range(len({p.column for p in places.values()}) + 1)):
+            room = all(p.column != column or p.bottom <= top or p.top >= bottom for p in places.values())
             so_far = {node: extents.get(node, (column, column)) for node in ends}
             wider = {node: (min(lo, column), max(hi, column)) for node, (lo, hi) in so_far.items()}
             after = {**extents, **wider}
@@ -138,10 +129,7 @@ def _place_columns(order: Sequence[tuple[Element, Element | None]], rows: Mappin
                 break
         else:
             return None
-        if column == len(taken):
-            taken.append([])
         places[element.name] = Place(element, column, top, bottom, rows[ends[0]] < rows[ends[1]])
-        taken[column].append(places[element.name])
         extents = after
     return Placement(list(places.values()), rows, extents)
 
@@ -163,21 +151,17 @@ _PLUS_MINUS: list[Stroke] = [
     [(-0.045, 0.085), (0.045, 0.085)], [(0.0, 0.04), (0.0, 0.13)], [(-0.045, -0.085), (0.045, -0.085)]
 ]  # fmt: skip
 _ARROW: list[Stroke] = [[(0.0, 0.11), (0.0, -0.11)], [(-0.045, -0.05), (0.0, -0.11), (0.045, -0.05)]]
-#: Strokes of the parts, and half their width. The arrow of a current points from the first node to the second.
-_PARTS = {
-    "R": (_RESISTOR, 0.08), "C": (_CAPACITOR, 0.12),
-    "V": (_CIRCLE + _PLUS_MINUS, _RADIUS), "I": (_CIRCLE + _ARROW, _RADIUS),
+Symbol = tuple[list[Stroke], float, float]  # Strokes of a symbol, half its height, and half its width
+#: Symbols of the parts. The arrow of a current points from the first node to the second.
+_PARTS: dict[str, Symbol] = {
+    "R": (_RESISTOR, _HALF, 0.08), "C": (_CAPACITOR, _HALF, 0.12),
+    "V": (_CIRCLE + _PLUS_MINUS, _HALF, _RADIUS), "I": (_CIRCLE + _ARROW, _HALF, _RADIUS),
 }  # fmt: skip
-
-
-#: Strokes of an element's symbol, half its height, and half its width.
-Symbol = tuple[list[Stroke], float, float]
 
 
 def _symbol(element: Element) -> Symbol:
     if element.device in _PARTS:
-        strokes, wide = _PARTS[element.device]
-        return strokes, _HALF, wide
+        return _PARTS[element.device]
     if element.device == "SKIN_DISPERSIVE":
         # Two cells stand for the many of the ladder, with dots in between.
         away = _HALF + 0.1
@@ -198,15 +182,12 @@ def _moved(strokes: Sequence[Stroke], x: float, y: float, up: float = 1.0) -> li
     return [[(x + dx, y + up * dy) for dx, dy in stroke] for stroke in strokes]
 
 
-#: Largest number of elements that a picture can show.
-MOST_ELEMENTS = 200
-#: Letters in a line of values and in a name, and lines of values at most.
-_LETTERS, _LONGEST, _LINES = 34, 40, 7
+MOST_ELEMENTS = 200  # Largest number of elements that a picture can show
+_LETTERS, _LONGEST, _LINES = 34, 40, 7  # Letters in a line of values and in a name, and lines of values at most
 #: Inches: height of a line of text, from a symbol to its label, around everything, and around a label in its row.
 _LINE, _BESIDE, _MARGIN, _ROOM = 0.135, 0.08, 0.15, 0.1
-#: Largest size of a schematic beside a run's picture, over its own, and its resolution there, dots per inch of its own
-#: size; and how low that picture may become beside it, over its own height.
-_LARGE, _SMALL_DPI, _LEAST = 1.3, 200, 0.8
+#: Largest size of a schematic beside a run's picture, and how low that picture may become beside it, over their own.
+_LARGE, _LEAST = 1.3, 0.8
 _TINTS = {"LAYER": drawing.SKY, "SLAB": drawing.SKY, "SKIN": drawing.ORANGE, "SKIN_DISPERSIVE": drawing.ORANGE}
 
 
@@ -250,22 +231,19 @@ class Schematic(Picture):
 
 def put_beside(picture: Figure, circuit: Circuit) -> Figure:
     """The picture of a run with the circuit's schematic, small, on its right."""
-    schematic, content = draw_circuit(circuit), io.BytesIO()
-    schematic.savefig(content, format="png", dpi=_SMALL_DPI)
-    content.seek(0)
+    schematic = draw_circuit(circuit)
     width, height = picture.get_size_inches()
     wide, high = schematic.get_size_inches()
     height = min(height, max(_LEAST * height, _LARGE * high))
     shrunk = min(_LARGE, height / high)
     total = width + shrunk * wide
     picture.set_size_inches(total, height)
-    engine: Any = picture.get_layout_engine()
-    engine.set(rect=(0.0, 0.0, width / total, 1.0))
+    picture.get_layout_engine().set(rect=(0.0, 0.0, width / total, 1.0))  # type: ignore[union-attr, call-arg]
     # Axes without a grid take no part in the layout.
     share = shrunk * high / height
     ax = picture.add_axes((width / total, 0.5 - 0.5 * share, shrunk * wide / total, share), label="schematic")
     ax.set_axis_off()
-    ax.imshow(image.imread(content), aspect="auto", interpolation="antialiased")
+    ax.imshow(image.imread(io.BytesIO(schematic._repr_png_()[0])), aspect="auto", interpolation="antialiased")
     return picture
 
 
@@ -287,8 +265,9 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set(xlim=(0.0, width), ylim=(0.0, height))
     ax.set_axis_off()
+    write = partial(ax.text, fontsize=drawing.FONT, color=drawing.BLACK, va="center", parse_math=False)
     for k, line in enumerate(title):
-        _write(ax, _MARGIN, height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, bold=True)
+        write(_MARGIN, height - _MARGIN - (k + 0.5) * _LINE * 1.2, line, weight="bold")
     strokes, dots = _wires(placed, columns, rows)
     for p, (symbol, tall, wide), label in labelled:
         # The name of the node below needs the lowest line.
@@ -297,11 +276,12 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
             corner = (x - wide - 0.02, y - tall)
             ax.add_patch(Rectangle(corner, 2.0 * wide + 0.04, 2.0 * tall, color=tint, alpha=0.2, linewidth=0))
         for k, line in enumerate(label):
-            _write(ax, x + wide + _BESIDE, y + 0.5 * _LINE * len(label) - (k + 0.5) * _LINE, line, bold=k == 0)
+            at = x + wide + _BESIDE, y + 0.5 * _LINE * len(label) - (k + 0.5) * _LINE
+            write(*at, line, weight="normal" if k else "bold")
         strokes += _moved(symbol, x, y, 1.0 if p.upright else -1.0)
         strokes += [[(x, rows[p.top]), (x, y + tall)], [(x, y - tall), (x, rows[p.bottom])]]
     for node, name in names.items():
-        _write(ax, columns[placed.extents[node][0]] + 0.07, rows[placed.rows[node]] + 0.08, name, color=drawing.BLUE)
+        write(columns[placed.extents[node][0]] + 0.07, rows[placed.rows[node]] + 0.08, name, color=drawing.BLUE)
     for stroke in strokes:
         ax.plot(*zip(*stroke, strict=True), color=drawing.BLACK, linewidth=1.0, solid_capstyle="round")
     for dot in dots:
@@ -311,12 +291,6 @@ def draw_circuit(circuit: Circuit, path: str | Path | None = None) -> Schematic:
     return figure
 
 
-def _write(ax: Axes, x: float, y: float, text: str, *, bold: bool = False, color: str = drawing.BLACK) -> None:
-    """A line of text, its left middle at (x, y)."""
-    weight = "bold" if bold else "normal"
-    ax.text(x, y, text, fontsize=drawing.FONT, weight=weight, color=color, va="center", parse_math=False)
-
-
 def _sheet(
     figure: Figure, placed: Placement, labelled: Sequence[tuple[Place, Symbol, Sequence[str]]],
     names: Mapping[str, str], title: Sequence[str],
@@ -324,15 +298,14 @@ def _sheet(
     """Places of columns and rows, between which nothing meets, and width and height of the sheet (inches)."""
     renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
 
-    def size(text: str, *, bold: bool = False) -> float:
-        """The width of a text, inches."""
-        font = FontProperties(size=drawing.FONT, weight="bold" if bold else "normal")
+    def size(text: str, weight: str = "normal") -> float:
+        font = FontProperties(size=drawing.FONT, weight=weight)
         return float(renderer.get_text_width_height_descent(text, font, False)[0]) / float(figure.dpi)
 
     columns = 1 + max(p.column for p in placed.places)
     left, right, high = [0.2] * columns, [0.3] * columns, [0.0] * max(p.bottom for p in placed.places)
     for p, (_, tall, wide), label in labelled:
-        beside = max(size(line, bold=k == 0) for k, line in enumerate(label))
+        beside = max(size(line, "normal" if k else "bold") for k, line in enumerate(label))
         left[p.column] = max(left[p.column], wide)
         right[p.column] = max(right[p.column], wide + _BESIDE + beside)
         high[p.gap] = max(high[p.gap], 2.0 * tall, _LINE * len(label))
@@ -342,7 +315,7 @@ def _sheet(
     x = [_MARGIN + left[0]]
     for before, own in itertools.pairwise(zip(left, right, strict=True)):
         x.append(x[-1] + before[1] + _MARGIN + own[0])
-    width = max(x[-1] + right[-1] + _MARGIN, max(size(line, bold=True) for line in title) + 2.0 * _MARGIN)
+    width = max(x[-1] + right[-1] + _MARGIN, max(size(line, "bold") for line in title) + 2.0 * _MARGIN)
     # Names of nodes stand above their rows, also above the first one; ground hangs below the last.
     above = [_MARGIN + 1.2 * _LINE * len(title) + _ROOM + _LINE, *(h + 2.0 * _ROOM + _LINE for h in high)]
     height = sum(above) + 0.24 + _MARGIN

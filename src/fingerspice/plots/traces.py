@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import FloatArray, IntArray, real_numbers
+from fingerspice.base.arrays import FloatArray, real_numbers
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.describe import changes_text, drive_text, heading
 from fingerspice.physics.materials import SKIN_BAND
@@ -26,13 +27,11 @@ if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
     from fingerspice.results.spectrum import PhasorSolution, Spectrum
 
-#: Up to MOST_DRAWN oscillations are drawn as lines. More are drawn as an envelope, with an enlargement of the last
-#: ZOOMED oscillations whose swing is at least the fraction _LOUD of the largest swing.
+#: More than MOST_DRAWN oscillations are drawn as an envelope, with an enlargement of the last ZOOMED ones with a swing
+#: of at least the fraction _LOUD of the largest.
 MOST_DRAWN, ZOOMED, _LOUD = 30, 4, 0.7
-#: Smallest number of outputs in an oscillation for which its shape is visible.
-_FEWEST = 12
-#: An envelope divides the window into at most this many parts, each at least one oscillation long.
-_PARTS = 240
+_FEWEST = 12  # Smallest number of outputs in an oscillation for which its shape is visible
+_PARTS = 240  # An envelope divides the window into at most this many parts, each at least one oscillation long
 #: Number of letters for which a legend has room: across the page, and over the left one of two columns.
 _PAGE, _HALF = 90, 50
 #: Line widths (points) in one panel: later lines are narrower and dashed, so that all stay visible where they coincide.
@@ -45,13 +44,7 @@ COLORS = {
     "Friction": drawing.PURPLE, "Friction coefficient": drawing.PURPLE, "Distance to the fold": drawing.BLACK,
     "Force": drawing.VERMILION, "Stress": drawing.VERMILION,
 }  # fmt: skip
-
-
-class Drawn(NamedTuple):
-    """A run in a picture, with its name in the legend."""
-
-    solution: Solution
-    label: str
+Drawn = tuple["Solution", str]  # A run in a picture, with its name in the legend
 
 
 class Trace(NamedTuple):
@@ -63,12 +56,7 @@ class Trace(NamedTuple):
     style: dict[str, Any]
 
 
-def plot_solution(
-    solution: Solution,
-    signals: str | Sequence[str] | None = None,
-    window: tuple[float, float] | None = None,
-    others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
-) -> Picture:
+def plot_solution(solution: Solution, signals: Any = None, window: Any = None, others: Any = ()) -> Picture:
     """Signals over one time axis; arguments as in `Solution.plot`."""
     runs = _runs(solution, others)
     panels = _panels(runs, signals)
@@ -107,15 +95,11 @@ def plot_solution(
         part = f"the last {ZOOMED}" if dense and marks[-1] <= zoomed[1] else "enlarged"
         left[-1].set_xlabel(f"{left[-1].get_xlabel()}: {whole}", fontsize=drawing.FONT)
         right[-1].set_xlabel(f"{right[-1].get_xlabel()}: {part}", fontsize=drawing.FONT)
-        t = solution.t
-        if dense and np.count_nonzero((t >= zoomed[0]) & (t <= zoomed[1])) < _FEWEST * ZOOMED:
+        if dense and np.count_nonzero((solution.t >= zoomed[0]) & (solution.t <= zoomed[1])) < _FEWEST * ZOOMED:
             small += f" · fewer than {_FEWEST} outputs an oscillation: their shape needs a shorter TSTEP"
-    drawing.caption(figure, small, drawing.GREY if all(run.solution.success for run in runs) else drawing.VERMILION)
+    drawing.caption(figure, small, drawing.GREY if all(run.success for run, _ in runs) else drawing.VERMILION)
     figure.align_ylabels(left)
     return figure
-
-
-# What is drawn: runs, panels, interval
 
 
 def _runs(solution: Solution, others: Any) -> list[Drawn]:
@@ -123,12 +107,11 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     from fingerspice.results.solution import Solution
 
     named = isinstance(others, Mapping)
-    rest = [*(others.values() if named else others if isinstance(others, Sequence) else [others])]
-    for other in rest:
+    every = [solution, *(others.values() if named else others if isinstance(others, Sequence) else [others])]
+    for other in every:
         require(isinstance(other, Solution), "others", repr(other), "Solutions, or a mapping of names to Solutions")
-    every = [solution, *rest]
     if len(every) == 1:
-        return [Drawn(solution, "")]
+        return [(solution, "")]
     facts = [
         (s.circuit.title, changes_text(s.circuit), f"{s.charge_law} law", f"area {s.area_mode}", s.method,
          f"rtol {s.rtol:g}")
@@ -138,16 +121,15 @@ def _runs(solution: Solution, others: Any) -> list[Drawn]:
     labels = [", ".join(fact[i] or "the deck as it is" for i in told) or f"run {n}" for n, fact in enumerate(facts, 1)]
     if named:
         labels[1:] = map(str, others)
-    return [Drawn(s, label) for s, label in zip(every, labels, strict=True)]
+    return list(zip(every, labels, strict=True))
 
 
-def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[list[str]]:
+def _panels(runs: list[Drawn], signals: Any) -> list[list[str]]:
     """Names of the signals of each panel, from top to bottom: those of one quantity share one."""
-    every = [run.solution.record for run in runs]
+    every = [run.record for run, _ in runs]
     if signals is None:
         inside = "u_layer" if any(s.layers for s in every) else "v"
-        contact = any(s.gaps for s in every)
-        signals = ["u_source", *(("u_gap", "f_el", "area", "f_t") if contact else (inside,))]
+        signals = ["u_source", *(("u_gap", "f_el", "area", "f_t") if any(s.gaps for s in every) else (inside,))]
     known = {name: None for s in every for key in SIGNALS for name in (key, *s.names(key)) if s.names(key)}
     panels: dict[str, list[str]] = {}
     for name in [signals] if isinstance(signals, str) else signals:
@@ -160,10 +142,10 @@ def _panels(runs: list[Drawn], signals: str | Sequence[str] | None) -> list[list
     return list(panels.values())
 
 
-def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[float, float]:
+def _window(runs: list[Drawn], window: Any) -> tuple[float, float]:
     """Start and end of the drawn interval, s."""
-    times = [run.solution.t for run in runs if run.solution.t.size]
-    first, last = min((float(t[0]) for t in times), default=0.0), max(_end_of(run.solution) for run in runs)
+    times = [run.t for run, _ in runs if run.t.size]
+    first, last = min((float(t[0]) for t in times), default=0.0), max(_end_of(run) for run, _ in runs)
     if window is None:
         return first, last
     ends = real_numbers("window", window, "two times in s, (start, stop)")
@@ -178,36 +160,29 @@ def _window(runs: list[Drawn], window: tuple[float, float] | None) -> tuple[floa
 def _turns(runs: list[Drawn], keys: Sequence[str], start: float, stop: float) -> tuple[FloatArray, FloatArray]:
     """Times (s) and values of the turning points, two per oscillation, of a panel's most oscillating signal."""
     best = np.zeros(0), np.zeros(0)
-    for run in runs:
-        t = run.solution.t
+    for (run, _), key in itertools.product(runs, keys):
+        t = run.t
         kept = (t >= start) & (t <= stop)
-        for key in keys:
-            for x in _columns_of(run.solution, key).values():
-                step = np.diff(x[kept])
-                # Turning points of round-off are not counted.
-                steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
-                turns = steep[1:][np.signbit(step[steep[1:]]) != np.signbit(step[steep[:-1]])]
-                if turns.size > best[0].size:
-                    best = t[kept][turns], x[kept][turns]
+        for x in _columns_of(run, key).values():
+            step = np.diff(x[kept])
+            # Turning points of round-off are not counted.
+            steep = np.flatnonzero(np.abs(step) > 1e-6 * drawing.peak_of(x))
+            turns = steep[1:][np.signbit(step[steep[1:]]) != np.signbit(step[steep[:-1]])]
+            if turns.size > best[0].size:
+                best = t[kept][turns], x[kept][turns]
     return best
 
 
 def _zoom(marks: FloatArray, heights: FloatArray, start: float, stop: float) -> tuple[float, float] | None:
-    """Start and end (s) of the interval that is enlarged in a second column; None if no enlargement is needed.
-
-    With many oscillations, the interval holds the last ones that are not small. With few oscillations in a small part
-    of the time, such as a click, it holds all of them.
-    """
-    length = 2 * ZOOMED
+    """Start and end (s) of what is enlarged: the last of many oscillations that are not small, or few as of a click."""
     if marks.size > 2 * MOST_DRAWN:
-        swing = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(heights)), length).max(axis=1)
+        swing = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(heights)), 2 * ZOOMED).max(axis=1)
         place = int(np.flatnonzero(swing >= _LOUD * swing.max())[-1])
-        first, last = float(marks[place]), float(marks[place + length])
+        first, last = float(marks[place]), float(marks[place + 2 * ZOOMED])
         # Leave out a constant part that may follow the oscillations.
         return first, min(stop, last + 0.1 * (last - first))
-    if marks.size < 2 or marks[-1] - marks[0] > (stop - start) / MOST_DRAWN:
+    if marks.size < 2 or (around := float(marks[-1] - marks[0])) > (stop - start) / MOST_DRAWN:
         return None
-    around = float(marks[-1] - marks[0])
     return max(start, float(marks[0]) - around), min(stop, float(marks[-1]) + around)
 
 
@@ -222,16 +197,10 @@ def _columns_of(solution: Solution, key: str) -> dict[str, FloatArray]:
     return solution.by_name(key) if not colon or key in solution.record.names(kind) else {}
 
 
-# Panels and their lines
-
-
 def draw_panel(
     ax: Axes, runs: Sequence[Drawn], keys: Sequence[str], start: float, stop: float, envelope: FloatArray | None = None
 ) -> tuple[list[Trace], float, str]:
-    """Draw signals of one quantity from `start` to `stop` (s), and give the lines with factor and unit of the panel.
-
-    With the times (s) of their turning points `envelope` it is their envelopes.
-    """
+    """Draw signals of one quantity, or with the times (s) of turning points envelopes; gives lines, factor and unit."""
     traces, signal, factor, unit = _traces_of(runs, keys), signal_of(keys[0]), 1.0, ""
     if signal.unit != "1":
         peaks = [drawing.peak_of(t.x[(t.solution.t >= start) & (t.solution.t <= stop)]) for t in traces]
@@ -244,41 +213,40 @@ def draw_panel(
 def _traces_of(runs: Sequence[Drawn], keys: Sequence[str]) -> list[Trace]:
     """The lines of one panel; the colour of a finger, or of a run among several, is the same in every panel."""
     out: list[Trace] = []
-    gaps = list(dict.fromkeys(gap for run in runs for gap in run.solution.gaps))
+    gaps = list(dict.fromkeys(gap for run, _ in runs for gap in run.gaps))
     above = 0
     # If the source is the same in all runs, it is drawn once, without the name of a run.
-    shared = len({run.solution.u_source.tobytes() for run in runs}) == 1
-    for number, run in enumerate(runs):
-        for key in keys:
-            found = _columns_of(run.solution, key)
-            for place, (name, x) in enumerate(found.items()):
-                kind, _, element = name.partition(":")
-                source = kind == "u_source"
-                if source and shared and number > 0:
-                    continue
-                label = element if kind == "v" else f"{SIGNALS[kind].short} {element}".rstrip()
-                if len(gaps) > 1 and element in gaps:
-                    color = drawing.CYCLE[gaps.index(element) % len(drawing.CYCLE)]
-                elif len(runs) > 1 and not (source and shared):
-                    color = drawing.CYCLE[number % len(drawing.CYCLE)]
-                elif source:
-                    color = (drawing.GREY, *drawing.CYCLE[::-1])[place % (len(drawing.CYCLE) + 1)]
-                elif len(found) == 1 and len(keys) <= 2:
-                    color = COLORS[SIGNALS[kind].axis]
-                else:
-                    color = drawing.CYCLE[above % len(drawing.CYCLE)]
-                style = _PALE if source else {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
-                above += not source
-                if run.label and not (source and shared):
-                    label = f"{label}, {run.label}"
-                out.append(Trace(run.solution, label, x, {"color": color, **style}))
+    shared = len({run.u_source.tobytes() for run, _ in runs}) == 1
+    for (number, (run, run_name)), key in itertools.product(enumerate(runs), keys):
+        found = _columns_of(run, key)
+        for place, (name, x) in enumerate(found.items()):
+            kind, _, element = name.partition(":")
+            source = kind == "u_source"
+            alone = source and shared
+            if alone and number > 0:
+                continue
+            label = element if kind == "v" else f"{SIGNALS[kind].short} {element}".rstrip()
+            if len(gaps) > 1 and element in gaps:
+                color = drawing.CYCLE[gaps.index(element) % len(drawing.CYCLE)]
+            elif len(runs) > 1 and not alone:
+                color = drawing.CYCLE[number % len(drawing.CYCLE)]
+            elif source:
+                color = (drawing.GREY, *drawing.CYCLE[::-1])[place % (len(drawing.CYCLE) + 1)]
+            elif len(found) == 1 and len(keys) <= 2:
+                color = COLORS[SIGNALS[kind].axis]
+            else:
+                color = drawing.CYCLE[above % len(drawing.CYCLE)]
+            style = _PALE if source else {"linewidth": _WIDTHS[above % 4], "linestyle": drawing.DASHES[above % 4]}
+            above += not source
+            label += f", {run_name}" if run_name and not alone else ""
+            out.append(Trace(run, label, x, {"color": color, **style}))
     return out
 
 
 def _draw_line(
     ax: Axes, trace: Trace, factor: float, start: float, stop: float, scale: float, envelope: FloatArray | None = None
 ) -> None:
-    """Draw a line, or its envelope, of times multiplied by `scale`."""
+    """Draw a line, or from the times (s) of its turning points its envelope, of times multiplied by `scale`."""
     t = trace.solution.t
     # One output beyond each end of the window is drawn too, so that the line reaches the edges of the picture.
     first, last = max(int(np.searchsorted(t, start)) - 1, 0), int(np.searchsorted(t, stop, side="right")) + 1
@@ -287,18 +255,7 @@ def _draw_line(
         t, x = drawing.thin(t, x)
         ax.plot(scale * t, x, label=trace.label, **{"solid_joinstyle": "round", **trace.style})
         return
-    middle, spans = _envelope_spans(t, start, stop, envelope)
-    low, high = np.minimum.reduceat(x, spans)[::2], np.maximum.reduceat(x, spans)[::2]
-    pale = "alpha" in trace.style
-    ax.fill_between(scale * middle, low, high, color=trace.style["color"], alpha=0.3 if pale else 0.2, linewidth=0.0)
-    edge = {**trace.style, "linewidth": 1.6 if pale else 0.7 * trace.style["linewidth"]}
-    ax.plot(scale * middle, low, **edge)
-    ax.plot(scale * middle, high, **edge, label=trace.label)
-
-
-def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The middles (s) of an envelope's parts, and the first output and the one after the last of each part's span."""
-    lengths = np.diff(turns)
+    lengths = np.diff(envelope)
     parts = (stop - start) / (2.0 * float(np.median(lengths)))
     edges = np.linspace(start, stop, max(1, int(min(parts, _PARTS))) + 1)
     middle = 0.5 * (edges[:-1] + edges[1:])
@@ -306,24 +263,28 @@ def _envelope_spans(t: FloatArray, start: float, stop: float, turns: FloatArray)
     # at the beginning of a chirp. A pause between bursts is no oscillation: what is beside it is much shorter.
     beside = np.pad(lengths, 1, mode="edge")
     oscillation = 2.0 * np.median([beside[:-2], lengths, beside[2:]], axis=0)
-    here = np.clip(np.searchsorted(turns, middle) - 1, 0, lengths.size - 1)
+    here = np.clip(np.searchsorted(envelope, middle) - 1, 0, lengths.size - 1)
     whole = np.maximum(edges[1] - edges[0], oscillation[here])
     # At the ends of the window a span is one-sided, and as long as any other.
     begin = np.maximum(np.minimum(middle - 0.5 * whole, stop - whole), start)
-    first = np.searchsorted(t, begin)
-    after = np.minimum(np.searchsorted(t, np.minimum(begin + whole, stop)), t.size - 1)
-    kept = after > first
-    return middle[kept], np.column_stack([first, after])[kept].ravel()
+    spans = np.searchsorted(t, [begin, np.minimum(begin + whole, stop)]).clip(max=t.size - 1)
+    kept = spans[1] > spans[0]
+    t, spans = scale * middle[kept], spans[:, kept].T.ravel()
+    low, high = np.minimum.reduceat(x, spans)[::2], np.maximum.reduceat(x, spans)[::2]
+    pale = "alpha" in trace.style
+    ax.fill_between(t, low, high, color=trace.style["color"], alpha=0.3 if pale else 0.2, linewidth=0.0)
+    edge = {**trace.style, "linewidth": 1.6 if pale else 0.7 * trace.style["linewidth"]}
+    ax.plot(t, low, **edge)
+    ax.plot(t, high, **edge, label=trace.label)
 
 
 def _draw_mean(ax: Axes, trace: Trace, factor: float, unit: str, *, told: bool = True) -> None:
     """Draw the mean force as a horizontal line; with `told` the legend names it."""
-    summary = trace.solution.summary()
-    means = {"of the last period": summary.get("f_el_mean_periodic"), "of the run": summary.get("f_el_mean")}
-    known = [(of, factor * mean) for of, mean in means.items() if mean is not None]
-    if known:
-        label = f"mean {known[0][0]}, {known[0][1]:.4g} {unit}" if told else "_"
-        ax.axhline(known[0][1], color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
+    for kind, of in (("f_el_mean_periodic", "of the last period"), ("f_el_mean", "of the run")):
+        if (mean := trace.solution.summary().get(kind)) is not None:
+            label = f"mean {of}, {factor * mean:.4g} {unit}" if told else "_"
+            ax.axhline(factor * mean, color=drawing.BLACK, linewidth=1.0, linestyle=drawing.DASHES[1], label=label)
+            break
 
 
 def finish_panel(
@@ -335,15 +296,13 @@ def finish_panel(
     if signal.from_zero:
         drawing.from_zero(ax)
     else:
-        ax.ticklabel_format(axis="y", useOffset=False)
         drawing.flat(ax, np.concatenate([np.zeros(0), *(factor * trace.x for trace in traces)]))
     drawing.legend_within(ax, room)
 
 
 def _coefficient_axis(ax: Axes, solution: Solution, factor: float) -> None:
     """Add a second scale to the friction panel: friction force divided by the normal load."""
-    ((_, contact),) = solution.record.fingers
-    load = factor * contact.f_n
+    load = factor * solution.record.fingers[0][1].f_n
     right = ax.secondary_yaxis("right", functions=(partial(np.multiply, 1.0 / load), partial(np.multiply, load)))
     right.set_ylabel("coefficient", fontsize=drawing.FONT, color=drawing.GREY)
     right.tick_params(labelsize=drawing.FONT - 0.5, color="#999999", labelcolor=drawing.GREY)
@@ -352,23 +311,22 @@ def _coefficient_axis(ax: Axes, solution: Solution, factor: float) -> None:
 
 def time_unit(runs: Sequence[Drawn]) -> tuple[float, str]:
     """Factor and unit of the time axis."""
-    return drawing.engineering(max(max(_end_of(run.solution), drawing.peak_of(run.solution.t)) for run in runs), "s")
+    return drawing.engineering(max(max(_end_of(run), drawing.peak_of(run.t)) for run, _ in runs), "s")
 
 
 def time_axis(axes: Sequence[Axes], runs: Sequence[Drawn], start: float, stop: float) -> None:
     """Set limits (s) and label of the time axis, and mark where a run stopped early."""
     factor, unit = time_unit(runs)
-    span = (stop - start) or 1.0
-    stopped = [r.solution for r in runs if r.solution.status not in (Status.SUCCESS, Status.ERROR_NOT_MET)]
+    stopped = [run for run, _ in runs if run.status not in (Status.SUCCESS, Status.ERROR_NOT_MET)]
     early = [end for end in map(_end_of, stopped) if start <= end <= stop]
     # Extend the axis to the right of the end, to show that the run stopped early.
-    wide = 1.08 if early else 1.0
+    edge = factor * (start + ((stop - start) or 1.0) * (1.08 if early else 1.0))
     for ax in axes:
-        ax.set_xlim(factor * start, factor * (start + span * wide))
+        ax.set_xlim(factor * start, edge)
         ax.ticklabel_format(axis="x", useOffset=False)
         for end in early:
             if len(runs) == 1:
-                ax.axvspan(factor * end, factor * (start + wide * span), color="#EEEEEE", zorder=0.5)
+                ax.axvspan(factor * end, edge, color="#EEEEEE", zorder=0.5)
             ax.axvline(factor * end, color=drawing.VERMILION, linewidth=1.2, linestyle=drawing.DASHES[3])
     if early:
         axes[0].text(
@@ -388,17 +346,17 @@ def about_all(runs: Sequence[Drawn]) -> str:
             f"method {s.method}, rtol {s.rtol:.2g}", f"error estimate {s.error.u_gap:.2g} V{force}",
         ))  # fmt: skip
     if len(runs) == 1:
-        end = [] if runs[0].solution.success else [runs[0].solution.message]
+        end = [] if runs[0][0].success else [runs[0][0].message]
         return " · ".join([fact for fact in facts[0] if fact] + end)
-    shared = [f for i, f in enumerate(facts[0]) if f and all(other[i] == f for other in facts)]
+    alike = [len(set(same)) == 1 for same in zip(*facts, strict=True)]
+    shared = [f for f, same in zip(facts[0], alike, strict=True) if f and same]
     own = []
-    for run, fact in zip(runs, facts, strict=True):
+    for (_, name), fact in zip(runs, facts, strict=True):
         # Leave out the first fact (title and changed parameters), because the run's label has the changes.
-        differs = [f for i, f in enumerate(fact[1:], 1) if f and any(other[i] != f for other in facts)]
-        own.append(f"{run.label}: {', '.join(differs)}" if differs else run.label)
-    title = runs[0].solution.circuit.title
-    alike = all(run.solution.circuit.title == title for run in runs)
-    return " · ".join([*([title] if alike and title not in shared else []), *shared, *own])
+        differs = [f for f, same in zip(fact[1:], alike[1:], strict=True) if f and not same]
+        own.append(f"{name}: {', '.join(differs)}" if differs else name)
+    titles = {run.circuit.title for run, _ in runs}
+    return " · ".join([*(titles - set(shared) if len(titles) == 1 else ()), *shared, *own])
 
 
 #: Amplitudes below this fraction of the largest are not drawn: they are mostly numerical errors of the run.
@@ -449,9 +407,33 @@ def stems(
 
 def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     """Gain, phase, mean force and area against frequency, with a line per amplitude; without a GAP the nodes."""
+    figure, axes = drawing.new_figure(2, 1 if results[0].nodes else 2, height=4.6, sharex=True)
     if results[0].nodes:
-        return _plot_nodes(results[0], circuit)
-    figure, axes = drawing.new_figure(2, 2, height=4.6, sharex=True)
+        v = np.asarray(results[0].v_nodes)
+        _against_frequency(axes[0], results[0], np.abs(v), "Node voltage [V]", label=results[0].nodes)
+        _against_frequency(axes[1], results[0], np.degrees(np.angle(v)), "Phase [°]")
+        if np.all(np.abs(v).max(axis=0) > 0.0):
+            axes[0].set_yscale("log")
+        axes[0].legend(fontsize=drawing.FONT, frameon=False)
+        how = results[0].drive
+    else:
+        how = _plot_gains(axes, results)
+    f = results[0].frequency
+    low, high = f.min(), f.max()
+    outside = ((low, min(high, SKIN_BAND[0])), (max(low, SKIN_BAND[1]), high)) if circuit.by_device("SKIN") else ()
+    spans = [(a, b) for a, b in outside if b > a]
+    for ax in axes:
+        for a, b in spans:
+            ax.axvspan(a, b, color="#EEEEEE", zorder=0.5)
+    for ax in axes[-len(axes) // 2 :]:
+        ax.set_xlabel("Frequency [Hz]", fontsize=drawing.FONT)
+    shaded = "shaded: outside the skin data of Eqs. 18 and 19" if spans else ""
+    drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, shaded) if p))
+    return figure
+
+
+def _plot_gains(axes: Sequence[Axes], results: Sequence[PhasorSolution]) -> str:
+    """The four panels of a circuit with a GAP; gives the drive in words."""
     forces = np.concatenate([r.f_el_mean for r in results])
     factor, unit = drawing.engineering(drawing.peak_of(forces[np.isfinite(forces)]), "N", 0.05)
     for number, result in enumerate(results):
@@ -466,8 +448,8 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
             _against_frequency(ax, result, values, label, color=color, linestyle=dashes, label=name, markersize=3.5)
             ax.set_xlim(*((f[0], f[-1]) if f[0] < f[-1] else (0.1 * f[0], 10.0 * f[0])))
             ax.ticklabel_format(axis="y", useOffset=False)
-    for ax in (axes[0], axes[2]):
-        drawing.from_zero(ax)
+    drawing.from_zero(axes[0])
+    drawing.from_zero(axes[2])
     amplitude = results[0].amplitude
     if not np.isfinite(amplitude):
         told = "the source has no fundamental"
@@ -475,21 +457,9 @@ def plot_phasor(results: Sequence[PhasorSolution], circuit: Circuit) -> Picture:
     if len(results) > 1:
         axes[0].legend(fontsize=drawing.FONT, frameon=False, loc="lower right", handlelength=3.0)
     drawing.flat(axes[3], 1e6 * np.concatenate([r.area for r in results]))
-    drive = f"{amplitude:.4g} V" if np.isfinite(amplitude) else "no fundamental"
-    how = f"source amplitude {drive}" if len(results) == 1 else "several source amplitudes"
-    return _finished(figure, axes, 2, results[0], circuit, how)
-
-
-def _plot_nodes(result: PhasorSolution, circuit: Circuit) -> Picture:
-    """Amplitude and phase of every node's voltage against frequency."""
-    v = np.asarray(result.v_nodes)
-    figure, axes = drawing.new_figure(2, 1, height=4.6, sharex=True)
-    _against_frequency(axes[0], result, np.abs(v), "Node voltage [V]", label=result.nodes)
-    _against_frequency(axes[1], result, np.degrees(np.angle(v)), "Phase [°]")
-    if np.all(np.abs(v).max(axis=0) > 0.0):
-        axes[0].set_yscale("log")
-    axes[0].legend(fontsize=drawing.FONT, frameon=False)
-    return _finished(figure, axes, 1, result, circuit, result.drive)
+    if len(results) > 1:
+        return "several source amplitudes"
+    return f"source amplitude {f'{amplitude:.4g} V' if np.isfinite(amplitude) else 'no fundamental'}"
 
 
 def _against_frequency(ax: Axes, result: PhasorSolution, values: FloatArray, y_label: str, **style: Any) -> None:
@@ -498,21 +468,3 @@ def _against_frequency(ax: Axes, result: PhasorSolution, values: FloatArray, y_l
     ax.plot(result.frequency[order], values[order], linewidth=1.5, marker=marker, **style)
     drawing.dress(ax, y_label)
     ax.set_xscale("log")
-
-
-def _finished(
-    figure: Picture, axes: Sequence[Axes], columns: int, result: PhasorSolution, circuit: Circuit, how: str
-) -> Picture:
-    """The picture with its caption, the lowest row's label, and frequencies outside the data of SKIN shaded."""
-    f = result.frequency
-    low, high = f.min(), f.max()
-    outside = ((low, min(high, SKIN_BAND[0])), (max(low, SKIN_BAND[1]), high)) if circuit.by_device("SKIN") else ()
-    spans = [(a, b) for a, b in outside if b > a]
-    for ax in axes:
-        for a, b in spans:
-            ax.axvspan(a, b, color="#EEEEEE", zorder=0.5)
-    for ax in axes[-columns:]:
-        ax.set_xlabel("Frequency [Hz]", fontsize=drawing.FONT)
-    shaded = "shaded: outside the skin data of Eqs. 18 and 19" if spans else ""
-    drawing.caption(figure, " · ".join(p for p in (heading(circuit), how, shaded) if p))
-    return figure

@@ -29,10 +29,7 @@ class Status(Enum):
         "the source function has a feature at this output that its samples missed",
         "nothing from this time on is a result: give Function(f, breaks=(...)) the times of its edges",
     )
-    STEP_UNDERFLOW = (
-        "no step is small enough for the error asked for",
-        "ask for a larger rtol, or check the source",
-    )
+    STEP_UNDERFLOW = ("no step is small enough for the error asked for", "ask for a larger rtol, or check the source")
     TOO_MANY_STEPS = (
         "the run took more steps than any that was well posed has needed",
         "ask for a larger rtol, or a shorter run",
@@ -61,8 +58,7 @@ class Attempt(NamedTuple):
 
 def last_tried(rows: FloatArray) -> tuple[Attempt, ...]:
     """Attempted steps, oldest first, from rows of start, length, error and number, where number 0 means no step."""
-    kept = sorted((row for row in rows.tolist() if row[3] > 0.0), key=lambda row: row[3])
-    return tuple(Attempt(*row[:3]) for row in kept)
+    return tuple(Attempt(*row[:3]) for row in rows[rows[:, 3].argsort()].tolist() if row[3] > 0.0)
 
 
 @dataclass(frozen=True)
@@ -101,9 +97,8 @@ class Failure:
         return self.tried[-1].step if self.tried else None
 
     def __str__(self) -> str:
-        text = f"{self.cause}; {self.action}"
-        if self.t is not None:
-            text = f"stopped at t = {self.t:.10g} s: {text}"
+        text = "" if self.t is None else f"stopped at t = {self.t:.10g} s: "
+        text += f"{self.cause}; {self.action}"
         facts = [f"at {self.element}"] if self.element else []
         if self.u_gap is not None and self.area is not None:
             facts.append(f"just before: {self.u_gap:.4g} V across the gap, area {1e6 * self.area:.4g} mm^2")
@@ -220,8 +215,8 @@ class Plan(Shown):
 
     def _page(self) -> Page:
         rates = ", ".join(f"{r:.4g}" for r in self.rates) or "none"
-        lines = [f"model: {self.tier}", *(f"  because {r}" for r in self.reasons)]
-        lines.append(f"rates, area frozen: {rates} 1/s ({'' if self.stiff else 'not '}stiff for this source)")
+        stiff = f"rates, area frozen: {rates} 1/s ({'' if self.stiff else 'not '}stiff for this source)"
+        lines = [f"model: {self.tier}", *(f"  because {r}" for r in self.reasons), stiff]
         if not math.isnan(self.sensitivity):
             lines.append(f"the area differs from its middle by at most {100.0 * self.sensitivity:.3g} %")
         return Page(lines)

@@ -1,7 +1,4 @@
-"""Signals of a run: what is fixed about each, and their values by name from a record or from a file.
-
-Outputs of a run, and every signal that follows from them, each computed when it is first asked for.
-"""
+"""Signals of a run: what is fixed about each, and values by name, from a file or computed when first asked for."""
 
 from __future__ import annotations
 
@@ -32,9 +29,6 @@ class Signal(NamedTuple):
     from_zero: bool = False  # Whether the scale of a panel starts at 0
     of: str = ""  # "source", "layer", "gap" or "node" where each of these has a column
     ripple: bool = False  # Whether its summary has a ripple instead of an rms
-    # Other signals follow from the record itself: this one from another signal, with the contact of the gap
-    base: str = ""
-    make: Callable[[Contact, FloatArray], FloatArray] | None = None
 
 
 #: Signals in the order of tables and files; those of layers and nodes are ``u_layer:NAME`` and ``v:NAME``.
@@ -43,18 +37,11 @@ SIGNALS = {
     "u_layer": Signal("V", "layer voltage", "layer", "Voltage", 2.0, of="layer"),
     "u_gap": Signal("V", "gap voltage", "gap", "Voltage", 2.0, of="gap"),
     "area": Signal("m^2", "ridge contact area", "area", "Ridge area", of="gap", ripple=True),
-    "sigma_el": Signal(
-        "Pa", "electroadhesive stress", "electroadhesive stress", "Stress", 2.0, True, "gap", False, "u_gap",
-        Contact.stress,
-    ),
+    "sigma_el": Signal("Pa", "electroadhesive stress", "electroadhesive stress", "Stress", 2.0, True, "gap"),
     "f_el": Signal("N", "electroadhesive force", "electroadhesive force", "Force", 0.05, True, "gap", True),
-    "f_t": Signal(
-        "N", "friction force", "friction", "Friction", 0.05, True, "gap", True, "f_el",
-        lambda contact, f: contact.mu * (contact.f_n + f),
-    ),
+    "f_t": Signal("N", "friction force", "friction", "Friction", 0.05, True, "gap", True),
     "friction": Signal(
-        "1", "friction coefficient f_t / f_n", "coefficient", "Friction coefficient", 1.0, True, "gap", True, "f_t",
-        lambda contact, f: f / contact.f_n,
+        "1", "friction coefficient f_t / f_n", "coefficient", "Friction coefficient", 1.0, True, "gap", True
     ),
     "q_source": Signal("C", "charge delivered by the source", "charge", "Charge", 2.0, of="source"),
     "i_source": Signal("A", "source current, regular part", "current", "Current", 2.0, of="source"),
@@ -62,7 +49,13 @@ SIGNALS = {
         "1", "distance to the fold of the mobile law", "distance to the fold", "Distance to the fold", from_zero=True
     ),
     "v": Signal("V", "node voltage", "node", "Voltage", 2.0, of="node"),
-}  # fmt: skip
+}
+#: Signals that follow from another one of the same gap, with its contact.
+_FOLLOWING: dict[str, tuple[str, Callable[[Contact, FloatArray], FloatArray]]] = {
+    "sigma_el": ("u_gap", Contact.stress),
+    "f_t": ("f_el", lambda contact, f: contact.mu * (contact.f_n + f)),
+    "friction": ("f_t", lambda contact, f: f / contact.f_n),
+}
 
 
 def signal_of(name: str) -> Signal:
@@ -112,17 +105,21 @@ class Signals(Sealed):
 
     def value(self, key: str) -> FloatArray | None:
         """A signal, shape (n_t,), or (n_t, n) where n elements have it; None where the run has no such signal."""
-        signal = SIGNALS[key]
-        if signal.of == "gap" and key != "area" and not self.fingers:
+        if SIGNALS[key].of == "gap" and key != "area" and not self.fingers:
             return None
-        if signal.make is not None and key not in vars(self):
-            base = self.value(signal.base)
-            assert base is not None
-            columns = [base] if len(self.fingers) == 1 else base.T
-            made = [signal.make(contact, x) for (_, contact), x in zip(self.fingers, columns, strict=True)]
-            vars(self)[key] = side_by_side(made)
+        if key in _FOLLOWING and key not in vars(self):
+            base, make = _FOLLOWING[key]
+            pairs = zip(self.fingers, self.each(base), strict=True)
+            vars(self)[key] = side_by_side([make(contact, x) for (_, contact), x in pairs])
         found: FloatArray | None = getattr(self, key, None)
         return found
+
+    def each(self, key: str) -> Sequence[FloatArray]:
+        """A signal of each of its elements, shape (n_t,); none where the run has no such signal."""
+        if key == "v":
+            return tuple(self.node_voltages.values())
+        value = self.value(key)
+        return () if value is None else (value,) if value.ndim == 1 else tuple(value.T)
 
     def columns(self, key: str) -> tuple[str, ...]:
         """Names of the layers, gaps, sources or nodes to which the columns of a signal belong."""
@@ -148,11 +145,7 @@ class Signals(Sealed):
     def one(self, name: str) -> FloatArray:
         """The signal of one of the `names`, shape (n_t,)."""
         key, colon, element = name.partition(":")
-        if key == "v":
-            return self.node_voltages[element]
-        value = self.value(key)
-        assert value is not None
-        return value[:, self.columns(key).index(element)] if colon else value
+        return self.each(key)[self.columns(key).index(element) if colon else 0]
 
 
 class StoredRecord(Signals):
@@ -169,7 +162,7 @@ class StoredRecord(Signals):
         self.t, self.sources, self.fingers = t, sources, fingers
         self.node_voltages, layers = own.pop("v"), own.pop("u_layer")
         self.layers, self.u_layer = tuple(layers), np.column_stack([np.zeros((t.size, 0)), *layers.values()])
-        vars(self).update({k: side_by_side([*x.values()]) for k, x in own.items() if x and not SIGNALS[k].base})
+        vars(self).update({k: side_by_side([*x.values()]) for k, x in own.items() if x and k not in _FOLLOWING})
         self.__post_init__()
 
 
@@ -179,8 +172,8 @@ def attribute(get: Callable[[Any], Any], doc: str) -> Any:
 
 
 def _given(key: str, doc: str) -> Any:
-    """A property: a signal; None where the run has no such signal."""
-    return attribute(lambda result: result.record.value(key), doc)
+    """A property: a signal, None where the run has no such signal; or what else its record has."""
+    return attribute(lambda r: r.record.value(key) if key in SIGNALS else getattr(r.record, key), doc)
 
 
 class Signalled:
@@ -189,15 +182,12 @@ class Signalled:
     t: FloatArray
     record: Signals
 
-    layers: tuple[str, ...] = attribute(lambda result: result.record.layers, "Names of the columns of `u_layer`.")
-    gaps: tuple[str, ...] = attribute(lambda result: result.record.gaps, "Names of the GAPs.")
-    sources: tuple[str, ...] = attribute(
-        lambda result: result.record.sources,
-        "Names of the sources of a network; of a series stack there is one, its loop.",
+    layers: tuple[str, ...] = _given("layers", "Names of the columns of `u_layer`.")
+    gaps: tuple[str, ...] = _given("gaps", "Names of the GAPs.")
+    sources: tuple[str, ...] = _given(
+        "sources", "Names of the sources of a network; of a series stack there is one, its loop."
     )
-    node_voltages: dict[str, FloatArray] = attribute(
-        lambda result: result.record.node_voltages, "Node name to its voltage, V, shape (n_t,)."
-    )
+    node_voltages: dict[str, FloatArray] = _given("node_voltages", "Node name to its voltage, V, shape (n_t,).")
     u_source: FloatArray = _given(
         "u_source", "Voltage of each source, V; for a series stack the voltage around the loop, shape (n_t,)."
     )
@@ -245,13 +235,12 @@ class Signalled:
     @property
     def signals(self) -> dict[str, tuple[FloatArray, str, str]]:
         """Every signal by name, with its values (n_t,), unit and long name."""
-        out: dict[str, tuple[FloatArray, str, str]] = {}
-        for key, signal in SIGNALS.items():
-            for name, value in self.by_name(key).items():
-                element = name.partition(":")[2]
-                said = {"u_layer": f"voltage of {element}", "v": f"voltage of node {element}"}.get(key, signal.text)
-                out[name] = value, signal.unit, said
-        return out
+        named = {"u_layer": "voltage of {}", "v": "voltage of node {}"}
+        return {
+            name: (value, signal.unit, named.get(key, signal.text).format(name.partition(":")[2]))
+            for key, signal in SIGNALS.items()
+            for name, value in self.by_name(key).items()
+        }
 
 
 #: Dimensions, values and attributes of a variable, as xarray and NetCDF take them.
@@ -270,11 +259,10 @@ def variables(
     """Variables and coordinates of the data files, with the rows in `keep` and those signals that are wanted."""
     data: dict[str, Variable] = {}
     coords: dict[str, Variable] = {"time": (("time",), solution.t[keep], {"units": "s", "long_name": "time"})}
-    for key, signal in SIGNALS.items():
-        columns = [x[keep] for x in solution.by_name(key).values()] if key in wanted else []
-        several = key in ("u_layer", "v")
+    for key, signal in ((key, signal) for key, signal in SIGNALS.items() if key in wanted):
+        columns = [x[keep] for x in solution.by_name(key).values()]
         about = {"units": signal.unit, "long_name": signal.text}
-        if len(columns) > 1 or (several and key in wanted):
+        if len(columns) > 1 or key in ("u_layer", "v"):
             coords[signal.of] = ((signal.of,), np.array(solution.record.columns(key), dtype=object), {})
             table = np.column_stack([np.zeros((int(keep.sum()), 0)), *columns])
             data[key] = (("time", signal.of), table, about)
@@ -288,8 +276,7 @@ def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
     out = np.array(waveform.value(t), float)
     if left.any():
         out[left] = waveform.value(t[left], "left")
-    lost = ~np.isfinite(out)
-    if lost.any():
+    if (lost := ~np.isfinite(out)).any():
         # A run ends where the source stops being finite, at a time known to 1e-12: use the finite value just before.
         out[lost] = waveform.value(t[lost] * (1.0 - 4e-12))
     return sealed(out)
@@ -297,10 +284,7 @@ def sided(waveform: Waveform, t: FloatArray, left: BoolArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Record(Signals):
-    """Outputs of a run as they were computed, and the signals that follow from them.
-
-    Signals of gaps and of sources have the shape (n_t,) where there is one of them, else (n_t, n).
-    """
+    """Outputs of a run as they were computed, and the signals that follow from them."""
 
     network: Network
     net: Net
@@ -327,34 +311,24 @@ class Record(Signals):
     @cached_property
     def _s(self) -> FloatArray:
         """Values of the sources, and of those within a loop, V or A, shape (n_t, n_s + n_inner)."""
-        elements = (*self.network.sources, *self.network.inner)
-        return np.column_stack([sided(e.waveform, self.t, self.left) for e in elements if e.waveform is not None])
+        waveforms = (e.waveform for e in (*self.network.sources, *self.network.inner))
+        return np.column_stack([sided(w, self.t, self.left) for w in waveforms if w is not None])
 
     def _voltage(self, by_x: FloatArray, by_s: FloatArray) -> FloatArray:
         """A voltage (V), shape (n_t,), as a weighted sum of the live voltages and the sources."""
-        weights = (*by_x.tolist(), *by_s.tolist())
-        some = [i for i, weight in enumerate(weights) if weight != 0.0]
-        n = by_x.size
+        some = [(weight, self._s[:, i]) for i, weight in reversed([*enumerate(by_s.tolist())]) if weight != 0.0]
+        some += [(weight, self.rows[:, i]) for i, weight in reversed([*enumerate(by_x.tolist())]) if weight != 0.0]
         if len(some) >= 8:
             # Without BLAS, whose threads may round differently.
             return np.asarray((self._x * by_x).sum(1) + (self._s[:, : by_s.size] * by_s).sum(1))
-        columns = [self.rows[:, i] if i < n else self._s[:, i - n] for i in reversed(some)]
-        if len(some) == 1 and weights[some[0]] == 1.0:
-            return np.ascontiguousarray(columns[0])
-        out = weights[some[-1]] * columns[0] if some else np.zeros(self.t.size)
-        for i, column in zip(some[-2::-1], columns[1:], strict=True):
-            out += weights[i] * column
-        return out
+        if len(some) == 1 and some[0][0] == 1.0:
+            return np.ascontiguousarray(some[0][1])
+        terms = [weight * column for weight, column in some] or [np.zeros(self.t.size)]
+        return np.asarray(sum(terms[1:], terms[0]))
 
     def cell_voltage(self, cell: int) -> FloatArray:
         """Voltage of a cell from p to n, V, shape (n_t,)."""
         return self._voltage(self.network.p[cell], self.network.q[cell])
-
-    def finger_voltage(self, finger: int) -> FloatArray:
-        """Gap voltage of a finger, V, shape (n_t,)."""
-        gap = self.network.gaps[self.network.fingers[finger]]
-        assert gap is not None
-        return self.cell_voltage(gap)
 
     def _area_of(self, i: int) -> FloatArray:
         if self.net.slow[i] >= 0:
@@ -363,42 +337,27 @@ class Record(Signals):
             return np.full(self.t.size, self.net.area0[i])
         return areas(self.cell_voltage(int(self.net.gap[i])), self.net.curves[i])
 
-    def finger_area(self, finger: int) -> FloatArray:
-        """Contact area of a finger, m^2, shape (n_t,)."""
-        return self._area_of(self.network.fingers[finger])
-
-    def finger_force(self, finger: int) -> FloatArray:
-        """Electroadhesive force (Eq. 2 times A_R) of a finger, N, shape (n_t,)."""
-        _, contact = self.fingers[finger]
-        i, u = self.network.fingers[finger], self.finger_voltage(finger)
-        if self.net.gap[i] >= 0 and self.net.slow[i] < 0:
-            return forces(u, self.net.curves[i], float(contact.stress(1.0)))
-        return np.asarray(contact.stress(u) * self.finger_area(finger))
-
     @cached_property
     def u_source(self) -> FloatArray:
         """Voltage of each source, V: from p to n of a V, and from n to p of an I, the direction in which it drives."""
-        n_v = self.network.n_voltage
-        out = self._s[:, : len(self.network.sources)].copy()
-        if n_v < out.shape[1]:
+        out, zero = list(self._s.T[: len(self.network.sources)]), np.zeros(self.t.size)
+        for j, element in enumerate(self.network.sources[self.network.n_voltage :], self.network.n_voltage):
             at = {name.lower(): u for name, u in self.node_voltages.items()}
-            for j, element in enumerate(self.network.sources[n_v:]):
-                p, n = (at.get(node, 0.0) for node in element.nodes[:2])
-                out[:, n_v + j] = n - p
-        return side_by_side(out.T)
+            p, n = (at.get(node, zero) for node in element.nodes[:2])
+            out[j] = n - p
+        return side_by_side(out)
 
     @cached_property
     def u_layer(self) -> FloatArray:
         """Layer voltages from p to n, V, shape (n_t, n_layer)."""
-        cells = np.column_stack(
-            [np.zeros((self.t.size, 0)), *(self.cell_voltage(i) for i in range(len(self.network.cells)))]
-        )
-        return sealed(np.einsum("tc,lc->tl", cells, self.network.grouping))
+        cells = map(self.cell_voltage, range(len(self.network.cells)))
+        table = np.column_stack([np.zeros((self.t.size, 0)), *cells])
+        return sealed(np.einsum("tc,lc->tl", table, self.network.grouping))
 
     @cached_property
     def u_gap(self) -> FloatArray:
         """Gap voltage, V."""
-        return side_by_side([self.finger_voltage(i) for i in range(len(self.fingers))])
+        return side_by_side([self.cell_voltage(gap) for gap in self.network.gaps if gap is not None])
 
     @cached_property
     def area(self) -> FloatArray | None:
@@ -408,8 +367,14 @@ class Record(Signals):
 
     @cached_property
     def f_el(self) -> FloatArray:
-        """Electroadhesive force, N."""
-        return side_by_side([self.finger_force(i) for i in range(len(self.fingers))])
+        """Electroadhesive force (Eq. 2 times A_R), N."""
+        out = []
+        for i, (_, contact), u in zip(self.network.fingers, self.fingers, self.each("u_gap"), strict=True):
+            if self.net.gap[i] >= 0 and self.net.slow[i] < 0:
+                out.append(forces(u, self.net.curves[i], float(contact.stress(1.0))))
+            else:
+                out.append(np.asarray(contact.stress(u) * self._area_of(i)))
+        return side_by_side(out)
 
     @cached_property
     def q_source(self) -> FloatArray | None:

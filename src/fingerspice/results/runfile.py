@@ -1,15 +1,12 @@
-"""Zarr stores: arrays that are created whole and filled chunk by chunk, with the checksums of their chunks.
+"""The NetCDF file of a run, written and read back; and Zarr stores, created whole and filled chunk by chunk.
 
 A chunk's file is its bytes and their CRC-32C, as Zarr's codec of that name has it, so that every program that reads a
 store through Zarr refuses a chunk whose bytes have changed. Which chunks are done is known to the stores themselves:
 those of runs are in `cli/store.py`, and those of sweeps in `studies/sweep/chunks.py`.
-
-The NetCDF file of a run, written and read back, with its circuit as plain data and arrays.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import math
@@ -17,7 +14,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -29,7 +26,7 @@ from numpy.typing import NDArray
 from fingerspice.base import files
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.files import UNFINISHED, settle_on_disk
+from fingerspice.base.files import UNFINISHED, settle_on_disk, write_pieces
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element, SmallSignal, Tran
 from fingerspice.circuit.network import checked
 from fingerspice.numerics.lobatto import NODES
@@ -38,8 +35,7 @@ from fingerspice.results.outcome import Attempt, ErrorEstimate, Failure, Plan, S
 from fingerspice.results.record import StoredRecord, kept_rows, variables
 from fingerspice.results.solution import Solution
 from fingerspice.results.steps import Recorded, whole_steps
-from fingerspice.waveforms import periodic, samples
-from fingerspice.waveforms import waveform as waveforms
+from fingerspice.waveforms import periodic, samples, waveform
 from fingerspice.waveforms.sampling import Function, SourceTable, source_table
 from fingerspice.waveforms.waveform import Fundamental, Waveform
 
@@ -99,11 +95,9 @@ class Array:
 
     def put(self, place: tuple[int, ...], values: NDArray[Any]) -> None:
         """Write a chunk, which may be smaller at the array's edge, durably but for its name, which a crash may lose."""
-        if values.shape != self.chunk:
-            whole = np.full(self.chunk, self.fill, self.kind)
-            whole[tuple(map(slice, values.shape))] = values
-            values = whole
-        content = np.ascontiguousarray(values, self.kind).tobytes()
+        whole = np.full(self.chunk, self.fill, self.kind)
+        whole[tuple(map(slice, values.shape))] = values
+        content = whole.tobytes()
         temporary = self.path / f"{UNFINISHED}{os.urandom(6).hex()}"
         temporary.write_bytes(content + _checksum(content))
         settle_on_disk(temporary)
@@ -171,8 +165,7 @@ def check_store(path: Path) -> dict[str, int]:
     found = {name: [file for file in (path / name / "c").rglob("*") if file.is_file()] for name in about}
     bad = [f"{path / 'zarr.json'} has changed"] if head.get(SIGNATURE, "") not in ("", signature(head)) else []
     for name, chunks in found.items():
-        told = [(file, _fault(file, sizes[name])) for file in sorted(chunks)]
-        bad += [f"{file} {what}" for file, what in told if what is not None]
+        bad += [f"{file} {what}" for file in sorted(chunks) if (what := _fault(file, sizes[name])) is not None]
     # A run names how many chunks are done; of a sweep those are done that have a status.
     done = head.get("chunks_done", len(found.get("status", ())))
     dims = about["status"]["dimension_names"] if "status" in about else []
@@ -201,13 +194,12 @@ def _fault(file: Path, size: int) -> str | None:
 #: Name of the NetCDF group with what `load` needs besides the variables, and the number of its format.
 GROUP, FORMAT = "fingerspice", 1
 _ALLOWED = "allowed: a NetCDF file that to_netcdf or the command wrote"
-#: Largest number of a circuit's samples, points and coefficients that a file keeps (64 MB).
-MOST_NUMBERS = 8_000_000
+MOST_NUMBERS = 8_000_000  # Largest number of a circuit's samples, points and coefficients that a file keeps (64 MB)
 _WAVEFORMS = {
     kind.__name__: kind
     for kind in (
-        waveforms.DC, waveforms.Sine, waveforms.Chirp, waveforms.Exp, periodic.PWL, periodic.Pulse, periodic.Square,
-        periodic.Triangle, periodic.Sawtooth, waveforms.Sum, waveforms.Product, waveforms.AM, periodic.Burst,
+        waveform.DC, waveform.Sine, waveform.Chirp, waveform.Exp, periodic.PWL, periodic.Pulse, periodic.Square,
+        periodic.Triangle, periodic.Sawtooth, waveform.Sum, waveform.Product, waveform.AM, periodic.Burst,
         periodic.Repeat, samples.Samples,
     )
 }  # fmt: skip
@@ -216,9 +208,8 @@ _OF_CIRCUIT = ("title", "charge_law", "work", "warnings", "unused", "overrides",
 
 
 def _failure(plain: dict[str, Any]) -> Failure:
-    tried = tuple(Attempt(**a) for a in plain["tried"])
-    own = {key: x for key, x in plain.items() if key != "step"}
-    return Failure(**{**own, "status": Status[plain["status"]], "tried": tried})
+    own = {**plain, "status": Status[plain["status"]], "tried": tuple(Attempt(**a) for a in plain["tried"])}
+    return Failure(**{key: x for key, x in own.items() if key != "step"})
 
 
 def _state(plain: dict[str, Any]) -> State:
@@ -228,28 +219,18 @@ def _state(plain: dict[str, Any]) -> State:
 
 #: Attributes of a solution that its file holds as plain data, how each is made plain, and how it is made again.
 _PLAIN: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
-    "nfev": (int, int),
-    "error": (vars, lambda plain: ErrorEstimate(**plain)),
-    "rtol": (float, float),
+    "nfev": (int, int), "error": (vars, lambda plain: ErrorEstimate(**plain)), "rtol": (float, float),
     # Without the wall time, so that the same run gives the same file.
     "stats": (lambda x: {k: v for k, v in x.items() if isinstance(v, (int, float, str)) and k != "wall_s"}, dict),
-    "charge_law": (str, str),
-    "area_mode": (str, str),
-    "method": (str, str),
-    "plan": (
-        Plan.to_dict,
-        lambda plain: Plan(**{**plain, "reasons": tuple(plain["reasons"]), "rates": tuple(plain["rates"])}),
-    ),
+    "charge_law": (str, str), "area_mode": (str, str), "method": (str, str),
+    "plan": (Plan.to_dict, lambda x: Plan(**{**x, "reasons": tuple(x["reasons"]), "rates": tuple(x["rates"])})),
     "status": (lambda status: status.name, lambda name: Status[name]),
     "failure": (lambda failure: failure and failure.to_dict(), lambda plain: plain and _failure(plain)),
     "fundamental": (lambda x: x and vars(x), lambda plain: plain and Fundamental(**plain)),
-    "period": (lambda x: x, lambda x: x),
-    "fold_margin_min": (float, float),
-    "warnings": (list, lambda plain: tuple(map(str, plain))),
-    "first": (float, float),
-    "t_stop": (float, float),
+    "period": (lambda x: x, lambda x: x), "fold_margin_min": (float, float),
+    "warnings": (list, lambda plain: tuple(map(str, plain))), "first": (float, float), "t_stop": (float, float),
     "state": (lambda x: {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(x).items()}, _state),
-}
+}  # fmt: skip
 
 
 def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
@@ -269,31 +250,31 @@ def write_netcdf(solution: Solution, path: Path, jumps: str) -> Path:
             for name, (dimensions, values, attributes) in {**coords, **data}.items():
                 kind = h5py.string_dtype() if values.dtype == object else values.dtype
                 file.create_variable(name, dimensions, dtype=kind, data=values).attrs.update(attributes)
-            for key, text in solution.provenance().items():
-                file.attrs[key] = text
+            file.attrs.update(solution.provenance())
             group = file.create_group(GROUP)
             circuit, arrays = stored_circuit(solution.circuit, solution.t_stop, solution.rtol)
             between = solution._figures.between()
             run = {"format": FORMAT, **{name: plain(getattr(solution, name)) for name, (plain, _) in _PLAIN.items()}}
             run |= {
                 "sources": list(solution.sources), "signals": list(solution.signals),
-                "contacts": [[name, dataclasses.asdict(contact)] for name, contact in solution.record.fingers],
+                "contacts": [[name, asdict(contact)] for name, contact in solution.record.fingers],
                 "overrides": dict(solution.circuit.overrides), "summary": solution.summary(), "circuit": circuit,
                 "arrays": len(arrays), "between": between and between[0],
             }  # fmt: skip
             group.attrs["run"] = json.dumps(run, default=float)
             tables = {f"circuit{k}": array for k, array in enumerate(arrays)}
-            for name, table in (tables | ({} if between is None else {"between": between[1]})).items():
-                dimensions = tuple(f"{name}_{axis}" for axis in range(table.ndim))
-                group.dimensions.update(zip(dimensions, table.shape, strict=True))
-                group.create_variable(name, dimensions, dtype=float, data=table)
+            if between is not None:
+                tables["between"] = between[1]
             if not keep.all():
                 # Only `load` uses the left-hand rows of jumps; they form one table, because each variable takes time.
-                group.dimensions["jump"] = int(np.count_nonzero(~keep))
-                group.dimensions["signal"] = 1 + len(solution.signals)
                 rows = [np.flatnonzero(~keep), *(x[~keep] for x, _, _ in solution.signals.values())]
-                group.create_variable("before", ("jump", "signal"), dtype=float, data=np.column_stack(rows))
-        files.write_pieces(target, content.getbuffer())
+                tables["before"] = np.column_stack(rows)
+            for name, table in tables.items():
+                own = ("jump", "signal") if name == "before" else (f"{name}_{axis}" for axis in range(table.ndim))
+                dimensions = tuple(own)
+                group.dimensions.update(zip(dimensions, table.shape, strict=True))
+                group.create_variable(name, dimensions, dtype=float, data=table)
+        write_pieces(target, content.getbuffer())
 
     return files.write_aside(path, write)
 
@@ -327,9 +308,7 @@ def load(path: str | Path) -> Solution:
     try:
         with h5netcdf.File(path, "r") as file:
             if GROUP not in file.groups:
-                raise InputError(
-                    f"{path} is no run of fingerspice; allowed: a file that to_netcdf or the command wrote"
-                )
+                raise InputError(f"{path} is no run of fingerspice; {_ALLOWED}")
             return _solution(file)
     except InputError:
         raise
@@ -366,13 +345,10 @@ def _solution(file: Any) -> Solution:
         make = partial(StoredRecord, tuple(map(str, run["between"])), sources, fingers)
         continuous = Recorded(whole_steps(begin, end), values, float(run["t_stop"]) - float(run["period"]), make)
     return Solution(
-        t=t,
-        record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:]),
-        circuit=_circuit(file, run),
-        continuous=continuous,
-        stored=dict(run["summary"]),
+        t=t, record=StoredRecord(signals, sources, fingers, t, None, table[:, 1:]), circuit=_circuit(file, run),
+        continuous=continuous, stored=dict(run["summary"]),
         **{name: make(run[name]) for name, (_, make) in _PLAIN.items()},
-    )
+    )  # fmt: skip
 
 
 def _text(value: Any) -> str:
@@ -389,15 +365,10 @@ def _circuit(file: Any, run: dict[str, Any]) -> Circuit:
         made = made_again(kept, [np.asarray(group.variables[name][...], float) for name in names])
         return made._with(text=_text(file.attrs["deck"]))
     except (InputError, ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError) as error:
-        warnings.warn(
-            f"the circuit of this run cannot be made again from its file ({error}); its elements are left out",
-            FingerspiceWarning,
-            stacklevel=4,
-        )
-        sets = json.loads(_text(file.attrs["sets"])) if "sets" in file.attrs else {}
-        return Circuit(
-            _text(file.attrs["title"]), (), text=_text(file.attrs["deck"]), overrides=dict(run["overrides"]), sets=sets
-        )
+        told = f"the circuit of this run cannot be made again from its file ({error}); its elements are left out"
+        warnings.warn(told, FingerspiceWarning, stacklevel=4)
+        title, deck, sets = map(_text, (file.attrs["title"], file.attrs["deck"], file.attrs.get("sets", "{}")))
+        return Circuit(title, (), text=deck, overrides=dict(run["overrides"]), sets=json.loads(sets))
 
 
 def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str, Any] | str, list[FloatArray]]:
@@ -412,18 +383,19 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
         if isinstance(value, Waveform):
             kind: Any = samples.Samples if isinstance(value, samples.Samples) else type(value)
             if kind in _WAVEFORMS.values():
-                own = {"kind": kind.__name__} | {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}
+                own = {"kind": kind.__name__} | {f.name: getattr(value, f.name) for f in fields(kind)}
             else:
                 own = _tabulated(value, stop, rtol, circuit.tran.step if circuit.tran else 1e-3 * stop)
             return {name: plain(x) for name, x in own.items()}
-        waves = isinstance(value, tuple) and any(isinstance(x, Waveform) for x in value)
-        if waves or not isinstance(value, (tuple, np.ndarray)):
-            return [plain(part) for part in value] if waves else value
+        if isinstance(value, tuple) and any(isinstance(x, Waveform) for x in value):
+            return [plain(part) for part in value]
+        if not isinstance(value, (tuple, np.ndarray)):
+            return value
         arrays.append(np.asarray(value, float))
         return {"array": len(arrays) - 1}
 
     elements = [
-        {f.name: getattr(e, f.name) for f in dataclasses.fields(Element) if f.name != "where"}
+        {f.name: getattr(e, f.name) for f in fields(Element) if f.name != "where"}
         | {"waveform": plain(e.waveform), "values": dict(e.values), "ac": e.ac and vars(e.ac)}
         for e in circuit.elements
     ]
@@ -439,9 +411,8 @@ def stored_circuit(circuit: Circuit, stop: float, rtol: float) -> tuple[dict[str
 def _tabulated(wave: Waveform, stop: float, rtol: float, step: float) -> dict[str, Any]:
     """A function as the Chebyshev series by which a run represents it."""
     end = wave.settled + wave.period if wave.period is not None else stop
-    with warnings.catch_warnings():
-        # The run has warned of edges.
-        warnings.simplefilter("ignore")
+    # The run has warned of edges.
+    with warnings.catch_warnings(action="ignore"):
         table = source_table(wave, 0.0, end, min(1e-3, max(0.05 * rtol, 1e-14)), step)
     breaks = wave.breakpoints(0.0, end)
     return {

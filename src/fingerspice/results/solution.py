@@ -14,7 +14,7 @@ import numpy as np
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.files import write_csv
 from fingerspice.base.pages import Page, Shown
-from fingerspice.results.outcome import ErrorEstimate, Failure, State, Status
+from fingerspice.results.outcome import ErrorEstimate, Failure, Plan, State, Status
 from fingerspice.results.record import Sealed, Signalled, Signals, kept_rows, variables
 from fingerspice.results.summary import Figured, Figures
 
@@ -27,15 +27,13 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fingerspice.circuit.circuit import Circuit
-    from fingerspice.results.outcome import Plan
     from fingerspice.results.spectrum import Spectrum
     from fingerspice.results.steps import ClosedForm, Recorded
     from fingerspice.sets.parameters import Citation
     from fingerspice.waveforms.waveform import Fundamental
 
 
-#: Signals and means that have derivatives.
-SIGNALS = ("u_gap", "area", "f_el", "f_t", "friction")
+SIGNALS = ("u_gap", "area", "f_el", "f_t", "friction")  # Signals and means that have derivatives
 MEANS = ("f_el_mean", "f_t_mean", "friction_mean", "area_mean")
 
 
@@ -97,10 +95,8 @@ class SampleGradient(Sealed):
     error: float
 
     def __repr__(self) -> str:
-        largest = float(np.abs(self.values).max(initial=0.0))
-        return (
-            f"SampleGradient({self.source}: {self.values.size} samples, largest {largest:.4g}, error {self.error:.1g})"
-        )
+        told = f"{self.values.size} samples, largest {np.abs(self.values).max(initial=0.0):.4g}, error {self.error:.1g}"
+        return f"SampleGradient({self.source}: {told})"
 
 
 @dataclass(frozen=True, repr=False)
@@ -209,24 +205,16 @@ class Solution(Sealed, Shown, Signalled, Figured):
         """The data needed to repeat the run, as text."""
         from fingerspice import __version__
 
+        circuit, error = self.circuit, self.error
         return {
-            "program": f"fingerspice {__version__}",
-            "title": self.circuit.title,
-            "file": str(self.circuit.path or ""),
-            "deck": self.circuit.text,
-            "overrides": json.dumps(dict(self.circuit.overrides)),
-            "sets": json.dumps({n: {path: repr(x) for path, x in s.items()} for n, s in self.circuit.sets.items()}),
-            "charge_law": self.charge_law,
-            "area": self.area_mode,
-            "method": self.method,
-            "rtol": repr(self.rtol),
-            "error_u_gap_V": repr(self.error.u_gap),
-            "error_f_el_N": repr(self.error.f_el),
-            "error_q_source_C": repr(self.error.q_source),
-            "error_v_nodes_V": repr(self.error.v_nodes),
-            "status": self.status.name,
-            "message": self.message,
-        }
+            "program": f"fingerspice {__version__}", "title": circuit.title, "file": str(circuit.path or ""),
+            "deck": circuit.text, "overrides": json.dumps(dict(circuit.overrides)),
+            "sets": json.dumps({n: {path: repr(x) for path, x in s.items()} for n, s in circuit.sets.items()}),
+            "charge_law": self.charge_law, "area": self.area_mode, "method": self.method, "rtol": repr(self.rtol),
+            "error_u_gap_V": repr(error.u_gap), "error_f_el_N": repr(error.f_el),
+            "error_q_source_C": repr(error.q_source), "error_v_nodes_V": repr(error.v_nodes),
+            "status": self.status.name, "message": self.message,
+        }  # fmt: skip
 
     def to_csv(self, path: str | Path) -> Path:
         """Write every signal as CSV with names and units in the header; a jump has both its rows.
@@ -297,14 +285,9 @@ class Solution(Sealed, Shown, Signalled, Figured):
         return write_netcdf(self, Path(path), jumps)
 
     def spectrum(
-        self,
-        signal: str = "f_t",
-        *,
-        method: str = "auto",
-        highest: float | None = None,
-        resolution: float | None = None,
-        since: float | None = None,
-    ) -> Spectrum:
+        self, signal: str = "f_t", *, method: str = "auto", highest: float | None = None,
+        resolution: float | None = None, since: float | None = None,
+    ) -> Spectrum:  # fmt: skip
         """Spectrum of a signal: lines where the source is periodic, else a density by Welch's method.
 
         The lines are Fourier integrals over the last period of the source, whatever outputs were asked for; the density
@@ -334,12 +317,9 @@ class Solution(Sealed, Shown, Signalled, Figured):
         return spectrum_of(self, signal, method, highest, resolution, since)
 
     def plot(
-        self,
-        signals: str | Sequence[str] | None = None,
-        *,
-        window: tuple[float, float] | None = None,
+        self, signals: str | Sequence[str] | None = None, *, window: tuple[float, float] | None = None,
         others: Solution | Sequence[Solution] | Mapping[str, Solution] = (),
-    ) -> Figure:
+    ) -> Figure:  # fmt: skip
         """Draw signals against time: a notebook shows the figure, and from a script ``plot().show()`` opens a window.
 
         More than about 30 oscillations are drawn as envelopes, and a second column shows the last few of them enlarged;

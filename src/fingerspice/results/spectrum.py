@@ -1,7 +1,4 @@
-"""Spectrum of a signal: the lines of its last period as Fourier integrals, or a density by Welch's method.
-
-The result of a phasor sweep, with its columns, from which its table, file and plain data follow.
-"""
+"""Spectrum of a signal: lines of its last period, or a density by Welch's method; and the result of a phasor sweep."""
 
 from __future__ import annotations
 
@@ -23,6 +20,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import NOTABLE, energy_outside, heading
 from fingerspice.circuit.network import network_of
 from fingerspice.results.record import Sealed, signal_of
+from fingerspice.results.steps import Outputs
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -32,18 +30,14 @@ if TYPE_CHECKING:
 
 
 METHODS = ("auto", "lines", "welch")
-#: Number of lines unless a highest frequency is given, and the largest number.
-_LINES, _MOST_LINES = 1000, 10_000
+_LINES, _MOST_LINES = 1000, 10_000  # Number of lines unless a highest frequency is given, and the largest number
 #: Fewest outputs of a density; half-overlapping segments into which they are divided unless a resolution is given.
 _FEWEST, _SEGMENTS = 64, 8
-#: Largest deviation of output times from evenly spaced ones, relative to their distance.
-_EVEN = 1e-5
-#: Probability that the interval of a density contains the true density.
-CONFIDENCE = 0.95
+_EVEN = 1e-5  # Largest deviation of output times from evenly spaced ones, relative to their distance
+CONFIDENCE = 0.95  # Probability that the interval of a density contains the true density
 #: Largest change of a signal over its last period, relative to its range, without a warning that it is not periodic.
 _CLOSED = 0.01
-#: Number of lines in a report.
-_SHOWN = 12
+_SHOWN = 12  # Number of lines in a report
 
 
 @dataclass(frozen=True, repr=False)
@@ -139,16 +133,17 @@ def spectrum_of(
 
 def _lines(solution: Solution, name: str, highest: float | None) -> Spectrum | None:
     """Lines of the source's last period; None where the run holds none."""
-    period = solution.period
-    if period is None or solution._figures.last is None:
+    period, figures = solution.period, solution._figures
+    if period is None or figures.last is None:
         return None
     count = _LINES if highest is None else int(highest * period * (1.0 + 1e-12))
     allowed = f"{1.0 / period:g} Hz, the lowest line, to {_MOST_LINES / period:g} Hz"
     require(1 <= count <= _MOST_LINES, "highest", f"{highest} Hz", allowed)
-    if (found := solution._figures.last_finely(name, period / count)) is None:
+    # Charges and currents are those of the outputs alone.
+    if (last := figures.last_outputs if name.startswith(("q_", "i_")) else figures.last) is None:
         return None
-    weighed, exact = found
-    if not exact:
+    weighed = last.weigh(name, period / count)
+    if isinstance(last, Outputs):
         # The outputs alone determine no frequency beyond half their rate.
         count = max(min(count, (weighed.t.size - 1) // 2), 1)
     mean = weighed.mean()
@@ -157,12 +152,9 @@ def _lines(solution: Solution, name: str, highest: float | None) -> Spectrum | N
         # The signal is not periodic yet, unless a source has a breakpoint at the end, where it may jump.
         ends = solution.t_stop - 1e-6 * period, solution.t_stop + 1e-6 * period
         if not any(w.breakpoints(*ends).size for w in network_of(solution.circuit).waveforms):
-            warnings.warn(
-                f"{name} changes over the last period by more than {100 * _CLOSED:g} % of its range, so its lines are "
-                "not those of the periodic state; a longer run, or start='periodic', has it",
-                FingerspiceWarning,
-                stacklevel=4,
-            )
+            told = "so its lines are not those of the periodic state; a longer run, or start='periodic', has it"
+            changes = f"{name} changes over the last period by more than {100 * _CLOSED:g} % of its range, {told}"
+            warnings.warn(changes, FingerspiceWarning, stacklevel=4)
     turn = np.exp(-2j * np.pi * np.remainder(weighed.t.ravel() / period, 1.0))
     turning, amplitude = 2.0 * (weight * x) + 0j, np.empty(count)
     for k in range(count):
@@ -198,13 +190,12 @@ def _density(
     # finds energy that the first one's own sampling would alias.
     share = max((energy_outside(w, solution.t_stop, (0.0, f))[1] for w in waves for f in (half, 8.0 * half)), default=0)
     if share > NOTABLE:
-        warnings.warn(
+        told = (
             f"{name} has frequencies beyond half the rate of the outputs, {0.5 * rate:g} Hz, which are folded into its "
             f"spectrum ({100.0 * share:.0f} % of the source's energy lie above {half:g} Hz); a shorter step of the "
-            "outputs, at most half a period of the highest frequency, keeps them apart",
-            FingerspiceWarning,
-            stacklevel=4,
+            "outputs, at most half a period of the highest frequency, keeps them apart"
         )
+        warnings.warn(told, FingerspiceWarning, stacklevel=4)
     kept = slice(None) if highest is None else f <= highest
     require(bool(np.any(f[kept])), "highest", f"{highest} Hz", f"{f[1]:.4g} Hz or more")
     return Spectrum(

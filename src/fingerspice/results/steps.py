@@ -1,16 +1,16 @@
-"""A run between its outputs: steps with polynomials through their nodes, and the periods that each stands for.
+"""A run between its outputs: steps with polynomials through their nodes, and means and extremes of its signals on them.
 
 Steps are recorded as the run is made, or chosen for a run that can be computed at any times, or read from a file.
-
-Means, extremes and amplitudes of a run's signals, as integrals over its steps or its outputs.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
@@ -33,8 +33,7 @@ Panels = FloatArray
 CAPACITY, _AT_ONCE = 512, 16_384
 #: Largest number of values kept of a run's steps (64 MB); figures of a longer run are computed from its outputs.
 MOST_NUMBERS = 8_000_000
-#: Sets of places between the steps whose record is kept, and the most places of one.
-_KNOWN, _MOST_KNOWN = 8, 4096
+_KNOWN, _MOST_KNOWN = 8, 4096  # Sets of places between the steps whose record is kept, and the most places of one
 
 
 class Recorder:
@@ -82,9 +81,7 @@ class Recorded:
     first: float
     make: Make
     # Records at places that were asked for, as signals are mostly asked for at the same places one after another
-    _known: dict[tuple[bytes, bytes], tuple[FloatArray, Signals]] = field(
-        default_factory=dict, repr=False, compare=False
-    )
+    _known: dict[object, tuple[FloatArray, Signals]] = field(default_factory=dict, repr=False, compare=False)
 
     def run(self, names: Sequence[str], since: float, until: float) -> Recorded | None:
         """These steps; None where they begin after `since` (s)."""
@@ -96,8 +93,6 @@ class Recorded:
         begin, end = start + period, reached + period
         slack = same_time(1.0) * np.abs(end)
         index = np.arange(float(start.size))
-        if ((begin >= since - slack) & (end + (count - 1) * period <= until + slack)).all():
-            return np.array([index, 0.0 * index, reach, count * reach * length])
         period = np.where(count > 1, period, 1.0)
         # Of the periods that a step represents, those from number `first` to `last` lie wholly inside.
         first = np.clip(np.ceil((since - slack - begin) / period), 0, count)
@@ -133,14 +128,14 @@ class Recorded:
     def at_points(self, name: str, panels: Panels) -> tuple[FloatArray, FloatArray]:
         """Times (s) and a signal at the `POINTS` of panels, shape (p, ROWS) each."""
         step = panels[0].astype(int)
-        own = (panels[1] == 0.0) & (panels[2] == self.times[3, step])
-        if not own.any():
+        cut = (panels[1] != 0.0) | (panels[2] != self.times[3, step])
+        if cut.all():
             return self.values_at(name, panels, POINTS)
         # Panels that are whole steps share one record for all signals.
-        t_own, record = self._whole
-        t, x = t_own[step], record.one(name).reshape(t_own.shape)[step]
-        if not own.all():
-            t[~own], x[~own] = self.values_at(name, panels[:, ~own], POINTS)
+        t, record = self._whole
+        t, x = t[step], record.one(name).reshape(t.shape)[step]
+        if cut.any():
+            t[cut], x[cut] = self.values_at(name, panels[:, cut], POINTS)
         return t, x
 
     def values_at(self, name: str, panels: Panels, places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -149,8 +144,7 @@ class Recorded:
         # Written so that the places 0 and 1 give exactly `low` and `high`.
         fraction = low * (1.0 - places) + high * places
         key = index.tobytes(), fraction.tobytes()
-        found = self._known.get(key)
-        if found is None:
+        if (found := self._known.get(key)) is None:
             found = self._record(index, fraction, np.einsum("pcn,pqn->cpq", self.values[index], _basis(fraction)))
             if fraction.size <= _MOST_KNOWN:
                 while len(self._known) >= _KNOWN:
@@ -171,8 +165,7 @@ def _basis(fraction: FloatArray) -> FloatArray:
     distance = fraction[:, :, None] - POINTS[:NODES]
     hit = distance == 0.0
     weight = np.where(hit.any(axis=2, keepdims=True), hit, BARYCENTRIC / np.where(hit, 1.0, distance))
-    weight /= weight.sum(axis=2, keepdims=True)
-    return np.asarray(weight)
+    return np.asarray(weight / weight.sum(axis=2, keepdims=True))
 
 
 def missed(x: FloatArray) -> FloatArray:
@@ -180,14 +173,11 @@ def missed(x: FloatArray) -> FloatArray:
     return np.asarray(np.abs(x[:, :NODES] @ BETWEEN - x[:, NODES:]).max(axis=1, initial=0.0))
 
 
-#: Largest interpolation error of a panel between its nodes, relative to the signal's peak.
-_MISSED = 1e-11
+_MISSED = 1e-11  # Largest interpolation error of a panel between its nodes, relative to the signal's peak
 #: Largest number of panels, beyond which figures are computed from the outputs; and of halvings of one panel.
 MOST_PANELS, _MOST_ROUNDS = 20_000, 60
-# Length of a panel that is a straight line at all events, in units of the last place of the time.
-_ROUNDINGS = 32.0
-#: Largest number of the source's segments that an evaluation may pass; length of the first panels relative to the
-#: source's shortest time.
+_ROUNDINGS = 32.0  # Length of a panel that is a straight line at all events, in units of the last place of the time
+#: Most segments of the source that an evaluation may pass; length of the first panels in the source's shortest times.
 _MOST_PASSED, _LONGEST = 200_000, 0.5
 
 
@@ -205,18 +195,16 @@ class ClosedForm:
 
     def run(self, names: Sequence[str], since: float, until: float) -> Recorded | None:
         """Steps between two times (s), on each of which a polynomial represents every voltage; None if too many."""
-        marks = self._marks(since, until)
-        if marks is None:
+        if (marks := self._marks(since, until)) is None:
             return None
         begin, end = marks[:-1], marks[1:]
         done: list[FloatArray] = []
         peaks: dict[str, float] = {}
-        # Signals that follow from the gap voltage are smooth where it is, except at its zeros.
-        voltages = [name for name in names if name.startswith(("u_", "v:"))]
         for _ in range(_MOST_ROUNDS):
             record, place = self._at_points(begin, end)
             middle, wrong = 0.5 * (begin + end), np.zeros(begin.size, bool)
-            for name in voltages:
+            # Signals that follow from the gap voltage are smooth where it is, except at its zeros.
+            for name in (name for name in names if name.startswith(("u_", "v:"))):
                 x = record.one(name)[place]
                 peaks[name] = max(peaks.get(name, 0.0), float(np.abs(x).max(initial=0.0)))
                 wrong |= missed(x) > max(max(_MISSED, self.error) * peaks[name], self.rounding)
@@ -264,7 +252,7 @@ class ClosedForm:
 
     def _zeros(self, names: Sequence[str], marks: FloatArray, record: Record, place: IntArray) -> Iterator[FloatArray]:
         """Zeros of gap voltages (s) within panels, where the area has a kink."""
-        for name in (name for name in names if name.partition(":")[0] == "u_gap"):
+        for name in (name for name in names if name.startswith("u_gap")):
             values = record.one(name)[place[:, :NODES]]
             for i in np.flatnonzero((values.max(axis=1) > self.rounding) & (values.min(axis=1) < -self.rounding)):
                 roots = chebyshev.chebroots(values[i] @ TO_SERIES[:, :NODES])
@@ -272,12 +260,9 @@ class ClosedForm:
                 yield marks[i] + (marks[i + 1] - marks[i]) * 0.5 * (1.0 + inside)
 
 
-#: Smallest tolerance of the interpolation error of a panel, relative to the signal's peak.
-_FINEST = 1e-12
-#: Most halves of panels that are evaluated, in addition to four for each panel.
-_MOST_CUT = 4096
-#: Most times that one panel is halved.
-_MOST_SEARCHES = 60
+_FINEST = 1e-12  # Smallest tolerance of the interpolation error of a panel, relative to the signal's peak
+_MOST_CUT = 4096  # Most halves of panels that are evaluated, in addition to four for each panel
+_MOST_SEARCHES = 60  # Most times that one panel is halved
 #: Gauss-Lobatto weights on [0, 1]: exact for polynomials of degree 23.
 _WEIGHTS = 1.0 / (NODES * (NODES - 1) * legendre.Legendre.basis(NODES - 1)(2.0 * POINTS[:NODES] - 1.0) ** 2)
 
@@ -311,36 +296,32 @@ def _halved(panels: Panels) -> Panels:
 class Stretch:
     """A run between two times (s), with weights and extremes of every signal, more exact than its error `rtol`.
 
-    A panel is halved where it is longer than `longest` (s), or the polynomial through its nodes differs from the signal
-    between them: steps resolve the gap voltage, and the area may change within a small part of the voltage's range.
+    A panel is halved where the polynomial through its nodes differs from the signal between them: steps resolve the gap
+    voltage, and the area may change within a small part of the voltage's range.
     """
 
-    def __init__(self, run: Recorded, since: float, until: float, rtol: float, longest: float = math.inf) -> None:
+    def __init__(self, run: Recorded, since: float, until: float, rtol: float) -> None:
         self.run, self.span, self.rtol = run, (since, until), rtol
         self.panels = run.panels(since, until)
-        while (long := self.panels[3] > longest).any():
-            self.panels = np.concatenate([self.panels[:, ~long], _halved(self.panels[:, long])], axis=1)
 
-    def finely(self, longest: float) -> Stretch:
-        """The same with panels as short as that (s)."""
-        return Stretch(self.run, *self.span, self.rtol, longest)
-
-    def weigh(self, name: str) -> Weighed:
-        """A signal with weights for its means."""
-        t, x = self.run.at_points(name, self.panels)
+    def weigh(self, name: str, longest: float = math.inf) -> Weighed:
+        """A signal with weights for its means, on panels as short as `longest` (s)."""
+        panels = self.panels
+        while (long := panels[3] > longest).any():
+            panels = np.concatenate([panels[:, ~long], _halved(panels[:, long])], axis=1)
+        t, x = self.run.at_points(name, panels)
         error = missed(x) / (float(np.abs(x).max(initial=0.0)) or 1.0)
-        share = self.panels[3] / self.panels[3].sum()
-        # Gauss-Lobatto weights integrate polynomials up to twice the degree of the interpolant exactly. If the terms of
-        # the series fall geometrically, the quadrature error is about the interpolation error to the power 1.85; 1.5 is
-        # on the safe side.
+        share = panels[3] / panels[3].sum()
+        # Gauss-Lobatto weights are exact up to twice the degree of the interpolant: if the terms of the series fall
+        # geometrically, the quadrature error is about the interpolation error to the power 1.85, and 1.5 is safe.
         if float((share * error**1.5).sum()) <= max(_FINEST, 1e-3 * self.rtol):
             return Weighed(t[:, :NODES], share[:, None] * _WEIGHTS, x[:, :NODES])
-        return self._cut(name, _FINEST)[0]
+        return self._cut(name, _FINEST, panels)[0]
 
     def extremes(self, name: str) -> tuple[float, float]:
         """Smallest and largest value of a signal, evaluated where its polynomials have their extremes."""
         # An interpolation error shifts the place of an extreme, which changes the signal there by its square only.
-        weighed, panels = self._cut(name, max(_FINEST, 1e-3 * self.rtol))
+        weighed, panels = self._cut(name, max(_FINEST, 1e-3 * self.rtol), self.panels)
         found = [largest(weighed.x, sign) for sign in (-1.0, 1.0)]
         places = np.array([[place] for _, place, _ in found])
         _, exact = self.run.values_at(name, panels[:, [panel for panel, _, _ in found]], places)
@@ -350,23 +331,21 @@ class Stretch:
     def at_nodes(self, names: Sequence[str], tol: float) -> list[FloatArray]:
         """Times (s) and signals at the nodes (p, NODES) of panels on which each misses its polynomial by `tol`."""
         # Panels on which the rounding of the time alone is as much, as on an edge of 1 ns, are not cut.
-        shortest = np.finfo(float).eps * abs(self.span[1]) / tol
+        shortest, panels = np.finfo(float).eps * abs(self.span[1]) / tol, self.panels
         for name in names:
-            self.panels = self._cut(name, tol, shortest)[1]
-        found = [self.run.at_points(name, self.panels) for name in names]
+            panels = self._cut(name, tol, panels, shortest)[1]
+        found = [self.run.at_points(name, panels) for name in names]
         return [x[:, :NODES] for x in (found[0][0], *(x for _, x in found))]
 
-    def _cut(self, name: str, tol: float, shortest: float = 0.0) -> tuple[Weighed, Panels]:
+    def _cut(self, name: str, tol: float, panels: Panels, shortest: float = 0.0) -> tuple[Weighed, Panels]:
         """A signal, and panels on which its interpolation error is at most `tol` of its peak, or as short as told."""
-        panels, parts = self.panels, []
+        parts = []
         t, x = self.run.at_points(name, panels)
         smooth = tol * float(np.abs(x).max(initial=0.0))
         most = _MOST_CUT + 4 * len(t)
         for left in range(_MOST_SEARCHES, 0, -1):
-            wrong = (missed(x) > smooth) & (panels[3] > shortest)
-            if most <= 0 or left == 1:
-                # Panels that are still not smooth hold round-off, or a jump that round-off has shifted across an end.
-                wrong[:] = False
+            # Panels that are not smooth at the end hold round-off, or a jump that round-off has shifted across an end.
+            wrong = (missed(x) > smooth) & (panels[3] > shortest) & (most > 0 and left > 1)
             parts.append((panels[:, ~wrong].T, t[~wrong, :NODES], x[~wrong, :NODES]))
             if not wrong.any():
                 break
@@ -378,11 +357,12 @@ class Stretch:
         return Weighed(t, share[:, None] * _WEIGHTS, x), every.T
 
 
-class Outputs:
+class Outputs(NamedTuple):
     """Outputs of a record from number `first` on; after interpolated ones at a time `start` (s) if that is given."""
 
-    def __init__(self, record: Signals, first: int = 0, start: float | None = None) -> None:
-        self.record, self.first, self.start = record, first, start
+    record: Signals
+    first: int = 0
+    start: float | None = None
 
     def _values(self, name: str) -> tuple[FloatArray, FloatArray]:
         t, x = self.record.t, self.record.one(name)
@@ -390,8 +370,8 @@ class Outputs:
             return t[self.first :], x[self.first :]
         return np.append(self.start, t[self.first :]), np.append(np.interp(self.start, t, x), x[self.first :])
 
-    def weigh(self, name: str) -> Weighed:
-        """A signal with weights for its means."""
+    def weigh(self, name: str, longest: float = math.inf) -> Weighed:
+        """A signal with weights for its means, whatever `longest` is: nothing is known between the outputs."""
         return weigh_outputs(*self._values(name))
 
     def extremes(self, name: str) -> tuple[float, float]:
@@ -405,25 +385,23 @@ def weigh_outputs(t: FloatArray, x: FloatArray) -> Weighed:
 
     Where fewer than four values lie between two jumps, the trapezoidal rule is used.
     """
-    weight = np.zeros(t.size)
-    begins = np.flatnonzero(np.append(True, np.diff(t) == 0.0))
+    weight, step = np.zeros(t.size), np.diff(t)
+    begins = np.flatnonzero(np.append(True, step == 0.0))
     sizes = np.diff(np.append(begins, t.size))
     begin, size = np.repeat(begins, sizes), np.repeat(sizes, sizes)
-    i = np.flatnonzero(np.append(np.diff(t) > 0.0, False))
-    few = size[i] < 4
+    i = np.flatnonzero(step > 0.0)
+    few = i[size[i] < 4]
     for side in (0, 1):
-        np.add.at(weight, i[few] + side, 0.5 * (t[i[few] + 1] - t[i[few]]))
-    i = i[~few]
+        np.add.at(weight, few + side, 0.5 * step[few])
+    i = i[size[i] >= 4]
     first = np.clip(i - 1, begin[i], begin[i] + size[i] - 4)
     index = first[:, None] + np.arange(4)
     nodes = t[index]
-    half, middle = 0.5 * (t[i + 1] - t[i]), 0.5 * (t[i + 1] + t[i])
+    half, middle = 0.5 * step[i], 0.5 * (t[i + 1] + t[i])
     # Two Gauss points integrate a cubic exactly; it is evaluated there in Lagrange's form.
-    for at in (middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)):
-        for j in range(4):
-            share = half.copy()
-            for m in range(4):
-                if m != j:
-                    share *= (at - nodes[:, m]) / (nodes[:, j] - nodes[:, m])
-            weight += np.bincount(index[:, j], share, t.size)
+    for at, j in itertools.product((middle - half / np.sqrt(3.0), middle + half / np.sqrt(3.0)), range(4)):
+        share = half
+        for m in (m for m in range(4) if m != j):
+            share = share * ((at - nodes[:, m]) / (nodes[:, j] - nodes[:, m]))
+        weight += np.bincount(index[:, j], share, t.size)
     return Weighed(t, weight / weight.sum(), x)

@@ -15,15 +15,14 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.describe import head_lines
 from fingerspice.numerics.lobatto import NODES
 from fingerspice.results.record import attribute, sealed, signal_of
-from fingerspice.results.steps import Outputs, Stretch, Weighed
+from fingerspice.results.steps import Outputs, Stretch
 
 if TYPE_CHECKING:
     from fingerspice.results.solution import Solution
 
 Value = float | FloatArray | None
 
-#: Most numbers of the last period between the outputs that a file keeps (16 MB).
-MOST_BETWEEN = 2_000_000
+MOST_BETWEEN = 2_000_000  # Most numbers of the last period between the outputs that a file keeps (16 MB)
 # The signals in it, and how far they may be from their polynomials, relative to their peaks.
 _BETWEEN, _MISSED = ("u_source", "u_layer", "v", "u_gap", "area", "f_el", "fold_margin"), 1e-10
 #: Signals that have rows in the table, in their order, and its columns of figures: heading and key.
@@ -93,15 +92,15 @@ class Figures:
         s = self.solution
         if s.period is None or not s.t.size:
             return None
-        since, found = s.t_stop - s.period, None
-        if s.continuous is not None and since >= s.first - 1e-9 * s.period:
-            if since <= s.first + 1e-9 * s.period:
-                return self.whole
-            found = self._between(since, s.t_stop)
-        return found or self._last_outputs
+        since = s.t_stop - s.period
+        if s.continuous is None or since < s.first - 1e-9 * s.period:
+            return self.last_outputs
+        if since <= s.first + 1e-9 * s.period:
+            return self.whole
+        return self._between(since, s.t_stop) or self.last_outputs
 
     @cached_property
-    def _last_outputs(self) -> Outputs | None:
+    def last_outputs(self) -> Outputs | None:
         """The outputs of the source's last period; None where they are too few."""
         s = self.solution
         assert s.period is not None
@@ -109,39 +108,23 @@ class Figures:
         start = float(s.t[-1] - s.period)
         if start < s.t[0] - tolerance or np.count_nonzero(s.t >= start) < 8:
             return None
-        first = int(np.searchsorted(s.t, start - tolerance, side="right"))
-        if abs(s.t[first] - start) <= tolerance:
-            # Of two outputs at a jump, the period starts with the right-hand one.
-            return Outputs(s.record, int(np.searchsorted(s.t, start + tolerance, side="right")) - 1)
-        return Outputs(s.record, first, start)
-
-    def last_finely(self, name: str, longest: float) -> tuple[Weighed, bool] | None:
-        """A signal with weights over the last period, and whether it is known between the outputs; None without one.
-
-        Then the weights also integrate its product with an oscillation of the period `longest` (s).
-        """
-        # Charges and currents are those of the outputs alone.
-        last = self._last_outputs if self.last is not None and name.startswith(("q_", "i_")) else self.last
-        if isinstance(last, Stretch):
-            return last.finely(longest).weigh(name), True
-        return None if last is None else (last.weigh(name), False)
+        first, after = (int(i) for i in np.searchsorted(s.t, [start - tolerance, start + tolerance], side="right"))
+        # Of two outputs at a jump, the period starts with the right-hand one.
+        return Outputs(s.record, after - 1) if abs(s.t[first] - start) <= tolerance else Outputs(s.record, first, start)
 
     def between(self) -> tuple[list[str], FloatArray] | None:
         """Names of signals, and a table of times (s) and these signals at the nodes of the last period's panels.
 
         None where the run is not known between its outputs, or the table is larger than `MOST_BETWEEN`.
         """
-        if not isinstance(self.last, Stretch):
-            return None
-        fine = self.last.finely(math.inf)
         names = [name for key in _BETWEEN for name in self.signals.names(key)]
-        if fine.panels.shape[1] * NODES * len(names) > MOST_BETWEEN:
+        if not isinstance(self.last, Stretch) or self.last.panels.shape[1] * NODES * len(names) > MOST_BETWEEN:
             return None
-        t, *columns = fine.at_nodes(names, _MISSED)
+        t, *columns = self.last.at_nodes(names, _MISSED)
         # Steps that stand for equal periods have the times of the one that was integrated.
         period = self.solution.period
         assert period is not None
-        t = t + period * np.maximum(np.ceil((fine.span[0] - t[:, :1]) / period - 1e-9), 0.0)
+        t = t + period * np.maximum(np.ceil((self.last.span[0] - t[:, :1]) / period - 1e-9), 0.0)
         table = np.column_stack([x.ravel() for x in (t, *columns)])
         return (names, table) if table.size <= MOST_BETWEEN else None
 
@@ -160,19 +143,17 @@ class Figures:
         if s.stored is not None:
             return dict(s.stored)
         out: dict[str, Any] = {"t_stop": float(s.t[-1]) if s.t.size else None, "status": s.status.name}
-        out.update({f"error_{k}": v for k, v in vars(s.error).items()})
+        out |= {f"error_{k}": v for k, v in vars(s.error).items()}
         if self.whole is None:
             return out
         out["figures_from"] = "steps" if isinstance(self.whole, Stretch) else "outputs"
         for name in self.shown:
             kinds = ["max", "min", "peak", "mean", "rms", "mean_periodic"]
-            if self.last is not None:
-                kinds.append("ripple" if signal_of(name).ripple else "rms_periodic")
-            out.update({f"{name}_{kind}": one(name, kind) for kind in kinds})
+            kinds += ["ripple" if signal_of(name).ripple else "rms_periodic"] if self.last is not None else []
+            out |= {f"{name}_{kind}": one(name, kind) for kind in kinds}
         if self.last is not None and s.fundamental is not None:
-            for name in ("u_source", "u_gap"):
-                if name in self.shown:
-                    out.update({f"{name}_{kind}": one(name, kind) for kind in ("amplitude", "phase_deg")})
+            for name in (name for name in ("u_source", "u_gap") if name in self.shown):
+                out |= {f"{name}_{kind}": one(name, kind) for kind in ("amplitude", "phase_deg")}
             out["fundamental"] = s.fundamental.frequency
         if self.signals.gaps:
             out["fold_margin_min"] = min(s.fold_margin_min, float(s.fold_margin.min(initial=1.0)))
@@ -182,33 +163,22 @@ class Figures:
         """The figures as a table, and below it errors, the distance to the fold, and how the run ended."""
         run, s, error = self.solution, self.summary(), self.solution.error
         end = format_si(float(run.t[-1]), "s") if run.t.size else "nothing"
-        out: list[str | Table] = [
-            *head_lines(run.circuit),
-            f"{end} simulated; charge law {run.charge_law}, area {run.area_mode}, method {run.method}, "
-            f"rtol {run.rtol:g}",
-            "",
-        ]
+        how = f"charge law {run.charge_law}, area {run.area_mode}, method {run.method}, rtol {run.rtol:g}"
+        out: list[str | Table] = [*head_lines(run.circuit), f"{end} simulated; {how}", ""]
         if run.t.size >= 2:
             names = [name for key in _ROWS for name in self.signals.names(key) if f"{name}_max" in s]
             out.append(Table(("", *_COLUMNS), [_row(name, s) for name in names]))
             if any(s.get(f"{name}_mean_periodic") is not None for name in ("u_source", "f_el")):
-                out.append(
-                    "last period: the mean over it; rms and ripple (max - min) are those of the last period, too"
-                )
+                out += ["last period: the mean over it; rms and ripple (max - min) are those of the last period, too"]
             if "u_gap_amplitude" in s:
                 lead = (s["u_gap_phase_deg"] - s["u_source_phase_deg"] + 180.0) % 360.0 - 180.0
                 share = s["u_gap_amplitude"] / s["u_source_amplitude"] if s["u_source_amplitude"] else math.nan
-                out += [
-                    "",
-                    f"at {format_si(s['fundamental'], 'Hz')}: gap voltage {format_si(s['u_gap_amplitude'], 'V')}, "
-                    f"{100.0 * share:.2f} % of the source, leading by {lead:.2f} deg",
-                ]
-        force, inside = f", force {error.f_el:.2g} N", "layer" if run.layers else "capacitor"
-        about, rest = (
-            ("estimated error: gap", force) if run.gaps else (f"no GAP, no forces; estimated error: {inside}", "")
-        )
-        nodes = "" if error.v_nodes is None else f", node voltages {error.v_nodes:.2g} V"
-        out += ["", f"{about} voltage {error.u_gap:.2g} V{rest}{nodes}"]
+                told = f"at {format_si(s['fundamental'], 'Hz')}: gap voltage {format_si(s['u_gap_amplitude'], 'V')}"
+                out += ["", f"{told}, {100.0 * share:.2f} % of the source, leading by {lead:.2f} deg"]
+        of = "gap" if run.gaps else "layer" if run.layers else "capacitor"
+        told = f"estimated error: {of} voltage {error.u_gap:.2g} V"
+        told = f"{told}, force {error.f_el:.2g} N" if run.gaps else f"no GAP, no forces; {told}"
+        out += ["", told if error.v_nodes is None else f"{told}, node voltages {error.v_nodes:.2g} V"]
         if s.get("figures_from") == "outputs":
             out.append("figures are those of the outputs: what lies between them is not known")
         if run.charge_law == "mobile" and "fold_margin_min" in s:
@@ -226,8 +196,7 @@ def _row(name: str, s: dict[str, Any]) -> tuple[str, ...]:
     label = {"u_layer": f"{element} voltage", "v": f"node {element}", "friction": f"friction coefficient {element}"}
     cells = [label.get(key, f"{signal.text} {element}").rstrip()]
     for kind in _COLUMNS.values():
-        value = s.get(f"{name}_{kind}")
-        if value is None:
+        if (value := s.get(f"{name}_{kind}")) is None:
             cells.append("-")
             continue
         # A mean that is 0 to round-off is written as 0.
@@ -248,10 +217,6 @@ class Figured:
 
     Figures are integrals and extremes of the run itself, not of its outputs.
     """
-
-    @property
-    def _figures(self) -> Figures:
-        raise NotImplementedError
 
     f_el_mean = figure("f_el", "mean", "Mean electroadhesive force over the run, N.")
     f_el_mean_periodic = figure(

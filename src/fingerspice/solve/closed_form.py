@@ -195,13 +195,13 @@ def _finished(
 def _peaks(record: Record) -> Iterator[tuple[float, float]]:
     """Largest voltage (V) and force (N) of every gap, as of `gap_signals`."""
     for i, (place, (_, contact)) in enumerate(zip(record.network.fingers, record.fingers, strict=True)):
-        u = record.finger_voltage(i)
+        u = record.each("u_gap")[i]
         peak = max(float(u.max(initial=0.0)), -float(u.min(initial=0.0)))
         if record.net.gap[place] < 0 and record.net.slow[place] < 0:
             # The area is fixed: the force grows with the voltage.
             yield peak, float(contact.stress(peak) * record.net.area0[place])
         else:
-            yield peak, float(record.finger_force(i).max(initial=0.0))
+            yield peak, float(record.each("f_el")[i].max(initial=0.0))
     if not record.fingers:
         yield from ((float(np.abs(u).max(initial=0.0)), 0.0) for u, _ in gap_signals(record))
 

@@ -227,7 +227,7 @@ def _areas_met(problem: Problem, record: Record, finger: int, u_peak: float) -> 
     net, i = problem.scene.net, problem.network.fingers[finger]
     unloaded = float(net.area0[i])
     if net.slow[i] >= 0:
-        area = record.finger_area(finger)
+        area = record.each("area")[finger]
         return float(area.min(initial=math.inf)), float(area.max(initial=0.0))
     if net.gap[i] < 0:
         return math.inf, unloaded

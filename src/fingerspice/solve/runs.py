@@ -211,8 +211,7 @@ def integrate(one: Integration, tables: Tables, progress: Progress | None = None
 def gap_signals(record: Record) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Voltage (V) and force (N) of every gap; without one, the voltage of the smallest capacitor and no force."""
     network = record.network
-    for i in range(len(record.fingers)):
-        yield record.finger_voltage(i), record.finger_force(i)
+    yield from zip(record.each("u_gap"), record.each("f_el"), strict=True)
     if not record.fingers and network.cells:
         u = record.cell_voltage(int(np.argmin(network.capacitance(record.net.area0))))
         yield u, np.zeros(u.size)
@@ -242,9 +241,10 @@ def run_failure(problem: Problem, run: Run, record: Record) -> Failure:
     elif status is Status.FOLD and run.t.size and record.fingers:
         if run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size:
             cause += " (the source jumps past the fold at this time)"
-        shrunk = [record.finger_area(i)[-1] / problem.scene.area0[j] for i, j in enumerate(problem.network.fingers)]
+        areas = record.each("area")
+        shrunk = [x[-1] / problem.scene.area0[j] for x, j in zip(areas, problem.network.fingers, strict=True)]
         i = int(np.argmin(shrunk))
-        signals = record.finger_voltage(i), record.finger_area(i), record.fold_margin
+        signals = record.each("u_gap")[i], areas[i], record.fold_margin
         element, (u_gap, area, margin) = names[i], (float(x[-1]) for x in signals)
     if detail := run.detail or (ROUGH.format(run.rough) if run.rough > 0.0 else ""):
         cause += f" ({detail})"

@@ -104,7 +104,7 @@ class Comparison(Shown):
         # The table has four rows for each GAP.
         more = 0.53 * (len(self.gaps) - 1)
         figure, axes = drawing.new_figure(3, height=5.6 + 1.67 * more, height_ratios=[1.3, 1.3, 0.75 + more])
-        solution, runs = self.solution, [traces.Drawn(self.solution, "")]
+        solution, runs = self.solution, [(self.solution, "")]
         start, stop = float(solution.t[0]), float(solution.t[-1])
         turns = 2.0 * np.pi * self.frequency * solution.t
         turns += solution.fundamental.phase if solution.fundamental else 0.0
