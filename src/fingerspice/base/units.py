@@ -13,18 +13,15 @@ MIL = 25.4e-6
 #: ...) are not among them, because SPICE takes that letter as the scale; nor is `a`, which elsewhere means atto.
 PLAIN_UNITS = frozenset(
     (
-        *("v", "vdc", "vac", "vpp", "volt", "volts", "h", "henry", "hz", "hertz", "o", "ohm", "ohms", "ω"),
-        *("s", "sec", "second", "seconds", "c", "w", "watt", "watts"),
-        *("deg", "degree", "degrees", "rad", "radian", "radians", "°c"),
+        *("v", "vdc", "vac", "vpp", "volt", "volts", "h", "henry", "hz", "hertz", "o", "ohm", "ohms", "ω", "c", "°c"),
+        *("s", "sec", "second", "seconds", "w", "watt", "watts", "deg", "degree", "degrees", "rad", "radian"),
+        "radians",
     )
 )
 
 # Words whose first letters SPICE reads as another scale than is meant, with that scale and the right one.
-_MISREAD = {
-    "milli": ("mil (25.4e-6)", "m"),
-    "micro": ("m (milli)", "u"),
-    **dict.fromkeys(("met", "min"), ("m (milli)", "")),
-}
+_MILLI = "m (milli)"
+_MISREAD = {"milli": ("mil (25.4e-6)", "m"), "micro": (_MILLI, "u"), "met": (_MILLI, ""), "min": (_MILLI, "")}
 _LETTERS = "a-zµμωΩ"
 _NUMBER = re.compile(rf"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:e([+-]?[0-9]+))?(°c|[{_LETTERS}]*)", re.IGNORECASE)
 _LETTER_AS_POINT = re.compile(rf"([+-]?[0-9]+)([{_LETTERS}]+)([0-9]+)[{_LETTERS}]*", re.IGNORECASE)
@@ -65,8 +62,7 @@ def suspicious_mega(text: str) -> bool:
 
 def suggest_mega(text: str) -> str:
     """The same digits followed by ``meg``: ``0.2MOhm`` gives ``0.2meg``."""
-    match = _MEGA.fullmatch(text)
-    return text if match is None else f"{text[: match.start(1)]}meg"
+    return f"{text[: match.start(1)]}meg" if (match := _MEGA.fullmatch(text)) else text
 
 
 def unit_read_as_scale(text: str, unit: str, word: str = "") -> bool:
@@ -80,12 +76,11 @@ def format_si(value: float, unit: str, digits: int = 4) -> str:
     if not math.isfinite(value) or value == 0.0:
         return f"{value + 0.0:g} {unit}".rstrip()
     # Rounded first, as 999.96 to four digits is 1 k and not 1000.
-    mantissa, _, exponent_text = f"{value:.{digits - 1}e}".partition("e")
-    exponent = int(exponent_text)
-    power = 3 * (exponent // 3)
+    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
+    power = 3 * (int(exponent) // 3)
     if power not in _PREFIXES:
         return f"{value:.{digits}g} {unit}".rstrip()
-    scaled = float(mantissa) * 10.0 ** (exponent - power)
+    scaled = float(mantissa) * 10.0 ** (int(exponent) - power)
     return f"{scaled:.{max(digits, 3)}g} {_PREFIXES[power]}{unit}".rstrip()
 
 
@@ -103,17 +98,13 @@ def spice_text(value: float) -> str:
 
 def _power_of_ten(letters: str, text: str, as_written: str) -> int:
     """Power of ten for which the letters after a number, given in lower case, stand."""
-    if letters == "":
-        return 0
     digits = text[: len(text) - len(letters)]
-    if letters.startswith("meg"):
-        return SCALES["meg"]
     for word, (read_as, scale) in _MISREAD.items():
         if letters.startswith(word):
             raise ValueError(f"'{text}' would be read as {digits}{read_as}: write {digits}{scale}")
-    if letters[0] in SCALES:
-        return SCALES[letters[0]]
-    if letters in PLAIN_UNITS:
+    if (scale := "meg" if letters.startswith("meg") else letters[:1]) in SCALES:
+        return SCALES[scale]
+    if letters in {"", *PLAIN_UNITS}:
         return 0
     if letters[0] in "ax":
         meanings = {"a": f"atto ({digits}e-18) or ampere: write {digits}", "x": f"mega: write {digits}meg"}

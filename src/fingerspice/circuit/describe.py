@@ -1,7 +1,5 @@
 """A circuit in words and its digests, checks of a call's arguments, and warnings before a run.
 
-These are about a circuit before it runs: directives without effect, unsuitable skin data, sources that miss it.
-
 What is said about a skin's data rests on the source's spectrum: its energy outside their band, and the error of data
 held at one frequency.
 """
@@ -183,11 +181,7 @@ def values_text(element: Element) -> str:
 
 def _deck_value(value: float) -> str:
     """A number as written in decks: ``3.5u``, ``0.2meg``, ``0.3``."""
-    text = format_si(value, "").replace(" ", "")
-    # SPICE reads M as milli, and does not know P and E.
-    if 0.01 <= abs(value) < 1e4 or text[-1:] in "PEZY":
-        return f"{value:.4g}"
-    return f"{text[:-1]}meg" if text.endswith("M") else text
+    return f"{value:.4g}" if 0.01 <= abs(value) < 1e4 else format_si(value, "").replace(" ", "").replace("M", "meg")
 
 
 def _joined(said: list[str]) -> str:
@@ -228,9 +222,8 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
     named = {name.lower() for name in sources}
     on = [e.name for e in driving if e.name.lower() not in named and e.waveform not in (None, DC(0.0))]
     if on and any(e.name.lower() in named for e in driving):
-        text = (
-            f"sources names {', '.join(sources)} only: {', '.join(on)} stays on, as in the deck; 0 would switch it off"
-        )
+        text = f"sources names {', '.join(sources)} only: {', '.join(on)} stays on, as in the deck"
+        text += "; 0 would switch it off"
         warnings.warn(text, FingerspiceWarning, stacklevel=3)
         circuit = dataclasses.replace(circuit, warnings=(*circuit.warnings, text))
     return circuit.replace({circuit[name].name: value for name, value in sources.items()})
@@ -266,16 +259,13 @@ _RECORDED, _FILLED = 100, 0.01
 # Times (s) from `_CLOCK` on are those of a clock (this is a day in 1973, counted from 1970); times beyond the end of a
 # run by a factor of `_OTHER_UNIT` or more are probably in another unit.
 _CLOCK, _OTHER_UNIT = 1e8, 20.0
-# Largest number of samples of a spectrum, and largest number of periods over which a periodic source is evaluated.
-_MOST_SAMPLES = 2**17
-_PERIODS = 16
-# Number of pieces that represent a long run of a source without period, and number of frequencies at which gains are
-# computed.
+# Largest number of samples of a spectrum; and of periods over which a skin's data at one frequency are judged.
+_MOST_SAMPLES, _PERIODS = 2**17, 16
+# Number of pieces that represent a long run of a source without period, and of frequencies of gains.
 _PIECES, _GRID = 4, 49
-# Least length of a piece of a recording, s: two periods of the lowest frequency of the skin's data.
-_LEAST = 2.0 / SKIN_BAND[0]
-# Number of samples of a recording up to which straight lines between them are looked at instead.
-_FEW = 4096
+# Least length (s) of a piece of a recording, two periods of the lowest frequency of the skin's data; and the number of
+# samples up to which straight lines between them are looked at instead.
+_LEAST, _FEW = 2.0 / SKIN_BAND[0], 4096
 # A source is in a band if no more than this fraction of its energy is outside.
 NOTABLE = 0.01
 # The area's harmonics also drive currents through the skin. Skin data held at the fundamental cause an additional
@@ -380,10 +370,8 @@ def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
     skins = circuit.by_device("SKIN")
     waves = network_of(circuit).waveforms if skins else ()
     # With several sources only the user can know at which frequency the skin data should be taken.
-    if len(waves) != 1:
-        return
-    (wave,), fundamental, known = waves, waves[0].fundamental, 0.0 < stop < math.inf
-    for skin in skins:
+    for skin in skins if len(waves) == 1 else ():
+        (wave,), fundamental, known = waves, waves[0].fundamental, 0.0 < stop < math.inf
         f = skin.values["f"]
         if fundamental is not None and abs(f / fundamental.frequency - 1.0) > _SAME:
             yield (
@@ -392,11 +380,9 @@ def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
             )
         elif fundamental is None and not (known and is_near(wave, stop, f)):
             error = skin_error(circuit, wave, stop) if known else None
-            off = "may be 5 to 10 % off"
-            if error is not None:
+            off = f"may be {'5 to 10' if error is None else f'{100.0 * _LITTLE:g}'} % off"
+            if error is not None and abs(error) >= _LITTLE:
                 off = f"is about {100.0 * abs(error):.2g} % too {'large' if error > 0.0 else 'small'}"
-            if error is not None and abs(error) < _LITTLE:
-                off = f"may be {100.0 * _LITTLE:g} % off"
             yield (
                 f"{skin.name} {_TAKES} {f:g} Hz, and the source has no fundamental: the mean force {off}; "
                 f"SKIN_DISPERSIVE d={1e6 * skin.values['d']:g}u is right for any source"

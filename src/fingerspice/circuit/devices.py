@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.base.units import format_si, spice_text, suggest_mega, unit_read_as_scale
+from fingerspice.base.units import format_si, spice_text, suggest_mega, suspicious_mega, unit_read_as_scale
 from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, skin_permittivity, skin_resistivity
 
 if TYPE_CHECKING:
@@ -154,29 +154,20 @@ def _dispersive_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
 
 # Usual ranges, each with its source.
 
-# Sputtered and spun films have 10 nm to 10 um, foils up to 1 mm, cover glasses and screen protectors up to some mm.
 _COATING = Usual(10e-9, 1e-2, "from a sputtered film to a thick glass")
-# The horny layer has 10 to 20 um on most of the body and some 0.2 to 0.6 mm at the fingertip; callus has over 1 mm.
 _SKIN = Usual(1e-6, 2e-3, "skin has 10 um, a fingertip 0.2 to 0.6 mm, callus over 1 mm")
-# The air between rough skin and a screen: 3.5 um in Table 1; below 10 nm surfaces attract each other, and above 100 um
-# the ridges (some 60 um high) do not touch the screen.
+# Below 10 nm surfaces attract each other, and above 100 um the ridges (some 60 um high) do not touch the screen.
 _AIR = Usual(10e-9, 100e-6, "from van der Waals contact to ridges off the screen; 3.5 um in Table 1")
 _EPS_R = Usual(1.0, 1e4, "air has 1, polymers 2 to 10, ceramics up to some thousand")
-# Weak conductors, such as skin at low frequencies (the first slab of its ladder), have up to 1e5.
 _EPS_R_MATERIAL = Usual(1.0, 1e6, "polymers have 2 to 10, skin at low frequencies up to 1e5")
-# 0.2 and 1 megohm in Table 1. Sweat in the gap (some ohm m, a few um, 35 mm^2) gives an ohm; a good polymer, 1e14 ohm m
-# at 100 um, gives 1e14 ohm.
+# Sweat in the gap: some ohm m, a few um, 35 mm^2; a good polymer: 1e14 ohm m at 100 um.
 _LEAK = Usual(1.0, 1e15, "0.2 to 1 megohm in Table 1, an ohm for sweat, 1e14 ohm for a good polymer")
-# Sweat has 0.7 ohm m, skin 1e3 to 1e5 (Eq. 18), the best polymers 1e16.
 _RHO = Usual(0.1, 1e17, "sweat has 1 ohm m, skin 1e4, good polymers 1e14 to 1e16")
-# Air has 3 MV/m, glass 10 to 40, thin polymer and oxide films 100 to 1000.
 _STRENGTH = Usual(1e5, 1e10, "air has 3 MV/m, thin oxides 1 GV/m", "V/m, not V/um")
-# Fingers touch with 0.1 to 5 N and press with less than 50 N; a value of 50 is probably meant in millinewton.
+# Fingers press with less than 50 N: a value of 50 is probably meant in millinewton.
 _LOAD = Usual(1e-3, 49.9, "a finger touches with 0.1 to 5 N", "newton, not millinewton")
 _FRICTION = Usual(0.01, 5.0, "dry skin on glass has 0.1 to 1, moist skin up to 3")
-# The ridge area at 1 N (Eq. 5), from a pencil's tip to a palm; Table 1 has 54.4.
 _ALPHA = Usual(1.0, 2000.0, "the ridge area at 1 N; 54.4 in Table 1", "mm^2 and N")
-# A smooth ball has 2/3 (Hertz), a rough plane up to 1; measured fingers have 0.2 to 0.8, Table 1 has 0.52.
 _M_EXP = Usual(0.1, 1.0, "2/3 for a ball, 1 for a rough plane, 0.52 in Table 1")
 _BETA = Usual(0.3, 1e4, "pi for a full disc, 32 in Table 1", "mm")
 _N_EXP = Usual(0.5, 3.0, "2 for a full disc, 1.41 in Table 1")
@@ -184,10 +175,9 @@ _N_EXP = Usual(0.5, 3.0, "2 for a full disc, 1.41 in Table 1")
 _C2 = Usual(1.0, 1e6, "5000 in Table 1", "mm^4/N^2")
 _TAU = Usual(1e-5, 60.0, "skin creeps within 1 ms to some seconds")
 _BAND = Usual(*SKIN_BAND, "where the data of Eqs. 18 and 19 were measured")
-# Resistances from leads to insulators; capacitances from a fraction of a picofarad between leads to a power supply's.
 _OHM = Usual(1e-3, 1e15, "a lead has milliohms, an insulator up to 1e15 ohm")
 _FARAD = Usual(1e-16, 1e-2, "a body has 150 pF to ground, a supply's capacitor some mF")
-#: Area of a finger's ridges on the screen, mm^2: Table 1 has 35, the tip of a hair 0.01, a palm some thousand.
+#: Area of a finger's ridges on the screen, mm^2; Table 1 has 35.
 REST_AREA = Usual(0.1, 2000.0, "a fingertip has 20 to 400, a palm some 1000", "mm^2, not m^2")
 
 #: Usual ranges of sources, by the unit of the parameter. Screens for electrovibration take 10 to 400 V, electroadhesive
@@ -291,7 +281,7 @@ def unit_trap(spec: ParameterSpec, text: str) -> str | None:
 
 def mega_note(text: str, value: float, spec: ParameterSpec) -> str | None:
     """The warning about a number with a capital M, which SPICE reads as milli, if the parameter is a resistance."""
-    if spec.unit not in ("ohm", "ohm m"):
+    if spec.unit not in ("ohm", "ohm m") or not suspicious_mega(text):
         return None
     return f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for megohm write {suggest_mega(text)}"
 
@@ -299,7 +289,7 @@ def mega_note(text: str, value: float, spec: ParameterSpec) -> str | None:
 def unusual(element: Element) -> Iterator[tuple[str, str]]:
     """Warnings about an element's unusual values, each with the parameter's name (empty for the area at 0 V)."""
     v, own = element.values, {p.name: p.usual for p in element.spec.parameters}
-    ranges = ((name, p, own[name] if name in own else SOURCES.get(p.unit)) for name, p in element.parameters.items())
+    ranges = ((name, p, own.get(name, SOURCES.get(p.unit))) for name, p in element.parameters.items())
     found = [(name, usual.warning(f"{element.name} {name}", p.value, p.unit)) for name, p, usual in ranges if usual]
     if element.device == "GAP" and v["a_fix"] == 0.0 and not any(text for _, text in found):
         adhesive = v["alpha"] * v["fn"] ** v["m_exp"]

@@ -28,7 +28,6 @@ from fingerspice.circuit.devices import check
 from fingerspice.circuit.statespace import (
     Area,
     Stack,
-    Tree,
     build_stack,
     contact_of,
     find_branches,
@@ -36,11 +35,12 @@ from fingerspice.circuit.statespace import (
     layer_constants,
     shared,
     skin_admittance,
+    spanning_tree,
 )
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
-from fingerspice.waveforms.waveform import Fundamental, Waveform
+from fingerspice.waveforms.waveform import Waveform
 
 # A current of a source that is this small, relative to what it is the difference of, is rounding.
 _ROUNDING = 1e-13
@@ -76,11 +76,9 @@ class Network:
     areas: tuple[Area, ...]
     contacts: tuple[Contact | None, ...]  # Contact of each area; None for an area without GAP
     gaps: tuple[int | None, ...]  # Index of the cell of each area's GAP
-    # p, q (n_cell, n): u = p x + q s
-    p: FloatArray
+    p: FloatArray  # p, q (n_cell, n): u = p x + q s
     q: FloatArray
-    # k, b (n, n): Currents of the resistors and the current sources into the cuts of the live capacitors, S
-    k: FloatArray
+    k: FloatArray  # k, b (n, n): Currents of resistors and current sources into the cuts of the live capacitors, S
     b: FloatArray
     through: FloatArray  # (n_s, n_cell)
     # (n_s, n + n_s): The current that each source delivers (a V out of its p node, an I out of its n node) is through @
@@ -101,11 +99,15 @@ class Network:
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "kept": {}}
 
+    @property
+    def drives(self) -> tuple[tuple[Element, float], ...]:
+        """The deck's sources, each with its sign along the loop of a stack, and 1 in other networks."""
+        return tuple((e, 1.0) for e in self.sources) if self.stack is None else self.stack.sources
+
     @cached_property
     def inner(self) -> tuple[Element, ...]:
         """Sources of a series loop that has several; their sum is the network's one source."""
-        sources = () if self.stack is None else self.stack.sources
-        return tuple(e for e, _ in sources) if len(sources) > 1 else ()
+        return tuple(e for e, _ in self.drives) if len(self.drives) > len(self.sources) else ()
 
     @cached_property
     def waveforms(self) -> tuple[Waveform, ...]:
@@ -166,6 +168,13 @@ class Network:
         both = np.concatenate([self._live(self.admittances(frequency, area), s), s])
         return np.asarray(self.nodes[:, : both.size] @ both)
 
+    def layer_gain(self, frequency: float, area: FloatArray) -> ComplexArray:
+        """Ratio of each layer's voltage (from p to n) to the one source's, shape (n_layer,)."""
+        stack = self.stack
+        if stack is None:
+            return np.asarray(self.grouping @ self.phasors(frequency, area, np.ones(1, complex)))
+        return np.asarray(layer_gains(stack.admittance(frequency, area))[0] * stack.sign[stack.first_cell])
+
     def impedance(self, frequency: float, area: FloatArray) -> complex:
         """Voltage of the one source over the current that it delivers, at a frequency (Hz), ohm."""
         one, y = np.ones(1, complex), self.admittances(frequency, area)
@@ -198,13 +207,11 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     currents = [e for e in branches if e.device == "I"]
     resistors = [e for e in branches if e.device == "R"]
 
-    tree = Tree()
-    in_tree = [tree.add(e.nodes[0], e.nodes[1]) for e in voltages]
-    assert all(in_tree)
-    live = [tree.add(*cell.nodes) for cell in cells]
-    passive = [tree.add(e.nodes[0], e.nodes[1]) for e in resistors]
-    n_v, n_i, n_e, n_r = len(voltages), len(currents), len(voltages) + sum(live), sum(passive)
-    potential = tree.potentials()
+    n_v, n_i, n_c = len(voltages), len(currents), len(cells)
+    ends = [*(e.nodes for e in voltages), *(cell.nodes for cell in cells), *(e.nodes for e in resistors)]
+    taken, potential = spanning_tree(ends)
+    assert all(taken[:n_v])
+    live, n_e, n_r = taken[n_v : n_v + n_c], sum(taken[: n_v + n_c]), sum(taken[n_v + n_c :])
 
     def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
         """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between node pairs."""
@@ -217,23 +224,22 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
         rows([e.nodes for e in resistors]), rows([e.nodes for e in currents]), conductance, n_v, n_e
     )
     s, x, order = slice(0, n_v), slice(n_v, n_e), [*range(n_v, n_e), *range(n_v)]
-    through = np.zeros((n_v + n_i, len(cells)))
+    through = np.zeros((n_v + n_i, n_c))
     through[:n_v] = across[:, s].T + together @ across[:, x].T
-    names = list(tree.branches)
-    at_node = np.array([potential[name] for name in names]).reshape(len(names), n_e + n_r)
-    whole = at_node[:, :n_e] + at_node[:, n_e:] @ from_e
     written = {node: name for el in branches for node, name in zip(el.nodes, el.node_names, strict=True)}
-    shown = [i for i, name in enumerate(names) if name in written and name != "0"]
+    names = [node for node in potential if node in written and node != "0"]
+    at_node = rows([(name, "0") for name in names])
+    whole = at_node[:, :n_e] + at_node[:, n_e:] @ from_e
     return Network(
         sources=(*voltages, *currents), n_voltage=n_v, cells=tuple(cells),
-        layers=tuple(e for e in branches if e.spec.is_layer), live=tuple(i for i, taken in enumerate(live) if taken),
+        layers=tuple(e for e in branches if e.spec.is_layer), live=tuple(i for i, one in enumerate(live) if one),
         areas=areas, contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
         gaps=tuple(next((i for i, c in enumerate(cells) if c.element is a.gap), None) for a in areas),
-        p=np.ascontiguousarray(across[:, x]), q=np.hstack([across[:, s], np.zeros((len(cells), n_i))]),
+        p=np.ascontiguousarray(across[:, x]), q=np.hstack([across[:, s], np.zeros((n_c, n_i))]),
         k=into_e[x, x], b=np.hstack([into_e[x, s], into_i[x]]), through=through, delivered=delivered,
         resistor_factor=factor[:, x], resistor_factor_s=np.hstack([factor[:, s], np.zeros((len(resistors), n_i))]),
-        node_names=tuple(written[names[i]] for i in shown),
-        nodes=np.hstack([whole[shown][:, order], (at_node[:, n_e:] @ from_i)[shown]]),
+        node_names=tuple(written[name] for name in names),
+        nodes=np.hstack([whole[:, order], at_node[:, n_e:] @ from_i]),
     )  # fmt: skip
 
 
@@ -255,14 +261,13 @@ def _currents(
 ) -> tuple[FloatArray, ...]:
     """Eliminate the voltages of the tree's resistors: given its other voltages e = (s, x), they minimise the power.
 
-    `over_resistors` (n_resistor, n_e + n_r) and `over_currents` (n_i, n_e + n_r) are the voltages of all resistors and
-    current sources by those of the tree's branches: n_v voltage sources, capacitors, resistors; `conductance` is in S.
+    `over_resistors` and `over_currents` are the voltages of all resistors and current sources by those of the tree's
+    branches: n_v voltage sources, capacitors, resistors; `conductance` is in S.
 
-    Returned are the voltages of the tree's resistors by e (n_r, n_e) and by the currents of the current sources
-    (n_r, n_i); the currents into the cuts of the tree's sources and capacitors by both, (n_e, n_e) and (n_e, n_i); the
-    square roots of the power in each resistor by e (n_resistor, n_e), a factor f of these currents f^T f; the current
-    of each source (A) by x, s and the currents of the current sources (n_v + n_i, n_e + n_i); and the shares of the
-    capacitors' cuts (n_v, n) that are added to those of the voltage sources.
+    Returned are the voltages of the tree's resistors by e and by the currents of the current sources; the currents into
+    the cuts of the tree's sources and capacitors by both; the square roots of the power in each resistor by e, a factor
+    f of these currents f^T f; the current of each source by x, s and the currents of the current sources; and the
+    shares of the capacitors' cuts (n_v, n) that are added to those of the voltage sources.
 
     The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
     capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
@@ -401,32 +406,14 @@ def loop_network(stack: Stack) -> Network:
 # Linear response
 
 
-@dataclass(frozen=True)
-class LinearScene:
-    """The data of a circuit that the phasors of one of its contacts depend on."""
+class LinearScene(NamedTuple):
+    """A network with one source, and the contact whose phasors are wanted."""
 
     network: Network
     contact: Contact
     gap: int  # Index of the GAP among the layers
     finger: int  # Index of the GAP's area
     note: str  # Text that names the GAP if there are several; empty for one GAP
-    fixed: bool  # Whether the deck fixes the contact's area
-    fundamental: Fundamental | None  # Of the source
-    sources: tuple[tuple[Element, float], ...]  # Each with its sign along the loop of a stack; 1 in other networks
-    layers: tuple[str, ...]
-
-    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
-        """Areas at one frequency (Hz), m^2, shape (n_area,)."""
-        if not isinstance(area, str):
-            return np.full(len(self.network.areas), area)
-        return self.network.areas_at_rest if area == "frozen" else coupled_areas(self.network, f, amplitude)
-
-    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
-        """Ratio of each layer's voltage (from p to n) to the source's, shape (n_layer,)."""
-        network, stack = self.network, self.network.stack
-        if stack is None:
-            return np.asarray(network.grouping @ network.phasors(f, areas, np.ones(1, complex)))
-        return np.asarray(layer_gains(stack.admittance(f, areas))[0] * stack.sign[stack.first_cell])
 
 
 def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
@@ -449,20 +436,13 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     name = next(iter(gaps.values())) if finger is None else gaps[finger.lower()]
     # Every GAP drives an area: `find_branches` refuses two on one.
     place = next(i for i, area in enumerate(network.areas) if area.gap is not None and area.gap.name == name)
-    contact, area, stack = network.contacts[place], network.areas[place], network.stack
+    contact, gap = network.contacts[place], [e.name for e in network.layers].index(name)
     assert contact is not None
-    assert area.gap is not None
-    return LinearScene(
-        network, contact, network.layers.index(area.gap), finger=place, fixed=area.given is not None,
-        note=f"of several GAPs, {name}" if len(gaps) > 1 else "", fundamental=network.waveforms[0].fundamental,
-        sources=tuple((e, 1.0) for e in network.sources) if stack is None else stack.sources,
-        layers=tuple(e.name for e in network.layers),
-    )  # fmt: skip
+    return LinearScene(network, contact, gap, place, f"of several GAPs, {name}" if len(gaps) > 1 else "")
 
 
 def with_skin_held(circuit: Circuit) -> Circuit:
     """The circuit with each SKIN replaced by a SLAB that has the skin's data at the SKIN's own frequency."""
-
     held: dict[str, Element] = {}
     for skin in circuit.by_device("SKIN"):
         d, f = skin.values["d"], skin.values["f"]
@@ -476,25 +456,27 @@ def mean_areas(network: Network) -> FloatArray:
     if len(network.sources) > 1:
         what = "of one source at its fundamental, and this circuit has several sources"
     elif fundamental := network.waveforms[0].fundamental:
-        return coupled_areas(network, fundamental.frequency, fundamental.amplitude)
+        return phasor_areas(network, "mean", fundamental.frequency, fundamental.amplitude)
     else:
         what = "at the source's fundamental, and this source has none"
     raise InputError(f"area='mean' is the area of the phasor {what}; allowed: 'coupled', 'frozen' or an area in m^2")
 
 
-def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
-    """Areas under one source's amplitude (V or A) at one frequency (Hz), each at its gap's rms voltage."""
-    area = network.areas_at_rest
-    if all(a.given is not None for a in network.areas):
+def phasor_areas(network: Network, mode: str | float, f: float, amplitude: float) -> FloatArray:
+    """Areas under one source's amplitude (V or A) at one frequency (Hz), m^2, shape (n_area,).
+
+    They are those of the gaps' rms voltages, unless `mode` is ``frozen`` or one area in m^2.
+    """
+    area = network.areas_at_rest if isinstance(mode, str) else np.full(len(network.areas), mode)
+    if mode != "mean" or all(a.given is not None for a in network.areas):
         return area
-    stack, finger = network.stack, network.contacts[0]
+    stack, finger, s = network.stack, network.contacts[0], np.array([complex(amplitude)])
     if stack is not None and finger is not None:
 
         def gain(area: float) -> float:
             return float(np.abs(layer_gains(stack.admittance(f, area))[0, stack.gap_layer]))
 
         return np.array([coupled_area(lambda u: float(finger.area(u)), gain, amplitude)])
-    s = np.array([complex(amplitude)])
     for attempt in range(500):
         u, new = np.abs(network.phasors(f, area, s)), area.copy()
         for i, (contact, gap) in enumerate(zip(network.contacts, network.gaps, strict=True)):

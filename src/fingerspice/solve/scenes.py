@@ -117,25 +117,15 @@ class Scene:
         padded = np.zeros((count, max((c.size for c in curves), default=1)))
         for row, curve in zip(padded, curves, strict=True):
             row[: curve.size] = curve
-        cells = network.cells
+        constants = np.array([(c.c, c.g_total, c.g_area) for c in network.cells], float).reshape(-1, 3).T.copy()
+        place = np.array([-1 if c.area is None else c.area for c in network.cells], np.int64)
+        slow = np.where(tau > 0.0, np.cumsum(tau > 0.0) - 1, -1)
+        matrices = network.p, network.q, network.k, network.b, network.through, network.delivered
+        p, q, k, b, through, delivered = map(np.ascontiguousarray, matrices)
         return Net(
-            mobile=self.charge_law == "mobile",
-            p=np.ascontiguousarray(network.p),
-            q=np.ascontiguousarray(network.q),
-            c=np.array([c.c for c in cells], float),
-            g_total=np.array([c.g_total for c in cells], float),
-            g_area=np.array([c.g_area for c in cells], float),
-            place=np.array([-1 if c.area is None else c.area for c in cells], np.int64),
-            k=np.ascontiguousarray(network.k),
-            b=np.ascontiguousarray(network.b),
-            through=np.ascontiguousarray(network.through),
-            delivered=np.ascontiguousarray(network.delivered),
-            gap=gap,
-            area0=area0,
-            tau=tau,
-            slow=np.where(tau > 0.0, np.cumsum(tau > 0.0) - 1, -1),
-            curves=padded,
-        )
+            self.charge_law == "mobile", p, q, constants[0], constants[1], constants[2], place, k, b, through, delivered,
+            gap, area0, tau, slow, padded,
+        )  # fmt: skip
 
     @property
     def shown(self) -> Scene:
@@ -251,18 +241,15 @@ def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> flo
 
 def _fixed_areas(network: Network, area: str | float) -> tuple[tuple[float | None, ...], str]:
     """Each area (m^2), None for one that follows its gap, and the name of the area mode."""
-    given = [a.given for a in network.areas]
+    given = tuple(a.given for a in network.areas)
     if not isinstance(area, str):
         return (float(area),) * len(given), f"{area:g} m^2"
-    if not given:
-        return (), "none"
-    if all(x is not None for x in given):
-        return tuple(given), f"{given[0]:g} m^2 (from the deck)" if len(given) == 1 else "given by the deck"
+    if None not in given:
+        one = f"{given[0]:g} m^2 (from the deck)" if len(given) == 1 else "given by the deck"
+        return given, one if given else "none"
     if area == "coupled":
-        return tuple(given), area
-    if area == "mean":
-        return tuple(map(float, mean_areas(network))), area
-    return tuple(map(float, network.areas_at_rest)), area
+        return given, area
+    return tuple(map(float, mean_areas(network) if area == "mean" else network.areas_at_rest)), area
 
 
 def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
@@ -275,34 +262,20 @@ def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
         before: Model | None = stack.kept.get(("model", law))
         if before is not None:
             return before._replace(curve=curve)
-    order = list(stack.state_order)
+    order, n = list(stack.state_order), stack.c.size - 1
     probe = int(np.argmin(stack.c)) if stack.gap is None else stack.gap
-    k = stack.k[order]
-    leaks = stack.leak_rates(area0)
+    k, leaks = stack.k[order], stack.leak_rates(area0)
     slow = int(np.argmin(leaks))
-    rates, _, _, _ = modes(np.ascontiguousarray(leaks[order]), np.ascontiguousarray(k))
+    rates, _, _, _ = modes(leaks[order], k)
     fastest = float(rates.max(initial=0.0))
+    # Weights of the states in each cell's voltage beyond its share k U.
+    of_probe, of_slow = np.vstack([np.eye(n), np.full(n, -1.0)])[[order.index(probe), order.index(slow)]]
     model = Model(
-        mobile=law == "mobile",
-        coupled=fixed is None,
-        k=np.ascontiguousarray(k),
-        rate=np.ascontiguousarray((stack.g_area / stack.c)[order]),
-        rate0=np.ascontiguousarray((stack.g_total / stack.c)[order]),
-        k_gap=float(stack.k[probe]),
-        gap=_row(order, probe),
-        s=stack.s,
-        slow=np.append(_row(order, slow), [stack.k[slow], stack.c[slow], stack.g_area[slow], stack.g_total[slow]]),
-        area0=area0,
-        tau=1.0 / fastest if fastest > 0.0 else math.inf,
-        curve=curve,
-    )
+        mobile=law == "mobile", coupled=fixed is None, k=k, rate=(stack.g_area / stack.c)[order],
+        rate0=(stack.g_total / stack.c)[order], k_gap=float(stack.k[probe]), gap=of_probe, s=stack.s,
+        slow=np.append(of_slow, [stack.k[slow], stack.c[slow], stack.g_area[slow], stack.g_total[slow]]),
+        area0=area0, tau=1.0 / fastest if fastest > 0.0 else math.inf, curve=curve,
+    )  # fmt: skip
     if fixed is None:
         stack.kept["model", law] = model
     return model
-
-
-def _row(order: list[int], layer: int) -> FloatArray:
-    """Weights of the states in a cell's voltage beyond its share k U, shape (n_cell - 1,)."""
-    place = order.index(layer)
-    n = len(order) - 1
-    return np.full(n, -1.0) if place == n else np.eye(n)[place]
