@@ -13,9 +13,9 @@ MIL = 25.4e-6
 #: ...) are not among them, because SPICE takes that letter as the scale; nor is `a`, which elsewhere means atto.
 PLAIN_UNITS = frozenset(
     (
-        *("v", "vdc", "vac", "vpp", "volt", "volts", "h", "henry", "hz", "hertz", "o", "ohm", "ohms", "ω", "c", "°c"),
-        *("s", "sec", "second", "seconds", "w", "watt", "watts", "deg", "degree", "degrees", "rad", "radian"),
-        "radians",
+        *("v", "vdc", "vac", "vpp", "volt", "volts", "h", "henry", "hz", "hertz", "o", "ohm", "ohms", "ω"),
+        *("s", "sec", "second", "seconds", "c", "w", "watt", "watts"),
+        *("deg", "degree", "degrees", "rad", "radian", "radians", "°c"),
     )
 )
 

@@ -197,12 +197,9 @@ def check_outputs(circuit: Circuit, count: float) -> None:
     signals = sum(of_device.get(element.device, 0) + element.spec.is_layer for element in circuit.elements)
     signals += len({node for element in circuit.elements for node in element.nodes}) + 1
     size = 8.0 * signals * count
-    require(
-        size <= MOST_BYTES,
-        "the run",
-        f"one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB",
-        f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning",
-    )
+    told = f"one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB"
+    allowed = f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning"
+    require(size <= MOST_BYTES, "the run", told, allowed)
 
 
 def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
@@ -212,9 +209,8 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
     """
     if all(isinstance(wave, Samples | DC) for wave in problem.waveforms):
         return t
-    span = problem.t_start, problem.t_stop
+    span, moved = (problem.t_start, problem.t_stop), t
     windows = 1 + int((span[1] - span[0]) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
-    moved = t
     for w0, w1 in itertools.pairwise(span if windows == 1 else np.linspace(*span, windows + 1)):
         edges = problem.breakpoints() if windows == 1 else problem.waveform.breakpoints(w0, w1)
         reach = same_time(1.0) * np.abs(edges)
@@ -267,8 +263,7 @@ def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
         distance = np.minimum(np.abs(grid - at[near - 1]), np.abs(grid - at[np.minimum(near, at.size - 1)]))
         grid = grid[distance > 1e-9 * step]
     t = np.concatenate([grid, at, at])
-    left = np.zeros(t.size, bool)
-    left[grid.size : grid.size + at.size] = True
+    left = np.repeat([False, True, False], [grid.size, at.size, at.size])
     order = np.lexsort((~left, t))
     t, left = t[order], left[order]
     t.flags.writeable = left.flags.writeable = False
@@ -334,11 +329,10 @@ class Tables:
                 return
 
     def _tables(self, w0: float, w1: float) -> list[SourceTable]:
-        problem, shortest, tables = self.problem, shortest_event(self.problem), []
+        problem, tables = self.problem, []
+        make = partial(source_table, no_chirps=self.no_chirps, shortest=shortest_event(problem))
         for place, (wave, scale) in enumerate(zip(problem.waveforms, self.scales, strict=True)):
-            table = source_table(
-                wave, w0, w1, self.tol, problem.step, no_chirps=self.no_chirps, scale=scale, shortest=shortest
-            )
+            table = make(wave, w0, w1, self.tol, problem.step, scale=scale)
             if is_sampled(wave):
                 off = table.unseen(wave, problem.t_out, self.tol)
                 self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
@@ -347,19 +341,17 @@ class Tables:
 
     def peak(self) -> float:
         """Largest source voltage (V) of the run; of users' functions also between the samples that a scene knows."""
-        problem, n_voltage = self.problem, self.problem.network.n_voltage
+        problem = self.problem
         if not problem.scene.is_sampled:
             return problem.scene.u_peak or problem.waveform.peak(problem.t_start, problem.t_stop)
-        met = (table.scale for tables in self for table in tables[:n_voltage])
+        met = (table.scale for tables in self for table in tables[: problem.network.n_voltage])
         return max(met, default=0.0) or problem.scene.u_peak
 
 
 def shortest_event(problem: Problem) -> float:
     """Length (s) of the shortest event of a user's function that its samples surely meet."""
-    met = WIDEST * problem.step
-    if any(wave.kept.get("one by one") for wave in problem.waveforms):
-        return met
-    return min(met, (problem.t_stop - problem.t_start) / LOOKS)
+    one_by_one = any(wave.kept.get("one by one") for wave in problem.waveforms)
+    return min(WIDEST * problem.step, math.inf if one_by_one else (problem.t_stop - problem.t_start) / LOOKS)
 
 
 def joined(tables: list[SourceTable]) -> Sources:
@@ -367,10 +359,10 @@ def joined(tables: list[SourceTable]) -> Sources:
     if len(tables) == 1:
         (one,) = tables
         return Sources(np.array([0, one.edges.size]), one.edges, one.terms, one.series)
-    width = max(t.terms.shape[1] for t in tables), max(t.series.shape[1] for t in tables)
-    first = np.concatenate([[0], np.cumsum([t.edges.size for t in tables])]).astype(np.int64)
-    terms = [np.pad(t.terms, ((0, 0), (0, width[0] - t.terms.shape[1]), (0, 0))) for t in tables]
-    series = [np.pad(t.series, ((0, 0), (0, width[1] - t.series.shape[1]))) for t in tables]
+    most = max(t.terms.shape[1] for t in tables), max(t.series.shape[1] for t in tables)
+    first = np.cumsum([0, *(t.edges.size for t in tables)])
+    terms = [np.pad(t.terms, ((0, 0), (0, most[0] - t.terms.shape[1]), (0, 0))) for t in tables]
+    series = [np.pad(t.series, ((0, 0), (0, most[1] - t.series.shape[1]))) for t in tables]
     return Sources(first, np.concatenate([t.edges for t in tables]), np.concatenate(terms), np.concatenate(series))
 
 
@@ -395,10 +387,9 @@ def after_the_end(problem: Problem) -> Sources | None:
     if not any(breakpoints_at(wave, stop).size for wave in problem.waveforms):
         return None
 
-    def make() -> Sources:
-        return joined([source_table(w, stop, stop + problem.step, 1e-10, problem.step) for w in problem.waveforms])
-
-    return kept_with(problem.waveform.kept, ("after", stop, problem.step), 1, make)
+    key, step = ("after", stop, problem.step), problem.step
+    tables = (source_table(w, stop, stop + step, 1e-10, step) for w in problem.waveforms)
+    return kept_with(problem.waveform.kept, key, 1, lambda: joined(list(tables)))
 
 
 def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) -> IntArray:

@@ -123,8 +123,8 @@ class Scene:
         matrices = network.p, network.q, network.k, network.b, network.through, network.delivered
         p, q, k, b, through, delivered = map(np.ascontiguousarray, matrices)
         return Net(
-            self.charge_law == "mobile", p, q, constants[0], constants[1], constants[2], place, k, b, through, delivered,
-            gap, area0, tau, slow, padded,
+            self.charge_law == "mobile", p, q, constants[0], constants[1], constants[2], place, k, b, through,
+            delivered, gap, area0, tau, slow, padded,
         )  # fmt: skip
 
     @property

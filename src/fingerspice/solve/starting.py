@@ -191,16 +191,12 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
     if s is None and not u.any() and not np.any(net.slow >= 0):
         y, still = np.zeros(sum(network.b.shape)), np.zeros(len(network.sources))
         return State(0.0, y, still, np.zeros(len(network.areas)), scene.charge_law)
-    slow = (area / net.area0)[net.slow >= 0]
-    x: FloatArray = u[list(network.live)]
-    charge: FloatArray = np.zeros(len(network.sources))
+    slow, x, charge = (area / net.area0)[net.slow >= 0], u[list(network.live)], np.zeros(len(network.sources))
     rest, q = u - network.p @ x, network.q
-    if s is not None:
-        before = s
-    else:
+    before = np.zeros(q.shape[1]) if s is None else s
+    if s is None and q.size and np.any(rest):
         # The values that agree with the cell voltages in the least-squares sense.
-        fits = q.size and np.any(rest)
-        before = np.asarray(np.linalg.lstsq(q, rest, rcond=None)[0], float) if fits else np.zeros(q.shape[1])
+        before = np.asarray(np.linalg.lstsq(q, rest, rcond=None)[0], float)
     after = np.array([float(w.value(0.0)) for w in scene.waveforms])
     # The run itself reports a source that is not finite.
     after[~np.isfinite(after)] = 0.0
@@ -243,10 +239,7 @@ def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
     if stack.gap is None or not model.coupled:
         return split(model.area0)
     low, high = 0.0, abs(u_source)
-    for _ in range(200):
-        middle = 0.5 * (low + high)
-        if not low < middle < high:
-            break
+    while low < (middle := 0.5 * (low + high)) < high:
         more = abs(split(1.0 / inverse_area(middle, model.curve)[0])[stack.gap]) > middle
         low, high = (middle, high) if more else (low, middle)
     return split(1.0 / inverse_area(high, model.curve)[0])
@@ -273,24 +266,22 @@ def start_voltage(element: Element, initial: Mapping[str, float]) -> float:
 
 def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Element, ...]:
     """Voltage sources that hold the nodes of ``.ic`` (V) while the operating point is found."""
+    # Groups of nodes tied together by sources, with the voltage of each node above one of its group.
     tied: dict[str, dict[str, float]] = {}
     for element in circuit.by_device("V"):
-        # Groups of nodes tied together by sources, with the voltage of each node above one of its group.
         p, n = (tied.setdefault(node, {node: 0.0}) for node in element.nodes)
         assert element.waveform is not None
         shift = n[element.nodes[1]] + float(element.waveform.value(0.0, "left")) - p[element.nodes[0]]
         n.update({node: above + shift for node, above in p.items()})
         tied.update(dict.fromkeys(p, n))
-    out = []
-    done: set[str] = set()
+    out, done = list[Element](), {"0"}
     for node in initial:
         group = tied.get(node, {node: 0.0})
-        if node in done or "0" in group or node == "0":
-            continue
+        if node not in done and "0" not in group:
+            value = float(np.mean([initial[x] - group[x] for x in group if x in initial])) + group[node]
+            # This name contains characters that no netlist can contain, so that it cannot clash with an element's.
+            out.append(Element(f"v({node}) held", "V", (node, "0"), (node, "0"), MappingProxyType({}), DC(value)))
         done |= group.keys()
-        value = float(np.mean([initial[x] - group[x] for x in group if x in initial])) + group[node]
-        # This name contains characters that no netlist can contain, so that it cannot clash with an element's.
-        out.append(Element(f"v({node}) held", "V", (node, "0"), (node, "0"), MappingProxyType({}), DC(value)))
     return tuple(out)
 
 
@@ -301,15 +292,13 @@ def operating_point(
 
     The sources have their values at 0-, and the nodes in `initial` are held.
     """
-    contacts = [c if gap >= 0 else None for c, gap in zip(scene.network.contacts, scene.net.gap, strict=True)]
     conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in network.areas}
     held = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
     if held:
         network = build_network(replace(circuit, work="gap"), held)
     s = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
-    area = scene.area0.copy()
-    fixed = np.array([contact is None for contact in contacts], bool)
-    asked = np.array([a.node in initial for a in network.areas], bool) & ~fixed
+    area, follows = scene.area0.copy(), scene.net.gap >= 0
+    asked = np.array([a.node in initial for a in network.areas], bool) & follows
     area[asked] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, asked, strict=True) if mark]
     _refuse_floating_at_dc(network, area)
     part, before = 1.0, math.inf
@@ -318,8 +307,8 @@ def operating_point(
         x = np.linalg.solve(k, -b @ s) if k.size else np.zeros(0)
         u = network.p @ x + network.q @ s
         new = area.copy()
-        for i, (contact, gap) in enumerate(zip(contacts, network.gaps, strict=True)):
-            if contact is not None and gap is not None and not asked[i]:
+        for i, (contact, gap) in enumerate(zip(scene.network.contacts, network.gaps, strict=True)):
+            if contact is not None and gap is not None and follows[i] and not asked[i]:
                 new[i] = float(contact.area(abs(float(u[gap]))))
         off = float(np.max(np.abs(new / area - 1.0), initial=0.0))
         # The iteration has converged, or round-off lets it come no nearer.
@@ -340,14 +329,13 @@ def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
     size = np.linalg.norm(factor, axis=0)
     _, sigma, turned = np.linalg.svd(factor / np.where(size > 0.0, size, 1.0))
     rank = int(np.count_nonzero(sigma > 1e-12 * max(1.0, sigma.max(initial=0.0))))
-    if rank == factor.shape[1]:
-        return
-    held = np.abs(network.p @ turned[rank:].T).max(axis=1) > 1e-9
-    names = dict.fromkeys(c.element.name for c, mark in zip(network.cells, held, strict=True) if mark)
-    raise InputError(
-        f"no DC operating point: {' and '.join(names)} leave nodes that are reached by capacitors only; allowed: a "
-        "leakage (r=... or an R), or uic in .tran to start uncharged"
-    )
+    if rank < factor.shape[1]:
+        held = np.abs(network.p @ turned[rank:].T).max(axis=1) > 1e-9
+        names = dict.fromkeys(c.element.name for c, mark in zip(network.cells, held, strict=True) if mark)
+        raise InputError(
+            f"no DC operating point: {' and '.join(names)} leave nodes that are reached by capacitors only; allowed: a "
+            "leakage (r=... or an R), or uic in .tran to start uncharged"
+        )
 
 
 def at_own_area(u: float, area: float, curve: FloatArray) -> float:
@@ -363,8 +351,7 @@ def at_own_area(u: float, area: float, curve: FloatArray) -> float:
         low, high = high, 1.05 * high
         if high > 100.0 * abs(u):
             raise InputError(f"the start has {u:.4g} V across a gap of {area * 1e6:.4g} mm^2, {PAST_FOLD}")
-    while low < 0.5 * (low + high) < high:
-        middle = 0.5 * (low + high)
+    while low < (middle := 0.5 * (low + high)) < high:
         low, high = (middle, high) if charge(middle) < wanted else (low, middle)
     return math.copysign(high, u)
 
