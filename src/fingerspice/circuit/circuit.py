@@ -51,9 +51,8 @@ class Element:
 
     name: str  # As written; of an element of a subcircuit with its path, as in ``Xfinger.Xgap``
     device: str  # Entry of `DEVICES`
-    # nodes, node_names: Nodes in lower case with ground as ``0``, and the same nodes as written
-    nodes: tuple[str, ...]
-    node_names: tuple[str, ...]
+    nodes: tuple[str, ...]  # In lower case, with ground as ``0``
+    node_names: tuple[str, ...]  # As written
     values: Mapping[str, float]  # Value of every parameter of the device, in the netlist's unit
     waveform: Waveform | None = None  # Of a source
     initial: float | None = None  # ``IC=`` of a capacitor, V
@@ -283,19 +282,17 @@ class Circuit(Shown):
         elements = {e.name.lower(): e for e in self.elements}
         overrides, traps = dict(self.overrides), dict[str, str]()
         for path, value in changes.items():
-            name, _, parameter = path.lower().rpartition(".")
-            if path.lower() in elements and elements[path.lower()].device in "VI":
-                if isinstance(value, str):
-                    from fingerspice.netlist.netlist import source_from_text
+            key = path.lower()
+            name, _, parameter = key.rpartition(".")
+            if key in elements and elements[key].device in "VI":
+                from fingerspice.netlist.netlist import source_from_text
 
-                    waveform = source_from_text(value, self)
-                else:
-                    waveform = as_waveform(value)
+                waveform = source_from_text(value, self) if isinstance(value, str) else as_waveform(value)
                 # The AC magnitude belonged to the source that is replaced.
-                elements[path.lower()] = dataclasses.replace(elements[path.lower()], waveform=waveform, ac=None)
+                elements[key] = dataclasses.replace(elements[key], waveform=waveform, ac=None)
             elif name in elements:
                 elements[name], trap = _changed(elements[name], parameter, value, path)
-                traps |= {path.lower(): trap} if trap else {}
+                traps |= {key: trap} if trap else {}
             else:
                 raise InputError(self._unknown_path(path))
             overrides[path] = value if isinstance(value, str) else getattr(value, "__name__", str(value))

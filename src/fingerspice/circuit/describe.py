@@ -98,11 +98,10 @@ def waveform_text(waveform: Waveform, unit: str = "V") -> str:
     said += [waveform_text(waveform.waveform, unit)] if isinstance(waveform, Burst | Repeat) else []
     for field in dataclasses.fields(waveform):  # type: ignore[arg-type]
         value = getattr(waveform, field.name)
-        if field.name not in waveform.units or value == field.default:
-            continue
-        text = shown(value, waveform.units[field.name].replace("V", unit))
-        # A required figure is known by its position; one that has a default needs its name.
-        said.append(text if field.default is dataclasses.MISSING else f"{field.name} {text}")
+        if field.name in waveform.units and value != field.default:
+            # A required figure is known by its position; one that has a default needs its name.
+            name = "" if field.default is dataclasses.MISSING else f"{field.name} "
+            said.append(name + shown(value, waveform.units[field.name].replace("V", unit)))
     return f"{type(waveform).__name__}({', '.join(said)})"
 
 
@@ -175,13 +174,11 @@ def circuit_page(circuit: Circuit) -> Page:
 
 def values_text(element: Element) -> str:
     """Values of an element in the units of the netlist, without those that are infinite, and its waveform."""
-    said = [f"{name}={_deck_value(value)}" for name, value in element.values.items() if math.isfinite(value)]
+    said = []
+    for name, value in element.values.items():
+        text = f"{value:.4g}" if 0.01 <= abs(value) < 1e4 else format_si(value, "").replace(" ", "").replace("M", "meg")
+        said += [f"{name}={text}"] if math.isfinite(value) else []
     return " ".join(said if element.waveform is None else [*said, _own_text(element)])
-
-
-def _deck_value(value: float) -> str:
-    """A number as written in decks: ``3.5u``, ``0.2meg``, ``0.3``."""
-    return f"{value:.4g}" if 0.01 <= abs(value) < 1e4 else format_si(value, "").replace(" ", "").replace("M", "meg")
 
 
 def _joined(said: list[str]) -> str:
@@ -458,7 +455,7 @@ def energy_outside(waveform: Waveform, t_stop: float, band: tuple[float, float] 
     f, energy = (_recorded(waveform, t_stop) if slow else None) or _energies(waveform, t_stop, high)
     total = float(energy.sum())
     # The window spreads a line over the neighbouring bins, so one bin below the band counts as inside.
-    below = f < low - (0.0 if waveform.period is not None else f[1] if f.size > 1 else 0.0)
+    below = f < low - (f[1] if waveform.period is None and f.size > 1 else 0.0)
     return (float(energy[below].sum() / total), float(energy[f > high].sum() / total)) if total > 0.0 else (0.0, 0.0)
 
 
@@ -467,8 +464,7 @@ def is_near(waveform: Waveform, t_stop: float, frequency: float) -> bool:
 
     In that band the skin's data change by 3 %.
     """
-    found = _recorded(waveform, t_stop)
-    if found is not None:
+    if (found := _recorded(waveform, t_stop)) is not None:
         # A coarse look at a recording suffices if it finds a fifth of the energy more than half an octave away.
         (f, energy), blurred = found, 2.0 * found[0][1]
         far = (f < frequency / 1.4 - blurred) | (f > 1.4 * frequency + blurred)
@@ -513,17 +509,14 @@ def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str
     skins = circuit.by_device("SKIN_DISPERSIVE")
     if not skins or not (math.isfinite(t_stop) and t_stop > 0.0):
         return None
-    end, below, above = waveform.kept.get("outside", (None, 0.0, 0.0))
+    end, shares = waveform.kept.get("outside", (None, ()))
     if end != t_stop:
-        below, above = energy_outside(waveform, t_stop)
-        waveform.kept["outside"] = t_stop, below, above
-    parts = [
-        f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}"
-        for share, where in ((below, f"below {SKIN_BAND[0]:g} Hz"), (above, f"above {SKIN_BAND[1] / 1e3:g} kHz"))
-        if share > NOTABLE
-    ]
-    where = f"lie outside the band of the data behind {skins[0].name}"
-    return f"of the source's energy {' and '.join(parts)} {where}" if parts else None
+        _, shares = waveform.kept["outside"] = t_stop, energy_outside(waveform, t_stop)
+    ends = f"below {SKIN_BAND[0]:g} Hz", f"above {SKIN_BAND[1] / 1e3:g} kHz"
+    found = [(share, where) for share, where in zip(shares, ends, strict=True) if share > NOTABLE]
+    parts = " and ".join(f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}" for share, where in found)
+    told = f"of the source's energy {parts} lie outside the band of the data behind {skins[0].name}"
+    return told if found else None
 
 
 def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity: float, t_stop: float) -> float:
@@ -541,10 +534,6 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     lines = np.fft.rfft(u, 2 * u.size)
     f = np.arange(1, lines.size) / (2.0 * span)
     gains = [layer_gains(stack.admittance(f, np.array([area])))[:, gap] for stack in (dispersive, frozen)]
-    right, missed = (
-        np.fft.irfft(np.concatenate([[0.0], gain * lines[1:]]))[: u.size] for gain in (gains[0], gains[1] - gains[0])
-    )
-    peak = float(np.abs(right).max())
-    if not (peak > 0.0 and math.isfinite(peak)):
-        return math.inf
-    return float(np.abs(missed).max()) / peak + COUPLING * sensitivity
+    responses = (np.append(0.0, gain * lines[1:]) for gain in (gains[0], gains[1] - gains[0]))
+    peak, missed = (float(np.abs(np.fft.irfft(one)[: u.size]).max()) for one in responses)
+    return missed / peak + COUPLING * sensitivity if peak > 0.0 and math.isfinite(peak) else math.inf

@@ -33,10 +33,8 @@ _MILLIONS = {"mm^2": (6, -6), "mm^2/N^m": (6, -6), "mm^4/N^2": (12, -12)}
 
 @dataclass(frozen=True)
 class Usual:
-    """Usual range of a quantity, both ends included."""
+    """Usual range of the size of a quantity, both ends included; 0 and inf mean "none" and cause no warning."""
 
-    # least, most: Smallest and largest usual size of the quantity, in its unit. 0 and inf mean "none" and cause no
-    # warning.
     least: float
     most: float
     source: str  # Origin of the range, as words to stand in brackets
@@ -44,8 +42,7 @@ class Usual:
 
     def warning(self, what: str, value: float, unit: str) -> str | None:
         """The warning about a value of `what`, such as ``Xgap d``, outside the range; None for a value inside."""
-        size = abs(value)
-        if size == 0.0 or not math.isfinite(size) or self.least <= size <= self.most:
+        if abs(value) in (0.0, math.inf) or math.isnan(value) or self.least <= abs(value) <= self.most:
             return None
         ends = f"{shown(self.least, unit if unit in _PREFIXED else '')} to {shown(self.most, unit)}"
         said = f"{what} is {shown(value, unit)}, outside {ends}, the usual range ({self.source})"
@@ -83,8 +80,7 @@ class ParameterSpec:
     first: bool = False  # Whether the explorer's page shows it at once: the paper varies it, or Table 1 gives it
     may_be_zero: bool = False
     may_be_infinite: bool = False
-    # least, most: Range of all other numbers: wide enough for any device, and so narrow that products and quotients do
-    # not overflow
+    # Range of all other numbers: wide enough for any device, and so narrow that products and quotients do not overflow
     least: float = 1e-30
     most: float = 1e30
 
@@ -145,10 +141,8 @@ def _skin_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
 
 
 def _dispersive_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
-    if at is None:
-        eps_r, rho = SKIN_LADDER.cells()
-    else:
-        eps_r, rho = SKIN_LADDER.permittivity([at]), SKIN_LADDER.resistivity([at])
+    whole = SKIN_LADDER
+    eps_r, rho = whole.cells() if at is None else (whole.permittivity([at]), whole.resistivity([at]))
     return _cells(np.divide.outer(EPS0 * eps_r, v["d"]), 0.0, 1.0 / np.multiply.outer(rho, v["d"]))
 
 
@@ -262,10 +256,8 @@ def beyond_fingers(where: str, force: float, pressure: float, area: float) -> It
     """Warnings about largest values of a run (N, Pa and m^2) that no finger can have; `where` may be `` of Xgap``."""
     for value, (what, largest, unit, reason) in zip((force, pressure, area), _LARGEST, strict=True):
         if value > largest:
-            yield (
-                f"the {what}{where} reaches {shown(value, unit)}, over {shown(largest, unit)} ({reason}): some value "
-                "is probably in another unit"
-            )
+            reached = f"the {what}{where} reaches {shown(value, unit)}, over {shown(largest, unit)} ({reason})"
+            yield f"{reached}: some value is probably in another unit"
 
 
 # Units whose letter SPICE reads as a scale factor, with their names, and how SPICE reads them.
@@ -311,11 +303,10 @@ def unusual_of_changed(before: Circuit, after: Circuit) -> tuple[dict[str, str],
 
 def concerns(warning: str, changes: Mapping[str, Any]) -> bool:
     """Whether a warning of the reader is about the notation of a value that `changes` now replaces."""
-    subjects = list[str]()
+    subjects = set[str]()
     for path in map(str.lower, changes):
-        name, _, parameter = path.rpartition(".")
         # A warning that names only the source may be about its frequency.
-        subjects += [path, f"{name} {parameter}", *([name] if parameter == "frequency" else [])]
+        subjects |= {path, " ".join(path.rsplit(".", 1)), path.removesuffix(".frequency")}
     return any(f": {subject}: " in warning.lower() for subject in subjects)
 
 
@@ -336,14 +327,12 @@ def _check_element(element: Element) -> None:
     if element.device != "GAP":
         return
     m, n, fault = v["m_exp"], v["n_exp"], ""
-    loss = math.sqrt(v["c2"]) * v["mu"] * v["fn"]
+    loss, exponents = math.sqrt(v["c2"]) * v["mu"] * v["fn"], f"m_exp={m:g}, n_exp={n:g}"
     if not 0.0 < m < n:
-        fault = f"exponents are m_exp={m:g}, n_exp={n:g}; allowed: 0 < m_exp < n_exp"
-    elif not 1.0 / m + 1.0 / n > 1.0:
-        fault = (
-            f"exponents m_exp={m:g}, n_exp={n:g} give 1/m + 1/n = {1 / m + 1 / n:.4g}; allowed: more than 1 (else Eq. "
-            "4 has no single root)"
-        )
+        fault = f"exponents are {exponents}; allowed: 0 < m_exp < n_exp"
+    elif not (total := 1.0 / m + 1.0 / n) > 1.0:
+        allowed = "more than 1 (else Eq. 4 has no single root)"
+        fault = f"exponents {exponents} give 1/m + 1/n = {total:.4g}; allowed: {allowed}"
     elif v["a_fix"] == 0.0 and not (area := v["alpha"] * v["fn"] ** m) > loss:
         hint = "".join(f"; note {text}" for _, text in unusual(element))
         fault = (

@@ -47,18 +47,14 @@ _ROUNDING = 1e-13
 
 
 class Cell(NamedTuple):
-    """A capacitor with its parallel leak: a C, a layer, or one of the slabs of a dispersive layer.
-
-    The capacitance is `c` times the area, and the leak is `g_area` times the area plus `g_total`; a cell without an
-    area has the capacitance `c`.
-    """
+    """A capacitor with its parallel leak: a C, a layer, or one of the slabs of a dispersive layer."""
 
     element: Element
     nodes: tuple[str, str]
-    c: float
-    g_total: float
-    g_area: float
     area: int | None
+    c: float  # Capacitance, F; with an area per area, F/m^2
+    g_total: float
+    g_area: float  # The leak is this times the area plus `g_total`
 
 
 @dataclass(frozen=True)
@@ -90,8 +86,7 @@ class Network:
     resistor_factor_s: FloatArray
     node_names: tuple[str, ...]
     nodes: FloatArray  # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources
-    # The series stack if this is its network (see `loop_network`): modes and phasors are then computed from it, to full
-    # relative precision
+    # The series stack if this is its network: modes and phasors are then computed from it, to full relative precision
     stack: Stack | None = None
     # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
     kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
@@ -139,10 +134,10 @@ class Network:
         """Leakage conductance of every cell at areas (n_area,) in m^2, S, shape (n_cell,)."""
         return np.array([c.g_total + (0.0 if c.area is None else c.g_area * area[c.area]) for c in self.cells])
 
-    def stiffness(self, area: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Matrices of the currents into the cuts from x (n, n) and from s (n, n_s), S, the leaks included."""
-        leak = self.leak(area)[:, None]
-        return self.k + self.p.T @ (leak * self.p), self.b + self.p.T @ (leak * self.q)
+    def stiffness(self, y: ArrayLike) -> tuple[Any, Any]:
+        """Matrices of the currents into the cuts from x (..., n, n) and s (..., n, n_s), S, at y (..., n_cell), S."""
+        y = np.asarray(y)[..., None]
+        return self.k + self.p.T @ (y * self.p), self.b + self.p.T @ (y * self.q)
 
     def admittances(self, frequency: ArrayLike, area: FloatArray) -> ComplexArray:
         """Complex admittance of every cell at frequencies (Hz), with SKIN's data there, S, shape (..., n_cell)."""
@@ -159,9 +154,8 @@ class Network:
 
     def _live(self, y: ComplexArray, s: ComplexArray) -> ComplexArray:
         """Phasors of the live voltages (..., n) for cells of the admittances y (..., n_cell)."""
-        y = y[..., None]
-        driven = (self.b + self.p.T @ (y * self.q)) @ s
-        return np.asarray(np.linalg.solve(self.k + self.p.T @ (y * self.p), -driven[..., None])[..., 0])
+        k, b = self.stiffness(y)
+        return np.asarray(np.linalg.solve(k, -(b @ s)[..., None])[..., 0])
 
     def node_phasors(self, frequency: float, area: FloatArray, s: ComplexArray) -> ComplexArray:
         """Node voltages (n_node,) at a frequency (Hz) and areas (n_area,) in m^2 for source phasors s (n_s,)."""
@@ -178,13 +172,12 @@ class Network:
     def impedance(self, frequency: float, area: FloatArray) -> complex:
         """Voltage of the one source over the current that it delivers, at a frequency (Hz), ohm."""
         one, y = np.ones(1, complex), self.admittances(frequency, area)
-        x = self._live(y, one)
-        both = np.concatenate([x, one])
         if self.n_voltage:
-            current = self.through[0] @ (y * (self.p @ x + self.q @ one)) + self.delivered[0] @ both
+            x = self._live(y, one)
+            current = self.through[0] @ (y * (self.p @ x + self.q @ one)) + self.delivered[0] @ np.append(x, one)
             return complex(1.0 / current) if current != 0.0 else complex(np.inf)
-        source, at = self.sources[0], dict(zip(self.node_names, self.node_phasors(frequency, area, one), strict=True))
-        p, n = (at.get(name, 0.0) for name in source.node_names[:2])
+        at = dict(zip(self.node_names, self.node_phasors(frequency, area, one), strict=True))
+        p, n = (at.get(name, 0.0) for name in self.sources[0].node_names[:2])
         return complex(n - p)
 
 
@@ -193,8 +186,8 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
 
     The voltage sources in `held` are added, to hold the voltages of nodes; they may close no loop of voltage sources.
     """
-    areas, branches = find_branches(circuit)
-    branches = [*branches, *held]
+    areas, carrying = find_branches(circuit)
+    branches = [*carrying, *held]
     if circuit.work == "total" and any(area.gap for area in areas):
         raise InputError(
             ".options work=total holds the voltage across a series stack, and this circuit is none; allowed: work=gap"
@@ -203,10 +196,7 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     cells = [cell for e in branches for cell in _cells(e, place)]
     # The gaps come first, so that the tree contains them and their voltages are states.
     cells.sort(key=lambda cell: cell.element.device != "GAP")
-    voltages = [e for e in branches if e.device == "V"]
-    currents = [e for e in branches if e.device == "I"]
-    resistors = [e for e in branches if e.device == "R"]
-
+    voltages, currents, resistors = ([e for e in branches if e.device == device] for device in "VIR")
     n_v, n_i, n_c = len(voltages), len(currents), len(cells)
     ends = [*(e.nodes for e in voltages), *(cell.nodes for cell in cells), *(e.nodes for e in resistors)]
     taken, potential = spanning_tree(ends)
@@ -246,14 +236,11 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
 def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
     a, b, *area = element.nodes
     if element.device == "C":
-        return [Cell(element, (a, b), element.values["value"], 0.0, 0.0, None)]
+        return [Cell(element, (a, b), None, element.values["value"], 0.0, 0.0)]
     constants = layer_constants(element).tolist() if area else []
     # The nodes between the slabs of a dispersive layer have names that no netlist can write.
     path = [a, *(f"{element.name.lower()} {i}" for i in range(1, len(constants))), b]
-    return [
-        Cell(element, ends, c, g_total, g_area, place[area[0]])
-        for (c, g_total, g_area), ends in zip(constants, pairwise(path), strict=False)
-    ]
+    return [Cell(element, ends, place[area[0]], *own) for own, ends in zip(constants, pairwise(path), strict=False)]
 
 
 def _currents(
@@ -310,26 +297,22 @@ def network_modes(network: Network, area: FloatArray) -> Modes:
     The rates are squares of the singular values of the conductance matrix's factor, not eigenvalues of the matrix: so a
     slow mode beside a fast one has its rate, and its drive by the sources, with twice as many digits.
     """
-    capacitance, leak = network.capacitance(area), network.leak(area)
-    n, n_v = network.k.shape[0], network.n_voltage
-    lower = np.linalg.cholesky(network.p.T @ (capacitance[:, None] * network.p))
-    weight = np.sqrt(leak)[:, None]
+    capacitance, weight = network.capacitance(area)[:, None], np.sqrt(network.leak(area))[:, None]
+    (n, n_s), n_v = network.b.shape, network.n_voltage
+    lower = np.linalg.cholesky(network.p.T @ (capacitance * network.p))
     factor = np.vstack([network.resistor_factor, weight * network.p])
     factor_s = np.vstack([network.resistor_factor_s, weight * network.q])
     left, sigma, turned = np.linalg.svd(np.linalg.solve(lower, factor.T).T)
-    rates = np.zeros(n)
+    rates, pushed = np.zeros(n), np.zeros((n, n_s))
     rates[: sigma.size] = sigma**2
     # The computed rate of a charge that no conductance drains is round-off.
     rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0
-    inverse = turned @ lower.T
     take = turned @ np.linalg.solve(lower, network.p.T)
-    moved = take @ (capacitance[:, None] * network.q)
-    pushed = np.zeros((n, network.b.shape[1]))
+    moved, shape = take @ (capacitance * network.q), np.linalg.solve(lower.T, turned.T)
     pushed[: sigma.size] = sigma[:, None] * (left[:, : sigma.size].T @ factor_s)
     pushed[:, n_v:] += turned @ np.linalg.solve(lower, network.b[:, n_v:])
-    shape = np.linalg.solve(lower.T, turned.T)
     gains = rates[:, None] * moved - pushed
-    return Modes(*(np.asarray(x, float) for x in (rates, gains, shape, inverse, shape @ moved, take)))
+    return Modes(*(np.asarray(x, float) for x in (rates, gains, shape, turned @ lower.T, shape @ moved, take)))
 
 
 # Networks of circuits
@@ -388,10 +371,7 @@ def loop_network(stack: Stack) -> Network:
             row[n] += 1.0
         rows.append(row.copy())
     gap = None if stack.gap_layer is None else stack.layers[stack.gap_layer]
-    cells = [
-        Cell(stack.layers[i], ("1", "0"), c, g_total, g_area, 0)
-        for i, (c, g_total, g_area) in zip(of_layer, constants, strict=True)
-    ]
+    cells = [Cell(stack.layers[i], ("1", "0"), 0, *own) for i, own in zip(of_layer, constants, strict=True)]
     return Network(
         sources=(_source(stack),), n_voltage=1, cells=tuple(cells), layers=stack.layers, live=tuple(range(n)),
         areas=(Area(stack.layers[0].nodes[2], gap, stack.area_given),), contacts=(stack.contact,),

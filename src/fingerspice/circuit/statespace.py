@@ -132,8 +132,7 @@ def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
     for start in at["0"]:
         hops, node, element = list[Hop](), "0", start
         while not hops or node != "0":
-            if hops:
-                element = next(e for e in at[node] if e is not element)
+            element = next(e for e in at[node] if e is not element) if hops else start
             end = 1 if element.nodes[0] == node else 0
             node = element.nodes[end]
             hops.append(Hop(element, 1.0 if end else -1.0, element.node_names[end]))
@@ -153,8 +152,7 @@ def count_of(circuit: Circuit) -> int:
 
 
 def _areas(circuit: Circuit) -> tuple[Area, ...]:
-    layers = [e for e in circuit.elements if e.spec.is_layer]
-    owners: dict[str, Element] = {}
+    layers, owners = [e for e in circuit.elements if e.spec.is_layer], dict[str, Element]()
     for gap in circuit.by_device("GAP"):
         node = gap.nodes[2]
         if node in owners:
@@ -167,11 +165,9 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
         on_node = list({id(e): e for e in at.get(node, ())}.values())
         owner = owners.get(node)
         if owner is not None and on_node:
-            raise InputError(
-                f"{on_node[0].name} and {owner.name} both drive the area node {owner.node_names[2]!r}, which is a "
-                f"signal; allowed: a_fix= on {owner.name} for a given area, another node for what carries current",
-                on_node[0].where,
-            )
+            both = f"{on_node[0].name} and {owner.name} both drive the area node {owner.node_names[2]!r}"
+            allowed = f"a_fix= on {owner.name} for a given area, another node for what carries current"
+            raise InputError(f"{both}, which is a signal; allowed: {allowed}", on_node[0].where)
         if owner is None and len(on_node) != 1:
             what = f"node {layer.node_names[2]!r} gives {layer.name} its area, but "
             what += "more than one source drives it" if on_node else "no GAP and no DC source drives it"
@@ -200,15 +196,13 @@ def _incidence(branches: list[Element]) -> dict[str, list[Element]]:
 
 def _ways(branches: list[Element], start: str) -> dict[str, Element | None]:
     """The element by which one gets to each node that is connected to the start."""
-    at = _incidence(branches)
+    at, ahead = _incidence(branches), [start]
     came: dict[str, Element | None] = {start: None}
-    ahead = [start]
     while ahead:
         for element in at.get(ahead.pop(), ()):
-            for node in element.nodes[:2]:
-                if node not in came:
-                    came[node] = element
-                    ahead.append(node)
+            new = [node for node in element.nodes[:2] if node not in came]
+            came.update(dict.fromkeys(new, element))
+            ahead += new
     return came
 
 
@@ -270,8 +264,7 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
     reached = _ways(branches, "0")
     for node, (e, *_) in at.items():
         if node not in reached:
-            what = f"node {named(node, e)} ({e.name})"
-            raise InputError(f"{what} is floating: nothing connects it to ground", e.where)
+            raise InputError(f"node {named(node, e)} ({e.name}) is floating: nothing connects it to ground", e.where)
     voltages = [e for e in branches if e.device == "V"]
     taken, _ = spanning_tree(e.nodes for e in voltages)
     if not all(taken):
@@ -288,9 +281,8 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
     for source, node in ((e, node) for e in branches if e.device == "I" for node in e.nodes[:2]):
         if node not in reached:
             where = f"node {named(node, source)} is reached through current sources only"
-            allowed = "an R, C or layer that takes the current to ground"
-            problem = f"{source.name} is a current source without a path: {where}; allowed: {allowed}"
-            raise InputError(problem, source.where)
+            problem = f"{source.name} is a current source without a path: {where}; allowed: an R, C or layer that takes"
+            raise InputError(f"{problem} the current to ground", source.where)
 
 
 # Series stacks
@@ -298,22 +290,18 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
 
 @dataclass(frozen=True)
 class Stack:
-    """Layers in one series loop with an ideal source, sharing one area. SI throughout.
-
-    A layer is one cell, which is a capacitor parallel to a resistor, or, for a dispersive material, several in series.
-    """
+    """Layers in one series loop with an ideal source, sharing one area, each of one or several cells. SI throughout."""
 
     layers: tuple[Element, ...]  # In loop order, from the source's positive side
-    # Number of cells of each layer; the arrays below list the cells of a layer one after the other
-    cells: tuple[int, ...]
-    # (n_cell,): +1 for a layer whose p node comes first along the loop, -1 for a layer whose n node does
-    sign: FloatArray
+    cells: tuple[int, ...]  # Number of cells of each layer, which the arrays list one after the other
+    sign: FloatArray  # (n_cell,): +1 for a layer whose p node comes first along the loop, -1 for the others
     # c, g_total, g_area (n_cell,): Capacitance per area, F/m^2; leakage conductance independent of the area, S, and
     # per area, S/m^2
     c: FloatArray
     g_total: FloatArray
     g_area: FloatArray
     gap: int | None  # Index of the gap among the cells
+    gap_layer: int | None  # Index of the gap among the layers
     contact: Contact | None
     area_given: float | None  # Area fixed by the deck, m^2
     hops: tuple[Hop, ...]  # The elements of the loop in order, from ground to ground
@@ -329,11 +317,6 @@ class Stack:
     def first_cell(self) -> NDArray[np.intp]:
         """Index of the first cell of each layer."""
         return np.concatenate([[0], np.cumsum(self.cells)[:-1]]).astype(np.intp)
-
-    @property
-    def gap_layer(self) -> int | None:
-        """Index of the gap among the layers."""
-        return None if self.gap is None else int(self.layer_of[self.gap])
 
     def layers_of(self, cells: NDArray[np.bool_]) -> list[str]:
         """Names of the layers that have at least one marked cell."""
@@ -403,9 +386,8 @@ class Stack:
         return np.asarray(y)
 
 
-def skin_admittance(skin: Element, frequency: FloatArray, area: FloatArray) -> ComplexArray:
+def skin_admittance(skin: Element, f: FloatArray, area: FloatArray) -> ComplexArray:
     """Complex admittance of a SKIN with its data at each frequency (Hz), S; `area` (m^2) is broadcast."""
-    f = frequency
     per_area = 1.0 / skin_resistivity(f) + 2j * math.pi * f * EPS0 * skin_permittivity(f)
     return np.asarray(per_area * area / skin.values["d"])
 
@@ -431,11 +413,8 @@ def contact_of(gap: Element) -> Contact:
             contact = Contact(v["d"], v["eps_r"], v["fn"], v["mu"], alpha, v["m_exp"], beta, v["n_exp"], c2)
             if np.all(np.isfinite(contact.packed)):
                 return contact
-        raise InputError(
-            f"{gap.name} has a contact whose constants are beyond the range of numbers; allowed: fn, alpha, m_exp, "
-            "beta, n_exp nearer to Table 1's",
-            gap.where,
-        )
+        what = f"{gap.name} has a contact whose constants are beyond the range of numbers"
+        raise InputError(f"{what}; allowed: fn, alpha, m_exp, beta, n_exp nearer to Table 1's", gap.where)
 
     return gap.remember("contact", make)
 
@@ -459,14 +438,15 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
         parts = [layer_constants(e, skin_at) for e in layers]
         cells = tuple(map(len, parts))
         c, g_total, g_area = np.concatenate(parts).T
-        contact, gap = None, None
+        contact, gap, gap_layer = None, None, None
         if area.gap is not None:
-            contact, gap = contact_of(area.gap), sum(cells[: layers.index(area.gap)])
+            contact, gap_layer = contact_of(area.gap), layers.index(area.gap)
+            gap = sum(cells[:gap_layer])
             if circuit.work == "total":
                 d = np.repeat([e.values["d"] for e in layers], cells)
                 contact = contact.with_total_voltage_held(d, c * d / EPS0)
         sign = np.repeat([hop.sign for hop in along], cells)
-        return Stack(layers, cells, sign, c, g_total, g_area, gap, contact, area.given, hops)
+        return Stack(layers, cells, sign, c, g_total, g_area, gap, gap_layer, contact, area.given, hops)
 
     def make() -> Stack:
         loop = loop_of(circuit)

@@ -43,17 +43,14 @@ from fingerspice.solve.runs import (
     nodes_apart,
 )
 
-# Stages of a run and of the coarser run, and the ratio of the coarser run's tolerance to the run's. The stated error is
-# the difference of the two runs. They need different orders as well: where edges or zeros cut the steps short, both
-# runs take the same steps, whatever their tolerances.
+# Stages of a run and of the coarser run, and the ratio of the coarser run's tolerance to the run's. They need different
+# orders as well: where edges or zeros cut the steps short, both runs take the same steps, whatever their tolerances.
 STAGES, STAGES_BESIDE, BESIDE = 7, 5, 10.0
-# Residual of Newton's method that both runs may have in common, and their difference does not show, as a fraction of
-# the step tolerance.
-ALIKE = 0.05
+# Residual of Newton's method that both runs may have in common, as a fraction of the step tolerance; and the longest
+# step, relative to the shortest time scale of the sources, which its stages must not alias.
+ALIKE, LONGEST_STEP = 0.05, 0.5
 # Error allowed in a step, over the one asked for; the least one, and rounding that all errors have, over the voltages.
 LOCAL_SHARE, FINEST, ROUNDED = 0.2, 1e-14, 4e-15
-# Longest step, relative to the shortest time scale of the sources: its stages must not alias the sources.
-LONGEST_STEP = 0.5
 # Number of equidistant times at which the two runs are compared: least, per period, and most.
 PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
 # They are also compared after at most so many edges of the sources, at these fractions of the time to the next edge.
@@ -63,13 +60,12 @@ ATTEMPTS, TELL_AFTER = 6, 3.0
 # Difference of a fold's times in two successive runs at which the fold is accepted at once, over its time; and the one
 # at which it is accepted after the last attempt, over its time or the source's shortest time, if that is longer.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
-# Part of a run's stated error that its polynomials between outputs may be off by.
-_BETWEEN = 0.1
+# Part of a run's stated error that its polynomials between outputs may be off by; and the least area that the scale of
+# the charge counts with, over that at 0 V: with less, rounding may ask for minutes.
+_BETWEEN, LEAST_SHARE = 0.1, 1e-3
 # Limit of accepted and rejected steps: at the start, and over the whole run. A run that needs more has a cause that
 # smaller steps do not remove.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
-# Least area that the scale of the charge counts with, over that at 0 V: with less, rounding may ask for minutes.
-LEAST_SHARE = 1e-3
 
 
 @cache
@@ -140,10 +136,9 @@ class Collocation(Integration):
                 return self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
-        control = np.zeros(implicit.N_CONTROL)
         run = Passage(
-            self.y, self.s_before.copy(), control, self.counters, self.peaks, False, self.t_out[:0], self.left[:0],
-            np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
+            self.y, self.s_before.copy(), np.zeros(implicit.N_CONTROL), self.counters, self.peaks, False,
+            self.t_out[:0], self.left[:0], np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
         )  # fmt: skip
         nodal = self.nodal(ramp(self.s_before, after))
         code = advance(nodal._replace(scheme=self.scheme._replace(h_max=1.0), jump=True), run, 1.0)

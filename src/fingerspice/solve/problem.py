@@ -42,13 +42,11 @@ MOST_PERIODS, MOST_BREAKPOINTS = 1e10, 4e9
 MOST_BYTES = 2e9
 # Round-off of a gap voltage relative to the voltages that cancel in it; finer steps cannot reduce the error below that.
 ROUNDING = 2e-14
-# Largest number of breakpoints (64 kB) and of output times (0.3 MB) cached with a waveform.
-KEPT_BREAKPOINTS, KEPT_OUTPUTS = 8192, 32_768
+# Largest number of breakpoints and of output times (0.3 MB) cached with a waveform, and of breakpoints in memory.
+KEPT_BREAKPOINTS, KEPT_OUTPUTS, _BREAKPOINTS_AT_ONCE = 8192, 32_768, 65_536
 # Resolution of a time in units of its rounding error; a difference of a source's two limits at an edge is no jump if
 # the source changes as much within this resolution beside the edge.
 _RESOLVED = 8.0
-# Breakpoints held in memory at a time, so that memory does not grow with the length of the run.
-_BREAKPOINTS_AT_ONCE = 65_536
 
 
 @dataclass(frozen=True)
@@ -270,8 +268,7 @@ def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
     return t, left
 
 
-PERIODS_PER_WINDOW = 4096.0
-BREAKPOINTS_PER_WINDOW = 2000.0
+PERIODS_PER_WINDOW, BREAKPOINTS_PER_WINDOW = 4096.0, 2000.0
 # A run of at most KEPT_WINDOWS windows leaves its tables in the waveform's cache, which holds about MOST_KEPT of them.
 KEPT_WINDOWS, MOST_KEPT = 4, 16
 # Number of times, evenly through the run, at which a function of arrays is looked at in any case: they take 1 ms.
@@ -281,8 +278,8 @@ LOOKS = 20_000
 class Tables:
     """Tables of a problem's sources, window by window, until one of them stops being finite.
 
-    A user's function is expensive to evaluate, so its tables are cached for the run. The tables of library waveforms
-    are cached with the waveform if the run has few windows; in a longer run they are computed anew, in constant memory.
+    Those of a user's function, which is expensive, are cached for the run, and others with the waveform if the run has
+    few windows; in a longer run they are computed anew, in constant memory.
     """
 
     def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:

@@ -303,7 +303,7 @@ def operating_point(
     _refuse_floating_at_dc(network, area)
     part, before = 1.0, math.inf
     for _ in range(500):
-        k, b = network.stiffness(area)
+        k, b = network.stiffness(network.leak(area))
         x = np.linalg.solve(k, -b @ s) if k.size else np.zeros(0)
         u = network.p @ x + network.q @ s
         new = area.copy()
