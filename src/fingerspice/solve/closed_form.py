@@ -11,7 +11,7 @@ m = 0, or comes to rest there.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -25,7 +25,6 @@ from fingerspice.engine.network import Segment, at_sources, source
 from fingerspice.engine.one_area.model import branch_area, dot, follow, ramp, source_at, voltage_by_time, write_row_at
 from fingerspice.numerics import linear
 from fingerspice.results.outcome import State, Status
-from fingerspice.results.record import Record
 from fingerspice.solve.collocation import solve as solve_by_steps
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, segment_of
 from fingerspice.solve.runs import PAST_FOLD, Run, closed_form, gap_signals
@@ -172,30 +171,24 @@ def _finished(
     if problem.network.n_voltage < len(problem.network.sources):
         largest = max(largest, float(np.abs(rows[:, : problem.network.k.shape[0]]).max(initial=0.0)))
     rounding = (ROUNDING_OF_MATRICES if problem.scene.stack is None else ROUNDING) * largest
-    gaps = []
-    for peak, force in _peaks(run.record(problem)):
+    gaps, record = [], run.record(problem)
+    for i, u in enumerate(map(record.finger_voltage, range(len(record.fingers)))):
+        place, peak = record.network.fingers[i], max(float(u.max(initial=0.0)), -float(u.min(initial=0.0)))
+        if record.net.gap[place] < 0 and record.net.slow[place] < 0:
+            # The area is fixed: the force grows with the voltage.
+            force = float(record.fingers[i][1].stress(peak) * record.net.area0[place])
+        else:
+            force = float(record.finger_force(i).max(initial=0.0))
         share = rounding / peak if peak > 0.0 else 0.0
         gaps.append((peak, force, rounding + bound * peak, (2.0 * share + 3.0 * bound) * force))
-    run.gaps = np.array(gaps or [(0.0, 0.0, rounding, 0.0)])
-    run.node_error = rounding + bound * largest
+    if not gaps:
+        peak = max((float(np.abs(u).max(initial=0.0)) for u, _ in gap_signals(record)), default=0.0)
+        gaps = [(peak, 0.0, rounding + bound * peak, 0.0)]
+    run.gaps, run.node_error = np.array(gaps), rounding + bound * largest
     if not problem.scene.is_sampled:
         # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
         run.continuous = closed_form(replace(problem, charge=False), again)
     return run
-
-
-def _peaks(record: Record) -> Iterator[tuple[float, float]]:
-    """Largest voltage (V) and force (N) of every gap, as of `gap_signals`."""
-    for i, (place, (_, contact)) in enumerate(zip(record.network.fingers, record.fingers, strict=True)):
-        u = record.finger_voltage(i)
-        peak = max(float(u.max(initial=0.0)), -float(u.min(initial=0.0)))
-        if record.net.gap[place] < 0 and record.net.slow[place] < 0:
-            # The area is fixed: the force grows with the voltage.
-            yield peak, float(contact.stress(peak) * record.net.area0[place])
-        else:
-            yield peak, float(record.finger_force(i).max(initial=0.0))
-    if not record.fingers:
-        yield from ((float(np.abs(u).max(initial=0.0)), 0.0) for u, _ in gap_signals(record))
 
 
 def solve_algebraic(problem: Problem) -> Run:
@@ -208,8 +201,8 @@ def solve_algebraic(problem: Problem) -> Run:
     charge_error = follow(model, answer.s[:, 0], answer.slope[:, 0], start.y, start.u_before, rows)
     # The final state is the left-hand one: it does not include a jump at the end.
     follow(model, last.s[:, 0], np.zeros(1), start.y, start.u_before, ended)
-    y = np.append(start.y[:-1], ended[0, -1])
-    state = from_stack(scene, StackState(end, y, float(last.s[0, 0]), float(ended[0, 1]), start.offset))
+    u, u_gap = ended[0, :2].tolist()
+    state = from_stack(scene, StackState(end, ended[0, 5:].copy(), u, u_gap, start.offset))
     shown = from_written(scene, rows, start.offset, by_layer=False)
     run = _finished(problem, tables, shown, state, 0.0, solve_algebraic)
     if problem.charge:
@@ -266,9 +259,8 @@ def lead_to_fold(problem: Problem, run: Run) -> Run | None:
         force = contact.stress(written[:, 1]) / written[:, 2]
         run.gaps[0, :2] = np.maximum(run.gaps[0, :2], (np.abs(written[:, 1]).max(), force.max()))
     u, u_gap = written[-1, :2].tolist()
-    n = model_of(problem.scene).gap.size
-    end = StackState(path.t, written[-1, -n - 1 :].copy(), u, u_gap, state.offset)
-    run.state = from_stack(problem.scene, end)
+    # Behind 5 columns that follow from it, a row has the state.
+    run.state = from_stack(problem.scene, StackState(path.t, written[-1, 5:].copy(), u, u_gap, state.offset))
     return run
 
 

@@ -69,10 +69,10 @@ def to_stack(scene: Scene, state: State) -> StackState:
     u_gap = float(np.einsum("k,k->", along[: model.gap.size], model.gap))
     # If the gap's voltage is no state, it is the source's voltage less the states, whose weights are -1.
     u_gap += 0.0 if model.gap.size and model.gap.max() > 0.0 else before
-    inverse = inverse_area(abs(u_gap), model.curve)[0] if model.mobile else 0.0
-    scale = model.area0 * inverse if model.mobile else 1.0
-    offset = before / inverse / model.s if model.mobile else 0.0
-    share = model.k[:-1] * before
+    scale, offset, share = 1.0, 0.0, model.k[:-1] * before
+    if model.mobile:
+        inverse = inverse_area(abs(u_gap), model.curve)[0]
+        scale, offset = model.area0 * inverse, before / inverse / model.s
     x = along - share
     # A remainder within the rounding of the capacitive share is no stored charge: an uncharged start gives exactly 0.
     x[np.abs(x) <= 4e-16 * np.abs(share)] = 0.0
@@ -81,14 +81,12 @@ def to_stack(scene: Scene, state: State) -> StackState:
 
 def from_stack(scene: Scene, state: StackState) -> State:
     """The state used for all circuits from a state in the engine's form."""
-    model = model_of(scene)
-    stack, sign, scale, y = scene.stack, 0.0, 1.0, state.y.copy()
-    assert stack is not None
+    model, stack, sign, scale, y = model_of(scene), scene.stack, 0.0, 1.0, state.y.copy()
     if model.mobile:
         inverse = inverse_area(abs(state.u_gap), model.curve)[0]
         scale = model.area0 * inverse
         y[-1] += state.u_before / inverse / model.s - state.offset
-        if stack.gap is not None and state.u_gap != 0.0:
+        if stack is not None and stack.gap is not None and state.u_gap != 0.0:
             sign = math.copysign(1.0, state.u_gap) * float(stack.sign[stack.gap])
     y[:-1] = scene.turn * (model.k[:-1] * state.u_before + scale * y[:-1])
     return State(state.t, y, np.array([state.u_before]), np.array([sign]), scene.charge_law)
@@ -166,11 +164,9 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
     whole = network if stack is None else build_network(replace(circuit, work="gap"))
     u, area, held = operating_point(scene, circuit, whole, initial)
     if stack is not None:
-        of: dict[str, list[float]] = {}
-        for cell, one in zip(whole.cells, u.tolist(), strict=True):
-            of.setdefault(cell.element.name, []).append(one)
-        for layer in network.layers:
-            if sum(cell.element is layer for cell in network.cells) == 1:
+        of = {e.name: [v for c, v in zip(whole.cells, u.tolist(), strict=True) if c.element is e] for e in stack.layers}
+        for layer, count in zip(stack.layers, stack.cells, strict=True):
+            if count == 1:
                 # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
                 of[layer.name] = [sum(of[layer.name])]
         u = np.array([of[cell.element.name].pop(0) for cell in network.cells])
@@ -231,9 +227,8 @@ def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
 
     def split(area: float) -> FloatArray:
         g = stack.g_total + stack.g_area * area
-        if insulating:
-            return np.asarray(np.where(g == 0.0, u_source, 0.0))
-        r = 1.0 / g
+        # A layer that does not leak takes all of the voltage.
+        r = (g == 0.0) + 0.0 if insulating else 1.0 / g
         return np.asarray(u_source * r / r.sum())
 
     if stack.gap is None or not model.coupled:
@@ -245,10 +240,9 @@ def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
     return split(1.0 / inverse_area(high, model.curve)[0])
 
 
-# Residual of Kirchhoff's law, relative to the largest start voltage, that rounded decimals of a deck may cause.
-ROUNDING = 1e-12
-# Tolerances of a step towards consistent start voltages, relative to the largest voltage and to each voltage itself.
-STEP_ERROR, STEP_RTOL = 1e-14, 2.3e-14
+# Residual of Kirchhoff's law that rounded decimals of a deck may cause, relative to the largest start voltage; and
+# tolerances of a step towards consistent start voltages, relative to that voltage and to each voltage itself.
+ROUNDING, STEP_ERROR, STEP_RTOL = 1e-12, 1e-14, 2.3e-14
 PAST_FOLD = "past the fold of the mobile law; allowed: less voltage, more load, or the local law"
 
 
@@ -406,8 +400,7 @@ def _rate(
 ) -> FloatArray:
     """Derivative of (x, charges) by the homotopy's `theta` in [0, 1], NaN past a fold; `follows` have no delay."""
     u = net.p @ y[: net.k.shape[0]] + net.q @ s + (1.0 - theta) * off
-    area, slope = net.area0.copy(), np.zeros(net.area0.size)
-    delayed = net.slow >= 0
+    area, slope, delayed = net.area0.copy(), np.zeros(net.area0.size), net.slow >= 0
     area[delayed] *= slow[net.slow[delayed]]
     for i in follows:
         inverse, change = inverse_area(abs(float(u[net.gap[i]])), net.curves[i])
