@@ -193,43 +193,58 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
             ".options work=total holds the voltage across a series stack, and this circuit is none; allowed: work=gap"
         )
     place = {area.node: i for i, area in enumerate(areas)}
-    cells = [cell for e in branches for cell in _cells(e, place)]
     # The gaps come first, so that the tree contains them and their voltages are states.
-    cells.sort(key=lambda cell: cell.element.device != "GAP")
+    cells = sorted((cell for e in branches for cell in _cells(e, place)), key=lambda cell: cell.element.device != "GAP")
     voltages, currents, resistors = ([e for e in branches if e.device == device] for device in "VIR")
     n_v, n_i, n_c = len(voltages), len(currents), len(cells)
     ends = [*(e.nodes for e in voltages), *(cell.nodes for cell in cells), *(e.nodes for e in resistors)]
     taken, potential = spanning_tree(ends)
     assert all(taken[:n_v])
-    live, n_e, n_r = taken[n_v : n_v + n_c], sum(taken[: n_v + n_c]), sum(taken[n_v + n_c :])
+    live = [i for i in range(n_c) if taken[n_v + i]]
+    n, n_e = len(live), len(live) + n_v
+    # The tree's branches are voltage sources, capacitors and resistors: their voltages are s, x and r.
+    order = [*range(n_v, n_e), *range(n_v)]
 
     def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
         """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between node pairs."""
         out = [potential[a] - potential[b] for a, b, *_ in pairs]
-        return np.array(out).reshape(len(pairs), n_e + n_r)
+        return np.array(out).reshape(len(pairs), sum(taken))
 
-    across = rows([cell.nodes for cell in cells])
-    conductance = np.array([1.0 / e.values["value"] for e in resistors])
-    from_e, from_i, into_e, into_i, factor, delivered, together = _currents(
-        rows([e.nodes for e in resistors]), rows([e.nodes for e in currents]), conductance, n_v, n_e
-    )
-    s, x, order = slice(0, n_v), slice(n_v, n_e), [*range(n_v, n_e), *range(n_v)]
+    across, over_currents = rows([cell.nodes for cell in cells])[:, order], rows([e.nodes for e in currents])
+    over_e, over_r = np.hsplit(rows([e.nodes for e in resistors]), [n_e])
+    conductance = np.array([1.0 / e.values["value"] for e in resistors])[:, None]
+    weight = np.sqrt(conductance)
+    # Given e = (s, x), the voltages r minimise the power.
+    orthogonal, upper = np.linalg.qr(weight * over_r)
+    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_e))
+    from_i = -np.linalg.solve(upper, np.linalg.solve(upper.T, over_currents[:, n_e:].T))
+    by_e, by_i = over_e + over_r @ from_e, over_r @ from_i
+    # Currents into the cuts of e by (x, s) and by the currents of the current sources.
+    into_e, into_i = by_e.T @ (conductance * by_e), over_e.T @ (conductance * by_i) + over_currents[:, :n_e].T
+    into = np.hstack([into_e[:, order], into_i])
+    # The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
+    # capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
+    factor, together = (weight * by_e)[:, order], np.zeros((n_v, n))
+    if factor.size:
+        together = np.asarray(-np.linalg.lstsq(factor[:, :n], factor[:, n:], rcond=None)[0].T, float)
+    delivered: FloatArray = np.vstack([into[:n_v] + together @ into[n_v:], np.eye(n_i, n_e + n_i, n_e)])
+    size = np.linalg.norm(factor, axis=0)
+    delivered[:n_v, :n_e][np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.outer(size[n:], size)] = 0.0
     through = np.zeros((n_v + n_i, n_c))
-    through[:n_v] = across[:, s].T + together @ across[:, x].T
+    through[:n_v] = across[:, n:].T + together @ across[:, :n].T
     written = {node: name for el in branches for node, name in zip(el.nodes, el.node_names, strict=True)}
     names = [node for node in potential if node in written and node != "0"]
-    at_node = rows([(name, "0") for name in names])
-    whole = at_node[:, :n_e] + at_node[:, n_e:] @ from_e
+    at_e, at_r = np.hsplit(rows([(name, "0") for name in names]), [n_e])
     return Network(
-        sources=(*voltages, *currents), n_voltage=n_v, cells=tuple(cells),
-        layers=tuple(e for e in branches if e.spec.is_layer), live=tuple(i for i, one in enumerate(live) if one),
-        areas=areas, contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
+        sources=(*voltages, *currents), n_voltage=n_v, cells=tuple(cells), live=tuple(live),
+        layers=tuple(e for e in branches if e.spec.is_layer), areas=areas,
+        contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
         gaps=tuple(next((i for i, c in enumerate(cells) if c.element is a.gap), None) for a in areas),
-        p=np.ascontiguousarray(across[:, x]), q=np.hstack([across[:, s], np.zeros((n_c, n_i))]),
-        k=into_e[x, x], b=np.hstack([into_e[x, s], into_i[x]]), through=through, delivered=delivered,
-        resistor_factor=factor[:, x], resistor_factor_s=np.hstack([factor[:, s], np.zeros((len(resistors), n_i))]),
+        p=np.ascontiguousarray(across[:, :n]), q=np.hstack([across[:, n:], np.zeros((n_c, n_i))]),
+        k=into[n_v:, :n], b=into[n_v:, n:], through=through, delivered=delivered,
+        resistor_factor=factor[:, :n], resistor_factor_s=np.hstack([factor[:, n:], np.zeros((len(resistors), n_i))]),
         node_names=tuple(written[name] for name in names),
-        nodes=np.hstack([whole[:, order], at_node[:, n_e:] @ from_i]),
+        nodes=np.hstack([(at_e + at_r @ from_e)[:, order], at_r @ from_i]),
     )  # fmt: skip
 
 
@@ -241,41 +256,6 @@ def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
     # The nodes between the slabs of a dispersive layer have names that no netlist can write.
     path = [a, *(f"{element.name.lower()} {i}" for i in range(1, len(constants))), b]
     return [Cell(element, ends, place[area[0]], *own) for own, ends in zip(constants, pairwise(path), strict=False)]
-
-
-def _currents(
-    over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_v: int, n_e: int
-) -> tuple[FloatArray, ...]:
-    """Eliminate the voltages of the tree's resistors: given its other voltages e = (s, x), they minimise the power.
-
-    `over_resistors` and `over_currents` are the voltages of all resistors and current sources by those of the tree's
-    branches: n_v voltage sources, capacitors, resistors; `conductance` is in S.
-
-    Returned are the voltages of the tree's resistors by e and by the currents of the current sources; the currents into
-    the cuts of the tree's sources and capacitors by both; the square roots of the power in each resistor by e, a factor
-    f of these currents f^T f; the current of each source by x, s and the currents of the current sources; and the
-    shares of the capacitors' cuts (n_v, n) that are added to those of the voltage sources.
-
-    The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
-    capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
-    """
-    weight, (over_e, over_r) = np.sqrt(conductance)[:, None], np.hsplit(over_resistors, [n_e])
-    orthogonal, upper = np.linalg.qr(weight * over_r)
-    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_e))
-    from_i = -np.linalg.solve(upper, np.linalg.solve(upper.T, over_currents[:, n_e:].T))
-    by_e, by_i = over_e + over_r @ from_e, over_r @ from_i
-    into_e = by_e.T @ (conductance[:, None] * by_e)
-    into_i = over_e.T @ (conductance[:, None] * by_i) + over_currents[:, :n_e].T
-    factor, n_i, order = weight * by_e, len(over_currents), [*range(n_v, n_e), *range(n_v)]
-    together: FloatArray = np.zeros((n_v, n_e - n_v))
-    if factor.size:
-        together = np.asarray(-np.linalg.lstsq(factor[:, n_v:], factor[:, :n_v], rcond=None)[0].T, float)
-    into = np.hstack([into_e[:, order], into_i])
-    delivered: FloatArray = np.vstack([into[:n_v] + together @ into[n_v:], np.eye(n_i, n_e + n_i, n_e)])
-    size = np.linalg.norm(factor, axis=0)
-    rounding = np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.outer(size[:n_v], size[order])
-    delivered[:n_v, :n_e][rounding] = 0.0
-    return from_e, from_i, into_e, into_i, factor, delivered, together
 
 
 class Modes(NamedTuple):
