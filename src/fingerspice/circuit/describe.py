@@ -229,9 +229,8 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
 def require_circuit(circuit: Any) -> None:
     """Refuse anything but a circuit, and say how a circuit is made."""
     if not isinstance(circuit, Circuit):
-        raise InputError(
-            f"the circuit is a {type(circuit).__name__}; allowed: a Circuit, such as fs.read_netlist('deck.cir') gives"
-        )
+        allowed = "a Circuit, such as fs.read_netlist('deck.cir') gives"
+        raise InputError(f"the circuit is a {type(circuit).__name__}; allowed: {allowed}")
 
 
 def area_given(area: Any) -> str | float:
@@ -297,20 +296,16 @@ def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) 
         count = count if recording is None else recording.count
         if (count > 1 and last < start == 0.0) or stop <= first < math.inf:
             until = f" to {last:g} s" if last < math.inf else " on"
-            yield (
-                f"{name} changes from {first:g} s{until} only, and covers nothing of the run from {start:g} s to "
-                f"{stop:g} s, in which it stays at {wave.value(stop, 'left'):.4g}{time_slip(first, last, stop)}"
-            )
+            where = f"the run from {start:g} s to {stop:g} s, in which it stays at {wave.value(stop, 'left'):.4g}"
+            slip = time_slip(first, last, stop)
+            yield f"{name} changes from {first:g} s{until} only, and covers nothing of {where}{slip}"
         elif count >= _RECORDED and last - first < _FILLED * (stop - start):
-            yield (
-                f"{name}: the recording, from {first:g} s to {last:g} s, is {100.0 * (last - first) / stop:.2g} % of "
-                f"the run to {stop:g} s, and constant in the rest; its times, or its rate, are probably in another unit"
-            )
+            share = f"{100.0 * (last - first) / stop:.2g} % of the run to {stop:g} s, and constant in the rest"
+            unit = "its times, or its rate, are probably in another unit"
+            yield f"{name}: the recording, from {first:g} s to {last:g} s, is {share}; {unit}"
         elif by_deck and count >= _RECORDED and last > stop + (last - first) / (count - 1):
-            yield (
-                f"{name}: the recording ends at {last:g} s, and the run at the deck's TSTOP = {stop:g} s; --stop "
-                f"{last:.9g} takes all of it (in Python t_stop={last:.9g})"
-            )
+            ends = f"{name}: the recording ends at {last:g} s, and the run at the deck's TSTOP = {stop:g} s"
+            yield f"{ends}; --stop {last:.9g} takes all of it (in Python t_stop={last:.9g})"
 
 
 def time_slip(first: float, last: float, stop: float) -> str:
@@ -357,10 +352,8 @@ def scenes_warnings(
         for path in own:
             f = scenes.get(path, np.array(circuit.parameters[path].value))
             if np.any(np.abs(f / at - 1.0) > _SAME):
-                yield (
-                    f"{path.removesuffix('.f')} {_TAKES} {span(f)}, the source's fundamental is {span(at)}; with "
-                    "skin 'follow' they are taken at the fundamental"
-                )
+                taken = f"{path.removesuffix('.f')} {_TAKES} {span(f)}, the source's fundamental is {span(at)}"
+                yield f"{taken}; with skin 'follow' they are taken at the fundamental"
 
 
 def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
@@ -370,20 +363,17 @@ def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
     for skin in skins if len(waves) == 1 else ():
         (wave,), fundamental, known = waves, waves[0].fundamental, 0.0 < stop < math.inf
         f = skin.values["f"]
+        taken = f"{skin.name} {_TAKES} {f:g} Hz"
         if fundamental is not None and abs(f / fundamental.frequency - 1.0) > _SAME:
-            yield (
-                f"{skin.name} {_TAKES} {f:g} Hz, the source's fundamental is "
-                f"{fundamental.frequency:g} Hz; {skin.name}.f={fundamental.frequency:g} would match"
-            )
+            own = f"{fundamental.frequency:g}"
+            yield f"{taken}, the source's fundamental is {own} Hz; {skin.name}.f={own} would match"
         elif fundamental is None and not (known and is_near(wave, stop, f)):
             error = skin_error(circuit, wave, stop) if known else None
             off = f"may be {'5 to 10' if error is None else f'{100.0 * _LITTLE:g}'} % off"
             if error is not None and abs(error) >= _LITTLE:
                 off = f"is about {100.0 * abs(error):.2g} % too {'large' if error > 0.0 else 'small'}"
-            yield (
-                f"{skin.name} {_TAKES} {f:g} Hz, and the source has no fundamental: the mean force {off}; "
-                f"SKIN_DISPERSIVE d={1e6 * skin.values['d']:g}u is right for any source"
-            )
+            right = f"SKIN_DISPERSIVE d={1e6 * skin.values['d']:g}u is right for any source"
+            yield f"{taken}, and the source has no fundamental: the mean force {off}; {right}"
 
 
 # Spectra

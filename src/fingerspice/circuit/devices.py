@@ -162,9 +162,6 @@ _STRENGTH = Usual(1e5, 1e10, "air has 3 MV/m, thin oxides 1 GV/m", "V/m, not V/u
 _LOAD = Usual(1e-3, 49.9, "a finger touches with 0.1 to 5 N", "newton, not millinewton")
 _FRICTION = Usual(0.01, 5.0, "dry skin on glass has 0.1 to 1, moist skin up to 3")
 _ALPHA = Usual(1.0, 2000.0, "the ridge area at 1 N; 54.4 in Table 1", "mm^2 and N")
-_M_EXP = Usual(0.1, 1.0, "2/3 for a ball, 1 for a rough plane, 0.52 in Table 1")
-_BETA = Usual(0.3, 1e4, "pi for a full disc, 32 in Table 1", "mm")
-_N_EXP = Usual(0.5, 3.0, "2 for a full disc, 1.41 in Table 1")
 # Table 1 has 5000: at a friction force of 0.15 N, c2 F_T^2 is then a tenth of the square of a fingertip's area.
 _C2 = Usual(1.0, 1e6, "5000 in Table 1", "mm^4/N^2")
 _TAU = Usual(1e-5, 60.0, "skin creeps within 1 ms to some seconds")
@@ -212,9 +209,9 @@ _DEVICES = (
             _P("fn", "N", 0.5, _LOAD, "load", first=True),
             _P("mu", "", 0.3, _FRICTION, "friction coeff.", first=True, may_be_zero=True),
             _P("alpha", "mm^2/N^m", 54.4, _ALPHA, "area at 1 N"),
-            _P("m_exp", "", 0.52, _M_EXP, "load exp."),
-            _P("beta", "mm^(2-n)", 32.0, _BETA, "area at 1 mm"),
-            _P("n_exp", "", 1.41, _N_EXP, "indent exp."),
+            _P("m_exp", "", 0.52, Usual(0.1, 1.0, "2/3 for a ball, 1 for a rough plane, 0.52 in Table 1"), "load exp."),
+            _P("beta", "mm^(2-n)", 32.0, Usual(0.3, 1e4, "pi for a full disc, 32 in Table 1", "mm"), "area at 1 mm"),
+            _P("n_exp", "", 1.41, Usual(0.5, 3.0, "2 for a full disc, 1.41 in Table 1"), "indent exp."),
             _P("c2", "mm^4/N^2", 5000.0, _C2, "friction loss", may_be_zero=True),
             _P("a_fix", "mm^2", 0.0, REST_AREA, "fixed area", may_be_zero=True),
             _P("tau", "s", 0.0, _TAU, "area lag", may_be_zero=True),

@@ -194,7 +194,14 @@ def scene_of(
 
     def make() -> Scene:
         network = network_of(circuit, None if skin is None else skin.frequency)
-        fixed, mode = _fixed_areas(network, area)
+        # Each area (m^2), None for one that follows its gap, and the name of the area mode.
+        fixed, mode = tuple(a.given for a in network.areas), str(area)
+        if not isinstance(area, str):
+            fixed, mode = (float(area),) * len(fixed), f"{area:g} m^2"
+        elif None not in fixed:
+            mode = f"{fixed[0]:g} m^2 (from the deck)" if len(fixed) == 1 else "given by the deck" if fixed else "none"
+        elif area != "coupled":
+            fixed = tuple(map(float, mean_areas(network) if area == "mean" else network.areas_at_rest))
         waves = network.waveforms[: network.n_voltage]
         u_peak = sum(_largest_voltage(wave, stop, network.stack is not None) for wave in waves)
         u_size = max(u_peak, sum(wave.cancelling(0.0, stop) for wave in waves))
@@ -237,19 +244,6 @@ def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> flo
         _, peak = waveform.kept["peak"] = stop, waveform.peak(0.0, stop)
     require(not 0.0 < peak < LEAST_PEAK, "the source's peak", f"{peak:g} V", f"0, or {LEAST_PEAK:g} V or more")
     return peak if math.isfinite(peak) else 0.0
-
-
-def _fixed_areas(network: Network, area: str | float) -> tuple[tuple[float | None, ...], str]:
-    """Each area (m^2), None for one that follows its gap, and the name of the area mode."""
-    given = tuple(a.given for a in network.areas)
-    if not isinstance(area, str):
-        return (float(area),) * len(given), f"{area:g} m^2"
-    if None not in given:
-        one = f"{given[0]:g} m^2 (from the deck)" if len(given) == 1 else "given by the deck"
-        return given, one if given else "none"
-    if area == "coupled":
-        return given, area
-    return tuple(map(float, mean_areas(network) if area == "mean" else network.areas_at_rest)), area
 
 
 def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:

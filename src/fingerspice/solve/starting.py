@@ -24,13 +24,12 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Network, build_network
@@ -154,30 +153,52 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
 
 
 def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Cell voltages (V), areas (m^2) and sources at the operating point, with the nodes in `initial` held."""
-    network, net, stack = scene.network, scene.net, scene.stack
+    """Cell voltages (V), areas (m^2) and sources at the DC operating point (at 0-), the nodes in `initial` held."""
+    net, stack = scene.net, scene.stack
     s = np.array([float(w.value(0.0, "left")) for w in scene.waveforms])
     if stack is not None and scene.model is not None and not initial:
         order = list(stack.state_order)
         return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.area0, s
+    conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in scene.network.areas}
+    added = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
     # The reduced network of a series loop has no nodes, so the operating point needs the unreduced network.
-    whole = network if stack is None else build_network(replace(circuit, work="gap"))
-    u, area, held = operating_point(scene, circuit, whole, initial)
+    reduced = stack is not None or added
+    network = build_network(replace(circuit, work="gap"), added) if reduced else scene.network
+    sources = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
+    area, follows = scene.area0.copy(), net.gap >= 0
+    held = np.array([a.node in initial for a in network.areas], bool) & follows
+    area[held] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, held, strict=True) if mark]
+    _refuse_floating_at_dc(network, area)
+    part, before = 1.0, math.inf
+    for _ in range(500):
+        k, b = network.stiffness(network.leak(area))
+        x = np.linalg.solve(k, -b @ sources) if k.size else np.zeros(0)
+        u, new = network.p @ x + network.q @ sources, area.copy()
+        for i, (contact, gap) in enumerate(zip(scene.network.contacts, network.gaps, strict=True)):
+            if contact is not None and gap is not None and follows[i] and not held[i]:
+                new[i] = float(contact.area(abs(float(u[gap]))))
+        off = float(np.max(np.abs(new / area - 1.0), initial=0.0))
+        # The iteration has converged, or round-off lets it come no nearer.
+        if off <= 4e-16 or 0.8 * before < off <= 1e-13:
+            break
+        # Damping, because leaks that scale with the area may make the iteration oscillate.
+        part *= 0.7 if off > 0.8 * before else 1.0
+        area, before = area + part * (new - area), off
+    else:
+        raise InputError("the areas find no DC operating point; allowed: uic in .tran, to start uncharged")
     if stack is not None:
-        of = {e.name: [v for c, v in zip(whole.cells, u.tolist(), strict=True) if c.element is e] for e in stack.layers}
+        found = list(zip(network.cells, u.tolist(), strict=True))
+        of = {e.name: [v for cell, v in found if cell.element is e] for e in stack.layers}
         for layer, count in zip(stack.layers, stack.cells, strict=True):
             if count == 1:
                 # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
                 of[layer.name] = [sum(of[layer.name])]
-        u = np.array([of[cell.element.name].pop(0) for cell in network.cells])
-    if net.mobile:
-        for i in np.flatnonzero(held & (net.slow < 0)):
-            # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.
-            gap = net.gap[i]
-            own = at_own_area(float(u[gap]), area[i], net.curves[i])
-            rest = 1.0 / inverse_area(abs(own), net.curves[i])[0]
-            u[net.place == i] *= area[i] / rest
-            u[gap] = own
+        u = np.array([of[cell.element.name].pop(0) for cell in scene.network.cells])
+    for i in np.flatnonzero(held & (net.slow < 0)) if net.mobile else ():
+        # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.
+        own = at_own_area(float(u[net.gap[i]]), area[i], net.curves[i])
+        u[net.place == i] *= area[i] / (1.0 / inverse_area(abs(own), net.curves[i])[0])
+        u[net.gap[i]] = own
     return u, area, s
 
 
@@ -279,41 +300,6 @@ def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Elemen
     return tuple(out)
 
 
-def operating_point(
-    scene: Scene, circuit: Circuit, network: Network, initial: Mapping[str, float]
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Voltages of all cells (V) and areas (m^2) at the DC operating point, and which areas ``.ic`` holds.
-
-    The sources have their values at 0-, and the nodes in `initial` are held.
-    """
-    conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in network.areas}
-    held = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
-    if held:
-        network = build_network(replace(circuit, work="gap"), held)
-    s = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
-    area, follows = scene.area0.copy(), scene.net.gap >= 0
-    asked = np.array([a.node in initial for a in network.areas], bool) & follows
-    area[asked] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, asked, strict=True) if mark]
-    _refuse_floating_at_dc(network, area)
-    part, before = 1.0, math.inf
-    for _ in range(500):
-        k, b = network.stiffness(network.leak(area))
-        x = np.linalg.solve(k, -b @ s) if k.size else np.zeros(0)
-        u = network.p @ x + network.q @ s
-        new = area.copy()
-        for i, (contact, gap) in enumerate(zip(scene.network.contacts, network.gaps, strict=True)):
-            if contact is not None and gap is not None and follows[i] and not asked[i]:
-                new[i] = float(contact.area(abs(float(u[gap]))))
-        off = float(np.max(np.abs(new / area - 1.0), initial=0.0))
-        # The iteration has converged, or round-off lets it come no nearer.
-        if off <= 4e-16 or 0.8 * before < off <= 1e-13:
-            return u, area, asked
-        # Damping, because leaks that scale with the area may make the iteration oscillate.
-        part *= 0.7 if off > 0.8 * before else 1.0
-        area, before = area + part * (new - area), off
-    raise InputError("the areas find no DC operating point; allowed: uic in .tran, to start uncharged")
-
-
 def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
     """Refuse a network in which some voltage is determined by capacitors only, so that it has no DC value."""
     factor = np.vstack([network.resistor_factor, np.sqrt(network.leak(area))[:, None] * network.p])
@@ -373,54 +359,50 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> tuple[Fl
 
 def _along(net: Net, off: FloatArray, s: FloatArray, slow: FloatArray) -> FloatArray:
     """Live voltages (V) and charges (C) where Kirchhoff's residual `off` (n_cell,), V, has fallen to 0 linearly."""
-    n, follows = net.k.shape[0], np.flatnonzero((net.gap >= 0) & (net.slow < 0))
-    y = np.zeros(n + net.q.shape[1])
+    n, follows, delayed = net.k.shape[0], np.flatnonzero((net.gap >= 0) & (net.slow < 0)), net.slow >= 0
+    begin = np.zeros(n + net.q.shape[1])
     if not np.any(off):
-        return y
-    rate = partial(_rate, net, off, s, slow, follows)
+        return begin
+
+    def rate(theta: float, y: FloatArray) -> FloatArray:
+        """Derivative by the homotopy's `theta` in [0, 1], NaN past a fold."""
+        u = net.p @ y[:n] + net.q @ s + (1.0 - theta) * off
+        area, slope = net.area0.copy(), np.zeros(net.area0.size)
+        area[delayed] *= slow[net.slow[delayed]]
+        for i in follows:
+            inverse, change = inverse_area(abs(float(u[net.gap[i]])), net.curves[i])
+            area[i], slope[i] = 1.0 / inverse, -change / inverse**2
+        held = net.c * np.append(area, 1.0)[net.place]
+        met = net.p.T @ (held[:, None] * net.p)
+        x = _solved(met, net.p.T @ (held * off))
+        along = net.p @ x - off
+        current = held * along
+        if net.mobile and follows.size:
+            # The derivatives of the areas add to the capacitance matrix, in the columns of the gaps that they follow.
+            gaps, more = net.gap[follows], np.zeros((net.c.size, follows.size))
+            for column, i, gap in zip(more.T, follows, gaps, strict=True):
+                at = net.place == i
+                # At 0 V the direction of the change decides on the branch.
+                column[at] = (net.c * u)[at] * slope[i] * (np.sign(u[gap]) or np.sign(along[gap]))
+            x = _solved(met + net.p.T @ more @ net.p[gaps], net.p.T @ (held * off + more @ off[gaps]))
+            along = net.p @ x - off
+            current = held * along + more @ along[gaps]
+        return np.concatenate([x, net.through @ current])
+
     if not follows.size:
-        return rate(0.0, y)
+        return rate(0.0, begin)
     from scipy.integrate import solve_ivp
 
     scale = np.concatenate([np.ones(n), np.full(net.q.shape[1], math.inf)]) * np.abs(off).max()
+    how = {"first_step": 0.1, "rtol": STEP_RTOL, "atol": STEP_ERROR * scale, "t_eval": [1.0]}
     with warnings.catch_warnings():
         # Past a fold the derivative is NaN, of which numpy and scipy would warn; `status` tells of it.
         warnings.simplefilter("ignore")
-        found = solve_ivp(
-            rate, (0.0, 1.0), y, "DOP853", first_step=0.1, rtol=STEP_RTOL, atol=STEP_ERROR * scale, t_eval=[1.0]
-        )
+        found = solve_ivp(rate, (0.0, 1.0), begin, "DOP853", **how)
     if found.status != 0:
         where = PAST_FOLD if net.mobile else "where no area is left; allowed: less voltage"
         raise InputError(f"the capacitors' start voltages settle {where}")
     return np.asarray(found.y[:, -1])
-
-
-def _rate(
-    net: Net, off: FloatArray, s: FloatArray, slow: FloatArray, follows: IntArray, theta: float, y: FloatArray
-) -> FloatArray:
-    """Derivative of (x, charges) by the homotopy's `theta` in [0, 1], NaN past a fold; `follows` have no delay."""
-    u = net.p @ y[: net.k.shape[0]] + net.q @ s + (1.0 - theta) * off
-    area, slope, delayed = net.area0.copy(), np.zeros(net.area0.size), net.slow >= 0
-    area[delayed] *= slow[net.slow[delayed]]
-    for i in follows:
-        inverse, change = inverse_area(abs(float(u[net.gap[i]])), net.curves[i])
-        area[i], slope[i] = 1.0 / inverse, -change / inverse**2
-    held = net.c * np.append(area, 1.0)[net.place]
-    met = net.p.T @ (held[:, None] * net.p)
-    x = _solved(met, net.p.T @ (held * off))
-    along = net.p @ x - off
-    current = held * along
-    if net.mobile and follows.size:
-        # The derivatives of the areas add to the capacitance matrix, in the columns of the gaps that they follow.
-        gaps, more = net.gap[follows], np.zeros((net.c.size, follows.size))
-        for column, i, gap in zip(more.T, follows, gaps, strict=True):
-            at = net.place == i
-            # At 0 V the direction of the change decides on the branch.
-            column[at] = (net.c * u)[at] * slope[i] * (np.sign(u[gap]) or np.sign(along[gap]))
-        x = _solved(met + net.p.T @ more @ net.p[gaps], net.p.T @ (held * off + more @ off[gaps]))
-        along = net.p @ x - off
-        current = held * along + more @ along[gaps]
-    return np.concatenate([x, net.through @ current])
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
