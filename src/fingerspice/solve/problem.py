@@ -145,13 +145,12 @@ def prepare(
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
     tran, wave, stop = circuit.tran, scene.waveform, t_stop
-    if stop is None:
-        if tran is not None:
-            stop = t_start + tran.stop
-        elif t_eval is not None and t_eval.size:
-            stop = float(t_eval[-1])
-        else:
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+    if stop is None and tran is not None:
+        stop = t_start + tran.stop
+    elif stop is None and t_eval is not None and t_eval.size:
+        stop = float(t_eval[-1])
+    elif stop is None:
+        raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
     require(math.isfinite(stop) and stop > t_start, "t_stop", f"{stop:g} s", f"more than {t_start:g} s")
     if t_eval is not None:
         require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
@@ -391,10 +390,9 @@ def after_the_end(problem: Problem) -> Sources | None:
 
 def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) -> IntArray:
     """Index of every source's segment (n_s,) that contains t (s); at an edge, the segment on the given side."""
-    return np.array([
-        min(max(int(np.searchsorted(sources.edges[a:b], t, side=side)) - 1, 0), b - a - 2)
-        for a, b in itertools.pairwise(sources.first)
-    ])  # fmt: skip
+    spans = itertools.pairwise(sources.first)
+    found = ((int(sources.edges[a:b].searchsorted(t, side)) - 1, b - a - 2) for a, b in spans)
+    return np.array([min(max(i, 0), last) for i, last in found])
 
 
 def segment_of(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:

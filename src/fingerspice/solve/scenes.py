@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, T
 from fingerspice.circuit.describe import COUPLING, freezing_error
 from fingerspice.circuit.network import Modes, Network, loop_network, mean_areas, network_modes, network_of
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
@@ -27,31 +27,17 @@ from fingerspice.waveforms.waveform import Sum, Waveform, require
 FREEZING_SHARE = 0.3
 # Smallest peak of a source other than 0, V; below it, forces and errors are denormal numbers with too few digits.
 LEAST_PEAK = 1e-300
-# Gap voltage (V) that an area's curve covers if the sources' peak is unknown; over a tiny range it would be constant.
-PEAK_UNKNOWN = 1.0
-# Range of an area's curve over the source's peak: the voltage of discharging layers adds to the gap's share of a jump.
-BEYOND_PEAK = 1.3
-# Gap voltage (V) that an area's curve covers under current sources, which do not bound it; beyond the curve, the
-# contact equations are solved at each evaluation.
-DRIVEN_BY_CURRENT = 300.0
+# Range of an area's curve over the source's peak, as the voltage of discharging layers adds to the gap's share of a
+# jump; gap voltages (V) that it covers under current sources, which do not bound it, and if the peak is unknown.
+BEYOND_PEAK, DRIVEN_BY_CURRENT, PEAK_UNKNOWN = 1.3, 300.0, 1.0
 
 
-Kept = TypeVar("Kept")
-
-
-class Freezing(NamedTuple):
-    """The single frequency at which a dispersive skin's data are taken, and the error of doing so."""
-
-    frequency: float  # Hz
-    error: float  # Error of the gap voltage, relative to its peak
-
-
-def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], Kept]) -> Kept:
+def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], T]) -> T:
     """The entry of a cache under a key, of which at most `most` share the first part; else all of these make room.
 
     Other threads may remove entries at any time, so that the entry is looked up only once.
     """
-    found: Kept | None = prepared.get(key)
+    found: T | None = prepared.get(key)
     if found is None:
         kept = [name for name in list(prepared) if name[0] == key[0]]
         for name in kept if len(kept) >= most else ():
@@ -72,8 +58,9 @@ class Scene:
     u_size: float  # The larger one of `u_peak` and the sum of the peaks of all parts that may cancel in the sources, V
     u_top: float  # Largest gap voltage that the areas' curves cover, V
     model: Model | None = None  # Model of a series stack, whose modes follow from a secular equation
-    # Frequency at which a dispersive skin's data are taken, if one is accurate enough for the error asked for
-    skin: Freezing | None = None
+    # Frequency (Hz) at which a dispersive skin's data are taken, if one is accurate enough for the error asked for, and
+    # the error of the gap voltage of doing so, relative to its peak
+    skin: tuple[float, float] | None = None
     # Cache of the tables and systems that integrators have made for this scene
     prepared: dict[Any, Any] = field(default_factory=dict)
 
@@ -193,7 +180,7 @@ def scene_of(
     skin = _freezing(circuit, stop, rtol)
 
     def make() -> Scene:
-        network = network_of(circuit, None if skin is None else skin.frequency)
+        network = network_of(circuit, None if skin is None else skin[0])
         # Each area (m^2), None for one that follows its gap, and the name of the area mode.
         fixed, mode = tuple(a.given for a in network.areas), str(area)
         if not isinstance(area, str):
@@ -213,8 +200,8 @@ def scene_of(
     return circuit.remember(("scene", law, area, stop, skin), make)
 
 
-def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
-    """The single frequency for a dispersive skin's data, if the error of using it is small compared with `rtol`."""
+def _freezing(circuit: Circuit, stop: float, rtol: float) -> tuple[float, float] | None:
+    """`Scene.skin`, if the error is small compared with `rtol`."""
     if not circuit.by_device("SKIN_DISPERSIVE") or not is_stack(circuit):
         return None
     stack, allowed = build_stack(circuit), FREEZING_SHARE * rtol
@@ -229,7 +216,7 @@ def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
         return None
     f = fundamental.frequency
     error = circuit.remember(("freezing", stop), lambda: freezing_error(circuit, f, area, change, stop))
-    return Freezing(f, error) if error <= allowed else None
+    return (f, error) if error <= allowed else None
 
 
 def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> float:
