@@ -63,8 +63,7 @@ def shown(value: float, unit: str) -> str:
 Value = float | FloatArray
 #: Function from an element's values (in the netlist's units), or those of several scenes (n,), to its cells in series,
 #: shape (n_cell, 3) or (n_cell, 3, n): capacitance per area (F/m^2), total leakage (S) and leakage per area (S/m^2). At
-#: a frequency (Hz), the second argument, a dispersive material becomes one cell with its data there; None gives all
-#: cells of its ladder.
+#: a frequency (Hz), the second argument if not None, a dispersive material becomes one cell with its data there.
 Cells = Callable[[Mapping[str, Value], float | None], FloatArray]
 
 
@@ -126,8 +125,8 @@ class DeviceSpec:
         return "area" in self.nodes
 
 
-def _cells(c: ArrayLike, g_total: ArrayLike, g_area: ArrayLike) -> FloatArray:
-    return np.stack(np.broadcast_arrays(c, g_total, g_area), axis=1)
+def _cells(*constants: ArrayLike) -> FloatArray:
+    return np.stack(np.broadcast_arrays(*constants), axis=1)
 
 
 def _layer_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:

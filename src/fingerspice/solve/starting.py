@@ -194,11 +194,11 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
                 # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
                 of[layer.name] = [sum(of[layer.name])]
         u = np.array([of[cell.element.name].pop(0) for cell in scene.network.cells])
-    for i in np.flatnonzero(held & (net.slow < 0)) if net.mobile else ():
+    for place in np.flatnonzero(held & (net.slow < 0)) if net.mobile else ():
         # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.
-        own = at_own_area(float(u[net.gap[i]]), area[i], net.curves[i])
-        u[net.place == i] *= area[i] / (1.0 / inverse_area(abs(own), net.curves[i])[0])
-        u[net.gap[i]] = own
+        own = at_own_area(float(u[net.gap[place]]), area[place], net.curves[place])
+        u[net.place == place] *= area[place] / (1.0 / inverse_area(abs(own), net.curves[place])[0])
+        u[net.gap[place]] = own
     return u, area, s
 
 
