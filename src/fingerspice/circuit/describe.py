@@ -71,10 +71,8 @@ MEANINGS_OF_WAVEFORMS = {
     "modulation": "envelope", "phase_deg": "phase", "f0": "first frequency", "f1": "last frequency", "v1": "low level",
     "v2": "high level", "td1": "rise begins", "tau1": "rise constant", "td2": "fall begins", "tau2": "fall constant",
 }  # fmt: skip
-#: Largest number of changes, or of sources, that one line names; the number of the others is added.
-_MOST = 8
-#: Largest number of elements that a circuit's page lists.
-_MOST_ELEMENTS = 25
+# Largest number of changes, or of sources, that one line names, and of elements that a circuit's page lists.
+_MOST, _MOST_ELEMENTS = 8, 25
 
 
 def meaning_of(circuit: Circuit, path: str) -> str:
@@ -243,10 +241,9 @@ def area_given(area: Any) -> str | float:
     return number
 
 
-# Largest relative difference of frequencies that are the same; and the words by which a warning about a SKIN begins.
-_SAME, _TAKES = 1e-9, "takes its data at f ="
-# Smallest relative error of the mean force that is given as a number.
-_LITTLE = 0.005
+# Largest relative difference of frequencies that are the same, and smallest one of the mean force that is given as a
+# number; and the words by which a warning about a SKIN begins.
+_SAME, _LITTLE, _TAKES = 1e-9, 0.005, "takes its data at f ="
 # Directives that only ngspice needs, so that no warning is given about them.
 _FOR_NGSPICE = (".nodeset", ".options")
 # Smallest number of points that make a PWL a recording, which is meant to be run to its end and not to be a step in a
@@ -265,8 +262,7 @@ _LEAST, _FEW = 2.0 / SKIN_BAND[0], 4096
 # A source is in a band if no more than this fraction of its energy is outside.
 NOTABLE = 0.01
 # The area's harmonics also drive currents through the skin. Skin data held at the fundamental cause an additional
-# relative error of at most COUPLING times the relative change of the area: 0.004 was found where the area changes by a
-# quarter (sine of 200 V and 100 Hz).
+# relative error of at most COUPLING times the relative change of the area; 0.004 was found for a change of a quarter.
 COUPLING = 0.05
 
 
@@ -292,8 +288,8 @@ def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) 
     for name, wave in ((e.name, e.waveform) for e in driving(circuit) if e.waveform is not None):
         (first, last), recording = wave.course, as_samples(wave)
         # Of a recording or table; 0 of other waveforms.
-        count = len(wave.times) if isinstance(wave, PWL) and wave.repeat is None else 0
-        count = count if recording is None else recording.count
+        table = len(wave.times) if isinstance(wave, PWL) and wave.repeat is None else 0
+        count = table if recording is None else recording.count
         if (count > 1 and last < start == 0.0) or stop <= first < math.inf:
             until = f" to {last:g} s" if last < math.inf else " on"
             where = f"the run from {start:g} s to {stop:g} s, in which it stays at {wave.value(stop, 'left'):.4g}"
@@ -338,8 +334,7 @@ def scenes_warnings(
         return
 
     def span(f: FloatArray) -> str:
-        low, high = float(f.min()), float(f.max())
-        return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+        return " to ".join(f"{end:g}" for end in sorted({float(f.min()), float(f.max())})) + " Hz"
 
     own = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     on = driving_sources(circuit) if own else []
@@ -494,19 +489,19 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     return float(errors[np.argmax(np.abs(errors))])
 
 
-def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str | None:
-    """A warning where a dispersive skin is driven outside the band of its data, or None."""
+def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> Iterator[str]:
+    """A warning where a dispersive skin is driven outside the band of its data."""
     skins = circuit.by_device("SKIN_DISPERSIVE")
-    if not skins or not (math.isfinite(t_stop) and t_stop > 0.0):
-        return None
+    if not skins or not 0.0 < t_stop < math.inf:
+        return
     end, shares = waveform.kept.get("outside", (None, ()))
     if end != t_stop:
         _, shares = waveform.kept["outside"] = t_stop, energy_outside(waveform, t_stop)
     ends = f"below {SKIN_BAND[0]:g} Hz", f"above {SKIN_BAND[1] / 1e3:g} kHz"
     found = [(share, where) for share, where in zip(shares, ends, strict=True) if share > NOTABLE]
     parts = " and ".join(f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}" for share, where in found)
-    told = f"of the source's energy {parts} lie outside the band of the data behind {skins[0].name}"
-    return told if found else None
+    if found:
+        yield f"of the source's energy {parts} lie outside the band of the data behind {skins[0].name}"
 
 
 def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity: float, t_stop: float) -> float:

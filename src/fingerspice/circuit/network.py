@@ -23,20 +23,10 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
+from fingerspice.circuit import statespace
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import check
-from fingerspice.circuit.statespace import (
-    Area,
-    Stack,
-    build_stack,
-    contact_of,
-    find_branches,
-    is_stack,
-    layer_constants,
-    shared,
-    skin_admittance,
-    spanning_tree,
-)
+from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of, find_branches, shared
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
@@ -145,7 +135,7 @@ class Network:
         y = self.leak(area) + 2j * np.pi * f[..., None] * self.capacitance(area)
         for i, cell in enumerate(self.cells):
             if cell.element.device == "SKIN" and cell.area is not None:
-                y[..., i] = skin_admittance(cell.element, f, area[cell.area])
+                y[..., i] = statespace.skin_admittance(cell.element, f, area[cell.area])
         return np.asarray(y)
 
     def phasors(self, frequency: ArrayLike, area: FloatArray, s: ComplexArray) -> ComplexArray:
@@ -198,7 +188,7 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
     voltages, currents, resistors = ([e for e in branches if e.device == device] for device in "VIR")
     n_v, n_i, n_c = len(voltages), len(currents), len(cells)
     ends = [*(e.nodes for e in voltages), *(cell.nodes for cell in cells), *(e.nodes for e in resistors)]
-    taken, potential = spanning_tree(ends)
+    taken, potential = statespace.spanning_tree(ends)
     assert all(taken[:n_v])
     live = [i for i in range(n_c) if taken[n_v + i]]
     n, n_e = len(live), len(live) + n_v
@@ -252,7 +242,7 @@ def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
     a, b, *area = element.nodes
     if element.device == "C":
         return [Cell(element, (a, b), None, element.values["value"], 0.0, 0.0)]
-    constants = layer_constants(element).tolist() if area else []
+    constants = statespace.layer_constants(element).tolist() if area else []
     # The nodes between the slabs of a dispersive layer have names that no netlist can write.
     path = [a, *(f"{element.name.lower()} {i}" for i in range(1, len(constants))), b]
     return [Cell(element, ends, place[area[0]], *own) for own, ends in zip(constants, pairwise(path), strict=False)]
@@ -302,7 +292,7 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
     """The network of a circuit; with `skin_at`, dispersive skins of a stack have their data at that frequency (Hz)."""
 
     def make() -> Network:
-        if not is_stack(circuit):
+        if not statespace.is_stack(circuit):
             network = shared(circuit, "network", lambda: build_network(circuit))
             now = {e.name: e for e in circuit.elements}
             return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))

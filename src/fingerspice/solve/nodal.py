@@ -29,19 +29,9 @@ from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_si
 from fingerspice.numerics.lobatto import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
+from fingerspice.solve import runs
 from fingerspice.solve.problem import ROUNDING, Problem, Tables, ramp, segment_index, values_at
-from fingerspice.solve.runs import (
-    PAST_FOLD,
-    Integration,
-    Progress,
-    Run,
-    apart,
-    closed_form,
-    excess_of,
-    gap_signals,
-    integrate,
-    nodes_apart,
-)
+from fingerspice.solve.runs import Integration, Progress, Run, apart, closed_form, excess_of, gap_signals, integrate
 
 # Stages of a run and of the coarser run, and the ratio of the coarser run's tolerance to the run's. They need different
 # orders as well: where edges or zeros cut the steps short, both runs take the same steps, whatever their tolerances.
@@ -202,7 +192,7 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
         run.nfev = nfev
         worst = _stated(problem, run, run.only(probed), beside, u_scale, ALIKE * tol) / rtol
         last = tol <= finest or attempt == ATTEMPTS - 1
-        if mobile and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
+        if mobile and run.record(problem).fold_margin.min(initial=1.0) < runs.PAST_FOLD:
             # A step has crossed a fold onto a branch of the area equation that no continuous path reaches.
             tol, run.status = max(0.03 * tol, finest), Status.ERROR_NOT_MET
         elif run.status is Status.FOLD and run.t_failed is not None:
@@ -307,7 +297,7 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
         moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
         gaps.append((peak, force, apart(u, v) + both, apart(f, g) + moved))
     run.gaps = np.array(gaps).reshape(-1, 4)
-    run.node_error = nodes_apart(fine, coarse) + both
+    run.node_error = runs.nodes_apart(fine, coarse) + both
     if problem.charge:
         at = slice(problem.initial.y.size - problem.initial.s_before.size, problem.initial.y.size)
         run.charge_error = apart(probed.rows[:, at], beside.rows[:, at])
@@ -456,7 +446,7 @@ def solve_foreign(problem: Problem, method: str, rtol: float, progress: Progress
         run.nfev, run.margin, run.gaps = nfev, reference.margin, reference.gaps.copy()
         for gap, mine, other in zip(run.gaps, gap_signals(ours), gap_signals(theirs), strict=True):
             gap[2:] += list(map(apart, mine, other))
-        run.node_error = (reference.node_error or 0.0) + nodes_apart(ours, theirs)
+        run.node_error = (reference.node_error or 0.0) + runs.nodes_apart(ours, theirs)
         worst = excess_of(run.gaps, max(ROUNDING * u_scale, problem.rounding)) / rtol
         if run.status is not Status.SUCCESS:
             if reference.status is Status.FOLD:

@@ -24,16 +24,9 @@ from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
 from fingerspice.solve.scenes import Scene, kept_with, scene_of
 from fingerspice.solve.starting import StackState, initial_state, to_stack
+from fingerspice.waveforms import sampling
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.sampling import (
-    WIDEST,
-    SourceTable,
-    breakpoints_at,
-    is_sampled,
-    on_breakpoint,
-    same_time,
-    source_table,
-)
+from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, is_sampled, same_time, source_table
 from fingerspice.waveforms.waveform import DC, Waveform, require
 
 #: Most periods (or shortest time scales) of the source in a run, and most breakpoints: they take hours and a gigabyte.
@@ -159,7 +152,7 @@ def prepare(
         first, last = float(t_eval[0]), float(t_eval[-1])
         allowed = f"times from {t_start:g} s to t_stop = {stop:g} s{time_slip(first, last, stop)}"
         require(first >= t_start and last <= stop, "t_eval", f"{first:g} s to {last:g} s", allowed)
-    end = kept_with(wave.kept, ("end", stop), 1, lambda: on_breakpoint(wave, stop))
+    end = kept_with(wave.kept, ("end", stop), 1, lambda: sampling.on_breakpoint(wave, stop))
     return Problem(
         circuit, scene, t_start, end, t_start + (tran.start if tran else 0.0),
         tran.step if tran else (stop - t_start) / 1000.0,
@@ -347,7 +340,7 @@ class Tables:
 def shortest_event(problem: Problem) -> float:
     """Length (s) of the shortest event of a user's function that its samples surely meet."""
     one_by_one = any(wave.kept.get("one by one") for wave in problem.waveforms)
-    return min(WIDEST * problem.step, math.inf if one_by_one else (problem.t_stop - problem.t_start) / LOOKS)
+    return min(sampling.WIDEST * problem.step, math.inf if one_by_one else (problem.t_stop - problem.t_start) / LOOKS)
 
 
 def joined(tables: list[SourceTable]) -> Sources:
