@@ -122,16 +122,12 @@ def _why_not_a_number(text: str) -> str:
         if letters.lower().startswith(tuple(SCALES)) or letters.lower() in ("r", "v"):
             scale = "" if letters.lower() in ("r", "v") else letters
             return f"'{text}' differs between simulators: write {whole}.{fraction}{scale}"
-    bare = text.rstrip("%°")
-    if bare != text and _NUMBER.fullmatch(bare):
-        plain = f"{float(parse_number(bare)) / 100.0:g}" if text.endswith("%") else bare
-        return f"'{text}' is not a number: write {plain}"
-    joined = "".join(text.split())
-    if joined != text.strip() and _NUMBER.fullmatch(joined):
-        return f"'{text}' is not a number, its unit stands apart: write {joined}"
-    plain = text.translate(_DASHES)
-    if plain != text and _NUMBER.fullmatch(plain):
-        return f"'{text}' is not a number, its minus is a typographic one: write {plain}"
-    if text.count(",") == 1 and _NUMBER.fullmatch(text.replace(",", ".")):
-        return f"'{text}' is not a number, its comma separates: write {text.replace(',', '.')}"
+    guesses = {
+        text.rstrip("%°"): "", "".join(text.split()): ", its unit stands apart",
+        text.translate(_DASHES): ", its minus is a typographic one", text.replace(",", "."): ", its comma separates",
+    }  # fmt: skip
+    for guess, why in guesses.items():
+        if guess != text.strip() and _NUMBER.fullmatch(guess):
+            plain = f"{parse_number(guess) / 100.0:g}" if text.endswith("%") else guess
+            return f"'{text}' is not a number{why}: write {plain}"
     return f"'{text}' is not a number (examples: 10, 2.5, 1e-6, 3.5u, 0.2meg)"
