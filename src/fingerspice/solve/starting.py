@@ -162,8 +162,8 @@ def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tu
     conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in scene.network.areas}
     added = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
     # The reduced network of a series loop has no nodes, so the operating point needs the unreduced network.
-    reduced = stack is not None or added
-    network = build_network(replace(circuit, work="gap"), added) if reduced else scene.network
+    rebuilt = stack is not None or added
+    network = build_network(replace(circuit, work="gap"), added) if rebuilt else scene.network
     sources = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
     area, follows = scene.area0.copy(), net.gap >= 0
     held = np.array([a.node in initial for a in network.areas], bool) & follows
