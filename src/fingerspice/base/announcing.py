@@ -21,13 +21,10 @@ LONG = {
     ("engine.implicit.advance", "Nodal"): "implicit steps, about 15 s",
     ("engine.lockstep.march.march", ""): "scenes in lockstep, about 15 s",
 }
-_KEPT = {
-    True: "only once: later runs find it on the disk",
-    False: (
-        "at every run: no folder for compiled code can be written, neither the package's nor the user's; set "
-        "NUMBA_CACHE_DIR to one that can"
-    ),
-}
+_NOT_KEPT = (
+    "at every run: no folder for compiled code can be written, neither the package's nor the user's; set "
+    "NUMBA_CACHE_DIR to one that can"
+)
 
 
 class Bar:
@@ -46,11 +43,10 @@ class Bar:
     def show(self, done: float = 0.0, note: str = "") -> None:
         """Show the bar with this fraction done, and a note behind it."""
         if self._bar is None:
-            standing = Bar._standing
-            if not sys.stderr.isatty() or (standing is not None and not self._endless):
+            if not sys.stderr.isatty() or (Bar._standing is not None and not self._endless):
                 return
-            if standing is not None:
-                standing.stop()
+            if Bar._standing is not None:
+                Bar._standing.stop()
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -111,7 +107,8 @@ class Compiling:
 
     def begins(self, function: str, kind: str, kept: bool) -> None:
         """Announce that a function is compiled, whose first argument is of this kind, and whether that is kept."""
-        text = f"compiling {LONG.get((function, kind), 'a small part, some seconds')}, {_KEPT[kept]}"
+        often = "only once: later runs find it on the disk" if kept else _NOT_KEPT
+        text = f"compiling {LONG.get((function, kind), 'a small part, some seconds')}, {often}"
         wanted = _LOG.level in (logging.NOTSET, logging.INFO)
         if wanted and self._bar is None and sys.stderr is not None and sys.stderr.isatty():
             self._bar = Bar(text.partition(":")[0], endless=True)

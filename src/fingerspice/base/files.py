@@ -70,10 +70,8 @@ def write_durably(path: Path, content: bytes) -> None:
     """Replace a file as a whole: after a crash of the machine there is the old one or the new one."""
 
     def write(temporary: Path) -> None:
-        with temporary.open("wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
+        temporary.write_bytes(content)
+        settle_on_disk(temporary)
 
     write_aside(path, write)
     settle_on_disk(path.parent)
@@ -107,11 +105,9 @@ class _Raw(io.FileIO):
     def write(self, data: Any) -> int:
         try:
             return super().write(data)
-        except BrokenPipeError:
-            return len(data)
-        except OSError:
+        except OSError as error:
             # A failure to write to stderr is ignored; the caller has to report a full disk under stdout.
-            if self.fileno() != 2:
+            if self.fileno() != 2 and not isinstance(error, BrokenPipeError):
                 raise
             return len(data)
 
@@ -124,13 +120,8 @@ def mend_streams() -> None:
         except OSError:
             # Opens the lowest free number, which is this one; else the first file opened would become this stream.
             os.open(os.devnull, os.O_RDWR)
-    sys.stdout = _mended(sys.stdout, 1)
-    sys.stderr = _mended(sys.stderr, 2)
-
-
-def _mended(stream: Any, number: int) -> io.TextIOWrapper:
-    raw = _Raw(number, "w", closefd=False)
-    return io.TextIOWrapper(
-        io.BufferedWriter(raw), encoding=getattr(stream, "encoding", None) or "utf-8", errors="backslashreplace",
-        line_buffering=raw.isatty() or number == 2,
-    )  # fmt: skip
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        raw, encoding = _Raw(number, "w", closefd=False), getattr(getattr(sys, name), "encoding", None) or "utf-8"
+        lines = raw.isatty() or number == 2
+        mended = io.TextIOWrapper(io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=lines)
+        setattr(sys, name, mended)

@@ -9,10 +9,8 @@ from dataclasses import dataclass
 
 from fingerspice.base.errors import printable
 
-#: Largest number of characters of a row's name in a table.
-LONGEST_LABEL = 60
-#: Number of lines of a result that Python's prompt shows.
-SCREEN = 40
+#: Largest number of characters of a row's name in a table, and number of lines of a result that Python's prompt shows.
+LONGEST_LABEL, SCREEN = 60, 40
 _CELL = "padding: 0.1em 0.7em; white-space: nowrap;"
 
 

@@ -20,11 +20,8 @@ PLAIN_UNITS = frozenset(
 )
 
 # Words whose first letters SPICE reads as another scale than is meant, with that scale and the right one.
-_MISREAD = {
-    "milli": ("mil (25.4e-6)", "m"),
-    "micro": ("m (milli)", "u"),
-    **dict.fromkeys(("met", "min"), ("m (milli)", "")),
-}
+_MILLI = "m (milli)"
+_MISREAD = {"milli": ("mil (25.4e-6)", "m"), "micro": (_MILLI, "u"), "met": (_MILLI, ""), "min": (_MILLI, "")}
 _LETTERS = "a-zµμωΩ"
 _NUMBER = re.compile(rf"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:e([+-]?[0-9]+))?(°c|[{_LETTERS}]*)", re.IGNORECASE)
 _LETTER_AS_POINT = re.compile(rf"([+-]?[0-9]+)([{_LETTERS}]+)([0-9]+)[{_LETTERS}]*", re.IGNORECASE)
@@ -65,8 +62,7 @@ def suspicious_mega(text: str) -> bool:
 
 def suggest_mega(text: str) -> str:
     """The same digits followed by ``meg``: ``0.2MOhm`` gives ``0.2meg``."""
-    match = _MEGA.fullmatch(text)
-    return text if match is None else f"{text[: match.start(1)]}meg"
+    return f"{text[: match.start(1)]}meg" if (match := _MEGA.fullmatch(text)) else text
 
 
 def unit_read_as_scale(text: str, unit: str, word: str = "") -> bool:
@@ -80,12 +76,11 @@ def format_si(value: float, unit: str, digits: int = 4) -> str:
     if not math.isfinite(value) or value == 0.0:
         return f"{value + 0.0:g} {unit}".rstrip()
     # Rounded first, as 999.96 to four digits is 1 k and not 1000.
-    mantissa, _, exponent_text = f"{value:.{digits - 1}e}".partition("e")
-    exponent = int(exponent_text)
-    power = 3 * (exponent // 3)
+    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
+    power = 3 * (int(exponent) // 3)
     if power not in _PREFIXES:
         return f"{value:.{digits}g} {unit}".rstrip()
-    scaled = float(mantissa) * 10.0 ** (exponent - power)
+    scaled = float(mantissa) * 10.0 ** (int(exponent) - power)
     return f"{scaled:.{max(digits, 3)}g} {_PREFIXES[power]}{unit}".rstrip()
 
 
@@ -103,17 +98,13 @@ def spice_text(value: float) -> str:
 
 def _power_of_ten(letters: str, text: str, as_written: str) -> int:
     """Power of ten for which the letters after a number, given in lower case, stand."""
-    if letters == "":
-        return 0
     digits = text[: len(text) - len(letters)]
-    if letters.startswith("meg"):
-        return SCALES["meg"]
     for word, (read_as, scale) in _MISREAD.items():
         if letters.startswith(word):
             raise ValueError(f"'{text}' would be read as {digits}{read_as}: write {digits}{scale}")
-    if letters[0] in SCALES:
-        return SCALES[letters[0]]
-    if letters in PLAIN_UNITS:
+    if (scale := "meg" if letters.startswith("meg") else letters[:1]) in SCALES:
+        return SCALES[scale]
+    if letters in {"", *PLAIN_UNITS}:
         return 0
     if letters[0] in "ax":
         meanings = {"a": f"atto ({digits}e-18) or ampere: write {digits}", "x": f"mega: write {digits}meg"}
@@ -131,16 +122,12 @@ def _why_not_a_number(text: str) -> str:
         if letters.lower().startswith(tuple(SCALES)) or letters.lower() in ("r", "v"):
             scale = "" if letters.lower() in ("r", "v") else letters
             return f"'{text}' differs between simulators: write {whole}.{fraction}{scale}"
-    bare = text.rstrip("%°")
-    if bare != text and _NUMBER.fullmatch(bare):
-        plain = f"{float(parse_number(bare)) / 100.0:g}" if text.endswith("%") else bare
-        return f"'{text}' is not a number: write {plain}"
-    joined = "".join(text.split())
-    if joined != text.strip() and _NUMBER.fullmatch(joined):
-        return f"'{text}' is not a number, its unit stands apart: write {joined}"
-    plain = text.translate(_DASHES)
-    if plain != text and _NUMBER.fullmatch(plain):
-        return f"'{text}' is not a number, its minus is a typographic one: write {plain}"
-    if text.count(",") == 1 and _NUMBER.fullmatch(text.replace(",", ".")):
-        return f"'{text}' is not a number, its comma separates: write {text.replace(',', '.')}"
+    guesses = {
+        text.rstrip("%°"): "", "".join(text.split()): ", its unit stands apart",
+        text.translate(_DASHES): ", its minus is a typographic one", text.replace(",", "."): ", its comma separates",
+    }  # fmt: skip
+    for guess, why in guesses.items():
+        if guess != text.strip() and _NUMBER.fullmatch(guess):
+            plain = f"{parse_number(guess) / 100.0:g}" if text.endswith("%") else guess
+            return f"'{text}' is not a number{why}: write {plain}"
     return f"'{text}' is not a number (examples: 10, 2.5, 1e-6, 3.5u, 0.2meg)"

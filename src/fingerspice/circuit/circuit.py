@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 from fingerspice.base.arrays import real_number
 from fingerspice.base.errors import FingerspiceWarning, InputError, Where
 from fingerspice.base.pages import Page, Shown
-from fingerspice.base.units import parse_number, suspicious_mega
+from fingerspice.base.units import parse_number
 from fingerspice.circuit.devices import DEVICES, DeviceSpec, check, concerns, mega_note, unit_trap, unusual_of_changed
-from fingerspice.waveforms.waveform import Waveform, as_waveform
+from fingerspice.waveforms.waveform import Waveform, as_waveform, require
 
 CHARGE_LAWS = ("local", "mobile")
 WORK_READINGS = ("gap", "total")
@@ -37,8 +37,7 @@ class SmallSignal:
 
     def __post_init__(self) -> None:
         for what, value in (("magnitude", self.magnitude), ("phase", self.phase_deg)):
-            if not math.isfinite(value):
-                raise InputError(f"AC {what} is {value:g}; allowed: a finite number")
+            require(math.isfinite(value), f"AC {what}", f"{value:g}", "a finite number")
 
     @property
     def phasor(self) -> complex:
@@ -52,9 +51,8 @@ class Element:
 
     name: str  # As written; of an element of a subcircuit with its path, as in ``Xfinger.Xgap``
     device: str  # Entry of `DEVICES`
-    # nodes, node_names: Nodes in lower case with ground as ``0``, and the same nodes as written
-    nodes: tuple[str, ...]
-    node_names: tuple[str, ...]
+    nodes: tuple[str, ...]  # In lower case, with ground as ``0``
+    node_names: tuple[str, ...]  # As written
     values: Mapping[str, float]  # Value of every parameter of the device, in the netlist's unit
     waveform: Waveform | None = None  # Of a source
     initial: float | None = None  # ``IC=`` of a capacitor, V
@@ -81,9 +79,8 @@ class Element:
     def parameters(self) -> dict[str, Parameter]:
         """Every number of the device and of its waveform by name, with its unit."""
         found = {p.name: Parameter(self.values[p.name], p.unit) for p in self.spec.parameters}
-        units = {} if self.waveform is None else type(self.waveform).units
-        given = {name: Parameter(getattr(self.waveform, name, math.nan), unit) for name, unit in units.items()}
-        return found | {name: p for name, p in given.items() if hasattr(self.waveform, name)}
+        wave, units = self.waveform, {} if self.waveform is None else type(self.waveform).units
+        return found | {x: Parameter(getattr(wave, x), unit) for x, unit in units.items() if hasattr(wave, x)}
 
     def remember(self, key: Any, make: Callable[[], T]) -> T:
         """The result of `make`, which depends on this element alone, for all circuits that contain it."""
@@ -285,19 +282,17 @@ class Circuit(Shown):
         elements = {e.name.lower(): e for e in self.elements}
         overrides, traps = dict(self.overrides), dict[str, str]()
         for path, value in changes.items():
-            name, _, parameter = path.lower().rpartition(".")
-            if path.lower() in elements and elements[path.lower()].device in "VI":
-                if isinstance(value, str):
-                    from fingerspice.netlist.netlist import source_from_text
+            key = path.lower()
+            name, _, parameter = key.rpartition(".")
+            if key in elements and elements[key].device in "VI":
+                from fingerspice.netlist.netlist import source_from_text
 
-                    waveform = source_from_text(value, self)
-                else:
-                    waveform = as_waveform(value)
+                waveform = source_from_text(value, self) if isinstance(value, str) else as_waveform(value)
                 # The AC magnitude belonged to the source that is replaced.
-                elements[path.lower()] = dataclasses.replace(elements[path.lower()], waveform=waveform, ac=None)
+                elements[key] = dataclasses.replace(elements[key], waveform=waveform, ac=None)
             elif name in elements:
                 elements[name], trap = _changed(elements[name], parameter, value, path)
-                traps |= {path.lower(): trap} if trap else {}
+                traps |= {key: trap} if trap else {}
             else:
                 raise InputError(self._unknown_path(path))
             overrides[path] = value if isinstance(value, str) else getattr(value, "__name__", str(value))
@@ -318,13 +313,13 @@ class Circuit(Shown):
         """The message about a path that `replace` does not know."""
         name = path.rpartition(".")[0] or path
         inside = [e.name for e in self.elements if e.name.lower().startswith(f"{name.lower()}.")]
-        if inside:
-            shown = ", ".join([*inside[:8], *(["..."] if len(inside) > 8 else [])])
-            return (
-                f"unknown parameter {path!r}: {name} is a subcircuit, whose own parameters got their values when "
-                f"the deck was read; allowed: a parameter of an element inside it ({shown})"
-            )
-        return _unknown("parameter", path, [*self.parameters, *(e.name for e in self.by_device("V", "I"))])
+        if not inside:
+            return _unknown("parameter", path, [*self.parameters, *(e.name for e in self.by_device("V", "I"))])
+        shown = ", ".join(inside if len(inside) <= 8 else [*inside[:8], "..."])
+        return (
+            f"unknown parameter {path!r}: {name} is a subcircuit, whose own parameters got their values when the deck "
+            f"was read; allowed: a parameter of an element inside it ({shown})"
+        )
 
 
 def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[Element, str | None]:
@@ -342,9 +337,9 @@ def _changed(element: Element, parameter: str, given: Any, path: str) -> tuple[E
             value = parse_number(text)
         except ValueError as error:
             raise InputError(f"{path}: {error}") from None
-        if spec is not None and (trap := unit_trap(spec, text)):
-            raise InputError(f"{path} {trap}")
-        if spec is not None and suspicious_mega(text):
+        if spec is not None:
+            if trap := unit_trap(spec, text):
+                raise InputError(f"{path} {trap}")
             note = mega_note(text, value, spec)
     told = f"{path}: {note}" if note else None
     if spec is not None:

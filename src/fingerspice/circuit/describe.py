@@ -1,7 +1,5 @@
 """A circuit in words and its digests, checks of a call's arguments, and warnings before a run.
 
-These are about a circuit before it runs: directives without effect, unsuitable skin data, sources that miss it.
-
 What is said about a skin's data rests on the source's spectrum: its energy outside their band, and the error of data
 held at one frequency.
 """
@@ -73,10 +71,8 @@ MEANINGS_OF_WAVEFORMS = {
     "modulation": "envelope", "phase_deg": "phase", "f0": "first frequency", "f1": "last frequency", "v1": "low level",
     "v2": "high level", "td1": "rise begins", "tau1": "rise constant", "td2": "fall begins", "tau2": "fall constant",
 }  # fmt: skip
-#: Largest number of changes, or of sources, that one line names; the number of the others is added.
-_MOST = 8
-#: Largest number of elements that a circuit's page lists.
-_MOST_ELEMENTS = 25
+# Largest number of changes, or of sources, that one line names, and of elements that a circuit's page lists.
+_MOST, _MOST_ELEMENTS = 8, 25
 
 
 def meaning_of(circuit: Circuit, path: str) -> str:
@@ -100,11 +96,10 @@ def waveform_text(waveform: Waveform, unit: str = "V") -> str:
     said += [waveform_text(waveform.waveform, unit)] if isinstance(waveform, Burst | Repeat) else []
     for field in dataclasses.fields(waveform):  # type: ignore[arg-type]
         value = getattr(waveform, field.name)
-        if field.name not in waveform.units or value == field.default:
-            continue
-        text = shown(value, waveform.units[field.name].replace("V", unit))
-        # A required figure is known by its position; one that has a default needs its name.
-        said.append(text if field.default is dataclasses.MISSING else f"{field.name} {text}")
+        if field.name in waveform.units and value != field.default:
+            # A required figure is known by its position; one that has a default needs its name.
+            name = "" if field.default is dataclasses.MISSING else f"{field.name} "
+            said.append(name + shown(value, waveform.units[field.name].replace("V", unit)))
     return f"{type(waveform).__name__}({', '.join(said)})"
 
 
@@ -177,17 +172,11 @@ def circuit_page(circuit: Circuit) -> Page:
 
 def values_text(element: Element) -> str:
     """Values of an element in the units of the netlist, without those that are infinite, and its waveform."""
-    said = [f"{name}={_deck_value(value)}" for name, value in element.values.items() if math.isfinite(value)]
+    said = []
+    for name, value in element.values.items():
+        text = f"{value:.4g}" if 0.01 <= abs(value) < 1e4 else format_si(value, "").replace(" ", "").replace("M", "meg")
+        said += [f"{name}={text}"] if math.isfinite(value) else []
     return " ".join(said if element.waveform is None else [*said, _own_text(element)])
-
-
-def _deck_value(value: float) -> str:
-    """A number as written in decks: ``3.5u``, ``0.2meg``, ``0.3``."""
-    text = format_si(value, "").replace(" ", "")
-    # SPICE reads M as milli, and does not know P and E.
-    if 0.01 <= abs(value) < 1e4 or text[-1:] in "PEZY":
-        return f"{value:.4g}"
-    return f"{text[:-1]}meg" if text.endswith("M") else text
 
 
 def _joined(said: list[str]) -> str:
@@ -228,9 +217,8 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
     named = {name.lower() for name in sources}
     on = [e.name for e in driving if e.name.lower() not in named and e.waveform not in (None, DC(0.0))]
     if on and any(e.name.lower() in named for e in driving):
-        text = (
-            f"sources names {', '.join(sources)} only: {', '.join(on)} stays on, as in the deck; 0 would switch it off"
-        )
+        text = f"sources names {', '.join(sources)} only: {', '.join(on)} stays on, as in the deck"
+        text += "; 0 would switch it off"
         warnings.warn(text, FingerspiceWarning, stacklevel=3)
         circuit = dataclasses.replace(circuit, warnings=(*circuit.warnings, text))
     return circuit.replace({circuit[name].name: value for name, value in sources.items()})
@@ -239,9 +227,8 @@ def overridden(circuit: Circuit, sources: Sources | None = None, parameters: Par
 def require_circuit(circuit: Any) -> None:
     """Refuse anything but a circuit, and say how a circuit is made."""
     if not isinstance(circuit, Circuit):
-        raise InputError(
-            f"the circuit is a {type(circuit).__name__}; allowed: a Circuit, such as fs.read_netlist('deck.cir') gives"
-        )
+        allowed = "a Circuit, such as fs.read_netlist('deck.cir') gives"
+        raise InputError(f"the circuit is a {type(circuit).__name__}; allowed: {allowed}")
 
 
 def area_given(area: Any) -> str | float:
@@ -254,10 +241,9 @@ def area_given(area: Any) -> str | float:
     return number
 
 
-# Largest relative difference of frequencies that are the same; and the words by which a warning about a SKIN begins.
-_SAME, _TAKES = 1e-9, "takes its data at f ="
-# Smallest relative error of the mean force that is given as a number.
-_LITTLE = 0.005
+# Largest relative difference of frequencies that are the same, and smallest one of the mean force that is given as a
+# number; and the words by which a warning about a SKIN begins.
+_SAME, _LITTLE, _TAKES = 1e-9, 0.005, "takes its data at f ="
 # Directives that only ngspice needs, so that no warning is given about them.
 _FOR_NGSPICE = (".nodeset", ".options")
 # Smallest number of points that make a PWL a recording, which is meant to be run to its end and not to be a step in a
@@ -266,21 +252,17 @@ _RECORDED, _FILLED = 100, 0.01
 # Times (s) from `_CLOCK` on are those of a clock (this is a day in 1973, counted from 1970); times beyond the end of a
 # run by a factor of `_OTHER_UNIT` or more are probably in another unit.
 _CLOCK, _OTHER_UNIT = 1e8, 20.0
-# Largest number of samples of a spectrum, and largest number of periods over which a periodic source is evaluated.
-_MOST_SAMPLES = 2**17
-_PERIODS = 16
-# Number of pieces that represent a long run of a source without period, and number of frequencies at which gains are
-# computed.
+# Largest number of samples of a spectrum; and of periods over which a skin's data at one frequency are judged.
+_MOST_SAMPLES, _PERIODS = 2**17, 16
+# Number of pieces that represent a long run of a source without period, and of frequencies of gains.
 _PIECES, _GRID = 4, 49
-# Least length of a piece of a recording, s: two periods of the lowest frequency of the skin's data.
-_LEAST = 2.0 / SKIN_BAND[0]
-# Number of samples of a recording up to which straight lines between them are looked at instead.
-_FEW = 4096
+# Least length (s) of a piece of a recording, two periods of the lowest frequency of the skin's data; and the number of
+# samples up to which straight lines between them are looked at instead.
+_LEAST, _FEW = 2.0 / SKIN_BAND[0], 4096
 # A source is in a band if no more than this fraction of its energy is outside.
 NOTABLE = 0.01
 # The area's harmonics also drive currents through the skin. Skin data held at the fundamental cause an additional
-# relative error of at most COUPLING times the relative change of the area: 0.004 was found where the area changes by a
-# quarter (sine of 200 V and 100 Hz).
+# relative error of at most COUPLING times the relative change of the area; 0.004 was found for a change of a quarter.
 COUPLING = 0.05
 
 
@@ -306,24 +288,20 @@ def course_warnings(circuit: Circuit, start: float, stop: float, by_deck: bool) 
     for name, wave in ((e.name, e.waveform) for e in driving(circuit) if e.waveform is not None):
         (first, last), recording = wave.course, as_samples(wave)
         # Of a recording or table; 0 of other waveforms.
-        count = len(wave.times) if isinstance(wave, PWL) and wave.repeat is None else 0
-        count = count if recording is None else recording.count
+        table = len(wave.times) if isinstance(wave, PWL) and wave.repeat is None else 0
+        count = table if recording is None else recording.count
         if (count > 1 and last < start == 0.0) or stop <= first < math.inf:
             until = f" to {last:g} s" if last < math.inf else " on"
-            yield (
-                f"{name} changes from {first:g} s{until} only, and covers nothing of the run from {start:g} s to "
-                f"{stop:g} s, in which it stays at {wave.value(stop, 'left'):.4g}{time_slip(first, last, stop)}"
-            )
+            where = f"the run from {start:g} s to {stop:g} s, in which it stays at {wave.value(stop, 'left'):.4g}"
+            slip = time_slip(first, last, stop)
+            yield f"{name} changes from {first:g} s{until} only, and covers nothing of {where}{slip}"
         elif count >= _RECORDED and last - first < _FILLED * (stop - start):
-            yield (
-                f"{name}: the recording, from {first:g} s to {last:g} s, is {100.0 * (last - first) / stop:.2g} % of "
-                f"the run to {stop:g} s, and constant in the rest; its times, or its rate, are probably in another unit"
-            )
+            share = f"{100.0 * (last - first) / stop:.2g} % of the run to {stop:g} s, and constant in the rest"
+            unit = "its times, or its rate, are probably in another unit"
+            yield f"{name}: the recording, from {first:g} s to {last:g} s, is {share}; {unit}"
         elif by_deck and count >= _RECORDED and last > stop + (last - first) / (count - 1):
-            yield (
-                f"{name}: the recording ends at {last:g} s, and the run at the deck's TSTOP = {stop:g} s; --stop "
-                f"{last:.9g} takes all of it (in Python t_stop={last:.9g})"
-            )
+            ends = f"{name}: the recording ends at {last:g} s, and the run at the deck's TSTOP = {stop:g} s"
+            yield f"{ends}; --stop {last:.9g} takes all of it (in Python t_stop={last:.9g})"
 
 
 def time_slip(first: float, last: float, stop: float) -> str:
@@ -356,8 +334,7 @@ def scenes_warnings(
         return
 
     def span(f: FloatArray) -> str:
-        low, high = float(f.min()), float(f.max())
-        return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+        return " to ".join(f"{end:g}" for end in sorted({float(f.min()), float(f.max())})) + " Hz"
 
     own = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     on = driving_sources(circuit) if own else []
@@ -370,37 +347,28 @@ def scenes_warnings(
         for path in own:
             f = scenes.get(path, np.array(circuit.parameters[path].value))
             if np.any(np.abs(f / at - 1.0) > _SAME):
-                yield (
-                    f"{path.removesuffix('.f')} {_TAKES} {span(f)}, the source's fundamental is {span(at)}; with "
-                    "skin 'follow' they are taken at the fundamental"
-                )
+                taken = f"{path.removesuffix('.f')} {_TAKES} {span(f)}, the source's fundamental is {span(at)}"
+                yield f"{taken}; with skin 'follow' they are taken at the fundamental"
 
 
 def _skin_warnings(circuit: Circuit, stop: float) -> Iterator[str]:
     skins = circuit.by_device("SKIN")
     waves = network_of(circuit).waveforms if skins else ()
     # With several sources only the user can know at which frequency the skin data should be taken.
-    if len(waves) != 1:
-        return
-    (wave,), fundamental, known = waves, waves[0].fundamental, 0.0 < stop < math.inf
-    for skin in skins:
+    for skin in skins if len(waves) == 1 else ():
+        (wave,), fundamental, known = waves, waves[0].fundamental, 0.0 < stop < math.inf
         f = skin.values["f"]
+        taken = f"{skin.name} {_TAKES} {f:g} Hz"
         if fundamental is not None and abs(f / fundamental.frequency - 1.0) > _SAME:
-            yield (
-                f"{skin.name} {_TAKES} {f:g} Hz, the source's fundamental is "
-                f"{fundamental.frequency:g} Hz; {skin.name}.f={fundamental.frequency:g} would match"
-            )
+            own = f"{fundamental.frequency:g}"
+            yield f"{taken}, the source's fundamental is {own} Hz; {skin.name}.f={own} would match"
         elif fundamental is None and not (known and is_near(wave, stop, f)):
             error = skin_error(circuit, wave, stop) if known else None
-            off = "may be 5 to 10 % off"
-            if error is not None:
+            off = f"may be {'5 to 10' if error is None else f'{100.0 * _LITTLE:g}'} % off"
+            if error is not None and abs(error) >= _LITTLE:
                 off = f"is about {100.0 * abs(error):.2g} % too {'large' if error > 0.0 else 'small'}"
-            if error is not None and abs(error) < _LITTLE:
-                off = f"may be {100.0 * _LITTLE:g} % off"
-            yield (
-                f"{skin.name} {_TAKES} {f:g} Hz, and the source has no fundamental: the mean force {off}; "
-                f"SKIN_DISPERSIVE d={1e6 * skin.values['d']:g}u is right for any source"
-            )
+            right = f"SKIN_DISPERSIVE d={1e6 * skin.values['d']:g}u is right for any source"
+            yield f"{taken}, and the source has no fundamental: the mean force {off}; {right}"
 
 
 # Spectra
@@ -472,7 +440,7 @@ def energy_outside(waveform: Waveform, t_stop: float, band: tuple[float, float] 
     f, energy = (_recorded(waveform, t_stop) if slow else None) or _energies(waveform, t_stop, high)
     total = float(energy.sum())
     # The window spreads a line over the neighbouring bins, so one bin below the band counts as inside.
-    below = f < low - (0.0 if waveform.period is not None else f[1] if f.size > 1 else 0.0)
+    below = f < low - (f[1] if waveform.period is None and f.size > 1 else 0.0)
     return (float(energy[below].sum() / total), float(energy[f > high].sum() / total)) if total > 0.0 else (0.0, 0.0)
 
 
@@ -481,8 +449,7 @@ def is_near(waveform: Waveform, t_stop: float, frequency: float) -> bool:
 
     In that band the skin's data change by 3 %.
     """
-    found = _recorded(waveform, t_stop)
-    if found is not None:
+    if (found := _recorded(waveform, t_stop)) is not None:
         # A coarse look at a recording suffices if it finds a fifth of the energy more than half an octave away.
         (f, energy), blurred = found, 2.0 * found[0][1]
         far = (f < frequency / 1.4 - blurred) | (f > 1.4 * frequency + blurred)
@@ -522,22 +489,19 @@ def skin_error(circuit: Circuit, waveform: Waveform, t_stop: float) -> float | N
     return float(errors[np.argmax(np.abs(errors))])
 
 
-def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> str | None:
-    """A warning where a dispersive skin is driven outside the band of its data, or None."""
+def spectrum_warning(circuit: Circuit, waveform: Waveform, t_stop: float) -> Iterator[str]:
+    """A warning where a dispersive skin is driven outside the band of its data."""
     skins = circuit.by_device("SKIN_DISPERSIVE")
-    if not skins or not (math.isfinite(t_stop) and t_stop > 0.0):
-        return None
-    end, below, above = waveform.kept.get("outside", (None, 0.0, 0.0))
+    if not skins or not 0.0 < t_stop < math.inf:
+        return
+    end, shares = waveform.kept.get("outside", (None, ()))
     if end != t_stop:
-        below, above = energy_outside(waveform, t_stop)
-        waveform.kept["outside"] = t_stop, below, above
-    parts = [
-        f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}"
-        for share, where in ((below, f"below {SKIN_BAND[0]:g} Hz"), (above, f"above {SKIN_BAND[1] / 1e3:g} kHz"))
-        if share > NOTABLE
-    ]
-    where = f"lie outside the band of the data behind {skins[0].name}"
-    return f"of the source's energy {' and '.join(parts)} {where}" if parts else None
+        _, shares = waveform.kept["outside"] = t_stop, energy_outside(waveform, t_stop)
+    ends = f"below {SKIN_BAND[0]:g} Hz", f"above {SKIN_BAND[1] / 1e3:g} kHz"
+    found = [(share, where) for share, where in zip(shares, ends, strict=True) if share > NOTABLE]
+    parts = " and ".join(f"{100.0 * share:.{0 if share > 0.1 else 1}f} % {where}" for share, where in found)
+    if found:
+        yield f"of the source's energy {parts} lie outside the band of the data behind {skins[0].name}"
 
 
 def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity: float, t_stop: float) -> float:
@@ -555,10 +519,6 @@ def freezing_error(circuit: Circuit, frequency: float, area: float, sensitivity:
     lines = np.fft.rfft(u, 2 * u.size)
     f = np.arange(1, lines.size) / (2.0 * span)
     gains = [layer_gains(stack.admittance(f, np.array([area])))[:, gap] for stack in (dispersive, frozen)]
-    right, missed = (
-        np.fft.irfft(np.concatenate([[0.0], gain * lines[1:]]))[: u.size] for gain in (gains[0], gains[1] - gains[0])
-    )
-    peak = float(np.abs(right).max())
-    if not (peak > 0.0 and math.isfinite(peak)):
-        return math.inf
-    return float(np.abs(missed).max()) / peak + COUPLING * sensitivity
+    responses = (np.append(0.0, gain * lines[1:]) for gain in (gains[0], gains[1] - gains[0]))
+    peak, missed = (float(np.abs(np.fft.irfft(one)[: u.size]).max()) for one in responses)
+    return missed / peak + COUPLING * sensitivity if peak > 0.0 and math.isfinite(peak) else math.inf

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
-from fingerspice.base.units import format_si, spice_text, suggest_mega, unit_read_as_scale
+from fingerspice.base.units import format_si, spice_text, suggest_mega, suspicious_mega, unit_read_as_scale
 from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, skin_permittivity, skin_resistivity
 
 if TYPE_CHECKING:
@@ -33,10 +33,8 @@ _MILLIONS = {"mm^2": (6, -6), "mm^2/N^m": (6, -6), "mm^4/N^2": (12, -12)}
 
 @dataclass(frozen=True)
 class Usual:
-    """Usual range of a quantity, both ends included."""
+    """Usual range of the size of a quantity, both ends included; 0 and inf mean "none" and cause no warning."""
 
-    # least, most: Smallest and largest usual size of the quantity, in its unit. 0 and inf mean "none" and cause no
-    # warning.
     least: float
     most: float
     source: str  # Origin of the range, as words to stand in brackets
@@ -44,8 +42,7 @@ class Usual:
 
     def warning(self, what: str, value: float, unit: str) -> str | None:
         """The warning about a value of `what`, such as ``Xgap d``, outside the range; None for a value inside."""
-        size = abs(value)
-        if size == 0.0 or not math.isfinite(size) or self.least <= size <= self.most:
+        if abs(value) in (0.0, math.inf) or math.isnan(value) or self.least <= abs(value) <= self.most:
             return None
         ends = f"{shown(self.least, unit if unit in _PREFIXED else '')} to {shown(self.most, unit)}"
         said = f"{what} is {shown(value, unit)}, outside {ends}, the usual range ({self.source})"
@@ -66,8 +63,7 @@ def shown(value: float, unit: str) -> str:
 Value = float | FloatArray
 #: Function from an element's values (in the netlist's units), or those of several scenes (n,), to its cells in series,
 #: shape (n_cell, 3) or (n_cell, 3, n): capacitance per area (F/m^2), total leakage (S) and leakage per area (S/m^2). At
-#: a frequency (Hz), the second argument, a dispersive material becomes one cell with its data there; None gives all
-#: cells of its ladder.
+#: a frequency (Hz), the second argument if not None, a dispersive material becomes one cell with its data there.
 Cells = Callable[[Mapping[str, Value], float | None], FloatArray]
 
 
@@ -83,8 +79,7 @@ class ParameterSpec:
     first: bool = False  # Whether the explorer's page shows it at once: the paper varies it, or Table 1 gives it
     may_be_zero: bool = False
     may_be_infinite: bool = False
-    # least, most: Range of all other numbers: wide enough for any device, and so narrow that products and quotients do
-    # not overflow
+    # Range of all other numbers: wide enough for any device, and so narrow that products and quotients do not overflow
     least: float = 1e-30
     most: float = 1e30
 
@@ -130,8 +125,8 @@ class DeviceSpec:
         return "area" in self.nodes
 
 
-def _cells(c: ArrayLike, g_total: ArrayLike, g_area: ArrayLike) -> FloatArray:
-    return np.stack(np.broadcast_arrays(c, g_total, g_area), axis=1)
+def _cells(*constants: ArrayLike) -> FloatArray:
+    return np.stack(np.broadcast_arrays(*constants), axis=1)
 
 
 def _layer_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
@@ -145,49 +140,34 @@ def _skin_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
 
 
 def _dispersive_cells(v: Mapping[str, Value], at: float | None) -> FloatArray:
-    if at is None:
-        eps_r, rho = SKIN_LADDER.cells()
-    else:
-        eps_r, rho = SKIN_LADDER.permittivity([at]), SKIN_LADDER.resistivity([at])
+    whole = SKIN_LADDER
+    eps_r, rho = whole.cells() if at is None else (whole.permittivity([at]), whole.resistivity([at]))
     return _cells(np.divide.outer(EPS0 * eps_r, v["d"]), 0.0, 1.0 / np.multiply.outer(rho, v["d"]))
 
 
 # Usual ranges, each with its source.
 
-# Sputtered and spun films have 10 nm to 10 um, foils up to 1 mm, cover glasses and screen protectors up to some mm.
 _COATING = Usual(10e-9, 1e-2, "from a sputtered film to a thick glass")
-# The horny layer has 10 to 20 um on most of the body and some 0.2 to 0.6 mm at the fingertip; callus has over 1 mm.
 _SKIN = Usual(1e-6, 2e-3, "skin has 10 um, a fingertip 0.2 to 0.6 mm, callus over 1 mm")
-# The air between rough skin and a screen: 3.5 um in Table 1; below 10 nm surfaces attract each other, and above 100 um
-# the ridges (some 60 um high) do not touch the screen.
+# Below 10 nm surfaces attract each other, and above 100 um the ridges (some 60 um high) do not touch the screen.
 _AIR = Usual(10e-9, 100e-6, "from van der Waals contact to ridges off the screen; 3.5 um in Table 1")
 _EPS_R = Usual(1.0, 1e4, "air has 1, polymers 2 to 10, ceramics up to some thousand")
-# Weak conductors, such as skin at low frequencies (the first slab of its ladder), have up to 1e5.
 _EPS_R_MATERIAL = Usual(1.0, 1e6, "polymers have 2 to 10, skin at low frequencies up to 1e5")
-# 0.2 and 1 megohm in Table 1. Sweat in the gap (some ohm m, a few um, 35 mm^2) gives an ohm; a good polymer, 1e14 ohm m
-# at 100 um, gives 1e14 ohm.
+# Sweat in the gap: some ohm m, a few um, 35 mm^2; a good polymer: 1e14 ohm m at 100 um.
 _LEAK = Usual(1.0, 1e15, "0.2 to 1 megohm in Table 1, an ohm for sweat, 1e14 ohm for a good polymer")
-# Sweat has 0.7 ohm m, skin 1e3 to 1e5 (Eq. 18), the best polymers 1e16.
 _RHO = Usual(0.1, 1e17, "sweat has 1 ohm m, skin 1e4, good polymers 1e14 to 1e16")
-# Air has 3 MV/m, glass 10 to 40, thin polymer and oxide films 100 to 1000.
 _STRENGTH = Usual(1e5, 1e10, "air has 3 MV/m, thin oxides 1 GV/m", "V/m, not V/um")
-# Fingers touch with 0.1 to 5 N and press with less than 50 N; a value of 50 is probably meant in millinewton.
+# Fingers press with less than 50 N: a value of 50 is probably meant in millinewton.
 _LOAD = Usual(1e-3, 49.9, "a finger touches with 0.1 to 5 N", "newton, not millinewton")
 _FRICTION = Usual(0.01, 5.0, "dry skin on glass has 0.1 to 1, moist skin up to 3")
-# The ridge area at 1 N (Eq. 5), from a pencil's tip to a palm; Table 1 has 54.4.
 _ALPHA = Usual(1.0, 2000.0, "the ridge area at 1 N; 54.4 in Table 1", "mm^2 and N")
-# A smooth ball has 2/3 (Hertz), a rough plane up to 1; measured fingers have 0.2 to 0.8, Table 1 has 0.52.
-_M_EXP = Usual(0.1, 1.0, "2/3 for a ball, 1 for a rough plane, 0.52 in Table 1")
-_BETA = Usual(0.3, 1e4, "pi for a full disc, 32 in Table 1", "mm")
-_N_EXP = Usual(0.5, 3.0, "2 for a full disc, 1.41 in Table 1")
 # Table 1 has 5000: at a friction force of 0.15 N, c2 F_T^2 is then a tenth of the square of a fingertip's area.
 _C2 = Usual(1.0, 1e6, "5000 in Table 1", "mm^4/N^2")
 _TAU = Usual(1e-5, 60.0, "skin creeps within 1 ms to some seconds")
 _BAND = Usual(*SKIN_BAND, "where the data of Eqs. 18 and 19 were measured")
-# Resistances from leads to insulators; capacitances from a fraction of a picofarad between leads to a power supply's.
 _OHM = Usual(1e-3, 1e15, "a lead has milliohms, an insulator up to 1e15 ohm")
 _FARAD = Usual(1e-16, 1e-2, "a body has 150 pF to ground, a supply's capacitor some mF")
-#: Area of a finger's ridges on the screen, mm^2: Table 1 has 35, the tip of a hair 0.01, a palm some thousand.
+#: Area of a finger's ridges on the screen, mm^2; Table 1 has 35.
 REST_AREA = Usual(0.1, 2000.0, "a fingertip has 20 to 400, a palm some 1000", "mm^2, not m^2")
 
 #: Usual ranges of sources, by the unit of the parameter. Screens for electrovibration take 10 to 400 V, electroadhesive
@@ -228,9 +208,9 @@ _DEVICES = (
             _P("fn", "N", 0.5, _LOAD, "load", first=True),
             _P("mu", "", 0.3, _FRICTION, "friction coeff.", first=True, may_be_zero=True),
             _P("alpha", "mm^2/N^m", 54.4, _ALPHA, "area at 1 N"),
-            _P("m_exp", "", 0.52, _M_EXP, "load exp."),
-            _P("beta", "mm^(2-n)", 32.0, _BETA, "area at 1 mm"),
-            _P("n_exp", "", 1.41, _N_EXP, "indent exp."),
+            _P("m_exp", "", 0.52, Usual(0.1, 1.0, "2/3 for a ball, 1 for a rough plane, 0.52 in Table 1"), "load exp."),
+            _P("beta", "mm^(2-n)", 32.0, Usual(0.3, 1e4, "pi for a full disc, 32 in Table 1", "mm"), "area at 1 mm"),
+            _P("n_exp", "", 1.41, Usual(0.5, 3.0, "2 for a full disc, 1.41 in Table 1"), "indent exp."),
             _P("c2", "mm^4/N^2", 5000.0, _C2, "friction loss", may_be_zero=True),
             _P("a_fix", "mm^2", 0.0, REST_AREA, "fixed area", may_be_zero=True),
             _P("tau", "s", 0.0, _TAU, "area lag", may_be_zero=True),
@@ -272,10 +252,8 @@ def beyond_fingers(where: str, force: float, pressure: float, area: float) -> It
     """Warnings about largest values of a run (N, Pa and m^2) that no finger can have; `where` may be `` of Xgap``."""
     for value, (what, largest, unit, reason) in zip((force, pressure, area), _LARGEST, strict=True):
         if value > largest:
-            yield (
-                f"the {what}{where} reaches {shown(value, unit)}, over {shown(largest, unit)} ({reason}): some value "
-                "is probably in another unit"
-            )
+            reached = f"the {what}{where} reaches {shown(value, unit)}, over {shown(largest, unit)} ({reason})"
+            yield f"{reached}: some value is probably in another unit"
 
 
 # Units whose letter SPICE reads as a scale factor, with their names, and how SPICE reads them.
@@ -291,7 +269,7 @@ def unit_trap(spec: ParameterSpec, text: str) -> str | None:
 
 def mega_note(text: str, value: float, spec: ParameterSpec) -> str | None:
     """The warning about a number with a capital M, which SPICE reads as milli, if the parameter is a resistance."""
-    if spec.unit not in ("ohm", "ohm m"):
+    if spec.unit not in ("ohm", "ohm m") or not suspicious_mega(text):
         return None
     return f"{text!r} is milli ({value:g} {spec.unit}), as everywhere in SPICE; for megohm write {suggest_mega(text)}"
 
@@ -299,7 +277,7 @@ def mega_note(text: str, value: float, spec: ParameterSpec) -> str | None:
 def unusual(element: Element) -> Iterator[tuple[str, str]]:
     """Warnings about an element's unusual values, each with the parameter's name (empty for the area at 0 V)."""
     v, own = element.values, {p.name: p.usual for p in element.spec.parameters}
-    ranges = ((name, p, own[name] if name in own else SOURCES.get(p.unit)) for name, p in element.parameters.items())
+    ranges = ((name, p, own.get(name, SOURCES.get(p.unit))) for name, p in element.parameters.items())
     found = [(name, usual.warning(f"{element.name} {name}", p.value, p.unit)) for name, p, usual in ranges if usual]
     if element.device == "GAP" and v["a_fix"] == 0.0 and not any(text for _, text in found):
         adhesive = v["alpha"] * v["fn"] ** v["m_exp"]
@@ -321,11 +299,10 @@ def unusual_of_changed(before: Circuit, after: Circuit) -> tuple[dict[str, str],
 
 def concerns(warning: str, changes: Mapping[str, Any]) -> bool:
     """Whether a warning of the reader is about the notation of a value that `changes` now replaces."""
-    subjects = list[str]()
+    subjects = set[str]()
     for path in map(str.lower, changes):
-        name, _, parameter = path.rpartition(".")
         # A warning that names only the source may be about its frequency.
-        subjects += [path, f"{name} {parameter}", *([name] if parameter == "frequency" else [])]
+        subjects |= {path, " ".join(path.rsplit(".", 1)), path.removesuffix(".frequency")}
     return any(f": {subject}: " in warning.lower() for subject in subjects)
 
 
@@ -346,14 +323,12 @@ def _check_element(element: Element) -> None:
     if element.device != "GAP":
         return
     m, n, fault = v["m_exp"], v["n_exp"], ""
-    loss = math.sqrt(v["c2"]) * v["mu"] * v["fn"]
+    loss, exponents = math.sqrt(v["c2"]) * v["mu"] * v["fn"], f"m_exp={m:g}, n_exp={n:g}"
     if not 0.0 < m < n:
-        fault = f"exponents are m_exp={m:g}, n_exp={n:g}; allowed: 0 < m_exp < n_exp"
-    elif not 1.0 / m + 1.0 / n > 1.0:
-        fault = (
-            f"exponents m_exp={m:g}, n_exp={n:g} give 1/m + 1/n = {1 / m + 1 / n:.4g}; allowed: more than 1 (else Eq. "
-            "4 has no single root)"
-        )
+        fault = f"exponents are {exponents}; allowed: 0 < m_exp < n_exp"
+    elif not (total := 1.0 / m + 1.0 / n) > 1.0:
+        allowed = "more than 1 (else Eq. 4 has no single root)"
+        fault = f"exponents {exponents} give 1/m + 1/n = {total:.4g}; allowed: {allowed}"
     elif v["a_fix"] == 0.0 and not (area := v["alpha"] * v["fn"] ** m) > loss:
         hint = "".join(f"; note {text}" for _, text in unusual(element))
         fault = (

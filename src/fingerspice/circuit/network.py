@@ -23,42 +23,28 @@ from numpy.typing import ArrayLike
 
 from fingerspice.base.arrays import ComplexArray, FloatArray
 from fingerspice.base.errors import InputError
+from fingerspice.circuit import statespace
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.devices import check
-from fingerspice.circuit.statespace import (
-    Area,
-    Stack,
-    Tree,
-    build_stack,
-    contact_of,
-    find_branches,
-    is_stack,
-    layer_constants,
-    shared,
-    skin_admittance,
-)
+from fingerspice.circuit.statespace import Area, Stack, build_stack, contact_of, find_branches, shared
 from fingerspice.physics.contact import Contact
 from fingerspice.physics.materials import skin_permittivity, skin_resistivity
 from fingerspice.physics.phasor import coupled_area, layer_gains
-from fingerspice.waveforms.waveform import Fundamental, Waveform
+from fingerspice.waveforms.waveform import Waveform
 
 # A current of a source that is this small, relative to what it is the difference of, is rounding.
 _ROUNDING = 1e-13
 
 
 class Cell(NamedTuple):
-    """A capacitor with its parallel leak: a C, a layer, or one of the slabs of a dispersive layer.
-
-    The capacitance is `c` times the area, and the leak is `g_area` times the area plus `g_total`; a cell without an
-    area has the capacitance `c`.
-    """
+    """A capacitor with its parallel leak: a C, a layer, or one of the slabs of a dispersive layer."""
 
     element: Element
     nodes: tuple[str, str]
-    c: float
-    g_total: float
-    g_area: float
     area: int | None
+    c: float  # Capacitance, F; with an area per area, F/m^2
+    g_total: float
+    g_area: float  # The leak is this times the area plus `g_total`
 
 
 @dataclass(frozen=True)
@@ -76,11 +62,9 @@ class Network:
     areas: tuple[Area, ...]
     contacts: tuple[Contact | None, ...]  # Contact of each area; None for an area without GAP
     gaps: tuple[int | None, ...]  # Index of the cell of each area's GAP
-    # p, q (n_cell, n): u = p x + q s
-    p: FloatArray
+    p: FloatArray  # p, q (n_cell, n): u = p x + q s
     q: FloatArray
-    # k, b (n, n): Currents of the resistors and the current sources into the cuts of the live capacitors, S
-    k: FloatArray
+    k: FloatArray  # k, b (n, n): Currents of resistors and current sources into the cuts of the live capacitors, S
     b: FloatArray
     through: FloatArray  # (n_s, n_cell)
     # (n_s, n + n_s): The current that each source delivers (a V out of its p node, an I out of its n node) is through @
@@ -92,8 +76,7 @@ class Network:
     resistor_factor_s: FloatArray
     node_names: tuple[str, ...]
     nodes: FloatArray  # (n_node, n + n_s + n_inner): Node voltages from x, s and the inner sources
-    # The series stack if this is its network (see `loop_network`): modes and phasors are then computed from it, to full
-    # relative precision
+    # The series stack if this is its network: modes and phasors are then computed from it, to full relative precision
     stack: Stack | None = None
     # Cache of results that do not depend on the sources, shared by networks that differ in their sources only
     kept: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
@@ -101,11 +84,15 @@ class Network:
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "kept": {}}
 
+    @property
+    def drives(self) -> tuple[tuple[Element, float], ...]:
+        """The deck's sources, each with its sign along the loop of a stack, and 1 in other networks."""
+        return tuple((e, 1.0) for e in self.sources) if self.stack is None else self.stack.sources
+
     @cached_property
     def inner(self) -> tuple[Element, ...]:
         """Sources of a series loop that has several; their sum is the network's one source."""
-        sources = () if self.stack is None else self.stack.sources
-        return tuple(e for e, _ in sources) if len(sources) > 1 else ()
+        return tuple(e for e, _ in self.drives) if len(self.drives) > len(self.sources) else ()
 
     @cached_property
     def waveforms(self) -> tuple[Waveform, ...]:
@@ -137,10 +124,10 @@ class Network:
         """Leakage conductance of every cell at areas (n_area,) in m^2, S, shape (n_cell,)."""
         return np.array([c.g_total + (0.0 if c.area is None else c.g_area * area[c.area]) for c in self.cells])
 
-    def stiffness(self, area: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Matrices of the currents into the cuts from x (n, n) and from s (n, n_s), S, the leaks included."""
-        leak = self.leak(area)[:, None]
-        return self.k + self.p.T @ (leak * self.p), self.b + self.p.T @ (leak * self.q)
+    def stiffness(self, y: ArrayLike) -> tuple[Any, Any]:
+        """Matrices of the currents into the cuts from x (..., n, n) and s (..., n, n_s), S, at y (..., n_cell), S."""
+        y = np.asarray(y)[..., None]
+        return self.k + self.p.T @ (y * self.p), self.b + self.p.T @ (y * self.q)
 
     def admittances(self, frequency: ArrayLike, area: FloatArray) -> ComplexArray:
         """Complex admittance of every cell at frequencies (Hz), with SKIN's data there, S, shape (..., n_cell)."""
@@ -148,7 +135,7 @@ class Network:
         y = self.leak(area) + 2j * np.pi * f[..., None] * self.capacitance(area)
         for i, cell in enumerate(self.cells):
             if cell.element.device == "SKIN" and cell.area is not None:
-                y[..., i] = skin_admittance(cell.element, f, area[cell.area])
+                y[..., i] = statespace.skin_admittance(cell.element, f, area[cell.area])
         return np.asarray(y)
 
     def phasors(self, frequency: ArrayLike, area: FloatArray, s: ComplexArray) -> ComplexArray:
@@ -157,25 +144,30 @@ class Network:
 
     def _live(self, y: ComplexArray, s: ComplexArray) -> ComplexArray:
         """Phasors of the live voltages (..., n) for cells of the admittances y (..., n_cell)."""
-        y = y[..., None]
-        driven = (self.b + self.p.T @ (y * self.q)) @ s
-        return np.asarray(np.linalg.solve(self.k + self.p.T @ (y * self.p), -driven[..., None])[..., 0])
+        k, b = self.stiffness(y)
+        return np.asarray(np.linalg.solve(k, -(b @ s)[..., None])[..., 0])
 
     def node_phasors(self, frequency: float, area: FloatArray, s: ComplexArray) -> ComplexArray:
         """Node voltages (n_node,) at a frequency (Hz) and areas (n_area,) in m^2 for source phasors s (n_s,)."""
         both = np.concatenate([self._live(self.admittances(frequency, area), s), s])
         return np.asarray(self.nodes[:, : both.size] @ both)
 
+    def layer_gain(self, frequency: float, area: FloatArray) -> ComplexArray:
+        """Ratio of each layer's voltage (from p to n) to the one source's, shape (n_layer,)."""
+        stack = self.stack
+        if stack is None:
+            return np.asarray(self.grouping @ self.phasors(frequency, area, np.ones(1, complex)))
+        return np.asarray(layer_gains(stack.admittance(frequency, area))[0] * stack.sign[stack.first_cell])
+
     def impedance(self, frequency: float, area: FloatArray) -> complex:
         """Voltage of the one source over the current that it delivers, at a frequency (Hz), ohm."""
         one, y = np.ones(1, complex), self.admittances(frequency, area)
-        x = self._live(y, one)
-        both = np.concatenate([x, one])
         if self.n_voltage:
-            current = self.through[0] @ (y * (self.p @ x + self.q @ one)) + self.delivered[0] @ both
+            x = self._live(y, one)
+            current = self.through[0] @ (y * (self.p @ x + self.q @ one)) + self.delivered[0] @ np.append(x, one)
             return complex(1.0 / current) if current != 0.0 else complex(np.inf)
-        source, at = self.sources[0], dict(zip(self.node_names, self.node_phasors(frequency, area, one), strict=True))
-        p, n = (at.get(name, 0.0) for name in source.node_names[:2])
+        at = dict(zip(self.node_names, self.node_phasors(frequency, area, one), strict=True))
+        p, n = (at.get(name, 0.0) for name in self.sources[0].node_names[:2])
         return complex(n - p)
 
 
@@ -184,106 +176,76 @@ def build_network(circuit: Circuit, held: tuple[Element, ...] = ()) -> Network:
 
     The voltage sources in `held` are added, to hold the voltages of nodes; they may close no loop of voltage sources.
     """
-    areas, branches = find_branches(circuit)
-    branches = [*branches, *held]
+    areas, carrying = find_branches(circuit)
+    branches = [*carrying, *held]
     if circuit.work == "total" and any(area.gap for area in areas):
         raise InputError(
             ".options work=total holds the voltage across a series stack, and this circuit is none; allowed: work=gap"
         )
     place = {area.node: i for i, area in enumerate(areas)}
-    cells = [cell for e in branches for cell in _cells(e, place)]
     # The gaps come first, so that the tree contains them and their voltages are states.
-    cells.sort(key=lambda cell: cell.element.device != "GAP")
-    voltages = [e for e in branches if e.device == "V"]
-    currents = [e for e in branches if e.device == "I"]
-    resistors = [e for e in branches if e.device == "R"]
-
-    tree = Tree()
-    in_tree = [tree.add(e.nodes[0], e.nodes[1]) for e in voltages]
-    assert all(in_tree)
-    live = [tree.add(*cell.nodes) for cell in cells]
-    passive = [tree.add(e.nodes[0], e.nodes[1]) for e in resistors]
-    n_v, n_i, n_e, n_r = len(voltages), len(currents), len(voltages) + sum(live), sum(passive)
-    potential = tree.potentials()
+    cells = sorted((cell for e in branches for cell in _cells(e, place)), key=lambda cell: cell.element.device != "GAP")
+    voltages, currents, resistors = ([e for e in branches if e.device == device] for device in "VIR")
+    n_v, n_i, n_c = len(voltages), len(currents), len(cells)
+    ends = [*(e.nodes for e in voltages), *(cell.nodes for cell in cells), *(e.nodes for e in resistors)]
+    taken, potential = statespace.spanning_tree(ends)
+    assert all(taken[:n_v])
+    live = [i for i in range(n_c) if taken[n_v + i]]
+    n, n_e = len(live), len(live) + n_v
+    # The tree's branches are voltage sources, capacitors and resistors: their voltages are s, x and r.
+    order = [*range(n_v, n_e), *range(n_v)]
 
     def rows(pairs: list[tuple[str, ...]]) -> FloatArray:
         """Matrix from the voltages of the tree's branches, in the tree's order, to the voltages between node pairs."""
         out = [potential[a] - potential[b] for a, b, *_ in pairs]
-        return np.array(out).reshape(len(pairs), n_e + n_r)
+        return np.array(out).reshape(len(pairs), sum(taken))
 
-    across = rows([cell.nodes for cell in cells])
-    conductance = np.array([1.0 / e.values["value"] for e in resistors])
-    from_e, from_i, into_e, into_i, factor, delivered, together = _currents(
-        rows([e.nodes for e in resistors]), rows([e.nodes for e in currents]), conductance, n_v, n_e
-    )
-    s, x, order = slice(0, n_v), slice(n_v, n_e), [*range(n_v, n_e), *range(n_v)]
-    through = np.zeros((n_v + n_i, len(cells)))
-    through[:n_v] = across[:, s].T + together @ across[:, x].T
-    names = list(tree.branches)
-    at_node = np.array([potential[name] for name in names]).reshape(len(names), n_e + n_r)
-    whole = at_node[:, :n_e] + at_node[:, n_e:] @ from_e
+    across, over_currents = rows([cell.nodes for cell in cells])[:, order], rows([e.nodes for e in currents])
+    over_e, over_r = np.hsplit(rows([e.nodes for e in resistors]), [n_e])
+    conductance = np.array([1.0 / e.values["value"] for e in resistors])[:, None]
+    weight = np.sqrt(conductance)
+    # Given e = (s, x), the voltages r minimise the power.
+    orthogonal, upper = np.linalg.qr(weight * over_r)
+    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_e))
+    from_i = -np.linalg.solve(upper, np.linalg.solve(upper.T, over_currents[:, n_e:].T))
+    by_e, by_i = over_e + over_r @ from_e, over_r @ from_i
+    # Currents into the cuts of e by (x, s) and by the currents of the current sources.
+    into_e, into_i = by_e.T @ (conductance * by_e), over_e.T @ (conductance * by_i) + over_currents[:, :n_e].T
+    into = np.hstack([into_e[:, order], into_i])
+    # The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
+    # capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
+    factor, together = (weight * by_e)[:, order], np.zeros((n_v, n))
+    if factor.size:
+        together = np.asarray(-np.linalg.lstsq(factor[:, :n], factor[:, n:], rcond=None)[0].T, float)
+    delivered: FloatArray = np.vstack([into[:n_v] + together @ into[n_v:], np.eye(n_i, n_e + n_i, n_e)])
+    size = np.linalg.norm(factor, axis=0)
+    delivered[:n_v, :n_e][np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.outer(size[n:], size)] = 0.0
+    through = np.zeros((n_v + n_i, n_c))
+    through[:n_v] = across[:, n:].T + together @ across[:, :n].T
     written = {node: name for el in branches for node, name in zip(el.nodes, el.node_names, strict=True)}
-    shown = [i for i, name in enumerate(names) if name in written and name != "0"]
+    names = [node for node in potential if node in written and node != "0"]
+    at_e, at_r = np.hsplit(rows([(name, "0") for name in names]), [n_e])
     return Network(
-        sources=(*voltages, *currents), n_voltage=n_v, cells=tuple(cells),
-        layers=tuple(e for e in branches if e.spec.is_layer), live=tuple(i for i, taken in enumerate(live) if taken),
-        areas=areas, contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
+        sources=(*voltages, *currents), n_voltage=n_v, cells=tuple(cells), live=tuple(live),
+        layers=tuple(e for e in branches if e.spec.is_layer), areas=areas,
+        contacts=tuple(None if area.gap is None else contact_of(area.gap) for area in areas),
         gaps=tuple(next((i for i, c in enumerate(cells) if c.element is a.gap), None) for a in areas),
-        p=np.ascontiguousarray(across[:, x]), q=np.hstack([across[:, s], np.zeros((len(cells), n_i))]),
-        k=into_e[x, x], b=np.hstack([into_e[x, s], into_i[x]]), through=through, delivered=delivered,
-        resistor_factor=factor[:, x], resistor_factor_s=np.hstack([factor[:, s], np.zeros((len(resistors), n_i))]),
-        node_names=tuple(written[names[i]] for i in shown),
-        nodes=np.hstack([whole[shown][:, order], (at_node[:, n_e:] @ from_i)[shown]]),
+        p=np.ascontiguousarray(across[:, :n]), q=np.hstack([across[:, n:], np.zeros((n_c, n_i))]),
+        k=into[n_v:, :n], b=into[n_v:, n:], through=through, delivered=delivered,
+        resistor_factor=factor[:, :n], resistor_factor_s=np.hstack([factor[:, n:], np.zeros((len(resistors), n_i))]),
+        node_names=tuple(written[name] for name in names),
+        nodes=np.hstack([(at_e + at_r @ from_e)[:, order], at_r @ from_i]),
     )  # fmt: skip
 
 
 def _cells(element: Element, place: dict[str, int]) -> list[Cell]:
     a, b, *area = element.nodes
     if element.device == "C":
-        return [Cell(element, (a, b), element.values["value"], 0.0, 0.0, None)]
-    constants = layer_constants(element).tolist() if area else []
+        return [Cell(element, (a, b), None, element.values["value"], 0.0, 0.0)]
+    constants = statespace.layer_constants(element).tolist() if area else []
     # The nodes between the slabs of a dispersive layer have names that no netlist can write.
     path = [a, *(f"{element.name.lower()} {i}" for i in range(1, len(constants))), b]
-    return [
-        Cell(element, ends, c, g_total, g_area, place[area[0]])
-        for (c, g_total, g_area), ends in zip(constants, pairwise(path), strict=False)
-    ]
-
-
-def _currents(
-    over_resistors: FloatArray, over_currents: FloatArray, conductance: FloatArray, n_v: int, n_e: int
-) -> tuple[FloatArray, ...]:
-    """Eliminate the voltages of the tree's resistors: given its other voltages e = (s, x), they minimise the power.
-
-    `over_resistors` (n_resistor, n_e + n_r) and `over_currents` (n_i, n_e + n_r) are the voltages of all resistors and
-    current sources by those of the tree's branches: n_v voltage sources, capacitors, resistors; `conductance` is in S.
-
-    Returned are the voltages of the tree's resistors by e (n_r, n_e) and by the currents of the current sources
-    (n_r, n_i); the currents into the cuts of the tree's sources and capacitors by both, (n_e, n_e) and (n_e, n_i); the
-    square roots of the power in each resistor by e (n_resistor, n_e), a factor f of these currents f^T f; the current
-    of each source (A) by x, s and the currents of the current sources (n_v + n_i, n_e + n_i); and the shares of the
-    capacitors' cuts (n_v, n) that are added to those of the voltage sources.
-
-    The current of a small resistance suffers from cancellation. Adding to a source's cut the combination of the
-    capacitors' cuts with the least contribution of resistors takes the source's current from the cells instead.
-    """
-    weight, (over_e, over_r) = np.sqrt(conductance)[:, None], np.hsplit(over_resistors, [n_e])
-    orthogonal, upper = np.linalg.qr(weight * over_r)
-    from_e = -np.linalg.solve(upper, orthogonal.T @ (weight * over_e))
-    from_i = -np.linalg.solve(upper, np.linalg.solve(upper.T, over_currents[:, n_e:].T))
-    by_e, by_i = over_e + over_r @ from_e, over_r @ from_i
-    into_e = by_e.T @ (conductance[:, None] * by_e)
-    into_i = over_e.T @ (conductance[:, None] * by_i) + over_currents[:, :n_e].T
-    factor, n_i, order = weight * by_e, len(over_currents), [*range(n_v, n_e), *range(n_v)]
-    together: FloatArray = np.zeros((n_v, n_e - n_v))
-    if factor.size:
-        together = np.asarray(-np.linalg.lstsq(factor[:, n_v:], factor[:, :n_v], rcond=None)[0].T, float)
-    into = np.hstack([into_e[:, order], into_i])
-    delivered: FloatArray = np.vstack([into[:n_v] + together @ into[n_v:], np.eye(n_i, n_e + n_i, n_e)])
-    size = np.linalg.norm(factor, axis=0)
-    rounding = np.abs(delivered[:n_v, :n_e]) <= _ROUNDING * np.outer(size[:n_v], size[order])
-    delivered[:n_v, :n_e][rounding] = 0.0
-    return from_e, from_i, into_e, into_i, factor, delivered, together
+    return [Cell(element, ends, place[area[0]], *own) for own, ends in zip(constants, pairwise(path), strict=False)]
 
 
 class Modes(NamedTuple):
@@ -305,26 +267,22 @@ def network_modes(network: Network, area: FloatArray) -> Modes:
     The rates are squares of the singular values of the conductance matrix's factor, not eigenvalues of the matrix: so a
     slow mode beside a fast one has its rate, and its drive by the sources, with twice as many digits.
     """
-    capacitance, leak = network.capacitance(area), network.leak(area)
-    n, n_v = network.k.shape[0], network.n_voltage
-    lower = np.linalg.cholesky(network.p.T @ (capacitance[:, None] * network.p))
-    weight = np.sqrt(leak)[:, None]
+    capacitance, weight = network.capacitance(area)[:, None], np.sqrt(network.leak(area))[:, None]
+    (n, n_s), n_v = network.b.shape, network.n_voltage
+    lower = np.linalg.cholesky(network.p.T @ (capacitance * network.p))
     factor = np.vstack([network.resistor_factor, weight * network.p])
     factor_s = np.vstack([network.resistor_factor_s, weight * network.q])
     left, sigma, turned = np.linalg.svd(np.linalg.solve(lower, factor.T).T)
-    rates = np.zeros(n)
+    rates, pushed = np.zeros(n), np.zeros((n, n_s))
     rates[: sigma.size] = sigma**2
     # The computed rate of a charge that no conductance drains is round-off.
     rates[rates < 1e-28 * rates.max(initial=0.0)] = 0.0
-    inverse = turned @ lower.T
     take = turned @ np.linalg.solve(lower, network.p.T)
-    moved = take @ (capacitance[:, None] * network.q)
-    pushed = np.zeros((n, network.b.shape[1]))
+    moved, shape = take @ (capacitance * network.q), np.linalg.solve(lower.T, turned.T)
     pushed[: sigma.size] = sigma[:, None] * (left[:, : sigma.size].T @ factor_s)
     pushed[:, n_v:] += turned @ np.linalg.solve(lower, network.b[:, n_v:])
-    shape = np.linalg.solve(lower.T, turned.T)
     gains = rates[:, None] * moved - pushed
-    return Modes(*(np.asarray(x, float) for x in (rates, gains, shape, inverse, shape @ moved, take)))
+    return Modes(*(np.asarray(x, float) for x in (rates, gains, shape, turned @ lower.T, shape @ moved, take)))
 
 
 # Networks of circuits
@@ -334,7 +292,7 @@ def network_of(circuit: Circuit, skin_at: float | None = None) -> Network:
     """The network of a circuit; with `skin_at`, dispersive skins of a stack have their data at that frequency (Hz)."""
 
     def make() -> Network:
-        if not is_stack(circuit):
+        if not statespace.is_stack(circuit):
             network = shared(circuit, "network", lambda: build_network(circuit))
             now = {e.name: e for e in circuit.elements}
             return replace(network, sources=tuple(now.get(e.name, e) for e in network.sources))
@@ -383,10 +341,7 @@ def loop_network(stack: Stack) -> Network:
             row[n] += 1.0
         rows.append(row.copy())
     gap = None if stack.gap_layer is None else stack.layers[stack.gap_layer]
-    cells = [
-        Cell(stack.layers[i], ("1", "0"), c, g_total, g_area, 0)
-        for i, (c, g_total, g_area) in zip(of_layer, constants, strict=True)
-    ]
+    cells = [Cell(stack.layers[i], ("1", "0"), 0, *own) for i, own in zip(of_layer, constants, strict=True)]
     return Network(
         sources=(_source(stack),), n_voltage=1, cells=tuple(cells), layers=stack.layers, live=tuple(range(n)),
         areas=(Area(stack.layers[0].nodes[2], gap, stack.area_given),), contacts=(stack.contact,),
@@ -401,32 +356,14 @@ def loop_network(stack: Stack) -> Network:
 # Linear response
 
 
-@dataclass(frozen=True)
-class LinearScene:
-    """The data of a circuit that the phasors of one of its contacts depend on."""
+class LinearScene(NamedTuple):
+    """A network with one source, and the contact whose phasors are wanted."""
 
     network: Network
     contact: Contact
     gap: int  # Index of the GAP among the layers
     finger: int  # Index of the GAP's area
     note: str  # Text that names the GAP if there are several; empty for one GAP
-    fixed: bool  # Whether the deck fixes the contact's area
-    fundamental: Fundamental | None  # Of the source
-    sources: tuple[tuple[Element, float], ...]  # Each with its sign along the loop of a stack; 1 in other networks
-    layers: tuple[str, ...]
-
-    def areas(self, f: float, area: str | float, amplitude: float) -> FloatArray:
-        """Areas at one frequency (Hz), m^2, shape (n_area,)."""
-        if not isinstance(area, str):
-            return np.full(len(self.network.areas), area)
-        return self.network.areas_at_rest if area == "frozen" else coupled_areas(self.network, f, amplitude)
-
-    def layer_gain(self, f: float, areas: FloatArray) -> ComplexArray:
-        """Ratio of each layer's voltage (from p to n) to the source's, shape (n_layer,)."""
-        network, stack = self.network, self.network.stack
-        if stack is None:
-            return np.asarray(network.grouping @ network.phasors(f, areas, np.ones(1, complex)))
-        return np.asarray(layer_gains(stack.admittance(f, areas))[0] * stack.sign[stack.first_cell])
 
 
 def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
@@ -449,20 +386,13 @@ def linear_scene(circuit: Circuit, finger: str | None = None) -> LinearScene:
     name = next(iter(gaps.values())) if finger is None else gaps[finger.lower()]
     # Every GAP drives an area: `find_branches` refuses two on one.
     place = next(i for i, area in enumerate(network.areas) if area.gap is not None and area.gap.name == name)
-    contact, area, stack = network.contacts[place], network.areas[place], network.stack
+    contact, gap = network.contacts[place], [e.name for e in network.layers].index(name)
     assert contact is not None
-    assert area.gap is not None
-    return LinearScene(
-        network, contact, network.layers.index(area.gap), finger=place, fixed=area.given is not None,
-        note=f"of several GAPs, {name}" if len(gaps) > 1 else "", fundamental=network.waveforms[0].fundamental,
-        sources=tuple((e, 1.0) for e in network.sources) if stack is None else stack.sources,
-        layers=tuple(e.name for e in network.layers),
-    )  # fmt: skip
+    return LinearScene(network, contact, gap, place, f"of several GAPs, {name}" if len(gaps) > 1 else "")
 
 
 def with_skin_held(circuit: Circuit) -> Circuit:
     """The circuit with each SKIN replaced by a SLAB that has the skin's data at the SKIN's own frequency."""
-
     held: dict[str, Element] = {}
     for skin in circuit.by_device("SKIN"):
         d, f = skin.values["d"], skin.values["f"]
@@ -476,25 +406,27 @@ def mean_areas(network: Network) -> FloatArray:
     if len(network.sources) > 1:
         what = "of one source at its fundamental, and this circuit has several sources"
     elif fundamental := network.waveforms[0].fundamental:
-        return coupled_areas(network, fundamental.frequency, fundamental.amplitude)
+        return phasor_areas(network, "mean", fundamental.frequency, fundamental.amplitude)
     else:
         what = "at the source's fundamental, and this source has none"
     raise InputError(f"area='mean' is the area of the phasor {what}; allowed: 'coupled', 'frozen' or an area in m^2")
 
 
-def coupled_areas(network: Network, f: float, amplitude: float) -> FloatArray:
-    """Areas under one source's amplitude (V or A) at one frequency (Hz), each at its gap's rms voltage."""
-    area = network.areas_at_rest
-    if all(a.given is not None for a in network.areas):
+def phasor_areas(network: Network, mode: str | float, f: float, amplitude: float) -> FloatArray:
+    """Areas under one source's amplitude (V or A) at one frequency (Hz), m^2, shape (n_area,).
+
+    They are those of the gaps' rms voltages, unless `mode` is ``frozen`` or one area in m^2.
+    """
+    area = network.areas_at_rest if isinstance(mode, str) else np.full(len(network.areas), mode)
+    if mode != "mean" or all(a.given is not None for a in network.areas):
         return area
-    stack, finger = network.stack, network.contacts[0]
+    stack, finger, s = network.stack, network.contacts[0], np.array([complex(amplitude)])
     if stack is not None and finger is not None:
 
         def gain(area: float) -> float:
             return float(np.abs(layer_gains(stack.admittance(f, area))[0, stack.gap_layer]))
 
         return np.array([coupled_area(lambda u: float(finger.area(u)), gain, amplitude)])
-    s = np.array([complex(amplitude)])
     for attempt in range(500):
         u, new = np.abs(network.phasors(f, area, s)), area.copy()
         for i, (contact, gap) in enumerate(zip(network.contacts, network.gaps, strict=True)):

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import operator
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
@@ -132,8 +132,7 @@ def _find_hops(circuit: Circuit) -> tuple[Hop, ...] | None:
     for start in at["0"]:
         hops, node, element = list[Hop](), "0", start
         while not hops or node != "0":
-            if hops:
-                element = next(e for e in at[node] if e is not element)
+            element = next(e for e in at[node] if e is not element) if hops else start
             end = 1 if element.nodes[0] == node else 0
             node = element.nodes[end]
             hops.append(Hop(element, 1.0 if end else -1.0, element.node_names[end]))
@@ -153,8 +152,7 @@ def count_of(circuit: Circuit) -> int:
 
 
 def _areas(circuit: Circuit) -> tuple[Area, ...]:
-    layers = [e for e in circuit.elements if e.spec.is_layer]
-    owners: dict[str, Element] = {}
+    layers, owners = [e for e in circuit.elements if e.spec.is_layer], dict[str, Element]()
     for gap in circuit.by_device("GAP"):
         node = gap.nodes[2]
         if node in owners:
@@ -166,32 +164,26 @@ def _areas(circuit: Circuit) -> tuple[Area, ...]:
     for node, layer in {e.nodes[2]: e for e in reversed(layers)}.items():
         on_node = list({id(e): e for e in at.get(node, ())}.values())
         owner = owners.get(node)
-        if owner is None:
-            out.append(Area(node, None, _given_by_source(layer, on_node, list(owners.values()))))
-            continue
-        if on_node:
-            raise InputError(
-                f"{on_node[0].name} and {owner.name} both drive the area node {owner.node_names[2]!r}, which is a "
-                f"signal; allowed: a_fix= on {owner.name} for a given area, another node for what carries current",
-                on_node[0].where,
-            )
-        fixed = owner.values["a_fix"]
-        out.append(Area(node, owner, fixed * 1e-6 if fixed > 0.0 else None))
+        if owner is not None and on_node:
+            both = f"{on_node[0].name} and {owner.name} both drive the area node {owner.node_names[2]!r}"
+            allowed = f"a_fix= on {owner.name} for a given area, another node for what carries current"
+            raise InputError(f"{both}, which is a signal; allowed: {allowed}", on_node[0].where)
+        if owner is None and len(on_node) != 1:
+            what = f"node {layer.node_names[2]!r} gives {layer.name} its area, but "
+            what += "more than one source drives it" if on_node else "no GAP and no DC source drives it"
+            allowed = f"one GAP, or one V element such as 'Varea {layer.node_names[2]} 0 35' (mm^2)"
+            driven = "".join(f"; {gap.name} drives {gap.node_names[2]!r}" for gap in owners.values())
+            raise InputError(f"{what}; allowed: {allowed}{driven}", layer.where)
+        wave = None if owner is not None else on_node[0].waveform
+        if owner is not None:
+            size = owner.values["a_fix"]
+        elif isinstance(wave, DC) and on_node[0].nodes[1] == "0" and 1e-30 <= wave.level <= 1e30:
+            size = wave.level
+        else:
+            allowed = "allowed is a DC value above 0 (mm^2, from 1e-30 to 1e30) from the area node to 0"
+            raise InputError(f"{on_node[0].name} drives an area: {allowed}", on_node[0].where)
+        out.append(Area(node, owner, size * 1e-6 if size > 0.0 else None))
     return tuple(reversed(out))
-
-
-def _given_by_source(layer: Element, sources: list[Element], gaps: list[Element]) -> float:
-    if len(sources) != 1:
-        what = f"node {layer.node_names[2]!r} gives {layer.name} its area, but "
-        what += "more than one source drives it" if sources else "no GAP and no DC source drives it"
-        allowed = f"one GAP, or one V element such as 'Varea {layer.node_names[2]} 0 35' (mm^2)"
-        driven = "".join(f"; {gap.name} drives {gap.node_names[2]!r}" for gap in gaps)
-        raise InputError(f"{what}; allowed: {allowed}{driven}", layer.where)
-    source = sources[0]
-    if not isinstance(source.waveform, DC) or source.nodes[1] != "0" or not 1e-30 <= source.waveform.level <= 1e30:
-        allowed = "allowed is a DC value above 0 (mm^2, from 1e-30 to 1e30) from the area node to 0"
-        raise InputError(f"{source.name} drives an area: {allowed}", source.where)
-    return source.waveform.level * 1e-6
 
 
 def _incidence(branches: list[Element]) -> dict[str, list[Element]]:
@@ -204,55 +196,48 @@ def _incidence(branches: list[Element]) -> dict[str, list[Element]]:
 
 def _ways(branches: list[Element], start: str) -> dict[str, Element | None]:
     """The element by which one gets to each node that is connected to the start."""
-    at = _incidence(branches)
+    at, ahead = _incidence(branches), [start]
     came: dict[str, Element | None] = {start: None}
-    ahead = [start]
     while ahead:
         for element in at.get(ahead.pop(), ()):
-            for node in element.nodes[:2]:
-                if node not in came:
-                    came[node] = element
-                    ahead.append(node)
+            new = [node for node in element.nodes[:2] if node not in came]
+            came.update(dict.fromkeys(new, element))
+            ahead += new
     return came
 
 
-class Tree:
-    """A spanning tree that grows branch by branch."""
+def spanning_tree(branches: Iterable[tuple[str, ...]]) -> tuple[list[bool], dict[str, FloatArray]]:
+    """Which branches, given by their nodes p and n, close no loop with those before.
 
-    def __init__(self) -> None:
-        self._parent: dict[str, str] = {}
-        # Of each node its branches: the other node, the branch's number, and the sign of its voltage from here
-        self.branches: dict[str, list[tuple[str, int, float]]] = defaultdict(list)
-        self._count = 0
+    They form a tree. Given with them is the voltage of every node that it connects to ground, as a row of coefficients
+    of its branches' voltages.
+    """
+    above, taken, count = dict[str, str](), list[bool](), 0
+    # Of each node its branches: the other node, the branch's number, and the sign of its voltage from here
+    at: dict[str, list[tuple[str, int, float]]] = defaultdict(list)
 
-    def add(self, p: str, n: str) -> bool:
-        """Add a branch if it closes no loop, and return whether it was added."""
-        roots = []
-        for node in (p, n):
-            while (above := self._parent.setdefault(node, node)) != node:
-                self._parent[node] = self._parent[above]
-                node = self._parent[above]
-            roots.append(node)
-        if roots[0] == roots[1]:
-            return False
-        self._parent[roots[0]] = roots[1]
-        self.branches[p].append((n, self._count, -1.0))
-        self.branches[n].append((p, self._count, 1.0))
-        self._count += 1
-        return True
+    def root(node: str) -> str:
+        while (up := above.setdefault(node, node)) != node:
+            above[node] = node = above[up]
+        return node
 
-    def potentials(self) -> dict[str, FloatArray]:
-        """Voltage of every node against ground, as a row of coefficients of the branch voltages."""
-        out = {"0": np.zeros(self._count)}
-        todo = ["0"]
-        while todo:
-            node = todo.pop()
-            for other, branch, sign in self.branches[node]:
-                if other not in out:
-                    out[other] = out[node].copy()
-                    out[other][branch] = sign
-                    todo.append(other)
-        return out
+    for p, n, *_ in branches:
+        ends = root(p), root(n)
+        taken.append(ends[0] != ends[1])
+        if taken[-1]:
+            above[ends[0]] = ends[1]
+            at[p].append((n, count, -1.0))
+            at[n].append((p, count, 1.0))
+            count += 1
+    out, todo = {"0": np.zeros(count)}, ["0"]
+    while todo:
+        node = todo.pop()
+        for other, number, sign in at[node]:
+            if other not in out:
+                out[other] = out[node].copy()
+                out[other][number] = sign
+                todo.append(other)
+    return taken, {node: out[node] for node in at if node in out}
 
 
 def _refuse_unsolvable(branches: list[Element]) -> None:
@@ -279,15 +264,13 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
     reached = _ways(branches, "0")
     for node, (e, *_) in at.items():
         if node not in reached:
-            what = f"node {named(node, e)} ({e.name})"
-            raise InputError(f"{what} is floating: nothing connects it to ground", e.where)
-    tree, before = Tree(), list[Element]()
-    for e in (e for e in branches if e.device == "V"):
-        if tree.add(*e.nodes[:2]):
-            before.append(e)
-            continue
+            raise InputError(f"node {named(node, e)} ({e.name}) is floating: nothing connects it to ground", e.where)
+    voltages = [e for e in branches if e.device == "V"]
+    taken, _ = spanning_tree(e.nodes for e in voltages)
+    if not all(taken):
         # The sources before form no loop: there is one way through them from one end to the other.
-        came, names, node = _ways(before, e.nodes[0]), list[str](), e.nodes[1]
+        e = voltages[taken.index(False)]
+        came, names, node = _ways(voltages[: taken.index(False)], e.nodes[0]), list[str](), e.nodes[1]
         while (step := came[node]) is not None:
             names.append(step.name)
             node = step.nodes[0] if step.nodes[1] == node else step.nodes[1]
@@ -298,9 +281,8 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
     for source, node in ((e, node) for e in branches if e.device == "I" for node in e.nodes[:2]):
         if node not in reached:
             where = f"node {named(node, source)} is reached through current sources only"
-            allowed = "an R, C or layer that takes the current to ground"
-            problem = f"{source.name} is a current source without a path: {where}; allowed: {allowed}"
-            raise InputError(problem, source.where)
+            problem = f"{source.name} is a current source without a path: {where}; allowed: an R, C or layer that takes"
+            raise InputError(f"{problem} the current to ground", source.where)
 
 
 # Series stacks
@@ -308,20 +290,18 @@ def _refuse_unsolvable(branches: list[Element]) -> None:
 
 @dataclass(frozen=True)
 class Stack:
-    """Layers in one series loop with an ideal source, sharing one area. SI throughout.
-
-    A layer is one cell, which is a capacitor parallel to a resistor, or, for a dispersive material, several in series.
-    """
+    """Layers in one series loop with an ideal source, sharing one area, each of one or several cells. SI throughout."""
 
     layers: tuple[Element, ...]  # In loop order, from the source's positive side
-    # Number of cells of each layer; the arrays below list the cells of a layer one after the other
-    cells: tuple[int, ...]
-    # (n_cell,): +1 for a layer whose p node comes first along the loop, -1 for a layer whose n node does
-    sign: FloatArray
-    c: FloatArray  # (n_cell,): Capacitance per area, F/m^2
-    g_total: FloatArray  # (n_cell,): Leakage conductance independent of the area, S
-    g_area: FloatArray  # (n_cell,): Leakage conductance per area, S/m^2
+    cells: tuple[int, ...]  # Number of cells of each layer, which the arrays list one after the other
+    sign: FloatArray  # (n_cell,): +1 for a layer whose p node comes first along the loop, -1 for the others
+    # c, g_total, g_area (n_cell,): Capacitance per area, F/m^2; leakage conductance independent of the area, S, and
+    # per area, S/m^2
+    c: FloatArray
+    g_total: FloatArray
+    g_area: FloatArray
     gap: int | None  # Index of the gap among the cells
+    gap_layer: int | None  # Index of the gap among the layers
     contact: Contact | None
     area_given: float | None  # Area fixed by the deck, m^2
     hops: tuple[Hop, ...]  # The elements of the loop in order, from ground to ground
@@ -338,15 +318,9 @@ class Stack:
         """Index of the first cell of each layer."""
         return np.concatenate([[0], np.cumsum(self.cells)[:-1]]).astype(np.intp)
 
-    @property
-    def gap_layer(self) -> int | None:
-        """Index of the gap among the layers."""
-        return None if self.gap is None else int(self.layer_of[self.gap])
-
     def layers_of(self, cells: NDArray[np.bool_]) -> list[str]:
         """Names of the layers that have at least one marked cell."""
-        marked = np.logical_or.reduceat(cells, self.first_cell)
-        return [e.name for e, mark in zip(self.layers, marked, strict=True) if mark]
+        return list(dict.fromkeys(self.layers[i].name for i in self.layer_of[cells].tolist()))
 
     @cached_property
     def s(self) -> float:
@@ -412,9 +386,8 @@ class Stack:
         return np.asarray(y)
 
 
-def skin_admittance(skin: Element, frequency: FloatArray, area: FloatArray) -> ComplexArray:
+def skin_admittance(skin: Element, f: FloatArray, area: FloatArray) -> ComplexArray:
     """Complex admittance of a SKIN with its data at each frequency (Hz), S; `area` (m^2) is broadcast."""
-    f = frequency
     per_area = 1.0 / skin_resistivity(f) + 2j * math.pi * f * EPS0 * skin_permittivity(f)
     return np.asarray(per_area * area / skin.values["d"])
 
@@ -440,11 +413,8 @@ def contact_of(gap: Element) -> Contact:
             contact = Contact(v["d"], v["eps_r"], v["fn"], v["mu"], alpha, v["m_exp"], beta, v["n_exp"], c2)
             if np.all(np.isfinite(contact.packed)):
                 return contact
-        raise InputError(
-            f"{gap.name} has a contact whose constants are beyond the range of numbers; allowed: fn, alpha, m_exp, "
-            "beta, n_exp nearer to Table 1's",
-            gap.where,
-        )
+        what = f"{gap.name} has a contact whose constants are beyond the range of numbers"
+        raise InputError(f"{what}; allowed: fn, alpha, m_exp, beta, n_exp nearer to Table 1's", gap.where)
 
     return gap.remember("contact", make)
 
@@ -466,15 +436,17 @@ def build_stack(circuit: Circuit, skin_at: float | None = None) -> Stack:
         along = [hop for hop in hops if hop.element.spec.is_layer]
         layers = tuple(hop.element for hop in along)
         parts = [layer_constants(e, skin_at) for e in layers]
-        cells = tuple(len(part) for part in parts)
+        cells = tuple(map(len, parts))
         c, g_total, g_area = np.concatenate(parts).T
-        contact = None if area.gap is None else contact_of(area.gap)
-        if contact is not None and circuit.work == "total":
-            d = np.repeat([e.values["d"] for e in layers], cells)
-            contact = contact.with_total_voltage_held(d, c * d / EPS0)
+        contact, gap, gap_layer = None, None, None
+        if area.gap is not None:
+            contact, gap_layer = contact_of(area.gap), layers.index(area.gap)
+            gap = sum(cells[:gap_layer])
+            if circuit.work == "total":
+                d = np.repeat([e.values["d"] for e in layers], cells)
+                contact = contact.with_total_voltage_held(d, c * d / EPS0)
         sign = np.repeat([hop.sign for hop in along], cells)
-        gap = None if area.gap is None else sum(cells[: layers.index(area.gap)])
-        return Stack(layers, cells, sign, c, g_total, g_area, gap, contact, area.given, hops)
+        return Stack(layers, cells, sign, c, g_total, g_area, gap, gap_layer, contact, area.given, hops)
 
     def make() -> Stack:
         loop = loop_of(circuit)

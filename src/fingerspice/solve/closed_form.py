@@ -11,7 +11,8 @@ m = 0, or comes to rest there.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -24,7 +25,6 @@ from fingerspice.engine.network import Segment, at_sources, source
 from fingerspice.engine.one_area.model import branch_area, dot, follow, ramp, source_at, voltage_by_time, write_row_at
 from fingerspice.numerics import linear
 from fingerspice.results.outcome import State, Status
-from fingerspice.results.record import Record
 from fingerspice.solve.collocation import solve as solve_by_steps
 from fingerspice.solve.problem import Problem, Tables, after_the_end, joined, segment_index, segment_of
 from fingerspice.solve.runs import PAST_FOLD, Run, closed_form, gap_signals
@@ -46,14 +46,11 @@ def solve_linear(problem: Problem, area: FloatArray | None = None, bound: float 
     Areas (n_area,) in m^2 are the scene's by default, and a problem may ask for charge only if the circuit fixes them.
     `bound` is the error from holding them, relative to the peaks; 0 where they are exact or have no effect.
     """
-    scene, start = problem.scene, problem.initial
+    scene, start, tables = problem.scene, problem.initial, Tables(problem, 1e-13, no_chirps=True)
     area = scene.area0 if area is None else area
-    key = ("modes", *area.tolist())
-    modes = kept_with(scene.prepared, key, MOST_MODES, lambda: scene.modes_at(area))
+    modes = kept_with(scene.prepared, ("modes", *area.tolist()), MOST_MODES, lambda: scene.modes_at(area))
     n = modes.rates.size
-    v0 = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before)
-    tables = Tables(problem, 1e-13, no_chirps=True)
-    z_end = start.y[n:]
+    v0, z_end = modes.inverse @ (start.y[:n] + modes.follow @ start.s_before), start.y[n:]
     sampled = _at_samples(problem, modes, v0)
     if sampled is not None:
         rows, last, end = *sampled, problem.t_stop
@@ -79,15 +76,15 @@ class _Answer(NamedTuple):
 
     def x(self, modes: Modes) -> FloatArray:
         """Live voltages, V, shape (n_t, n)."""
-        # Not by BLAS: its threads cost more than the product, and their number changes the rounding.
-        return np.asarray(
-            np.einsum("jk,tk->tj", modes.shape, self.v) - np.einsum("jk,tk->tj", modes.follow, self.s), float
-        )
+        return _along(modes.shape, self.v) - _along(modes.follow, self.s)
 
 
-def _answer(
-    problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray
-) -> tuple[_Answer, _Answer, float]:  # fmt: skip
+def _along(matrix: FloatArray, values: FloatArray) -> FloatArray:
+    """A matrix times the values at each time; not by BLAS, whose threads cost more and may round otherwise."""
+    return np.asarray(np.einsum("kj,tj->tk", matrix, values))
+
+
+def _answer(problem: Problem, tables: Tables, modes: Modes | None, v0: FloatArray) -> tuple[_Answer, _Answer, float]:
     """Response at the outputs reached, left-hand response at the end of the windows (n_t = 1), and that end, s."""
     t_out, left = problem.t_out, problem.left
     n, n_s, size = v0.size, len(problem.waveforms), t_out.size
@@ -151,20 +148,14 @@ def _charge(
     lost_x = net.through @ (leak * net.p) + net.delivered[:, :n]
     lost_s = net.through @ (leak * net.q) + net.delivered[:, n:]
     draining = modes.rates > 0.0
-    passed = np.einsum("kj,tj->tk", modes.gains, answer.integral) - (answer.v - v0)
-    held = np.outer(t - problem.t_start, v0)
+    passed, held = _along(modes.gains, answer.integral) - (answer.v - v0), np.outer(t - problem.t_start, v0)
     # A mode with rate 0 has no leakage current, so that any value of its integral will do.
     integral = np.where(draining, passed / np.where(draining, modes.rates, 1.0), held)
     x_integral = answer._replace(v=integral, s=answer.integral).x(modes)
-    rate = np.einsum("kj,tj->tk", modes.gains, s) - modes.rates * answer.v
-    dx = answer._replace(v=rate, s=answer.slope).x(modes)
-
-    def along(matrix: FloatArray, values: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum("kj,tj->tk", matrix, values))
-
-    moved = along(stored_x, x - start.y[:n]) + along(stored_s, s - start.s_before)
-    charge = start.y[n:] + moved + along(lost_x, x_integral) + along(lost_s, answer.integral)
-    current = along(stored_x, dx) + along(stored_s, answer.slope) + along(lost_x, x) + along(lost_s, s)
+    dx = answer._replace(v=_along(modes.gains, s) - modes.rates * answer.v, s=answer.slope).x(modes)
+    moved = _along(stored_x, x - start.y[:n]) + _along(stored_s, s - start.s_before)
+    charge = start.y[n:] + moved + _along(lost_x, x_integral) + _along(lost_s, answer.integral)
+    current = _along(stored_x, dx) + _along(stored_s, answer.slope) + _along(lost_x, x) + _along(lost_s, s)
     return [charge, current]
 
 
@@ -180,30 +171,24 @@ def _finished(
     if problem.network.n_voltage < len(problem.network.sources):
         largest = max(largest, float(np.abs(rows[:, : problem.network.k.shape[0]]).max(initial=0.0)))
     rounding = (ROUNDING_OF_MATRICES if problem.scene.stack is None else ROUNDING) * largest
-    gaps = []
-    for peak, force in _peaks(run.record(problem)):
+    gaps, record = [], run.record(problem)
+    for i, u in enumerate(record.each("u_gap")):
+        place, peak = record.network.fingers[i], max(float(u.max(initial=0.0)), -float(u.min(initial=0.0)))
+        if record.net.gap[place] < 0 and record.net.slow[place] < 0:
+            # The area is fixed: the force grows with the voltage.
+            force = float(record.fingers[i][1].stress(peak) * record.net.area0[place])
+        else:
+            force = float(record.each("f_el")[i].max(initial=0.0))
         share = rounding / peak if peak > 0.0 else 0.0
         gaps.append((peak, force, rounding + bound * peak, (2.0 * share + 3.0 * bound) * force))
-    run.gaps = np.array(gaps or [(0.0, 0.0, rounding, 0.0)])
-    run.node_error = rounding + bound * largest
+    if not gaps:
+        peak = max((float(np.abs(u).max(initial=0.0)) for u, _ in gap_signals(record)), default=0.0)
+        gaps = [(peak, 0.0, rounding + bound * peak, 0.0)]
+    run.gaps, run.node_error = np.array(gaps), rounding + bound * largest
     if not problem.scene.is_sampled:
         # Not for a source given as a user's function: evaluating it between the outputs would cost too much.
         run.continuous = closed_form(replace(problem, charge=False), again)
     return run
-
-
-def _peaks(record: Record) -> Iterator[tuple[float, float]]:
-    """Largest voltage (V) and force (N) of every gap, as of `gap_signals`."""
-    for i, (place, (_, contact)) in enumerate(zip(record.network.fingers, record.fingers, strict=True)):
-        u = record.each("u_gap")[i]
-        peak = max(float(u.max(initial=0.0)), -float(u.min(initial=0.0)))
-        if record.net.gap[place] < 0 and record.net.slow[place] < 0:
-            # The area is fixed: the force grows with the voltage.
-            yield peak, float(contact.stress(peak) * record.net.area0[place])
-        else:
-            yield peak, float(record.each("f_el")[i].max(initial=0.0))
-    if not record.fingers:
-        yield from ((float(np.abs(u).max(initial=0.0)), 0.0) for u, _ in gap_signals(record))
 
 
 def solve_algebraic(problem: Problem) -> Run:
@@ -216,8 +201,8 @@ def solve_algebraic(problem: Problem) -> Run:
     charge_error = follow(model, answer.s[:, 0], answer.slope[:, 0], start.y, start.u_before, rows)
     # The final state is the left-hand one: it does not include a jump at the end.
     follow(model, last.s[:, 0], np.zeros(1), start.y, start.u_before, ended)
-    y = np.append(start.y[:-1], ended[0, -1])
-    state = from_stack(scene, StackState(end, y, float(last.s[0, 0]), float(ended[0, 1]), start.offset))
+    u, u_gap = ended[0, :2].tolist()
+    state = from_stack(scene, StackState(end, ended[0, 5:].copy(), u, u_gap, start.offset))
     shown = from_written(scene, rows, start.offset, by_layer=False)
     run = _finished(problem, tables, shown, state, 0.0, solve_algebraic)
     if problem.charge:
@@ -227,19 +212,15 @@ def solve_algebraic(problem: Problem) -> Run:
     return run
 
 
-FINEST_RTOL = 1e-12
-# Stated over estimated error of such a run towards a fold: alone, the estimate was as low as half the true error.
-SAFETY = 4.0
+# Tolerance of a run towards a fold; and its stated error over the estimated one, which was as low as half the true one.
+FINEST_RTOL, SAFETY = 1e-12, 4.0
 # Where leaks are much faster than the path to the fold, their round-off makes a tight tolerance unattainable. The
 # second attempt uses LOOSER_RTOL. The third, with LOOSEST_RTOL, is made only within the distance NEAR of the fold,
 # where the path is too short to drift from the solution of the area equation.
 LOOSER_RTOL, LOOSEST_RTOL, NEAR = 1e-9, 1e-6, 3e-3
-# Largest residual of the area equation at the end of a path, relative to the gap voltage.
-STRAYED = 1e-3
-# Distance at which the fold counts as reached, and largest value of s in units of the shortest time constant.
-NOTHING_LEFT, LONGEST = 1e-10, 1e12
-# Limit of the evaluations of a path; most paths to a fold take a few thousand.
-MOST_EVALUATIONS = 10_000
+# Distance at which the fold counts as reached, and the largest residual of the area equation there, relative to the gap
+# voltage; largest value of s, in units of the shortest time constant, and number of evaluations of a path.
+NOTHING_LEFT, STRAYED, LONGEST, MOST_EVALUATIONS = 1e-10, 1e-3, 1e12, 10_000
 
 
 class _LostError(Exception):
@@ -251,12 +232,11 @@ def run_to_fold(problem: Problem) -> Run | None:
     run = solve_by_steps(problem, FINEST_RTOL, repeat=False)
     run.gaps[:, 2:] *= SAFETY
     jumped = run.t_failed is not None and breakpoints_at(problem.waveform, run.t_failed).size > 0
-    if not jumped and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
-        # Where the gap voltage is as small as rounding, steps may cross a fold unseen: their end is not the fold.
-        return None
-    if run.status is Status.FOLD:
+    # Where the gap voltage is as small as rounding, steps may cross a fold unseen: their end is not the fold.
+    unseen = not jumped and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD
+    if run.status is Status.FOLD and not unseen:
         return lead_to_fold(problem, run)
-    return run if run.status is Status.SUCCESS else None
+    return run if run.status is Status.SUCCESS and not unseen else None
 
 
 def lead_to_fold(problem: Problem, run: Run) -> Run | None:
@@ -279,9 +259,8 @@ def lead_to_fold(problem: Problem, run: Run) -> Run | None:
         force = contact.stress(written[:, 1]) / written[:, 2]
         run.gaps[0, :2] = np.maximum(run.gaps[0, :2], (np.abs(written[:, 1]).max(), force.max()))
     u, u_gap = written[-1, :2].tolist()
-    n = model_of(problem.scene).gap.size
-    end = StackState(path.t, written[-1, -n - 1 :].copy(), u, u_gap, state.offset)
-    run.state = from_stack(problem.scene, end)
+    # Behind 5 columns that follow from it, a row has the state.
+    run.state = from_stack(problem.scene, StackState(path.t, written[-1, 5:].copy(), u, u_gap, state.offset))
     return run
 
 
@@ -345,23 +324,18 @@ def _ahead(problem: Problem, run: Run, state: StackState, rtol: float) -> tuple[
         return False, None
     tries = (rtol, LOOSER_RTOL, LOOSEST_RTOL) if run.margin < NEAR else (rtol, LOOSER_RTOL)
     for tried in sorted({max(rtol, x) for x in tries}):
-        try:
+        with suppress(_LostError):
             path = _path(problem, state, segment, sign, u, tried)
-        except _LostError:
-            continue
-        return path is not None, path
+            return path is not None, path
     return False, None
 
 
-def _path(
-    problem: Problem, state: StackState, segment: Segment, sign: float, u: float, rtol: float
-) -> _Path | None:  # fmt: skip
+def _path(problem: Problem, state: StackState, segment: Segment, sign: float, u: float, rtol: float) -> _Path | None:
     """The path from a state with the gap voltage u (V) on the branch `sign` to a fold; None where it meets none."""
     t, y, model, n = state.t, state.y, model_of(problem.scene), state.y.size
     pace = model.tau if math.isfinite(model.tau) else segment.length
-    scale = np.concatenate([
-        np.full(n - 1, max(np.abs(y[:-1]).max(), abs(u))), [model.area0 / model.s * abs(u), pace, abs(u)]
-    ])  # fmt: skip
+    scale = np.full(n + 2, max(np.abs(y[:-1]).max(), abs(u)))
+    scale[n - 1 :] = model.area0 / model.s * abs(u), pace, abs(u)
     dy, left = np.empty(n), MOST_EVALUATIONS
 
     def at(z: FloatArray) -> tuple[float, float]:
@@ -395,12 +369,9 @@ def _path(
     ]  # fmt: skip
     for event in events:
         event.terminal = True
-
     # Near the fold the mode that folds may be the stiffest of all: an explicit method would need too many steps.
-    found = solve_ivp(
-        slope, (0.0, LONGEST), begin, "Radau",
-        rtol=rtol, atol=rtol, jac=jacobian, events=events, dense_output=True,
-    )  # fmt: skip
+    how = {"rtol": rtol, "atol": rtol, "jac": jacobian, "events": events, "dense_output": True}
+    found = solve_ivp(slope, (0.0, LONGEST), begin, "Radau", **how)
     if found.status < 1:
         raise _LostError
     if not found.t_events[0].size:

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable
 from functools import cache, partial
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 
@@ -28,48 +29,33 @@ from fingerspice.engine.network import Net, Room, Sources, at_sources, choose_si
 from fingerspice.numerics.lobatto import radau
 from fingerspice.physics.contact import inverse_area
 from fingerspice.results.outcome import Status
+from fingerspice.solve import runs
 from fingerspice.solve.problem import ROUNDING, Problem, Tables, ramp, segment_index, values_at
-from fingerspice.solve.runs import (
-    PAST_FOLD,
-    Integration,
-    Progress,
-    Run,
-    apart,
-    closed_form,
-    excess_of,
-    gap_signals,
-    integrate,
-    nodes_apart,
-)
+from fingerspice.solve.runs import Integration, Progress, Run, apart, closed_form, excess_of, gap_signals, integrate
 
-# Stages of a run and of the coarser run, and the ratio of the coarser run's tolerance to the run's. The stated error is
-# the difference of the two runs. They need different orders as well: where edges or zeros cut the steps short, both
-# runs take the same steps, whatever their tolerances.
+# Stages of a run and of the coarser run, and the ratio of the coarser run's tolerance to the run's. They need different
+# orders as well: where edges or zeros cut the steps short, both runs take the same steps, whatever their tolerances.
 STAGES, STAGES_BESIDE, BESIDE = 7, 5, 10.0
-# Residual of Newton's method that both runs may have in common, and their difference does not show, as a fraction of
-# the step tolerance.
-ALIKE = 0.05
+# Residual of Newton's method that both runs may have in common, as a fraction of the step tolerance; and the longest
+# step, relative to the shortest time scale of the sources, which its stages must not alias.
+ALIKE, LONGEST_STEP = 0.05, 0.5
 # Error allowed in a step, over the one asked for; the least one, and rounding that all errors have, over the voltages.
 LOCAL_SHARE, FINEST, ROUNDED = 0.2, 1e-14, 4e-15
-# Longest step, relative to the shortest time scale of the sources: its stages must not alias the sources.
-LONGEST_STEP = 0.5
 # Number of equidistant times at which the two runs are compared: least, per period, and most.
 PROBES, PROBES_PER_PERIOD, MOST_PROBES = 512, 32, 20_000
 # They are also compared after at most so many edges of the sources, at these fractions of the time to the next edge.
 MOST_EDGES, AFTER_EDGE = 256, np.geomspace(1e-15, 0.3, 30)
-ATTEMPTS = 6
-# Time after which the expected time of a run is announced, s.
-TELL_AFTER = 3.0
+# Number of attempts, and time after which the expected time of a run is announced, s.
+ATTEMPTS, TELL_AFTER = 6, 3.0
 # Difference of a fold's times in two successive runs at which the fold is accepted at once, over its time; and the one
 # at which it is accepted after the last attempt, over its time or the source's shortest time, if that is longer.
 FOLD_TIME, FOLD_SPREAD = 1e-10, 1e-5
-# Part of a run's stated error that its polynomials between outputs may be off by.
-_BETWEEN = 0.1
+# Part of a run's stated error that its polynomials between outputs may be off by; and the least area that the scale of
+# the charge counts with, over that at 0 V: with less, rounding may ask for minutes.
+_BETWEEN, LEAST_SHARE = 0.1, 1e-3
 # Limit of accepted and rejected steps: at the start, and over the whole run. A run that needs more has a cause that
 # smaller steps do not remove.
 FIRST_STEPS, MOST_STEPS = 20_000, 10_000_000
-# Least area that the scale of the charge counts with, over that at 0 V: with less, rounding may ask for minutes.
-LEAST_SHARE = 1e-3
 
 
 @cache
@@ -97,7 +83,6 @@ class Collocation(Integration):
         super().__init__(problem)
         self.scheme, self.tol, self.progress = scheme, tol, progress
         self.rows = np.full((self.t_out.size, self.width), np.nan)
-        n_s = self.s_before.size
         least = problem.scene.area0.copy()
         for i, contact in enumerate(problem.network.contacts):
             if contact is not None and self.net.gap[i] >= 0:
@@ -105,11 +90,10 @@ class Collocation(Integration):
                 least[i] = min(least[i], max(float(contact.area(u_scale)), LEAST_SHARE * least[i]))
         stored = u_scale * float(np.abs(problem.network.capacitance(least)).sum()) or u_scale
         # With an infinite scale the error of the charge does not control the steps, unless charge was asked for.
-        charge = stored if problem.charge else np.inf
-        self.scale = np.concatenate([np.full(self.n, u_scale), np.ones(self.n_slow), np.full(n_s, charge)])
-        self.control = np.zeros(implicit.N_CONTROL)
+        charge, sizes = stored if problem.charge else np.inf, [self.n, self.n_slow, self.s_before.size]
+        self.scale = np.repeat([u_scale, 1.0, charge], sizes)
+        self.control, self.counters = np.zeros(implicit.N_CONTROL), np.zeros(implicit.N_COUNTERS, np.int64)
         self.control[implicit.BASE] = problem.t_start
-        self.counters = np.zeros(implicit.N_COUNTERS, np.int64)
         self.peaks = np.zeros(self.net.gap.size)
         self.room = new_room(self.net, self.y.size)
         self.work = new_work(self.net, scheme.c.size, scheme.eigenvalues.size, self.y.size)
@@ -133,10 +117,8 @@ class Collocation(Integration):
                 return Status.SUCCESS
             if code == implicit.PAUSED:
                 done = self.problem.done(self.t)
-                if (
-                    self.counters[implicit.ACCEPTED] + self.counters[implicit.REJECTED]
-                    > FIRST_STEPS + done * MOST_STEPS
-                ):
+                taken = self.counters[implicit.ACCEPTED] + self.counters[implicit.REJECTED]
+                if taken > FIRST_STEPS + done * MOST_STEPS:
                     return Status.TOO_MANY_STEPS
                 if self.progress is not None:
                     self.progress(done)
@@ -144,16 +126,14 @@ class Collocation(Integration):
                 return self.stuck()
 
     def jump(self, after: FloatArray) -> bool:
-        control = np.zeros(implicit.N_CONTROL)
         run = Passage(
-            self.y, self.s_before.copy(), control, self.counters, self.peaks, False, self.t_out[:0], self.left[:0],
-            np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
+            self.y, self.s_before.copy(), np.zeros(implicit.N_CONTROL), self.counters, self.peaks, False,
+            self.t_out[:0], self.left[:0], np.empty((0, self.y.size)), np.zeros((TRIED, 4)),
         )  # fmt: skip
         nodal = self.nodal(ramp(self.s_before, after))
         code = advance(nodal._replace(scheme=self.scheme._replace(h_max=1.0), jump=True), run, 1.0)
         self.s_before[:] = after
-        self.control[implicit.H] = self.control[implicit.H_AFTER_JUMP]
-        self.control[implicit.JUMPED] = 1.0
+        self.control[[implicit.H, implicit.JUMPED]] = self.control[implicit.H_AFTER_JUMP], 1.0
         return code == implicit.DONE
 
 
@@ -212,7 +192,7 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
         run.nfev = nfev
         worst = _stated(problem, run, run.only(probed), beside, u_scale, ALIKE * tol) / rtol
         last = tol <= finest or attempt == ATTEMPTS - 1
-        if mobile and run.record(problem).fold_margin.min(initial=1.0) < PAST_FOLD:
+        if mobile and run.record(problem).fold_margin.min(initial=1.0) < runs.PAST_FOLD:
             # A step has crossed a fold onto a branch of the area equation that no continuous path reaches.
             tol, run.status = max(0.03 * tol, finest), Status.ERROR_NOT_MET
         elif run.status is Status.FOLD and run.t_failed is not None:
@@ -250,17 +230,17 @@ def solve_coupled(problem: Problem, rtol: float, progress: Progress | None = Non
 
 def _announced(progress: Progress | None, reason: str) -> Progress:
     """Progress of implicit steps, which tells once how long they are expected to take."""
-    first, told = (0.0, 0.0), False
+    # Time and progress at the first call, because the compiler may have worked before it; infinite once that was told.
+    first: tuple[float, float] | None = None
 
     def update(done: float) -> None:
-        nonlocal first, told
-        # From the first call on, because the compiler may have worked before it.
-        first = first if first[0] else (time.perf_counter(), done)
+        nonlocal first
+        first = first or (time.perf_counter(), done)
         taken, more = time.perf_counter() - first[0], done - first[1]
-        if not told and taken > TELL_AFTER and more > 0.0:
+        if taken > TELL_AFTER and more > 0.0:
             # A run consists of the coarser one, which comes first, and the finer one.
             tell(f"{reason}implicit steps take about {2.0 * taken / more:.2g} s in all")
-            told = True
+            first = math.inf, done
         if progress is not None:
             progress(done)
 
@@ -317,7 +297,7 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
         moved = 2.0 * both / peak * force if peak > 0.0 else 0.0
         gaps.append((peak, force, apart(u, v) + both, apart(f, g) + moved))
     run.gaps = np.array(gaps).reshape(-1, 4)
-    run.node_error = nodes_apart(fine, coarse) + both
+    run.node_error = runs.nodes_apart(fine, coarse) + both
     if problem.charge:
         at = slice(problem.initial.y.size - problem.initial.s_before.size, problem.initial.y.size)
         run.charge_error = apart(probed.rows[:, at], beside.rows[:, at])
@@ -326,11 +306,10 @@ def _stated(problem: Problem, run: Run, probed: Run, beside: Run, u_scale: float
 
 _QUIET = threading.Lock()
 SCIPY_METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
-TORCH_METHODS = ("dopri5", "dopri8", "bosh3", "adaptive_heun", "rk4", "midpoint", "euler")
 _TORCH_ORDER = {"rk4": 4, "midpoint": 2, "euler": 1}  # Of those with fixed steps
+TORCH_METHODS = ("dopri5", "dopri8", "bosh3", "adaptive_heun", *_TORCH_ORDER)
 # Tolerances of our own run and of the library's first run, relative to the error asked for.
 REFERENCE, FIRST = 0.03, 0.1
-
 Rate = Callable[[float, FloatArray], FloatArray]
 
 
@@ -364,14 +343,12 @@ class Foreign(Collocation):
         """States at `times` (s, ascending from 0) of y' = rate(t, y), and the number of evaluations."""
         from scipy.integrate import solve_ivp
 
+        how = {"rtol": max(self.tol, 3e-14), "atol": self.tol * self.scale}
         # Warning filters belong to the whole process: change them in one thread at a time, for scipy's warnings only.
         with _QUIET, warnings.catch_warnings():
             warnings.filterwarnings("ignore", module=r"scipy\.")
             try:
-                found = solve_ivp(
-                    rate, (0.0, times[-1]), self.y.copy(), self.name, times, rtol=max(self.tol, 3e-14),
-                    atol=self.tol * self.scale,
-                )  # fmt: skip
+                found = solve_ivp(rate, (0.0, times[-1]), self.y.copy(), self.name, times, **how)
             except ValueError as error:
                 # Past a fold y' is NaN, and scipy's implicit methods refuse to factor a matrix with NaN.
                 raise _FailedError(f"scipy: {error}") from None
@@ -385,7 +362,7 @@ class Foreign(Collocation):
         import torch
         from torchdiffeq import odeint
 
-        count, length, tol, scale, order = 0, float(times[-1]), self.tol, self.scale, _TORCH_ORDER.get(self.name)
+        count, length, tol, scale = 0, float(times[-1]), self.tol, self.scale
 
         def slope(t: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
             nonlocal count
@@ -395,16 +372,14 @@ class Foreign(Collocation):
             # Past a fold y' is NaN, which would make torchdiffeq's step NaN; it rejects the step if y' is huge.
             return torch.from_numpy(np.where(np.isfinite(found), found, 1e9 / length))
 
-        options = {}
-        if order is not None:
+        how: dict[str, Any] = {"method": self.name, "rtol": max(tol, 3e-14), "atol": tol, "options": {}}
+        if (order := _TORCH_ORDER.get(self.name)) is not None:
             # A fixed step h from the tolerance, with the error model (h / tau)^order, tau the shortest time constant.
             longest = min(1.0 / max(float(self.problem.scene.rates.max(initial=0.0)), 1e-300), length / 4.0)
-            options = {"step_size": min(longest, 2.0 * longest * tol ** (1.0 / order))}
-        begin, at = torch.from_numpy(self.y / scale), torch.from_numpy(times)
-        how = {"method": self.name, "rtol": max(tol, 3e-14), "atol": tol, "options": options}
+            how["options"] = {"step_size": min(longest, 2.0 * longest * tol ** (1.0 / order))}
         try:
             with torch.no_grad():
-                states = odeint(slope, begin, at, **how).numpy() * scale
+                states = odeint(slope, torch.from_numpy(self.y / scale), torch.from_numpy(times), **how).numpy() * scale
         except AssertionError as error:
             short = "torchdiffeq's step underflowed: its methods are explicit, and this scene may be too stiff for them"
             raise _FailedError(short if "underflow in dt" in str(error) else str(error)) from None
@@ -471,7 +446,7 @@ def solve_foreign(problem: Problem, method: str, rtol: float, progress: Progress
         run.nfev, run.margin, run.gaps = nfev, reference.margin, reference.gaps.copy()
         for gap, mine, other in zip(run.gaps, gap_signals(ours), gap_signals(theirs), strict=True):
             gap[2:] += list(map(apart, mine, other))
-        run.node_error = (reference.node_error or 0.0) + nodes_apart(ours, theirs)
+        run.node_error = (reference.node_error or 0.0) + runs.nodes_apart(ours, theirs)
         worst = excess_of(run.gaps, max(ROUNDING * u_scale, problem.rounding)) / rtol
         if run.status is not Status.SUCCESS:
             if reference.status is Status.FOLD:

@@ -245,9 +245,7 @@ def _source_warnings(problem: Problem) -> Iterator[str]:
             f"the source is a function, which was looked at every {format_si(event, 's')}: an event shorter than that "
             "may have been missed; give Function(f, breaks=(...)) its edges, or the circuit a .tran of a shorter TSTEP"
         )
-    outside = spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
-    if outside is not None:
-        yield outside
+    yield from spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
 
 
 def _off_warning(problem: Problem) -> Iterator[str]:

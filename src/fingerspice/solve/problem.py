@@ -24,16 +24,9 @@ from fingerspice.results.outcome import State
 from fingerspice.results.solution import Solution
 from fingerspice.solve.scenes import Scene, kept_with, scene_of
 from fingerspice.solve.starting import StackState, initial_state, to_stack
+from fingerspice.waveforms import sampling
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.sampling import (
-    WIDEST,
-    SourceTable,
-    breakpoints_at,
-    is_sampled,
-    on_breakpoint,
-    same_time,
-    source_table,
-)
+from fingerspice.waveforms.sampling import SourceTable, breakpoints_at, is_sampled, same_time, source_table
 from fingerspice.waveforms.waveform import DC, Waveform, require
 
 #: Most periods (or shortest time scales) of the source in a run, and most breakpoints: they take hours and a gigabyte.
@@ -42,13 +35,11 @@ MOST_PERIODS, MOST_BREAKPOINTS = 1e10, 4e9
 MOST_BYTES = 2e9
 # Round-off of a gap voltage relative to the voltages that cancel in it; finer steps cannot reduce the error below that.
 ROUNDING = 2e-14
-# Largest number of breakpoints (64 kB) and of output times (0.3 MB) cached with a waveform.
-KEPT_BREAKPOINTS, KEPT_OUTPUTS = 8192, 32_768
+# Largest number of breakpoints and of output times (0.3 MB) cached with a waveform, and of breakpoints in memory.
+KEPT_BREAKPOINTS, KEPT_OUTPUTS, _BREAKPOINTS_AT_ONCE = 8192, 32_768, 65_536
 # Resolution of a time in units of its rounding error; a difference of a source's two limits at an edge is no jump if
 # the source changes as much within this resolution beside the edge.
 _RESOLVED = 8.0
-# Breakpoints held in memory at a time, so that memory does not grow with the length of the run.
-_BREAKPOINTS_AT_ONCE = 65_536
 
 
 @dataclass(frozen=True)
@@ -147,13 +138,12 @@ def prepare(
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
     tran, wave, stop = circuit.tran, scene.waveform, t_stop
-    if stop is None:
-        if tran is not None:
-            stop = t_start + tran.stop
-        elif t_eval is not None and t_eval.size:
-            stop = float(t_eval[-1])
-        else:
-            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+    if stop is None and tran is not None:
+        stop = t_start + tran.stop
+    elif stop is None and t_eval is not None and t_eval.size:
+        stop = float(t_eval[-1])
+    elif stop is None:
+        raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
     require(math.isfinite(stop) and stop > t_start, "t_stop", f"{stop:g} s", f"more than {t_start:g} s")
     if t_eval is not None:
         require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
@@ -162,7 +152,7 @@ def prepare(
         first, last = float(t_eval[0]), float(t_eval[-1])
         allowed = f"times from {t_start:g} s to t_stop = {stop:g} s{time_slip(first, last, stop)}"
         require(first >= t_start and last <= stop, "t_eval", f"{first:g} s to {last:g} s", allowed)
-    end = kept_with(wave.kept, ("end", stop), 1, lambda: on_breakpoint(wave, stop))
+    end = kept_with(wave.kept, ("end", stop), 1, lambda: sampling.on_breakpoint(wave, stop))
     return Problem(
         circuit, scene, t_start, end, t_start + (tran.start if tran else 0.0),
         tran.step if tran else (stop - t_start) / 1000.0,
@@ -197,12 +187,9 @@ def check_outputs(circuit: Circuit, count: float) -> None:
     signals = sum(of_device.get(element.device, 0) + element.spec.is_layer for element in circuit.elements)
     signals += len({node for element in circuit.elements for node in element.nodes}) + 1
     size = 8.0 * signals * count
-    require(
-        size <= MOST_BYTES,
-        "the run",
-        f"one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB",
-        f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning",
-    )
+    told = f"one of {count:.3g} outputs with {signals} signals, {size / 1e9:.3g} GB"
+    allowed = f"at most {MOST_BYTES / 1e9:g} GB: a longer TSTEP, or a TSTART that leaves out the beginning"
+    require(size <= MOST_BYTES, "the run", told, allowed)
 
 
 def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
@@ -212,9 +199,8 @@ def at_breakpoints(problem: Problem, t: FloatArray) -> FloatArray:
     """
     if all(isinstance(wave, Samples | DC) for wave in problem.waveforms):
         return t
-    span = problem.t_start, problem.t_stop
+    span, moved = (problem.t_start, problem.t_stop), t
     windows = 1 + int((span[1] - span[0]) * problem.waveform.breakpoint_rate() / _BREAKPOINTS_AT_ONCE)
-    moved = t
     for w0, w1 in itertools.pairwise(span if windows == 1 else np.linspace(*span, windows + 1)):
         edges = problem.breakpoints() if windows == 1 else problem.waveform.breakpoints(w0, w1)
         reach = same_time(1.0) * np.abs(edges)
@@ -267,16 +253,14 @@ def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
         distance = np.minimum(np.abs(grid - at[near - 1]), np.abs(grid - at[np.minimum(near, at.size - 1)]))
         grid = grid[distance > 1e-9 * step]
     t = np.concatenate([grid, at, at])
-    left = np.zeros(t.size, bool)
-    left[grid.size : grid.size + at.size] = True
+    left = np.repeat([False, True, False], [grid.size, at.size, at.size])
     order = np.lexsort((~left, t))
     t, left = t[order], left[order]
     t.flags.writeable = left.flags.writeable = False
     return t, left
 
 
-PERIODS_PER_WINDOW = 4096.0
-BREAKPOINTS_PER_WINDOW = 2000.0
+PERIODS_PER_WINDOW, BREAKPOINTS_PER_WINDOW = 4096.0, 2000.0
 # A run of at most KEPT_WINDOWS windows leaves its tables in the waveform's cache, which holds about MOST_KEPT of them.
 KEPT_WINDOWS, MOST_KEPT = 4, 16
 # Number of times, evenly through the run, at which a function of arrays is looked at in any case: they take 1 ms.
@@ -286,8 +270,8 @@ LOOKS = 20_000
 class Tables:
     """Tables of a problem's sources, window by window, until one of them stops being finite.
 
-    A user's function is expensive to evaluate, so its tables are cached for the run. The tables of library waveforms
-    are cached with the waveform if the run has few windows; in a longer run they are computed anew, in constant memory.
+    Those of a user's function, which is expensive, are cached for the run, and others with the waveform if the run has
+    few windows; in a longer run they are computed anew, in constant memory.
     """
 
     def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
@@ -334,11 +318,10 @@ class Tables:
                 return
 
     def _tables(self, w0: float, w1: float) -> list[SourceTable]:
-        problem, shortest, tables = self.problem, shortest_event(self.problem), []
+        problem, tables = self.problem, []
+        make = partial(source_table, no_chirps=self.no_chirps, shortest=shortest_event(problem))
         for place, (wave, scale) in enumerate(zip(problem.waveforms, self.scales, strict=True)):
-            table = source_table(
-                wave, w0, w1, self.tol, problem.step, no_chirps=self.no_chirps, scale=scale, shortest=shortest
-            )
+            table = make(wave, w0, w1, self.tol, problem.step, scale=scale)
             if is_sampled(wave):
                 off = table.unseen(wave, problem.t_out, self.tol)
                 self.unseen = min((one for one in (self.unseen, off and (*off, place)) if one), default=None)
@@ -347,19 +330,17 @@ class Tables:
 
     def peak(self) -> float:
         """Largest source voltage (V) of the run; of users' functions also between the samples that a scene knows."""
-        problem, n_voltage = self.problem, self.problem.network.n_voltage
+        problem = self.problem
         if not problem.scene.is_sampled:
             return problem.scene.u_peak or problem.waveform.peak(problem.t_start, problem.t_stop)
-        met = (table.scale for tables in self for table in tables[:n_voltage])
+        met = (table.scale for tables in self for table in tables[: problem.network.n_voltage])
         return max(met, default=0.0) or problem.scene.u_peak
 
 
 def shortest_event(problem: Problem) -> float:
     """Length (s) of the shortest event of a user's function that its samples surely meet."""
-    met = WIDEST * problem.step
-    if any(wave.kept.get("one by one") for wave in problem.waveforms):
-        return met
-    return min(met, (problem.t_stop - problem.t_start) / LOOKS)
+    one_by_one = any(wave.kept.get("one by one") for wave in problem.waveforms)
+    return min(sampling.WIDEST * problem.step, math.inf if one_by_one else (problem.t_stop - problem.t_start) / LOOKS)
 
 
 def joined(tables: list[SourceTable]) -> Sources:
@@ -367,10 +348,10 @@ def joined(tables: list[SourceTable]) -> Sources:
     if len(tables) == 1:
         (one,) = tables
         return Sources(np.array([0, one.edges.size]), one.edges, one.terms, one.series)
-    width = max(t.terms.shape[1] for t in tables), max(t.series.shape[1] for t in tables)
-    first = np.concatenate([[0], np.cumsum([t.edges.size for t in tables])]).astype(np.int64)
-    terms = [np.pad(t.terms, ((0, 0), (0, width[0] - t.terms.shape[1]), (0, 0))) for t in tables]
-    series = [np.pad(t.series, ((0, 0), (0, width[1] - t.series.shape[1]))) for t in tables]
+    most = max(t.terms.shape[1] for t in tables), max(t.series.shape[1] for t in tables)
+    first = np.cumsum([0, *(t.edges.size for t in tables)])
+    terms = [np.pad(t.terms, ((0, 0), (0, most[0] - t.terms.shape[1]), (0, 0))) for t in tables]
+    series = [np.pad(t.series, ((0, 0), (0, most[1] - t.series.shape[1]))) for t in tables]
     return Sources(first, np.concatenate([t.edges for t in tables]), np.concatenate(terms), np.concatenate(series))
 
 
@@ -395,18 +376,16 @@ def after_the_end(problem: Problem) -> Sources | None:
     if not any(breakpoints_at(wave, stop).size for wave in problem.waveforms):
         return None
 
-    def make() -> Sources:
-        return joined([source_table(w, stop, stop + problem.step, 1e-10, problem.step) for w in problem.waveforms])
-
-    return kept_with(problem.waveform.kept, ("after", stop, problem.step), 1, make)
+    key, step = ("after", stop, problem.step), problem.step
+    tables = (source_table(w, stop, stop + step, 1e-10, step) for w in problem.waveforms)
+    return kept_with(problem.waveform.kept, key, 1, lambda: joined(list(tables)))
 
 
 def segment_index(sources: Sources, t: float, side: Literal["left", "right"]) -> IntArray:
     """Index of every source's segment (n_s,) that contains t (s); at an edge, the segment on the given side."""
-    return np.array([
-        min(max(int(np.searchsorted(sources.edges[a:b], t, side=side)) - 1, 0), b - a - 2)
-        for a, b in itertools.pairwise(sources.first)
-    ])  # fmt: skip
+    spans = itertools.pairwise(sources.first)
+    found = ((int(sources.edges[a:b].searchsorted(t, side)) - 1, b - a - 2) for a, b in spans)
+    return np.array([min(max(i, 0), last) for i, last in found])
 
 
 def segment_of(sources: Sources, t: float, side: Literal["left", "right"]) -> tuple[Segment, float]:

@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import numpy as np
 
 from fingerspice.base.arrays import FloatArray
-from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
+from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, T
 from fingerspice.circuit.describe import COUPLING, freezing_error
 from fingerspice.circuit.network import Modes, Network, loop_network, mean_areas, network_modes, network_of
 from fingerspice.circuit.statespace import Stack, build_stack, is_stack
@@ -27,31 +27,17 @@ from fingerspice.waveforms.waveform import Sum, Waveform, require
 FREEZING_SHARE = 0.3
 # Smallest peak of a source other than 0, V; below it, forces and errors are denormal numbers with too few digits.
 LEAST_PEAK = 1e-300
-# Gap voltage (V) that an area's curve covers if the sources' peak is unknown; over a tiny range it would be constant.
-PEAK_UNKNOWN = 1.0
-# Range of an area's curve over the source's peak: the voltage of discharging layers adds to the gap's share of a jump.
-BEYOND_PEAK = 1.3
-# Gap voltage (V) that an area's curve covers under current sources, which do not bound it; beyond the curve, the
-# contact equations are solved at each evaluation.
-DRIVEN_BY_CURRENT = 300.0
+# Range of an area's curve over the source's peak, as the voltage of discharging layers adds to the gap's share of a
+# jump; gap voltages (V) that it covers under current sources, which do not bound it, and if the peak is unknown.
+BEYOND_PEAK, DRIVEN_BY_CURRENT, PEAK_UNKNOWN = 1.3, 300.0, 1.0
 
 
-Kept = TypeVar("Kept")
-
-
-class Freezing(NamedTuple):
-    """The single frequency at which a dispersive skin's data are taken, and the error of doing so."""
-
-    frequency: float  # Hz
-    error: float  # Error of the gap voltage, relative to its peak
-
-
-def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], Kept]) -> Kept:
+def kept_with(prepared: dict[Any, Any], key: tuple[Any, ...], most: int, make: Callable[[], T]) -> T:
     """The entry of a cache under a key, of which at most `most` share the first part; else all of these make room.
 
     Other threads may remove entries at any time, so that the entry is looked up only once.
     """
-    found: Kept | None = prepared.get(key)
+    found: T | None = prepared.get(key)
     if found is None:
         kept = [name for name in list(prepared) if name[0] == key[0]]
         for name in kept if len(kept) >= most else ():
@@ -72,8 +58,9 @@ class Scene:
     u_size: float  # The larger one of `u_peak` and the sum of the peaks of all parts that may cancel in the sources, V
     u_top: float  # Largest gap voltage that the areas' curves cover, V
     model: Model | None = None  # Model of a series stack, whose modes follow from a secular equation
-    # Frequency at which a dispersive skin's data are taken, if one is accurate enough for the error asked for
-    skin: Freezing | None = None
+    # Frequency (Hz) at which a dispersive skin's data are taken, if one is accurate enough for the error asked for, and
+    # the error of the gap voltage of doing so, relative to its peak
+    skin: tuple[float, float] | None = None
     # Cache of the tables and systems that integrators have made for this scene
     prepared: dict[Any, Any] = field(default_factory=dict)
 
@@ -117,25 +104,15 @@ class Scene:
         padded = np.zeros((count, max((c.size for c in curves), default=1)))
         for row, curve in zip(padded, curves, strict=True):
             row[: curve.size] = curve
-        cells = network.cells
+        constants = np.array([(c.c, c.g_total, c.g_area) for c in network.cells], float).reshape(-1, 3).T.copy()
+        place = np.array([-1 if c.area is None else c.area for c in network.cells], np.int64)
+        slow = np.where(tau > 0.0, np.cumsum(tau > 0.0) - 1, -1)
+        matrices = network.p, network.q, network.k, network.b, network.through, network.delivered
+        p, q, k, b, through, delivered = map(np.ascontiguousarray, matrices)
         return Net(
-            mobile=self.charge_law == "mobile",
-            p=np.ascontiguousarray(network.p),
-            q=np.ascontiguousarray(network.q),
-            c=np.array([c.c for c in cells], float),
-            g_total=np.array([c.g_total for c in cells], float),
-            g_area=np.array([c.g_area for c in cells], float),
-            place=np.array([-1 if c.area is None else c.area for c in cells], np.int64),
-            k=np.ascontiguousarray(network.k),
-            b=np.ascontiguousarray(network.b),
-            through=np.ascontiguousarray(network.through),
-            delivered=np.ascontiguousarray(network.delivered),
-            gap=gap,
-            area0=area0,
-            tau=tau,
-            slow=np.where(tau > 0.0, np.cumsum(tau > 0.0) - 1, -1),
-            curves=padded,
-        )
+            self.charge_law == "mobile", p, q, constants[0], constants[1], constants[2], place, k, b, through,
+            delivered, gap, area0, tau, slow, padded,
+        )  # fmt: skip
 
     @property
     def shown(self) -> Scene:
@@ -203,8 +180,15 @@ def scene_of(
     skin = _freezing(circuit, stop, rtol)
 
     def make() -> Scene:
-        network = network_of(circuit, None if skin is None else skin.frequency)
-        fixed, mode = _fixed_areas(network, area)
+        network = network_of(circuit, None if skin is None else skin[0])
+        # Each area (m^2), None for one that follows its gap, and the name of the area mode.
+        fixed, mode = tuple(a.given for a in network.areas), str(area)
+        if not isinstance(area, str):
+            fixed, mode = (float(area),) * len(fixed), f"{area:g} m^2"
+        elif None not in fixed:
+            mode = f"{fixed[0]:g} m^2 (from the deck)" if len(fixed) == 1 else "given by the deck" if fixed else "none"
+        elif area != "coupled":
+            fixed = tuple(map(float, mean_areas(network) if area == "mean" else network.areas_at_rest))
         waves = network.waveforms[: network.n_voltage]
         u_peak = sum(_largest_voltage(wave, stop, network.stack is not None) for wave in waves)
         u_size = max(u_peak, sum(wave.cancelling(0.0, stop) for wave in waves))
@@ -216,8 +200,8 @@ def scene_of(
     return circuit.remember(("scene", law, area, stop, skin), make)
 
 
-def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
-    """The single frequency for a dispersive skin's data, if the error of using it is small compared with `rtol`."""
+def _freezing(circuit: Circuit, stop: float, rtol: float) -> tuple[float, float] | None:
+    """`Scene.skin`, if the error is small compared with `rtol`."""
     if not circuit.by_device("SKIN_DISPERSIVE") or not is_stack(circuit):
         return None
     stack, allowed = build_stack(circuit), FREEZING_SHARE * rtol
@@ -232,7 +216,7 @@ def _freezing(circuit: Circuit, stop: float, rtol: float) -> Freezing | None:
         return None
     f = fundamental.frequency
     error = circuit.remember(("freezing", stop), lambda: freezing_error(circuit, f, area, change, stop))
-    return Freezing(f, error) if error <= allowed else None
+    return (f, error) if error <= allowed else None
 
 
 def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> float:
@@ -249,22 +233,6 @@ def _largest_voltage(waveform: Waveform, stop: float, whole: bool = True) -> flo
     return peak if math.isfinite(peak) else 0.0
 
 
-def _fixed_areas(network: Network, area: str | float) -> tuple[tuple[float | None, ...], str]:
-    """Each area (m^2), None for one that follows its gap, and the name of the area mode."""
-    given = [a.given for a in network.areas]
-    if not isinstance(area, str):
-        return (float(area),) * len(given), f"{area:g} m^2"
-    if not given:
-        return (), "none"
-    if all(x is not None for x in given):
-        return tuple(given), f"{given[0]:g} m^2 (from the deck)" if len(given) == 1 else "given by the deck"
-    if area == "coupled":
-        return tuple(given), area
-    if area == "mean":
-        return tuple(map(float, mean_areas(network))), area
-    return tuple(map(float, network.areas_at_rest)), area
-
-
 def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
     """The model of a stack for compiled code; only the range of the area's curve depends on the source."""
     if fixed is not None:
@@ -275,34 +243,20 @@ def _model(stack: Stack, law: str, fixed: float | None, u_top: float) -> Model:
         before: Model | None = stack.kept.get(("model", law))
         if before is not None:
             return before._replace(curve=curve)
-    order = list(stack.state_order)
+    order, n = list(stack.state_order), stack.c.size - 1
     probe = int(np.argmin(stack.c)) if stack.gap is None else stack.gap
-    k = stack.k[order]
-    leaks = stack.leak_rates(area0)
+    k, leaks = stack.k[order], stack.leak_rates(area0)
     slow = int(np.argmin(leaks))
-    rates, _, _, _ = modes(np.ascontiguousarray(leaks[order]), np.ascontiguousarray(k))
+    rates, _, _, _ = modes(leaks[order], k)
     fastest = float(rates.max(initial=0.0))
+    # Weights of the states in each cell's voltage beyond its share k U.
+    of_probe, of_slow = np.vstack([np.eye(n), np.full(n, -1.0)])[[order.index(probe), order.index(slow)]]
     model = Model(
-        mobile=law == "mobile",
-        coupled=fixed is None,
-        k=np.ascontiguousarray(k),
-        rate=np.ascontiguousarray((stack.g_area / stack.c)[order]),
-        rate0=np.ascontiguousarray((stack.g_total / stack.c)[order]),
-        k_gap=float(stack.k[probe]),
-        gap=_row(order, probe),
-        s=stack.s,
-        slow=np.append(_row(order, slow), [stack.k[slow], stack.c[slow], stack.g_area[slow], stack.g_total[slow]]),
-        area0=area0,
-        tau=1.0 / fastest if fastest > 0.0 else math.inf,
-        curve=curve,
-    )
+        mobile=law == "mobile", coupled=fixed is None, k=k, rate=(stack.g_area / stack.c)[order],
+        rate0=(stack.g_total / stack.c)[order], k_gap=float(stack.k[probe]), gap=of_probe, s=stack.s,
+        slow=np.append(of_slow, [stack.k[slow], stack.c[slow], stack.g_area[slow], stack.g_total[slow]]),
+        area0=area0, tau=1.0 / fastest if fastest > 0.0 else math.inf, curve=curve,
+    )  # fmt: skip
     if fixed is None:
         stack.kept["model", law] = model
     return model
-
-
-def _row(order: list[int], layer: int) -> FloatArray:
-    """Weights of the states in a cell's voltage beyond its share k U, shape (n_cell - 1,)."""
-    place = order.index(layer)
-    n = len(order) - 1
-    return np.full(n, -1.0) if place == n else np.eye(n)[place]

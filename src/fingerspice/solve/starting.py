@@ -24,13 +24,12 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
+from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.network import Network, build_network
@@ -69,10 +68,10 @@ def to_stack(scene: Scene, state: State) -> StackState:
     u_gap = float(np.einsum("k,k->", along[: model.gap.size], model.gap))
     # If the gap's voltage is no state, it is the source's voltage less the states, whose weights are -1.
     u_gap += 0.0 if model.gap.size and model.gap.max() > 0.0 else before
-    inverse = inverse_area(abs(u_gap), model.curve)[0] if model.mobile else 0.0
-    scale = model.area0 * inverse if model.mobile else 1.0
-    offset = before / inverse / model.s if model.mobile else 0.0
-    share = model.k[:-1] * before
+    scale, offset, share = 1.0, 0.0, model.k[:-1] * before
+    if model.mobile:
+        inverse = inverse_area(abs(u_gap), model.curve)[0]
+        scale, offset = model.area0 * inverse, before / inverse / model.s
     x = along - share
     # A remainder within the rounding of the capacitive share is no stored charge: an uncharged start gives exactly 0.
     x[np.abs(x) <= 4e-16 * np.abs(share)] = 0.0
@@ -81,14 +80,12 @@ def to_stack(scene: Scene, state: State) -> StackState:
 
 def from_stack(scene: Scene, state: StackState) -> State:
     """The state used for all circuits from a state in the engine's form."""
-    model = model_of(scene)
-    stack, sign, scale, y = scene.stack, 0.0, 1.0, state.y.copy()
-    assert stack is not None
+    model, stack, sign, scale, y = model_of(scene), scene.stack, 0.0, 1.0, state.y.copy()
     if model.mobile:
         inverse = inverse_area(abs(state.u_gap), model.curve)[0]
         scale = model.area0 * inverse
         y[-1] += state.u_before / inverse / model.s - state.offset
-        if stack.gap is not None and state.u_gap != 0.0:
+        if stack is not None and stack.gap is not None and state.u_gap != 0.0:
             sign = math.copysign(1.0, state.u_gap) * float(stack.sign[stack.gap])
     y[:-1] = scene.turn * (model.k[:-1] * state.u_before + scale * y[:-1])
     return State(state.t, y, np.array([state.u_before]), np.array([sign]), scene.charge_law)
@@ -156,32 +153,52 @@ def initial_state(circuit: Circuit, scene: Scene, start: str | Solution) -> Stat
 
 
 def _at_rest(circuit: Circuit, scene: Scene, initial: Mapping[str, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Cell voltages (V), areas (m^2) and sources at the operating point, with the nodes in `initial` held."""
-    network, net, stack = scene.network, scene.net, scene.stack
+    """Cell voltages (V), areas (m^2) and sources at the DC operating point (at 0-), the nodes in `initial` held."""
+    net, stack = scene.net, scene.stack
     s = np.array([float(w.value(0.0, "left")) for w in scene.waveforms])
     if stack is not None and scene.model is not None and not initial:
         order = list(stack.state_order)
         return (stack.sign * dc_voltages(stack, float(s[0]), scene.model))[order], scene.area0, s
+    conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in scene.network.areas}
+    added = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
     # The reduced network of a series loop has no nodes, so the operating point needs the unreduced network.
-    whole = network if stack is None else build_network(replace(circuit, work="gap"))
-    u, area, held = operating_point(scene, circuit, whole, initial)
+    rebuilt = stack is not None or added
+    network = build_network(replace(circuit, work="gap"), added) if rebuilt else scene.network
+    sources = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
+    area, follows = scene.area0.copy(), net.gap >= 0
+    held = np.array([a.node in initial for a in network.areas], bool) & follows
+    area[held] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, held, strict=True) if mark]
+    _refuse_floating_at_dc(network, area)
+    part, before = 1.0, math.inf
+    for _ in range(500):
+        k, b = network.stiffness(network.leak(area))
+        x = np.linalg.solve(k, -b @ sources) if k.size else np.zeros(0)
+        u, new = network.p @ x + network.q @ sources, area.copy()
+        for i, (contact, gap) in enumerate(zip(scene.network.contacts, network.gaps, strict=True)):
+            if contact is not None and gap is not None and follows[i] and not held[i]:
+                new[i] = float(contact.area(abs(float(u[gap]))))
+        off = float(np.max(np.abs(new / area - 1.0), initial=0.0))
+        # The iteration has converged, or round-off lets it come no nearer.
+        if off <= 4e-16 or 0.8 * before < off <= 1e-13:
+            break
+        # Damping, because leaks that scale with the area may make the iteration oscillate.
+        part *= 0.7 if off > 0.8 * before else 1.0
+        area, before = area + part * (new - area), off
+    else:
+        raise InputError("the areas find no DC operating point; allowed: uic in .tran, to start uncharged")
     if stack is not None:
-        of: dict[str, list[float]] = {}
-        for cell, one in zip(whole.cells, u.tolist(), strict=True):
-            of.setdefault(cell.element.name, []).append(one)
-        for layer in network.layers:
-            if sum(cell.element is layer for cell in network.cells) == 1:
+        found = list(zip(network.cells, u.tolist(), strict=True))
+        of = {e.name: [v for cell, v in found if cell.element is e] for e in stack.layers}
+        for layer, count in zip(stack.layers, stack.cells, strict=True):
+            if count == 1:
                 # A dispersive skin evaluated at one frequency is one cell of the loop, but several of the network.
                 of[layer.name] = [sum(of[layer.name])]
-        u = np.array([of[cell.element.name].pop(0) for cell in network.cells])
-    if net.mobile:
-        for i in np.flatnonzero(held & (net.slow < 0)):
-            # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.
-            gap = net.gap[i]
-            own = at_own_area(float(u[gap]), area[i], net.curves[i])
-            rest = 1.0 / inverse_area(abs(own), net.curves[i])[0]
-            u[net.place == i] *= area[i] / rest
-            u[gap] = own
+        u = np.array([of[cell.element.name].pop(0) for cell in scene.network.cells])
+    for place in np.flatnonzero(held & (net.slow < 0)) if net.mobile else ():
+        # A held area is released at the start: it becomes that of its gap voltage, and the charge is conserved.
+        own = at_own_area(float(u[net.gap[place]]), area[place], net.curves[place])
+        u[net.place == place] *= area[place] / (1.0 / inverse_area(abs(own), net.curves[place])[0])
+        u[net.gap[place]] = own
     return u, area, s
 
 
@@ -191,16 +208,12 @@ def _state(scene: Scene, u: FloatArray, area: FloatArray, s: FloatArray | None) 
     if s is None and not u.any() and not np.any(net.slow >= 0):
         y, still = np.zeros(sum(network.b.shape)), np.zeros(len(network.sources))
         return State(0.0, y, still, np.zeros(len(network.areas)), scene.charge_law)
-    slow = (area / net.area0)[net.slow >= 0]
-    x: FloatArray = u[list(network.live)]
-    charge: FloatArray = np.zeros(len(network.sources))
+    slow, x, charge = (area / net.area0)[net.slow >= 0], u[list(network.live)], np.zeros(len(network.sources))
     rest, q = u - network.p @ x, network.q
-    if s is not None:
-        before = s
-    else:
+    before = np.zeros(q.shape[1]) if s is None else s
+    if s is None and q.size and np.any(rest):
         # The values that agree with the cell voltages in the least-squares sense.
-        fits = q.size and np.any(rest)
-        before = np.asarray(np.linalg.lstsq(q, rest, rcond=None)[0], float) if fits else np.zeros(q.shape[1])
+        before = np.asarray(np.linalg.lstsq(q, rest, rcond=None)[0], float)
     after = np.array([float(w.value(0.0)) for w in scene.waveforms])
     # The run itself reports a source that is not finite.
     after[~np.isfinite(after)] = 0.0
@@ -235,27 +248,22 @@ def dc_voltages(stack: Stack, u_source: float, model: Model) -> FloatArray:
 
     def split(area: float) -> FloatArray:
         g = stack.g_total + stack.g_area * area
-        if insulating:
-            return np.asarray(np.where(g == 0.0, u_source, 0.0))
-        r = 1.0 / g
+        # A layer that does not leak takes all of the voltage.
+        r = (g == 0.0) + 0.0 if insulating else 1.0 / g
         return np.asarray(u_source * r / r.sum())
 
     if stack.gap is None or not model.coupled:
         return split(model.area0)
     low, high = 0.0, abs(u_source)
-    for _ in range(200):
-        middle = 0.5 * (low + high)
-        if not low < middle < high:
-            break
+    while low < (middle := 0.5 * (low + high)) < high:
         more = abs(split(1.0 / inverse_area(middle, model.curve)[0])[stack.gap]) > middle
         low, high = (middle, high) if more else (low, middle)
     return split(1.0 / inverse_area(high, model.curve)[0])
 
 
-# Residual of Kirchhoff's law, relative to the largest start voltage, that rounded decimals of a deck may cause.
-ROUNDING = 1e-12
-# Tolerances of a step towards consistent start voltages, relative to the largest voltage and to each voltage itself.
-STEP_ERROR, STEP_RTOL = 1e-14, 2.3e-14
+# Residual of Kirchhoff's law that rounded decimals of a deck may cause, relative to the largest start voltage; and
+# tolerances of a step towards consistent start voltages, relative to that voltage and to each voltage itself.
+ROUNDING, STEP_ERROR, STEP_RTOL = 1e-12, 1e-14, 2.3e-14
 PAST_FOLD = "past the fold of the mobile law; allowed: less voltage, more load, or the local law"
 
 
@@ -273,62 +281,23 @@ def start_voltage(element: Element, initial: Mapping[str, float]) -> float:
 
 def held_sources(circuit: Circuit, initial: Mapping[str, float]) -> tuple[Element, ...]:
     """Voltage sources that hold the nodes of ``.ic`` (V) while the operating point is found."""
+    # Groups of nodes tied together by sources, with the voltage of each node above one of its group.
     tied: dict[str, dict[str, float]] = {}
     for element in circuit.by_device("V"):
-        # Groups of nodes tied together by sources, with the voltage of each node above one of its group.
         p, n = (tied.setdefault(node, {node: 0.0}) for node in element.nodes)
         assert element.waveform is not None
         shift = n[element.nodes[1]] + float(element.waveform.value(0.0, "left")) - p[element.nodes[0]]
         n.update({node: above + shift for node, above in p.items()})
         tied.update(dict.fromkeys(p, n))
-    out = []
-    done: set[str] = set()
+    out, done = list[Element](), {"0"}
     for node in initial:
         group = tied.get(node, {node: 0.0})
-        if node in done or "0" in group or node == "0":
-            continue
+        if node not in done and "0" not in group:
+            value = float(np.mean([initial[x] - group[x] for x in group if x in initial])) + group[node]
+            # This name contains characters that no netlist can contain, so that it cannot clash with an element's.
+            out.append(Element(f"v({node}) held", "V", (node, "0"), (node, "0"), MappingProxyType({}), DC(value)))
         done |= group.keys()
-        value = float(np.mean([initial[x] - group[x] for x in group if x in initial])) + group[node]
-        # This name contains characters that no netlist can contain, so that it cannot clash with an element's.
-        out.append(Element(f"v({node}) held", "V", (node, "0"), (node, "0"), MappingProxyType({}), DC(value)))
     return tuple(out)
-
-
-def operating_point(
-    scene: Scene, circuit: Circuit, network: Network, initial: Mapping[str, float]
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Voltages of all cells (V) and areas (m^2) at the DC operating point, and which areas ``.ic`` holds.
-
-    The sources have their values at 0-, and the nodes in `initial` are held.
-    """
-    contacts = [c if gap >= 0 else None for c, gap in zip(scene.network.contacts, scene.net.gap, strict=True)]
-    conductors = {node for e in circuit.elements for node in e.nodes[:2]} - {a.node for a in network.areas}
-    held = held_sources(circuit, {node: v for node, v in initial.items() if node in conductors})
-    if held:
-        network = build_network(replace(circuit, work="gap"), held)
-    s = np.array([float(w.value(0.0, "left")) for w in network.waveforms])
-    area = scene.area0.copy()
-    fixed = np.array([contact is None for contact in contacts], bool)
-    asked = np.array([a.node in initial for a in network.areas], bool) & ~fixed
-    area[asked] = [1e-6 * initial[a.node] for a, mark in zip(network.areas, asked, strict=True) if mark]
-    _refuse_floating_at_dc(network, area)
-    part, before = 1.0, math.inf
-    for _ in range(500):
-        k, b = network.stiffness(area)
-        x = np.linalg.solve(k, -b @ s) if k.size else np.zeros(0)
-        u = network.p @ x + network.q @ s
-        new = area.copy()
-        for i, (contact, gap) in enumerate(zip(contacts, network.gaps, strict=True)):
-            if contact is not None and gap is not None and not asked[i]:
-                new[i] = float(contact.area(abs(float(u[gap]))))
-        off = float(np.max(np.abs(new / area - 1.0), initial=0.0))
-        # The iteration has converged, or round-off lets it come no nearer.
-        if off <= 4e-16 or 0.8 * before < off <= 1e-13:
-            return u, area, asked
-        # Damping, because leaks that scale with the area may make the iteration oscillate.
-        part *= 0.7 if off > 0.8 * before else 1.0
-        area, before = area + part * (new - area), off
-    raise InputError("the areas find no DC operating point; allowed: uic in .tran, to start uncharged")
 
 
 def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
@@ -340,14 +309,13 @@ def _refuse_floating_at_dc(network: Network, area: FloatArray) -> None:
     size = np.linalg.norm(factor, axis=0)
     _, sigma, turned = np.linalg.svd(factor / np.where(size > 0.0, size, 1.0))
     rank = int(np.count_nonzero(sigma > 1e-12 * max(1.0, sigma.max(initial=0.0))))
-    if rank == factor.shape[1]:
-        return
-    held = np.abs(network.p @ turned[rank:].T).max(axis=1) > 1e-9
-    names = dict.fromkeys(c.element.name for c, mark in zip(network.cells, held, strict=True) if mark)
-    raise InputError(
-        f"no DC operating point: {' and '.join(names)} leave nodes that are reached by capacitors only; allowed: a "
-        "leakage (r=... or an R), or uic in .tran to start uncharged"
-    )
+    if rank < factor.shape[1]:
+        held = np.abs(network.p @ turned[rank:].T).max(axis=1) > 1e-9
+        names = dict.fromkeys(c.element.name for c, mark in zip(network.cells, held, strict=True) if mark)
+        raise InputError(
+            f"no DC operating point: {' and '.join(names)} leave nodes that are reached by capacitors only; allowed: a "
+            "leakage (r=... or an R), or uic in .tran to start uncharged"
+        )
 
 
 def at_own_area(u: float, area: float, curve: FloatArray) -> float:
@@ -363,8 +331,7 @@ def at_own_area(u: float, area: float, curve: FloatArray) -> float:
         low, high = high, 1.05 * high
         if high > 100.0 * abs(u):
             raise InputError(f"the start has {u:.4g} V across a gap of {area * 1e6:.4g} mm^2, {PAST_FOLD}")
-    while low < 0.5 * (low + high) < high:
-        middle = 0.5 * (low + high)
+    while low < (middle := 0.5 * (low + high)) < high:
         low, high = (middle, high) if charge(middle) < wanted else (low, middle)
     return math.copysign(high, u)
 
@@ -392,55 +359,50 @@ def settle(net: Net, u: FloatArray, slow: FloatArray, s: FloatArray) -> tuple[Fl
 
 def _along(net: Net, off: FloatArray, s: FloatArray, slow: FloatArray) -> FloatArray:
     """Live voltages (V) and charges (C) where Kirchhoff's residual `off` (n_cell,), V, has fallen to 0 linearly."""
-    n, follows = net.k.shape[0], np.flatnonzero((net.gap >= 0) & (net.slow < 0))
-    y = np.zeros(n + net.q.shape[1])
+    n, follows, delayed = net.k.shape[0], np.flatnonzero((net.gap >= 0) & (net.slow < 0)), net.slow >= 0
+    begin = np.zeros(n + net.q.shape[1])
     if not np.any(off):
-        return y
-    rate = partial(_rate, net, off, s, slow, follows)
+        return begin
+
+    def rate(theta: float, y: FloatArray) -> FloatArray:
+        """Derivative by the homotopy's `theta` in [0, 1], NaN past a fold."""
+        u = net.p @ y[:n] + net.q @ s + (1.0 - theta) * off
+        area, slope = net.area0.copy(), np.zeros(net.area0.size)
+        area[delayed] *= slow[net.slow[delayed]]
+        for i in follows:
+            inverse, change = inverse_area(abs(float(u[net.gap[i]])), net.curves[i])
+            area[i], slope[i] = 1.0 / inverse, -change / inverse**2
+        held = net.c * np.append(area, 1.0)[net.place]
+        met = net.p.T @ (held[:, None] * net.p)
+        x = _solved(met, net.p.T @ (held * off))
+        along = net.p @ x - off
+        current = held * along
+        if net.mobile and follows.size:
+            # The derivatives of the areas add to the capacitance matrix, in the columns of the gaps that they follow.
+            gaps, more = net.gap[follows], np.zeros((net.c.size, follows.size))
+            for column, i, gap in zip(more.T, follows, gaps, strict=True):
+                at = net.place == i
+                # At 0 V the direction of the change decides on the branch.
+                column[at] = (net.c * u)[at] * slope[i] * (np.sign(u[gap]) or np.sign(along[gap]))
+            x = _solved(met + net.p.T @ more @ net.p[gaps], net.p.T @ (held * off + more @ off[gaps]))
+            along = net.p @ x - off
+            current = held * along + more @ along[gaps]
+        return np.concatenate([x, net.through @ current])
+
     if not follows.size:
-        return rate(0.0, y)
+        return rate(0.0, begin)
     from scipy.integrate import solve_ivp
 
     scale = np.concatenate([np.ones(n), np.full(net.q.shape[1], math.inf)]) * np.abs(off).max()
+    how = {"first_step": 0.1, "rtol": STEP_RTOL, "atol": STEP_ERROR * scale, "t_eval": [1.0]}
     with warnings.catch_warnings():
         # Past a fold the derivative is NaN, of which numpy and scipy would warn; `status` tells of it.
         warnings.simplefilter("ignore")
-        found = solve_ivp(
-            rate, (0.0, 1.0), y, "DOP853", first_step=0.1, rtol=STEP_RTOL, atol=STEP_ERROR * scale, t_eval=[1.0]
-        )
+        found = solve_ivp(rate, (0.0, 1.0), begin, "DOP853", **how)
     if found.status != 0:
         where = PAST_FOLD if net.mobile else "where no area is left; allowed: less voltage"
         raise InputError(f"the capacitors' start voltages settle {where}")
     return np.asarray(found.y[:, -1])
-
-
-def _rate(
-    net: Net, off: FloatArray, s: FloatArray, slow: FloatArray, follows: IntArray, theta: float, y: FloatArray
-) -> FloatArray:
-    """Derivative of (x, charges) by the homotopy's `theta` in [0, 1], NaN past a fold; `follows` have no delay."""
-    u = net.p @ y[: net.k.shape[0]] + net.q @ s + (1.0 - theta) * off
-    area, slope = net.area0.copy(), np.zeros(net.area0.size)
-    delayed = net.slow >= 0
-    area[delayed] *= slow[net.slow[delayed]]
-    for i in follows:
-        inverse, change = inverse_area(abs(float(u[net.gap[i]])), net.curves[i])
-        area[i], slope[i] = 1.0 / inverse, -change / inverse**2
-    held = net.c * np.append(area, 1.0)[net.place]
-    met = net.p.T @ (held[:, None] * net.p)
-    x = _solved(met, net.p.T @ (held * off))
-    along = net.p @ x - off
-    current = held * along
-    if net.mobile and follows.size:
-        # The derivatives of the areas add to the capacitance matrix, in the columns of the gaps that they follow.
-        gaps, more = net.gap[follows], np.zeros((net.c.size, follows.size))
-        for column, i, gap in zip(more.T, follows, gaps, strict=True):
-            at = net.place == i
-            # At 0 V the direction of the change decides on the branch.
-            column[at] = (net.c * u)[at] * slope[i] * (np.sign(u[gap]) or np.sign(along[gap]))
-        x = _solved(met + net.p.T @ more @ net.p[gaps], net.p.T @ (held * off + more @ off[gaps]))
-        along = net.p @ x - off
-        current = held * along + more @ along[gaps]
-    return np.concatenate([x, net.through @ current])
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:

@@ -208,7 +208,7 @@ def compare(
     """
     circuit = overridden(circuit, sources, parameters)
     names = [e.name for e in circuit.by_device("GAP")]
-    fundamental = linear_scene(circuit, next(iter(names), None)).fundamental
+    fundamental = linear_scene(circuit, next(iter(names), None)).network.waveforms[0].fundamental
     if fundamental is None:
         raise InputError("compare needs a source with a fundamental: a periodic one; this source has none")
     phasors = {name: phasor(circuit, finger=name) for name in names}
@@ -275,10 +275,11 @@ def large_signal(
     """
     require_circuit(circuit)
     scene = linear_scene(circuit, finger)
-    if len(scene.sources) != 1:
-        names = ", ".join(e.name for e, _ in scene.sources)
+    drives = scene.network.drives
+    if len(drives) != 1:
+        names = ", ".join(e.name for e, _ in drives)
         raise InputError(f"a large-signal sweep drives one source, and this circuit has {names}")
-    own = sweep_drive(scene.sources, scene.fundamental, swept=True)
+    own = sweep_drive(drives, scene.network.waveforms[0].fundamental, swept=True)
     if amplitude is None and math.isnan(own[0]):
         raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
     given = positive_row("amplitude", own[0] if amplitude is None else amplitude, "V")
@@ -287,22 +288,22 @@ def large_signal(
     notes = (*notes, scene.note) if scene.note else notes
     for text in warned:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    drives = [own] if amplitude is None else [(float(a), 0.0, "the amplitude given") for a in given]
-    (source, sign), *_ = scene.sources
+    sizes = [own] if amplitude is None else [(float(a), 0.0, "the amplitude given") for a in given]
+    ((source, sign),) = drives
     skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
     found = []
-    for place, (size, phase, drive) in enumerate(drives):
+    for place, (size, phase, drive) in enumerate(sizes):
         rows = []
         for number, x in enumerate(f.tolist(), place * f.size + 1):
             changed = circuit.varied({**dict.fromkeys(skins, x), source.name: Sine(size, x)})
             s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution
             # The output starts at a multiple of the period, so that phases from its start are phases relative to the
             # source.
-            period, end = s.t - s.t[0], "" if len(s.gaps) == 1 else f":{scene.layers[scene.gap]}"
+            period, end = s.t - s.t[0], "" if len(s.gaps) == 1 else f":{s.layers[scene.gap]}"
             means = [weigh_outputs(period, s.record.one(key + end)).mean() for key in ("area", "f_el")]
             rows.append([*means, *(weigh_outputs(period, u).phasor(x) * sign / size for u in s.u_layer.T)])
             if progress is not None:
-                progress(number / (f.size * len(drives)))
+                progress(number / (f.size * len(sizes)))
         table = np.array(rows, np.complex128)
         (areas, forces), gain = table[:, :2].real.T.copy(), table[:, 2:].copy()
         u_gap = gain[:, scene.gap] * size * np.exp(1j * phase)

@@ -23,7 +23,7 @@ from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element
 from fingerspice.circuit.describe import Parameters, Sources, area_given, overridden
 from fingerspice.circuit.devices import beyond_fingers
-from fingerspice.circuit.network import build_network, linear_scene, with_skin_held
+from fingerspice.circuit.network import build_network, linear_scene, phasor_areas, with_skin_held
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.solution import Sensitivity, Solution
@@ -150,11 +150,11 @@ def phasor(
     if asked is None:
         raise InputError("the source has no fundamental: give the frequencies in Hz")
     f = positive_row("frequency", asked, "Hz")
-    driving = tuple((e, 1.0) for e in network.sources) if scene is None else scene.sources
-    amplitude, phase, drive = sweep_drive(driving, fundamental, frequency is not None)
+    amplitude, phase, drive = sweep_drive(network.drives, fundamental, frequency is not None)
     if scene is None and math.isnan(amplitude):
         raise InputError("no source has an amplitude; allowed: AC on a source, such as V1 in 0 AC 1, or one sine")
-    if scene is not None and area == "mean" and math.isnan(amplitude) and not scene.fixed:
+    fixed = scene is None or network.areas[scene.finger].given is not None
+    if area == "mean" and math.isnan(amplitude) and not fixed:
         raise InputError(
             "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
             "'frozen' or an area in m^2"
@@ -162,18 +162,16 @@ def phasor(
     notes, warned = sweep_notes(circuit, f, skin)
     v, none = None, np.full(f.size, math.nan)
     with np.errstate(all="ignore"):
+        areas = np.array([phasor_areas(network, area, float(x), amplitude) for x in f])
         if scene is None:
             # Node voltages at the areas that the circuit gives; as in ngspice, the AC of every source counts.
             own = [amplitude * np.exp(1j * phase)]
             s = own if alone else [0.0 if e.ac is None else e.ac.phasor for e in network.sources]
-            at = network.areas_at_rest if isinstance(area, str) else np.full(len(network.areas), area)
-            areas = np.tile(at, (f.size, 1))
-            v = np.array([network.node_phasors(float(x), at, np.array(s, complex)) for x in f])
+            v = np.array([network.node_phasors(float(x), areas[0], np.array(s, complex)) for x in f])
             layers, gain, u_gap, size, force = np.zeros((f.size, 0), complex), none + 0j, none + 0j, none, none
             results: tuple[NDArray[np.inexact], ...] = (v,)
         else:
-            areas = np.array([scene.areas(float(x), area, amplitude) for x in f])
-            layers = np.array([scene.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
+            layers = np.array([network.layer_gain(float(x), a) for x, a in zip(f, areas, strict=True)])
             gain, size = layers[:, scene.gap], areas[:, scene.finger].copy()
             u_gap = gain * amplitude * np.exp(1j * phase)
             stress = scene.contact.stress(np.abs(u_gap))
@@ -191,9 +189,10 @@ def phasor(
         warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
     for text in warned:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    names = () if scene is None else tuple(e.name for e in network.layers)
     return PhasorSolution(
-        f, gain, layers, u_gap, size, force, amplitude, () if scene is None else scene.layers, phase, drive, notes,
-        warned, circuit, impedance, network.node_names if scene is None else (), v,
+        f, gain, layers, u_gap, size, force, amplitude, names, phase, drive, notes, warned, circuit, impedance,
+        network.node_names if scene is None else (), v,
     )  # fmt: skip
 
 
