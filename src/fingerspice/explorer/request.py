@@ -55,26 +55,25 @@ def sliders(base: Circuit, shown: Circuit) -> list[dict[str, Any]]:
     order = {"V": 0, "I": 0, "GAP": 1, "LAYER": 2, "SLAB": 2, "SKIN": 3, "SKIN_DISPERSIVE": 3}
     groups = []
     for e in sorted(shown.elements, key=lambda e: order.get(e.device, 4)):
-        old, drives, rows = before[e.name], e.name in driving, list[tuple[Any, ...]]()
-        for spec in e.spec.parameters:
-            limits = _of_parameter(spec, old.values.get(spec.name, e.values[spec.name]))
-            rows.append((spec.name, spec.unit, e.values[spec.name], *limits, spec.first, spec.meaning))
-        same = type(old.waveform) is type(e.waveform)
-        for name, unit in type(e.waveform).units.items() if e.waveform is not None else ():
-            value = getattr(e.waveform, name, None)
-            if isinstance(value, (int, float)):
-                own = getattr(old.waveform, name) if same else value
+        old, specs, found = before[e.name], {p.name: p for p in e.spec.parameters}, []
+        for name, one in e.parameters.items():
+            value, unit, spec = one.value, one.unit, specs.get(name)
+            if spec is not None:
+                limits, first, meaning = _of_parameter(spec, old.values.get(name, value)), spec.first, spec.meaning
+            elif isinstance(value, (int, float)):
+                own = getattr(old.waveform, name) if type(old.waveform) is type(e.waveform) else value
                 # A source that does not drive is on an area node, and gives mm^2.
+                drives = e.name in driving
                 limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
                 unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
-                rows.append(
-                    (name, unit, value, *limits, name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, ""))
-                )
-        found = [
-            {"path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
-             "text": value_text(value, unit), "low": low, "high": high, "log": log, "first": first, "meaning": meaning}
-            for name, unit, value, low, high, log, first, meaning in rows
-        ]  # fmt: skip
+                first, meaning = name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, "")
+            else:
+                continue
+            found.append({
+                "path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
+                "text": value_text(value, unit), "low": limits[0], "high": limits[1], "log": limits[2],
+                "first": first, "meaning": meaning,
+            })  # fmt: skip
         if found:
             groups.append({"element": e.name, "device": e.device, "what": e.spec.what or e.device, "sliders": found})
     return groups
@@ -118,8 +117,6 @@ def _of_waveform(name: str, unit: str, value: float) -> tuple[float, float, bool
     return 0.0, (5.0 * abs(value) or (0.1 if unit == "s" else 1000.0)), False
 
 
-#: Largest number of characters of a source's text.
-LONGEST = 20_000
 _NAMED = re.compile(r"(?:\s*([\w.]+)\s*=)?\s*(.*)", re.DOTALL)
 #: The source that stands for the file dropped on the page.
 RECORDING = "RECORDING"
@@ -182,8 +179,7 @@ def read_source(text: str, circuit: Circuit, recording: Recording | None = None)
     They are read from text such as ``SQUARE(200 100)`` or ``Vdrive=AM(200 5k 50)``. No file is read, whatever the text
     names; ``RECORDING(150)`` is the recording given.
     """
-    if len(text) > LONGEST:
-        raise InputError(f"the source has {len(text):,} characters; allowed: at most {LONGEST:,}")
+    text = _read("source", text).strip()
     names = {e.name.lower(): e.name for e in driving_sources(circuit)}
     given, said = _NAMED.fullmatch(text).groups()  # type: ignore[union-attr]
     given = given or next(iter(names), "")
@@ -224,8 +220,14 @@ POINTS, MOST_POINTS = 2000, 12_000
 _OF_OSCILLATION, _OF_PIECE = 16, 2
 #: Most numbers of a recording: four seconds at 48 kHz.
 MOST_SAMPLES = 200_000
-_LARGEST, _LONGEST_SETS = 1e300, 2000
+_LARGEST = 1e300
 _AREAS = ("coupled", "mean", "frozen")
+#: Texts of a request with what is allowed and their largest length, words to choose from, and ranges of numbers.
+_TEXTS = {
+    "deck": ("the text of a netlist", LONGEST_DECK), "source": ("text such as SQUARE(200 100)", 20_000),
+    "sets": ("names with commas", 2000),
+}  # fmt: skip
+_CHOICES = {"charge_law": CHARGE_LAWS, "skin": ("own", "follow", "dispersive")}
 _RANGES = {"rtol": (1e-12, 0.1), "periods": (0.01, MOST_PERIODS), "last": (0.01, MOST_PERIODS)}
 
 
@@ -256,21 +258,14 @@ _NAMES = ("deck", "overrides", "source", "charge_law", "area", "skin", "rtol", "
 def _read(name: str, given: Any) -> Any:
     """A value of a request, checked; texts are as in a link."""
     match name:
-        case "deck":
-            require(isinstance(given, str), name, f"of type {type(given).__name__}", "the text of a netlist")
-            require(len(given) <= LONGEST_DECK, name, f"{len(given):,} characters long", f"at most {LONGEST_DECK:,}")
+        case "deck" | "source" | "sets":
+            allowed, longest = _TEXTS[name]
+            require(isinstance(given, str), name, f"of type {type(given).__name__}", allowed)
+            require(len(given) <= longest, name, f"{len(given):,} characters long", f"at most {longest:,}")
             return given
-        case "source":
-            require(isinstance(given, str), name, f"of type {type(given).__name__}", "text such as SQUARE(200 100)")
-            return given.strip()
         case "charge_law" | "skin":
-            allowed = CHARGE_LAWS if name == "charge_law" else ("own", "follow", "dispersive")
-            require(given in allowed, name, _short(given), " or ".join(allowed))
+            require(given in _CHOICES[name], name, _short(given), " or ".join(_CHOICES[name]))
             return given
-        case "sets":
-            good = isinstance(given, str) and len(given) <= _LONGEST_SETS
-            require(good, name, _short(given), f"names with commas, at most {_LONGEST_SETS:,} characters")
-            return tuple(filter(None, map(str.strip, given.split(","))))
         case "area" if given in _AREAS:
             return str(given)
         case "area":
@@ -363,9 +358,9 @@ class Asked:
     periods: float = 5.0
     last: float | None = None  # How many of the last periods are shown; None for all of the run
     recording: Recording | None = None  # The file dropped on the page, for the source ``RECORDING(gain)``
-    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME``; they change nothing, and
-    # the page shows their caveats
-    sets: tuple[str, ...] = ()
+    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME`` with commas; they change
+    # nothing, and the page shows their caveats
+    sets: str = ""
 
     base: Circuit  # The deck's
     circuit: Circuit  # With all changes
@@ -388,16 +383,16 @@ class Asked:
                 f"at most {MOST_ELEMENTS} on this page"
             )
         circuit = base
-        if self.source:
+        if self.source.strip():
             name, waveform, self.gain = read_source(self.source, circuit, self.recording)
             self.replaced = name, waveform
             circuit = circuit.replace({name: waveform})
         paths = {path.lower(): path for path in circuit.parameters}
-        known = {paths[path.lower()]: x for path, x in self.overrides.items() if path.lower() in paths}
-        lost = [path for path in self.overrides if path.lower() not in paths]
         self.unknown = [_unknown("name", str(name), _NAMES) for name in given if name not in _NAMES]
+        lost = [path for path in self.overrides if path.lower() not in paths]
         self.unknown += [_unknown("parameter", path, paths.values()) for path in lost]
-        circuit = circuit.replace(known) if known else circuit
+        self.overrides = {paths[path.lower()]: x for path, x in self.overrides.items() if path.lower() in paths}
+        circuit = circuit.replace(self.overrides) if self.overrides else circuit
         self.base, self.circuit = base, circuit
         fundamental = self.waveform.fundamental if self.skin == "follow" else None
         if fundamental is not None:

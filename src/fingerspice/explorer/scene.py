@@ -6,6 +6,7 @@ import dataclasses
 import math
 import re
 import time
+import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ import numpy as np
 
 from fingerspice import __version__
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.units import format_si, spice_text
+from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit, Element, Tran
 from fingerspice.circuit.describe import in_force, remembering
 from fingerspice.circuit.statespace import driving_sources
@@ -214,7 +215,7 @@ def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]
 def in_scene(asked: Asked) -> tuple[list[dict[str, Any]], set[str], list[str]]:
     """What the page says of each set with a value in force, the paths that sets give, and sets that mean nothing."""
     circuit, given, lost = asked.circuit._with(sets={}), [], []
-    for entry in asked.sets:
+    for entry in filter(None, map(str.strip, asked.sets.split(","))):
         try:
             name, to, changes = asked.base.remember(("set", entry), partial(_changes, asked.base, entry))
         except InputError as error:
@@ -322,17 +323,15 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     name, waveform = asked.replaced or ("", None)
     lines = ["import dataclasses", "", "import numpy as np", "", "import fingerspice as fs", ""]
     # The values changed before the page was opened are those of the user's own circuit.
-    mine = own if own is not None and asked.deck == own.text else None
-    before = mine.overrides if mine is not None else {}
-    known = {path.lower(): one.value for path, one in mine.parameters.items()} if mine is not None else {}
-    if mine is not None and mine.path is not None:
-        lines.append(f"circuit = fs.read_netlist({str(mine.path)!r})")
+    known = {path.lower(): one.value for path, one in asked.base.parameters.items()}
+    if asked.base.path is not None:
+        lines.append(f"circuit = fs.read_netlist({str(asked.base.path)!r})")
     else:
         deck = [f"    {line!r}" for line in asked.deck.splitlines(keepends=True)]
         lines += ["circuit = fs.parse_netlist(", *deck, ")"]
     lines += [
         f"# Changed before, in Python: {path} = {' '.join(text.split())}"
-        for path, text in before.items()
+        for path, text in asked.base.overrides.items()
         if path.lower() not in (*known, name.lower())
     ]
     if asked.skin == "dispersive":
@@ -345,9 +344,7 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
         if asked.recording is not None and asked.gain is not None:
             code = asked.recording.python(asked.gain)
         lines.append(f"circuit = circuit.replace({{{name!r}: {code}}})")
-    changes = {path: known[path.lower()] for path in before if path.lower() in known}
-    there = {path.lower() for path in asked.circuit.parameters}
-    changes |= {path: x for path, x in asked.overrides.items() if path.lower() in there}
+    changes = {path: known[path.lower()] for path in asked.base.overrides if path.lower() in known} | asked.overrides
     changes = {path: x for path, x in changes.items() if path.lower() not in by_sets}
     if asked.skin == "follow":
         changes |= {f"{e.name}.f": e.values["f"] for e in asked.circuit.by_device("SKIN")}
@@ -405,97 +402,8 @@ class Example(NamedTuple):
     asked: Mapping[str, object] = {}  # Further keys of the request, as in `scene`
 
 
-_COAT = "Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg"
-_ALL_TONES = "Xskin   skin  0    area  SKIN_DISPERSIVE d=350u"
-
-
-def _skin(frequency: str, node: str = "0") -> str:
-    return f"Xskin   skin  {node:<4} area  SKIN  d=350u f={frequency}"
-
-
-def _gap(*, d: str = "3.5u", r: str = "1meg", fn: str = "0.5", mu: str = "0.3") -> str:
-    return (
-        f"Xgap    top   skin area  GAP   d={d} eps_r=1 r={r} fn={fn} mu={mu}\n"
-        "+                              alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
-    )
-
-
-def _gap_of(finger: str) -> str:
-    """The gap of Table 1 with the values in which a named set of parameters differs from the normal finger."""
-    normal, values = parameters("normal").values, parameters(finger).values
-    changed = [v for path, v in values.items() if v.element == "gap" and v.value != normal[path].value]
-    return _gap(**{v.parameter: spice_text(v.value) if v.unit else f"{v.value:g}" for v in changed})
-
-
-def _deck(title: str, *lines: str) -> str:
-    return "\n".join([title, ".include fingerspice.lib", *lines, ".end", ""])
-
-
-def _finger(title: str, source: str, skin: str, tran: str, *more: str, gap: str = "") -> str:
-    """Table 1's finger on one source."""
-    return _deck(title, f"Vdrive  drive 0          {source}", *more, _COAT, gap or _gap(), skin, f".tran {tran} uic")
-
-
-_AMPLIFIER = _deck(
-    "Finger behind an amplifier with a safety resistor, 5 kHz",
-    "Vdrive  amp   0          SIN(0 200 5k)",
-    "Rout    amp   drive      47k",
-    "Ccable  drive 0          150p",
-    *(_COAT, _gap(), _skin("5k"), ".tran 0.5u 1m uic"),
-)
-_UNGROUNDED = _finger(
-    "User not grounded, 5 kHz", "SIN(0 200 5k)", _skin("5k", "body"), "0.5u 1m",
-    "Rbody   body  far        1.5k", "Cbody   far   0          150p",
-)  # fmt: skip
-_TWO = _deck(
-    "Two fingers on one screen, 5 kHz",
-    "Vdrive  drive 0           SIN(0 200 5k)",
-    ".subckt finger drive body area fn=0.5",
-    *(_COAT, _gap(fn="{fn}"), _skin("5k", "body"), ".ends"),
-    "Xfirm   drive body firm   finger fn=0.5",
-    "Xlight  drive body light  finger fn=0.2",
-    "Rbody   body  far         1.5k",
-    "Cbody   far   0           150p",
-    ".tran 0.5u 1m uic",
-)
-_TONES = _deck(
-    "Two tones on a dispersive skin",
-    "Vdrive  drive fast       SIN(0 120 100)",
-    "Vfast   fast  0          SIN(0 80 5k)",
-    *(_COAT, _gap(), _ALL_TONES, ".tran 1u 30m uic"),
-)
-EXAMPLES: tuple[Example, ...] = (
-    Example("sine", "Sine, 100 Hz (Fig. 4, left)", "Table 1: the layers leak, and the force follows the sine.",
-            _finger("Table 1, sine of 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m")),
-    Example("sine-5k", "Sine, 5 kHz (Fig. 4, right)", "At 5 kHz the capacitances divide the voltage.",
-            _finger("Table 1, sine of 5 kHz", "SIN(0 200 5k)", _skin("5k"), "0.2u 1m")),
-    Example("square", "Square wave, 100 Hz (Fig. 5, left)", "After each edge the gap's voltage leaks away.",
-            _finger("Table 1, square wave of 100 Hz", "SQUARE(200 100)", _skin("100"), "10u 50m")),
-    Example("square-5k", "Square wave, 5 kHz (Fig. 5, right)", "The force is nearly constant.",
-            _finger("Table 1, square wave of 5 kHz", "SQUARE(200 5k)", _skin("5k"), "0.2u 1m")),
-    Example("ungrounded", "User not grounded", "The body's capacitance to ground takes voltage.", _UNGROUNDED),
-    Example("two-fingers", "Two fingers of one hand", "A firm and a light finger share a body that floats.", _TWO),
-    Example("amplifier", "Amplifier's limit", "A safety resistor and the cable take voltage at high frequencies.",
-            _AMPLIFIER),
-    Example("tones", "Two tones, dispersive skin", "The skin's data at all frequencies, for two tones at once.", _TONES,
-            {"periods": 3}),
-    Example("am", "AM texture", "A carrier of 5 kHz whose envelope of 50 Hz is what the finger feels.",
-            _finger("AM texture", "SIN(0 200 5k)", _skin("5k"), "2u 40m"),
-            {"source": "AM(200 5k 50)", "periods": 2}),
-    Example("click", "Click", "A damped sine of 250 Hz, where fingers feel best.",
-            _finger("Click", "SIN(0 200 250 0 250)", _ALL_TONES, "10u 40m")),
-    Example("chirp", "Chirp, 20 Hz to 1 kHz", "All frequencies that fingers feel, one after the other.",
-            _finger("Chirp", "CHIRP(150 20 1k 0.1)", _ALL_TONES, "20u 0.1")),
-    Example("bursts", "Bursts of 5 kHz", "Ten cycles every 10 ms: the finger feels 100 Hz.",
-            _finger("Bursts of 5 kHz", "SIN(0 200 5k)", _ALL_TONES, "5u 50m"), {"source": "BURST(200 5k 10 10m)"}),
-    Example("wet", "Moist finger", "Sweat in the gap conducts: the set moist, whose leak and friction are assumed.",
-            _finger("Moist finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_gap_of("moist"))),
-    Example("dry", "Dry finger", "The gap hardly leaks: the set dry, whose leak and friction are assumed.",
-            _finger("Dry finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_gap_of("dry"))),
-    Example("fold", "Fold of the mobile law", "A thin gap under the mobile charge law: no solution, and why.",
-            _finger("A gap of 10 nm under the law mobile", "SIN(0 200 100)", _skin("100"), "10u 50m",
-                    gap=_gap(d="10n")), {"charge_law": "mobile"}),
-)  # fmt: skip
+_FILE = Path(__file__).with_name("examples.toml")
+EXAMPLES = tuple(Example(**one) for one in tomllib.loads(_FILE.read_text(encoding="utf-8"))["scene"])
 """The scenes of the menu, the first of which is shown at the start."""
 
 
@@ -542,14 +450,15 @@ def decks(folder: Path) -> Iterator[Entry]:
 def scenes() -> Iterator[Entry]:
     """The example scenes of the explorer."""
     for one in EXAMPLES:
-        yield Entry(f"scene-{one.name}", one.title, one.note, Path(__file__), partial(_run_scene, one))
+        yield Entry(f"scene-{one.name}", one.title, one.note, _FILE, partial(_run_scene, one))
 
 
 def _run_scene(example: Example) -> Solution:
     asked = Asked({"deck": example.deck, **example.asked})
     first, stop, _ = asked.times
-    times = np.linspace(first, stop, 4001)
-    return simulate(asked.circuit, t_stop=stop, t_eval=times, charge_law=asked.charge_law, throw=False)
+    return simulate(
+        asked.circuit, t_stop=stop, t_eval=np.linspace(first, stop, 4001), charge_law=asked.charge_law, throw=False
+    )
 
 
 def draw(entry: Entry, picture: Path) -> None:

@@ -35,7 +35,7 @@ FRAME_HEIGHT, MOST_FRAMES = 900, 8
 """Height (px) of the page in a notebook; explorers that one notebook keeps running."""
 #: Largest request, bytes; seconds that a connection may be silent; connections at once.
 MOST_BYTES, SILENCE, MOST_CONNECTIONS = 5_000_000, 30.0, 32
-_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 #: Pages that may show the explorer within them, where a notebook has asked for it: those of this computer.
 _NOTEBOOKS = " ".join(f"{kind}://{host}:*" for kind in ("http", "https") for host in (ADDRESS, "localhost"))
 _POLICY = (
@@ -302,7 +302,6 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "fingerspice", ""
     timeout = SILENCE
-    _read = False
 
     def setup(self) -> None:
         super().setup()
@@ -315,7 +314,13 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(self._file)
 
     def do_POST(self) -> None:
-        self._read = False
+        # Also of a request that is refused all is read, up to a limit, so that the browser takes the answer.
+        length = self.headers.get("Content-Length", "")
+        known = length.isascii() and length.isdigit() and "Transfer-Encoding" not in self.headers
+        self._size = None if not known else int(length) if len(length) <= 12 else 10**12
+        self._sent, left = b"", min(self._size or 0, 4 * MOST_BYTES)
+        while left > 0 and (piece := self.rfile.read(min(left, MOST_BYTES))):
+            self._sent, left = piece, left - len(piece)
         self._answer(self._run)
 
     def _answer(self, make: Callable[[str], tuple[str, Iterator[bytes]]]) -> None:
@@ -324,7 +329,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             kind, parts = make(self._allowed())
         except _Refused as error:
-            self._discard()
+            self.close_connection = True
             status, text = error.args
             kind, parts = "application/json", iter([json.dumps({"ok": False, "message": text}).encode()])
         part = next(parts)
@@ -369,24 +374,13 @@ class _Handler(BaseHTTPRequestHandler):
     def _run(self, what: str) -> tuple[str, Iterator[bytes]]:
         if what not in _ACTIONS:
             raise _Refused(HTTPStatus.NOT_FOUND, f"nothing of that name; allowed: {', '.join(_ACTIONS)}")
-        length = self.headers.get("Content-Length", "")
-        if not (length.isascii() and length.isdigit()) or "Transfer-Encoding" in self.headers:
+        if self._size is None:
             raise _Refused(HTTPStatus.LENGTH_REQUIRED, "the request has no length")
-        if len(length) > 12 or int(length) > MOST_BYTES:
-            text = f"the request has {length[:12]} bytes; allowed: at most {MOST_BYTES:,}"
+        if self._size > MOST_BYTES:
+            text = f"the request has {self._size} bytes; allowed: at most {MOST_BYTES:,}"
             raise _Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, text)
         try:
-            self._read = True
-            given = json.loads(self.rfile.read(int(length)))
+            given = json.loads(self._sent)
         except (ValueError, RecursionError):
             raise _Refused(HTTPStatus.BAD_REQUEST, "the request is not JSON") from None
         return "application/octet-stream", self.explorer.answers(what, given)
-
-    def _discard(self) -> None:
-        """Read what was sent with a refused request, up to a limit, so that the browser takes the answer."""
-        self.close_connection = True
-        length = self.headers.get("Content-Length", "")
-        left = min(int(length), 4 * MOST_BYTES) if length.isascii() and length.isdigit() and len(length) < 12 else 0
-        while left > 0 and not self._read:
-            piece = self.rfile.read(min(left, 65_536))
-            left = left - len(piece) if piece else 0
