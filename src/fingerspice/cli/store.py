@@ -27,7 +27,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.files import settle_on_disk, write_aside, write_durably
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import digests
-from fingerspice.cli.options import Results, check_output, time_from_text
+from fingerspice.cli.options import Job, Results, check_output, number
 from fingerspice.results.record import SIGNALS, variables
 from fingerspice.results.runfile import CHECKSUM, SIGNATURE, Array, attributes_of, create, signature, tidy, zarr_library
 from fingerspice.results.solution import Solution
@@ -55,6 +55,7 @@ class Store:
         self.mark: dict[str, Any] = {}
         self.so_far: dict[str, Any] = {}
         self.lock = ExitStack()
+        self._busy = f"another process writes {path}; allowed: to wait for it, --name NAME, or another --out"
 
     def _hold(self, folder: Path) -> None:
         """Keep other processes from the store in a folder, also after it is renamed."""
@@ -65,10 +66,7 @@ class Store:
             try:
                 fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise self._busy() from None
-
-    def _busy(self) -> InputError:
-        return InputError(f"another process writes {self.path}; allowed: to wait for it, --name NAME, or another --out")
+                raise InputError(self._busy) from None
 
     def open(self, overwrite: bool) -> None:
         """Open an existing store of the same run, to continue it; with `overwrite` remove any store.
@@ -81,8 +79,7 @@ class Store:
         try:
             held = attributes_of(self.path)
             whole = all(isinstance(held[key], dict) for key in (RUN, MARK, SO_FAR, COLUMNS))
-            whole = whole and held.get(SIGNATURE, "") in ("", signature(held))
-            whole = whole and isinstance(held[DONE], int) and held[DONE] >= 0
+            whole = whole and held.get(SIGNATURE, "") in ("", signature(held)) and int(held[DONE]) >= 0
         except (OSError, ValueError, KeyError, TypeError):
             whole = False
         if not whole:
@@ -138,7 +135,7 @@ class Store:
                 blank = {RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, COLUMNS: columns}
                 # The store is locked before it has its name.
                 if not create(self.path, {**about, **blank}, arrays, {}, self._hold):
-                    raise self._busy()
+                    raise InputError(self._busy)
                 self.there = True
             for name, one in arrays.items():
                 place = _place(chunk, one)
@@ -172,13 +169,10 @@ class Store:
                 elif shutil.disk_usage(target.parent).free < size:
                     raise OSError(f"it takes {size / 1e9:.3g} GB, which the disk has not")
             with h5netcdf.File(target, "w") as file:
-                file.dimensions["time"] = self.total
                 for name, array in arrays.items():
-                    names = array.metadata.dimension_names
-                    for dimension, length in zip(names[1:], array.shape[1:], strict=True):
-                        if dimension not in file.dimensions:
-                            file.dimensions[dimension] = length
-                    variable = file.create_variable(name, names, dtype="f8")
+                    lengths = dict(zip(array.metadata.dimension_names, array.shape, strict=True))
+                    file.dimensions.update({key: x for key, x in lengths.items() if key not in file.dimensions})
+                    variable = file.create_variable(name, tuple(lengths), dtype="f8")
                     for key, value in array.attrs.asdict().items():
                         variable.attrs[key] = value if isinstance(value, str) else json.dumps(value)
                     rows = max(1, _PIECE // (8 * max(1, int(np.prod(array.shape[1:])))))
@@ -194,26 +188,25 @@ def _place(chunk: int, array: Array) -> tuple[int, ...]:
 
 
 def run_streamed(
-    results: Results, how: dict[str, Any], *, chunk: str | None, signals: str | None, netcdf: bool
+    job: Job, circuit: Circuit, how: dict[str, Any], *, chunk: str | None, signals: str | None, netcdf: bool
 ) -> None:
     """Run a circuit, write its chunks to a store, and fill the answer; what a failed run has written stays."""
-    circuit, answer, path = results.circuit, results.job.answer, results.folder / f"{results.name}.zarr"
-    # The store is a folder, so check that a file can be written next to it.
-    check_output(path.with_suffix(".zarr.part"), results.job.deck)
-    names = _names(signals, circuit)
+    names, answer = _names(signals, circuit), job.answer
     charge = any(name in ("q_source", "i_source") for name in names)
-    run = stream(circuit, chunk=time_from_text("--chunk", chunk), charge=charge, **how)
-    if netcdf:
-        results.will_write(".nc", lambda file: store.to_netcdf(file))
+    run = stream(circuit, chunk=number("--chunk", chunk), charge=charge, **how)
+    results = Results(job, circuit, *([".nc"] if netcdf else []))
+    path = results.folder / f"{results.name}.zarr"
+    # The store is a folder, so check that a file can be written next to it.
+    check_output(path.with_suffix(".zarr.part"), job.deck)
     total, span = run.outputs.total, run.problem.t_stop - run.problem.t_start
     store = Store(path, _identity(run, circuit, how, names), total, run.count)
     with store.lock:
-        store.open(results.job.overwrite)
+        store.open(job.overwrite)
         if store.done and store.done < store.chunks:
             run.go_to(store.mark, store.done * store.count)
         results.open()
         begun, first = time.perf_counter(), store.done
-        answer.data["files"].append(str(path))
+        answer["files"].append(str(path))
         if first < store.chunks:
             _fill(run, store, names, results)
         took = time.perf_counter() - begun
@@ -226,7 +219,7 @@ def run_streamed(
             said.append(f"the first {first:,} were there already")
         found = {"chunks": store.chunks, "found": first, "outputs": total, "seconds": took}
         answer.update(**store.so_far, stream=found)
-        answer.give(lambda: "; ".join(said), results.ready())
+        results.give(lambda: "; ".join(said), {".nc": store.to_netcdf})
 
 
 def _names(signals: str | None, circuit: Circuit) -> list[str]:

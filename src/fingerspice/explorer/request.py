@@ -18,19 +18,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import fingerspice as fs
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number, spice_text
-from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
+from fingerspice.circuit.circuit import CHARGE_LAWS, nearest
 from fingerspice.circuit.describe import MEANINGS_OF_WAVEFORMS
 from fingerspice.circuit.devices import ParameterSpec
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import SLABS, count_of, driving_sources
-from fingerspice.netlist.netlist import parse_netlist, source_from_text
-from fingerspice.results.solution import Solution
-from fingerspice.waveforms.periodic import PWL, Sawtooth, Square, Triangle
-from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import AM, DC, Sine, Sum, Waveform, require
+from fingerspice.netlist.netlist import source_from_text
+from fingerspice.waveforms.waveform import require
 
 #: Numbers of waveforms that the page shows at once; the others it shows on request.
 _FIRST_OF_SOURCES = (
@@ -48,7 +46,7 @@ _LARGEST_VOLTAGE = 400.0
 _PREFIXED = ("m", "V", "A", "ohm", "ohm m", "F", "Hz", "s", "V/m")
 
 
-def sliders(base: Circuit, shown: Circuit) -> list[dict[str, Any]]:
+def sliders(base: fs.Circuit, shown: fs.Circuit) -> list[dict[str, Any]]:
     """Sliders by element, of sources, gap and layers first; values of the deck's `base` set the ranges, which stay."""
     driving = {e.name for e in driving_sources(shown)}
     before = {e.name: e for e in base.elements}
@@ -161,7 +159,7 @@ WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
     "DC": ("Constant", (_usual("level", 200.0, "V"),)),
 }  # fmt: skip
 #: Waveforms that the page can say as text; their numbers are those of the menu, one of them by another name.
-_TEXTS = {Sine: "SIN", Square: "SQUARE", Triangle: "TRIANGLE", Sawtooth: "SAWTOOTH", AM: "AM", DC: "DC"}
+_TEXTS = {"Sine": "SIN", "Square": "SQUARE", "Triangle": "TRIANGLE", "Sawtooth": "SAWTOOTH", "AM": "AM", "DC": "DC"}
 _FIELDS = {"envelope": "modulation"}
 
 
@@ -173,7 +171,9 @@ def quiet() -> Iterator[None]:
         yield
 
 
-def read_source(text: str, circuit: Circuit, recording: Recording | None = None) -> tuple[str, Waveform, float | None]:
+def read_source(
+    text: str, circuit: fs.Circuit, recording: Recording | None = None
+) -> tuple[str, fs.Waveform, float | None]:
     """The source's name, its new waveform, and the gain (V) of one that is a recording.
 
     They are read from text such as ``SQUARE(200 100)`` or ``Vdrive=AM(200 5k 50)``. No file is read, whatever the text
@@ -191,8 +191,7 @@ def read_source(text: str, circuit: Circuit, recording: Recording | None = None)
         with quiet():
             return name, source_from_text(said, circuit, files=False), None
     words = recorded[1].replace(",", " ").split()
-    if len(words) != 1:
-        raise InputError(f"{RECORDING} is given {len(words)} numbers; allowed: {RECORDING}(gain)")
+    require(len(words) == 1, RECORDING, f"given {len(words)} numbers", f"{RECORDING}(gain)")
     try:
         gain = parse_number(words[0])
     except ValueError as error:
@@ -202,9 +201,9 @@ def read_source(text: str, circuit: Circuit, recording: Recording | None = None)
     return name, recording.waveform(gain), gain
 
 
-def text_of(waveform: Waveform) -> str | None:
+def text_of(waveform: fs.Waveform) -> str | None:
     """The text that `read_source` reads as this waveform; None of one for which the page has no function."""
-    kind = _TEXTS.get(type(waveform))
+    kind = _TEXTS.get(type(waveform).__name__)
     if kind is None:
         return None
     names = [_FIELDS.get(a.name, a.name) for a in WAVEFORMS[kind][1]]
@@ -223,7 +222,7 @@ MOST_SAMPLES = 200_000
 _LARGEST = 1e300
 _AREAS = ("coupled", "mean", "frozen")
 #: Texts of a request with what is allowed and their largest length, words to choose from, and ranges of numbers.
-_TEXTS = {
+_WORDS = {
     "deck": ("the text of a netlist", LONGEST_DECK), "source": ("text such as SQUARE(200 100)", 20_000),
     "sets": ("names with commas", 2000),
 }  # fmt: skip
@@ -239,11 +238,11 @@ class Recording(NamedTuple):
     times: FloatArray | None  # Times of a table, s; None of a recording
     rate: float = 1.0  # Samples per second of a recording
 
-    def waveform(self, gain: float) -> Waveform:
+    def waveform(self, gain: float) -> fs.Waveform:
         """The values times the gain (V) as a source."""
         if self.times is not None:
-            return PWL(tuple(self.times.tolist()), tuple((gain * self.values).tolist()))
-        return Samples(gain * self.values, self.rate)
+            return fs.PWL(tuple(self.times.tolist()), tuple((gain * self.values).tolist()))
+        return fs.Samples(gain * self.values, self.rate)
 
     def python(self, gain: float) -> str:
         """The same source from its file, as Python."""
@@ -259,7 +258,7 @@ def _read(name: str, given: Any) -> Any:
     """A value of a request, checked; texts are as in a link."""
     match name:
         case "deck" | "source" | "sets":
-            allowed, longest = _TEXTS[name]
+            allowed, longest = _WORDS[name]
             require(isinstance(given, str), name, f"of type {type(given).__name__}", allowed)
             require(len(given) <= longest, name, f"{len(given):,} characters long", f"at most {longest:,}")
             return given
@@ -277,7 +276,7 @@ def _read(name: str, given: Any) -> Any:
         case "overrides":
             require(isinstance(given, dict), name, type(given).__name__, "an object from paths to numbers")
             require(len(given) <= MOST_OVERRIDES, name, f"{len(given):,} values", f"at most {MOST_OVERRIDES}")
-            return {path: _override(path, value) for path, value in given.items()}
+            return {path: _override(path, x) for path, x in given.items()}
         case "recording":
             return _recording(given)
     least, most = _RANGES[name]
@@ -324,7 +323,7 @@ def _numbers(what: str, given: Any) -> FloatArray:
     return values
 
 
-def asked_by(solution: Solution) -> dict[str, Any]:
+def asked_by(solution: fs.Solution) -> dict[str, Any]:
     """How a run was made, as far as a request can say it."""
     area: str | float = solution.area_mode
     if solution.area_mode not in _AREAS and solution.area is not None:
@@ -362,13 +361,13 @@ class Asked:
     # nothing, and the page shows their caveats
     sets: str = ""
 
-    base: Circuit  # The deck's
-    circuit: Circuit  # With all changes
-    replaced: tuple[str, Waveform] | None = None  # What `source` says: the name of the source, and its new waveform
+    base: fs.Circuit  # The deck's
+    circuit: fs.Circuit  # With all changes
+    replaced: tuple[str, fs.Waveform] | None = None  # What `source` says: the name of the source, and its new waveform
     gain: float | None = None  # V, of a source that is a recording
     unknown: list[str]  # Sentences about names that mean nothing here
 
-    def __init__(self, given: Any, own: Circuit | None = None) -> None:
+    def __init__(self, given: Any, own: fs.Circuit | None = None) -> None:
         keys = f"an object with the keys {', '.join(_NAMES)}"
         require(isinstance(given, dict), "the request", type(given).__name__, keys)
         for name in _NAMES:
@@ -399,10 +398,10 @@ class Asked:
             self.circuit = circuit.replace({f"{e.name}.f": fundamental.frequency for e in circuit.by_device("SKIN")})
 
     @cached_property
-    def waveform(self) -> Waveform:
+    def waveform(self) -> fs.Waveform:
         """All sources as one waveform."""
         waveforms = network_of(self.circuit).waveforms
-        return waveforms[0] if len(waveforms) == 1 else Sum(waveforms)
+        return waveforms[0] if len(waveforms) == 1 else fs.Sum(waveforms)
 
     @cached_property
     def times(self) -> tuple[float, float, float | None]:
@@ -441,14 +440,14 @@ class Asked:
 
 
 @lru_cache(maxsize=32)
-def _parsed(text: str) -> Circuit:
+def _parsed(text: str) -> fs.Circuit:
     """The circuit of a text from the page, which may include no file."""
-    circuit = parse_netlist(text)
+    circuit = fs.parse_netlist(text)
     driving_sources(circuit)
     return circuit
 
 
-def _dispersive(circuit: Circuit) -> Circuit:
+def _dispersive(circuit: fs.Circuit) -> fs.Circuit:
     """The circuit with the data of every skin at all frequencies."""
     elements = list(circuit.elements)
     for i, e in enumerate(elements):

@@ -16,23 +16,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fingerspice import __version__
+import fingerspice as fs
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.units import format_si
-from fingerspice.circuit.circuit import Circuit, Element, Tran
+from fingerspice.circuit.circuit import Element, Tran
 from fingerspice.circuit.describe import in_force, remembering
 from fingerspice.circuit.statespace import driving_sources
 from fingerspice.explorer.request import WAVEFORMS, Asked, quiet, read_source, sliders, text_of, value_text
-from fingerspice.netlist.netlist import read_netlist
 from fingerspice.plots.drawing import save
-from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
-from fingerspice.results.solution import Solution
-from fingerspice.sets.parameters import parameters
-from fingerspice.solve.simulation import simulate
-from fingerspice.studies.comparison import large_signal
-from fingerspice.studies.export import export_netlist
-from fingerspice.waveforms.waveform import Sine, Waveform
 
 #: Traces of each kind, and harmonics.
 MOST_TRACES, HARMONICS = 8, 20
@@ -43,7 +35,7 @@ _WITHOUT_GAP = ("u_source", "u_layer", "v", "area")
 _FIGURES = ("mean", "max", "min", "mean_periodic")
 
 
-def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
+def scene(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any]:
     """Run what the page asks for, for the circuit `own` if the page was opened for it, which stands for its own text.
 
     The keys of the request are those of `request.Asked`; only ``deck`` is needed. The answer has ``ok``, ``status``
@@ -56,7 +48,7 @@ def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     return traces | rest
 
 
-def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[str, Any]]:
+def parts(given: dict[str, Any], own: fs.Circuit | None = None) -> Iterator[dict[str, Any]]:
     """The answer of `scene` without ``figures``, ``harmonics`` and ``stacks``, to be drawn at once, and then these."""
     answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
     solution = None
@@ -73,7 +65,7 @@ def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[st
             answer |= _traces(asked, solution)
         except InputError as error:
             answer["message"] = str(error)
-        except SolveError as error:
+        except fs.SolveError as error:
             answer |= {"status": error.failure.status.name, "message": error.message, "failed_at": error.failure.t}
         except MemoryError:
             answer["message"] = "not enough memory for this scene; allowed: fewer periods or elements"
@@ -120,12 +112,12 @@ def deadline() -> Callable[[float], None]:
     return check
 
 
-def _shown(asked: Asked) -> Solution:
+def _shown(asked: Asked) -> fs.Solution:
     """The run that is asked for, with outputs where it is shown."""
 
-    def run(first: float, last: float) -> Solution:
+    def run(first: float, last: float) -> fs.Solution:
         times = np.linspace(first, last, asked.points(first, last)[0])
-        return simulate(
+        return fs.simulate(
             asked.circuit, t_stop=stop, t_eval=times, charge_law=asked.charge_law, area=asked.area, rtol=asked.rtol,
             charge=False, throw=False, progress=deadline(),
         )  # fmt: skip
@@ -138,7 +130,7 @@ def _shown(asked: Asked) -> Solution:
     return solution
 
 
-def _traces(asked: Asked, solution: Solution) -> dict[str, Any]:
+def _traces(asked: Asked, solution: fs.Solution) -> dict[str, Any]:
     """The first part of an answer, as far as a run gives it: each column of a signal is one trace."""
     first, stop, period = asked.times
     too_few, error = asked.points(first, stop)[1], solution.error
@@ -161,7 +153,7 @@ def _traces(asked: Asked, solution: Solution) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _stacks(solution: Solution) -> list[dict[str, Any]]:
+def _stacks(solution: fs.Solution) -> list[dict[str, Any]]:
     """The layers on each contact area with their thickness and voltage, for the drawing of the stack."""
     stacks: dict[str, dict[str, Any]] = {}
     for name, values in solution.by_name("u_layer").items():
@@ -173,7 +165,7 @@ def _stacks(solution: Solution) -> list[dict[str, Any]]:
     return [stack for stack in stacks.values() if stack["gap"] is not None][:MOST_TRACES]
 
 
-def _harmonics(solution: Solution, period: float | None) -> list[dict[str, Any]]:
+def _harmonics(solution: fs.Solution, period: float | None) -> list[dict[str, Any]]:
     """Amplitudes of the friction force at multiples of the source's frequency, for each gap."""
     if period is None or not solution.gaps:
         return []
@@ -191,7 +183,7 @@ def _harmonics(solution: Solution, period: float | None) -> list[dict[str, Any]]
 
 
 @quiet()
-def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
+def applied(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any]:
     """What the set changes in the scene that a request names in its key ``apply``, as in `Asked.sets`.
 
     The answer has ``ok`` and ``message``; ``overrides`` (path to value as text), ``source`` (text, or None where the
@@ -205,7 +197,7 @@ def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]
     units = {path.lower(): parameter.unit for path, parameter in circuit.parameters.items()}
     overrides, source = {}, None
     for path, value in changes.items():
-        if not isinstance(value, Waveform):
+        if not isinstance(value, fs.Waveform):
             overrides[path] = value_text(value, units[path.lower()])
         elif source is None:
             source = f"{path}={text_of(value)}" if len(driving_sources(circuit)) > 1 else text_of(value)
@@ -225,15 +217,15 @@ def in_scene(asked: Asked) -> tuple[list[dict[str, Any]], set[str], list[str]]:
         circuit = remembering(circuit, name, changes)
     force = in_force(circuit)
     said = [
-        {"name": name, "to": to, "title": parameters(name).title, "caveat": parameters(name).not_claimed,
-         "assumed": list(parameters(name).assumed), "changed": list(force[name][1])}
+        {"name": name, "to": to, "title": fs.parameters(name).title, "caveat": fs.parameters(name).not_claimed,
+         "assumed": list(fs.parameters(name).assumed), "changed": list(force[name][1])}
         for name, to in given
         if name in force and force[name][0]
     ]  # fmt: skip
     return said, {path.lower() for kept, _ in force.values() for path in kept}, lost
 
 
-def before(circuit: Circuit) -> tuple[dict[str, Any], list[str]]:
+def before(circuit: fs.Circuit) -> tuple[dict[str, Any], list[str]]:
     """What had been changed in a circuit before the page was opened, as the request's overrides, source and sets.
 
     With it go the names of replaced sources that it does not say: a request has one, and a recording or a function has
@@ -254,7 +246,7 @@ def before(circuit: Circuit) -> tuple[dict[str, Any], list[str]]:
     return {key: value for key, value in found.items() if value}, [e.name for e in replaced if e.name not in said]
 
 
-def _source_text(circuit: Circuit, element: Element) -> str | None:
+def _source_text(circuit: fs.Circuit, element: Element) -> str | None:
     """The text of a source of now, as in `Asked.source`; None where the page has none for it."""
     assert element.waveform is not None
     for text in (text_of(element.waveform), circuit.overrides.get(element.name)):
@@ -266,14 +258,14 @@ def _source_text(circuit: Circuit, element: Element) -> str | None:
     return None
 
 
-def _entry(circuit: Circuit, name: str) -> str | None:
+def _entry(circuit: fs.Circuit, name: str) -> str | None:
     """The set of that name as in `Asked.sets`: applied to all, or as narrowly as gives its values in the circuit."""
     values = circuit.sets[name]
     elements = dict.fromkeys(path.rpartition(".")[0] or path for path in values)
     inside = {e.rpartition(".")[0] for e in elements}
     for to in (None, *elements, *sorted(inside - {""}, key=len, reverse=True)):
         try:
-            found = parameters(name).apply(circuit, to).sets[name]
+            found = fs.parameters(name).apply(circuit, to).sets[name]
         except InputError:
             continue
         if values == found or (to is not None and values.items() <= found.items()):
@@ -281,10 +273,10 @@ def _entry(circuit: Circuit, name: str) -> str | None:
     return None
 
 
-def _changes(circuit: Circuit, entry: str) -> tuple[str, str | None, dict[str, Any]]:
+def _changes(circuit: fs.Circuit, entry: str) -> tuple[str, str | None, dict[str, Any]]:
     """Name and element of a set as in `Asked.sets`, and what it gives to a circuit, by path."""
     to, _, name = (part.strip() for part in entry.rpartition("="))
-    one = parameters(name)
+    one = fs.parameters(name)
     return one.name, to or None, dict(one.apply(circuit, to or None).sets[one.name])
 
 
@@ -302,20 +294,20 @@ circuit = dataclasses.replace(circuit, elements=tuple(map(dispersive, circuit.el
 
 
 @quiet()
-def as_deck(given: dict[str, Any], own: Circuit | None = None) -> str:
+def as_deck(given: dict[str, Any], own: fs.Circuit | None = None) -> str:
     """The scene as one deck that fingerspice and ngspice run, with the length of the page's run and its outputs."""
     asked = Asked(given, own)
     circuit, (first, stop, _) = asked.circuit, asked.times
     step = (stop - first) / asked.points(first, stop)[0]
     tran = Tran(step, stop, uic=circuit.tran is None or circuit.tran.uic)
-    text = export_netlist(dataclasses.replace(circuit, tran=tran), charge_law=asked.charge_law)
+    text = fs.export_netlist(dataclasses.replace(circuit, tran=tran), charge_law=asked.charge_law)
     if len(text) > _LONGEST_EXPORT:
         raise InputError(f"the deck would have {len(text):,} characters; allowed: at most {_LONGEST_EXPORT:,}")
     return text
 
 
 @quiet()
-def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
+def as_python(given: dict[str, Any], own: fs.Circuit | None = None) -> str:
     """The scene as Python that gives the page's solution."""
     asked = Asked(given, own)
     sets, by_sets, _ = in_scene(asked)
@@ -344,7 +336,8 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
         if asked.recording is not None and asked.gain is not None:
             code = asked.recording.python(asked.gain)
         lines.append(f"circuit = circuit.replace({{{name!r}: {code}}})")
-    changes = {path: known[path.lower()] for path in asked.base.overrides if path.lower() in known} | asked.overrides
+    before = {path: known[path.lower()] for path in asked.base.overrides if path.lower() in known}
+    changes = {**before, **asked.overrides}
     changes = {path: x for path, x in changes.items() if path.lower() not in by_sets}
     if asked.skin == "follow":
         changes |= {f"{e.name}.f": e.values["f"] for e in asked.circuit.by_device("SKIN")}
@@ -362,7 +355,7 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
 
 
 @quiet()
-def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
+def means(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any]:
     """Mean force of the periodic state under sines of the source's amplitude, at frequencies that the request names.
 
     Its key ``frequencies`` (Hz) has at most 16. The answer has ``ok`` and ``message``; ``frequency`` and ``force`` (Hz
@@ -378,12 +371,12 @@ def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
         raise InputError("the circuit has no GAP, and so no force")
     if wave.fundamental is None:
         raise InputError("the source has no one amplitude that sines could have; allowed: a periodic source")
-    (found,) = large_signal(
+    (found,) = fs.large_signal(
         asked.circuit, np.asarray(frequencies, float), charge_law=asked.charge_law, finger=gaps[0].name,
         rtol=max(asked.rtol, _RTOL), progress=deadline(),
     )  # fmt: skip
     amplitude = format_si(float(np.max(found.amplitude)), "V")
-    if not (isinstance(wave, Sine) and wave.offset == 0.0):
+    if not (isinstance(wave, fs.Sine) and wave.offset == 0.0):
         amplitude += ", the source's fundamental,"
     return {
         "ok": True, "message": "", "frequency": found.frequency, "force": found.f_el_mean, "gap": gaps[0].name,
@@ -407,7 +400,7 @@ EXAMPLES = tuple(Example(**one) for one in tomllib.loads(_FILE.read_text(encodin
 """The scenes of the menu, the first of which is shown at the start."""
 
 
-def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def beginning(circuit: fs.Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """What the page needs first: its menus, and the scene to begin with."""
     examples = [
         {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
@@ -420,8 +413,8 @@ def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -
         {"kind": kind, "title": title, "arguments": [a._asdict() for a in arguments]}
         for kind, (title, arguments) in WAVEFORMS.items()
     ]
-    sets = [{"name": one.name, "kind": one.kind, "title": one.title} for one in parameters().values()]
-    return {"version": __version__, "own": own, "examples": examples, "waveforms": waveforms, "sets": sets}
+    sets = [{"name": one.name, "kind": one.kind, "title": one.title} for one in fs.parameters().values()]
+    return {"version": fs.__version__, "own": own, "examples": examples, "waveforms": waveforms, "sets": sets}
 
 
 class Entry(NamedTuple):
@@ -432,7 +425,7 @@ class Entry(NamedTuple):
     title: str
     about: str
     origin: Path  # File that it is drawn from
-    run: Callable[[], Solution]  # Runs it
+    run: Callable[[], fs.Solution]  # Runs it
 
 
 def decks(folder: Path) -> Iterator[Entry]:
@@ -444,7 +437,7 @@ def decks(folder: Path) -> Iterator[Entry]:
         about = re.split(r"Layers(?:,| and) contact|SI units|V\(area\)|In ngspice|Charge law:", " ".join(comments))[0]
         title = re.sub(r"Fingerpad on a (3M-coated )?touchscreen,? (with )?", "", lines[0]) or path.stem
         title = title[0].upper() + title[1:]
-        yield Entry(path.stem, title, about.strip(), path, partial(lambda path: simulate(read_netlist(path)), path))
+        yield Entry(path.stem, title, about.strip(), path, lambda path=path: fs.simulate(fs.read_netlist(path)))
 
 
 def scenes() -> Iterator[Entry]:
@@ -453,10 +446,10 @@ def scenes() -> Iterator[Entry]:
         yield Entry(f"scene-{one.name}", one.title, one.note, _FILE, partial(_run_scene, one))
 
 
-def _run_scene(example: Example) -> Solution:
+def _run_scene(example: Example) -> fs.Solution:
     asked = Asked({"deck": example.deck, **example.asked})
     first, stop, _ = asked.times
-    return simulate(
+    return fs.simulate(
         asked.circuit, t_stop=stop, t_eval=np.linspace(first, stop, 4001), charge_law=asked.charge_law, throw=False
     )
 

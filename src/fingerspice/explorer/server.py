@@ -15,20 +15,18 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib import resources
-from itertools import chain
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+import fingerspice as fs
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError, printable
 from fingerspice.base.pages import in_notebook
-from fingerspice.circuit.circuit import Circuit
 from fingerspice.explorer import scene
 from fingerspice.explorer.request import asked_by
-from fingerspice.results.outcome import SolveError
-from fingerspice.results.solution import Solution
+from fingerspice.waveforms.waveform import require
 
 ADDRESS = "127.0.0.1"
 FRAME_HEIGHT, MOST_FRAMES = 900, 8
@@ -55,9 +53,8 @@ _FRAMES: deque[Explorer] = deque()
 
 def pages() -> dict[str, bytes]:
     """The files of the page by name."""
-    folder = resources.files("fingerspice.explorer") / "page"
-    names = (entry.name for entry in folder.iterdir())
-    return {name: (folder / name).read_bytes() for name in names if name.rpartition(".")[2] in _TYPES}
+    files = Path(__file__).with_name("page").iterdir()
+    return {file.name: file.read_bytes() for file in files if file.suffix[1:] in _TYPES}
 
 
 class Explorer:
@@ -86,11 +83,10 @@ class Explorer:
     """
 
     def __init__(
-        self, circuit: Circuit | None = None, port: int = 0, *, asked: Mapping[str, Any] | None = None,
+        self, circuit: fs.Circuit | None = None, port: int = 0, *, asked: Mapping[str, Any] | None = None,
         framed: bool = False,
     ) -> None:  # fmt: skip
-        if not 0 <= port <= 65535:
-            raise InputError(f"port is {port}; allowed: 0 to 65535, where 0 takes a free one")
+        require(0 <= port <= 65535, "port", port, "0 to 65535, where 0 takes a free one")
         self.token = secrets.token_urlsafe(24)
         self.circuit, self.asked, self.framed = circuit, dict(asked or {}), framed
         self.files = pages()
@@ -98,9 +94,8 @@ class Explorer:
         try:
             self._server = _Server((ADDRESS, port), type("Handler", (_Handler,), {"explorer": self}))
         except OSError as error:
-            raise InputError(
-                f"port {port} of {ADDRESS} cannot be used: {error.strerror}; allowed: a free port"
-            ) from None
+            text = f"port {port} of {ADDRESS} cannot be used: {error.strerror}; allowed: a free port"
+            raise InputError(text) from None
         self.port = int(self._server.server_address[1])
         self.url = f"http://{ADDRESS}:{self.port}/{self.token}/"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
@@ -152,14 +147,14 @@ class Explorer:
                 if part is None:
                     return
                 yield framed(part)
-        except (InputError, SolveError) as error:
+        except (InputError, fs.SolveError) as error:
             yield framed({"ok": False, "message": str(error)})
         except Exception as error:
             text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
             yield framed({"ok": False, "status": "FAULT", "message": text})
 
 
-def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
+def explore(shown: fs.Circuit | fs.Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
     """Show a circuit, or a run's circuit, on a local page on which its values can be changed (docs/explore.md).
 
     Parameters
@@ -183,8 +178,8 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
     InputError
         If the port is taken, or no port number.
     """
-    asked = asked_by(shown) if isinstance(shown, Solution) else {}
-    circuit = shown.circuit if isinstance(shown, Solution) else shown
+    asked = asked_by(shown) if isinstance(shown, fs.Solution) else {}
+    circuit = shown.circuit if isinstance(shown, fs.Solution) else shown
     framed = browser and in_notebook()
     explorer = Explorer(circuit, port, asked=asked, framed=framed)
     if framed:
@@ -197,7 +192,7 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
 
 
 #: What the page asks for, and what answers, in one part or in several.
-_ACTIONS: dict[str, Callable[[Any, Circuit | None], Any]] = {
+_ACTIONS: dict[str, Callable[[Any, fs.Circuit | None], Any]] = {
     "scene": scene.parts, "set": scene.applied, "means": scene.means, "deck": scene.as_deck,
     "python": scene.as_python,
 }  # fmt: skip
@@ -233,7 +228,7 @@ def framed(data: Any) -> bytes:
 _STATIC_POLICY = "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data: blob:"
 
 
-def static_page(circuit: Circuit | None = None) -> str:
+def static_page(circuit: fs.Circuit | None = None) -> str:
     """The page as HTML that needs no other file, of a circuit's run or all example scenes; no slider moves on it."""
     files = {name: content.decode("utf-8") for name, content in pages().items()}
     start = scene.beginning(circuit)
@@ -332,7 +327,6 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             status, text = error.args
             kind, parts = "application/json", iter([json.dumps({"ok": False, "message": text}).encode()])
-        part = next(parts)
         self.send_response(status)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
         self.send_header("Transfer-Encoding", "chunked")
@@ -342,8 +336,8 @@ class _Handler(BaseHTTPRequestHandler):
         if self.close_connection:
             self.send_header("Connection", "close")
         self.end_headers()
-        for more in chain([part], parts):
-            self.wfile.write(b"%x\r\n%b\r\n" % (len(more), more))
+        for part in parts:
+            self.wfile.write(b"%x\r\n%b\r\n" % (len(part), part))
         self.wfile.write(b"0\r\n\r\n")
 
     def _allowed(self) -> str:
