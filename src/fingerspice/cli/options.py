@@ -78,8 +78,7 @@ class Job:
         from fingerspice.circuit.circuit import CHARGE_LAWS
         from fingerspice.circuit.describe import directive_warnings
 
-        with warnings.catch_warnings(record=True) as noticed:
-            warnings.simplefilter("always", FingerspiceWarning)
+        with warnings.catch_warnings(record=True, action="always", category=FingerspiceWarning) as noticed:
             circuit = fs.read_netlist(self.deck)
         given, changes = circuit.warnings, self.set or []
         # A path has a dot, and the name of a set none.

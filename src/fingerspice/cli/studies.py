@@ -301,11 +301,11 @@ def _shared(rows: list[dict[str, Any]], output: str) -> str:
         told = f"{row['total']:.2f} ({row['low']:.2f}-{row['high']:.2f})"
         lines.setdefault(place, {})[row["parameter"]] = told
     wide = max(len(place) for place in lines) + 2 * any(lines)
-    head = " " * wide + "".join(f"{name:>{width}}" for name, width in widths.items())
-    body = [
-        f"{place:<{wide}}" + "".join(f"{told[name]:>{width}}" for name, width in widths.items())
-        for place, told in lines.items()
-    ]
+
+    def line(place: str, cells: Mapping[str, str]) -> str:
+        return f"{place:<{wide}}" + "".join(f"{cells[name]:>{width}}" for name, width in widths.items())
+
+    head, body = line("", {name: name for name in widths}), [line(place, told) for place, told in lines.items()]
     most = "; ".join(
         name + ("" if len(first) == 1 else f" ({places[0]}{f' to {places[-1]}' if len(places) > 1 else ''})")
         for name, places in first.items()

@@ -9,14 +9,11 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from fingerspice import __version__
+import fingerspice as fs
 from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.results.outcome import SolveError
-
-if TYPE_CHECKING:
-    from fingerspice.results.solution import Solution
 
 #: Keys of every answer, whatever its outcome (docs/json.md).
 COMMON = (
@@ -54,10 +51,10 @@ def blank(command: str | None) -> dict[str, Any]:
     """An answer with all its keys, before any result is known."""
     keys = (*COMMON, *OWN.get(command or "", ()))
     empty = {"success": False, "warnings": [], "files": [], "overrides": {}, "sets": []}
-    return {**dict.fromkeys(keys), **empty, "version": __version__, "command": command}
+    return {**dict.fromkeys(keys), **empty, "version": fs.__version__, "command": command}
 
 
-def of_run(solution: Solution) -> dict[str, Any]:
+def of_run(solution: fs.Solution) -> dict[str, Any]:
     """The part of an answer that describes a run: its method and error, and figures of every signal in SI units."""
     from fingerspice.results.record import SIGNALS
 
@@ -131,11 +128,10 @@ class Answering(dict[str, Any]):
         super().__init__(blank(command))
         self.json_wanted = given["json"]
         self.update({key: given[key] for key in AS_ASKED if key in given and key in self})
-        self._warnings = warnings.catch_warnings()
+        self._warnings = warnings.catch_warnings(action="always", category=FingerspiceWarning)
 
     def __enter__(self) -> Answering:
         self._warnings.__enter__()
-        warnings.simplefilter("always", FingerspiceWarning)
         warnings.showwarning = self._show
         return self
 

@@ -166,8 +166,7 @@ _FIELDS = {"envelope": "modulation"}
 @contextmanager
 def quiet() -> Iterator[None]:
     """Nothing inside warns: the scene itself says what there is to say."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         yield
 
 

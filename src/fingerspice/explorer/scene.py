@@ -88,8 +88,7 @@ def parts(given: dict[str, Any], own: fs.Circuit | None = None) -> Iterator[dict
 @contextmanager
 def _noticing(answer: dict[str, Any]) -> Iterator[None]:
     """Add the warnings that are given inside to those of an answer, each once."""
-    with warnings.catch_warnings(record=True) as noticed:
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(record=True, action="ignore") as noticed:
         warnings.simplefilter("always", FingerspiceWarning)
         yield
     said = [*answer.get("warnings", ()), *(str(w.message) for w in noticed)]
@@ -437,7 +436,8 @@ def decks(folder: Path) -> Iterator[Entry]:
         about = re.split(r"Layers(?:,| and) contact|SI units|V\(area\)|In ngspice|Charge law:", " ".join(comments))[0]
         title = re.sub(r"Fingerpad on a (3M-coated )?touchscreen,? (with )?", "", lines[0]) or path.stem
         title = title[0].upper() + title[1:]
-        yield Entry(path.stem, title, about.strip(), path, lambda path=path: fs.simulate(fs.read_netlist(path)))
+        run = partial(lambda path: fs.simulate(fs.read_netlist(path)), path)
+        yield Entry(path.stem, title, about.strip(), path, run)
 
 
 def scenes() -> Iterator[Entry]:
@@ -456,6 +456,5 @@ def _run_scene(example: Example) -> fs.Solution:
 
 def draw(entry: Entry, picture: Path) -> None:
     """Run an entry, and draw source, gap voltage and friction."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FingerspiceWarning)
+    with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
         save(entry.run().plot(("u_source", "u_gap", "f_t")), picture, dpi=110.0)

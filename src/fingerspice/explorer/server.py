@@ -7,7 +7,6 @@ import hmac
 import json
 import re
 import secrets
-import socket
 import struct
 import threading
 import webbrowser
@@ -270,11 +269,8 @@ class _Server(ThreadingHTTPServer):
         self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
         super().__init__(*arguments)
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        if not self._room.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        super().process_request(request, client_address)
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        return self._room.acquire(blocking=False)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
@@ -296,11 +292,7 @@ class _Handler(BaseHTTPRequestHandler):
     explorer: ClassVar[Explorer]
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "fingerspice", ""
-    timeout = SILENCE
-
-    def setup(self) -> None:
-        super().setup()
-        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    timeout, disable_nagle_algorithm = SILENCE, True
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing is logged: the token stands in every line."""
