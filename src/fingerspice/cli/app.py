@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import signal
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -31,7 +32,7 @@ from fingerspice.cli.options import (
     check_output,
     with_times,
 )
-from fingerspice.cli.terminal import answer_usage, complain, outcome, say
+from fingerspice.cli.terminal import complain, outcome, say
 from fingerspice.waveforms.waveform import require
 
 app = typer.Typer(
@@ -54,8 +55,9 @@ def main() -> None:
     except SystemExit as exit_:
         # typer has refused the usage with a message on stderr; with --json print an answer as well.
         refused = getattr(exit_.__context__, "format_message", None)
-        if refused is not None:
-            answer_usage(refused())
+        if refused is not None and "--json" in sys.argv[1:]:
+            command = next((word for word in sys.argv[1:] if word in terminal.OWN), None)
+            terminal.say_json({**terminal.blank(command), "status": "BAD_INPUT", "message": refused()})
         raise
     except Exception as error:
         # One sentence instead of a traceback.

@@ -34,13 +34,9 @@ OWN = {
         "fit": "parameters correlation groups signal count residual_rms objective objectives notes profiles",
         "fit-contact": "gap parameters correlation relations objective notes profiles",
         "sweep": "scenes failed n seed figures shares store",
-        "export": "",
-        "figures": "",
-        "explore": "url",
-        "sets": "parameter_sets",
-        "check": "chunks",
+        "export": "", "figures": "", "explore": "url", "sets": "parameter_sets", "check": "chunks",
     }.items()
-}
+}  # fmt: skip
 #: Keys that are options, too.
 AS_ASKED = ("charge_law", "method", "rtol", "area", "skin")
 #: Figures of a signal; a figure that a signal lacks is null.
@@ -167,11 +163,3 @@ class Answering(dict[str, Any]):
             said = [*filter(None, [text()]), *(f"wrote {file}" for file in files)]
             if said and not self.json_wanted:
                 say("\n".join(said))
-
-
-def answer_usage(message: str) -> None:
-    """Print the JSON answer to a command line that typer refused, if it asks for JSON."""
-    words = sys.argv[1:]
-    if "--json" in words:
-        command = next((word for word in words if word in OWN), None)
-        say_json({**blank(command), "status": "BAD_INPUT", "message": message})

@@ -1,7 +1,4 @@
-"""Sliders: every parameter of every element, with a range in which it makes sense; and the menu of waveforms.
-
-What the page asks for: its values checked, and the circuit and the times of its run made of them.
-"""
+"""The page's sliders and menu of waveforms; its requests, checked, with the circuit and the times made of them."""
 
 from __future__ import annotations
 
