@@ -1,8 +1,4 @@
-"""One call of a command: its options and the circuit that they ask for, and the files of its results.
-
-Options that commands share are here. Files are named after the deck and never replace results of another circuit; all
-that can be checked before a run is.
-"""
+"""One call of a command: the options that commands share, the circuit they ask for, and the files of its results."""
 
 from __future__ import annotations
 
@@ -18,20 +14,19 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 from typer import Argument, Option
 
+import fingerspice as fs
 from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.base.files import write_aside
 from fingerspice.base.units import parse_number
-from fingerspice.cli.terminal import Answering, Write, complain
-
-if TYPE_CHECKING:
-    from fingerspice.circuit.circuit import Circuit
-    from fingerspice.waveforms.waveform import Waveform
+from fingerspice.cli.terminal import Answering, complain
+from fingerspice.waveforms.waveform import require
 
 #: Largest area that causes no warning, m^2; a larger one was probably given in mm^2.
 LARGEST_AREA = 0.01
@@ -46,11 +41,9 @@ _HEADS = (
 )  # fmt: skip
 
 
-def _named(kind: str, example: str) -> Any:
-    said = f"Apply a named set of this kind: {example} (list: fingerspice sets)."
-    return Option(f"--{kind}", metavar="[ELEMENT=]NAME", help=said)
-
-
+#: Options that name sets of parameters.
+SETS = ("set", "finger", "coating", "drive")
+_SET = "Apply a named set of this kind: {} (list: fingerspice sets)."
 _SPECS = "'SQUARE(200 100)', 'Vdrive=DC 5', 'WAV(a.wav gain=150)', 'TABLE(a.csv)'"
 
 
@@ -60,50 +53,39 @@ class Job:
 
     answer: Answering
     deck: Annotated[Path, Argument(metavar="DECK", help="Netlist file (.cir), - for standard input.")]
-    out: Annotated[Path | None, Option(metavar="FOLDER", help="Folder of the files; out by default.")] = None
-    name: Annotated[str | None, Option(metavar="NAME", help="Name of the files; that of the deck by default.")] = None
-    overwrite: Annotated[bool, Option("--overwrite", help="Replace results of other circuits, and other files.")] = (
-        False
-    )
-    rtol: Annotated[float, Option(help="Largest error of gap voltage and force, relative to their peaks.")] = 1e-8
-    charge_law: Annotated[str | None, Option(help="local or mobile; the included library's by default.")] = None
-    changes: Annotated[
-        list[str] | None,
-        Option(
-            "--set", metavar="PATH=VALUE|NAME",
-            help="Change a value: Xgap.d=3u; or apply a named set: moist. Repeatable.",
-        ),
-    ] = None  # fmt: skip
-    finger: Annotated[list[str] | None, _named("finger", "moist, or Xlight=dry for one of several")] = None
-    coating: Annotated[list[str] | None, _named("coating", "3M")] = None
-    drive: Annotated[list[str] | None, _named("drive", "Fig4-5kHz")] = None
-    source: Annotated[list[str] | None, Option(metavar="[NAME=]SPEC", help=f"Replace a source: {_SPECS}.")] = None
-    stop: Annotated[str | None, Option(metavar="TIME", help="End of the run, s: 50m; TSTOP by default.")] = None
-    as_json: Annotated[bool, Option("--json", help="Print JSON (docs/json.md), nothing else on stdout.")] = False
-    no_plot: Annotated[bool, Option("--no-plot", help="Write no picture.")] = False
+    out: Annotated[Path | None, "Folder of the files; out by default.", "FOLDER"] = None
+    name: Annotated[str | None, "Name of the files; that of the deck by default.", "NAME"] = None
+    overwrite: Annotated[bool, "Replace results of other circuits, and other files."] = False
+    rtol: Annotated[float, "Largest error of gap voltage and force, relative to their peaks."] = 1e-8
+    charge_law: Annotated[str | None, "local or mobile; the included library's by default."] = None
+    set: Annotated[
+        list[str] | None, "Change a value: Xgap.d=3u; or apply a named set: moist. Repeatable.", "PATH=VALUE|NAME"
+    ] = None
+    finger: Annotated[list[str] | None, _SET.format("moist, or Xlight=dry for one of several"), "[ELEMENT=]NAME"] = None
+    coating: Annotated[list[str] | None, _SET.format("3M"), "[ELEMENT=]NAME"] = None
+    drive: Annotated[list[str] | None, _SET.format("Fig4-5kHz"), "[ELEMENT=]NAME"] = None
+    source: Annotated[list[str] | None, f"Replace a source: {_SPECS}.", "[NAME=]SPEC"] = None
+    stop: Annotated[str | None, "End of the run, s: 50m; TSTOP by default.", "TIME"] = None
+    json: Annotated[bool, "Print JSON (docs/json.md), nothing else on stdout."] = False
+    no_plot: Annotated[bool, "Write no picture."] = False
 
-    def read(self) -> Circuit:
+    def read(self) -> fs.Circuit:
         """The circuit that the options ask for, of which the answer tells.
 
-        It is the deck's with the named sets of ``--set`` and of options by kind, ``--set`` values, and ``--source``:
-        what comes later in this order has the last word. Gives the reader's warnings, without those about replaced
-        values, and warnings about directives without effect.
+        It is the deck's with named sets, ``--set`` values, and ``--source``: of these the last has the last word. Gives
+        the reader's warnings, without those about replaced values, and those about directives.
         """
         from fingerspice.circuit.circuit import CHARGE_LAWS
         from fingerspice.circuit.describe import directive_warnings
-        from fingerspice.netlist.netlist import read_netlist
-        from fingerspice.waveforms.waveform import require
 
-        with warnings.catch_warnings(record=True) as noticed:
-            warnings.simplefilter("always", FingerspiceWarning)
-            circuit = read_netlist(self.deck)
-        given, changes = circuit.warnings, self.changes or []
+        with warnings.catch_warnings(record=True, action="always", category=FingerspiceWarning) as noticed:
+            circuit = fs.read_netlist(self.deck)
+        given, changes = circuit.warnings, self.set or []
         # A path has a dot, and the name of a set none.
-        named = [change for change in changes if change and not set("=.") & set(change)]
-        sets = {"set": named, "finger": self.finger, "coating": self.coating, "drive": self.drive}
+        named = [change for change in changes if change and not re.search("[=.]", change)]
         try:
-            for option, texts in sets.items():
-                for text in texts or ():
+            for option in SETS:
+                for text in named if option == "set" else getattr(self, option) or ():
                     circuit = _with_set(circuit, option, text)
             circuit = _with_values(circuit, changes, named)
             circuit = _with_sources(circuit, self.source or [])
@@ -142,23 +124,32 @@ def add_command(app: typer.Typer, options: str, function: Callable[..., Callable
         if then is not None:
             then()
 
-    taken = [known[key].replace(kind=inspect.Parameter.KEYWORD_ONLY) for key in options.split()]
-    call.__doc__, call.__signature__ = function.__doc__, inspect.Signature(taken)  # type: ignore[attr-defined]
+    taken = [_declared(known[key]) for key in options.split()]
+    # In the help an empty line keeps two lines apart.
+    call.__doc__ = (inspect.getdoc(function) or "").replace("\n  fingerspice", "\n\n  fingerspice")
+    call.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]
     app.command(name)(call)
 
 
-def _with_set(circuit: Circuit, option: str, text: str) -> Circuit:
-    from fingerspice.sets.parameters import parameters
+def _declared(one: inspect.Parameter) -> inspect.Parameter:
+    """A parameter as typer takes it: its annotation has its help, and what stands for its value there."""
+    kind, said, *value = get_args(one.annotation)
+    if isinstance(said, str):
+        # With its name a switch has no second option that switches it off.
+        said = Option(f"--{one.name.replace('_', '-')}", help=said, metavar=value[0] if value else None)
+    return one.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, said])
 
+
+def _with_set(circuit: fs.Circuit, option: str, text: str) -> fs.Circuit:
     element, equals, name = (part.strip() for part in text.rpartition("="))
     try:
-        return parameters(name, None if option == "set" else option).apply(circuit, element if equals else None)
+        return fs.parameters(name, None if option == "set" else option).apply(circuit, element if equals else None)
     except InputError as error:
         other = "; or PATH=VALUE, such as Xgap.d=3u" if option == "set" and "unknown set" in error.message else ""
         raise InputError(f"--{option} {text!r}: {error.message}{other}") from None
 
 
-def _with_values(circuit: Circuit, changes: list[str], named: list[str]) -> Circuit:
+def _with_values(circuit: fs.Circuit, changes: list[str], named: list[str]) -> fs.Circuit:
     """The circuit with all ``--set`` values applied together, as two exponents may only be legal together."""
     values: dict[str, str] = {}
     for change in (change for change in changes if change not in named):
@@ -173,18 +164,17 @@ def _with_values(circuit: Circuit, changes: list[str], named: list[str]) -> Circ
         raise InputError(f"--set {' '.join(map(repr, changes))}: {error.message}") from None
 
 
-def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
+def _with_sources(circuit: fs.Circuit, texts: list[str]) -> fs.Circuit:
     """The circuit with every ``--source``; the source's name may be left out if the circuit has only one."""
     from fingerspice.circuit.describe import overridden
     from fingerspice.circuit.statespace import driving_sources
     from fingerspice.netlist.netlist import source_from_text
-    from fingerspice.waveforms.periodic import MOST_SHOWN, PWL
-    from fingerspice.waveforms.samples import Samples
+    from fingerspice.waveforms.periodic import MOST_SHOWN
 
     if not texts:
         return circuit
     names = {e.name.lower(): e.name for e in driving_sources(circuit)}
-    sources: dict[str, Waveform] = {}
+    sources: dict[str, fs.Waveform] = {}
     # The results describe a recording or a long table by the option's text, instead of by its numbers.
     named_by: dict[str, str] = {}
     for text in texts:
@@ -204,22 +194,22 @@ def _with_sources(circuit: Circuit, texts: list[str]) -> Circuit:
         except InputError as error:
             raise InputError(f"--source {error.message}") from None
         wave = sources[name]
-        long = isinstance(wave, PWL) and len(wave.times) > MOST_SHOWN
-        if long or isinstance(wave, Samples) or len(repr(wave)) > LONGEST_SOURCE:
+        long = isinstance(wave, fs.PWL) and len(wave.times) > MOST_SHOWN
+        if long or isinstance(wave, fs.Samples) or len(repr(wave)) > LONGEST_SOURCE:
             named_by[name] = spec
     changed = overridden(circuit, sources)
     return dataclasses.replace(changed, overrides={**changed.overrides, **named_by})
 
 
-def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple[Circuit, str]:
+def with_times(circuit: fs.Circuit, stop: str | None, start: str = "deck") -> tuple[fs.Circuit, str]:
     """The circuit with ``--stop`` and ``--start`` in place of TSTOP and TSTART, and the mode of the run's start.
 
     Without a .tran line the run starts uncharged and has 1,001 outputs.
     """
     from fingerspice.circuit.circuit import Tran
 
-    tran, t_stop = circuit.tran, time_from_text("--stop", stop)
-    t_start = time_from_text("--start", start) if start and start[0] in "+-.0123456789" else None
+    tran, t_stop = circuit.tran, number("--stop", stop)
+    t_start = number("--start", start) if start and start[0] in "+-.0123456789" else None
     start = start if t_start is None else "deck"
     if tran is None and t_stop is not None:
         tran = Tran((t_stop - (t_start or 0.0)) / 1000.0, t_stop, uic=True)
@@ -230,20 +220,20 @@ def with_times(circuit: Circuit, stop: str | None, start: str = "deck") -> tuple
         raise InputError(f"--stop {last:g} s; allowed: more than 0 s")
     if t_start is not None and not 0.0 <= first < last:
         raise InputError(f"--start {first:g} s; allowed: from 0 s to less than the end, {last:g} s")
-    if last < first + tran.step * (1.0 - 1e-12):
-        least = first + tran.step
-        raise InputError(
-            f"--stop {last:g} s is before the second output; allowed: TSTART + TSTEP = {least:g} s or more"
-        )
+    least = first + tran.step
+    enough = last >= first + tran.step * (1.0 - 1e-12)
+    require(enough, f"--stop {last:g} s", "before the second output", f"TSTART + TSTEP = {least:g} s or more")
     return dataclasses.replace(circuit, tran=dataclasses.replace(tran, stop=last, start=first)), start
 
 
-def time_from_text(option: str, text: str | None) -> float | None:
-    """A time in s, such as ``50m``."""
+def number(option: str, text: str | None, *, positive: bool = False) -> float | None:
+    """The number of an option, with SPICE's scales, such as ``50m``; None if the option is not given."""
     try:
-        return None if text is None else parse_number(text)
+        value = None if text is None else parse_number(text)
     except ValueError as error:
         raise InputError(f"{option} {text!r}: {error}") from None
+    require(value is None or value > 0.0 or not positive, option, text, "> 0")
+    return value
 
 
 def area_from_text(text: str) -> str | float:
@@ -253,24 +243,19 @@ def area_from_text(text: str) -> str | float:
     except ValueError:
         return text
     if area > LARGEST_AREA:
-        warnings.warn(
-            f"--area {text} is in m^2, {area * 1e6:g} mm^2; a fingerpad has tens of mm^2, which is 35e-6 or 35u here",
-            FingerspiceWarning,
-            stacklevel=2,
-        )
+        text = f"--area {text} is in m^2, {area * 1e6:g} mm^2; a fingerpad has tens of mm^2, which is 35e-6 or 35u here"
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
     return area
 
 
 def check_output(file: Path, deck: Path | None = None) -> None:
     """Before a run, refuse an output file that cannot be written or is the deck itself; writes nothing."""
-    folder, names, allowed = file.parent, [file.name], "allowed: a folder that can be written"
+    allowed = "allowed: a folder that can be written"
     try:
-        while not folder.exists() and folder != folder.parent and not folder.is_symlink():
-            names.append(folder.name)
-            folder = folder.parent
+        folder = next((one for one in file.parents if one.exists() or one.is_symlink()), file.parents[-1])
         # This raises OSError if a name is too long; the check needs a folder that exists.
-        for one in names:
-            (folder / one).exists()
+        for name in file.relative_to(folder).parts:
+            (folder / name).exists()
         if not folder.is_dir():
             raise InputError(f"cannot write {file}: {folder} is not a folder; {allowed}")
         if not os.access(folder, os.W_OK | os.X_OK):
@@ -286,64 +271,53 @@ def check_output(file: Path, deck: Path | None = None) -> None:
         raise InputError(f"cannot write {file}: {error.strerror}; {allowed}") from None
 
 
-class Results:
-    """The files of a job's results for its circuit, with all changes.
+#: What makes the files of a job, by their endings: it draws a picture or gives None; else it is given the path.
+Makes = Mapping[str, Callable[..., Any]]
 
-    They go into the job's folder (`FOLDER` by default) under its name (that of the deck) with their endings; with
-    `overwrite` they may replace files of other or unknown circuits.
+
+class Results:
+    """The files with these endings that a job writes for its circuit, checked before anything is run.
+
+    They go into the job's folder (`FOLDER` by default) under its name (that of the deck); with `overwrite` they may
+    replace files of other or unknown circuits.
     """
 
-    def __init__(self, job: Job, circuit: Circuit) -> None:
-        name = job.name
-        if name is not None and (name in ("", ".", "..") or Path(name).name != name or not name.isprintable()):
-            raise InputError(
-                f"--name is {name!r}; allowed: a file's name without folder and end; --out names the folder"
-            )
-        self.job, self.circuit, self.folder = job, circuit, job.out or FOLDER
-        self.name = name or (circuit.path or job.deck).stem
-        self._names: list[str] = []
-        self._noted = False
-        self._own = {
+    def __init__(self, job: Job, circuit: fs.Circuit, *ends: str) -> None:
+        name, allowed = job.name, "a file's name without folder and end; --out names the folder"
+        plain = name is None or (name not in ("", ".", "..") and Path(name).name == name and name.isprintable())
+        require(plain, "--name", repr(name), allowed)
+        self.job, self.folder, self.name = job, job.out or FOLDER, name or (circuit.path or job.deck).stem
+        wanted = [end for end in ends if not (job.no_plot and end.endswith(".png"))]
+        self.files = {end: self.folder / f"{self.name}{end}" for end in wanted}
+        # Texts kept in a picture: the circuit, and the files that are made with the picture.
+        self.about = {
             "program": "fingerspice", "title": circuit.title, "file": str(circuit.path or ""),
             "deck_sha256": _hash(circuit.text), "overrides": json.dumps(dict(circuit.overrides)),
             "charge_law": job.charge_law or circuit.charge_law or "local",
+            "files": json.dumps([file.name for file in self.files.values()]),
         }  # fmt: skip
-        self._writes: list[Write] = []
+        earlier = False
+        for file in self.files.values():
+            check_output(file, job.deck)
+            if file.is_file() and not job.overwrite:
+                earlier |= self._of_earlier_text(file)
+        if earlier:
+            complain(f"note: the results in {self.folder} are of an earlier text of {job.deck} and are replaced")
 
-    @property
-    def about(self) -> dict[str, str]:
-        """Texts kept in a picture: the circuit, and the files that were made with the picture."""
-        return {**self._own, "files": json.dumps(self._names)}
-
-    def will_write(self, end: str, write: Callable[[Path], Path | None]) -> None:
-        """Let `ready` have the function that writes the file with this ending.
-
-        Refused is a file that cannot be written, or must not be replaced.
-        """
-        file = self.folder / f"{self.name}{end}"
-        check_output(file, self.job.deck)
-        self._names.append(file.name)
-        if file.is_file() and not self.job.overwrite:
-            self._check(file)
-        self._writes.append(lambda: write(file))
-
-    def will_draw(self, end: str, draw: Callable[[], Any]) -> None:
-        """As `will_write`, of the picture that a function draws, if it draws one, unless the job wants none."""
-
-        def write(file: Path) -> Path | None:
-            from fingerspice.plots.drawing import save
-
-            picture = draw()
-            return None if picture is None else save(picture, file, about=self.about)
-
-        if not self.job.no_plot:
-            self.will_write(end, write)
-
-    def ready(self) -> list[Write]:
-        """The functions that write the files, for which there is a folder now."""
-        if self._writes:
+    def give(self, text: Callable[[], str], makes: Makes) -> None:
+        """Give a text and write the files."""
+        if self.files:
             self.open()
-        return self._writes
+        self.job.answer.give(text, [partial(self._write, file, makes[end]) for end, file in self.files.items()])
+
+    def _write(self, file: Path, make: Callable[..., Any]) -> Path | None:
+        if file.suffix != ".png":
+            make(file)
+            return file
+        from fingerspice.plots.drawing import save
+
+        picture = make()
+        return None if picture is None else save(picture, file, about=self.about)
 
     def open(self) -> None:
         """When the default folder is created, put a .gitignore into it, to keep results out of version control."""
@@ -352,29 +326,25 @@ class Results:
             with suppress(InputError):
                 write_aside(self.folder / ".gitignore", lambda path: path.write_text("*\n"))
 
-    def _check(self, file: Path) -> None:
-        held = _held(file)
+    def _of_earlier_text(self, file: Path) -> bool:
+        """Whether a file is of an earlier text of the deck; refused is one of another circuit, or an unknown one."""
+        held, own = _held(file), self.about
         ways = "allowed: --name NAME, another --out, or --overwrite"
-        if held is None and _is_table(file):
-            complain(f"note: {file} is replaced; a table alone does not say which circuit it is of")
-            return
         if held is None:
-            raise InputError(f"{file} is there already, and nothing says which circuit it is of; {ways}")
-        same_deck = held["deck_sha256"] == self._own["deck_sha256"]
-        if json.loads(held["overrides"]) != dict(self.circuit.overrides):
-            said, own = _of(held), _of(self._own)
-        elif held["charge_law"] != self._own["charge_law"]:
-            said, own = (f"under the {x['charge_law']} law" for x in (held, self._own))
-        elif not same_deck and (held.get("file", "") != self._own["file"] or not held.get("file")):
-            said, own = f"of the deck {held.get('file') or 'of another text'}", f"of {self.job.deck}"
+            if not _is_table(file):
+                raise InputError(f"{file} is there already, and nothing says which circuit it is of; {ways}")
+            complain(f"note: {file} is replaced; a table alone does not say which circuit it is of")
+            return False
+        same_deck = held["deck_sha256"] == own["deck_sha256"]
+        if json.loads(held["overrides"]) != json.loads(own["overrides"]):
+            said = [_of(one) for one in (held, own)]
+        elif held["charge_law"] != own["charge_law"]:
+            said = [f"under the {one['charge_law']} law" for one in (held, own)]
+        elif not same_deck and (held.get("file", "") != own["file"] or not held.get("file")):
+            said = [f"of the deck {held.get('file') or 'of another text'}", f"of {self.job.deck}"]
         else:
-            if not same_deck and not self._noted:
-                self._noted = True
-                complain(
-                    f"note: the results in {self.folder} are of an earlier text of {self.job.deck} and are replaced"
-                )
-            return
-        raise InputError(f"{file} holds a result {said}, and this one is {own}; {ways}")
+            return not same_deck
+        raise InputError(f"{file} holds a result {said[0]}, and this one is {said[1]}; {ways}")
 
 
 def _of(held: Mapping[str, str]) -> str:

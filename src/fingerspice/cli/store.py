@@ -12,7 +12,6 @@ import os
 import shutil
 import time
 import warnings
-from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -20,17 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from fingerspice import __version__
+import fingerspice as fs
 from fingerspice.base.announcing import paced
 from fingerspice.base.compiled import STAMP
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.files import settle_on_disk, write_aside, write_durably
-from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import digests
-from fingerspice.cli.options import Results, check_output, time_from_text
+from fingerspice.cli.options import Job, Results, check_output, number
 from fingerspice.results.record import SIGNALS, variables
 from fingerspice.results.runfile import CHECKSUM, SIGNATURE, Array, attributes_of, create, signature, tidy, zarr_library
-from fingerspice.results.solution import Solution
 from fingerspice.solve.streaming import Stream, stream
 
 #: Attributes of the group: identity of the run, number of finished chunks, state to continue from, results so far, and
@@ -55,6 +52,7 @@ class Store:
         self.mark: dict[str, Any] = {}
         self.so_far: dict[str, Any] = {}
         self.lock = ExitStack()
+        self._busy = f"another process writes {path}; allowed: to wait for it, --name NAME, or another --out"
 
     def _hold(self, folder: Path) -> None:
         """Keep other processes from the store in a folder, also after it is renamed."""
@@ -65,10 +63,7 @@ class Store:
             try:
                 fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise self._busy() from None
-
-    def _busy(self) -> InputError:
-        return InputError(f"another process writes {self.path}; allowed: to wait for it, --name NAME, or another --out")
+                raise InputError(self._busy) from None
 
     def open(self, overwrite: bool) -> None:
         """Open an existing store of the same run, to continue it; with `overwrite` remove any store.
@@ -81,8 +76,8 @@ class Store:
         try:
             held = attributes_of(self.path)
             whole = all(isinstance(held[key], dict) for key in (RUN, MARK, SO_FAR, COLUMNS))
-            whole = whole and held.get(SIGNATURE, "") in ("", signature(held))
             whole = whole and isinstance(held[DONE], int) and held[DONE] >= 0
+            whole = whole and held.get(SIGNATURE, "") in ("", signature(held))
         except (OSError, ValueError, KeyError, TypeError):
             whole = False
         if not whole:
@@ -103,7 +98,7 @@ class Store:
         for name, columns in held[COLUMNS].items():
             array = self._array(name, columns)
             for chunk in range(self.done):
-                place = _place(chunk, array)
+                place = (chunk, 0)[: len(array.shape)]
                 if fault := array.fault(place):
                     raise InputError(f"{self.path} is damaged: {array.file(place)} {fault}; allowed: --overwrite")
                 written.add(array.file(place))
@@ -113,13 +108,11 @@ class Store:
             if file not in written and file.is_file():
                 file.unlink()
 
-    def _array(
-        self, name: str, columns: int, dims: tuple[str, ...] = (), attributes: Mapping[str, Any] | None = None
-    ) -> Array:
+    def _array(self, name: str, columns: int, dims: tuple[str, ...] = (), attributes: Any = None) -> Array:
         more = (columns,) if columns else ()
         return Array(self.path / name, dims, (self.total, *more), (self.count, *more), attributes or {})
 
-    def write(self, chunk: int, solution: Solution, signals: list[str], about: dict[str, Any], mark: Any) -> None:
+    def write(self, chunk: int, solution: fs.Solution, signals: list[str], about: dict[str, Any], mark: Any) -> None:
         """Write a chunk, then record it as finished; `mark` is the state from which the run continues."""
         data, coords = variables(solution, np.ones(solution.t.size, bool), signals)
         data = {"time": coords["time"], **data}
@@ -138,10 +131,10 @@ class Store:
                 blank = {RUN: self.run, DONE: 0, MARK: {}, SO_FAR: {}, COLUMNS: columns}
                 # The store is locked before it has its name.
                 if not create(self.path, {**about, **blank}, arrays, {}, self._hold):
-                    raise self._busy()
+                    raise InputError(self._busy)
                 self.there = True
             for name, one in arrays.items():
-                place = _place(chunk, one)
+                place = (chunk, 0)[: len(one.shape)]
                 one.put(place, data[name][1])
                 settle_on_disk(one.file(place).parent)
             head = json.loads((self.path / "zarr.json").read_text())
@@ -149,10 +142,8 @@ class Store:
             head["attributes"][SIGNATURE] = signature(head["attributes"])
             write_durably(self.path / "zarr.json", json.dumps(head, indent=1).encode())
         except OSError as error:
-            raise InputError(
-                f"cannot write {self.path}: {error.strerror or error}; {self.done} of {self.chunks} pieces are "
-                "written, and the same command goes on from there"
-            ) from None
+            done = f"{self.done} of {self.chunks} pieces are written, and the same command goes on from there"
+            raise InputError(f"cannot write {self.path}: {error.strerror or error}; {done}") from None
         self.done = chunk + 1
 
     def to_netcdf(self, path: Path) -> Path:
@@ -172,13 +163,10 @@ class Store:
                 elif shutil.disk_usage(target.parent).free < size:
                     raise OSError(f"it takes {size / 1e9:.3g} GB, which the disk has not")
             with h5netcdf.File(target, "w") as file:
-                file.dimensions["time"] = self.total
                 for name, array in arrays.items():
-                    names = array.metadata.dimension_names
-                    for dimension, length in zip(names[1:], array.shape[1:], strict=True):
-                        if dimension not in file.dimensions:
-                            file.dimensions[dimension] = length
-                    variable = file.create_variable(name, names, dtype="f8")
+                    lengths = dict(zip(array.metadata.dimension_names, array.shape, strict=True))
+                    file.dimensions.update({key: x for key, x in lengths.items() if key not in file.dimensions})
+                    variable = file.create_variable(name, tuple(lengths), dtype="f8")
                     for key, value in array.attrs.asdict().items():
                         variable.attrs[key] = value if isinstance(value, str) else json.dumps(value)
                     rows = max(1, _PIECE // (8 * max(1, int(np.prod(array.shape[1:])))))
@@ -189,31 +177,26 @@ class Store:
         return write_aside(path, write)
 
 
-def _place(chunk: int, array: Array) -> tuple[int, ...]:
-    return (chunk, *(0,) * (len(array.shape) - 1))
-
-
 def run_streamed(
-    results: Results, how: dict[str, Any], *, chunk: str | None, signals: str | None, netcdf: bool
+    job: Job, circuit: fs.Circuit, how: dict[str, Any], *, chunk: str | None, signals: str | None, netcdf: bool
 ) -> None:
     """Run a circuit, write its chunks to a store, and fill the answer; what a failed run has written stays."""
-    circuit, answer, path = results.circuit, results.job.answer, results.folder / f"{results.name}.zarr"
-    # The store is a folder, so check that a file can be written next to it.
-    check_output(path.with_suffix(".zarr.part"), results.job.deck)
-    names = _names(signals, circuit)
+    names, answer = _names(signals, circuit), job.answer
     charge = any(name in ("q_source", "i_source") for name in names)
-    run = stream(circuit, chunk=time_from_text("--chunk", chunk), charge=charge, **how)
-    if netcdf:
-        results.will_write(".nc", lambda file: store.to_netcdf(file))
+    run = stream(circuit, chunk=number("--chunk", chunk), charge=charge, **how)
+    results = Results(job, circuit, *([".nc"] if netcdf else []))
+    path = results.folder / f"{results.name}.zarr"
+    # The store is a folder, so check that a file can be written next to it.
+    check_output(path.with_suffix(".zarr.part"), job.deck)
     total, span = run.outputs.total, run.problem.t_stop - run.problem.t_start
     store = Store(path, _identity(run, circuit, how, names), total, run.count)
     with store.lock:
-        store.open(results.job.overwrite)
+        store.open(job.overwrite)
         if store.done and store.done < store.chunks:
             run.go_to(store.mark, store.done * store.count)
         results.open()
         begun, first = time.perf_counter(), store.done
-        answer.data["files"].append(str(path))
+        answer["files"].append(str(path))
         if first < store.chunks:
             _fill(run, store, names, results)
         took = time.perf_counter() - begun
@@ -226,10 +209,10 @@ def run_streamed(
             said.append(f"the first {first:,} were there already")
         found = {"chunks": store.chunks, "found": first, "outputs": total, "seconds": took}
         answer.update(**store.so_far, stream=found)
-        answer.give(lambda: "; ".join(said), results.ready())
+        results.give(lambda: "; ".join(said), {".nc": store.to_netcdf})
 
 
-def _names(signals: str | None, circuit: Circuit) -> list[str]:
+def _names(signals: str | None, circuit: fs.Circuit) -> list[str]:
     """Keys of the signals that are written, of those that the circuit has."""
     has = {"gap": circuit.by_device("GAP"), "layer": [e for e in circuit.elements if e.spec.is_layer]}
     allowed = [name for name, signal in SIGNALS.items() if has.get(signal.of, True)]
@@ -241,7 +224,7 @@ def _names(signals: str | None, circuit: Circuit) -> list[str]:
     return sorted(set(names), key=list(SIGNALS).index)
 
 
-def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[str]) -> dict[str, Any]:
+def _identity(run: Stream, circuit: fs.Circuit, how: dict[str, Any], names: list[str]) -> dict[str, Any]:
     """All inputs that determine the bytes of a store, by which a later call recognises its own store."""
     elements, sources = digests(circuit)
     o, scene = run.outputs, run.problem.scene
@@ -249,25 +232,23 @@ def _identity(run: Stream, circuit: Circuit, how: dict[str, Any], names: list[st
         "circuit": elements, "source": sources, "rtol": how["rtol"], "charge_law": scene.charge_law,
         "area": scene.area_mode, "method": how["method"], "start": str(how["start"]), "chunk": run.count,
         "signals": names, "end": run.problem.t_stop, "output_times": [o.start, o.over, o.low, o.total],
-        "program": f"fingerspice {__version__} ({STAMP[:12]}), NumPy {np.__version__}",
+        "program": f"fingerspice {fs.__version__} ({STAMP[:12]}), NumPy {np.__version__}",
     }  # fmt: skip
 
 
 def _fill(run: Stream, store: Store, names: list[str], results: Results) -> None:
     """Compute and write all missing chunks; a chunk is written while the next one is computed."""
     about = {key: text for key, text in results.about.items() if key != "files"}
-    writing: Future[None] | None = None
     start, span = run.problem.t_start, run.problem.t_stop - run.problem.t_start
     first = float(run.outputs.times(run.done, run.done + 1)[0])
     with ThreadPoolExecutor(1) as writer, paced("simulating", (first - start) / span) as show:
+        writing: Future[None] = writer.submit(lambda: None)
         for number, solution in enumerate(run, store.done):
             for text in solution.warnings:
                 # One that comes again is not told again.
                 warnings.warn(text, FingerspiceWarning, stacklevel=2)
-            if writing is not None:
-                writing.result()
+            writing.result()
             writing = writer.submit(store.write, number, solution, names, about, run.mark())
             reached = solution.t_stop
             show((reached - start) / span, lambda s, t=reached: f"{(t - first) / s:,.3g} times real time,")
-        if writing is not None:
-            writing.result()
+        writing.result()

@@ -1,24 +1,21 @@
-"""The commands for studies: tables, files and pictures of each.
-
-`design` finds a drive, `limits` a map of friction or where the mobile law folds; `fit` and `fit-contact` fit parameters
-of a deck to measured data; `sweep` runs a grid or a random population that a TOML file describes.
-"""
+"""The commands for studies: `design`, `limits`, `fit`, `fit-contact` and `sweep`."""
 
 from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from typer import Argument, Option
+from typer import Argument
 
+import fingerspice as fs
 from fingerspice.base.announcing import paced
 from fingerspice.base.errors import InputError
 from fingerspice.base.files import write_aside
-from fingerspice.base.units import parse_number
-from fingerspice.cli.options import Job, Results
+from fingerspice.cli.options import Job, Makes, Results, number
 from fingerspice.cli.terminal import Answering
 from fingerspice.waveforms.waveform import require
 
@@ -37,66 +34,56 @@ _MOST_TOLD = 8
 _LARGEST = 1 << 20
 
 
-def number(option: str, text: str | None) -> float | None:
-    """The positive number of an option, with SPICE's scales; None if the option is not given."""
-    if text is None:
-        return None
-    try:
-        value = parse_number(text)
-    except ValueError as error:
-        raise InputError(f"{option}: {error}") from None
-    require(value > 0.0, option, text, "> 0")
-    return value
+def _report(job: Job, circuit: fs.Circuit, files: Mapping[str, str], make: Callable[[], Any], key: str = "") -> None:
+    """Give the text and the data of what `make` finds, and write these files by its methods of these names.
+
+    The files are checked first. The data are keys of the answer, or all of them one key.
+    """
+    results = Results(job, circuit, *files)
+    found = make()
+    job.answer.update({key: found.to_dict()} if key else found.to_dict())
+    results.give(lambda: str(found), {end: getattr(found, method) for end, method in files.items()})
 
 
 def design(
     job: Job,
     table: Annotated[Path, Argument(metavar="FRICTION.csv", help="Columns time and friction, or force (N).")],
-    carrier: Annotated[str | None, Option(metavar="HZ", help="Carrier of the drive; none by default.")] = None,
-    limit: Annotated[str | None, Option(metavar="V", help="Largest voltage of the source.")] = None,
-    slew: Annotated[str | None, Option(metavar="V/S", help="Its largest change.")] = None,
-    rate: Annotated[str | None, Option(metavar="HZ", help="Samples per second of the table and drive.")] = None,
+    carrier: Annotated[str | None, "Carrier of the drive; none by default.", "HZ"] = None,
+    limit: Annotated[str | None, "Largest voltage of the source.", "V"] = None,
+    slew: Annotated[str | None, "Its largest change.", "V/S"] = None,
+    rate: Annotated[str | None, "Samples per second of the table and drive.", "HZ"] = None,
 ) -> None:
     """Find the drive of DECK that makes the friction (or force) of a table: WAV, CSV, prediction and picture.
 
     Example:
-
       fingerspice design wanted.csv circuits/fingerpad_5khz.cir --carrier 5k --limit 200
     """
-    from fingerspice.studies.inverse import inverse_drive, read_wanted
+    from fingerspice.studies.inverse import read_wanted
 
     circuit = job.read()
     given = {"carrier": carrier, "limit": limit, "slew": slew, "rate": rate}
-    numbers = {key: number(f"--{key}", text) for key, text in given.items()}
-    results = Results(job, circuit)
+    numbers = {key: number(f"--{key}", text, positive=True) for key, text in given.items()}
     kind, wave, end = read_wanted(table, numbers["rate"])
-    results.will_write("_drive.wav", lambda file: found.to_wav(file))
-    results.will_write("_drive.csv", lambda file: found.to_csv(file))
-    results.will_write("_friction.csv", lambda file: found.friction_to_csv(file))
-    results.will_draw("_design.png", lambda: found.plot())
-    wanted: dict[str, Any] = {kind: wave}
-    found = inverse_drive(circuit, duration=end, charge_law=job.charge_law, **numbers, **wanted)
-    job.answer.update(**found.to_dict())
-    job.answer.give(lambda: str(found), results.ready())
+    wanted: dict[str, Any] = {kind: wave, "duration": end, "charge_law": job.charge_law, **numbers}
+    files = {"_drive.wav": "to_wav", "_drive.csv": "to_csv", "_friction.csv": "friction_to_csv", "_design.png": "plot"}
+    _report(job, circuit, files, lambda: fs.inverse_drive(circuit, **wanted))
 
 
 def limits(
     job: Job,
-    points: Annotated[int, Option(help="Values of each parameter.")] = 9,
-    span: Annotated[float, Option(help="Each goes from its value over this to its value times this.")] = 10.0,
-    capability: Annotated[bool, Option("--capability", help="Map the friction it can make instead.")] = False,
-    limit: Annotated[str | None, Option(metavar="V", help="--capability: largest voltage of the source.")] = None,
-    carrier: Annotated[str | None, Option(metavar="HZ", help="--capability: of the drive; none.")] = None,
+    points: Annotated[int, "Values of each parameter."] = 9,
+    span: Annotated[float, "Each goes from its value over this to its value times this."] = 10.0,
+    capability: Annotated[bool, "Map the friction it can make instead."] = False,
+    limit: Annotated[str | None, "--capability: largest voltage of the source.", "V"] = None,
+    carrier: Annotated[str | None, "--capability: of the drive; none.", "HZ"] = None,
 ) -> None:
     """Map where DECK folds under the mobile charge law: source voltage against load, gap and frequency.
 
     Examples:
-
       fingerspice limits circuits/fingerpad.cir --set Xgap.d=100n --points 7 --out out
-
       fingerspice limits circuits/fingerpad.cir --capability --limit 150 --carrier 5k
     """
-    from fingerspice.studies.limits import fold_limits, grid_of
+    from fingerspice.studies import limits as study
 
     job.charge_law = None if capability else "mobile"
     job.answer.update(charge_law=job.charge_law)
@@ -104,113 +91,85 @@ def limits(
     if not capability:
         if limit is not None or carrier is not None:
             raise InputError("--limit and --carrier belong to --capability")
-        grid_of(points, span)
-    largest, tone = number("--limit", limit), number("--carrier", carrier)
-    results = Results(job, circuit)
-    end = "_capability" if capability else "_limits"
-    results.will_write(f"{end}.csv", lambda file: found.to_csv(file))
-    results.will_draw(f"{end}.png", lambda: found.plot())
-    found: Any
-    if capability:
-        from fingerspice.studies.limits import capability as friction_map
+        study.grid_of(points, span)
+    largest, tone = number("--limit", limit, positive=True), number("--carrier", carrier, positive=True)
+    if capability and largest is None:
+        # The peak of the deck's own sources.
+        stop, own = circuit.tran.stop if circuit.tran else 1.0, circuit.by_device("V")
+        largest = max((e.waveform.peak(0.0, stop) for e in own if e.waveform is not None), default=0.0)
 
-        if largest is None:
-            # The peak of the deck's own sources.
-            stop, own = circuit.tran.stop if circuit.tran else 1.0, circuit.by_device("V")
-            largest = max((e.waveform.peak(0.0, stop) for e in own if e.waveform is not None), default=0.0)
-        with paced("looking for the largest amplitudes") as update:
-            found = friction_map(circuit, largest, carrier=tone, progress=update)
-    else:
-        with paced("looking for folds") as update:
-            found = fold_limits(circuit, points=points, span=span, progress=update)
-    job.answer.update(**({"capability": found.to_dict()} if capability else found.to_dict()))
-    job.answer.give(lambda: str(found), results.ready())
+    def found() -> Any:
+        with paced(f"looking for {'the largest amplitudes' if capability else 'folds'}") as update:
+            if largest is not None:
+                return study.capability(circuit, largest, carrier=tone, progress=update)
+            return study.fold_limits(circuit, points=points, span=span, progress=update)
+
+    key = "capability" if capability else ""
+    end = key or "limits"
+    _report(job, circuit, {f"_{end}.csv": "to_csv", f"_{end}.png": "plot"}, found, key)
 
 
 def fit(
     job: Job,
     table: Annotated[Path, Argument(metavar="DATA.csv", help="Conditions and a measured mean, with units.")],
-    free: Annotated[str, Option(metavar="PATH,...", help="Parameters to fit: Xgap.d,Xgap.r.")],
-    groups: Annotated[
-        str | None, Option(metavar="COLUMN:PATH,...", help="Free parameters of each group: finger:Xgap.d.")
-    ] = None,
-    average: Annotated[str, Option(help="periodic (periodic state) or run (over the deck's run).")] = "periodic",
-    skin: Annotated[str, Option(help="own, or follow: a SKIN's f is the source's frequency.")] = "own",
-    profile: Annotated[bool, Option("--profile", help="Profile likelihood of every parameter.")] = False,
+    free: Annotated[str, "Parameters to fit: Xgap.d,Xgap.r.", "PATH,..."],
+    groups: Annotated[str | None, "Free parameters of each group: finger:Xgap.d.", "COLUMN:PATH,..."] = None,
+    average: Annotated[str, "periodic (periodic state) or run (over the deck's run)."] = "periodic",
+    skin: Annotated[str, "own, or follow: a SKIN's f is the source's frequency."] = "own",
+    profile: Annotated[bool, "Profile likelihood of every parameter."] = False,
 ) -> None:
     """Fit parameters of DECK to measured means or a signal over time: values with intervals, CSV and picture.
 
     Example:
-
       fingerspice fit circuits/measured.csv circuits/fingerpad.cir --free Xgap.d,Xgap.r --skin follow
     """
-    from fingerspice.studies.fit.circuitfit import fit as find
-
     grouped = None
     if groups is not None:
-        column, _, paths = groups.partition(":")
-        if not (column.strip() and paths.strip()):
-            allowed = "a column of the data and paths, such as finger:Xgap.d,Xgap.r"
-            raise InputError(f"--groups is {groups!r}; allowed: {allowed}")
-        grouped = {column.strip(): [path.strip() for path in paths.split(",")]}
+        column, _, paths = (part.strip() for part in groups.partition(":"))
+        allowed = "a column of the data and paths, such as finger:Xgap.d,Xgap.r"
+        require(bool(column and paths), "--groups", repr(groups), allowed)
+        grouped = {column: _split(paths)}
     circuit = job.read()
-    results = Results(job, circuit)
-    results.will_write("_fit.csv", lambda file: found.to_csv(file))
-    results.will_draw("_fit.png", lambda: found.plot())
-    found = find(
-        circuit, table, [path.strip() for path in free.split(",")], groups=grouped, average=average, skin=skin,
-        charge_law=job.charge_law, profiles=profile,
-    )  # fmt: skip
-    job.answer.update(**found.to_dict())
-    job.answer.give(lambda: str(found), results.ready())
+    options: dict[str, Any] = {"groups": grouped, "average": average, "skin": skin, "charge_law": job.charge_law}
+    files = {"_fit.csv": "to_csv", "_fit.png": "plot"}
+    _report(job, circuit, files, lambda: fs.fit(circuit, table, _split(free), **options, profiles=profile))
 
 
 def fit_contact(
     job: Job,
     tables: Annotated[list[Path], Argument(metavar="DATA.csv ...", help="Areas and friction forces, with units.")],
-    free: Annotated[
-        str | None, Option(metavar="NAME,...", help="alpha,m_exp,beta,n_exp,mu,c2; those that the data tell.")
-    ] = None,
-    finger: Annotated[str | None, Option(metavar="GAP", help="Which of several GAPs.")] = None,
-    profile: Annotated[bool, Option("--profile", help="Profile likelihood of every parameter.")] = False,
+    free: Annotated[str | None, "alpha,m_exp,beta,n_exp,mu,c2; those that the data tell.", "NAME,..."] = None,
+    finger: Annotated[str | None, "Which of several GAPs.", "GAP"] = None,
+    profile: Annotated[bool, "Profile likelihood of every parameter."] = False,
 ) -> None:
     """Fit the contact of DECK's finger to measured ridge areas and friction forces: values with intervals.
 
     Example:
-
       fingerspice fit-contact circuits/contact.csv circuits/indentation.csv circuits/fingerpad.cir
     """
-    from fingerspice.studies.fit.contactfit import fit_contact as find
-
     circuit = job.read()
-    names = None if free is None else [one.strip() for one in free.split(",")]
-    found = find(circuit, list(tables), names, finger=finger, profiles=profile)
-    results = Results(job, circuit)
-    results.will_write("_contact.csv", found.to_csv)
-    results.will_draw("_contact.png", found.plot)
-    job.answer.update(**found.to_dict())
-    job.answer.give(lambda: str(found), results.ready())
+    names = None if free is None else _split(free)
+    files = {"_contact.csv": "to_csv", "_contact.png": "plot"}
+    _report(job, circuit, files, lambda: fs.fit_contact(circuit, tables, names, finger=finger, profiles=profile))
+
+
+def _split(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",")]
 
 
 def sweep(
     job: Job,
     file: Annotated[Path, Argument(metavar="SWEEP.toml", help="Deck, parameters and outputs.")],
     store: Annotated[
-        Path | None,
-        Option(metavar="OUT.zarr", help="Write piece by piece to a Zarr store, which a second call goes on with."),
+        Path | None, "Write piece by piece to a Zarr store, which a second call goes on with.", "OUT.zarr"
     ] = None,
-    workers: Annotated[int | None, Option(metavar="N", help="With --store: in N processes.")] = None,
-    scheduler: Annotated[
-        str | None, Option(metavar="ADDRESS", help="With --store: by the workers of a Dask scheduler.")
-    ] = None,
-    shard: Annotated[
-        str | None, Option(metavar="I/M", help="With --store: the I-th of M parts, from 1/M to M/M.")
-    ] = None,
+    workers: Annotated[int | None, "With --store: in N processes.", "N"] = None,
+    scheduler: Annotated[str | None, "With --store: by the workers of a Dask scheduler.", "ADDRESS"] = None,
+    shard: Annotated[str | None, "With --store: the I-th of M parts, from 1/M to M/M.", "I/M"] = None,
 ) -> None:
     """Run a grid or a random population of parameters: table, NetCDF, picture, and what the variance comes from.
 
     Example:
-
       fingerspice sweep circuits/population.toml
     """
     from fingerspice.plots.picture import plot_sweep
@@ -223,12 +182,8 @@ def sweep(
     options = {key: asked[key] for key in ("n", "seed", *_OPTIONS) if key in asked}
     if store is None:
         for option, given in (("workers", workers), ("scheduler", scheduler), ("shard", shard)):
-            if given is not None:
-                raise InputError(f"--{option} is given without --store; allowed: --store OUT.zarr, too")
-        results = Results(job, circuit)
-        own = {"deck": circuit.text}
-        results.will_write(".nc", lambda path: _written(found, indices, own | results.about, path))
-        results.will_draw(".png", lambda: plot_sweep(found, output, indices))
+            require(given is None, f"--{option}", "given without --store", "--store OUT.zarr, too")
+        results = Results(job, circuit, ".nc", ".png")
     else:
         if asked.get("indices"):
             raise InputError(f"{file}: indices = true and --store are both given; allowed: one of them")
@@ -241,7 +196,7 @@ def sweep(
     known = {"sets": about.get("sets", []), "n": about.get("n"), "seed": about.get("seed")}
     answer.update(scenes=int(found.status.size), **known)
     if store is not None:
-        answer.data["files"].append(str(store))
+        answer["files"].append(str(store))
         answer.update(store={key: about[key] for key in ("chunks", "chunks_found", "chunks_missing", "seconds")})
         whole = not about["chunks_missing"] and found.status.size <= populations.MOST_SCENES
         said = [_told(answer, found)] if whole else []
@@ -257,7 +212,10 @@ def sweep(
         shares = populations.ranking(indices, output)
         answer.update(shares=shares)
         said.append(_shared(shares, output))
-    answer.give(lambda: "\n\n".join(said), results.ready())
+    own = {"deck": circuit.text, **results.about}
+    plot = partial(plot_sweep, found, output, indices)
+    makes: Makes = {".nc": partial(_written, found, indices, own), ".png": plot}
+    results.give(lambda: "\n\n".join(said), makes)
 
 
 def _told(answer: Answering, found: Any) -> str:
@@ -285,9 +243,8 @@ def _read(file: Path) -> tuple[dict[str, Any], Path]:
         if key not in _KEYS:
             raise InputError(f"{file}: unknown key {key!r}; allowed: {', '.join(_KEYS)}")
     for key, kind in (("deck", str), ("parameters", dict)):
-        if not isinstance(asked.get(key), kind) or not asked[key]:
-            what = "the deck's file name" if key == "deck" else "a table such as [parameters] with Xgap.d = {...}"
-            raise InputError(f"{file}: {key} is {asked.get(key)!r}; allowed: {what}")
+        what = "the deck's file name" if key == "deck" else "a table such as [parameters] with Xgap.d = {...}"
+        require(isinstance(asked.get(key), kind) and asked[key] != kind(), f"{file}: {key}", repr(asked.get(key)), what)
     folder = file.resolve().parent
     deck = (folder / asked["deck"]).resolve()
     if not deck.is_relative_to(folder):
@@ -308,8 +265,8 @@ def _parameter(path: str, one: Any) -> Any:
     if isinstance(one, int | float) and not isinstance(one, bool):
         return float(one)
     allowed = "a number, or one of " + ", ".join(f"{{{kind} = {what}}}" for kind, what in _KINDS.items())
-    if not isinstance(one, Mapping) or len(one) != 1 or next(iter(one)) not in _KINDS:
-        raise InputError(f"{path} is {one!r}; allowed: {allowed}")
+    known = isinstance(one, Mapping) and len(one) == 1 and next(iter(one)) in _KINDS
+    require(known, path, repr(one), allowed)
     kind, numbers = next(iter(one.items()))
     allowed = _KINDS[kind]
     good = isinstance(numbers, list) and len(numbers) > 0 and all(isinstance(x, int | float) for x in numbers)
@@ -344,11 +301,11 @@ def _shared(rows: list[dict[str, Any]], output: str) -> str:
         told = f"{row['total']:.2f} ({row['low']:.2f}-{row['high']:.2f})"
         lines.setdefault(place, {})[row["parameter"]] = told
     wide = max(len(place) for place in lines) + 2 * any(lines)
-    head = " " * wide + "".join(f"{name:>{width}}" for name, width in widths.items())
-    body = [
-        f"{place:<{wide}}" + "".join(f"{told[name]:>{width}}" for name, width in widths.items())
-        for place, told in lines.items()
-    ]
+
+    def line(place: str, cells: Mapping[str, str]) -> str:
+        return f"{place:<{wide}}" + "".join(f"{cells[name]:>{width}}" for name, width in widths.items())
+
+    head, body = line("", {name: name for name in widths}), [line(place, told) for place, told in lines.items()]
     most = "; ".join(
         name + ("" if len(first) == 1 else f" ({places[0]}{f' to {places[-1]}' if len(places) > 1 else ''})")
         for name, places in first.items()

@@ -1,30 +1,21 @@
-"""What the command line says: on the terminal, without control characters of a deck and tracebacks, and with `--json`.
-
-The answers of `--json` have the same keys for every outcome (docs/json.md).
-"""
+"""What the command line says, without control characters and tracebacks, and its answers with `--json`."""
 
 from __future__ import annotations
 
 import json
-import logging
 import os
 import sys
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from fingerspice import __version__
+import fingerspice as fs
 from fingerspice.base.errors import FingerspiceWarning, InputError, printable
 from fingerspice.results.outcome import SolveError
 
-if TYPE_CHECKING:
-    from fingerspice.results.solution import Solution
-
-
-Answer = dict[str, Any]
-#: Keys of every answer.
+#: Keys of every answer, whatever its outcome (docs/json.md).
 COMMON = (
     *("version", "command", "success", "status", "message", "failure", "warnings", "files"),
     *("title", "overrides", "sets", "charge_law", "method", "rtol"),
@@ -43,27 +34,23 @@ OWN = {
         "fit": "parameters correlation groups signal count residual_rms objective objectives notes profiles",
         "fit-contact": "gap parameters correlation relations objective notes profiles",
         "sweep": "scenes failed n seed figures shares store",
-        "export": "",
-        "figures": "",
-        "explore": "url",
-        "sets": "parameter_sets",
-        "check": "chunks",
+        "export": "", "figures": "", "explore": "url", "sets": "parameter_sets", "check": "chunks",
     }.items()
-}
+}  # fmt: skip
 #: Keys that are options, too.
 AS_ASKED = ("charge_law", "method", "rtol", "area", "skin")
 #: Figures of a signal; a figure that a signal lacks is null.
 FIGURES = ("min", "max", "peak", "mean", "rms", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
 
 
-def blank(command: str | None) -> Answer:
+def blank(command: str | None) -> dict[str, Any]:
     """An answer with all its keys, before any result is known."""
     keys = (*COMMON, *OWN.get(command or "", ()))
     empty = {"success": False, "warnings": [], "files": [], "overrides": {}, "sets": []}
-    return {**dict.fromkeys(keys), **empty, "version": __version__, "command": command}
+    return {**dict.fromkeys(keys), **empty, "version": fs.__version__, "command": command}
 
 
-def of_run(solution: Solution) -> Answer:
+def of_run(solution: fs.Solution) -> dict[str, Any]:
     """The part of an answer that describes a run: its method and error, and figures of every signal in SI units."""
     from fingerspice.results.record import SIGNALS
 
@@ -98,97 +85,69 @@ def say_json(data: dict[str, Any]) -> None:
 
 
 def _print(text: str, end: str) -> None:
-    """Print and flush; a full disk is an `InputError`, and a closed pipe (head, less) is not an error."""
+    """Print and flush; a full disk is an `InputError`."""
     try:
         print(text, end=end, flush=True)
     except OSError as error:
         # Redirect stdout, since Python flushes it again at exit and would report the error a second time.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
-            raise InputError(f"cannot write to the standard output: {error.strerror}") from None
+        raise InputError(f"cannot write to the standard output: {error.strerror}") from None
 
 
 def complain(text: str) -> None:
-    """Write a line to stderr; a closed stderr is not an error."""
-    try:
-        print(f"fingerspice: {printable(text, LONGEST_LINE)}", file=sys.stderr, flush=True)
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+    """Write a line to stderr."""
+    print(f"fingerspice: {printable(text, LONGEST_LINE)}", file=sys.stderr, flush=True)
 
 
-class _Notes(logging.Handler):
-    """Writes the package's log messages, such as a note that it compiles, as lines to stderr."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        complain(f"note: {record.getMessage()}")
-
-
-_NOTES = _Notes()
-
-
-def listen() -> None:
-    """Show the package's log messages as lines on stderr."""
-    logger = logging.getLogger("fingerspice")
-    logger.setLevel(logging.INFO)
-    logger.addHandler(_NOTES)
-
-
-def is_input(error: Exception) -> bool:
-    """Whether the user has to change the input or the request."""
-    return isinstance(error, (InputError, MemoryError))
-
-
-def said_of(error: Exception) -> str:
-    """An error in one sentence."""
-    if isinstance(error, (InputError, SolveError)):
-        return str(error)
+def outcome(error: Exception) -> tuple[int, str, str]:
+    """The exit code of a command that ended with an error, its status, and the error in one sentence."""
+    if isinstance(error, SolveError):
+        return 1, error.failure.status.name, error.message
+    if isinstance(error, InputError):
+        return 2, "BAD_INPUT", str(error)
     if isinstance(error, MemoryError):
-        return "not enough memory; allowed: fewer outputs (a longer TSTEP, or TSTART), or a shorter run"
+        allowed = "fewer outputs (a longer TSTEP, or TSTART), or a shorter run"
+        return 2, "BAD_INPUT", f"not enough memory; allowed: {allowed}"
     place = traceback.extract_tb(error.__traceback__)[-1]
     said = f"{type(error).__name__} in {Path(place.filename).name}:{place.lineno}, {error}"
-    return f"this is a fault of fingerspice, please report it with the deck ({said})"
+    return 1, "FAULT", f"this is a fault of fingerspice, please report it with the deck ({said})"
 
 
-class Answering:
+class Answering(dict[str, Any]):
     """The answer of one command, collected while it runs and printed at its end as text or JSON.
 
     It is used as a context. Each warning becomes one line on stderr and a part of the answer. If JSON is wanted, it is
     printed even when the command ends with an error. Of the options given it has some as they are, until more is known.
     """
 
-    def __init__(self, command: str, as_json: bool, **given: Any) -> None:
-        self.as_json, self.data = as_json, blank(command)
-        self.data |= {key: given[key] for key in AS_ASKED if key in given and key in self.data}
-        self._warnings = warnings.catch_warnings()
+    def __init__(self, command: str, **given: Any) -> None:
+        super().__init__(blank(command))
+        self.json_wanted = given["json"]
+        self.update({key: given[key] for key in AS_ASKED if key in given and key in self})
+        self._warnings = warnings.catch_warnings(action="always", category=FingerspiceWarning)
 
     def __enter__(self) -> Answering:
         self._warnings.__enter__()
-        warnings.simplefilter("always", FingerspiceWarning)
         warnings.showwarning = self._show
         return self
 
     def _show(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         text = str(message)
-        if text not in self.data["warnings"]:
-            self.data["warnings"].append(text)
+        if text not in self["warnings"]:
+            self["warnings"].append(text)
             complain(f"warning: {text}")
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: Any) -> None:
         self._warnings.__exit__(kind, error, None)
-        if not self.as_json or not (error is None or isinstance(error, Exception)):
+        if not self.json_wanted or not (error is None or isinstance(error, Exception)):
             return
         if error is None:
-            self.data.update(success=True, status="SUCCESS", message="success")
-        elif isinstance(error, SolveError):
-            failure = error.failure
-            self.data.update(status=failure.status.name, message=error.message, failure=failure.to_dict())
+            self.update(success=True, status="SUCCESS", message="success")
         else:
-            self.data.update(status="BAD_INPUT" if is_input(error) else "FAULT", message=said_of(error))
-        say_json(self.data)
-
-    def update(self, **found: Any) -> None:
-        """Set keys of the answer."""
-        self.data.update(found)
+            _, status, said = outcome(error)
+            failure = error.failure.to_dict() if isinstance(error, SolveError) else None
+            self.update(status=status, message=said, failure=failure)
+        say_json(self)
 
     def give(self, text: Callable[[], str], writes: Sequence[Write] = ()) -> None:
         """Write files, then print the result as text unless JSON is wanted.
@@ -196,23 +155,11 @@ class Answering:
         Each of `writes` writes a file and returns its path, or None for no file. If one cannot be written, the text is
         still printed before the error is raised.
         """
-        files: list[str] = self.data["files"]
-        failed = None
+        files: list[str] = self["files"]
         try:
             for write in writes:
                 files += [str(file)] if (file := write()) is not None else []
-        except InputError as error:
-            failed = error
-        said = [*filter(None, [text()]), *(f"wrote {file}" for file in files)]
-        if said and not self.as_json:
-            say("\n".join(said))
-        if failed is not None:
-            raise failed
-
-
-def answer_usage(message: str) -> None:
-    """Print the JSON answer to a command line that typer refused, if it asks for JSON."""
-    words = sys.argv[1:]
-    if "--json" in words:
-        command = next((word for word in words if word in OWN), None)
-        say_json({**blank(command), "status": "BAD_INPUT", "message": message})
+        finally:
+            said = [*filter(None, [text()]), *(f"wrote {file}" for file in files)]
+            if said and not self.json_wanted:
+                say("\n".join(said))

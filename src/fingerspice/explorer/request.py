@@ -1,7 +1,4 @@
-"""Sliders: every parameter of every element, with a range in which it makes sense; and the menu of waveforms.
-
-What the page asks for: its values checked, and the circuit and the times of its run made of them.
-"""
+"""The page's sliders and menu of waveforms; its requests, checked, with the circuit and the times made of them."""
 
 from __future__ import annotations
 
@@ -18,19 +15,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import fingerspice as fs
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError
 from fingerspice.base.units import parse_number, spice_text
-from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit, nearest
+from fingerspice.circuit.circuit import CHARGE_LAWS, nearest
 from fingerspice.circuit.describe import MEANINGS_OF_WAVEFORMS
 from fingerspice.circuit.devices import ParameterSpec
 from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import SLABS, count_of, driving_sources
-from fingerspice.netlist.netlist import parse_netlist, source_from_text
-from fingerspice.results.solution import Solution
-from fingerspice.waveforms.periodic import PWL, Sawtooth, Square, Triangle
-from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import AM, DC, Sine, Sum, Waveform, require
+from fingerspice.netlist.netlist import source_from_text
+from fingerspice.waveforms.waveform import require
 
 #: Numbers of waveforms that the page shows at once; the others it shows on request.
 _FIRST_OF_SOURCES = (
@@ -48,33 +43,32 @@ _LARGEST_VOLTAGE = 400.0
 _PREFIXED = ("m", "V", "A", "ohm", "ohm m", "F", "Hz", "s", "V/m")
 
 
-def sliders(base: Circuit, shown: Circuit) -> list[dict[str, Any]]:
+def sliders(base: fs.Circuit, shown: fs.Circuit) -> list[dict[str, Any]]:
     """Sliders by element, of sources, gap and layers first; values of the deck's `base` set the ranges, which stay."""
     driving = {e.name for e in driving_sources(shown)}
     before = {e.name: e for e in base.elements}
     order = {"V": 0, "I": 0, "GAP": 1, "LAYER": 2, "SLAB": 2, "SKIN": 3, "SKIN_DISPERSIVE": 3}
     groups = []
     for e in sorted(shown.elements, key=lambda e: order.get(e.device, 4)):
-        old, drives, rows = before[e.name], e.name in driving, list[tuple[Any, ...]]()
-        for spec in e.spec.parameters:
-            limits = _of_parameter(spec, old.values.get(spec.name, e.values[spec.name]))
-            rows.append((spec.name, spec.unit, e.values[spec.name], *limits, spec.first, spec.meaning))
-        same = type(old.waveform) is type(e.waveform)
-        for name, unit in type(e.waveform).units.items() if e.waveform is not None else ():
-            value = getattr(e.waveform, name, None)
-            if isinstance(value, (int, float)):
-                own = getattr(old.waveform, name) if same else value
+        old, specs, found = before[e.name], {p.name: p for p in e.spec.parameters}, []
+        for name, one in e.parameters.items():
+            value, unit, spec = one.value, one.unit, specs.get(name)
+            if spec is not None:
+                limits, first, meaning = _of_parameter(spec, old.values.get(name, value)), spec.first, spec.meaning
+            elif isinstance(value, (int, float)):
+                own = getattr(old.waveform, name) if type(old.waveform) is type(e.waveform) else value
                 # A source that does not drive is on an area node, and gives mm^2.
+                drives = e.name in driving
                 limits = _of_waveform(name, unit, own) if drives else (0.1 * abs(own), 10.0 * abs(own), False)
                 unit = unit if unit != "V" else "mm^2" if not drives else "A" if e.device == "I" else "V"
-                rows.append(
-                    (name, unit, value, *limits, name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, ""))
-                )
-        found = [
-            {"path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
-             "text": value_text(value, unit), "low": low, "high": high, "log": log, "first": first, "meaning": meaning}
-            for name, unit, value, low, high, log, first, meaning in rows
-        ]  # fmt: skip
+                first, meaning = name in _FIRST_OF_SOURCES, MEANINGS_OF_WAVEFORMS.get(name, "")
+            else:
+                continue
+            found.append({
+                "path": f"{e.name}.{name}", "unit": unit, "value": value if math.isfinite(value) else None,
+                "text": value_text(value, unit), "low": limits[0], "high": limits[1], "log": limits[2],
+                "first": first, "meaning": meaning,
+            })  # fmt: skip
         if found:
             groups.append({"element": e.name, "device": e.device, "what": e.spec.what or e.device, "sliders": found})
     return groups
@@ -118,8 +112,6 @@ def _of_waveform(name: str, unit: str, value: float) -> tuple[float, float, bool
     return 0.0, (5.0 * abs(value) or (0.1 if unit == "s" else 1000.0)), False
 
 
-#: Largest number of characters of a source's text.
-LONGEST = 20_000
 _NAMED = re.compile(r"(?:\s*([\w.]+)\s*=)?\s*(.*)", re.DOTALL)
 #: The source that stands for the file dropped on the page.
 RECORDING = "RECORDING"
@@ -164,26 +156,26 @@ WAVEFORMS: dict[str, tuple[str, tuple[Argument, ...]]] = {
     "DC": ("Constant", (_usual("level", 200.0, "V"),)),
 }  # fmt: skip
 #: Waveforms that the page can say as text; their numbers are those of the menu, one of them by another name.
-_TEXTS = {Sine: "SIN", Square: "SQUARE", Triangle: "TRIANGLE", Sawtooth: "SAWTOOTH", AM: "AM", DC: "DC"}
+_TEXTS = {"Sine": "SIN", "Square": "SQUARE", "Triangle": "TRIANGLE", "Sawtooth": "SAWTOOTH", "AM": "AM", "DC": "DC"}
 _FIELDS = {"envelope": "modulation"}
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
     """Nothing inside warns: the scene itself says what there is to say."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         yield
 
 
-def read_source(text: str, circuit: Circuit, recording: Recording | None = None) -> tuple[str, Waveform, float | None]:
+def read_source(
+    text: str, circuit: fs.Circuit, recording: Recording | None = None
+) -> tuple[str, fs.Waveform, float | None]:
     """The source's name, its new waveform, and the gain (V) of one that is a recording.
 
     They are read from text such as ``SQUARE(200 100)`` or ``Vdrive=AM(200 5k 50)``. No file is read, whatever the text
     names; ``RECORDING(150)`` is the recording given.
     """
-    if len(text) > LONGEST:
-        raise InputError(f"the source has {len(text):,} characters; allowed: at most {LONGEST:,}")
+    text = _read("source", text).strip()
     names = {e.name.lower(): e.name for e in driving_sources(circuit)}
     given, said = _NAMED.fullmatch(text).groups()  # type: ignore[union-attr]
     given = given or next(iter(names), "")
@@ -195,8 +187,7 @@ def read_source(text: str, circuit: Circuit, recording: Recording | None = None)
         with quiet():
             return name, source_from_text(said, circuit, files=False), None
     words = recorded[1].replace(",", " ").split()
-    if len(words) != 1:
-        raise InputError(f"{RECORDING} is given {len(words)} numbers; allowed: {RECORDING}(gain)")
+    require(len(words) == 1, RECORDING, f"given {len(words)} numbers", f"{RECORDING}(gain)")
     try:
         gain = parse_number(words[0])
     except ValueError as error:
@@ -206,9 +197,9 @@ def read_source(text: str, circuit: Circuit, recording: Recording | None = None)
     return name, recording.waveform(gain), gain
 
 
-def text_of(waveform: Waveform) -> str | None:
+def text_of(waveform: fs.Waveform) -> str | None:
     """The text that `read_source` reads as this waveform; None of one for which the page has no function."""
-    kind = _TEXTS.get(type(waveform))
+    kind = _TEXTS.get(type(waveform).__name__)
     if kind is None:
         return None
     names = [_FIELDS.get(a.name, a.name) for a in WAVEFORMS[kind][1]]
@@ -224,8 +215,14 @@ POINTS, MOST_POINTS = 2000, 12_000
 _OF_OSCILLATION, _OF_PIECE = 16, 2
 #: Most numbers of a recording: four seconds at 48 kHz.
 MOST_SAMPLES = 200_000
-_LARGEST, _LONGEST_SETS = 1e300, 2000
+_LARGEST = 1e300
 _AREAS = ("coupled", "mean", "frozen")
+#: Texts of a request with what is allowed and their largest length, words to choose from, and ranges of numbers.
+_WORDS = {
+    "deck": ("the text of a netlist", LONGEST_DECK), "source": ("text such as SQUARE(200 100)", 20_000),
+    "sets": ("names with commas", 2000),
+}  # fmt: skip
+_CHOICES = {"charge_law": CHARGE_LAWS, "skin": ("own", "follow", "dispersive")}
 _RANGES = {"rtol": (1e-12, 0.1), "periods": (0.01, MOST_PERIODS), "last": (0.01, MOST_PERIODS)}
 
 
@@ -237,11 +234,11 @@ class Recording(NamedTuple):
     times: FloatArray | None  # Times of a table, s; None of a recording
     rate: float = 1.0  # Samples per second of a recording
 
-    def waveform(self, gain: float) -> Waveform:
+    def waveform(self, gain: float) -> fs.Waveform:
         """The values times the gain (V) as a source."""
         if self.times is not None:
-            return PWL(tuple(self.times.tolist()), tuple((gain * self.values).tolist()))
-        return Samples(gain * self.values, self.rate)
+            return fs.PWL(tuple(self.times.tolist()), tuple((gain * self.values).tolist()))
+        return fs.Samples(gain * self.values, self.rate)
 
     def python(self, gain: float) -> str:
         """The same source from its file, as Python."""
@@ -256,21 +253,14 @@ _NAMES = ("deck", "overrides", "source", "charge_law", "area", "skin", "rtol", "
 def _read(name: str, given: Any) -> Any:
     """A value of a request, checked; texts are as in a link."""
     match name:
-        case "deck":
-            require(isinstance(given, str), name, f"of type {type(given).__name__}", "the text of a netlist")
-            require(len(given) <= LONGEST_DECK, name, f"{len(given):,} characters long", f"at most {LONGEST_DECK:,}")
+        case "deck" | "source" | "sets":
+            allowed, longest = _WORDS[name]
+            require(isinstance(given, str), name, f"of type {type(given).__name__}", allowed)
+            require(len(given) <= longest, name, f"{len(given):,} characters long", f"at most {longest:,}")
             return given
-        case "source":
-            require(isinstance(given, str), name, f"of type {type(given).__name__}", "text such as SQUARE(200 100)")
-            return given.strip()
         case "charge_law" | "skin":
-            allowed = CHARGE_LAWS if name == "charge_law" else ("own", "follow", "dispersive")
-            require(given in allowed, name, _short(given), " or ".join(allowed))
+            require(given in _CHOICES[name], name, _short(given), " or ".join(_CHOICES[name]))
             return given
-        case "sets":
-            good = isinstance(given, str) and len(given) <= _LONGEST_SETS
-            require(good, name, _short(given), f"names with commas, at most {_LONGEST_SETS:,} characters")
-            return tuple(filter(None, map(str.strip, given.split(","))))
         case "area" if given in _AREAS:
             return str(given)
         case "area":
@@ -282,7 +272,7 @@ def _read(name: str, given: Any) -> Any:
         case "overrides":
             require(isinstance(given, dict), name, type(given).__name__, "an object from paths to numbers")
             require(len(given) <= MOST_OVERRIDES, name, f"{len(given):,} values", f"at most {MOST_OVERRIDES}")
-            return {path: _override(path, value) for path, value in given.items()}
+            return {path: _override(path, x) for path, x in given.items()}
         case "recording":
             return _recording(given)
     least, most = _RANGES[name]
@@ -329,7 +319,7 @@ def _numbers(what: str, given: Any) -> FloatArray:
     return values
 
 
-def asked_by(solution: Solution) -> dict[str, Any]:
+def asked_by(solution: fs.Solution) -> dict[str, Any]:
     """How a run was made, as far as a request can say it."""
     area: str | float = solution.area_mode
     if solution.area_mode not in _AREAS and solution.area is not None:
@@ -363,17 +353,17 @@ class Asked:
     periods: float = 5.0
     last: float | None = None  # How many of the last periods are shown; None for all of the run
     recording: Recording | None = None  # The file dropped on the page, for the source ``RECORDING(gain)``
-    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME``; they change nothing, and
-    # the page shows their caveats
-    sets: tuple[str, ...] = ()
+    # Named sets whose values are in `overrides` and `source`, as ``NAME`` or ``ELEMENT=NAME`` with commas; they change
+    # nothing, and the page shows their caveats
+    sets: str = ""
 
-    base: Circuit  # The deck's
-    circuit: Circuit  # With all changes
-    replaced: tuple[str, Waveform] | None = None  # What `source` says: the name of the source, and its new waveform
+    base: fs.Circuit  # The deck's
+    circuit: fs.Circuit  # With all changes
+    replaced: tuple[str, fs.Waveform] | None = None  # What `source` says: the name of the source, and its new waveform
     gain: float | None = None  # V, of a source that is a recording
     unknown: list[str]  # Sentences about names that mean nothing here
 
-    def __init__(self, given: Any, own: Circuit | None = None) -> None:
+    def __init__(self, given: Any, own: fs.Circuit | None = None) -> None:
         keys = f"an object with the keys {', '.join(_NAMES)}"
         require(isinstance(given, dict), "the request", type(given).__name__, keys)
         for name in _NAMES:
@@ -388,26 +378,26 @@ class Asked:
                 f"at most {MOST_ELEMENTS} on this page"
             )
         circuit = base
-        if self.source:
+        if self.source.strip():
             name, waveform, self.gain = read_source(self.source, circuit, self.recording)
             self.replaced = name, waveform
             circuit = circuit.replace({name: waveform})
         paths = {path.lower(): path for path in circuit.parameters}
-        known = {paths[path.lower()]: x for path, x in self.overrides.items() if path.lower() in paths}
-        lost = [path for path in self.overrides if path.lower() not in paths]
         self.unknown = [_unknown("name", str(name), _NAMES) for name in given if name not in _NAMES]
+        lost = [path for path in self.overrides if path.lower() not in paths]
         self.unknown += [_unknown("parameter", path, paths.values()) for path in lost]
-        circuit = circuit.replace(known) if known else circuit
+        self.overrides = {paths[path.lower()]: x for path, x in self.overrides.items() if path.lower() in paths}
+        circuit = circuit.replace(self.overrides) if self.overrides else circuit
         self.base, self.circuit = base, circuit
         fundamental = self.waveform.fundamental if self.skin == "follow" else None
         if fundamental is not None:
             self.circuit = circuit.replace({f"{e.name}.f": fundamental.frequency for e in circuit.by_device("SKIN")})
 
     @cached_property
-    def waveform(self) -> Waveform:
+    def waveform(self) -> fs.Waveform:
         """All sources as one waveform."""
         waveforms = network_of(self.circuit).waveforms
-        return waveforms[0] if len(waveforms) == 1 else Sum(waveforms)
+        return waveforms[0] if len(waveforms) == 1 else fs.Sum(waveforms)
 
     @cached_property
     def times(self) -> tuple[float, float, float | None]:
@@ -446,14 +436,14 @@ class Asked:
 
 
 @lru_cache(maxsize=32)
-def _parsed(text: str) -> Circuit:
+def _parsed(text: str) -> fs.Circuit:
     """The circuit of a text from the page, which may include no file."""
-    circuit = parse_netlist(text)
+    circuit = fs.parse_netlist(text)
     driving_sources(circuit)
     return circuit
 
 
-def _dispersive(circuit: Circuit) -> Circuit:
+def _dispersive(circuit: fs.Circuit) -> fs.Circuit:
     """The circuit with the data of every skin at all frequencies."""
     elements = list(circuit.elements)
     for i, e in enumerate(elements):

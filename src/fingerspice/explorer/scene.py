@@ -6,6 +6,7 @@ import dataclasses
 import math
 import re
 import time
+import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,23 +16,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fingerspice import __version__
+import fingerspice as fs
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.units import format_si, spice_text
-from fingerspice.circuit.circuit import Circuit, Element, Tran
+from fingerspice.base.units import format_si
+from fingerspice.circuit.circuit import Element, Tran
 from fingerspice.circuit.describe import in_force, remembering
 from fingerspice.circuit.statespace import driving_sources
 from fingerspice.explorer.request import WAVEFORMS, Asked, quiet, read_source, sliders, text_of, value_text
-from fingerspice.netlist.netlist import read_netlist
 from fingerspice.plots.drawing import save
-from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
-from fingerspice.results.solution import Solution
-from fingerspice.sets.parameters import parameters
-from fingerspice.solve.simulation import simulate
-from fingerspice.studies.comparison import large_signal
-from fingerspice.studies.export import export_netlist
-from fingerspice.waveforms.waveform import Sine, Waveform
 
 #: Traces of each kind, and harmonics.
 MOST_TRACES, HARMONICS = 8, 20
@@ -42,7 +35,7 @@ _WITHOUT_GAP = ("u_source", "u_layer", "v", "area")
 _FIGURES = ("mean", "max", "min", "mean_periodic")
 
 
-def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
+def scene(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any]:
     """Run what the page asks for, for the circuit `own` if the page was opened for it, which stands for its own text.
 
     The keys of the request are those of `request.Asked`; only ``deck`` is needed. The answer has ``ok``, ``status``
@@ -55,7 +48,7 @@ def scene(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
     return traces | rest
 
 
-def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[str, Any]]:
+def parts(given: dict[str, Any], own: fs.Circuit | None = None) -> Iterator[dict[str, Any]]:
     """The answer of `scene` without ``figures``, ``harmonics`` and ``stacks``, to be drawn at once, and then these."""
     answer: dict[str, Any] = {"ok": False, "status": "BAD_INPUT", "message": "", "sliders": [], "traces": []}
     solution = None
@@ -72,7 +65,7 @@ def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[st
             answer |= _traces(asked, solution)
         except InputError as error:
             answer["message"] = str(error)
-        except SolveError as error:
+        except fs.SolveError as error:
             answer |= {"status": error.failure.status.name, "message": error.message, "failed_at": error.failure.t}
         except MemoryError:
             answer["message"] = "not enough memory for this scene; allowed: fewer periods or elements"
@@ -95,8 +88,7 @@ def parts(given: dict[str, Any], own: Circuit | None = None) -> Iterator[dict[st
 @contextmanager
 def _noticing(answer: dict[str, Any]) -> Iterator[None]:
     """Add the warnings that are given inside to those of an answer, each once."""
-    with warnings.catch_warnings(record=True) as noticed:
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(record=True, action="ignore") as noticed:
         warnings.simplefilter("always", FingerspiceWarning)
         yield
     said = [*answer.get("warnings", ()), *(str(w.message) for w in noticed)]
@@ -119,12 +111,12 @@ def deadline() -> Callable[[float], None]:
     return check
 
 
-def _shown(asked: Asked) -> Solution:
+def _shown(asked: Asked) -> fs.Solution:
     """The run that is asked for, with outputs where it is shown."""
 
-    def run(first: float, last: float) -> Solution:
+    def run(first: float, last: float) -> fs.Solution:
         times = np.linspace(first, last, asked.points(first, last)[0])
-        return simulate(
+        return fs.simulate(
             asked.circuit, t_stop=stop, t_eval=times, charge_law=asked.charge_law, area=asked.area, rtol=asked.rtol,
             charge=False, throw=False, progress=deadline(),
         )  # fmt: skip
@@ -137,7 +129,7 @@ def _shown(asked: Asked) -> Solution:
     return solution
 
 
-def _traces(asked: Asked, solution: Solution) -> dict[str, Any]:
+def _traces(asked: Asked, solution: fs.Solution) -> dict[str, Any]:
     """The first part of an answer, as far as a run gives it: each column of a signal is one trace."""
     first, stop, period = asked.times
     too_few, error = asked.points(first, stop)[1], solution.error
@@ -160,7 +152,7 @@ def _traces(asked: Asked, solution: Solution) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _stacks(solution: Solution) -> list[dict[str, Any]]:
+def _stacks(solution: fs.Solution) -> list[dict[str, Any]]:
     """The layers on each contact area with their thickness and voltage, for the drawing of the stack."""
     stacks: dict[str, dict[str, Any]] = {}
     for name, values in solution.by_name("u_layer").items():
@@ -172,7 +164,7 @@ def _stacks(solution: Solution) -> list[dict[str, Any]]:
     return [stack for stack in stacks.values() if stack["gap"] is not None][:MOST_TRACES]
 
 
-def _harmonics(solution: Solution, period: float | None) -> list[dict[str, Any]]:
+def _harmonics(solution: fs.Solution, period: float | None) -> list[dict[str, Any]]:
     """Amplitudes of the friction force at multiples of the source's frequency, for each gap."""
     if period is None or not solution.gaps:
         return []
@@ -190,7 +182,7 @@ def _harmonics(solution: Solution, period: float | None) -> list[dict[str, Any]]
 
 
 @quiet()
-def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
+def applied(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any]:
     """What the set changes in the scene that a request names in its key ``apply``, as in `Asked.sets`.
 
     The answer has ``ok`` and ``message``; ``overrides`` (path to value as text), ``source`` (text, or None where the
@@ -204,7 +196,7 @@ def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]
     units = {path.lower(): parameter.unit for path, parameter in circuit.parameters.items()}
     overrides, source = {}, None
     for path, value in changes.items():
-        if not isinstance(value, Waveform):
+        if not isinstance(value, fs.Waveform):
             overrides[path] = value_text(value, units[path.lower()])
         elif source is None:
             source = f"{path}={text_of(value)}" if len(driving_sources(circuit)) > 1 else text_of(value)
@@ -214,7 +206,7 @@ def applied(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]
 def in_scene(asked: Asked) -> tuple[list[dict[str, Any]], set[str], list[str]]:
     """What the page says of each set with a value in force, the paths that sets give, and sets that mean nothing."""
     circuit, given, lost = asked.circuit._with(sets={}), [], []
-    for entry in asked.sets:
+    for entry in filter(None, map(str.strip, asked.sets.split(","))):
         try:
             name, to, changes = asked.base.remember(("set", entry), partial(_changes, asked.base, entry))
         except InputError as error:
@@ -224,15 +216,15 @@ def in_scene(asked: Asked) -> tuple[list[dict[str, Any]], set[str], list[str]]:
         circuit = remembering(circuit, name, changes)
     force = in_force(circuit)
     said = [
-        {"name": name, "to": to, "title": parameters(name).title, "caveat": parameters(name).not_claimed,
-         "assumed": list(parameters(name).assumed), "changed": list(force[name][1])}
+        {"name": name, "to": to, "title": fs.parameters(name).title, "caveat": fs.parameters(name).not_claimed,
+         "assumed": list(fs.parameters(name).assumed), "changed": list(force[name][1])}
         for name, to in given
         if name in force and force[name][0]
     ]  # fmt: skip
     return said, {path.lower() for kept, _ in force.values() for path in kept}, lost
 
 
-def before(circuit: Circuit) -> tuple[dict[str, Any], list[str]]:
+def before(circuit: fs.Circuit) -> tuple[dict[str, Any], list[str]]:
     """What had been changed in a circuit before the page was opened, as the request's overrides, source and sets.
 
     With it go the names of replaced sources that it does not say: a request has one, and a recording or a function has
@@ -253,7 +245,7 @@ def before(circuit: Circuit) -> tuple[dict[str, Any], list[str]]:
     return {key: value for key, value in found.items() if value}, [e.name for e in replaced if e.name not in said]
 
 
-def _source_text(circuit: Circuit, element: Element) -> str | None:
+def _source_text(circuit: fs.Circuit, element: Element) -> str | None:
     """The text of a source of now, as in `Asked.source`; None where the page has none for it."""
     assert element.waveform is not None
     for text in (text_of(element.waveform), circuit.overrides.get(element.name)):
@@ -265,14 +257,14 @@ def _source_text(circuit: Circuit, element: Element) -> str | None:
     return None
 
 
-def _entry(circuit: Circuit, name: str) -> str | None:
+def _entry(circuit: fs.Circuit, name: str) -> str | None:
     """The set of that name as in `Asked.sets`: applied to all, or as narrowly as gives its values in the circuit."""
     values = circuit.sets[name]
     elements = dict.fromkeys(path.rpartition(".")[0] or path for path in values)
     inside = {e.rpartition(".")[0] for e in elements}
     for to in (None, *elements, *sorted(inside - {""}, key=len, reverse=True)):
         try:
-            found = parameters(name).apply(circuit, to).sets[name]
+            found = fs.parameters(name).apply(circuit, to).sets[name]
         except InputError:
             continue
         if values == found or (to is not None and values.items() <= found.items()):
@@ -280,10 +272,10 @@ def _entry(circuit: Circuit, name: str) -> str | None:
     return None
 
 
-def _changes(circuit: Circuit, entry: str) -> tuple[str, str | None, dict[str, Any]]:
+def _changes(circuit: fs.Circuit, entry: str) -> tuple[str, str | None, dict[str, Any]]:
     """Name and element of a set as in `Asked.sets`, and what it gives to a circuit, by path."""
     to, _, name = (part.strip() for part in entry.rpartition("="))
-    one = parameters(name)
+    one = fs.parameters(name)
     return one.name, to or None, dict(one.apply(circuit, to or None).sets[one.name])
 
 
@@ -301,20 +293,20 @@ circuit = dataclasses.replace(circuit, elements=tuple(map(dispersive, circuit.el
 
 
 @quiet()
-def as_deck(given: dict[str, Any], own: Circuit | None = None) -> str:
+def as_deck(given: dict[str, Any], own: fs.Circuit | None = None) -> str:
     """The scene as one deck that fingerspice and ngspice run, with the length of the page's run and its outputs."""
     asked = Asked(given, own)
     circuit, (first, stop, _) = asked.circuit, asked.times
     step = (stop - first) / asked.points(first, stop)[0]
     tran = Tran(step, stop, uic=circuit.tran is None or circuit.tran.uic)
-    text = export_netlist(dataclasses.replace(circuit, tran=tran), charge_law=asked.charge_law)
+    text = fs.export_netlist(dataclasses.replace(circuit, tran=tran), charge_law=asked.charge_law)
     if len(text) > _LONGEST_EXPORT:
         raise InputError(f"the deck would have {len(text):,} characters; allowed: at most {_LONGEST_EXPORT:,}")
     return text
 
 
 @quiet()
-def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
+def as_python(given: dict[str, Any], own: fs.Circuit | None = None) -> str:
     """The scene as Python that gives the page's solution."""
     asked = Asked(given, own)
     sets, by_sets, _ = in_scene(asked)
@@ -322,17 +314,15 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
     name, waveform = asked.replaced or ("", None)
     lines = ["import dataclasses", "", "import numpy as np", "", "import fingerspice as fs", ""]
     # The values changed before the page was opened are those of the user's own circuit.
-    mine = own if own is not None and asked.deck == own.text else None
-    before = mine.overrides if mine is not None else {}
-    known = {path.lower(): one.value for path, one in mine.parameters.items()} if mine is not None else {}
-    if mine is not None and mine.path is not None:
-        lines.append(f"circuit = fs.read_netlist({str(mine.path)!r})")
+    known = {path.lower(): one.value for path, one in asked.base.parameters.items()}
+    if asked.base.path is not None:
+        lines.append(f"circuit = fs.read_netlist({str(asked.base.path)!r})")
     else:
         deck = [f"    {line!r}" for line in asked.deck.splitlines(keepends=True)]
         lines += ["circuit = fs.parse_netlist(", *deck, ")"]
     lines += [
         f"# Changed before, in Python: {path} = {' '.join(text.split())}"
-        for path, text in before.items()
+        for path, text in asked.base.overrides.items()
         if path.lower() not in (*known, name.lower())
     ]
     if asked.skin == "dispersive":
@@ -345,9 +335,8 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
         if asked.recording is not None and asked.gain is not None:
             code = asked.recording.python(asked.gain)
         lines.append(f"circuit = circuit.replace({{{name!r}: {code}}})")
-    changes = {path: known[path.lower()] for path in before if path.lower() in known}
-    there = {path.lower() for path in asked.circuit.parameters}
-    changes |= {path: x for path, x in asked.overrides.items() if path.lower() in there}
+    before = {path: known[path.lower()] for path in asked.base.overrides if path.lower() in known}
+    changes = {**before, **asked.overrides}
     changes = {path: x for path, x in changes.items() if path.lower() not in by_sets}
     if asked.skin == "follow":
         changes |= {f"{e.name}.f": e.values["f"] for e in asked.circuit.by_device("SKIN")}
@@ -365,7 +354,7 @@ def as_python(given: dict[str, Any], own: Circuit | None = None) -> str:
 
 
 @quiet()
-def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
+def means(given: dict[str, Any], own: fs.Circuit | None = None) -> dict[str, Any]:
     """Mean force of the periodic state under sines of the source's amplitude, at frequencies that the request names.
 
     Its key ``frequencies`` (Hz) has at most 16. The answer has ``ok`` and ``message``; ``frequency`` and ``force`` (Hz
@@ -381,12 +370,12 @@ def means(given: dict[str, Any], own: Circuit | None = None) -> dict[str, Any]:
         raise InputError("the circuit has no GAP, and so no force")
     if wave.fundamental is None:
         raise InputError("the source has no one amplitude that sines could have; allowed: a periodic source")
-    (found,) = large_signal(
+    (found,) = fs.large_signal(
         asked.circuit, np.asarray(frequencies, float), charge_law=asked.charge_law, finger=gaps[0].name,
         rtol=max(asked.rtol, _RTOL), progress=deadline(),
     )  # fmt: skip
     amplitude = format_si(float(np.max(found.amplitude)), "V")
-    if not (isinstance(wave, Sine) and wave.offset == 0.0):
+    if not (isinstance(wave, fs.Sine) and wave.offset == 0.0):
         amplitude += ", the source's fundamental,"
     return {
         "ok": True, "message": "", "frequency": found.frequency, "force": found.f_el_mean, "gap": gaps[0].name,
@@ -405,101 +394,12 @@ class Example(NamedTuple):
     asked: Mapping[str, object] = {}  # Further keys of the request, as in `scene`
 
 
-_COAT = "Xcoat   drive top  area  LAYER d=1u eps_r=3.9 r=0.2meg"
-_ALL_TONES = "Xskin   skin  0    area  SKIN_DISPERSIVE d=350u"
-
-
-def _skin(frequency: str, node: str = "0") -> str:
-    return f"Xskin   skin  {node:<4} area  SKIN  d=350u f={frequency}"
-
-
-def _gap(*, d: str = "3.5u", r: str = "1meg", fn: str = "0.5", mu: str = "0.3") -> str:
-    return (
-        f"Xgap    top   skin area  GAP   d={d} eps_r=1 r={r} fn={fn} mu={mu}\n"
-        "+                              alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
-    )
-
-
-def _gap_of(finger: str) -> str:
-    """The gap of Table 1 with the values in which a named set of parameters differs from the normal finger."""
-    normal, values = parameters("normal").values, parameters(finger).values
-    changed = [v for path, v in values.items() if v.element == "gap" and v.value != normal[path].value]
-    return _gap(**{v.parameter: spice_text(v.value) if v.unit else f"{v.value:g}" for v in changed})
-
-
-def _deck(title: str, *lines: str) -> str:
-    return "\n".join([title, ".include fingerspice.lib", *lines, ".end", ""])
-
-
-def _finger(title: str, source: str, skin: str, tran: str, *more: str, gap: str = "") -> str:
-    """Table 1's finger on one source."""
-    return _deck(title, f"Vdrive  drive 0          {source}", *more, _COAT, gap or _gap(), skin, f".tran {tran} uic")
-
-
-_AMPLIFIER = _deck(
-    "Finger behind an amplifier with a safety resistor, 5 kHz",
-    "Vdrive  amp   0          SIN(0 200 5k)",
-    "Rout    amp   drive      47k",
-    "Ccable  drive 0          150p",
-    *(_COAT, _gap(), _skin("5k"), ".tran 0.5u 1m uic"),
-)
-_UNGROUNDED = _finger(
-    "User not grounded, 5 kHz", "SIN(0 200 5k)", _skin("5k", "body"), "0.5u 1m",
-    "Rbody   body  far        1.5k", "Cbody   far   0          150p",
-)  # fmt: skip
-_TWO = _deck(
-    "Two fingers on one screen, 5 kHz",
-    "Vdrive  drive 0           SIN(0 200 5k)",
-    ".subckt finger drive body area fn=0.5",
-    *(_COAT, _gap(fn="{fn}"), _skin("5k", "body"), ".ends"),
-    "Xfirm   drive body firm   finger fn=0.5",
-    "Xlight  drive body light  finger fn=0.2",
-    "Rbody   body  far         1.5k",
-    "Cbody   far   0           150p",
-    ".tran 0.5u 1m uic",
-)
-_TONES = _deck(
-    "Two tones on a dispersive skin",
-    "Vdrive  drive fast       SIN(0 120 100)",
-    "Vfast   fast  0          SIN(0 80 5k)",
-    *(_COAT, _gap(), _ALL_TONES, ".tran 1u 30m uic"),
-)
-EXAMPLES: tuple[Example, ...] = (
-    Example("sine", "Sine, 100 Hz (Fig. 4, left)", "Table 1: the layers leak, and the force follows the sine.",
-            _finger("Table 1, sine of 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m")),
-    Example("sine-5k", "Sine, 5 kHz (Fig. 4, right)", "At 5 kHz the capacitances divide the voltage.",
-            _finger("Table 1, sine of 5 kHz", "SIN(0 200 5k)", _skin("5k"), "0.2u 1m")),
-    Example("square", "Square wave, 100 Hz (Fig. 5, left)", "After each edge the gap's voltage leaks away.",
-            _finger("Table 1, square wave of 100 Hz", "SQUARE(200 100)", _skin("100"), "10u 50m")),
-    Example("square-5k", "Square wave, 5 kHz (Fig. 5, right)", "The force is nearly constant.",
-            _finger("Table 1, square wave of 5 kHz", "SQUARE(200 5k)", _skin("5k"), "0.2u 1m")),
-    Example("ungrounded", "User not grounded", "The body's capacitance to ground takes voltage.", _UNGROUNDED),
-    Example("two-fingers", "Two fingers of one hand", "A firm and a light finger share a body that floats.", _TWO),
-    Example("amplifier", "Amplifier's limit", "A safety resistor and the cable take voltage at high frequencies.",
-            _AMPLIFIER),
-    Example("tones", "Two tones, dispersive skin", "The skin's data at all frequencies, for two tones at once.", _TONES,
-            {"periods": 3}),
-    Example("am", "AM texture", "A carrier of 5 kHz whose envelope of 50 Hz is what the finger feels.",
-            _finger("AM texture", "SIN(0 200 5k)", _skin("5k"), "2u 40m"),
-            {"source": "AM(200 5k 50)", "periods": 2}),
-    Example("click", "Click", "A damped sine of 250 Hz, where fingers feel best.",
-            _finger("Click", "SIN(0 200 250 0 250)", _ALL_TONES, "10u 40m")),
-    Example("chirp", "Chirp, 20 Hz to 1 kHz", "All frequencies that fingers feel, one after the other.",
-            _finger("Chirp", "CHIRP(150 20 1k 0.1)", _ALL_TONES, "20u 0.1")),
-    Example("bursts", "Bursts of 5 kHz", "Ten cycles every 10 ms: the finger feels 100 Hz.",
-            _finger("Bursts of 5 kHz", "SIN(0 200 5k)", _ALL_TONES, "5u 50m"), {"source": "BURST(200 5k 10 10m)"}),
-    Example("wet", "Moist finger", "Sweat in the gap conducts: the set moist, whose leak and friction are assumed.",
-            _finger("Moist finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_gap_of("moist"))),
-    Example("dry", "Dry finger", "The gap hardly leaks: the set dry, whose leak and friction are assumed.",
-            _finger("Dry finger, 100 Hz", "SIN(0 200 100)", _skin("100"), "10u 50m", gap=_gap_of("dry"))),
-    Example("fold", "Fold of the mobile law", "A thin gap under the mobile charge law: no solution, and why.",
-            _finger("A gap of 10 nm under the law mobile", "SIN(0 200 100)", _skin("100"), "10u 50m",
-                    gap=_gap(d="10n")), {"charge_law": "mobile"}),
-)  # fmt: skip
+_FILE = Path(__file__).with_name("examples.toml")
+EXAMPLES = tuple(Example(**one) for one in tomllib.loads(_FILE.read_text(encoding="utf-8"))["scene"])
 """The scenes of the menu, the first of which is shown at the start."""
 
 
-def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def beginning(circuit: fs.Circuit | None, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """What the page needs first: its menus, and the scene to begin with."""
     examples = [
         {"name": e.name, "title": e.title, "note": e.note, "request": {"deck": e.deck, **e.asked}} for e in EXAMPLES
@@ -512,8 +412,8 @@ def beginning(circuit: Circuit | None, asked: Mapping[str, Any] | None = None) -
         {"kind": kind, "title": title, "arguments": [a._asdict() for a in arguments]}
         for kind, (title, arguments) in WAVEFORMS.items()
     ]
-    sets = [{"name": one.name, "kind": one.kind, "title": one.title} for one in parameters().values()]
-    return {"version": __version__, "own": own, "examples": examples, "waveforms": waveforms, "sets": sets}
+    sets = [{"name": one.name, "kind": one.kind, "title": one.title} for one in fs.parameters().values()]
+    return {"version": fs.__version__, "own": own, "examples": examples, "waveforms": waveforms, "sets": sets}
 
 
 class Entry(NamedTuple):
@@ -524,7 +424,7 @@ class Entry(NamedTuple):
     title: str
     about: str
     origin: Path  # File that it is drawn from
-    run: Callable[[], Solution]  # Runs it
+    run: Callable[[], fs.Solution]  # Runs it
 
 
 def decks(folder: Path) -> Iterator[Entry]:
@@ -536,24 +436,25 @@ def decks(folder: Path) -> Iterator[Entry]:
         about = re.split(r"Layers(?:,| and) contact|SI units|V\(area\)|In ngspice|Charge law:", " ".join(comments))[0]
         title = re.sub(r"Fingerpad on a (3M-coated )?touchscreen,? (with )?", "", lines[0]) or path.stem
         title = title[0].upper() + title[1:]
-        yield Entry(path.stem, title, about.strip(), path, partial(lambda path: simulate(read_netlist(path)), path))
+        run = partial(lambda path: fs.simulate(fs.read_netlist(path)), path)
+        yield Entry(path.stem, title, about.strip(), path, run)
 
 
 def scenes() -> Iterator[Entry]:
     """The example scenes of the explorer."""
     for one in EXAMPLES:
-        yield Entry(f"scene-{one.name}", one.title, one.note, Path(__file__), partial(_run_scene, one))
+        yield Entry(f"scene-{one.name}", one.title, one.note, _FILE, partial(_run_scene, one))
 
 
-def _run_scene(example: Example) -> Solution:
+def _run_scene(example: Example) -> fs.Solution:
     asked = Asked({"deck": example.deck, **example.asked})
     first, stop, _ = asked.times
-    times = np.linspace(first, stop, 4001)
-    return simulate(asked.circuit, t_stop=stop, t_eval=times, charge_law=asked.charge_law, throw=False)
+    return fs.simulate(
+        asked.circuit, t_stop=stop, t_eval=np.linspace(first, stop, 4001), charge_law=asked.charge_law, throw=False
+    )
 
 
 def draw(entry: Entry, picture: Path) -> None:
     """Run an entry, and draw source, gap voltage and friction."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FingerspiceWarning)
+    with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
         save(entry.run().plot(("u_source", "u_gap", "f_t")), picture, dpi=110.0)

@@ -7,7 +7,6 @@ import hmac
 import json
 import re
 import secrets
-import socket
 import struct
 import threading
 import webbrowser
@@ -15,27 +14,25 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib import resources
-from itertools import chain
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+import fingerspice as fs
 from fingerspice.base.arrays import FloatArray
 from fingerspice.base.errors import InputError, printable
 from fingerspice.base.pages import in_notebook
-from fingerspice.circuit.circuit import Circuit
 from fingerspice.explorer import scene
 from fingerspice.explorer.request import asked_by
-from fingerspice.results.outcome import SolveError
-from fingerspice.results.solution import Solution
+from fingerspice.waveforms.waveform import require
 
 ADDRESS = "127.0.0.1"
 FRAME_HEIGHT, MOST_FRAMES = 900, 8
 """Height (px) of the page in a notebook; explorers that one notebook keeps running."""
 #: Largest request, bytes; seconds that a connection may be silent; connections at once.
 MOST_BYTES, SILENCE, MOST_CONNECTIONS = 5_000_000, 30.0, 32
-_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 #: Pages that may show the explorer within them, where a notebook has asked for it: those of this computer.
 _NOTEBOOKS = " ".join(f"{kind}://{host}:*" for kind in ("http", "https") for host in (ADDRESS, "localhost"))
 _POLICY = (
@@ -55,9 +52,8 @@ _FRAMES: deque[Explorer] = deque()
 
 def pages() -> dict[str, bytes]:
     """The files of the page by name."""
-    folder = resources.files("fingerspice.explorer") / "page"
-    names = (entry.name for entry in folder.iterdir())
-    return {name: (folder / name).read_bytes() for name in names if name.rpartition(".")[2] in _TYPES}
+    files = Path(__file__).with_name("page").iterdir()
+    return {file.name: file.read_bytes() for file in files if file.suffix[1:] in _TYPES}
 
 
 class Explorer:
@@ -86,11 +82,10 @@ class Explorer:
     """
 
     def __init__(
-        self, circuit: Circuit | None = None, port: int = 0, *, asked: Mapping[str, Any] | None = None,
+        self, circuit: fs.Circuit | None = None, port: int = 0, *, asked: Mapping[str, Any] | None = None,
         framed: bool = False,
     ) -> None:  # fmt: skip
-        if not 0 <= port <= 65535:
-            raise InputError(f"port is {port}; allowed: 0 to 65535, where 0 takes a free one")
+        require(0 <= port <= 65535, "port", port, "0 to 65535, where 0 takes a free one")
         self.token = secrets.token_urlsafe(24)
         self.circuit, self.asked, self.framed = circuit, dict(asked or {}), framed
         self.files = pages()
@@ -98,9 +93,8 @@ class Explorer:
         try:
             self._server = _Server((ADDRESS, port), type("Handler", (_Handler,), {"explorer": self}))
         except OSError as error:
-            raise InputError(
-                f"port {port} of {ADDRESS} cannot be used: {error.strerror}; allowed: a free port"
-            ) from None
+            text = f"port {port} of {ADDRESS} cannot be used: {error.strerror}; allowed: a free port"
+            raise InputError(text) from None
         self.port = int(self._server.server_address[1])
         self.url = f"http://{ADDRESS}:{self.port}/{self.token}/"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
@@ -152,14 +146,14 @@ class Explorer:
                 if part is None:
                     return
                 yield framed(part)
-        except (InputError, SolveError) as error:
+        except (InputError, fs.SolveError) as error:
             yield framed({"ok": False, "message": str(error)})
         except Exception as error:
             text = printable(f"this is a fault of fingerspice, please report it ({type(error).__name__}: {error})")
             yield framed({"ok": False, "status": "FAULT", "message": text})
 
 
-def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
+def explore(shown: fs.Circuit | fs.Solution | None = None, *, port: int = 0, browser: bool = True) -> Explorer:
     """Show a circuit, or a run's circuit, on a local page on which its values can be changed (docs/explore.md).
 
     Parameters
@@ -183,8 +177,8 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
     InputError
         If the port is taken, or no port number.
     """
-    asked = asked_by(shown) if isinstance(shown, Solution) else {}
-    circuit = shown.circuit if isinstance(shown, Solution) else shown
+    asked = asked_by(shown) if isinstance(shown, fs.Solution) else {}
+    circuit = shown.circuit if isinstance(shown, fs.Solution) else shown
     framed = browser and in_notebook()
     explorer = Explorer(circuit, port, asked=asked, framed=framed)
     if framed:
@@ -197,7 +191,7 @@ def explore(shown: Circuit | Solution | None = None, *, port: int = 0, browser: 
 
 
 #: What the page asks for, and what answers, in one part or in several.
-_ACTIONS: dict[str, Callable[[Any, Circuit | None], Any]] = {
+_ACTIONS: dict[str, Callable[[Any, fs.Circuit | None], Any]] = {
     "scene": scene.parts, "set": scene.applied, "means": scene.means, "deck": scene.as_deck,
     "python": scene.as_python,
 }  # fmt: skip
@@ -233,7 +227,7 @@ def framed(data: Any) -> bytes:
 _STATIC_POLICY = "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data: blob:"
 
 
-def static_page(circuit: Circuit | None = None) -> str:
+def static_page(circuit: fs.Circuit | None = None) -> str:
     """The page as HTML that needs no other file, of a circuit's run or all example scenes; no slider moves on it."""
     files = {name: content.decode("utf-8") for name, content in pages().items()}
     start = scene.beginning(circuit)
@@ -275,11 +269,8 @@ class _Server(ThreadingHTTPServer):
         self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
         super().__init__(*arguments)
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        if not self._room.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        super().process_request(request, client_address)
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        return self._room.acquire(blocking=False)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
@@ -301,12 +292,7 @@ class _Handler(BaseHTTPRequestHandler):
     explorer: ClassVar[Explorer]
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "fingerspice", ""
-    timeout = SILENCE
-    _read = False
-
-    def setup(self) -> None:
-        super().setup()
-        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    timeout, disable_nagle_algorithm = SILENCE, True
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing is logged: the token stands in every line."""
@@ -315,7 +301,13 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(self._file)
 
     def do_POST(self) -> None:
-        self._read = False
+        # Also of a request that is refused all is read, up to a limit, so that the browser takes the answer.
+        length = self.headers.get("Content-Length", "")
+        known = length.isascii() and length.isdigit() and "Transfer-Encoding" not in self.headers
+        self._size = None if not known else int(length) if len(length) <= 12 else 10**12
+        self._sent, left = b"", min(self._size or 0, 4 * MOST_BYTES)
+        while left > 0 and (piece := self.rfile.read(min(left, MOST_BYTES))):
+            self._sent, left = piece, left - len(piece)
         self._answer(self._run)
 
     def _answer(self, make: Callable[[str], tuple[str, Iterator[bytes]]]) -> None:
@@ -324,10 +316,9 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             kind, parts = make(self._allowed())
         except _Refused as error:
-            self._discard()
+            self.close_connection = True
             status, text = error.args
             kind, parts = "application/json", iter([json.dumps({"ok": False, "message": text}).encode()])
-        part = next(parts)
         self.send_response(status)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
         self.send_header("Transfer-Encoding", "chunked")
@@ -337,8 +328,8 @@ class _Handler(BaseHTTPRequestHandler):
         if self.close_connection:
             self.send_header("Connection", "close")
         self.end_headers()
-        for more in chain([part], parts):
-            self.wfile.write(b"%x\r\n%b\r\n" % (len(more), more))
+        for part in parts:
+            self.wfile.write(b"%x\r\n%b\r\n" % (len(part), part))
         self.wfile.write(b"0\r\n\r\n")
 
     def _allowed(self) -> str:
@@ -369,24 +360,13 @@ class _Handler(BaseHTTPRequestHandler):
     def _run(self, what: str) -> tuple[str, Iterator[bytes]]:
         if what not in _ACTIONS:
             raise _Refused(HTTPStatus.NOT_FOUND, f"nothing of that name; allowed: {', '.join(_ACTIONS)}")
-        length = self.headers.get("Content-Length", "")
-        if not (length.isascii() and length.isdigit()) or "Transfer-Encoding" in self.headers:
+        if self._size is None:
             raise _Refused(HTTPStatus.LENGTH_REQUIRED, "the request has no length")
-        if len(length) > 12 or int(length) > MOST_BYTES:
-            text = f"the request has {length[:12]} bytes; allowed: at most {MOST_BYTES:,}"
+        if self._size > MOST_BYTES:
+            text = f"the request has {self._size} bytes; allowed: at most {MOST_BYTES:,}"
             raise _Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, text)
         try:
-            self._read = True
-            given = json.loads(self.rfile.read(int(length)))
+            given = json.loads(self._sent)
         except (ValueError, RecursionError):
             raise _Refused(HTTPStatus.BAD_REQUEST, "the request is not JSON") from None
         return "application/octet-stream", self.explorer.answers(what, given)
-
-    def _discard(self) -> None:
-        """Read what was sent with a refused request, up to a limit, so that the browser takes the answer."""
-        self.close_connection = True
-        length = self.headers.get("Content-Length", "")
-        left = min(int(length), 4 * MOST_BYTES) if length.isascii() and length.isdigit() and len(length) < 12 else 0
-        while left > 0 and not self._read:
-            piece = self.rfile.read(min(left, 65_536))
-            left = left - len(piece) if piece else 0
