@@ -21,7 +21,7 @@ from fingerspice.results.outcome import SolveError
 from fingerspice.results.solution import MEANS, SIGNALS, Solution
 from fingerspice.solve.simulation import rtol_given, simulate
 from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.form import LEAST_RTOL, REFUSED, in_lockstep_by, own_path
+from fingerspice.studies.batch.form import LEAST_RTOL, REFUSED, lockstep_form, own_path, why_alone
 from fingerspice.studies.steady import SteadyState, steady_state
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
@@ -50,23 +50,22 @@ class Scenes:
         for name in self.outputs:
             if name not in (*MEANS, *SIGNALS):
                 raise InputError(f"unknown output {name!r}; allowed: {', '.join((*MEANS, *SIGNALS))}")
-        require(len(self.outputs) > 0, "outputs", "empty", "one or more names")
+        require(bool(self.outputs), "outputs", "empty", "one or more names")
         require(len(set(self.outputs)) == len(self.outputs), "outputs", repr(self.outputs), "every name once")
         signals = [name for name in self.outputs if name in SIGNALS]
-        # Times of the signals, s; none where there are only means.
+        # Times of the signals, s; none where there are only means
         self.t = np.zeros(0) if t is None else real_numbers("t", t, "numbers in s")
         if signals and (self.t.ndim != 1 or not self.t.size):
             raise InputError(f"{signals[0]} is asked for, and t is {t!r}; allowed: a row of times in s")
         if not signals and t is not None:
             raise InputError(f"t is given, and no signal is asked for; allowed: outputs such as {', '.join(SIGNALS)}")
-        # End of every run, s; none where only the periodic state is asked for.
-        self.t_stop = circuit.tran.stop if circuit.tran is not None else None
-        if t_stop is not None:
-            self.t_stop = positive_number("t_stop", t_stop, "s")
-        elif self.t_stop is None and (signals or not periodic):
+        # End of every run, s; none where only the periodic state is asked for
+        deck = None if circuit.tran is None else circuit.tran.stop
+        self.t_stop = deck if t_stop is None else positive_number("t_stop", t_stop, "s")
+        if self.t_stop is None and (signals or not periodic):
             raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
         self.rtol = rtol_given(rtol, LEAST_RTOL)
-        # How many numbers each output has.
+        # How many numbers each output has
         self.sizes = [1 if name in MEANS else self.t.size for name in self.outputs]
 
     def values(self, paths: Sequence[str], given: FloatArray, wanted: Sequence[str] = ()) -> FloatArray:
@@ -74,7 +73,9 @@ class Scenes:
 
         With `wanted`, their derivatives by these parameters, shape (n_scene, sum of `sizes`, n_wanted).
         """
-        if not self.t.size and (not wanted or in_lockstep_by(self.circuit, paths, self.outputs, self.rtol)):
+        form = lockstep_form(self.circuit, paths)
+        # Where derivatives are not to be had in lockstep, a batch would also run every scene for its outputs.
+        if not self.t.size and not (wanted and why_alone(form, self.outputs, self.rtol)):
             # The means, or their derivatives, of all scenes at once.
             found = batch(
                 self.circuit, dict(zip(paths, given.T, strict=True)), outputs=self.outputs, rtol=self.rtol,
@@ -284,7 +285,13 @@ class Simulator(torch.nn.Module):
         self.circuit, self.logarithms = circuit, logarithms
         self._scenes = Scenes(circuit, outputs, t, t_stop, periodic, rtol)
         self.paths: dict[str, str] = {}
-        for path, value in _initial(circuit, parameters).items():
+        single = isinstance(parameters, str)
+        require(not single, "parameters", repr(parameters), "a sequence of paths such as ('Xgap.d',)")
+        for given in parameters:
+            path = own_path(circuit, given)
+            require(path not in self.paths, path, "given twice", "once")
+            one = parameters[given] if isinstance(parameters, Mapping) else circuit.parameters[path].value
+            value = tensor_of(given, one).detach().clone()
             if logarithms and not bool((value > 0.0).all()):
                 raise InputError(f"{path} is {value.min():g}, and logarithms are asked for; allowed: more than 0")
             self.paths[path] = path.replace(".", "_")
@@ -302,9 +309,9 @@ class Simulator(torch.nn.Module):
         InputError
             If it is no parameter of the module.
         """
-        name = own_path(self.circuit, path)
+        name, known = own_path(self.circuit, path), ", ".join(self.paths) or "none"
         if name not in self.paths:
-            raise InputError(f"{name} is no parameter of this module; allowed: {', '.join(self.paths) or 'none'}")
+            raise InputError(f"{name} is no parameter of this module; allowed: {known}")
         held: Tensor = getattr(self, self.paths[name])
         return held.exp() if self.logarithms else held
 
@@ -327,11 +334,8 @@ class Simulator(torch.nn.Module):
         InputError
             If a path is unknown, a value is out of range, shapes do not fit, or a scene cannot be run.
         """
-        given = {}
-        for path, one in ({} if values is None else values).items():
-            given[own_path(self.circuit, path)] = tensor_of(path, one)
-        own = {path: tensor_of(path, self.value(path)) for path in self.paths if path not in given}
-        every = {**own, **given}
+        given = {own_path(self.circuit, path): tensor_of(path, one) for path, one in (values or {}).items()}
+        every = {path: tensor_of(path, self.value(path)) for path in self.paths if path not in given} | given
         if not every:
             raise InputError("there are no values; allowed: parameters of the module, or values for its call")
         try:
@@ -341,20 +345,6 @@ class Simulator(torch.nn.Module):
             raise InputError(f"the values have shapes {shapes}; allowed: shapes that broadcast") from None
         found: Tensor = _Run.apply(self._scenes, tuple(every), (), *shaped)
         return self._scenes.given_back(found)
-
-
-def _initial(circuit: Circuit, parameters: Sequence[str] | Mapping[str, ArrayLike]) -> dict[str, Tensor]:
-    """The values to start from, by path in the circuit's own spelling."""
-    if isinstance(parameters, str):
-        raise InputError(f"parameters is {parameters!r}; allowed: a sequence of paths such as ('Xgap.d',)")
-    found: dict[str, Tensor] = {}
-    for path in parameters:
-        name = own_path(circuit, path)
-        if name in found:
-            raise InputError(f"{name} is given twice; allowed: once")
-        one = parameters[path] if isinstance(parameters, Mapping) else circuit.parameters[name].value
-        found[name] = tensor_of(path, one).detach().clone()
-    return found
 
 
 # The methods have the names and signatures that torch calls.

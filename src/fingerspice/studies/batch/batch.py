@@ -35,7 +35,7 @@ from fingerspice.studies.batch.form import (
     why_alone,
 )
 from fingerspice.studies.batch.ladder import Ladder, Slopes
-from fingerspice.studies.steady import SteadyState, steady_state
+from fingerspice.studies.steady import steady_state
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -124,10 +124,8 @@ def batch(
         require_card()
     task = Task(circuit, outputs, rtol, t_stop, periods, periodic, points, device)
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
-    if threads is not None:
-        threads = whole_number("threads", threads, 1)
-    elif hasattr(os, "sched_getaffinity"):
-        threads = len(os.sched_getaffinity(0))
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads = own if threads is None else whole_number("threads", threads, 1)
     scenes = checked_scenes(circuit, parameters)
     task.scenes, skins = dict(scenes), circuit.by_device("SKIN")
     if skin == "follow":
@@ -140,7 +138,7 @@ def batch(
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     slopes, form = gradients_of(task, gradients, skin), lockstep_form(circuit, task.scenes)
     why, recorded = why_alone(form, task.outputs), isinstance(form, LockstepForm) and form.recording is not None
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         _begin(task, recorded)
         _find(task, why or form, pool)
         if slopes is not None:
@@ -156,23 +154,23 @@ def batch(
         varied = any(path.lower().endswith(".frequency") for path in scenes)
         held = ", ".join(f"{e.name}.f" for e in skins)
         said = f"the skin's data are those at its own {held}{', whatever the source frequency is' if varied else ''}"
-    attrs = {
-        "skin": said, "n_ordinary": task.n_ordinary, "ordinary": task.ordinary,
-        "device": "cpu" if why or recorded else task.device,
-    }  # fmt: skip
+    device = "cpu" if why or recorded else task.device
+    attrs = {"skin": said, "n_ordinary": task.n_ordinary, "ordinary": task.ordinary, "device": device}
     return _dataset(task, slopes, scenes, attrs)
 
 
 def _begin(task: Task, recorded: bool) -> None:
-    """Take memory for the outputs, none of which is found."""
-    n, width = task.n, 0
+    """Take memory for the outputs, none of which is found; those of several GAPs have one column each."""
+    n, width, gaps = task.n, 0, len(task.circuit.by_device("GAP"))
     if task.traced or (recorded and task.t_stop is None):
         # Refused for what has no period, such as a recording.
         count = task.count(task.frequencies())
         width = math.ceil(float(count.max()) * task.points - 1e-9) if task.traced else 0
-    require(n * width <= _MOST_VOLTAGES, "outputs", f"of {n * width:.3g} gap voltages", f"at most {_MOST_VOLTAGES:g}")
+    size, each = n * width * max(gaps, 1), (gaps,) if gaps > 1 else ()
+    require(size <= _MOST_VOLTAGES, "outputs", f"of {size:.3g} gap voltages", f"at most {_MOST_VOLTAGES:g}")
     # The memory of gap voltages, which is much, is taken by the threads that write them.
-    task.begin({name: np.empty((n, width)) if name == "u_gap" else np.full(n, np.nan) for name in task.outputs})
+    values = {name: np.full((n, *each), np.nan) for name in task.outputs if name != "u_gap"}
+    task.begin(values | ({"u_gap": np.empty((n, width, *each))} if task.traced else {}))
 
 
 def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> None:
@@ -216,7 +214,7 @@ def _find_alone(task: Task, ladder: type[Ladder], rest: IntArray, pool: ThreadPo
     frequency = task.frequencies() if by_period else np.ones(task.n)
     allowed, finest = ladder.limit * task.rtol, RTOL_RANGE[0]
 
-    def alone(i: int) -> dict[str, FloatArray]:
+    def alone(i: int) -> None:
         rtol = max(_OVER_PEAK * task.rtol, finest)
         try:
             circuit = task.circuit.varied({path: float(array[i]) for path, array in task.scenes.items()})
@@ -228,70 +226,64 @@ def _find_alone(task: Task, ladder: type[Ladder], rest: IntArray, pool: ThreadPo
         except (InputError, SolveError) as failure:
             task.status[i] = REFUSED if isinstance(failure, InputError) else FAILED
             task.messages[i] = f"{ladder.named}{failure}"
-            return {}
+            return
         task.error[i], task.status[i] = error, ONE_BY_ONE
-        return values
+        for name, value in values.items():
+            # Shorter runs have fewer gap voltages.
+            task.values[name][(i, slice(len(value))) if name == "u_gap" else i] = value
 
     # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        ran = list(pool.map(alone, rest.tolist()))
-    for i, values in zip(rest, ran, strict=True):
-        for name, value in values.items():
-            if value.ndim == 1 and task.values[name].ndim == 1:
-                # Several gaps have one column each.
-                task.values[name] = np.full((task.n, value.size), np.nan)
-            task.values[name][(i, slice(value.size)) if value.ndim == 1 else i] = value
+        list(pool.map(alone, rest.tolist()))
 
 
 def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
     """What is wanted of a scene from one run, and its stated error; `frequency` (Hz) is that of its periods."""
     stop, t = (task.periods or 1.0) / frequency if task.t_stop is None else task.t_stop, None
     paths = tuple(dict.fromkeys(path for together in task.paths.values() for path in together))
-    ran: Solution | SteadyState
     if task.periodic:
-        ran = steady_state(circuit, rtol=rtol, points=4 if paths else task.points, charge=False, sensitivities=paths)
+        state = steady_state(circuit, rtol=rtol, points=4 if paths else task.points, charge=False, sensitivities=paths)
+        run, off = state.solution, state.error
     else:
         if paths:
             t = np.array([stop])
         elif task.traced:
             t = np.arange(math.ceil(stop * frequency * task.points - 1e-9)) / (frequency * task.points)
-        ran = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False, sensitivities=paths)
+        run = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False, sensitivities=paths)
+        off = run.error
     # Largest of the errors of the gap voltage relative to its peak, and of the force relative to its mean.
-    pairs = (ran.error.u_gap, ran.u_gap_peak), (ran.error.f_el, ran.f_el_mean)
-    sizes = [(off, 0.0 if size is None else float(np.min(size))) for off, size in pairs]
-    error = max((off / size for off, size in sizes if size > 0.0), default=0.0)
+    sizes = [0.0 if size is None else float(np.min(size)) for size in (run.u_gap_peak, run.f_el_mean)]
+    error = max((x / size for x, size in zip((off.u_gap, off.f_el), sizes, strict=True) if size > 0.0), default=0.0)
     if paths:
         # The error of a change by all of the parameter is about ten times that of the run.
-        return {name: _slopes_of(task, circuit, ran, name, stop) for name in task.outputs}, Slopes.limit * error
+        return {name: _slopes_of(task, circuit, run, name, stop) for name in task.outputs}, Slopes.limit * error
     values = {}
     for name in task.outputs:
-        if name == "u_gap":
-            u = np.asarray(ran.solution.u_gap if isinstance(ran, SteadyState) else ran.u_gap)
-            values[name] = u[:-1] if task.periodic else u
-            continue
         signal = _signal_of(name)
-        value = ran._figures.value(signal, name[len(signal) + 1 :])
+        value = run.u_gap if name == "u_gap" else run._figures.value(signal, name[len(signal) + 1 :])
         values[name] = np.asarray(math.nan if value is None else value, float)
+        if name == "u_gap":
+            values[name] = np.atleast_1d(values[name])[: -1 if task.periodic else None]
     return values, error
 
 
-def _slopes_of(task: Task, circuit: Circuit, ran: Solution | SteadyState, name: str, stop: float) -> FloatArray:
+def _slopes_of(task: Task, circuit: Circuit, run: Solution, name: str, stop: float) -> FloatArray:
     """Derivatives of a mean by the parameters of a task."""
     known = circuit.parameters
     # For a change of each parameter by all of itself.
-    each = {path: getattr(one, name) * known[path].value for path, one in ran.sensitivities.items()}
+    each = {path: getattr(one, name) * known[path].value for path, one in run.sensitivities.items()}
     by = {path: sum(each[other] for other in together) for path, together in task.paths.items()}
-    if task.clock is not None and task.periods is not None and isinstance(ran, Solution):
+    if task.clock is not None and task.periods is not None and not task.periodic:
         # The run ends after a number of periods: its end moves with the frequency, and the mean with its end.
         start = circuit.tran.start if circuit.tran is not None else 0.0
-        gained = float(getattr(ran, name.removesuffix("_mean"))[-1]) - float(getattr(ran, name))
+        gained = float(getattr(run, name.removesuffix("_mean"))[-1]) - float(getattr(run, name))
         by[task.clock] -= gained * stop / (stop - start)
     return np.array([x / known[path].value for path, x in by.items()])
 
 
 def _signal_of(output: str) -> str:
-    return next(s for s in SIGNALS_OF_BATCH if output == s or output.startswith(f"{s}_"))
+    return next(signal for signal in SIGNALS_OF_BATCH if output.startswith(signal))
 
 
 def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], attrs: dict[str, Any]) -> Dataset:
@@ -301,11 +293,11 @@ def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], 
     known = task.circuit.parameters
     meanings = {"flag_values": list(range(len(STATUS_NAMES))), "flag_meanings": " ".join(STATUS_NAMES)}
     data: dict[str, Any] = {}
-    for name, values in task.values.items():
-        signal = _signal_of(name)
+    for name in task.outputs:
+        signal, dims = _signal_of(name), ("scene", "turn", "gap") if name == "u_gap" else ("scene", "gap")
         unit = "deg" if name.endswith("phase_deg") else SIGNALS[signal][0]
-        dims = ("scene",) if values.ndim == 1 else ("scene", "turn" if name == "u_gap" else "gap")
-        data[name] = (dims, values, {"units": unit, "long_name": f"{SIGNALS[signal][1]}{name[len(signal) :]}"})
+        about, values = {"units": unit, "long_name": f"{SIGNALS[signal][1]}{name[len(signal) :]}"}, task.values[name]
+        data[name] = (dims[: values.ndim], values, about)
     data["error"] = ("scene", task.error, {"units": "1", "long_name": "stated error, relative"})
     data["status"] = ("scene", task.status, meanings)
     coords: dict[str, Any] = {path: ("scene", array, {"units": known[path].unit}) for path, array in scenes.items()}

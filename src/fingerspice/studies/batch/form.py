@@ -62,8 +62,8 @@ class Task:
     """
 
     scenes: dict[str, FloatArray]  # Values by path, (n,) each
-    # What is found: (n,) each, (n, n_parameter) of derivatives, or (n, width) of gap voltages, which become NaN last; a
-    # scene without a result has NaN
+    # What is found, NaN in a scene without a result: (n,) each, (n, n_gap) of several GAPs, (n, n_parameter) of
+    # derivatives, or, of gap voltages, (n, width) and (n, width, n_gap)
     values: dict[str, FloatArray]
     error: FloatArray  # (n,): Stated error, of outputs relative to themselves
     status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`, and -1 before there are results
@@ -80,12 +80,11 @@ class Task:
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in self.outputs:
             if name not in ("u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)):
-                kinds = ", ".join(f"_{kind}" for kind in _KINDS)
-                signals = ", ".join(SIGNALS_OF_BATCH)
+                kinds, signals = ", ".join(f"_{kind}" for kind in _KINDS), ", ".join(SIGNALS_OF_BATCH)
                 raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
-        require(len(self.outputs) > 0, "outputs", "empty", "one or more names")
-        # Gap voltages stay on the processor.
+        require(bool(self.outputs), "outputs", "empty", "one or more names")
         self.traced = "u_gap" in self.outputs
+        # Gap voltages stay on the processor.
         self.device = "cpu" if self.traced else device
         if periods is not None and t_stop is not None:
             raise InputError("t_stop and periods are both given; allowed: one of them")
@@ -97,12 +96,11 @@ class Task:
             self.periods = 1.0
         elif periods is None and t_stop is None:
             if circuit.tran is None:
-                raise InputError(
-                    "no t_stop: the deck has no .tran line and none was given; give t_stop in s, or periods"
-                )
+                raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s, or "
+                                 "periods")  # fmt: skip
             self.t_stop = circuit.tran.stop
-        # The parameters by which the means are to be differentiated, in the circuit's own spelling, each with those
-        # that grow in proportion to it: the frequency of a source with that of a skin
+        # Parameters by which the means are differentiated, in the circuit's spelling, each with those that grow in
+        # proportion to it: a source's frequency with that of a skin
         self.paths: dict[str, tuple[str, ...]] = {}
         self.clock: str | None = None  # The frequency of the only source, if it is one of `paths`
 
@@ -147,16 +145,15 @@ class Task:
 
 def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
     """Values by path, all of one shape (n_scene,); refused where a path is unknown or a value NaN or out of range."""
-    if not isinstance(parameters, Mapping) or not parameters:
-        raise InputError(f"parameters is {parameters!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
     given: dict[str, FloatArray] = {}
+    good = isinstance(parameters, Mapping) and bool(parameters)
+    require(good, "parameters", repr(parameters), "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
     for path, values in parameters.items():
         name = own_path(circuit, path)
         array = real_numbers(path, values, "an array of numbers")
-        allowed = "one number, or one row of numbers"
-        require(array.ndim <= 1 and array.size > 0, path, f"of shape {array.shape}", allowed)
-        if name in given:
-            raise InputError(f"{name} is given twice; allowed: once")
+        one_row = array.ndim <= 1 and array.size > 0
+        require(one_row, path, f"of shape {array.shape}", "one number, or one row of numbers")
+        require(name not in given, name, "given twice", "once")
         given[name] = array
     sizes = {path: array.size for path, array in given.items() if array.ndim == 1}
     if len(set(sizes.values())) > 1:
@@ -179,9 +176,8 @@ def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dic
                     circuit.varied({path: float(array[i])})
                 except InputError as error:
                     raise InputError(f"scene {i}: {error}") from None
-        if bad.any():
-            i = int(np.argmax(bad))
-            raise InputError(f"{path} is {array[i]:g} in scene {i}; allowed: {allowed}")
+        i = int(np.argmax(bad))
+        require(not bad[i], path, f"{array[i]:g} in scene {i}", allowed)
     return scenes
 
 
@@ -202,8 +198,7 @@ def own_path(circuit: Circuit, path: Any) -> str:
 def gradients_of(task: Task, gradients: Sequence[str], skin: str) -> Task | None:
     """The checked request of derivatives in the scenes of a task; None for none."""
     circuit = task.circuit
-    if isinstance(gradients, str):
-        raise InputError(f"gradients is {gradients!r}; allowed: a sequence of paths such as ('Xgap.d',)")
+    require(not isinstance(gradients, str), "gradients", repr(gradients), "a sequence of paths such as ('Xgap.d',)")
     paths = tuple(own_path(circuit, path) for path in gradients)
     if not paths:
         return None
@@ -212,21 +207,16 @@ def gradients_of(task: Task, gradients: Sequence[str], skin: str) -> Task | None
         raise InputError(f"gradients are asked for, and outputs has no mean; allowed: one of {', '.join(MEANS)}")
     if (number := len(circuit.by_device("GAP"))) != 1:
         raise InputError(f"gradients are asked for, and the circuit has {number} GAPs; allowed: one")
-    if len(set(paths)) < len(paths):
-        raise InputError(f"gradients is {paths!r}; allowed: every parameter once")
-    scenes, values = dict(task.scenes), {path: circuit.parameters[path].value for path in paths}
-    for path, value in values.items():
-        if path not in scenes and not (math.isfinite(value) and value != 0.0):
-            raise InputError(
-                f"gradients names {path}, which is {value:g}; allowed: parameters whose value is finite and not 0, as "
-                "steps are relative to it"
-            )
-        scenes.setdefault(path, np.full(task.n, value))
-    on = driving_sources(circuit)
+    require(len(set(paths)) == len(paths), "gradients", repr(paths), "every parameter once")
+    on, scenes = driving_sources(circuit), dict(task.scenes)
     clock = f"{on[0].name}.frequency" if len(on) == 1 else None
     skins = tuple(f"{e.name}.f" for e in circuit.by_device("SKIN")) if skin == "follow" else ()
-    for path, value in values.items():
-        turned = path in skins
+    for path in paths:
+        value, turned = circuit.parameters[path].value, path in skins
+        if path not in scenes and not (math.isfinite(value) and value != 0.0):
+            raise InputError(f"gradients names {path}, which is {value:g}; allowed: parameters whose value is finite "
+                             "and not 0, as steps are relative to it")  # fmt: skip
+        scenes.setdefault(path, np.full(task.n, value))
         if skins and not turned and path != clock:
             # Whether the parameter changes the frequency of a source.
             name, moved = path.rpartition(".")[0], circuit.varied({path: value * (1.0 + _SEEN)})
@@ -235,10 +225,9 @@ def gradients_of(task: Task, gradients: Sequence[str], skin: str) -> Task | None
         if turned:
             raise InputError(f"skin='follow', and gradients names {path}, with which the skin's frequency changes; "
                              "allowed: the frequency of the only source, or skin='own'")  # fmt: skip
-    together = {path: (path, *(skins if path == clock else ())) for path in paths}
     asked = copy(task)
-    asked.outputs, asked.traced, asked.scenes, asked.paths = outputs, False, scenes, together
-    asked.clock = clock if clock in paths else None
+    asked.outputs, asked.traced, asked.scenes, asked.clock = outputs, False, scenes, clock if clock in paths else None
+    asked.paths = {path: (path, *(skins if path == clock else ())) for path in paths}
     return asked
 
 
@@ -278,7 +267,7 @@ def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str
     waves = [e.waveform for e, _ in sources]
     recording = as_samples(waves[0]) if len(waves) == 1 and waves[0] is not None else None
     jumping = recording is None and any(isinstance(wave, Square | Pulse) for wave in waves)
-    tones = [hz for wave in waves for hz in _source_of(wave)[0]]
+    tones = [hz for wave in waves for hz, *_ in _tones_of(wave, {})[0]]
     multiples: tuple[int, ...] = (1,)
     frequency, charged = None, jumping
     if recording is not None:
@@ -286,10 +275,8 @@ def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str
             return "the recording does not start at 0 s"
         frequency, charged = 0.5 * recording.rate, recording.between(0, 1)[0] != 0.0
     elif not (tones and all(tones) and len(tones) <= (1 if jumping else _MOST_TONES)):
-        return (
-            f"the sources are not 1 to {_MOST_TONES} plain sines, not a square that starts with its period, and not a "
-            "recording"
-        )
+        said = f"the sources are not 1 to {_MOST_TONES} plain sines, not a square that starts with its period"
+        return f"{said}, and not a recording"
     elif len(tones) > 1:
         period = stack.waveform.period
         if period is None or max(tones) * period > _MOST_PERIODS:
@@ -305,7 +292,7 @@ def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str
     if given or (tran is not None and tran.start > 0.0):
         return "the run does not start uncharged, or its figures start late"
     fixed = () if frequency is None else ("frequency",)
-    may_vary = {e.name.lower(): set(_source_of(e.waveform)[1]).difference(fixed) for e, _ in sources}
+    may_vary = {e.name.lower(): set(_tones_of(e.waveform, {})[1]).difference(fixed) for e, _ in sources}
     layers = {e.name.lower() for e in stack.layers}
     for path in varied:
         name, _, parameter = path.rpartition(".")
@@ -330,47 +317,27 @@ def why_alone(form: LockstepForm | str, outputs: Iterable[str], slopes_at: float
     return ""
 
 
-def in_lockstep_by(circuit: Circuit, paths: Iterable[str], outputs: Iterable[str], rtol: float) -> bool:
-    """Whether derivatives of outputs by parameters, with the values of all `paths` varying, can be those of lockstep.
+def _tones_of(wave: object, given: Mapping[str, Value]) -> tuple[list[tuple[float, Value, Value]], tuple[str, ...]]:
+    """Frequency (Hz), amplitude (V) and phase (rad) of the tones of a source, and its parameters that may vary.
 
-    If not, a batch takes the derivatives of single runs, besides a run for every scene's outputs.
+    `given` has those that do. A square that starts with its period is one tone; a source without tones has one of 0 Hz.
     """
-    return not why_alone(lockstep_form(circuit, paths), outputs, rtol)
-
-
-def _source_of(wave: object) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """Frequencies of a source's tones from t = 0 on, and its parameters that may vary; 0 Hz of one without such tones.
-
-    A square that starts with its period counts as one tone.
-    """
+    height, depth, phase = (given.get(name, getattr(wave, name, 0.0)) for name in ("amplitude", "depth", "phase_deg"))
+    turn: Value = np.radians(phase)
     match wave:
         case AM():
-            sides = wave.carrier - wave.modulation, wave.carrier + wave.modulation
-            return (wave.carrier, *sides), ("amplitude", "depth", "phase_deg")
+            # sin(x) sin(y) is half of cos(x - y) = sin(x - y + pi/2) and of -cos(x + y) = sin(x + y - pi/2).
+            share, quarter = height / (1.0 + depth), 0.5 * np.pi
+            side, low, high = 0.5 * depth * share, wave.carrier - wave.modulation, wave.carrier + wave.modulation
+            tones = [(wave.carrier, share, 0.0), (low, side, quarter - turn), (high, side, turn - quarter)]
+            return tones, ("amplitude", "depth", "phase_deg")
         case Sine(offset=0.0, delay=0.0, damping=0.0):
-            return (wave.frequency,), ("amplitude", "frequency", "phase_deg")
+            return [(wave.frequency, height, turn)], ("amplitude", "frequency", "phase_deg")
         case Square(half_wave=True, phase_deg=0.0, delay=0.0):
-            return (wave.frequency,), ("amplitude", "frequency")
+            return [(wave.frequency, height, turn)], ("amplitude", "frequency")
         case Pulse(half_wave=True, rise=0.0, delay=0.0):
-            return (wave.tone() or 0.0,), ()
-    return (0.0,), ()
-
-
-def _tones_of(wave: object, given: Mapping[str, Value]) -> list[tuple[Value, Value]]:
-    """Amplitude (V) and phase (rad) of the tones of a source, in the order of `_source_of`; `given` has what varies."""
-
-    def value(name: str) -> Value:
-        return given.get(name, getattr(wave, name, 0.0))
-
-    if isinstance(wave, Pulse):
-        return [(wave.v2, 0.0)]
-    if isinstance(wave, AM):
-        # sin(x) sin(y) is half of cos(x - y) = sin(x - y + pi/2) and of -cos(x + y) = sin(x + y - pi/2).
-        depth, turn = value("depth"), np.radians(value("phase_deg"))
-        share = value("amplitude") / (1.0 + depth)
-        side = 0.5 * depth * share
-        return [(share, 0.0), (side, 0.5 * np.pi - turn), (side, turn - 0.5 * np.pi)]
-    return [(value("amplitude"), np.radians(value("phase_deg")))]
+            return [(wave.tone() or 0.0, wave.v2, 0.0)], ()
+    return [(0.0, 0.0, 0.0)], ()
 
 
 def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:
@@ -384,9 +351,9 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
         given = {path.removeprefix(start): array for path, array in scenes.items() if path.startswith(start)}
         return {**element.values, **given}
 
-    n = next(iter(scenes.values())).size
-    out = np.empty((CELL_ROWS * form.cells + N_OTHERS + 2 * len(form.multiples), n))
-    of_cells, cell = out[: CELL_ROWS * form.cells].reshape(CELL_ROWS, form.cells, n), 0
+    n, others = next(iter(scenes.values())).size, CELL_ROWS * form.cells
+    out = np.empty((others + N_OTHERS + 2 * len(form.multiples), n))
+    of_cells, cell = out[:others].reshape(CELL_ROWS, form.cells, n), 0
     for layer, count in zip(form.stack.layers, form.stack.cells, strict=True):
         assert layer.spec.cells is not None
         cells = layer.spec.cells(values(layer), None)
@@ -397,11 +364,11 @@ def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray
     frequency = form.frequency or values(first).get("frequency", 1.0 / (period or math.nan))
     rows = [*_contact_rows(values(form.gap)), 2.0 * np.pi * np.asarray(frequency)]
     for element, sign in form.sources:
-        recorded = None if form.recording is None else [(peak_of(form.recording), 0.0)]
-        for amplitude, phase in recorded or _tones_of(element.waveform, values(element)):
+        recorded = None if form.recording is None else [(0.0, peak_of(form.recording), 0.0)]
+        for _, amplitude, phase in recorded or _tones_of(element.waveform, values(element))[0]:
             rows += [sign * amplitude * np.cos(phase), sign * amplitude * np.sin(phase)]
     for i, row in enumerate(rows):
-        out[CELL_ROWS * form.cells + i] = row
+        out[others + i] = row
     return out
 
 

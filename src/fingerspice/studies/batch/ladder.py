@@ -110,13 +110,8 @@ class Ladder:
         # Rows of the moments that the figures need
         self.needed = sorted({i for name in self.names for i in FIGURES[name.removesuffix("_periodic")]} or {0})
         self.n_moment = ALL_MOMENTS if self.needed[-1] else 1
-        self._look()
-
-    def _look(self) -> None:
-        """Find what the scenes need of their steps, each of shape (n,)."""
-        form, table, periodic = self.form, self.table, self.task.periodic
-        cells, others = form.cells, CELL_ROWS * form.cells
-        # Whether there is contact
+        # What the scenes need of their steps, each of shape (n,); first, whether there is contact
+        table, periodic, cells, others = self.table, task.periodic, form.cells, CELL_ROWS * form.cells
         self.possible = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
         # Leakage rate of every cell with its area at rest; the largest is an upper bound of the rates of the modes.
         leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
@@ -127,7 +122,7 @@ class Ladder:
         first: FloatArray | float = 0.0
         if form.jumping:
             # Gap voltages at equal distances need a single piece.
-            most = 1 if self.task.traced else _MOST_PIECES
+            most = 1 if task.traced else _MOST_PIECES
             self.pieces = np.ceil(np.log2(1.0 + _PIECE_START * self.decays)).clip(1, most).astype(int)
             first = self.pieces / (2.0**self.pieces - 1.0)
         elif form.recording is not None and not periodic:
@@ -135,7 +130,7 @@ class Ladder:
         elif not periodic:
             sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
             from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
-            first = np.where(from_zero, START_TIMES[2] if self.task.rtol < _LEADING else 0.0, 1.0)
+            first = np.where(from_zero, START_TIMES[2] if task.rtol < _LEADING else 0.0, 1.0)
         # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
         self.least = 2.0 * first * self.decays / _LONGEST_STEP
 
@@ -143,7 +138,7 @@ class Ladder:
         """Find what is wanted in runs of so many half periods; scenes whose error stays too large stay not done."""
         # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
         order = np.argsort(self.slowest) if halves > 4 else np.arange(self.members.size)
-        rtol, highest = self.task.rtol, max(self.form.multiples)
+        rtol, highest, points = self.task.rtol, max(self.form.multiples), self.task.points
         _, one, several, degree = next(rung for rung in _RUNGS if rtol >= rung[0])
         for pieces in np.unique(self.pieces[self.possible]).tolist():
             steps = one if highest == 1 else several * highest
@@ -153,8 +148,8 @@ class Ladder:
                 steps = _PARTS[0]
             if self.task.traced:
                 # Half of the steps, too, are an even number.
-                points = self.task.points * (1 if self.task.points % 4 == 0 else 2)
-                steps = points * -(-steps // points)
+                each = points * (1 if points % 4 == 0 else 2)
+                steps = each * -(-steps // each)
             pending = order[(self.possible & (self.pieces == pieces))[order]]
             for covered in _COVERED:
                 pending = self._climb(Level(halves, pieces, covered, steps, degree), pending)
@@ -190,11 +185,9 @@ class Ladder:
             left &= ~beyond
             outside.append(pending[beyond])
             kept = np.tile(left, self.copies)
-            before = run.fine[:, kept], run.trace[kept]
-            last, pending = error[left], pending[left]
-            degree = level.degree
-            if tail[:, left].max(initial=0.0) > _SMALL_TAIL * rtol:
-                degree = max(degree, min(degree + _MORE_DEGREE, highest))
+            before, last, pending = (run.fine[:, kept], run.trace[kept]), error[left], pending[left]
+            more = _MORE_DEGREE if tail[:, left].max(initial=0.0) > _SMALL_TAIL * rtol else 0
+            degree = max(level.degree, min(level.degree + more, highest))
             level = level._replace(steps=2 * level.steps, degree=degree)
         return np.concatenate(outside)
 
@@ -243,12 +236,12 @@ class Ladder:
         if signal == "f_el":
             return np.asarray(stress * (m[0] if kind == "mean" else np.sqrt(m[1])))
         mu = self.scenes.get(f"{gap.name.lower()}.mu")
-        friction = np.full(columns.size, gap.values["mu"]) if mu is None else mu[columns]
-        # Sum of load and electroadhesive force, N.
+        # Friction coefficient times the sum of load and electroadhesive force, N
         normal = load + stress * m[0]
         if kind == "rms":
             normal = np.sqrt(load * load + 2.0 * load * stress * m[0] + stress * stress * m[1])
-        return np.asarray(friction * normal if signal == "f_t" else friction * normal / load)
+        force = (gap.values["mu"] if mu is None else mu[columns]) * normal
+        return np.asarray(force if signal == "f_t" else force / load)
 
     def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
         """Put what is wanted of the scenes that are `good` among `pending` into the task."""
@@ -260,8 +253,7 @@ class Ladder:
             self.task.values[name][self.members[at]] = self.figure(name, moments, at)
         if self.task.traced:
             u, some = self.task.values["u_gap"], run.trace[good, :: level.steps // self.task.points]
-            u[self.members[at], : some.shape[1]] = some
-            u[self.members[at], some.shape[1] :] = np.nan
+            u[self.members[at]] = np.pad(some, ((0, 0), (0, u.shape[1] - some.shape[1])), constant_values=np.nan)
 
     def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
         """Estimated error of the scenes `pending`: the largest of all outputs, relative to themselves."""

@@ -73,9 +73,8 @@ class Work:
     """A sweep with its store, and all that it takes to run any chunk of it."""
 
     def __init__(self, plan: Plan, options: Mapping[str, Any], path: Path) -> None:
-        """The first scene is run to see what outputs there are."""
-        self.plan, self.path, self.programs = plan, path.absolute(), programs()
-        self.options = options  # Of `batch`
+        """The first scene is run to see what outputs there are; `options` are those of `batch`."""
+        self.plan, self.path, self.programs, self.options = plan, path.absolute(), programs(), options
         circuit = plan.circuit
         # What a parameter does not accept: values of the grid, and quantiles beyond which there are draws.
         beyond = plan.quantiles(np.repeat([[1.0 / plan.n], [1.0 - 1.0 / plan.n]], len(plan.drawn), axis=1))
@@ -88,11 +87,8 @@ class Work:
                 kind = "the distribution of" if name in plan.drawn else "the values of"
                 raise InputError(f"{kind} {name}: {error}") from None
         middle = plan.quantiles(np.full((1, len(plan.drawn)), 0.5))
-        ends = plan.spread({name: values[[0, -1]] for name, values in plan.grid.items()}, middle)
-        told = scenes_warnings(
-            circuit, options.get("t_stop"), checked_scenes(circuit, ends), options.get("skin", "own")
-        )
-        for text in told:
+        ends = checked_scenes(circuit, plan.spread({name: x[[0, -1]] for name, x in plan.grid.items()}, middle))
+        for text in scenes_warnings(circuit, options.get("t_stop"), ends, options.get("skin", "own")):
             warnings.warn(text, FingerspiceWarning, stacklevel=4)
         scene = plan.spread({name: values[:1] for name, values in plan.grid.items()}, middle)
         with warnings.catch_warnings():
@@ -101,12 +97,9 @@ class Work:
             first = batch(circuit, scene, **options)
         if "u_gap" in first:
             raise InputError("outputs are u_gap, and a store has figures, which are one number for each scene")
-        status, failures = int(first.status[0]), first.attrs["failures"]
-        if status >= REFUSED and len(circuit.by_device("GAP")) > 1:
-            raise InputError(f"the middle of the sweep has no result ({failures[0]}); allowed: one that has")
         self.block: tuple[int, ...] = ()  # Scenes of a chunk along each dimension
         for length in reversed(plan.sizes):
-            size = CHUNK if status == LOCKSTEP else SLOW_CHUNK
+            size = CHUNK if first.status[0] == LOCKSTEP else SLOW_CHUNK
             self.block = min(length, max(1, size // math.prod(self.block))), *self.block
         self._grid = tuple(-(-size // own) for size, own in zip(plan.sizes, self.block, strict=True))
         self.chunks = math.prod(self._grid)
@@ -121,10 +114,8 @@ class Work:
             )
             for name, one in first.data_vars.items()
         }  # fmt: skip
-        last = self.outputs.pop(STATUS)
-        flags = dict(last.attributes)
-        flags |= {"flag_values": [*flags["flag_values"], MISSING], "flag_meanings": f"{flags['flag_meanings']} missing"}
-        self.outputs[STATUS] = replace(last, kind="i1", fill=MISSING, attributes=flags)
+        flags = {"flag_values": list(range(MISSING + 1)), "flag_meanings": " ".join((*STATUS_NAMES, "missing"))}
+        self.outputs[STATUS] = replace(self.outputs.pop(STATUS), kind="i1", fill=MISSING, attributes=flags)
         # The drawn parameters
         self.drawn = {
             name: Array(self.path / name, ("scene",), plan.sizes[-1:], self.block[-1:], {"units": plan.units[name]})
@@ -214,39 +205,28 @@ class Work:
             raise InputError(f"{self.path} is not there on a worker; allowed: a folder that all machines share")
         if programs() != self.programs:
             raise InputError(f"a worker has {programs()}, and the sweep is of {self.programs}; allowed: the same")
-        ranges = zip(self._place(index), self.block, self.plan.sizes, strict=True)
+        plan, at = self.plan, self._place(index)
+        ranges = zip(at, self.block, plan.sizes, strict=True)
         part = tuple(slice(i * own, min((i + 1) * own, size)) for i, own, size in ranges)
         sizes = tuple(one.stop - one.start for one in part)
         with computing:
-            found, values = self._computed(index, part)
-        for name, one in self.outputs.items():
-            own, more = found[name].values, one.shape[len(part) :]
-            if own.ndim == 1 and more:
-                # No scene of the chunk has a result.
-                own = np.full((own.size, *more), np.nan)
-            values[name] = own.reshape((*sizes, *more))
+            draws = {} if self.draws is None else self.draws.part(at[-1])
+            grid = {name: values[one] for (name, values), one in zip(plan.grid.items(), part, strict=False)}
+            found = batch(plan.circuit, plan.spread(grid, draws), **self.options)
         with writing:
-            self._write(index, values)
+            try:
+                for name, one, place in self.pieces(index):
+                    own = draws[name] if name in draws else found[name].values
+                    one.put(place, own if name in draws else own.reshape((*sizes, *one.shape[len(part) :])))
+            except OSError as error:
+                raise InputError(f"cannot write {self.path}: {error.strerror or error}; {_GOES_ON}") from None
         failures = []
         for told in found.attrs["failures"]:
             # Scenes are told by their numbers in the whole sweep; a sweep without dimensions is one scene.
             scene, _, message = told.removeprefix("scene ").partition(": ")
             place = np.add([one.start for one in part], np.unravel_index(int(scene), sizes)).astype(int)
-            failures.append(f"scene {np.ravel_multi_index(tuple(place), self.plan.sizes) if part else 0}: {message}")
+            failures.append(f"scene {np.ravel_multi_index(tuple(place), plan.sizes) if part else 0}: {message}")
         return found.sizes["scene"], failures
-
-    def _computed(self, index: int, part: tuple[slice, ...]) -> tuple[Dataset, dict[str, NDArray[Any]]]:
-        """The batch of a chunk's scenes, and the values that are drawn."""
-        draws = {} if self.draws is None else self.draws.part(self._place(index)[-1])
-        grid = {name: values[one] for (name, values), one in zip(self.plan.grid.items(), part, strict=False)}
-        return batch(self.plan.circuit, self.plan.spread(grid, draws), **self.options), {**draws}
-
-    def _write(self, index: int, values: Mapping[str, NDArray[Any]]) -> None:
-        try:
-            for name, one, place in self.pieces(index):
-                one.put(place, np.asarray(values[name]))
-        except OSError as error:
-            raise InputError(f"cannot write {self.path}: {error.strerror or error}; {_GOES_ON}") from None
 
 
 def _identity_at(path: Path) -> dict[str, Any]:
@@ -270,10 +250,8 @@ def stored(
     require(good, "shard", shard, "two whole numbers (i, m), with i from 1 to m")
     if os.path.lexists(path):
         _identity_at(path)
-    work = Work(plan, options, path)
     here = workers is None and scheduler is None
-    if not here:
-        work.options = {"threads": 1, **options}
+    work = Work(plan, options if here else {"threads": 1, **options}, path)
     with nullcontext() if here else _client(workers and min(workers, work.chunks), scheduler) as client:
         work.open()
         begun, mine = time.perf_counter(), range(shard[0] - 1, work.chunks, shard[1])
