@@ -86,18 +86,18 @@ class Comparison(Shown):
     def _page(self) -> Page:
         rows = [(f"{label} [{unit}]", *(f"{x:.6g}" for x in numbers)) for label, unit, numbers in self._labelled(2)]
         head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
-        said = []
+        state = f"periodic state at {format_si(self.frequency, 'Hz')}, charge law {self.solution.charge_law}"
+        page = [*head_lines(self.solution.circuit), state, "", Table(head, rows), ""]
         for i, gap in enumerate(self.gaps):
             reference, mean, coupled = (f.of_gap(i)["f_el_mean"] for f in (self.phasor, self.mean, self.coupled))
             # Round before formatting, and add 0.0, so that -0.00 is not printed.
             total, waveform = (round(100.0 * (x / reference - 1.0), 2) + 0.0 for x in (coupled, mean))
-            said.append(
+            page.append(
                 f"mean force{f' of {gap}' if len(self.gaps) > 1 else ''}: {total:+.2f} % against the phasor; "
                 f"{total - waveform:+.2f} % of that is the ripple of the area, {waveform:+.2f} % is the waveform's "
                 "(zero for a sine)"
             )
-        state = f"periodic state at {format_si(self.frequency, 'Hz')}, charge law {self.solution.charge_law}"
-        return Page([*head_lines(self.solution.circuit), state, "", Table(head, rows), "", *said])
+        return Page(page)
 
     def plot(self) -> Picture:
         """Picture of one period of the transient and of the phasor, with the figures of both."""
@@ -224,10 +224,9 @@ def compare(
         area = one._figures.value("area", "mean_periodic")
         every = one.u_gap_amplitude, (lead + 180.0) % 360.0 - 180.0, one.f_el_mean_periodic, area
         ways.append(np.array(every, float).reshape(len(every), -1))
-    if len(found) == 1:
-        ways = [way[:, 0].tolist() for way in ways]
-    of_phasor, of_mean, of_coupled = (Figures(*way) for way in ways)
-    return Comparison(of_phasor, of_mean, of_coupled, fundamental.frequency, coupled)
+    # In the order of `Comparison`
+    figured = (Figures(*(way[:, 0].tolist() if len(found) == 1 else way)) for way in ways)
+    return Comparison(*figured, fundamental.frequency, coupled)
 
 
 # Number of outputs in a period; cubics through them interpolate a sine with an error of 1e-9 of its amplitude.
@@ -288,16 +287,13 @@ def large_signal(
     for text in warned:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     drives = [own] if amplitude is None else [(float(a), 0.0, "the amplitude given") for a in given]
-    (source, sign), *_ = scene.sources
-    skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
-    found = []
+    ((source, sign),), skins, found = scene.sources, [f"{e.name}.f" for e in circuit.by_device("SKIN")], []
     for place, (size, phase, drive) in enumerate(drives):
         rows = []
         for number, x in enumerate(f.tolist(), place * f.size + 1):
             changed = circuit.varied({**dict.fromkeys(skins, x), source.name: Sine(size, x)})
             s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution
-            # The output starts at a multiple of the period, so that phases from its start are phases relative to the
-            # source.
+            # The output starts at a multiple of the period: phases from its start are relative to the source.
             period, end = s.t - s.t[0], "" if len(s.gaps) == 1 else f":{scene.layers[scene.gap]}"
             means = [weigh_outputs(period, s.record.one(key + end)).mean() for key in ("area", "f_el")]
             rows.append([*means, *(weigh_outputs(period, u).phasor(x) * sign / size for u in s.u_layer.T)])

@@ -65,22 +65,19 @@ def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[t
     """Remarks on the frequency of the skin's data, and warnings about extrapolation, for a sweep (Hz)."""
     skins = {e.name: e.values["f"] for e in circuit.by_device("SKIN")}
     own = ", ".join(f"{name} f = {x:g} Hz" for name, x in skins.items())
-    notes: tuple[str, ...] = ()
+    notes, warned = list[str](), list[str]()
     if skins and skin == "own":
-        notes = (f"the skin's data are held at the deck's own frequency ({own}) over the whole sweep",)
+        notes.append(f"the skin's data are held at the deck's own frequency ({own}) over the whole sweep")
     elif any(np.any(np.abs(f / x - 1.0) > 1e-9) for x in skins.values()):
-        notes = (f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})",)
-    swept = bool(circuit.by_device("SKIN_DISPERSIVE")) or (bool(skins) and skin != "own")
+        notes.append(f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})")
     low, high = float(f.min()), float(f.max())
     ends = ("down to", low, SKIN_BAND[0] / low, "below"), ("up to", high, high / SKIN_BAND[1], "above")
     # The tolerance of 1e-6 allows for rounding of a sweep's end.
     beyond = [f"{to} {x:g} Hz, {math.log10(by):.2g} decades {side}" for to, x, by, side in ends if by > 1.0 + 1e-6]
-    if not swept or not beyond:
-        return notes, ()
-    return notes, (
-        f"the sweep goes {' and '.join(beyond)} the 10 Hz to 100 kHz of the skin's data (Eqs. 18, 19): what it shows "
-        "there is extrapolated",
-    )
+    if beyond and (circuit.by_device("SKIN_DISPERSIVE") or (skins and skin != "own")):
+        warned.append(f"the sweep goes {' and '.join(beyond)} the 10 Hz to 100 kHz of the skin's data (Eqs. 18, 19): "
+                      "what it shows there is extrapolated")  # fmt: skip
+    return tuple(notes), tuple(warned)
 
 
 def sweep_frequencies(sweep: AcSweep) -> FloatArray:
@@ -155,10 +152,8 @@ def phasor(
     if scene is None and math.isnan(amplitude):
         raise InputError("no source has an amplitude; allowed: AC on a source, such as V1 in 0 AC 1, or one sine")
     if scene is not None and area == "mean" and math.isnan(amplitude) and not scene.fixed:
-        raise InputError(
-            "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
-            "'frozen' or an area in m^2"
-        )
+        raise InputError("area='mean' needs the amplitude of the source's fundamental, and this source has none; "
+                         "allowed: 'frozen' or an area in m^2")  # fmt: skip
     notes, warned = sweep_notes(circuit, f, skin)
     v, none = None, np.full(f.size, math.nan)
     with np.errstate(all="ignore"):
@@ -182,10 +177,9 @@ def phasor(
         impedance = np.array([network.impedance(float(x), a) for x, a in zip(f, areas, strict=True)]) if alone else None
     finite = np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
     if not finite.all():
-        raise InputError(
-            f"the phasor at {f[np.argmin(finite)]:g} Hz is beyond the range of numbers; allowed: frequencies nearer to "
-            "the 10 Hz to 100 kHz of the skin's data, and values nearer to Table 1's"
-        )
+        raise InputError(f"the phasor at {f[np.argmin(finite)]:g} Hz is beyond the range of numbers; allowed: "
+                         "frequencies nearer to the 10 Hz to 100 kHz of the skin's data, and values nearer to Table "
+                         "1's")  # fmt: skip
     if scene is not None:
         notes = (*notes, *filter(None, [scene.note]))
         warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
@@ -231,17 +225,14 @@ class SteadyState(Shown, Figured):
     asked: tuple[str, ...] = ()
 
     def _page(self) -> Page:
-        largest = 1.0 - self.stability_margin
         found = f"periodic state of {format_si(self.period, 's')}, found in {self.periods:.3g} periods"
-        left = (
-            f"a further period changes the voltages by {self.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % "
-            "of a small disturbance"
-        )
+        left = f"{100.0 * (1.0 - self.stability_margin):.3g} % of a small disturbance"
+        changes = f"a further period changes the voltages by {self.defect:.2g} V at most, and leaves {left}"
         try:
             period = self.solution._page().blocks
         except SolveError as error:
             period = (error.message,)
-        return Page([found, left, "", *period])
+        return Page([found, changes, "", *period])
 
     def plot(self, signals: str | Sequence[str] | None = None) -> Figure:
         """The period's signals against time; `signals` as in `Solution.plot`."""
@@ -283,12 +274,9 @@ class SteadyState(Shown, Figured):
 
     def _run(self, circuit: Circuit, rtol: float) -> Solution:
         """The run from the periodic state of another circuit, as long as the period of this one."""
-        one = self.problem
-        other = prepare(
-            circuit, t_stop=self.period, t_eval=None, charge_law=one.scene.charge_law, area=self.area,
-            start="periodic", charge=False,
-        )  # fmt: skip
-        return run_problem(close_period(dataclasses.replace(other, first=0.0, step=one.step), 0.5 * rtol)[0], rtol=rtol)
+        law, step = self.problem.scene.charge_law, self.problem.step
+        other = prepare(circuit, t_stop=self.period, charge_law=law, area=self.area, start="periodic", charge=False)
+        return run_problem(close_period(dataclasses.replace(other, first=0.0, step=step), 0.5 * rtol)[0], rtol=rtol)
 
     @cached_property
     def solution(self) -> Solution:
@@ -350,15 +338,12 @@ def steady_state(
     SolveError
         If a period cannot be integrated, or Newton's method does not converge.
     """
-    rtol = rtol_given(rtol)
-    points = whole_number("points", points, 1)
+    rtol, points = rtol_given(rtol), whole_number("points", points, 1)
     circuit = overridden(circuit, sources, parameters)
     period = period_of(circuit)
     if period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
-    problem = prepare(
-        circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="periodic", charge=charge
-    )
+    problem = prepare(circuit, t_stop=period, charge_law=charge_law, area=area, start="periodic", charge=charge)
     if sensitivities:
         check_request(problem, sensitivities, "auto", "periodic")
     problem, found = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)

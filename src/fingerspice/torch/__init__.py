@@ -30,9 +30,8 @@ try:
     import torch
     from torch import Tensor
 except ImportError:
-    raise InputError(
-        "fingerspice.torch needs torch, which is not installed; pip install 'fingerspice[torch]'"
-    ) from None
+    missing = "fingerspice.torch needs torch, which is not installed; pip install 'fingerspice[torch]'"
+    raise InputError(missing) from None
 
 __all__ = ["Drive", "Simulator"]
 
@@ -153,12 +152,8 @@ class Drive(torch.nn.Module):
         V; several rows are several drives.
     rate : float
         Samples per second; the first one is at 0 s.
-    outputs : str or sequence of str
+    outputs, t, t_stop
         As for `Simulator`.
-    t : array_like, optional
-        Times of the signals, s, ascending.
-    t_stop : float, optional
-        End of every run, s; the deck's TSTOP by default.
     source : str, optional
         The source that is replaced; needed where there are several.
     rtol : float
@@ -309,9 +304,9 @@ class Simulator(torch.nn.Module):
         InputError
             If it is no parameter of the module.
         """
-        name, known = own_path(self.circuit, path), ", ".join(self.paths) or "none"
+        name = own_path(self.circuit, path)
         if name not in self.paths:
-            raise InputError(f"{name} is no parameter of this module; allowed: {known}")
+            raise InputError(f"{name} is no parameter of this module; allowed: {', '.join(self.paths) or 'none'}")
         held: Tensor = getattr(self, self.paths[name])
         return held.exp() if self.logarithms else held
 
@@ -353,8 +348,6 @@ class _Run(torch.autograd.Function):
 
     With `wanted`, their derivatives by these parameters: of shape (..., number of outputs, number of parameters).
     """
-
-    generate_vmap_rule = False
 
     @staticmethod
     def forward(scenes: Scenes, paths: tuple[str, ...], wanted: tuple[str, ...], *values: Tensor) -> Tensor:

@@ -18,15 +18,17 @@ from fingerspice.numerics.modes import STEP
 from fingerspice.studies.batch.form import FIGURES, LOCKSTEP, LockstepForm, Task, curves_of, peak_of, table_of
 
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
-# and (of the highest) under several; and initial degree of the area's polynomial, of which each takes the compiler 8 s.
-_RUNGS = ((5e-4, 20, 16, 8), (5e-5, 32, 24, 8), (5e-6, 48, 48, 16), (5e-7, 72, 72, 16), (0.0, 112, 112, 16))
+# and (of the highest) under several, and of a piece of a square's half period; and initial degree of the area's
+# polynomial, of which each takes the compiler 8 s.
+_RUNGS = (
+    (5e-4, 20, 16, 4, 8), (5e-5, 32, 24, 4, 8), (5e-6, 48, 48, 6, 16), (5e-7, 72, 72, 8, 16), (0.0, 112, 112, 16, 16),
+)  # fmt: skip
 # By how much that grows where the last coefficient is more than this share of rtol; and the largest number of steps.
 _MORE_DEGREE, _SMALL_TAIL, _MOST_STEPS = 8, 0.1, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
 # Largest gap voltage that the area's polynomial covers, as a ratio to its estimate: the second one for scenes that the
-# first did not cover. It is the same for all numbers of steps, whose results are compared, because the linear part of
-# the equations has the area of its middle, so that the error of a step depends on it.
+# first did not cover. As the linear part of the equations has the area of its middle, results are compared at one only.
 _COVERED = 1.2, 1.8
 # Allowed defect of the periodic state relative to rtol, and that of a run from rest that ends when it has settled.
 _CLOSING, _SETTLED = 0.02, 0.05
@@ -34,9 +36,8 @@ _CLOSING, _SETTLED = 0.02, 0.05
 # time constants of the fastest cell; and the voltage at the start that counts as 0 V, over all tones. Also from
 # there a leaking gap's voltage jumps, as it leads the source: below this rtol the first step is as short as a square's.
 _LONGEST_STEP, _FROM_ZERO, _LEADING = 1.0, 1e-12, 5e-5
-# Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
-# `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
-_PIECES = ((5e-5, 4), (5e-6, 6), (5e-7, 8), (0.0, 16))
+# Number by which the first step of a square, with so many steps a piece, is shorter than the fastest cell's time
+# constant; and the largest number of pieces.
 _PIECE_START, _MOST_PIECES = 2, 20
 #: A scene is accepted if its estimate is at most this fraction of the error allowed.
 ENOUGH = 0.7
@@ -44,18 +45,13 @@ ENOUGH = 0.7
 _ROUNDING = 1e-11
 # The error is estimated as this share of the change from half the steps to all steps. The order is 4, which would give
 # a fifteenth, and 3 for what the kinks of 1/A leave, where the gap voltage is 0. Pieces of 2 and of 4 steps are still
-# far from the order.
-_STATED, _STATED_JUMPING = 0.25, 0.5
-# Where a step is longer than this many of the fastest time constants, the start of a run from rest is not resolved, and
-# the change is no larger than the error; it is smaller where that start is most of the error.
-_STIFF, _STATED_STIFF = 2.0, 0.8
-# A gap voltage shows the kinks at its zeros more than means do.
-_STATED_TRACED = 0.8
-# Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
-# 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
-_STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
-# What decays after a start away from 0 V meets steps of several lengths, whose errors may cancel with half the steps.
-_STATED_STARTED = 0.8
+# far from the order. Under a recording it is 3, which would give a seventh, and 2 at those zeros; but 1, which gives 1,
+# for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
+_STATED, _STATED_JUMPING, _STATED_RECORDED, _STATED_DISPERSIVE = 0.25, 0.5, 0.5, 1.0
+# It is more of gap voltages, which show the kinks at their zeros more than means do; where a step is longer than this
+# many of the fastest time constants, so that the start of a run from rest is not resolved; and after a start away from
+# 0 V, as what decays then meets steps of several lengths, whose errors may cancel with half the steps.
+_STATED_MORE, _STIFF = 0.8, 2.0
 # Rounding error of a run in which the area's polynomial has degree d, relative: 2^d times this, by which the powers'
 # coefficients are larger than those of Chebyshev's series. And, in a derivative, that of all else.
 _EPS, _ROUNDING_OF_SLOPES = 4.4e-16, 1e-13
@@ -139,11 +135,9 @@ class Ladder:
         # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
         order = np.argsort(self.slowest) if halves > 4 else np.arange(self.members.size)
         rtol, highest, points = self.task.rtol, max(self.form.multiples), self.task.points
-        _, one, several, degree = next(rung for rung in _RUNGS if rtol >= rung[0])
+        _, one, several, of_piece, degree = next(rung for rung in _RUNGS if rtol >= rung[0])
         for pieces in np.unique(self.pieces[self.possible]).tolist():
-            steps = one if highest == 1 else several * highest
-            if pieces > 1:
-                steps = 2 * pieces * next(s for least, s in _PIECES if rtol >= least)
+            steps = 2 * pieces * of_piece if pieces > 1 else one if highest == 1 else several * highest
             if self.form.recording is not None:
                 steps = _PARTS[0]
             if self.task.traced:
@@ -275,20 +269,16 @@ class Ladder:
             off = np.abs(run.trace[:, : 2 * run.trace_coarse.shape[1] : 2] - run.trace_coarse).max(axis=1)
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
-        change = np.max(changes, axis=0) + run.coarse[-1]
-        share = self._share(level, self.decays[pending], self.least[pending])
-        return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING + 2.0**level.degree * _EPS)
-
-    def _share(self, level: Level, decays: FloatArray, least: FloatArray) -> FloatArray | float:
-        """The error as a share of the change."""
-        if self.form.recording is not None:
-            return _STATED_RECORDED if self.form.cells == len(self.form.stack.layers) else _STATED_DISPERSIVE
-        if self.form.jumping:
-            return _STATED_JUMPING
-        own = _STATED_TRACED if self.task.traced else _STATED
-        share = np.where(2.0 * decays > _STIFF * level.steps, max(own, _STATED_STIFF), own)
+        change, decays = np.max(changes, axis=0) + run.coarse[-1], self.decays[pending]
         # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
-        return np.where(least > decays, _STATED_STARTED, share)
+        more = self.task.traced | (2.0 * decays > _STIFF * level.steps) | (self.least[pending] > decays)
+        share = np.where(more, _STATED_MORE, _STATED)
+        if self.form.recording is not None:
+            plain = self.form.cells == len(self.form.stack.layers)
+            share = np.full_like(decays, _STATED_RECORDED if plain else _STATED_DISPERSIVE)
+        elif self.form.jumping:
+            share = np.full_like(decays, _STATED_JUMPING)
+        return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING + 2.0**level.degree * _EPS)
 
 
 class Slopes(Ladder):

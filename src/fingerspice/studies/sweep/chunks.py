@@ -35,7 +35,7 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.describe import digests, scenes_warnings
 from fingerspice.results.runfile import CHECKSUM, Array, attributes_of, create, tidy
 from fingerspice.studies.batch.batch import MESSAGES, batch
-from fingerspice.studies.batch.form import LOCKSTEP, REFUSED, STATUS_NAMES, checked_scenes
+from fingerspice.studies.batch.form import LOCKSTEP, STATUS_NAMES, checked_scenes
 from fingerspice.studies.sweep.populations import Draws, Plan
 from fingerspice.waveforms.waveform import require
 
@@ -154,10 +154,8 @@ class Work:
         if differ := [key for key in {**own, **held} if held.get(key) != own.get(key)]:
             key, told = differ[0], [str(one.get(differ[0])) for one in (held, own)]
             said = "" if max(map(len, told)) > 40 else f" ({told[0]}, and this one {told[1]})"
-            raise InputError(
-                f"{self.path} holds a sweep of another {key.replace('_', ' ')}{said}; allowed: another path, or to "
-                "remove that folder"
-            )
+            raise InputError(f"{self.path} holds a sweep of another {key.replace('_', ' ')}{said}; allowed: another "
+                             "path, or to remove that folder")  # fmt: skip
 
     def _identity(self) -> dict[str, Any]:
         """All inputs that determine the bytes of the store, by which a later call recognises it."""
@@ -213,13 +211,9 @@ class Work:
             draws = {} if self.draws is None else self.draws.part(at[-1])
             grid = {name: values[one] for (name, values), one in zip(plan.grid.items(), part, strict=False)}
             found = batch(plan.circuit, plan.spread(grid, draws), **self.options)
+        figures = {x: found[x].values.reshape((*sizes, *one.shape[len(part) :])) for x, one in self.outputs.items()}
         with writing:
-            try:
-                for name, one, place in self.pieces(index):
-                    own = draws[name] if name in draws else found[name].values
-                    one.put(place, own if name in draws else own.reshape((*sizes, *one.shape[len(part) :])))
-            except OSError as error:
-                raise InputError(f"cannot write {self.path}: {error.strerror or error}; {_GOES_ON}") from None
+            self._write(index, {**draws, **figures})
         failures = []
         for told in found.attrs["failures"]:
             # Scenes are told by their numbers in the whole sweep; a sweep without dimensions is one scene.
@@ -227,6 +221,13 @@ class Work:
             place = np.add([one.start for one in part], np.unravel_index(int(scene), sizes)).astype(int)
             failures.append(f"scene {np.ravel_multi_index(tuple(place), plan.sizes) if part else 0}: {message}")
         return found.sizes["scene"], failures
+
+    def _write(self, index: int, values: Mapping[str, NDArray[Any]]) -> None:
+        try:
+            for name, one, place in self.pieces(index):
+                one.put(place, values[name])
+        except OSError as error:
+            raise InputError(f"cannot write {self.path}: {error.strerror or error}; {_GOES_ON}") from None
 
 
 def _identity_at(path: Path) -> dict[str, Any]:
@@ -288,19 +289,16 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     try:
         import distributed
     except ImportError:
-        raise InputError(
-            f"{'scheduler' if workers is None else 'workers'} takes the package distributed, which is not installed; "
-            "allowed: pip install 'fingerspice[cluster]'"
-        ) from None
+        raise InputError(f"{'scheduler' if workers is None else 'workers'} takes the package distributed, which is not "
+                         "installed; allowed: pip install 'fingerspice[cluster]'") from None  # fmt: skip
     with ExitStack() as held:
         try:
             if workers is not None:
-                scheduler = held.enter_context(
-                    distributed.LocalCluster(
-                        n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0",
-                        silence_logs=logging.CRITICAL,
-                    )
-                ).scheduler_address  # fmt: skip
+                cluster = distributed.LocalCluster(
+                    n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.CRITICAL,
+                )  # fmt: skip
+                scheduler = held.enter_context(cluster).scheduler_address
             client = held.enter_context(distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False))
         except (OSError, ValueError, ImportError, RuntimeError) as error:
             raise InputError(
@@ -346,9 +344,8 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[R
             if lost[index] < TRIES:
                 todo.append(index)
         except Exception as error:
-            raise InputError(
-                f"the sweep at the scheduler ended with {type(error).__name__}: {error}; {_GOES_ON}"
-            ) from None
+            ended = f"the sweep at the scheduler ended with {type(error).__name__}"
+            raise InputError(f"{ended}: {error}; {_GOES_ON}") from None
         else:
             lost[None], _ = 0, given_up.pop(index, None)
             yield answer
@@ -357,10 +354,8 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[R
 
 
 def _lost(chunk: str, count: int, reason: Exception) -> InputError:
-    return InputError(
-        f"the workers of {chunk} were lost, {count} times: {reason}; allowed: fewer workers, if the memory is too "
-        f"small for these; {_GOES_ON}"
-    )
+    return InputError(f"the workers of {chunk} were lost, {count} times: {reason}; allowed: fewer workers, if the "
+                      f"memory is too small for these; {_GOES_ON}")  # fmt: skip
 
 
 def _run_and_write_aside(work: Work, index: int) -> Ran:

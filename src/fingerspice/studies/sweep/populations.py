@@ -338,10 +338,9 @@ def _indices(
     def figures(x: FloatArray) -> FloatArray:
         found = batch(plan.circuit, plan.spread(place, dict(zip(plan.drawn, x, strict=True))), **options)
         if lost := int(np.count_nonzero(found.status >= REFUSED)):
-            raise InputError(
-                f"{lost} of {found.sizes['scene']} scenes have no result ({found.attrs['failures'][0]}), and indices "
-                "need all; allowed: distributions that stay where the circuit works"
-            )
+            raise InputError(f"{lost} of {found.sizes['scene']} scenes have no result ({found.attrs['failures'][0]}), "
+                             "and indices need all; allowed: distributions that stay where the circuit "
+                             "works")  # fmt: skip
         values = np.array([found[name].values for name in outputs])
         require(values.ndim == 2, "outputs", "one for each of several gaps", "figures of a circuit with one GAP")
         return values
