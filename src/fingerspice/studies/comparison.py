@@ -35,10 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Figures:
-    """Gap voltage at the fundamental, mean force and mean area from one method.
-
-    Each is a number, or an array (n_gap,) if the circuit has several GAPs.
-    """
+    """Gap voltage at the fundamental, mean force and mean area from one method; arrays (n_gap,) of several GAPs."""
 
     amplitude: float | NDArray[np.float64]  # V
     phase_deg: float | NDArray[np.float64]  # Lead over the source's fundamental, degrees
@@ -87,7 +84,7 @@ class Comparison(Shown):
         rows = [(f"{label} [{unit}]", *(f"{x:.6g}" for x in numbers)) for label, unit, numbers in self._labelled(2)]
         head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
         state = f"periodic state at {format_si(self.frequency, 'Hz')}, charge law {self.solution.charge_law}"
-        page = [*head_lines(self.solution.circuit), state, "", Table(head, rows), ""]
+        page: list[str | Table] = [*head_lines(self.solution.circuit), state, "", Table(head, rows), ""]
         for i, gap in enumerate(self.gaps):
             reference, mean, coupled = (f.of_gap(i)["f_el_mean"] for f in (self.phasor, self.mean, self.coupled))
             # Round before formatting, and add 0.0, so that -0.00 is not printed.
@@ -224,9 +221,8 @@ def compare(
         area = one._figures.value("area", "mean_periodic")
         every = one.u_gap_amplitude, (lead + 180.0) % 360.0 - 180.0, one.f_el_mean_periodic, area
         ways.append(np.array(every, float).reshape(len(every), -1))
-    # In the order of `Comparison`
-    figured = (Figures(*(way[:, 0].tolist() if len(found) == 1 else way)) for way in ways)
-    return Comparison(*figured, fundamental.frequency, coupled)
+    of_phasor, of_mean, of_coupled = (Figures(*(way[:, 0].tolist() if len(found) == 1 else way)) for way in ways)
+    return Comparison(of_phasor, of_mean, of_coupled, fundamental.frequency, coupled)
 
 
 # Number of outputs in a period; cubics through them interpolate a sine with an error of 1e-9 of its amplitude.

@@ -1,7 +1,4 @@
-"""Phasors of a circuit: gain, gap voltage, area and mean force against frequency (Eqs. 9 to 15).
-
-Periodic state of a circuit under a periodic source, found by Newton's method, with its defect and stability.
-"""
+"""Phasors of a circuit against frequency (Eqs. 9 to 15), and its periodic state, with its defect and stability."""
 
 from __future__ import annotations
 
@@ -45,10 +42,7 @@ MAX_FREQUENCIES = 1_000_000
 def sweep_drive(
     sources: tuple[tuple[Element, float], ...], fundamental: Fundamental | None, swept: bool
 ) -> tuple[float, float, str]:
-    """The drive of a circuit: in a sweep the ``AC`` of its sources, if the deck has it, and else the fundamental.
-
-    Gives its amplitude (V, or A for a current source; NaN if there is neither), phase (rad), and their origin in words.
-    """
+    """Amplitude (V or A, else NaN), phase (rad) and origin of a drive: in a sweep AC if given, or the fundamental."""
     given = [(e, sign, e.ac) for e, sign in sources if e.ac is not None]
     if swept and given:
         # As in ngspice, a source without AC has an AC amplitude of 0.

@@ -344,10 +344,7 @@ class Simulator(torch.nn.Module):
 
 # The methods have the names and signatures that torch calls.
 class _Run(torch.autograd.Function):
-    """The outputs of scenes at values of one shape (...): a tensor of shape (..., number of outputs).
-
-    With `wanted`, their derivatives by these parameters: of shape (..., number of outputs, number of parameters).
-    """
+    """The outputs of scenes at values of one shape (...), or derivatives by `wanted`, as of `Scenes.values`."""
 
     @staticmethod
     def forward(scenes: Scenes, paths: tuple[str, ...], wanted: tuple[str, ...], *values: Tensor) -> Tensor:

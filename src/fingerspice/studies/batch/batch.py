@@ -23,6 +23,7 @@ from fingerspice.results.solution import Solution
 from fingerspice.solve.simulation import RTOL_RANGE, simulate
 from fingerspice.studies.batch.form import (
     FAILED,
+    LOCKSTEP,
     ONE_BY_ONE,
     REFUSED,
     SIGNALS_OF_BATCH,
@@ -154,9 +155,7 @@ def batch(
         varied = any(path.lower().endswith(".frequency") for path in scenes)
         held = ", ".join(f"{e.name}.f" for e in skins)
         said = f"the skin's data are those at its own {held}{', whatever the source frequency is' if varied else ''}"
-    device = "cpu" if why or recorded else task.device
-    attrs = {"skin": said, "n_ordinary": task.n_ordinary, "ordinary": task.ordinary, "device": device}
-    return _dataset(task, slopes, scenes, attrs)
+    return _dataset(task, slopes, scenes, said, "cpu" if why or recorded else task.device)
 
 
 def _begin(task: Task, recorded: bool) -> None:
@@ -182,34 +181,9 @@ def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> Non
     rest = np.flatnonzero(task.status < 0)
     if task.traced:
         task.values["u_gap"][rest] = np.nan
-    if rest.size:
-        task.ordinary = form if isinstance(form, str) else ladder.unmet
-        _find_alone(task, ladder, rest, pool)
-
-
-def _jobs(task: Task, form: LockstepForm) -> list[tuple[int, IntArray]]:
-    """Jobs of the scenes not done whose runs last for whole numbers of half periods: that number, and the scenes.
-
-    Under a recording half a period is a sample.
-    """
-    recorded = form.recording is not None
-    count = task.count(np.full(task.n, form.frequency) if recorded else task.frequencies())
-    halves = np.round(2.0 * count)
-    good = (task.status < 0) & (halves >= 1.0) & (np.abs(2.0 * count - halves) <= _WHOLE * halves)
-    if any(name.endswith("_periodic") for name in task.outputs):
-        good &= halves >= 2.0
-    jobs = []
-    for size in np.unique(halves[good]).astype(int).tolist():
-        members = np.flatnonzero(good & (halves == size))
-        chunk = int(np.clip(members.size // _JOBS, *(_RECORDED if recorded else _CHUNKS)))
-        if not recorded:
-            chunk = _TRACED if task.traced else _ON_CARD if task.device == "cuda" else chunk
-        jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
-    return jobs
-
-
-def _find_alone(task: Task, ladder: type[Ladder], rest: IntArray, pool: ThreadPoolExecutor) -> None:
-    """Find what a task asks for in the scenes `rest`, each by itself."""
+    if not rest.size:
+        return
+    task.ordinary = form if isinstance(form, str) else ladder.unmet
     by_period = (task.periods is not None and not task.periodic) or task.traced
     frequency = task.frequencies() if by_period else np.ones(task.n)
     allowed, finest = ladder.limit * task.rtol, RTOL_RANGE[0]
@@ -236,6 +210,24 @@ def _find_alone(task: Task, ladder: type[Ladder], rest: IntArray, pool: ThreadPo
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         list(pool.map(alone, rest.tolist()))
+
+
+def _jobs(task: Task, form: LockstepForm) -> list[tuple[int, IntArray]]:
+    """Jobs of the scenes not done that last for whole numbers of half periods (samples): the number, and the scenes."""
+    recorded = form.recording is not None
+    count = task.count(np.full(task.n, form.frequency) if recorded else task.frequencies())
+    halves = np.round(2.0 * count)
+    good = (task.status < 0) & (halves >= 1.0) & (np.abs(2.0 * count - halves) <= _WHOLE * halves)
+    if any(name.endswith("_periodic") for name in task.outputs):
+        good &= halves >= 2.0
+    jobs = []
+    for size in np.unique(halves[good]).astype(int).tolist():
+        members = np.flatnonzero(good & (halves == size))
+        chunk = int(np.clip(members.size // _JOBS, *(_RECORDED if recorded else _CHUNKS)))
+        if not recorded:
+            chunk = _TRACED if task.traced else _ON_CARD if task.device == "cuda" else chunk
+        jobs += [(size, members[i : i + chunk]) for i in range(0, members.size, chunk)]
+    return jobs
 
 
 def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
@@ -286,9 +278,12 @@ def _signal_of(output: str) -> str:
     return next(signal for signal in SIGNALS_OF_BATCH if output.startswith(signal))
 
 
-def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], attrs: dict[str, Any]) -> Dataset:
+def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], skin: str, device: str) -> Dataset:
     """The answers with the values given, `scenes`, as coordinates, and units."""
     from xarray import Dataset
+
+    def ordinary(one: Task, end: str = "") -> dict[str, Any]:
+        return {f"n_ordinary{end}": int(np.count_nonzero(one.status != LOCKSTEP)), f"ordinary{end}": one.ordinary}
 
     known = task.circuit.parameters
     meanings = {"flag_values": list(range(len(STATUS_NAMES))), "flag_meanings": " ".join(STATUS_NAMES)}
@@ -296,26 +291,24 @@ def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], 
     for name in task.outputs:
         signal, dims = _signal_of(name), ("scene", "turn", "gap") if name == "u_gap" else ("scene", "gap")
         unit = "deg" if name.endswith("phase_deg") else SIGNALS[signal][0]
-        about, values = {"units": unit, "long_name": f"{SIGNALS[signal][1]}{name[len(signal) :]}"}, task.values[name]
-        data[name] = (dims[: values.ndim], values, about)
+        text, values = f"{SIGNALS[signal][1]}{name[len(signal) :]}", task.values[name]
+        data[name] = (dims[: values.ndim], values, {"units": unit, "long_name": text})
     data["error"] = ("scene", task.error, {"units": "1", "long_name": "stated error, relative"})
     data["status"] = ("scene", task.status, meanings)
     coords: dict[str, Any] = {path: ("scene", array, {"units": known[path].unit}) for path, array in scenes.items()}
     if task.traced:
         turns = np.arange(task.values["u_gap"].shape[1]) / task.points
         coords["turn"] = ("turn", turns, {"units": "1", "long_name": "time in periods of the source"})
-    messages = task.messages
+    messages, attrs = task.messages, {"skin": skin, **ordinary(task), "device": device}
     if slopes is not None:
         for name, values in slopes.values.items():
             unit, text = SIGNALS[name.removesuffix("_mean")][:2]
-            about = {"units": f"{unit} per parameter_unit", "long_name": f"derivative of {text}_mean by each parameter"}
-            data[f"d_{name}"] = (("scene", "parameter"), values, about)
+            of = {"units": f"{unit} per parameter_unit", "long_name": f"derivative of {text}_mean by each parameter"}
+            data[f"d_{name}"] = (("scene", "parameter"), values, of)
         told = "stated error of a derivative times its parameter, relative to the output"
         data["gradient_error"] = ("scene", slopes.error, {"units": "1", "long_name": told})
         data["gradient_status"] = ("scene", slopes.status, meanings)
-        attrs |= {"ordinary_gradients": slopes.ordinary, "n_ordinary_gradients": slopes.n_ordinary}
-        messages = messages | slopes.messages
-        paths = list(slopes.paths)
+        paths, messages, attrs = list(slopes.paths), messages | slopes.messages, attrs | ordinary(slopes, "_gradients")
         coords |= {"parameter": paths, "parameter_unit": ("parameter", [known[path].unit for path in paths])}
     length = {"periods": task.periods} if task.t_stop is None else {"t_stop": task.t_stop}
     failures = [f"scene {i}: {messages[i]}" for i in sorted(messages)[:MESSAGES]]

@@ -55,11 +55,7 @@ _LEAST_RTOL_OF_SLOPES = 5e-7
 
 
 class Task:
-    """A request, which is checked, and what is found; most attributes are arguments of `batch`.
-
-    One of `t_stop` and `periods` is given. It asks for its outputs, or, if it has `paths`, for the derivatives of its
-    outputs, which are means.
-    """
+    """A checked request of `batch`, of outputs or, with `paths`, of means' derivatives, and what is found."""
 
     scenes: dict[str, FloatArray]  # Values by path, (n,) each
     # What is found, NaN in a scene without a result: (n,) each, (n, n_gap) of several GAPs, (n, n_parameter) of
@@ -109,11 +105,6 @@ class Task:
         """Number of scenes."""
         return next(iter(self.scenes.values())).size
 
-    @property
-    def n_ordinary(self) -> int:
-        """Number of scenes not in lockstep."""
-        return int(np.count_nonzero(self.status != LOCKSTEP))
-
     def begin(self, values: dict[str, FloatArray]) -> None:
         """Take these arrays for the values; no scene is done."""
         self.values, self.error, self.status = values, np.full(self.n, np.nan), np.full(self.n, -1, np.int8)
@@ -124,10 +115,7 @@ class Task:
         return np.full(self.n, self.periods) if self.t_stop is None else np.asarray(frequency * self.t_stop)
 
     def frequencies(self, of_skin: bool = False) -> FloatArray:
-        """The source's frequency in every scene, Hz: that of several together, or the one that a SKIN follows.
-
-        Refused if no source has a period, or several have none in common; a SKIN can follow one source only.
-        """
+        """The source's frequency in every scene, Hz: that of several together, or the one that a SKIN follows."""
         on = [e for e in driving_sources(self.circuit) if e.waveform is not None and e.waveform.period is not None]
         waves = [e.waveform for e in on if e.waveform is not None]
         if len(on) == 1:
@@ -318,10 +306,7 @@ def why_alone(form: LockstepForm | str, outputs: Iterable[str], slopes_at: float
 
 
 def _tones_of(wave: object, given: Mapping[str, Value]) -> tuple[list[tuple[float, Value, Value]], tuple[str, ...]]:
-    """Frequency (Hz), amplitude (V) and phase (rad) of the tones of a source, and its parameters that may vary.
-
-    `given` has those that do. A square that starts with its period is one tone; a source without tones has one of 0 Hz.
-    """
+    """Frequency (Hz; 0 of no tone), amplitude (V) and phase (rad) of a source's tones, and parameters that may vary."""
     height, depth, phase = (given.get(name, getattr(wave, name, 0.0)) for name in ("amplitude", "depth", "phase_deg"))
     turn: Value = np.radians(phase)
     match wave:
@@ -341,10 +326,7 @@ def _tones_of(wave: object, given: Mapping[str, Value]) -> tuple[list[tuple[floa
 
 
 def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:
-    """The table of some scenes as `engine.lockstep.march.march` takes it, shape (n_row, n).
-
-    `scenes` has values by path in lower case, in the netlist's units; all others are the circuit's.
-    """
+    """The table (n_row, n) that `engine.lockstep.march` takes of scenes, which are values by path in lower case."""
 
     def values(element: Element) -> dict[str, Any]:
         start = f"{element.name.lower()}."
@@ -390,10 +372,7 @@ def _contact_rows(v: Mapping[str, Value]) -> tuple[Value, ...]:
 
 @lru_cache(maxsize=32)
 def curves_of(m: float, n: float, degree: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Power series of the universal curve of two exponents, Chebyshev nodes and matrix of a degree, as for `march`.
-
-    None if no series of the allowed sizes reaches the error allowed.
-    """
+    """Power series of the universal curve, if there is one, Chebyshev nodes and matrix of a degree, as for `march`."""
     p = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
     series = chebyshev.fit(lambda x: universal_curve_array(x, 1.0 / m, p), 0.0, LARGEST_X, _CURVE_ERROR, _CURVE_SIZES)
     if series is None:

@@ -1,7 +1,4 @@
-"""Scenes of a batch in lockstep; the number of steps is doubled for the scenes whose error is too large.
-
-What is wanted of scenes in lockstep, with its error: figures and gap voltages, or derivatives of means.
-"""
+"""Scenes of a batch in lockstep: their figures and gap voltages, or derivatives of means, with their errors."""
 
 from __future__ import annotations
 
@@ -334,10 +331,7 @@ class Slopes(Ladder):
         return np.asarray(_STATED_SLOPES * change + cut + tail + noise / STEP)
 
     def _changes(self, mean: FloatArray, pending: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Changes of outputs by each parameter, for all of it, shape (n_output, n_parameter, n), and relative to them.
-
-        `mean` is the mean of u^2 A in all copies of the scenes.
-        """
+        """Changes of outputs by all of each parameter (n_output, n_parameter, n), and relative to the outputs."""
         columns, outputs = self._columns(pending), self.task.outputs
         values = np.array([self.figure(name, mean[None], columns) for name in outputs])
         low, high = np.moveaxis(values.reshape(len(outputs), 2, len(self.task.paths), -1), 1, 0)

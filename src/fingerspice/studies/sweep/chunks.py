@@ -136,10 +136,7 @@ class Work:
             yield name, one, tuple(at.get(dim, 0) for dim in one.dims)
 
     def open(self) -> None:
-        """Create the store, or make sure that the one there is of this sweep.
-
-        Anything else there, or the store of another sweep, is refused and stays.
-        """
+        """Create the store, or make sure that the one there is of this sweep: anything else there is refused."""
         own = json.loads(json.dumps({**self._identity(), "kind of checksum": CHECKSUM}, default=float))
         if not os.path.lexists(self.path):
             plan, arrays = self.plan, self.outputs | self.drawn
@@ -194,11 +191,7 @@ class Work:
     def run_chunk(
         self, index: int, computing: AbstractContextManager[Any] = _FREE, writing: AbstractContextManager[Any] = _FREE
     ) -> Ran:
-        """Run the scenes of a chunk and write them, which marks the chunk as done.
-
-        Scenes are run within `computing`: a lock, where several chunks of a process are to be computed one after
-        another; and written within `writing`.
-        """
+        """Run the scenes of a chunk within `computing`, such as a lock, and write them within `writing`."""
         if not (self.path / "zarr.json").is_file():
             raise InputError(f"{self.path} is not there on a worker; allowed: a folder that all machines share")
         if programs() != self.programs:

@@ -41,10 +41,9 @@ _NUMBERS = "a number, an array of numbers, or a frozen distribution of scipy.sta
 
 
 class Plan:
-    """Parameters of a circuit that make a grid, those that are drawn (`n` draws by `seed`), those that are one number.
+    """Parameters of a circuit that make a grid, those that are drawn, and those that are one number, by name.
 
-    Names are paths, or several paths with commas, whose numbers are factors. A kind of named sets, such as ``finger``,
-    is a name as well, whose numbers count the sets.
+    Names are paths, several paths with commas, whose numbers are factors, or kinds of sets, whose numbers count them.
     """
 
     def __init__(self, circuit: Circuit, asked: Mapping[str, Any], n: int, seed: int, most: int) -> None:
