@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -229,17 +229,8 @@ class ParameterSet(Shown):
         ])  # fmt: skip
 
 
-class ParameterSets(Shown, Mapping[str, ParameterSet]):
+class ParameterSets(Shown, dict[str, ParameterSet]):
     """All named sets, by name."""
-
-    def __getitem__(self, name: str) -> ParameterSet:
-        return _set(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(tables())
-
-    def __len__(self) -> int:
-        return len(tables())
 
     def _page(self) -> Page:
         rows = []
@@ -284,11 +275,11 @@ def parameters(name: str | None = None, kind: str | None = None) -> ParameterSet
         If there is no such set; the message gives the nearest names.
     """
     if name is None:
-        return ParameterSets()
+        return ParameterSets({own: _set(own) for own in tables()})
     if not isinstance(name, str):
         raise InputError(f"parameters is given {name!r}, a {type(name).__name__}; allowed: the name of a set")
     require(kind is None or kind in KINDS, "kind", repr(kind), ", ".join(KINDS))
-    known, key = {own.lower(): one for own, one in ParameterSets().items()}, name.strip().lower()
+    known, key = {own.lower(): _set(own) for own in tables()}, name.strip().lower()
     fitting = {own: one for own, one in known.items() if kind in (None, one.kind)}
     if key not in fitting:
         shown = ", ".join(one.name for one in fitting.values())

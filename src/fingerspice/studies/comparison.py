@@ -278,8 +278,7 @@ def large_signal(
         raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
     given = positive_row("amplitude", own[0] if amplitude is None else amplitude, "V")
     f = positive_row("frequency", frequency, "Hz")
-    notes, warned = sweep_notes(circuit, f)
-    notes = (*notes, scene.note) if scene.note else notes
+    notes, warned = sweep_notes(circuit, f, scene.note, "swept")
     for text in warned:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     drives = [own] if amplitude is None else [(float(a), 0.0, "the amplitude given") for a in given]

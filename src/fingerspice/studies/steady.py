@@ -55,8 +55,8 @@ def sweep_drive(
     return fundamental.amplitude, fundamental.phase, f"the fundamental of {names}"
 
 
-def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Remarks on the frequency of the skin's data, and warnings about extrapolation, for a sweep (Hz)."""
+def sweep_notes(circuit: Circuit, f: FloatArray, note: str, skin: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Remarks on a sweep (Hz), on the frequency of the skin's data and a `note`, and warnings about extrapolation."""
     skins = {e.name: e.values["f"] for e in circuit.by_device("SKIN")}
     own = ", ".join(f"{name} f = {x:g} Hz" for name, x in skins.items())
     notes, warned = list[str](), list[str]()
@@ -71,7 +71,7 @@ def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[t
     if beyond and (circuit.by_device("SKIN_DISPERSIVE") or (skins and skin != "own")):
         warned.append(f"the sweep goes {' and '.join(beyond)} the 10 Hz to 100 kHz of the skin's data (Eqs. 18, 19): "
                       "what it shows there is extrapolated")  # fmt: skip
-    return tuple(notes), tuple(warned)
+    return (*notes, *([note] if note else [])), tuple(warned)
 
 
 def sweep_frequencies(sweep: AcSweep) -> FloatArray:
@@ -148,7 +148,7 @@ def phasor(
     if scene is not None and area == "mean" and math.isnan(amplitude) and not scene.fixed:
         raise InputError("area='mean' needs the amplitude of the source's fundamental, and this source has none; "
                          "allowed: 'frozen' or an area in m^2")  # fmt: skip
-    notes, warned = sweep_notes(circuit, f, skin)
+    notes, warned = sweep_notes(circuit, f, "" if scene is None else scene.note, skin)
     v, none = None, np.full(f.size, math.nan)
     with np.errstate(all="ignore"):
         if scene is None:
@@ -175,7 +175,6 @@ def phasor(
                          "frequencies nearer to the 10 Hz to 100 kHz of the skin's data, and values nearer to Table "
                          "1's")  # fmt: skip
     if scene is not None:
-        notes = (*notes, *filter(None, [scene.note]))
         warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
     for text in warned:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)

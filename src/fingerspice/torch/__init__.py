@@ -43,6 +43,10 @@ class Scenes:
         self, circuit: Circuit, outputs: str | Sequence[str], t: ArrayLike | None, t_stop: float | None,
         periodic: bool, rtol: float,
     ) -> None:  # fmt: skip
+        require_circuit(circuit)
+        gaps = len(circuit.by_device("GAP"))
+        if gaps != 1:
+            raise InputError(f"the circuit has {gaps} GAPs; allowed: one")
         self.circuit, self.periodic, self.alone = circuit, bool(periodic), isinstance(outputs, str)
         # Names out of `SIGNALS` and `MEANS`.
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
@@ -170,15 +174,13 @@ class Drive(torch.nn.Module):
         t: ArrayLike | None = None, t_stop: float | None = None, source: str | None = None, rtol: float = 1e-8,
     ) -> None:  # fmt: skip
         super().__init__()
-        require_circuit(circuit)
-        names = [element.name for element in circuit.elements if element.waveform is not None]
-        known = {name.lower(): name for name in names}
-        if source is None:
-            require(len(names) == 1, "source", "missing", f"one of {', '.join(names)}")
-            source = names[0]
-        require(source.lower() in known, "source", repr(source), f"one of {', '.join(names)}")
         self._scenes = Scenes(circuit, outputs, t, t_stop, False, rtol)
-        self._source, self._rate = known[source.lower()], positive_number("rate", rate, "Hz")
+        known = {element.name.lower(): element.name for element in circuit.elements if element.waveform is not None}
+        allowed = f"one of {', '.join(known.values())}"
+        require(source is not None or len(known) == 1, "source", "missing", allowed)
+        key = next(iter(known)) if source is None else source.lower()
+        require(key in known, "source", repr(source), allowed)
+        self._source, self._rate = known[key], positive_number("rate", rate, "Hz")
         self.samples = torch.nn.Parameter(tensor_of("samples", samples).detach().clone())
 
     def forward(self, samples: Tensor | ArrayLike | None = None) -> Tensor | dict[str, Tensor]:
@@ -273,13 +275,8 @@ class Simulator(torch.nn.Module):
         periodic: bool = False, logarithms: bool = False, rtol: float = 1e-8,
     ) -> None:  # fmt: skip
         super().__init__()
-        require_circuit(circuit)
-        gaps = circuit.by_device("GAP")
-        if len(gaps) != 1:
-            raise InputError(f"the circuit has {len(gaps)} GAPs; allowed: one")
-        self.circuit, self.logarithms = circuit, logarithms
         self._scenes = Scenes(circuit, outputs, t, t_stop, periodic, rtol)
-        self.paths: dict[str, str] = {}
+        self.circuit, self.logarithms, self.paths = circuit, logarithms, dict[str, str]()
         single = isinstance(parameters, str)
         require(not single, "parameters", repr(parameters), "a sequence of paths such as ('Xgap.d',)")
         for given in parameters:

@@ -178,7 +178,7 @@ def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> Non
     if isinstance(form, LockstepForm):
         # Jobs have no scene in common, so that threads write to different places.
         list(pool.map(lambda job: ladder(task, form, job[1]).climb(job[0]), _jobs(task, form)))
-    rest = np.flatnonzero(task.status < 0)
+    rest, task.n_ordinary = np.flatnonzero(task.status < 0), int(np.count_nonzero(task.status != LOCKSTEP))
     if task.traced:
         task.values["u_gap"][rest] = np.nan
     if not rest.size:
@@ -282,9 +282,6 @@ def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], 
     """The answers with the values given, `scenes`, as coordinates, and units."""
     from xarray import Dataset
 
-    def ordinary(one: Task, end: str = "") -> dict[str, Any]:
-        return {f"n_ordinary{end}": int(np.count_nonzero(one.status != LOCKSTEP)), f"ordinary{end}": one.ordinary}
-
     known = task.circuit.parameters
     meanings = {"flag_values": list(range(len(STATUS_NAMES))), "flag_meanings": " ".join(STATUS_NAMES)}
     data: dict[str, Any] = {}
@@ -299,7 +296,8 @@ def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], 
     if task.traced:
         turns = np.arange(task.values["u_gap"].shape[1]) / task.points
         coords["turn"] = ("turn", turns, {"units": "1", "long_name": "time in periods of the source"})
-    messages, attrs = task.messages, {"skin": skin, **ordinary(task), "device": device}
+    about = {"skin": skin, "n_ordinary": task.n_ordinary, "ordinary": task.ordinary, "device": device}
+    messages = task.messages
     if slopes is not None:
         for name, values in slopes.values.items():
             unit, text = SIGNALS[name.removesuffix("_mean")][:2]
@@ -308,9 +306,10 @@ def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], 
         told = "stated error of a derivative times its parameter, relative to the output"
         data["gradient_error"] = ("scene", slopes.error, {"units": "1", "long_name": told})
         data["gradient_status"] = ("scene", slopes.status, meanings)
-        paths, messages, attrs = list(slopes.paths), messages | slopes.messages, attrs | ordinary(slopes, "_gradients")
+        about |= {"ordinary_gradients": slopes.ordinary, "n_ordinary_gradients": slopes.n_ordinary}
+        paths, messages = list(slopes.paths), messages | slopes.messages
         coords |= {"parameter": paths, "parameter_unit": ("parameter", [known[path].unit for path in paths])}
     length = {"periods": task.periods} if task.t_stop is None else {"t_stop": task.t_stop}
     failures = [f"scene {i}: {messages[i]}" for i in sorted(messages)[:MESSAGES]]
-    attrs |= {"rtol": task.rtol, "periodic": int(task.periodic), **length, "failures": failures}
-    return Dataset(data, coords, attrs)
+    about |= {"rtol": task.rtol, "periodic": int(task.periodic), **length, "failures": failures}
+    return Dataset(data, coords, about)

@@ -64,7 +64,8 @@ class Task:
     error: FloatArray  # (n,): Stated error, of outputs relative to themselves
     status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`, and -1 before there are results
     messages: dict[int, str]  # Of the scenes without a result
-    ordinary: str  # Why some scenes were not in lockstep
+    n_ordinary: int  # Scenes that were not in lockstep
+    ordinary: str  # Why
 
     def __init__(
         self, circuit: Circuit, outputs: Sequence[str], rtol: float, t_stop: float | None, periods: float | None,
