@@ -200,8 +200,7 @@ def ac(
     from fingerspice.results.spectrum import phasor_csv, phasor_tables
     from fingerspice.sets.parameters import parameters
     from fingerspice.solve.simulation import check_arguments
-    from fingerspice.studies.comparison import large_signal
-    from fingerspice.studies.steady import phasor, sweep_frequencies
+    from fingerspice.studies.steady import large_signal, phasor, sweep_frequencies
 
     coupled = area == "coupled"
     job.answer.update(method="steady_state" if coupled else "phasor")

@@ -29,8 +29,8 @@ from fingerspice.results.record import SIGNALS
 from fingerspice.results.solution import Solution
 from fingerspice.sets.parameters import parameters
 from fingerspice.solve.simulation import simulate
-from fingerspice.studies.comparison import large_signal
 from fingerspice.studies.export import export_netlist
+from fingerspice.studies.steady import large_signal
 from fingerspice.waveforms.waveform import Sine, Waveform
 
 #: Traces of each kind, and harmonics.

@@ -184,13 +184,16 @@ def _source_text(w: Waveform, name: str, circuit: Circuit) -> str:
     empty = tran is not None and starts_uncharged(circuit) and not given
     if isinstance(w, Pulse):
         stop = tran.stop if tran else 1.0
+        span, rise, fall = stop + abs(w.delay), w.rise or edge, w.fall or edge
+        # The rise time of a jump is subtracted from the width, so that the pulse still ends at its time.
+        width = w.width - (0.0 if w.rise else edge) if math.isfinite(w.width) else 10.0 * span
+        period = w.pulse_period if math.isfinite(w.pulse_period) else 20.0 * span + rise + width + fall
         jumps = empty and w.value(0.0) != 0.0 and w.breakpoint_rate() * stop < _FEW_POINTS
-        if not jumps and (numbers := _pulse_numbers(w, stop + abs(w.delay), edge)):
-            return _call("PULSE", numbers)
+        if not jumps and width > 0.0 and rise + width + fall <= period:
+            return _call("PULSE", (w.v1, w.v2, w.delay, rise, fall, width, period))
     t, v = _points(w, name, circuit)
     if empty:
-        # All voltages start at 0, so let the source start at 0 V and jump: otherwise ngspice often fails at its first
-        # step.
+        # All voltages start at 0: let the source start at 0 V and jump, or ngspice often fails at its first step.
         t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, w.value(0.0)], v[t > 0.0])
     points: list[float] = []
     for time, value in zip(t.tolist(), v.tolist(), strict=True):
@@ -205,16 +208,6 @@ def _source_text(w: Waveform, name: str, circuit: Circuit) -> str:
 
 def _call(name: str, numbers: Iterable[float]) -> str:
     return f"{name}({' '.join(repr(float(x)) for x in numbers)})"
-
-
-def _pulse_numbers(p: Pulse, span: float, edge: float) -> tuple[float, ...] | None:
-    """A pulse's numbers in ngspice, over a span (s); None if the edges of its jumps have no room."""
-    # The rise time of a jump is subtracted from the width, so that the pulse still ends at its time.
-    width = p.width - (0.0 if p.rise else edge) if math.isfinite(p.width) else 10.0 * span
-    rise, fall = p.rise or edge, p.fall or edge
-    period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * span + rise + width + fall
-    fits = width > 0.0 and rise + width + fall <= period
-    return (p.v1, p.v2, p.delay, rise, fall, width, period) if fits else None
 
 
 def _points(w: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:

@@ -129,6 +129,7 @@ def batch(
     threads = own if threads is None else whole_number("threads", threads, 1)
     scenes = checked_scenes(circuit, parameters)
     task.scenes, skins = dict(scenes), circuit.by_device("SKIN")
+    n = task.n = next(iter(scenes.values())).size
     if skin == "follow":
         frequency = task.frequencies(of_skin=True)
         for element in skins:
@@ -139,11 +140,22 @@ def batch(
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     slopes, form = gradients_of(task, gradients, skin), lockstep_form(circuit, task.scenes)
     why, recorded = why_alone(form, task.outputs), isinstance(form, LockstepForm) and form.recording is not None
+    width, gaps = 0, len(circuit.by_device("GAP"))
+    if task.traced or (recorded and task.t_stop is None):
+        # Refused for what has no period, such as a recording.
+        count = task.count(task.frequencies())
+        width = math.ceil(float(count.max()) * task.points - 1e-9) if task.traced else 0
+    # Figures of several GAPs have one column each.
+    size, each = n * width * max(gaps, 1), (gaps,) if gaps > 1 else ()
+    require(size <= _MOST_VOLTAGES, "outputs", f"of {size:.3g} gap voltages", f"at most {_MOST_VOLTAGES:g}")
+    task.begin({name: np.full((n, *each), np.nan) for name in task.outputs if name != "u_gap"})
+    if task.traced:
+        # This memory, which is much, is taken by the threads that write it.
+        task.values["u_gap"] = np.empty((n, width, *each))
     with ThreadPoolExecutor(threads) as pool:
-        _begin(task, recorded)
         _find(task, why or form, pool)
         if slopes is not None:
-            slopes.begin({name: np.full((task.n, len(slopes.paths)), np.nan) for name in slopes.outputs})
+            slopes.begin({name: np.full((n, len(slopes.paths)), np.nan) for name in slopes.outputs})
             slopes.status = np.where(task.status >= REFUSED, task.status, slopes.status)
             form = lockstep_form(circuit, slopes.scenes)
             unlike = why_alone(form, slopes.outputs, slopes.rtol)
@@ -156,20 +168,6 @@ def batch(
         held = ", ".join(f"{e.name}.f" for e in skins)
         said = f"the skin's data are those at its own {held}{', whatever the source frequency is' if varied else ''}"
     return _dataset(task, slopes, scenes, said, "cpu" if why or recorded else task.device)
-
-
-def _begin(task: Task, recorded: bool) -> None:
-    """Take memory for the outputs, none of which is found; those of several GAPs have one column each."""
-    n, width, gaps = task.n, 0, len(task.circuit.by_device("GAP"))
-    if task.traced or (recorded and task.t_stop is None):
-        # Refused for what has no period, such as a recording.
-        count = task.count(task.frequencies())
-        width = math.ceil(float(count.max()) * task.points - 1e-9) if task.traced else 0
-    size, each = n * width * max(gaps, 1), (gaps,) if gaps > 1 else ()
-    require(size <= _MOST_VOLTAGES, "outputs", f"of {size:.3g} gap voltages", f"at most {_MOST_VOLTAGES:g}")
-    # The memory of gap voltages, which is much, is taken by the threads that write them.
-    values = {name: np.full((n, *each), np.nan) for name in task.outputs if name != "u_gap"}
-    task.begin(values | ({"u_gap": np.empty((n, width, *each))} if task.traced else {}))
 
 
 def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> None:

@@ -57,6 +57,7 @@ _LEAST_RTOL_OF_SLOPES = 5e-7
 class Task:
     """A checked request of `batch`, of outputs or, with `paths`, of means' derivatives, and what is found."""
 
+    n: int  # Number of scenes
     scenes: dict[str, FloatArray]  # Values by path, (n,) each
     # What is found, NaN in a scene without a result: (n,) each, (n, n_gap) of several GAPs, (n, n_parameter) of
     # derivatives, or, of gap voltages, (n, width) and (n, width, n_gap)
@@ -100,11 +101,6 @@ class Task:
         # proportion to it: a source's frequency with that of a skin
         self.paths: dict[str, tuple[str, ...]] = {}
         self.clock: str | None = None  # The frequency of the only source, if it is one of `paths`
-
-    @property
-    def n(self) -> int:
-        """Number of scenes."""
-        return next(iter(self.scenes.values())).size
 
     def begin(self, values: dict[str, FloatArray]) -> None:
         """Take these arrays for the values; no scene is done."""

@@ -178,16 +178,6 @@ class Work:
             **options, "block": self.block,
         }  # fmt: skip
 
-    def dataset(self) -> Dataset:
-        """The sweep, whose values are read when they are used."""
-        import xarray
-
-        found: Dataset = xarray.open_zarr(self.path, chunks=None, consolidated=False, zarr_format=3)
-        del found.attrs[RUN]
-        found = found.set_coords(list(self.drawn))
-        named = {str(name): one.attrs[NAMES] for name, one in found.coords.items() if NAMES in one.attrs}
-        return found.assign_coords(named)[list(self.outputs)]
-
     def run_chunk(
         self, index: int, computing: AbstractContextManager[Any] = _FREE, writing: AbstractContextManager[Any] = _FREE
     ) -> Ran:
@@ -235,7 +225,9 @@ def stored(
     plan: Plan, options: Mapping[str, Any], path: Path, workers: int | None, scheduler: str | None,
     shard: tuple[int, int],
 ) -> Dataset:  # fmt: skip
-    """Run the missing chunks of a sweep, or of a shard of it, and return what the store has."""
+    """Run the missing chunks of a sweep, or of a shard of it, and return what the store has, read when it is used."""
+    from xarray import open_zarr
+
     if workers is not None:
         whole_number("workers", workers, 1)
         if scheduler is not None:
@@ -262,7 +254,10 @@ def stored(
         if not lacking:
             tidy(work.path)
         took = time.perf_counter() - begun
-    found = work.dataset()
+    found: Dataset = open_zarr(work.path, chunks=None, consolidated=False, zarr_format=3).set_coords(list(work.drawn))
+    named = {str(name): one.attrs[NAMES] for name, one in found.coords.items() if NAMES in one.attrs}
+    found = found.assign_coords(named)[list(work.outputs)]
+    del found.attrs[RUN]
     found.attrs |= {"chunks": len(mine), "chunks_found": there, "chunks_missing": lacking, "seconds": took}
     found.attrs["failures"] = failures[:MESSAGES]
     return found
