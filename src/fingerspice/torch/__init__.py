@@ -20,8 +20,8 @@ from fingerspice.circuit.describe import require_circuit
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.solution import MEANS, SIGNALS, Solution
 from fingerspice.solve.simulation import rtol_given, simulate
-from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.form import LEAST_RTOL, REFUSED, lockstep_form, own_path, why_alone
+from fingerspice.studies.batch.batch import LEAST_RTOL, REFUSED, batch, own_path
+from fingerspice.studies.batch.lockstep import lockstep_form, why_alone
 from fingerspice.studies.steady import SteadyState, steady_state
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require

@@ -7,41 +7,37 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray, IntArray, whole_number
+from fingerspice.base.arrays import FloatArray, IntArray, positive_number, real_numbers, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit, scenes_warnings
+from fingerspice.circuit.statespace import driving_sources
 from fingerspice.engine.lockstep.card import require_card
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
-from fingerspice.results.solution import Solution
-from fingerspice.solve.simulation import RTOL_RANGE, simulate
-from fingerspice.studies.batch.form import (
-    FAILED,
-    LOCKSTEP,
-    ONE_BY_ONE,
-    REFUSED,
-    SIGNALS_OF_BATCH,
-    STATUS_NAMES,
-    LockstepForm,
-    Task,
-    checked_scenes,
-    gradients_of,
-    lockstep_form,
-    why_alone,
-)
-from fingerspice.studies.batch.ladder import Ladder, Slopes
+from fingerspice.results.solution import MEANS, Solution
+from fingerspice.solve.simulation import RTOL_RANGE, rtol_given, simulate
+from fingerspice.studies.batch.lockstep import LOCKSTEP, Ladder, LockstepForm, Slopes, lockstep_form, why_alone
 from fingerspice.studies.steady import steady_state
-from fingerspice.waveforms.waveform import require
+from fingerspice.waveforms.waveform import Sum, require
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
+#: Signals whose figures a batch has, and the kinds of figures.
+SIGNALS_OF_BATCH = ("f_el", "f_t", "friction", "u_gap", "area")
+_KINDS = ("mean", "rms", "min", "max", "peak", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
+LEAST_RTOL = 1e-12
+ONE_BY_ONE, REFUSED, FAILED = 1, 2, 3
+STATUS_NAMES = ("lockstep", "one_by_one", "refused", "failed")
+# A relative change of a parameter by which it is seen whether the source's tone depends on it.
+_SEEN = 1e-3
 # Largest number of failure messages that a Dataset keeps, and of gap voltages (8 GB) that a batch may return.
 MESSAGES, _MOST_VOLTAGES = 16, 1e9
 # Smallest and largest number of scenes in a job, of which there are 8 or more between these limits; the number if gap
@@ -53,6 +49,168 @@ _WHOLE = 1e-9
 # A run's rtol is relative to peaks, and a batch's to the output itself: the first attempt assumes that an output is at
 # least this fraction of its peak.
 _OVER_PEAK = 0.1
+
+
+class Task:
+    """A checked request of `batch`, of outputs or, with `paths`, of means' derivatives, and what is found."""
+
+    n: int  # Number of scenes
+    scenes: dict[str, FloatArray]  # Values by path, (n,) each
+    # What is found, NaN in a scene without a result: (n,) each, (n, n_gap) of several GAPs, (n, n_parameter) of
+    # derivatives, or, of gap voltages, (n, width) and (n, width, n_gap)
+    values: dict[str, FloatArray]
+    error: FloatArray  # (n,): Stated error, of outputs relative to themselves
+    status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`, and -1 before there are results
+    messages: dict[int, str]  # Of the scenes without a result
+    n_ordinary: int  # Scenes that were not in lockstep
+    ordinary: str  # Why
+
+    def __init__(
+        self, circuit: Circuit, outputs: Sequence[str], rtol: float, t_stop: float | None, periods: float | None,
+        periodic: bool, points: int, device: str,
+    ) -> None:  # fmt: skip
+        self.circuit, self.periodic = circuit, periodic
+        self.rtol, self.points = rtol_given(rtol, LEAST_RTOL), whole_number("points", points, 2)
+        require(self.points % 2 == 0, "points", self.points, "an even number, 2 or more")
+        self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+        for name in self.outputs:
+            if name not in ("u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)):
+                kinds, signals = ", ".join(f"_{kind}" for kind in _KINDS), ", ".join(SIGNALS_OF_BATCH)
+                raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
+        require(bool(self.outputs), "outputs", "empty", "one or more names")
+        self.traced = "u_gap" in self.outputs
+        # Gap voltages stay on the processor.
+        self.device = "cpu" if self.traced else device
+        if periods is not None and t_stop is not None:
+            raise InputError("t_stop and periods are both given; allowed: one of them")
+        self.t_stop = None if t_stop is None else positive_number("t_stop", t_stop, "s")
+        self.periods = None if periods is None else positive_number("periods", periods)
+        if periodic and (periods is not None or t_stop is not None):
+            raise InputError("periodic=True takes one period, and t_stop or periods is given; allowed: neither")
+        if periodic:
+            self.periods = 1.0
+        elif periods is None and t_stop is None:
+            if circuit.tran is None:
+                raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s, or "
+                                 "periods")  # fmt: skip
+            self.t_stop = circuit.tran.stop
+        # Parameters by which the means are differentiated, in the circuit's spelling, each with those that grow in
+        # proportion to it: a source's frequency with that of a skin
+        self.paths: dict[str, tuple[str, ...]] = {}
+        self.clock: str | None = None  # The frequency of the only source, if it is one of `paths`
+
+    def begin(self, values: dict[str, FloatArray]) -> None:
+        """Take these arrays for the values; no scene is done."""
+        self.values, self.error, self.status = values, np.full(self.n, np.nan), np.full(self.n, -1, np.int8)
+        self.messages, self.ordinary = {}, ""
+
+    def count(self, frequency: FloatArray) -> FloatArray:
+        """Number of periods in runs with sources of these frequencies (Hz)."""
+        return np.full(self.n, self.periods) if self.t_stop is None else np.asarray(frequency * self.t_stop)
+
+    def frequencies(self, of_skin: bool = False) -> FloatArray:
+        """The source's frequency in every scene, Hz: that of several together, or the one that a SKIN follows."""
+        on = [e for e in driving_sources(self.circuit) if e.waveform is not None and e.waveform.period is not None]
+        waves = [e.waveform for e in on if e.waveform is not None]
+        if len(on) == 1:
+            given = self.scenes.get(f"{on[0].name}.frequency")
+            tone = waves[0].tone() if of_skin else None
+            return given if given is not None else np.full(self.n, tone or 1.0 / (waves[0].period or math.nan))
+        moved = any(f"{e.name}.frequency" in self.scenes for e in on)
+        period = None if of_skin or moved or not on else Sum(tuple(waves)).period
+        if period is None:
+            raise InputError(f"{len(on)} sources have a period; allowed: one, where periods, u_gap or the skin's "
+                             "frequency follow it, or several of fixed frequencies in a ratio of whole "
+                             "numbers")  # fmt: skip
+        return np.full(self.n, 1.0 / period)
+
+
+def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+    """Values by path, all of one shape (n_scene,); refused where a path is unknown or a value NaN or out of range."""
+    given: dict[str, FloatArray] = {}
+    good = isinstance(parameters, Mapping) and bool(parameters)
+    require(good, "parameters", repr(parameters), "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
+    for path, values in parameters.items():
+        name = own_path(circuit, path)
+        array = real_numbers(path, values, "an array of numbers")
+        one_row = array.ndim <= 1 and array.size > 0
+        require(one_row, path, f"of shape {array.shape}", "one number, or one row of numbers")
+        require(name not in given, name, "given twice", "once")
+        given[name] = array
+    sizes = {path: array.size for path, array in given.items() if array.ndim == 1}
+    if len(set(sizes.values())) > 1:
+        raise InputError(f"the arrays have {', '.join(f'{n} ({p})' for p, n in sizes.items())} values; allowed: equal "
+                         "lengths, or single numbers")  # fmt: skip
+    n = max(sizes.values(), default=1)
+    scenes = {path: np.ascontiguousarray(np.broadcast_to(array, (n,))) for path, array in given.items()}
+    for path, array in scenes.items():
+        name, _, parameter = path.rpartition(".")
+        element, allowed, bad = circuit[name], "numbers", np.isnan(array)
+        if not bad.any() and parameter in element.values:
+            spec = element.spec.parameter(parameter)
+            bad = ~((array >= spec.least) & (array <= spec.most))
+            bad &= ~((array == 0.0) & spec.may_be_zero) & ~((array == np.inf) & spec.may_be_infinite)
+            allowed = spec.allowed()
+        elif not bad.any():
+            # The legal values of a waveform's parameter form an interval: testing its ends is enough.
+            for i in (int(np.argmin(array)), int(np.argmax(array))):
+                try:
+                    circuit.varied({path: float(array[i])})
+                except InputError as error:
+                    raise InputError(f"scene {i}: {error}") from None
+        i = int(np.argmax(bad))
+        require(not bad[i], path, f"{array[i]:g} in scene {i}", allowed)
+    return scenes
+
+
+def own_path(circuit: Circuit, path: Any) -> str:
+    """A path in the circuit's own spelling."""
+    if isinstance(path, str) and path.lower().startswith("source."):
+        on = driving_sources(circuit)
+        if not any(e.name.lower() == "source" for e in circuit.elements) and len(on) == 1:
+            path = f"{on[0].name}.{path.partition('.')[2]}"
+    known = {name.lower(): name for name in circuit.parameters}
+    if not isinstance(path, str) or path.lower() not in known:
+        # The circuit raises the error about an unknown path, which gives the nearest name.
+        circuit.varied({path: 1.0})
+        raise InputError(f"{path!r} is no parameter that takes numbers; allowed: a path such as 'Xgap.d'")
+    return known[path.lower()]
+
+
+def gradients_of(task: Task, gradients: Sequence[str], skin: str) -> Task | None:
+    """The checked request of derivatives in the scenes of a task; None for none."""
+    circuit = task.circuit
+    require(not isinstance(gradients, str), "gradients", repr(gradients), "a sequence of paths such as ('Xgap.d',)")
+    paths = tuple(own_path(circuit, path) for path in gradients)
+    if not paths:
+        return None
+    outputs = tuple(name for name in task.outputs if name in MEANS)
+    if not outputs:
+        raise InputError(f"gradients are asked for, and outputs has no mean; allowed: one of {', '.join(MEANS)}")
+    if (number := len(circuit.by_device("GAP"))) != 1:
+        raise InputError(f"gradients are asked for, and the circuit has {number} GAPs; allowed: one")
+    require(len(set(paths)) == len(paths), "gradients", repr(paths), "every parameter once")
+    on, scenes = driving_sources(circuit), dict(task.scenes)
+    clock = f"{on[0].name}.frequency" if len(on) == 1 else None
+    skins = tuple(f"{e.name}.f" for e in circuit.by_device("SKIN")) if skin == "follow" else ()
+    for path in paths:
+        value, turned = circuit.parameters[path].value, path in skins
+        if path not in scenes and not (math.isfinite(value) and value != 0.0):
+            raise InputError(f"gradients names {path}, which is {value:g}; allowed: parameters whose value is finite "
+                             "and not 0, as steps are relative to it")  # fmt: skip
+        scenes.setdefault(path, np.full(task.n, value))
+        if skins and not turned and path != clock:
+            # Whether the parameter changes the frequency of a source.
+            name, moved = path.rpartition(".")[0], circuit.varied({path: value * (1.0 + _SEEN)})
+            own, other = circuit[name].waveform, moved[name].waveform
+            turned = own is not None and other is not None and own.tone() != other.tone()
+        if turned:
+            raise InputError(f"skin='follow', and gradients names {path}, with which the skin's frequency changes; "
+                             "allowed: the frequency of the only source, or skin='own'")  # fmt: skip
+    asked = copy(task)
+    asked.outputs, asked.traced, asked.scenes, asked.clock = outputs, False, scenes, clock if clock in paths else None
+    asked.paths = {path: (path, *(skins if path == clock else ())) for path in paths}
+    return asked
 
 
 def batch(

@@ -34,8 +34,8 @@ from fingerspice.base.arrays import keep_freed_memory, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.describe import digests, scenes_warnings
 from fingerspice.results.runfile import CHECKSUM, Array, attributes_of, create, tidy
-from fingerspice.studies.batch.batch import MESSAGES, batch
-from fingerspice.studies.batch.form import LOCKSTEP, STATUS_NAMES, checked_scenes
+from fingerspice.studies.batch.batch import MESSAGES, STATUS_NAMES, batch, checked_scenes
+from fingerspice.studies.batch.lockstep import LOCKSTEP
 from fingerspice.studies.sweep.populations import Draws, Plan
 from fingerspice.waveforms.waveform import require
 

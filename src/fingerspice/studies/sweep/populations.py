@@ -19,8 +19,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.sets.parameters import KINDS
 from fingerspice.sets.parameters import parameters as known_sets
-from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.form import REFUSED, own_path
+from fingerspice.studies.batch.batch import REFUSED, batch, own_path
 from fingerspice.waveforms.waveform import Waveform, require
 
 if TYPE_CHECKING:

@@ -1,19 +1,53 @@
-"""Scenes of a batch in lockstep: their figures and gap voltages, or derivatives of means, with their errors."""
+"""Scenes of a batch in lockstep: what goes there, the table of its values, and its figures, or derivatives of means."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial import chebyshev as powers
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
+from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.devices import Value
+from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.engine.lockstep.card import march_on_card
 from fingerspice.engine.lockstep.march import N_PORTION, march, march_samples
-from fingerspice.engine.lockstep.scenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
+from fingerspice.engine.lockstep.scenes import CELL_ROWS, LARGEST_X, LOAD, LOSS, OMEGA, REST, STRESS, new_block
 from fingerspice.engine.lockstep.step import ALL_MOMENTS, START_TIMES, marks_of
+from fingerspice.numerics import chebyshev
 from fingerspice.numerics.modes import STEP
-from fingerspice.studies.batch.form import FIGURES, LOCKSTEP, LockstepForm, Task, curves_of, peak_of, table_of
+from fingerspice.physics.contact import universal_curve_array
+from fingerspice.physics.materials import EPS0
+from fingerspice.waveforms.periodic import Pulse, Square
+from fingerspice.waveforms.samples import Samples, as_samples
+from fingerspice.waveforms.waveform import AM, DC, Sine
 
+if TYPE_CHECKING:
+    from fingerspice.studies.batch.batch import Task
+
+#: Status of a scene that has been run in lockstep.
+LOCKSTEP = 0
+#: For each figure that lockstep gives, the moments that it needs: the means of u^2 A (0), (u^2 A)^2 (1) and u^2 (2).
+FIGURES: dict[str, tuple[int, ...]] = {
+    "f_el_mean": (0,), "f_el_rms": (1,), "f_t_mean": (0,), "f_t_rms": (0, 1), "friction_mean": (0,),
+    "friction_rms": (0, 1), "u_gap_rms": (2,),
+}  # fmt: skip
+# Parameters that must be equal in all scenes of a lockstep, because the form of the equations depends on them.
+_FORM = ("m_exp", "n_exp", "a_fix", "tau")
+# Most layers and most tones of a lockstep: code is compiled for each number of cells and of tones.
+_MOST_LAYERS, _MOST_TONES = 4, 4
+_LAYERS = ("LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP")
+# Largest ratio of a tone's frequency to that of the whole source.
+_MOST_PERIODS = 2000
+# Numbers of points tried for the universal curve's Chebyshev series, and the relative error allowed.
+_CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
+# Smallest rtol at which derivatives are taken in lockstep: below it their kinks would take too many steps.
+_LEAST_RTOL_OF_SLOPES = 5e-7
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
 # and (of the highest) under several, and of a piece of a square's half period; and initial degree of the area's
 # polynomial, of which each takes the compiler 8 s.
@@ -54,6 +88,172 @@ _STATED_MORE, _STIFF = 0.8, 2.0
 _EPS, _ROUNDING_OF_SLOPES = 4.4e-16, 1e-13
 # The stated error of a derivative has this many changes from half the steps to all steps.
 _STATED_SLOPES = 2.0
+
+
+@dataclass(frozen=True)
+class LockstepForm:
+    """Properties that all scenes in lockstep have in common."""
+
+    stack: Stack
+    gap: Element
+    # The sources that are on; each with the sign of the gap along the loop times the sign of the source
+    sources: tuple[tuple[Element, float], ...]
+    multiples: tuple[int, ...]  # Frequency of every tone of the sources' sum, in that of the sum
+    # That of the sum, Hz; None for one source of one tone, whose frequency may vary. For a recording half of its sample
+    # rate, so that a sample's length is half a period.
+    frequency: float | None
+    jumping: bool  # Whether the source is a square
+    recording: Samples | None  # The samples of the only source, if it is a recording
+
+    @property
+    def cells(self) -> int:
+        """Number of cells of all layers."""
+        return self.stack.c.size
+
+
+def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str:
+    """The common form of scenes in lockstep, or the reason why there is none; `varied` has the paths that vary."""
+    if not is_stack(circuit):
+        return "the circuit is no series stack of layers"
+    stack, tran = build_stack(circuit), circuit.tran
+    if stack.contact is None or stack.gap is None or stack.gap_layer is None or stack.area_given is not None:
+        return "the stack has no contact whose area follows the gap"
+    if not {e.device for e in stack.layers} <= set(_LAYERS) or not 2 <= len(stack.layers) <= _MOST_LAYERS:
+        return f"the stack has other layers than {', '.join(_LAYERS)}, or not 2 to {_MOST_LAYERS} of them"
+    if (circuit.charge_law or "local") != "local" or circuit.work != "gap":
+        return "the charge law is mobile, or the total voltage is held"
+    sources = tuple((e, float(turn * stack.sign[stack.gap])) for e, turn in stack.sources if e.waveform != DC(0.0))
+    waves = [e.waveform for e, _ in sources]
+    recording = as_samples(waves[0]) if len(waves) == 1 and waves[0] is not None else None
+    jumping = recording is None and any(isinstance(wave, Square | Pulse) for wave in waves)
+    tones = [hz for wave in waves for hz, *_ in _tones_of(wave, {})[0]]
+    multiples: tuple[int, ...] = (1,)
+    frequency, charged = None, jumping
+    if recording is not None:
+        if recording.start != 0.0:
+            return "the recording does not start at 0 s"
+        frequency, charged = 0.5 * recording.rate, recording.between(0, 1)[0] != 0.0
+    elif not (tones and all(tones) and len(tones) <= (1 if jumping else _MOST_TONES)):
+        said = f"the sources are not 1 to {_MOST_TONES} plain sines, not a square that starts with its period"
+        return f"{said}, and not a recording"
+    elif len(tones) > 1:
+        period = stack.waveform.period
+        if period is None or max(tones) * period > _MOST_PERIODS:
+            return "the sources' tones have no common period, or one of very many of their own"
+        multiples, frequency = tuple(round(hz * period) for hz in tones), 1.0 / period
+    varied = [path.lower() for path in varied]
+    given = circuit.initial or any(e.initial is not None for e in circuit.elements)
+    if tran is not None and not tran.uic:
+        # The operating point of sines that start at 0 V is the uncharged state.
+        others = [e.waveform for e in circuit.by_device("V") if not isinstance(e.waveform, AM)]
+        charged = charged or any(getattr(wave, "phase_deg", 0.0) for wave in others)
+        given = given or charged or any(path.endswith(".phase_deg") for path in varied)
+    if given or (tran is not None and tran.start > 0.0):
+        return "the run does not start uncharged, or its figures start late"
+    fixed = () if frequency is None else ("frequency",)
+    may_vary = {e.name.lower(): set(_tones_of(e.waveform, {})[1]).difference(fixed) for e, _ in sources}
+    layers = {e.name.lower() for e in stack.layers}
+    for path in varied:
+        name, _, parameter = path.rpartition(".")
+        if parameter not in may_vary[name] if name in may_vary else parameter in _FORM or name not in layers:
+            return f"{path} varies"
+    return LockstepForm(stack, stack.layers[stack.gap_layer], sources, multiples, frequency, jumping, recording)
+
+
+def why_alone(form: LockstepForm | str, outputs: Iterable[str], slopes_at: float | None = None) -> str:
+    """Why outputs, or with `slopes_at` their derivatives at that rtol, need runs of their own; '' in lockstep."""
+    if isinstance(form, str):
+        return form
+    if slopes_at is not None and form.recording is not None:
+        return "the source is a recording"
+    # Of a recording no last period is kept.
+    suffix = "_periodic" if form.recording is None else ""
+    others = [name for name in outputs if name != "u_gap" and name.removesuffix(suffix) not in FIGURES]
+    if others:
+        return f"{', '.join(others)} needs a run of its own"
+    if slopes_at is not None and slopes_at < _LEAST_RTOL_OF_SLOPES:
+        return f"rtol is below {_LEAST_RTOL_OF_SLOPES:g}"
+    return ""
+
+
+def _tones_of(wave: object, given: Mapping[str, Value]) -> tuple[list[tuple[float, Value, Value]], tuple[str, ...]]:
+    """Frequency (Hz; 0 of no tone), amplitude (V) and phase (rad) of a source's tones, and parameters that may vary."""
+    height, depth, phase = (given.get(name, getattr(wave, name, 0.0)) for name in ("amplitude", "depth", "phase_deg"))
+    turn: Value = np.radians(phase)
+    match wave:
+        case AM():
+            # sin(x) sin(y) is half of cos(x - y) = sin(x - y + pi/2) and of -cos(x + y) = sin(x + y - pi/2).
+            share, quarter = height / (1.0 + depth), 0.5 * np.pi
+            side, low, high = 0.5 * depth * share, wave.carrier - wave.modulation, wave.carrier + wave.modulation
+            tones = [(wave.carrier, share, 0.0), (low, side, quarter - turn), (high, side, turn - quarter)]
+            return tones, ("amplitude", "depth", "phase_deg")
+        case Sine(offset=0.0, delay=0.0, damping=0.0):
+            return [(wave.frequency, height, turn)], ("amplitude", "frequency", "phase_deg")
+        case Square(half_wave=True, phase_deg=0.0, delay=0.0):
+            return [(wave.frequency, height, turn)], ("amplitude", "frequency")
+        case Pulse(half_wave=True, rise=0.0, delay=0.0):
+            return [(wave.tone() or 0.0, wave.v2, 0.0)], ()
+    return [(0.0, 0.0, 0.0)], ()
+
+
+def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:
+    """The table (n_row, n) that `engine.lockstep.march` takes of scenes, which are values by path in lower case."""
+
+    def values(element: Element) -> dict[str, Any]:
+        start = f"{element.name.lower()}."
+        given = {path.removeprefix(start): array for path, array in scenes.items() if path.startswith(start)}
+        return {**element.values, **given}
+
+    first = form.sources[0][0]
+    period = first.waveform.period if first.waveform is not None else None
+    frequency = form.frequency or values(first).get("frequency", 1.0 / (period or math.nan))
+    rows = [*_contact_rows(values(form.gap)), 2.0 * np.pi * np.asarray(frequency)]
+    for element, sign in form.sources:
+        recorded = None if form.recording is None else [(0.0, peak_of(form.recording), 0.0)]
+        for _, amplitude, phase in recorded or _tones_of(element.waveform, values(element))[0]:
+            rows += [sign * amplitude * np.cos(phase), sign * amplitude * np.sin(phase)]
+    n, others, cell = next(iter(scenes.values())).size, CELL_ROWS * form.cells, 0
+    out = np.empty((others + len(rows), n))
+    for i, row in enumerate(rows, others):
+        out[i] = row
+    of_cells = out[:others].reshape(CELL_ROWS, form.cells, n)
+    for layer, count in zip(form.stack.layers, form.stack.cells, strict=True):
+        assert layer.spec.cells is not None
+        cells = layer.spec.cells(values(layer), None)
+        of_cells[:, cell : cell + count] = np.moveaxis(cells.reshape(count, CELL_ROWS, -1), 0, 1)
+        cell += count
+    return out
+
+
+def peak_of(recording: Samples) -> float:
+    """Largest sample, V; 1 V if all are 0."""
+    return float(np.abs(recording.values).max()) or 1.0
+
+
+def _contact_rows(v: Mapping[str, Value]) -> tuple[Value, ...]:
+    """As `Contact.packed`, for arrays of values: X at 1 V, A0, stress at 1 V, load, c2 mu^2."""
+    m, n, f_n, d = v["m_exp"], v["n_exp"], np.asarray(v["fn"]), v["d"]
+    p = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
+    alpha, beta = np.asarray(v["alpha"]) * 1e-6, np.asarray(v["beta"]) * 1e-6 * 1e3**n
+    area = alpha * f_n**m
+    per_volt = EPS0 * v["eps_r"] / d
+    xi = np.sqrt(per_volt * (n * n / (n - m)) * beta ** (1.0 / n) * alpha ** (-1.0 / m)) * area**p / f_n
+    return xi, area, 0.5 * per_volt / d, f_n, v["c2"] * 1e-12 * np.asarray(v["mu"]) ** 2
+
+
+@lru_cache(maxsize=32)
+def curves_of(m: float, n: float, degree: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Power series of the universal curve, if there is one, Chebyshev nodes and matrix of a degree, as for `march`."""
+    p = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
+    series = chebyshev.fit(lambda x: universal_curve_array(x, 1.0 / m, p), 0.0, LARGEST_X, _CURVE_ERROR, _CURVE_SIZES)
+    if series is None:
+        return None
+    to_powers = np.zeros((degree + 1, degree + 1))
+    for k, one in enumerate(np.eye(degree + 1)):
+        to_powers[: k + 1, k] = powers.cheb2poly(one[: k + 1])
+    highest_first = (to_powers @ chebyshev.coefficients(np.eye(degree + 1)))[::-1]
+    at = chebyshev.nodes(degree + 1, -1.0, 1.0)
+    return np.ascontiguousarray(powers.cheb2poly(series)[::-1]), at, np.ascontiguousarray(highest_first)
 
 
 class Level(NamedTuple):
@@ -121,8 +321,9 @@ class Ladder:
         elif form.recording is not None and not periodic:
             first = 0.5 * (form.recording.between(0, 1)[0] != 0.0)
         elif not periodic:
-            sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
-            from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
+            tones = table[-2 * len(form.multiples) :]
+            size = np.hypot(tones[::2], tones[1::2]).sum(axis=0)
+            from_zero = abs(tones[1::2].sum(axis=0)) <= _FROM_ZERO * size
             first = np.where(from_zero, START_TIMES[2] if task.rtol < _LEADING else 0.0, 1.0)
         # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
         self.least = 2.0 * first * self.decays / _LONGEST_STEP
