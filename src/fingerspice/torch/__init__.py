@@ -76,9 +76,9 @@ class Scenes:
 
         With `wanted`, their derivatives by these parameters, shape (n_scene, sum of `sizes`, n_wanted).
         """
-        form = lockstep_form(self.circuit, paths)
         # Where derivatives are not to be had in lockstep, a batch would also run every scene for its outputs.
-        if not self.t.size and not (wanted and why_alone(form, self.outputs, self.rtol)):
+        why = why_alone(lockstep_form(self.circuit, paths), self.outputs, self.rtol) if wanted else ""
+        if not self.t.size and not why:
             # The means, or their derivatives, of all scenes at once.
             found = batch(
                 self.circuit, dict(zip(paths, given.T, strict=True)), outputs=self.outputs, rtol=self.rtol,

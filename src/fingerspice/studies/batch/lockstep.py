@@ -470,12 +470,11 @@ class Ladder:
         change, decays = np.max(changes, axis=0) + run.coarse[-1], self.decays[pending]
         # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
         more = self.task.traced | (2.0 * decays > _STIFF * level.steps) | (self.least[pending] > decays)
-        share = np.where(more, _STATED_MORE, _STATED)
+        share: FloatArray | float = np.where(more, _STATED_MORE, _STATED)
         if self.form.recording is not None:
-            plain = self.form.cells == len(self.form.stack.layers)
-            share = np.full_like(decays, _STATED_RECORDED if plain else _STATED_DISPERSIVE)
+            share = _STATED_RECORDED if self.form.cells == len(self.form.stack.layers) else _STATED_DISPERSIVE
         elif self.form.jumping:
-            share = np.full_like(decays, _STATED_JUMPING)
+            share = _STATED_JUMPING
         return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING + 2.0**level.degree * _EPS)
 
 
@@ -506,8 +505,7 @@ class Slopes(Ladder):
         moved = {path: np.tile(array, (2, len(task.paths), 1)) for path, array in self.scenes.items()}
         for k, together in enumerate(task.paths.values()):
             for path in together:
-                for side, sign in enumerate((-1.0, 1.0)):
-                    moved[path.lower()][side, k] *= 1.0 + sign * STEP
+                moved[path.lower()][:, k] *= [[1.0 - STEP], [1.0 + STEP]]
         self.scenes = {path: array.ravel() for path, array in moved.items()}
         self.table = table_of(form, self.scenes)
 
