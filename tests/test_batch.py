@@ -302,9 +302,18 @@ def test_what_lockstep_cannot_do_goes_one_by_one(
 def test_figures_of_several_gaps_have_a_column_each() -> None:
     circuit = fs.read_netlist("circuits/two_fingers.cir")
     gap = circuit.by_device("GAP")[0].name
-    found = fs.batch(circuit, {f"{gap}.d": [3e-6, 4e-6]}, rtol=1e-3)
+    parameters = {f"{gap}.d": [3e-6, 4e-6]}
+    found = fs.batch(circuit, parameters, rtol=1e-3)
     assert found.f_el_mean.dims == ("scene", "gap")
     assert found.f_el_mean.shape == (2, 2)
+    circuit = circuit.varied({"Vdrive": fs.Sine(200.0, 100.0)})
+    found = fs.batch(circuit, parameters, outputs=("u_gap",), periods=1, points=20)
+    assert found.u_gap.dims == ("scene", "turn", "gap")
+    for u, run in zip(found.u_gap, singles(circuit, parameters, periods=1, points=20), strict=True):
+        np.testing.assert_allclose(u, run.u_gap, rtol=0.0, atol=1e-4 * np.abs(run.u_gap).max())
+    refused = fs.batch(circuit, {f"{gap}.c2": [1e6]}, periods=1)
+    assert refused.status.values.tolist() == [2]
+    assert refused.f_el_mean.shape == (1, 2)
 
 
 def test_the_skin_follows_the_source_only_on_request() -> None:

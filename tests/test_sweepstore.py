@@ -336,13 +336,13 @@ def test_dask_workers_that_are_killed_again_and_again_cost_nothing(
 def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
     circuit: fs.Circuit, whole: dict[str, bytes | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, computed, write = tmp_path / "s.zarr", chunks.Work._computed, chunks.Work._write
+    path, part, write = tmp_path / "s.zarr", Draws.part, chunks.Work._write
     begun, written, at_once = 0, 0, 0
 
     def computing(*given: Any) -> Any:
         nonlocal begun
         begun += 1
-        return computed(*given)
+        return part(*given)
 
     def writing(*given: Any) -> None:
         nonlocal written, at_once
@@ -355,7 +355,7 @@ def test_a_dask_worker_computes_the_next_chunk_while_it_writes_one(
         written += 1
         write(*given)
 
-    monkeypatch.setattr(chunks.Work, "_computed", computing)
+    monkeypatch.setattr(Draws, "part", computing)
     monkeypatch.setattr(chunks.Work, "_write", writing)
     with cluster_of(1, processes=False) as cluster:
         fs.sweep(circuit, PARAMETERS, store=path, scheduler=cluster.scheduler_address, **HOW)

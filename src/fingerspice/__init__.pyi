@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from fingerspice.studies.batch.batch import batch as batch
     from fingerspice.studies.comparison import Comparison as Comparison
     from fingerspice.studies.comparison import compare as compare
-    from fingerspice.studies.comparison import large_signal as large_signal
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
@@ -45,6 +44,7 @@ if TYPE_CHECKING:
     from fingerspice.studies.limits import capability as capability
     from fingerspice.studies.limits import fold_limits as fold_limits
     from fingerspice.studies.steady import SteadyState as SteadyState
+    from fingerspice.studies.steady import large_signal as large_signal
     from fingerspice.studies.steady import phasor as phasor
     from fingerspice.studies.steady import steady_state as steady_state
     from fingerspice.studies.sweep.populations import sobol as sobol

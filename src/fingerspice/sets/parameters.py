@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import tomllib
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -21,7 +20,7 @@ from fingerspice.circuit.circuit import Circuit, Element
 from fingerspice.circuit.describe import in_force, remembering, require_circuit
 from fingerspice.circuit.statespace import driving_sources
 from fingerspice.waveforms.periodic import Square
-from fingerspice.waveforms.waveform import AM, Sine, Waveform
+from fingerspice.waveforms.waveform import AM, Sine, Waveform, require
 
 #: Waveforms of drives, by the name that a set gives.
 WAVEFORMS: dict[str, type[Waveform]] = {"Sine": Sine, "Square": Square, "AM": AM}
@@ -44,8 +43,7 @@ class SetValue:
     parameter: str  # As in the netlist, or a parameter of the set's waveform
     value: float
     unit: str
-    # low, high: The range of the value, in `unit`
-    low: float
+    low: float  # Range of the value, in `unit`
     high: float
     source: str  # Where the value comes from, with keys of references in brackets; "assumed ..." if not published
     range: str  # Where the range comes from
@@ -79,20 +77,17 @@ class Reference:
         """The reference in one sentence."""
         names = [a.strip("{}") if a[0] == "{" else " ".join(reversed(a.split(", ", 1))) for a in self.authors]
         who = ", ".join(names).replace(", others", " et al.")
-        said = [f"{who}, “{self.title}”"]
-        for key, word in _SAID:
-            if key in self.where:
-                # An article's number, in place of pages, needs no word.
-                bare = key == "pages" and "-" not in self.where[key]
-                said.append(self.where[key] if bare else f"{word} {self.where[key]}".strip())
+        # An article's number, in place of pages, needs no word.
+        words = dict(_SAID) | ({} if "-" in self.where.get("pages", "") else {"pages": ""})
+        said = [f"{word} {self.where[key]}".strip() for key, word in words.items() if key in self.where]
         said += [str(self.year or ""), f"doi:{self.doi}" if self.doi else self.url]
-        return f"{', '.join(filter(None, said))}."
+        return f"{', '.join(filter(None, [f'{who}, “{self.title}”', *said]))}."
 
     def bibtex(self) -> str:
         """The reference as a BibTeX entry, in UTF-8."""
         fields = {"author": " and ".join(self.authors), "title": f"{{{self.title}}}", **self.where}
-        fields |= {"pages": self.where["pages"].replace("-", "--")} if "pages" in self.where else {}
         fields |= {"year": str(self.year or ""), "doi": self.doi, "url": self.url}
+        fields |= {"pages": fields["pages"].replace("-", "--")} if "pages" in fields else {}
         lines = [f"  {name} = {{{value.replace('&', chr(92) + '&')}}}," for name, value in fields.items() if value]
         return "\n".join([f"@{self.kind}{{{self.key},", *lines, "}"])
 
@@ -203,12 +198,10 @@ class ParameterSet(Shown):
             there = f"its {', '.join(e.name for e in known)}" if known else f"a circuit with a {what}"
             raise InputError(f"the set {name!r} has values for a {what}, which {inside} lacks; allowed: {there}")
         # A finger has one layer of each kind on its area; two would be two parts of the screen, of which one is meant.
-        at = Counter("" if kind == "source" else e.nodes[2] for e in found)
-        if any(count > 1 for count in at.values()):
-            names = ", ".join(e.name for e in found)
+        if len(found) > len({"" if kind == "source" else e.nodes[2] for e in found}):
             raise InputError(
-                f"the set {name!r} has values for one {what}, and the circuit has {names}; allowed: one of these names "
-                f"(to={found[0].name!r}, or {found[0].name}={name} on the command line)"
+                f"the set {name!r} has values for one {what}, and the circuit has {', '.join(e.name for e in found)}; "
+                f"allowed: one of these names (to={found[0].name!r}, or {found[0].name}={name} on the command line)"
             )
         return found
 
@@ -236,21 +229,14 @@ class ParameterSet(Shown):
         ])  # fmt: skip
 
 
-class ParameterSets(Shown, Mapping[str, ParameterSet]):
+class ParameterSets(Shown, dict[str, ParameterSet]):
     """All named sets, by name."""
 
-    def __getitem__(self, name: str) -> ParameterSet:
-        return _set(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(tables())
-
-    def __len__(self) -> int:
-        return len(tables())
-
     def _page(self) -> Page:
-        assumed = {one.name: f", {len(one.assumed)} assumed" if one.assumed else "" for one in self.values()}
-        rows = [(one.name, one.kind, one.title, f"{len(one.values)}{assumed[one.name]}") for one in self.values()]
+        rows = []
+        for one in self.values():
+            assumed = f", {len(one.assumed)} assumed" if one.assumed else ""
+            rows.append((one.name, one.kind, one.title, f"{len(one.values)}{assumed}"))
         return Page([Table(("name", "kind", "what it is", "values"), rows, left=4)])
 
 
@@ -289,22 +275,20 @@ def parameters(name: str | None = None, kind: str | None = None) -> ParameterSet
         If there is no such set; the message gives the nearest names.
     """
     if name is None:
-        return ParameterSets()
+        return ParameterSets({own: _set(own) for own in tables()})
     if not isinstance(name, str):
         raise InputError(f"parameters is given {name!r}, a {type(name).__name__}; allowed: the name of a set")
-    if kind is not None and kind not in KINDS:
-        raise InputError(f"kind is {kind!r}; allowed: {', '.join(KINDS)}")
-    known = {own.lower(): one for own, one in ParameterSets().items()}
-    found = known.get(name.strip().lower())
-    fitting = [one for one in known.values() if kind in (None, one.kind)]
-    if found is None or found not in fitting:
-        shown = ", ".join(one.name for one in fitting)
-        if found is not None:
+    require(kind is None or kind in KINDS, "kind", repr(kind), ", ".join(KINDS))
+    known, key = {own.lower(): _set(own) for own in tables()}, name.strip().lower()
+    fitting = {own: one for own, one in known.items() if kind in (None, one.kind)}
+    if key not in fitting:
+        shown = ", ".join(one.name for one in fitting.values())
+        if (found := known.get(key)) is not None:
             raise InputError(f"the set {found.name!r} is a {found.kind}, not a {kind}; allowed: {shown}")
-        near = get_close_matches(name.strip().lower(), [one.name.lower() for one in fitting], 3, 0.4)
-        hint = f"nearest: {', '.join(repr(known[one].name) for one in near)}" if near else f"allowed: {shown}"
-        raise InputError(f"unknown {kind or 'parameter'} set {name!r}; {hint}".replace("parameter set", "set"))
-    return found
+        near = ", ".join(repr(fitting[one].name) for one in get_close_matches(key, fitting, 3, 0.4))
+        hint = f"nearest: {near}" if near else f"allowed: {shown}"
+        raise InputError(f"unknown {f'{kind} ' if kind else ''}set {name!r}; {hint}")
+    return fitting[key]
 
 
 def quantity(value: float, unit: str) -> str:
@@ -363,10 +347,8 @@ def cite(circuit: Circuit, method: str) -> Citation:
         texts = [one.claims, *(value.source for values in given.values() for value in values)] if kept else []
         found |= {key: known[key] for text in texts for key in keys_in(text)}
     said += [] if circuit.sets else ["No set of parameters was applied."]
-    said.append(
-        f"All other values are those of the deck “{circuit.title}” and of changes made to it; cite their sources, "
-        "which the program does not know."
-    )
+    rest = f"All other values are those of the deck “{circuit.title}” and of changes made to it"
+    said.append(f"{rest}; cite their sources, which the program does not know.")
     if (key := _METHODS.get(method.partition(":")[0])) is not None:
         said.append(f"The method {method} is that of [{key}].")
         found[key] = known[key]

@@ -1,31 +1,23 @@
-"""The periodic state beside the phasor: what the area's ripple adds, and the response to sines of given amplitude."""
+"""The periodic state beside the phasor: what the area's ripple adds."""
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from fingerspice.base.arrays import positive_row
-from fingerspice.base.errors import FingerspiceWarning, InputError
+from fingerspice.base.errors import InputError
 from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.circuit.describe import Parameters, Sources, head_lines, overridden, require_circuit
-from fingerspice.circuit.devices import beyond_fingers
+from fingerspice.circuit.describe import Parameters, Sources, head_lines, overridden
 from fingerspice.circuit.network import linear_scene
 from fingerspice.plots import drawing, traces
 from fingerspice.results.solution import Solution
-from fingerspice.results.spectrum import PhasorSolution
-from fingerspice.results.steps import weigh_outputs
-from fingerspice.solve.runs import Progress
-from fingerspice.studies.steady import phasor, steady_state, sweep_drive, sweep_notes
-from fingerspice.waveforms.waveform import Sine
+from fingerspice.studies.steady import phasor, steady_state
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,10 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Figures:
-    """Gap voltage at the fundamental, mean force and mean area from one method.
-
-    Each is a number, or an array (n_gap,) if the circuit has several GAPs.
-    """
+    """Gap voltage at the fundamental, mean force and mean area from one method; arrays (n_gap,) of several GAPs."""
 
     amplitude: float | NDArray[np.float64]  # V
     phase_deg: float | NDArray[np.float64]  # Lead over the source's fundamental, degrees
@@ -86,18 +75,18 @@ class Comparison(Shown):
     def _page(self) -> Page:
         rows = [(f"{label} [{unit}]", *(f"{x:.6g}" for x in numbers)) for label, unit, numbers in self._labelled(2)]
         head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
-        said = []
+        state = f"periodic state at {format_si(self.frequency, 'Hz')}, charge law {self.solution.charge_law}"
+        page: list[str | Table] = [*head_lines(self.solution.circuit), state, "", Table(head, rows), ""]
         for i, gap in enumerate(self.gaps):
             reference, mean, coupled = (f.of_gap(i)["f_el_mean"] for f in (self.phasor, self.mean, self.coupled))
             # Round before formatting, and add 0.0, so that -0.00 is not printed.
             total, waveform = (round(100.0 * (x / reference - 1.0), 2) + 0.0 for x in (coupled, mean))
-            said.append(
+            page.append(
                 f"mean force{f' of {gap}' if len(self.gaps) > 1 else ''}: {total:+.2f} % against the phasor; "
                 f"{total - waveform:+.2f} % of that is the ripple of the area, {waveform:+.2f} % is the waveform's "
                 "(zero for a sine)"
             )
-        state = f"periodic state at {format_si(self.frequency, 'Hz')}, charge law {self.solution.charge_law}"
-        return Page([*head_lines(self.solution.circuit), state, "", Table(head, rows), "", *said])
+        return Page(page)
 
     def plot(self) -> Picture:
         """Picture of one period of the transient and of the phasor, with the figures of both."""
@@ -224,94 +213,5 @@ def compare(
         area = one._figures.value("area", "mean_periodic")
         every = one.u_gap_amplitude, (lead + 180.0) % 360.0 - 180.0, one.f_el_mean_periodic, area
         ways.append(np.array(every, float).reshape(len(every), -1))
-    if len(found) == 1:
-        ways = [way[:, 0].tolist() for way in ways]
-    of_phasor, of_mean, of_coupled = (Figures(*way) for way in ways)
+    of_phasor, of_mean, of_coupled = (Figures(*(way[:, 0].tolist() if len(found) == 1 else way)) for way in ways)
     return Comparison(of_phasor, of_mean, of_coupled, fundamental.frequency, coupled)
-
-
-# Number of outputs in a period; cubics through them interpolate a sine with an error of 1e-9 of its amplitude.
-POINTS = 400
-
-
-def large_signal(
-    circuit: Circuit,
-    frequency: ArrayLike,
-    amplitude: ArrayLike | None = None,
-    *,
-    charge_law: str | None = None,
-    rtol: float = 1e-8,
-    finger: str | None = None,
-    progress: Progress | None = None,
-) -> tuple[PhasorSolution, ...]:
-    """Periodic states under sines, for each frequency and amplitude; SKIN is evaluated at each frequency.
-
-    Parameters
-    ----------
-    circuit : Circuit
-        A circuit with a GAP and one source.
-    frequency : array_like
-        Hz, positive.
-    amplitude : array_like, optional
-        V (A for a current source), positive; by default the amplitude of the source's ``AC``, or without AC that of its
-        fundamental.
-    charge_law, rtol, progress
-        As in `simulate`.
-    finger : str, optional
-        Name of the GAP whose figures are wanted; needed if the circuit has several.
-
-    Returns
-    -------
-    tuple of PhasorSolution
-        One per amplitude. Gains are those of the fundamental; area and force are means over the period.
-
-    Raises
-    ------
-    InputError
-        If the circuit has no GAP or several sources, if none of several GAPs is named, or if a frequency or amplitude
-        is not positive.
-    SolveError
-        If there is no periodic state.
-    """
-    require_circuit(circuit)
-    scene = linear_scene(circuit, finger)
-    drives = scene.network.drives
-    if len(drives) != 1:
-        names = ", ".join(e.name for e, _ in drives)
-        raise InputError(f"a large-signal sweep drives one source, and this circuit has {names}")
-    own = sweep_drive(drives, scene.network.waveforms[0].fundamental, swept=True)
-    if amplitude is None and math.isnan(own[0]):
-        raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
-    given = positive_row("amplitude", own[0] if amplitude is None else amplitude, "V")
-    f = positive_row("frequency", frequency, "Hz")
-    notes, warned = sweep_notes(circuit, f)
-    notes = (*notes, scene.note) if scene.note else notes
-    for text in warned:
-        warnings.warn(text, FingerspiceWarning, stacklevel=2)
-    sizes = [own] if amplitude is None else [(float(a), 0.0, "the amplitude given") for a in given]
-    ((source, sign),) = drives
-    skins = [f"{e.name}.f" for e in circuit.by_device("SKIN")]
-    found = []
-    for place, (size, phase, drive) in enumerate(sizes):
-        rows = []
-        for number, x in enumerate(f.tolist(), place * f.size + 1):
-            changed = circuit.varied({**dict.fromkeys(skins, x), source.name: Sine(size, x)})
-            s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution
-            # The output starts at a multiple of the period, so that phases from its start are phases relative to the
-            # source.
-            period, end = s.t - s.t[0], "" if len(s.gaps) == 1 else f":{s.layers[scene.gap]}"
-            means = [weigh_outputs(period, s.record.one(key + end)).mean() for key in ("area", "f_el")]
-            rows.append([*means, *(weigh_outputs(period, u).phasor(x) * sign / size for u in s.u_layer.T)])
-            if progress is not None:
-                progress(number / (f.size * len(sizes)))
-        table = np.array(rows, np.complex128)
-        (areas, forces), gain = table[:, :2].real.T.copy(), table[:, 2:].copy()
-        u_gap = gain[:, scene.gap] * size * np.exp(1j * phase)
-        largest = forces.max(), scene.contact.stress(np.abs(u_gap)).max(), areas.max()
-        found.append(
-            PhasorSolution(
-                f, gain[:, scene.gap], gain, u_gap, areas, forces, size, s.layers, phase, drive, notes,
-                (*warned, *beyond_fingers("", *map(float, largest))), circuit,
-            )
-        )  # fmt: skip
-    return tuple(found)

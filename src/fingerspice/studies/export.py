@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 import textwrap
@@ -21,18 +20,17 @@ from fingerspice.solve.problem import prepare
 from fingerspice.solve.starting import start_voltage, starts_uncharged
 from fingerspice.waveforms.periodic import PWL, Pulse
 from fingerspice.waveforms.samples import Samples
-from fingerspice.waveforms.waveform import DC, Exp, Sine, Waveform
+from fingerspice.waveforms.waveform import DC, Exp, Sine, Waveform, require
 
 EDGE = 1e-9
 """Rise time (s) of an ideal jump in the export, since ngspice has none; a thousandth of TSTEP if that is shorter."""
 NOW = 1e-30
 """Time (s) that is written for 0, because ngspice takes 0 for "not given"."""
 
-# Found by tests with ngspice 39 on edges, constant voltages and sines under both laws. At an edge ngspice's step
-# control reduces the step until the run fails; a large trtol switches it off, so that TMAX (by default TSTEP) sets the
-# accuracy. Inside a capacitor C='...' an auxiliary current of du/dt (in A) flows. At a constant voltage that current is
-# round-off divided by the step, about 1e-6 in the first steps and thus above the usual abstol of 1e-12. The last of
-# several .options lines counts, so this one follows the library.
+# Found by tests with ngspice 39. At an edge ngspice's step control reduces the step until the run fails; a large trtol
+# switches it off, so that TMAX (by default TSTEP) sets the accuracy. Inside a capacitor C='...' an auxiliary current of
+# du/dt (in A) flows. At a constant voltage that is round-off divided by the step, about 1e-6 in the first steps and
+# thus above the usual abstol of 1e-12. The last of several .options lines counts, so this one follows the library.
 _OPTIONS = ".options reltol=1e-4 trtol=1e4 abstol=1e-4"
 
 # Points per shortest time scale of a waveform; linear interpolation of a sine then has an error of 5e-6 of its
@@ -65,8 +63,7 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     """
     require_circuit(circuit)
     law = charge_law or circuit.charge_law or "local"
-    if law not in LIBRARIES:
-        raise InputError(f"charge_law is {law!r}; allowed: {' or '.join(map(repr, LIBRARIES))}")
+    require(law in LIBRARIES, "charge_law", repr(law), " or ".join(map(repr, LIBRARIES)))
     nodes = {n: _name(n) for e in circuit.elements for n in e.node_names}
     for names in (nodes, {e.name: _element_name(e) for e in circuit.elements}):
         seen: dict[str, str] = {}
@@ -79,10 +76,8 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     contacts = {area.node: contact for area, contact in pairs if contact is not None}
     areas = _start_areas(circuit, law, contacts)
     ratio = max((contact.work_ratio for contact in contacts.values()), default=1.0)
-    lines = [
-        circuit.title or "fingerspice export",
-        f"* Written by fingerspice; charge law {law}. Run: ngspice -b -r out.raw FILE",
-    ]
+    lines = [circuit.title or "fingerspice export"]
+    lines.append(f"* Written by fingerspice; charge law {law}. Run: ngspice -b -r out.raw FILE")
     if circuit.overrides:
         changed = ", ".join(f"{k} = {v}" for k, v in circuit.overrides.items())
         lines.append(f"* Changed from the deck: {' '.join(changed.split())}"[:1000])
@@ -90,9 +85,8 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
         text = _element_line(element, circuit, ratio, areas)
         lines += textwrap.wrap(text, 100, subsequent_indent="+ ", break_long_words=False, break_on_hyphens=False)
     if (tran := circuit.tran) is not None:
-        numbers = [tran.step, tran.stop, *([tran.start] if tran.start or tran.max_step else [])]
-        numbers += [tran.max_step] if tran.max_step else []
-        lines.append(f".tran {' '.join(map(repr, numbers))}{' uic' if tran.uic else ''}")
+        more = (tran.start, tran.max_step) if tran.max_step else (tran.start,) if tran.start else ()
+        lines.append(f".tran {' '.join(map(repr, (tran.step, tran.stop, *more)))}{' uic' if tran.uic else ''}")
     if (ac := circuit.ac) is not None:
         lines.append(f".ac {ac.scale} {ac.points} {ac.start!r} {ac.stop!r}")
     lines += _start_lines(circuit, areas, contacts)
@@ -109,16 +103,15 @@ def _name(name: str) -> str:
 def _element_name(element: Element) -> str:
     name = _name(element.name)
     letter = element.device if len(element.device) == 1 else "X"
-    # ngspice takes the device from the first letter of the name; the flat name of an element in a subcircuit begins
-    # with the X of the call, so put the right letter in front.
+    # ngspice takes the device from the name's first letter, which in a subcircuit's flat name is the X of the call.
     return name if name[0].upper() == letter else f"{letter}{name}"
 
 
 def _start_areas(circuit: Circuit, law: str, contacts: Mapping[str, Contact]) -> dict[str, float]:
     """Area (mm^2) of each area node at the start of a run with ``uic``; empty for a run that starts otherwise."""
+    out: dict[str, float] = {}
     if circuit.tran is None or not starts_uncharged(circuit):
-        return {}
-    out = {}
+        return out
     for area in find_branches(circuit)[0]:
         value = area.given
         if value is None and area.gap is not None:
@@ -127,7 +120,7 @@ def _start_areas(circuit: Circuit, law: str, contacts: Mapping[str, Contact]) ->
         out[area.node] = 1e6 * value
     if any(gap.values["tau"] > 0.0 for gap in circuit.by_device("GAP")):
         # Areas that follow with a delay start where the problem says.
-        problem = prepare(circuit, t_stop=None, t_eval=None, charge_law=law, area="coupled", start="deck", charge=False)
+        problem = prepare(circuit, charge_law=law, charge=False)
         net = problem.scene.net
         slow = problem.initial.y[net.k.shape[0] :]
         for area, place, area0 in zip(problem.network.areas, net.slow, net.area0, strict=True):
@@ -138,21 +131,18 @@ def _start_areas(circuit: Circuit, law: str, contacts: Mapping[str, Contact]) ->
 
 def _start_lines(circuit: Circuit, areas: Mapping[str, float], contacts: Mapping[str, Contact]) -> Iterator[str]:
     """Start values (.ic) and guesses (.nodeset) of nodes; with ``uic`` the layers' own lines hold start voltages."""
-    written = {node: name for e in circuit.elements for node, name in zip(e.nodes, e.node_names, strict=True)}
+    written = {node: _name(name) for e in circuit.elements for node, name in zip(e.nodes, e.node_names, strict=True)}
     gaps = {gap.nodes[2]: gap for gap in circuit.by_device("GAP")}
     for node, value in circuit.initial.items():
         if node != "0" and node not in gaps:
-            yield f".ic v({_name(written[node])})={value!r}"
+            yield f".ic v({written[node]})={value!r}"
     for node, gap in gaps.items():
-        contact = contacts[node]
+        contact, held = contacts[node], circuit.initial.get(node)
         guess = gap.values["a_fix"] or 1e6 * float(contact.area(0.0))
-        held = circuit.initial.get(node)
         if areas:
             # An area with a delay is a state and needs a start value; for an area without delay a guess is enough.
-            held = areas[node] if gap.values["tau"] > 0.0 else None
-            guess = areas[node]
-        word, value = (".nodeset", guess) if held is None else (".ic", held)
-        yield f"{word} v({_name(written[node])})={value!r}"
+            held, guess = areas[node] if gap.values["tau"] > 0.0 else None, areas[node]
+        yield f"{'.nodeset' if held is None else '.ic'} v({written[node]})={guess if held is None else held!r}"
         if areas and circuit.initial and not gap.values["a_fix"]:
             # Without guesses for the nodes inside a GAP, ngspice's first Newton iteration fails at u != 0.
             u, name = start_voltage(gap, circuit.initial), _element_name(gap)
@@ -180,10 +170,6 @@ def _element_line(element: Element, circuit: Circuit, work_ratio: float, start_a
     return f"{head} {element.device} {values}{extra}"
 
 
-def _call(name: str, numbers: Iterable[float]) -> str:
-    return f"{name}({' '.join(repr(float(x)) for x in numbers)})"
-
-
 def _source_text(w: Waveform, name: str, circuit: Circuit) -> str:
     """A waveform as ngspice has it, or as points."""
     if isinstance(w, DC):
@@ -198,26 +184,30 @@ def _source_text(w: Waveform, name: str, circuit: Circuit) -> str:
     empty = tran is not None and starts_uncharged(circuit) and not given
     if isinstance(w, Pulse):
         stop = tran.stop if tran else 1.0
+        span, rise, fall = stop + abs(w.delay), w.rise or edge, w.fall or edge
+        # The rise time of a jump is subtracted from the width, so that the pulse still ends at its time.
+        width = w.width - (0.0 if w.rise else edge) if math.isfinite(w.width) else 10.0 * span
+        period = w.pulse_period if math.isfinite(w.pulse_period) else 20.0 * span + rise + width + fall
         jumps = empty and w.value(0.0) != 0.0 and w.breakpoint_rate() * stop < _FEW_POINTS
-        if not jumps and (numbers := _pulse_numbers(w, stop + abs(w.delay), edge)):
-            return _call("PULSE", numbers)
+        if not jumps and width > 0.0 and rise + width + fall <= period:
+            return _call("PULSE", (w.v1, w.v2, w.delay, rise, fall, width, period))
     t, v = _points(w, name, circuit)
     if empty:
-        # All voltages start at 0, so let the source start at 0 V and jump: otherwise ngspice often fails at its first
-        # step.
+        # All voltages start at 0: let the source start at 0 V and jump, or ngspice often fails at its first step.
         t, v = np.append([0.0, 0.0], t[t > 0.0]), np.append([0.0, w.value(0.0)], v[t > 0.0])
-    return _pwl_text(t, v, edge)
+    points: list[float] = []
+    for time, value in zip(t.tolist(), v.tolist(), strict=True):
+        if points and time <= points[-2]:
+            if value == points[-1]:
+                continue
+            # A jump becomes an edge. Late in a long run it may be shorter than the spacing of doubles: take the next.
+            time = max(points[-2] + edge, np.nextafter(points[-2], math.inf).item())
+        points += [time, value]
+    return _call("PWL", points)
 
 
-def _pulse_numbers(p: Pulse, span: float, edge: float) -> tuple[float, ...] | None:
-    """A pulse's numbers in ngspice, over a span (s); None if the edges of its jumps have no room."""
-    # The rise time of a jump is subtracted from the width, so that the pulse still ends at its time.
-    width = p.width - (0.0 if p.rise else edge) if math.isfinite(p.width) else 10.0 * span
-    rise, fall = p.rise or edge, p.fall or edge
-    period = p.pulse_period if math.isfinite(p.pulse_period) else 20.0 * span + rise + width + fall
-    if width <= 0.0 or rise + width + fall > period:
-        return None
-    return p.v1, p.v2, p.delay, rise, fall, width, period
+def _call(name: str, numbers: Iterable[float]) -> str:
+    return f"{name}({' '.join(repr(float(x)) for x in numbers)})"
 
 
 def _points(w: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.ndarray]:
@@ -259,22 +249,5 @@ def _points(w: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.nd
 
 def _refuse_many(points: float, name: str) -> None:
     if points > _MAX_POINTS:
-        raise InputError(
-            f"{name}: the source would take {points:.0f} PWL points; allowed: at most {_MAX_POINTS}; shorten the run "
-            "(--stop, or .tran)"
-        )
-
-
-def _pwl_text(t: np.ndarray, v: np.ndarray, edge: float) -> str:
-    """PWL text; a jump becomes an edge of `edge` seconds, and repeated points are left out."""
-    times: list[float] = []
-    values: list[float] = []
-    for time, value in zip(t.tolist(), v.tolist(), strict=True):
-        if times and time <= times[-1]:
-            if value == values[-1]:
-                continue
-            # Late in a long run an edge may be shorter than the spacing of doubles: use the next double then.
-            time = max(times[-1] + edge, np.nextafter(times[-1], math.inf).item())
-        times.append(time)
-        values.append(value)
-    return _call("PWL", itertools.chain.from_iterable(zip(times, values, strict=True)))
+        raise InputError(f"{name}: the source would take {points:.0f} PWL points; allowed: at most {_MAX_POINTS}; "
+                         "shorten the run (--stop, or .tran)")  # fmt: skip

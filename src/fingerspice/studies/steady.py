@@ -1,7 +1,4 @@
-"""Phasors of a circuit: gain, gap voltage, area and mean force against frequency (Eqs. 9 to 15).
-
-Periodic state of a circuit under a periodic source, found by Newton's method, with its defect and stability.
-"""
+"""Phasors of a circuit (Eqs. 9 to 15), its periodic state, and its response to sines of given amplitude."""
 
 from __future__ import annotations
 
@@ -21,34 +18,33 @@ from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.base.pages import Page, Shown
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element
-from fingerspice.circuit.describe import Parameters, Sources, area_given, overridden
+from fingerspice.circuit.describe import Parameters, Sources, area_given, overridden, require_circuit
 from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.network import build_network, linear_scene, phasor_areas, with_skin_held
 from fingerspice.physics.materials import SKIN_BAND
 from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.solution import Sensitivity, Solution
 from fingerspice.results.spectrum import PhasorSolution
+from fingerspice.results.steps import weigh_outputs
 from fingerspice.results.summary import Figured, Figures
 from fingerspice.solve.derivatives import check_request, period_of, sensitivities_of
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
+from fingerspice.solve.runs import Progress
 from fingerspice.solve.simulation import rtol_given, run_problem
-from fingerspice.waveforms.waveform import Fundamental, require
+from fingerspice.waveforms.waveform import Fundamental, Sine, require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
-MAX_FREQUENCIES = 1_000_000
+# Largest number of frequencies; outputs in a period, through which cubics interpolate a sine to 1e-9 of its amplitude.
+MAX_FREQUENCIES, POINTS = 1_000_000, 400
 
 
 def sweep_drive(
     sources: tuple[tuple[Element, float], ...], fundamental: Fundamental | None, swept: bool
 ) -> tuple[float, float, str]:
-    """The drive of a circuit: in a sweep the ``AC`` of its sources, if the deck has it, and else the fundamental.
-
-    Gives its amplitude (V, or A for a current source; NaN if there is neither), phase (rad), and their origin in words.
-    """
+    """Amplitude (V or A, else NaN), phase (rad) and origin of a drive: in a sweep AC if given, or the fundamental."""
     given = [(e, sign, e.ac) for e, sign in sources if e.ac is not None]
     if swept and given:
         # As in ngspice, a source without AC has an AC amplitude of 0.
@@ -61,26 +57,23 @@ def sweep_drive(
     return fundamental.amplitude, fundamental.phase, f"the fundamental of {names}"
 
 
-def sweep_notes(circuit: Circuit, f: FloatArray, skin: str = "swept") -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Remarks on the frequency of the skin's data, and warnings about extrapolation, for a sweep (Hz)."""
+def sweep_notes(circuit: Circuit, f: FloatArray, note: str, skin: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Remarks on a sweep (Hz), on the frequency of the skin's data and a `note`, and warnings about extrapolation."""
     skins = {e.name: e.values["f"] for e in circuit.by_device("SKIN")}
     own = ", ".join(f"{name} f = {x:g} Hz" for name, x in skins.items())
-    notes: tuple[str, ...] = ()
+    notes, warned = list[str](), list[str]()
     if skins and skin == "own":
-        notes = (f"the skin's data are held at the deck's own frequency ({own}) over the whole sweep",)
+        notes.append(f"the skin's data are held at the deck's own frequency ({own}) over the whole sweep")
     elif any(np.any(np.abs(f / x - 1.0) > 1e-9) for x in skins.values()):
-        notes = (f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})",)
-    swept = bool(circuit.by_device("SKIN_DISPERSIVE")) or (bool(skins) and skin != "own")
+        notes.append(f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})")
     low, high = float(f.min()), float(f.max())
     ends = ("down to", low, SKIN_BAND[0] / low, "below"), ("up to", high, high / SKIN_BAND[1], "above")
     # The tolerance of 1e-6 allows for rounding of a sweep's end.
     beyond = [f"{to} {x:g} Hz, {math.log10(by):.2g} decades {side}" for to, x, by, side in ends if by > 1.0 + 1e-6]
-    if not swept or not beyond:
-        return notes, ()
-    return notes, (
-        f"the sweep goes {' and '.join(beyond)} the 10 Hz to 100 kHz of the skin's data (Eqs. 18, 19): what it shows "
-        "there is extrapolated",
-    )
+    if beyond and (circuit.by_device("SKIN_DISPERSIVE") or (skins and skin != "own")):
+        warned.append(f"the sweep goes {' and '.join(beyond)} the 10 Hz to 100 kHz of the skin's data (Eqs. 18, 19): "
+                      "what it shows there is extrapolated")  # fmt: skip
+    return (*notes, *([note] if note else [])), tuple(warned)
 
 
 def sweep_frequencies(sweep: AcSweep) -> FloatArray:
@@ -155,11 +148,9 @@ def phasor(
         raise InputError("no source has an amplitude; allowed: AC on a source, such as V1 in 0 AC 1, or one sine")
     fixed = scene is None or network.areas[scene.finger].given is not None
     if area == "mean" and math.isnan(amplitude) and not fixed:
-        raise InputError(
-            "area='mean' needs the amplitude of the source's fundamental, and this source has none; allowed: "
-            "'frozen' or an area in m^2"
-        )
-    notes, warned = sweep_notes(circuit, f, skin)
+        raise InputError("area='mean' needs the amplitude of the source's fundamental, and this source has none; "
+                         "allowed: 'frozen' or an area in m^2")  # fmt: skip
+    notes, warned = sweep_notes(circuit, f, "" if scene is None else scene.note, skin)
     v, none = None, np.full(f.size, math.nan)
     with np.errstate(all="ignore"):
         areas = np.array([phasor_areas(network, area, float(x), amplitude) for x in f])
@@ -180,12 +171,10 @@ def phasor(
         impedance = np.array([network.impedance(float(x), a) for x, a in zip(f, areas, strict=True)]) if alone else None
     finite = np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
     if not finite.all():
-        raise InputError(
-            f"the phasor at {f[np.argmin(finite)]:g} Hz is beyond the range of numbers; allowed: frequencies nearer to "
-            "the 10 Hz to 100 kHz of the skin's data, and values nearer to Table 1's"
-        )
+        raise InputError(f"the phasor at {f[np.argmin(finite)]:g} Hz is beyond the range of numbers; allowed: "
+                         "frequencies nearer to the 10 Hz to 100 kHz of the skin's data, and values nearer to Table "
+                         "1's")  # fmt: skip
     if scene is not None:
-        notes = (*notes, *filter(None, [scene.note]))
         warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
     for text in warned:
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
@@ -230,17 +219,14 @@ class SteadyState(Shown, Figured):
     asked: tuple[str, ...] = ()
 
     def _page(self) -> Page:
-        largest = 1.0 - self.stability_margin
         found = f"periodic state of {format_si(self.period, 's')}, found in {self.periods:.3g} periods"
-        left = (
-            f"a further period changes the voltages by {self.defect:.2g} V at most, and leaves {100.0 * largest:.3g} % "
-            "of a small disturbance"
-        )
+        left = f"{100.0 * (1.0 - self.stability_margin):.3g} % of a small disturbance"
+        changes = f"a further period changes the voltages by {self.defect:.2g} V at most, and leaves {left}"
         try:
             period = self.solution._page().blocks
         except SolveError as error:
             period = (error.message,)
-        return Page([found, left, "", *period])
+        return Page([found, changes, "", *period])
 
     def plot(self, signals: str | Sequence[str] | None = None) -> Figure:
         """The period's signals against time; `signals` as in `Solution.plot`."""
@@ -282,12 +268,9 @@ class SteadyState(Shown, Figured):
 
     def _run(self, circuit: Circuit, rtol: float) -> Solution:
         """The run from the periodic state of another circuit, as long as the period of this one."""
-        one = self.problem
-        other = prepare(
-            circuit, t_stop=self.period, t_eval=None, charge_law=one.scene.charge_law, area=self.area,
-            start="periodic", charge=False,
-        )  # fmt: skip
-        return run_problem(close_period(dataclasses.replace(other, first=0.0, step=one.step), 0.5 * rtol)[0], rtol=rtol)
+        law, step = self.problem.scene.charge_law, self.problem.step
+        other = prepare(circuit, t_stop=self.period, charge_law=law, area=self.area, start="periodic", charge=False)
+        return run_problem(close_period(dataclasses.replace(other, first=0.0, step=step), 0.5 * rtol)[0], rtol=rtol)
 
     @cached_property
     def solution(self) -> Solution:
@@ -349,15 +332,12 @@ def steady_state(
     SolveError
         If a period cannot be integrated, or Newton's method does not converge.
     """
-    rtol = rtol_given(rtol)
-    points = whole_number("points", points, 1)
+    rtol, points = rtol_given(rtol), whole_number("points", points, 1)
     circuit = overridden(circuit, sources, parameters)
     period = period_of(circuit)
     if period is None:
         raise InputError("the source has no period, so there is no periodic state to find")
-    problem = prepare(
-        circuit, t_stop=period, t_eval=None, charge_law=charge_law, area=area, start="periodic", charge=charge
-    )
+    problem = prepare(circuit, t_stop=period, charge_law=charge_law, area=area, start="periodic", charge=charge)
     if sensitivities:
         check_request(problem, sensitivities, "auto")
     problem, found = close_period(dataclasses.replace(problem, first=0.0, step=period / points), 0.5 * rtol)
@@ -365,3 +345,82 @@ def steady_state(
     return SteadyState(
         problem, rtol, found.defect, found.memory, error, found.periods, found.map_slope, area, tuple(sensitivities)
     )
+
+
+def large_signal(
+    circuit: Circuit,
+    frequency: ArrayLike,
+    amplitude: ArrayLike | None = None,
+    *,
+    charge_law: str | None = None,
+    rtol: float = 1e-8,
+    finger: str | None = None,
+    progress: Progress | None = None,
+) -> tuple[PhasorSolution, ...]:
+    """Periodic states under sines, for each frequency and amplitude; SKIN is evaluated at each frequency.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        A circuit with a GAP and one source.
+    frequency : array_like
+        Hz, positive.
+    amplitude : array_like, optional
+        V (A for a current source), positive; by default the amplitude of the source's ``AC``, or without AC that of its
+        fundamental.
+    charge_law, rtol, progress
+        As in `simulate`.
+    finger : str, optional
+        Name of the GAP whose figures are wanted; needed if the circuit has several.
+
+    Returns
+    -------
+    tuple of PhasorSolution
+        One per amplitude. Gains are those of the fundamental; area and force are means over the period.
+
+    Raises
+    ------
+    InputError
+        If the circuit has no GAP or several sources, if none of several GAPs is named, or if a frequency or amplitude
+        is not positive.
+    SolveError
+        If there is no periodic state.
+    """
+    require_circuit(circuit)
+    scene = linear_scene(circuit, finger)
+    driving = scene.network.drives
+    if len(driving) != 1:
+        names = ", ".join(e.name for e, _ in driving)
+        raise InputError(f"a large-signal sweep drives one source, and this circuit has {names}")
+    own = sweep_drive(driving, scene.network.waveforms[0].fundamental, swept=True)
+    if amplitude is None and math.isnan(own[0]):
+        raise InputError("the source has no fundamental to take the amplitude of: give the amplitudes in V")
+    given = positive_row("amplitude", own[0] if amplitude is None else amplitude, "V")
+    f = positive_row("frequency", frequency, "Hz")
+    notes, warned = sweep_notes(circuit, f, scene.note, "swept")
+    for text in warned:
+        warnings.warn(text, FingerspiceWarning, stacklevel=2)
+    drives = [own] if amplitude is None else [(float(a), 0.0, "the amplitude given") for a in given]
+    ((source, sign),), skins, found = driving, [f"{e.name}.f" for e in circuit.by_device("SKIN")], []
+    for place, (size, phase, drive) in enumerate(drives):
+        rows = []
+        for number, x in enumerate(f.tolist(), place * f.size + 1):
+            changed = circuit.varied({**dict.fromkeys(skins, x), source.name: Sine(size, x)})
+            s = steady_state(changed, charge_law=charge_law, rtol=rtol, points=POINTS, charge=False).solution
+            # The output starts at a multiple of the period: phases from its start are relative to the source.
+            period, end = s.t - s.t[0], "" if len(s.gaps) == 1 else f":{s.layers[scene.gap]}"
+            means = [weigh_outputs(period, s.record.one(key + end)).mean() for key in ("area", "f_el")]
+            rows.append([*means, *(weigh_outputs(period, u).phasor(x) * sign / size for u in s.u_layer.T)])
+            if progress is not None:
+                progress(number / (f.size * len(drives)))
+        table = np.array(rows, np.complex128)
+        (areas, forces), gain = table[:, :2].real.T.copy(), table[:, 2:].copy()
+        u_gap = gain[:, scene.gap] * size * np.exp(1j * phase)
+        largest = forces.max(), scene.contact.stress(np.abs(u_gap)).max(), areas.max()
+        found.append(
+            PhasorSolution(
+                f, gain[:, scene.gap], gain, u_gap, areas, forces, size, s.layers, phase, drive, notes,
+                (*warned, *beyond_fingers("", *map(float, largest))), circuit,
+            )
+        )  # fmt: skip
+    return tuple(found)

@@ -20,8 +20,8 @@ from fingerspice.circuit.describe import require_circuit
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.solution import MEANS, SIGNALS, Solution
 from fingerspice.solve.simulation import rtol_given, simulate
-from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.form import LEAST_RTOL, REFUSED, in_lockstep_by, own_path
+from fingerspice.studies.batch.batch import LEAST_RTOL, REFUSED, batch, own_path
+from fingerspice.studies.batch.lockstep import lockstep_form, why_alone
 from fingerspice.studies.steady import SteadyState, steady_state
 from fingerspice.waveforms.samples import Samples
 from fingerspice.waveforms.waveform import require
@@ -30,9 +30,8 @@ try:
     import torch
     from torch import Tensor
 except ImportError:
-    raise InputError(
-        "fingerspice.torch needs torch, which is not installed; pip install 'fingerspice[torch]'"
-    ) from None
+    missing = "fingerspice.torch needs torch, which is not installed; pip install 'fingerspice[torch]'"
+    raise InputError(missing) from None
 
 __all__ = ["Drive", "Simulator"]
 
@@ -44,29 +43,32 @@ class Scenes:
         self, circuit: Circuit, outputs: str | Sequence[str], t: ArrayLike | None, t_stop: float | None,
         periodic: bool, rtol: float,
     ) -> None:  # fmt: skip
+        require_circuit(circuit)
+        gaps = len(circuit.by_device("GAP"))
+        if gaps != 1:
+            raise InputError(f"the circuit has {gaps} GAPs; allowed: one")
         self.circuit, self.periodic, self.alone = circuit, bool(periodic), isinstance(outputs, str)
         # Names out of `SIGNALS` and `MEANS`.
         self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
         for name in self.outputs:
             if name not in (*MEANS, *SIGNALS):
                 raise InputError(f"unknown output {name!r}; allowed: {', '.join((*MEANS, *SIGNALS))}")
-        require(len(self.outputs) > 0, "outputs", "empty", "one or more names")
+        require(bool(self.outputs), "outputs", "empty", "one or more names")
         require(len(set(self.outputs)) == len(self.outputs), "outputs", repr(self.outputs), "every name once")
         signals = [name for name in self.outputs if name in SIGNALS]
-        # Times of the signals, s; none where there are only means.
+        # Times of the signals, s; none where there are only means
         self.t = np.zeros(0) if t is None else real_numbers("t", t, "numbers in s")
         if signals and (self.t.ndim != 1 or not self.t.size):
             raise InputError(f"{signals[0]} is asked for, and t is {t!r}; allowed: a row of times in s")
         if not signals and t is not None:
             raise InputError(f"t is given, and no signal is asked for; allowed: outputs such as {', '.join(SIGNALS)}")
-        # End of every run, s; none where only the periodic state is asked for.
-        self.t_stop = circuit.tran.stop if circuit.tran is not None else None
-        if t_stop is not None:
-            self.t_stop = positive_number("t_stop", t_stop, "s")
-        elif self.t_stop is None and (signals or not periodic):
+        # End of every run, s; none where only the periodic state is asked for
+        deck = None if circuit.tran is None else circuit.tran.stop
+        self.t_stop = deck if t_stop is None else positive_number("t_stop", t_stop, "s")
+        if self.t_stop is None and (signals or not periodic):
             raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
         self.rtol = rtol_given(rtol, LEAST_RTOL)
-        # How many numbers each output has.
+        # How many numbers each output has
         self.sizes = [1 if name in MEANS else self.t.size for name in self.outputs]
 
     def values(self, paths: Sequence[str], given: FloatArray, wanted: Sequence[str] = ()) -> FloatArray:
@@ -74,7 +76,9 @@ class Scenes:
 
         With `wanted`, their derivatives by these parameters, shape (n_scene, sum of `sizes`, n_wanted).
         """
-        if not self.t.size and (not wanted or in_lockstep_by(self.circuit, paths, self.outputs, self.rtol)):
+        # Where derivatives are not to be had in lockstep, a batch would also run every scene for its outputs.
+        why = why_alone(lockstep_form(self.circuit, paths), self.outputs, self.rtol) if wanted else ""
+        if not self.t.size and not why:
             # The means, or their derivatives, of all scenes at once.
             found = batch(
                 self.circuit, dict(zip(paths, given.T, strict=True)), outputs=self.outputs, rtol=self.rtol,
@@ -152,12 +156,8 @@ class Drive(torch.nn.Module):
         V; several rows are several drives.
     rate : float
         Samples per second; the first one is at 0 s.
-    outputs : str or sequence of str
+    outputs, t, t_stop
         As for `Simulator`.
-    t : array_like, optional
-        Times of the signals, s, ascending.
-    t_stop : float, optional
-        End of every run, s; the deck's TSTOP by default.
     source : str, optional
         The source that is replaced; needed where there are several.
     rtol : float
@@ -174,15 +174,13 @@ class Drive(torch.nn.Module):
         t: ArrayLike | None = None, t_stop: float | None = None, source: str | None = None, rtol: float = 1e-8,
     ) -> None:  # fmt: skip
         super().__init__()
-        require_circuit(circuit)
-        names = [element.name for element in circuit.elements if element.waveform is not None]
-        known = {name.lower(): name for name in names}
-        if source is None:
-            require(len(names) == 1, "source", "missing", f"one of {', '.join(names)}")
-            source = names[0]
-        require(source.lower() in known, "source", repr(source), f"one of {', '.join(names)}")
         self._scenes = Scenes(circuit, outputs, t, t_stop, False, rtol)
-        self._source, self._rate = known[source.lower()], positive_number("rate", rate, "Hz")
+        known = {element.name.lower(): element.name for element in circuit.elements if element.waveform is not None}
+        allowed = f"one of {', '.join(known.values())}"
+        require(source is not None or len(known) == 1, "source", "missing", allowed)
+        key = next(iter(known)) if source is None else source.lower()
+        require(key in known, "source", repr(source), allowed)
+        self._source, self._rate = known[key], positive_number("rate", rate, "Hz")
         self.samples = torch.nn.Parameter(tensor_of("samples", samples).detach().clone())
 
     def forward(self, samples: Tensor | ArrayLike | None = None) -> Tensor | dict[str, Tensor]:
@@ -277,14 +275,15 @@ class Simulator(torch.nn.Module):
         periodic: bool = False, logarithms: bool = False, rtol: float = 1e-8,
     ) -> None:  # fmt: skip
         super().__init__()
-        require_circuit(circuit)
-        gaps = circuit.by_device("GAP")
-        if len(gaps) != 1:
-            raise InputError(f"the circuit has {len(gaps)} GAPs; allowed: one")
-        self.circuit, self.logarithms = circuit, logarithms
         self._scenes = Scenes(circuit, outputs, t, t_stop, periodic, rtol)
-        self.paths: dict[str, str] = {}
-        for path, value in _initial(circuit, parameters).items():
+        self.circuit, self.logarithms, self.paths = circuit, logarithms, dict[str, str]()
+        single = isinstance(parameters, str)
+        require(not single, "parameters", repr(parameters), "a sequence of paths such as ('Xgap.d',)")
+        for given in parameters:
+            path = own_path(circuit, given)
+            require(path not in self.paths, path, "given twice", "once")
+            one = parameters[given] if isinstance(parameters, Mapping) else circuit.parameters[path].value
+            value = tensor_of(given, one).detach().clone()
             if logarithms and not bool((value > 0.0).all()):
                 raise InputError(f"{path} is {value.min():g}, and logarithms are asked for; allowed: more than 0")
             self.paths[path] = path.replace(".", "_")
@@ -327,11 +326,8 @@ class Simulator(torch.nn.Module):
         InputError
             If a path is unknown, a value is out of range, shapes do not fit, or a scene cannot be run.
         """
-        given = {}
-        for path, one in ({} if values is None else values).items():
-            given[own_path(self.circuit, path)] = tensor_of(path, one)
-        own = {path: tensor_of(path, self.value(path)) for path in self.paths if path not in given}
-        every = {**own, **given}
+        given = {own_path(self.circuit, path): tensor_of(path, one) for path, one in (values or {}).items()}
+        every = {path: tensor_of(path, self.value(path)) for path in self.paths if path not in given} | given
         if not every:
             raise InputError("there are no values; allowed: parameters of the module, or values for its call")
         try:
@@ -343,28 +339,9 @@ class Simulator(torch.nn.Module):
         return self._scenes.given_back(found)
 
 
-def _initial(circuit: Circuit, parameters: Sequence[str] | Mapping[str, ArrayLike]) -> dict[str, Tensor]:
-    """The values to start from, by path in the circuit's own spelling."""
-    if isinstance(parameters, str):
-        raise InputError(f"parameters is {parameters!r}; allowed: a sequence of paths such as ('Xgap.d',)")
-    found: dict[str, Tensor] = {}
-    for path in parameters:
-        name = own_path(circuit, path)
-        if name in found:
-            raise InputError(f"{name} is given twice; allowed: once")
-        one = parameters[path] if isinstance(parameters, Mapping) else circuit.parameters[name].value
-        found[name] = tensor_of(path, one).detach().clone()
-    return found
-
-
 # The methods have the names and signatures that torch calls.
 class _Run(torch.autograd.Function):
-    """The outputs of scenes at values of one shape (...): a tensor of shape (..., number of outputs).
-
-    With `wanted`, their derivatives by these parameters: of shape (..., number of outputs, number of parameters).
-    """
-
-    generate_vmap_rule = False
+    """The outputs of scenes at values of one shape (...), or derivatives by `wanted`, as of `Scenes.values`."""
 
     @staticmethod
     def forward(scenes: Scenes, paths: tuple[str, ...], wanted: tuple[str, ...], *values: Tensor) -> Tensor:

@@ -7,40 +7,37 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from fingerspice.base.arrays import FloatArray, IntArray, whole_number
+from fingerspice.base.arrays import FloatArray, IntArray, positive_number, real_numbers, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit, scenes_warnings
+from fingerspice.circuit.statespace import driving_sources
 from fingerspice.engine.lockstep.card import require_card
 from fingerspice.results.outcome import SolveError
 from fingerspice.results.record import SIGNALS
-from fingerspice.results.solution import Solution
-from fingerspice.solve.simulation import RTOL_RANGE, simulate
-from fingerspice.studies.batch.form import (
-    FAILED,
-    ONE_BY_ONE,
-    REFUSED,
-    SIGNALS_OF_BATCH,
-    STATUS_NAMES,
-    LockstepForm,
-    Task,
-    checked_scenes,
-    gradients_of,
-    lockstep_form,
-    why_alone,
-)
-from fingerspice.studies.batch.ladder import Ladder, Slopes
-from fingerspice.studies.steady import SteadyState, steady_state
-from fingerspice.waveforms.waveform import require
+from fingerspice.results.solution import MEANS, Solution
+from fingerspice.solve.simulation import RTOL_RANGE, rtol_given, simulate
+from fingerspice.studies.batch.lockstep import LOCKSTEP, Ladder, LockstepForm, Slopes, lockstep_form, why_alone
+from fingerspice.studies.steady import steady_state
+from fingerspice.waveforms.waveform import Sum, require
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
+#: Signals whose figures a batch has, and the kinds of figures.
+SIGNALS_OF_BATCH = ("f_el", "f_t", "friction", "u_gap", "area")
+_KINDS = ("mean", "rms", "min", "max", "peak", "mean_periodic", "rms_periodic", "ripple", "amplitude", "phase_deg")
+LEAST_RTOL = 1e-12
+ONE_BY_ONE, REFUSED, FAILED = 1, 2, 3
+STATUS_NAMES = ("lockstep", "one_by_one", "refused", "failed")
+# A relative change of a parameter by which it is seen whether the source's tone depends on it.
+_SEEN = 1e-3
 # Largest number of failure messages that a Dataset keeps, and of gap voltages (8 GB) that a batch may return.
 MESSAGES, _MOST_VOLTAGES = 16, 1e9
 # Smallest and largest number of scenes in a job, of which there are 8 or more between these limits; the number if gap
@@ -52,6 +49,168 @@ _WHOLE = 1e-9
 # A run's rtol is relative to peaks, and a batch's to the output itself: the first attempt assumes that an output is at
 # least this fraction of its peak.
 _OVER_PEAK = 0.1
+
+
+class Task:
+    """A checked request of `batch`, of outputs or, with `paths`, of means' derivatives, and what is found."""
+
+    n: int  # Number of scenes
+    scenes: dict[str, FloatArray]  # Values by path, (n,) each
+    # What is found, NaN in a scene without a result: (n,) each, (n, n_gap) of several GAPs, (n, n_parameter) of
+    # derivatives, or, of gap voltages, (n, width) and (n, width, n_gap)
+    values: dict[str, FloatArray]
+    error: FloatArray  # (n,): Stated error, of outputs relative to themselves
+    status: NDArray[np.int8]  # (n,): Index into `STATUS_NAMES`, and -1 before there are results
+    messages: dict[int, str]  # Of the scenes without a result
+    n_ordinary: int  # Scenes that were not in lockstep
+    ordinary: str  # Why
+
+    def __init__(
+        self, circuit: Circuit, outputs: Sequence[str], rtol: float, t_stop: float | None, periods: float | None,
+        periodic: bool, points: int, device: str,
+    ) -> None:  # fmt: skip
+        self.circuit, self.periodic = circuit, periodic
+        self.rtol, self.points = rtol_given(rtol, LEAST_RTOL), whole_number("points", points, 2)
+        require(self.points % 2 == 0, "points", self.points, "an even number, 2 or more")
+        self.outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+        for name in self.outputs:
+            if name not in ("u_gap", *(f"{signal}_{kind}" for signal in SIGNALS_OF_BATCH for kind in _KINDS)):
+                kinds, signals = ", ".join(f"_{kind}" for kind in _KINDS), ", ".join(SIGNALS_OF_BATCH)
+                raise InputError(f"unknown output {name!r}; allowed: u_gap, or one of {signals} with one of {kinds}")
+        require(bool(self.outputs), "outputs", "empty", "one or more names")
+        self.traced = "u_gap" in self.outputs
+        # Gap voltages stay on the processor.
+        self.device = "cpu" if self.traced else device
+        if periods is not None and t_stop is not None:
+            raise InputError("t_stop and periods are both given; allowed: one of them")
+        self.t_stop = None if t_stop is None else positive_number("t_stop", t_stop, "s")
+        self.periods = None if periods is None else positive_number("periods", periods)
+        if periodic and (periods is not None or t_stop is not None):
+            raise InputError("periodic=True takes one period, and t_stop or periods is given; allowed: neither")
+        if periodic:
+            self.periods = 1.0
+        elif periods is None and t_stop is None:
+            if circuit.tran is None:
+                raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s, or "
+                                 "periods")  # fmt: skip
+            self.t_stop = circuit.tran.stop
+        # Parameters by which the means are differentiated, in the circuit's spelling, each with those that grow in
+        # proportion to it: a source's frequency with that of a skin
+        self.paths: dict[str, tuple[str, ...]] = {}
+        self.clock: str | None = None  # The frequency of the only source, if it is one of `paths`
+
+    def begin(self, values: dict[str, FloatArray]) -> None:
+        """Take these arrays for the values; no scene is done."""
+        self.values, self.error, self.status = values, np.full(self.n, np.nan), np.full(self.n, -1, np.int8)
+        self.messages, self.ordinary = {}, ""
+
+    def count(self, frequency: FloatArray) -> FloatArray:
+        """Number of periods in runs with sources of these frequencies (Hz)."""
+        return np.full(self.n, self.periods) if self.t_stop is None else np.asarray(frequency * self.t_stop)
+
+    def frequencies(self, of_skin: bool = False) -> FloatArray:
+        """The source's frequency in every scene, Hz: that of several together, or the one that a SKIN follows."""
+        on = [e for e in driving_sources(self.circuit) if e.waveform is not None and e.waveform.period is not None]
+        waves = [e.waveform for e in on if e.waveform is not None]
+        if len(on) == 1:
+            given = self.scenes.get(f"{on[0].name}.frequency")
+            tone = waves[0].tone() if of_skin else None
+            return given if given is not None else np.full(self.n, tone or 1.0 / (waves[0].period or math.nan))
+        moved = any(f"{e.name}.frequency" in self.scenes for e in on)
+        period = None if of_skin or moved or not on else Sum(tuple(waves)).period
+        if period is None:
+            raise InputError(f"{len(on)} sources have a period; allowed: one, where periods, u_gap or the skin's "
+                             "frequency follow it, or several of fixed frequencies in a ratio of whole "
+                             "numbers")  # fmt: skip
+        return np.full(self.n, 1.0 / period)
+
+
+def checked_scenes(circuit: Circuit, parameters: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
+    """Values by path, all of one shape (n_scene,); refused where a path is unknown or a value NaN or out of range."""
+    given: dict[str, FloatArray] = {}
+    good = isinstance(parameters, Mapping) and bool(parameters)
+    require(good, "parameters", repr(parameters), "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
+    for path, values in parameters.items():
+        name = own_path(circuit, path)
+        array = real_numbers(path, values, "an array of numbers")
+        one_row = array.ndim <= 1 and array.size > 0
+        require(one_row, path, f"of shape {array.shape}", "one number, or one row of numbers")
+        require(name not in given, name, "given twice", "once")
+        given[name] = array
+    sizes = {path: array.size for path, array in given.items() if array.ndim == 1}
+    if len(set(sizes.values())) > 1:
+        raise InputError(f"the arrays have {', '.join(f'{n} ({p})' for p, n in sizes.items())} values; allowed: equal "
+                         "lengths, or single numbers")  # fmt: skip
+    n = max(sizes.values(), default=1)
+    scenes = {path: np.ascontiguousarray(np.broadcast_to(array, (n,))) for path, array in given.items()}
+    for path, array in scenes.items():
+        name, _, parameter = path.rpartition(".")
+        element, allowed, bad = circuit[name], "numbers", np.isnan(array)
+        if not bad.any() and parameter in element.values:
+            spec = element.spec.parameter(parameter)
+            bad = ~((array >= spec.least) & (array <= spec.most))
+            bad &= ~((array == 0.0) & spec.may_be_zero) & ~((array == np.inf) & spec.may_be_infinite)
+            allowed = spec.allowed()
+        elif not bad.any():
+            # The legal values of a waveform's parameter form an interval: testing its ends is enough.
+            for i in (int(np.argmin(array)), int(np.argmax(array))):
+                try:
+                    circuit.varied({path: float(array[i])})
+                except InputError as error:
+                    raise InputError(f"scene {i}: {error}") from None
+        i = int(np.argmax(bad))
+        require(not bad[i], path, f"{array[i]:g} in scene {i}", allowed)
+    return scenes
+
+
+def own_path(circuit: Circuit, path: Any) -> str:
+    """A path in the circuit's own spelling."""
+    if isinstance(path, str) and path.lower().startswith("source."):
+        on = driving_sources(circuit)
+        if not any(e.name.lower() == "source" for e in circuit.elements) and len(on) == 1:
+            path = f"{on[0].name}.{path.partition('.')[2]}"
+    known = {name.lower(): name for name in circuit.parameters}
+    if not isinstance(path, str) or path.lower() not in known:
+        # The circuit raises the error about an unknown path, which gives the nearest name.
+        circuit.varied({path: 1.0})
+        raise InputError(f"{path!r} is no parameter that takes numbers; allowed: a path such as 'Xgap.d'")
+    return known[path.lower()]
+
+
+def gradients_of(task: Task, gradients: Sequence[str], skin: str) -> Task | None:
+    """The checked request of derivatives in the scenes of a task; None for none."""
+    circuit = task.circuit
+    require(not isinstance(gradients, str), "gradients", repr(gradients), "a sequence of paths such as ('Xgap.d',)")
+    paths = tuple(own_path(circuit, path) for path in gradients)
+    if not paths:
+        return None
+    outputs = tuple(name for name in task.outputs if name in MEANS)
+    if not outputs:
+        raise InputError(f"gradients are asked for, and outputs has no mean; allowed: one of {', '.join(MEANS)}")
+    if (number := len(circuit.by_device("GAP"))) != 1:
+        raise InputError(f"gradients are asked for, and the circuit has {number} GAPs; allowed: one")
+    require(len(set(paths)) == len(paths), "gradients", repr(paths), "every parameter once")
+    on, scenes = driving_sources(circuit), dict(task.scenes)
+    clock = f"{on[0].name}.frequency" if len(on) == 1 else None
+    skins = tuple(f"{e.name}.f" for e in circuit.by_device("SKIN")) if skin == "follow" else ()
+    for path in paths:
+        value, turned = circuit.parameters[path].value, path in skins
+        if path not in scenes and not (math.isfinite(value) and value != 0.0):
+            raise InputError(f"gradients names {path}, which is {value:g}; allowed: parameters whose value is finite "
+                             "and not 0, as steps are relative to it")  # fmt: skip
+        scenes.setdefault(path, np.full(task.n, value))
+        if skins and not turned and path != clock:
+            # Whether the parameter changes the frequency of a source.
+            name, moved = path.rpartition(".")[0], circuit.varied({path: value * (1.0 + _SEEN)})
+            own, other = circuit[name].waveform, moved[name].waveform
+            turned = own is not None and other is not None and own.tone() != other.tone()
+        if turned:
+            raise InputError(f"skin='follow', and gradients names {path}, with which the skin's frequency changes; "
+                             "allowed: the frequency of the only source, or skin='own'")  # fmt: skip
+    asked = copy(task)
+    asked.outputs, asked.traced, asked.scenes, asked.clock = outputs, False, scenes, clock if clock in paths else None
+    asked.paths = {path: (path, *(skins if path == clock else ())) for path in paths}
+    return asked
 
 
 def batch(
@@ -124,12 +283,11 @@ def batch(
         require_card()
     task = Task(circuit, outputs, rtol, t_stop, periods, periodic, points, device)
     require(skin in ("own", "follow"), "skin", repr(skin), "'own' or 'follow'")
-    if threads is not None:
-        threads = whole_number("threads", threads, 1)
-    elif hasattr(os, "sched_getaffinity"):
-        threads = len(os.sched_getaffinity(0))
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads = own if threads is None else whole_number("threads", threads, 1)
     scenes = checked_scenes(circuit, parameters)
     task.scenes, skins = dict(scenes), circuit.by_device("SKIN")
+    n = task.n = next(iter(scenes.values())).size
     if skin == "follow":
         frequency = task.frequencies(of_skin=True)
         for element in skins:
@@ -140,11 +298,22 @@ def batch(
         warnings.warn(text, FingerspiceWarning, stacklevel=2)
     slopes, form = gradients_of(task, gradients, skin), lockstep_form(circuit, task.scenes)
     why, recorded = why_alone(form, task.outputs), isinstance(form, LockstepForm) and form.recording is not None
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        _begin(task, recorded)
+    width, gaps = 0, len(circuit.by_device("GAP"))
+    if task.traced or (recorded and task.t_stop is None):
+        # Refused for what has no period, such as a recording.
+        count = task.count(task.frequencies())
+        width = math.ceil(float(count.max()) * task.points - 1e-9) if task.traced else 0
+    # Figures of several GAPs have one column each.
+    size, each = n * width * max(gaps, 1), (gaps,) if gaps > 1 else ()
+    require(size <= _MOST_VOLTAGES, "outputs", f"of {size:.3g} gap voltages", f"at most {_MOST_VOLTAGES:g}")
+    task.begin({name: np.full((n, *each), np.nan) for name in task.outputs if name != "u_gap"})
+    if task.traced:
+        # This memory, which is much, is taken by the threads that write it.
+        task.values["u_gap"] = np.empty((n, width, *each))
+    with ThreadPoolExecutor(threads) as pool:
         _find(task, why or form, pool)
         if slopes is not None:
-            slopes.begin({name: np.full((task.n, len(slopes.paths)), np.nan) for name in slopes.outputs})
+            slopes.begin({name: np.full((n, len(slopes.paths)), np.nan) for name in slopes.outputs})
             slopes.status = np.where(task.status >= REFUSED, task.status, slopes.status)
             form = lockstep_form(circuit, slopes.scenes)
             unlike = why_alone(form, slopes.outputs, slopes.rtol)
@@ -156,23 +325,7 @@ def batch(
         varied = any(path.lower().endswith(".frequency") for path in scenes)
         held = ", ".join(f"{e.name}.f" for e in skins)
         said = f"the skin's data are those at its own {held}{', whatever the source frequency is' if varied else ''}"
-    attrs = {
-        "skin": said, "n_ordinary": task.n_ordinary, "ordinary": task.ordinary,
-        "device": "cpu" if why or recorded else task.device,
-    }  # fmt: skip
-    return _dataset(task, slopes, scenes, attrs)
-
-
-def _begin(task: Task, recorded: bool) -> None:
-    """Take memory for the outputs, none of which is found."""
-    n, width = task.n, 0
-    if task.traced or (recorded and task.t_stop is None):
-        # Refused for what has no period, such as a recording.
-        count = task.count(task.frequencies())
-        width = math.ceil(float(count.max()) * task.points - 1e-9) if task.traced else 0
-    require(n * width <= _MOST_VOLTAGES, "outputs", f"of {n * width:.3g} gap voltages", f"at most {_MOST_VOLTAGES:g}")
-    # The memory of gap voltages, which is much, is taken by the threads that write them.
-    task.begin({name: np.empty((n, width)) if name == "u_gap" else np.full(n, np.nan) for name in task.outputs})
+    return _dataset(task, slopes, scenes, said, "cpu" if why or recorded else task.device)
 
 
 def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> None:
@@ -181,19 +334,42 @@ def _find(task: Task, form: LockstepForm | str, pool: ThreadPoolExecutor) -> Non
     if isinstance(form, LockstepForm):
         # Jobs have no scene in common, so that threads write to different places.
         list(pool.map(lambda job: ladder(task, form, job[1]).climb(job[0]), _jobs(task, form)))
-    rest = np.flatnonzero(task.status < 0)
+    rest, task.n_ordinary = np.flatnonzero(task.status < 0), int(np.count_nonzero(task.status != LOCKSTEP))
     if task.traced:
         task.values["u_gap"][rest] = np.nan
-    if rest.size:
-        task.ordinary = form if isinstance(form, str) else ladder.unmet
-        _find_alone(task, ladder, rest, pool)
+    if not rest.size:
+        return
+    task.ordinary = form if isinstance(form, str) else ladder.unmet
+    by_period = (task.periods is not None and not task.periodic) or task.traced
+    frequency = task.frequencies() if by_period else np.ones(task.n)
+    allowed, finest = ladder.limit * task.rtol, RTOL_RANGE[0]
+
+    def alone(i: int) -> None:
+        rtol = max(_OVER_PEAK * task.rtol, finest)
+        try:
+            circuit = task.circuit.varied({path: float(array[i]) for path, array in task.scenes.items()})
+            values, error = _run_alone(task, circuit, float(frequency[i]), rtol)
+            if error > allowed and rtol > finest:
+                # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
+                closer = max(0.5 * rtol * allowed / error, finest)
+                values, error = _run_alone(task, circuit, float(frequency[i]), closer)
+        except (InputError, SolveError) as failure:
+            task.status[i] = REFUSED if isinstance(failure, InputError) else FAILED
+            task.messages[i] = f"{ladder.named}{failure}"
+            return
+        task.error[i], task.status[i] = error, ONE_BY_ONE
+        for name, value in values.items():
+            # Shorter runs have fewer gap voltages.
+            task.values[name][(i, slice(len(value))) if name == "u_gap" else i] = value
+
+    # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        list(pool.map(alone, rest.tolist()))
 
 
 def _jobs(task: Task, form: LockstepForm) -> list[tuple[int, IntArray]]:
-    """Jobs of the scenes not done whose runs last for whole numbers of half periods: that number, and the scenes.
-
-    Under a recording half a period is a sample.
-    """
+    """Jobs of the scenes not done that last for whole numbers of half periods (samples): the number, and the scenes."""
     recorded = form.recording is not None
     count = task.count(np.full(task.n, form.frequency) if recorded else task.frequencies())
     halves = np.round(2.0 * count)
@@ -210,122 +386,86 @@ def _jobs(task: Task, form: LockstepForm) -> list[tuple[int, IntArray]]:
     return jobs
 
 
-def _find_alone(task: Task, ladder: type[Ladder], rest: IntArray, pool: ThreadPoolExecutor) -> None:
-    """Find what a task asks for in the scenes `rest`, each by itself."""
-    by_period = (task.periods is not None and not task.periodic) or task.traced
-    frequency = task.frequencies() if by_period else np.ones(task.n)
-    allowed, finest = ladder.limit * task.rtol, RTOL_RANGE[0]
-
-    def alone(i: int) -> dict[str, FloatArray]:
-        rtol = max(_OVER_PEAK * task.rtol, finest)
-        try:
-            circuit = task.circuit.varied({path: float(array[i]) for path, array in task.scenes.items()})
-            values, error = _run_alone(task, circuit, float(frequency[i]), rtol)
-            if error > allowed and rtol > finest:
-                # The mean is smaller than assumed, relative to the peak: repeat with the rtol that the error asks for.
-                closer = max(0.5 * rtol * allowed / error, finest)
-                values, error = _run_alone(task, circuit, float(frequency[i]), closer)
-        except (InputError, SolveError) as failure:
-            task.status[i] = REFUSED if isinstance(failure, InputError) else FAILED
-            task.messages[i] = f"{ladder.named}{failure}"
-            return {}
-        task.error[i], task.status[i] = error, ONE_BY_ONE
-        return values
-
-    # Warnings about unusual values are not repeated for every scene. Filters apply to all threads, so set them here.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        ran = list(pool.map(alone, rest.tolist()))
-    for i, values in zip(rest, ran, strict=True):
-        for name, value in values.items():
-            if value.ndim == 1 and task.values[name].ndim == 1:
-                # Several gaps have one column each.
-                task.values[name] = np.full((task.n, value.size), np.nan)
-            task.values[name][(i, slice(value.size)) if value.ndim == 1 else i] = value
-
-
 def _run_alone(task: Task, circuit: Circuit, frequency: float, rtol: float) -> tuple[dict[str, FloatArray], float]:
     """What is wanted of a scene from one run, and its stated error; `frequency` (Hz) is that of its periods."""
     stop, t = (task.periods or 1.0) / frequency if task.t_stop is None else task.t_stop, None
     paths = tuple(dict.fromkeys(path for together in task.paths.values() for path in together))
-    ran: Solution | SteadyState
     if task.periodic:
-        ran = steady_state(circuit, rtol=rtol, points=4 if paths else task.points, charge=False, sensitivities=paths)
+        state = steady_state(circuit, rtol=rtol, points=4 if paths else task.points, charge=False, sensitivities=paths)
+        run, off = state.solution, state.error
     else:
         if paths:
             t = np.array([stop])
         elif task.traced:
             t = np.arange(math.ceil(stop * frequency * task.points - 1e-9)) / (frequency * task.points)
-        ran = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False, sensitivities=paths)
+        run = simulate(circuit, t_stop=stop, t_eval=t, rtol=rtol, charge=False, sensitivities=paths)
+        off = run.error
     # Largest of the errors of the gap voltage relative to its peak, and of the force relative to its mean.
-    pairs = (ran.error.u_gap, ran.u_gap_peak), (ran.error.f_el, ran.f_el_mean)
-    sizes = [(off, 0.0 if size is None else float(np.min(size))) for off, size in pairs]
-    error = max((off / size for off, size in sizes if size > 0.0), default=0.0)
+    sizes = [0.0 if size is None else float(np.min(size)) for size in (run.u_gap_peak, run.f_el_mean)]
+    error = max((x / size for x, size in zip((off.u_gap, off.f_el), sizes, strict=True) if size > 0.0), default=0.0)
     if paths:
         # The error of a change by all of the parameter is about ten times that of the run.
-        return {name: _slopes_of(task, circuit, ran, name, stop) for name in task.outputs}, Slopes.limit * error
+        return {name: _slopes_of(task, circuit, run, name, stop) for name in task.outputs}, Slopes.limit * error
     values = {}
     for name in task.outputs:
-        if name == "u_gap":
-            u = np.asarray(ran.solution.u_gap if isinstance(ran, SteadyState) else ran.u_gap)
-            values[name] = u[:-1] if task.periodic else u
-            continue
         signal = _signal_of(name)
-        value = ran._figures.value(signal, name[len(signal) + 1 :])
+        value = run.u_gap if name == "u_gap" else run._figures.value(signal, name[len(signal) + 1 :])
         values[name] = np.asarray(math.nan if value is None else value, float)
+        if name == "u_gap":
+            values[name] = np.atleast_1d(values[name])[: -1 if task.periodic else None]
     return values, error
 
 
-def _slopes_of(task: Task, circuit: Circuit, ran: Solution | SteadyState, name: str, stop: float) -> FloatArray:
+def _slopes_of(task: Task, circuit: Circuit, run: Solution, name: str, stop: float) -> FloatArray:
     """Derivatives of a mean by the parameters of a task."""
     known = circuit.parameters
     # For a change of each parameter by all of itself.
-    each = {path: getattr(one, name) * known[path].value for path, one in ran.sensitivities.items()}
+    each = {path: getattr(one, name) * known[path].value for path, one in run.sensitivities.items()}
     by = {path: sum(each[other] for other in together) for path, together in task.paths.items()}
-    if task.clock is not None and task.periods is not None and isinstance(ran, Solution):
+    if task.clock is not None and task.periods is not None and not task.periodic:
         # The run ends after a number of periods: its end moves with the frequency, and the mean with its end.
         start = circuit.tran.start if circuit.tran is not None else 0.0
-        gained = float(getattr(ran, name.removesuffix("_mean"))[-1]) - float(getattr(ran, name))
+        gained = float(getattr(run, name.removesuffix("_mean"))[-1]) - float(getattr(run, name))
         by[task.clock] -= gained * stop / (stop - start)
     return np.array([x / known[path].value for path, x in by.items()])
 
 
 def _signal_of(output: str) -> str:
-    return next(s for s in SIGNALS_OF_BATCH if output == s or output.startswith(f"{s}_"))
+    return next(signal for signal in SIGNALS_OF_BATCH if output.startswith(signal))
 
 
-def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], attrs: dict[str, Any]) -> Dataset:
+def _dataset(task: Task, slopes: Task | None, scenes: Mapping[str, FloatArray], skin: str, device: str) -> Dataset:
     """The answers with the values given, `scenes`, as coordinates, and units."""
     from xarray import Dataset
 
     known = task.circuit.parameters
     meanings = {"flag_values": list(range(len(STATUS_NAMES))), "flag_meanings": " ".join(STATUS_NAMES)}
     data: dict[str, Any] = {}
-    for name, values in task.values.items():
-        signal = _signal_of(name)
+    for name in task.outputs:
+        signal, dims = _signal_of(name), ("scene", "turn", "gap") if name == "u_gap" else ("scene", "gap")
         unit = "deg" if name.endswith("phase_deg") else SIGNALS[signal][0]
-        dims = ("scene",) if values.ndim == 1 else ("scene", "turn" if name == "u_gap" else "gap")
-        data[name] = (dims, values, {"units": unit, "long_name": f"{SIGNALS[signal][1]}{name[len(signal) :]}"})
+        text, values = f"{SIGNALS[signal][1]}{name[len(signal) :]}", task.values[name]
+        data[name] = (dims[: values.ndim], values, {"units": unit, "long_name": text})
     data["error"] = ("scene", task.error, {"units": "1", "long_name": "stated error, relative"})
     data["status"] = ("scene", task.status, meanings)
     coords: dict[str, Any] = {path: ("scene", array, {"units": known[path].unit}) for path, array in scenes.items()}
     if task.traced:
         turns = np.arange(task.values["u_gap"].shape[1]) / task.points
         coords["turn"] = ("turn", turns, {"units": "1", "long_name": "time in periods of the source"})
+    about = {"skin": skin, "n_ordinary": task.n_ordinary, "ordinary": task.ordinary, "device": device}
     messages = task.messages
     if slopes is not None:
         for name, values in slopes.values.items():
             unit, text = SIGNALS[name.removesuffix("_mean")][:2]
-            about = {"units": f"{unit} per parameter_unit", "long_name": f"derivative of {text}_mean by each parameter"}
-            data[f"d_{name}"] = (("scene", "parameter"), values, about)
+            of = {"units": f"{unit} per parameter_unit", "long_name": f"derivative of {text}_mean by each parameter"}
+            data[f"d_{name}"] = (("scene", "parameter"), values, of)
         told = "stated error of a derivative times its parameter, relative to the output"
         data["gradient_error"] = ("scene", slopes.error, {"units": "1", "long_name": told})
         data["gradient_status"] = ("scene", slopes.status, meanings)
-        attrs |= {"ordinary_gradients": slopes.ordinary, "n_ordinary_gradients": slopes.n_ordinary}
-        messages = messages | slopes.messages
-        paths = list(slopes.paths)
+        about |= {"ordinary_gradients": slopes.ordinary, "n_ordinary_gradients": slopes.n_ordinary}
+        paths, messages = list(slopes.paths), messages | slopes.messages
         coords |= {"parameter": paths, "parameter_unit": ("parameter", [known[path].unit for path in paths])}
     length = {"periods": task.periods} if task.t_stop is None else {"t_stop": task.t_stop}
     failures = [f"scene {i}: {messages[i]}" for i in sorted(messages)[:MESSAGES]]
-    attrs |= {"rtol": task.rtol, "periodic": int(task.periodic), **length, "failures": failures}
-    return Dataset(data, coords, attrs)
+    about |= {"rtol": task.rtol, "periodic": int(task.periodic), **length, "failures": failures}
+    return Dataset(data, coords, about)

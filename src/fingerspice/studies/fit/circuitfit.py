@@ -26,8 +26,7 @@ from fingerspice.circuit.network import network_of
 from fingerspice.circuit.statespace import driving_sources
 from fingerspice.results.record import SIGNALS
 from fingerspice.solve.simulation import rtol_given, simulate
-from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.form import REFUSED, own_path
+from fingerspice.studies.batch.batch import REFUSED, batch, own_path
 from fingerspice.studies.fit import fitting
 from fingerspice.studies.fit.fitting import SIGMA, FitResult, Fitted, Given, Problem, followed
 from fingerspice.studies.steady import phasor

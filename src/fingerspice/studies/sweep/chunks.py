@@ -34,8 +34,8 @@ from fingerspice.base.arrays import keep_freed_memory, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
 from fingerspice.circuit.describe import digests, scenes_warnings
 from fingerspice.results.runfile import CHECKSUM, Array, attributes_of, create, tidy
-from fingerspice.studies.batch.batch import MESSAGES, batch
-from fingerspice.studies.batch.form import LOCKSTEP, REFUSED, STATUS_NAMES, checked_scenes
+from fingerspice.studies.batch.batch import MESSAGES, STATUS_NAMES, batch, checked_scenes
+from fingerspice.studies.batch.lockstep import LOCKSTEP
 from fingerspice.studies.sweep.populations import Draws, Plan
 from fingerspice.waveforms.waveform import require
 
@@ -73,9 +73,8 @@ class Work:
     """A sweep with its store, and all that it takes to run any chunk of it."""
 
     def __init__(self, plan: Plan, options: Mapping[str, Any], path: Path) -> None:
-        """The first scene is run to see what outputs there are."""
-        self.plan, self.path, self.programs = plan, path.absolute(), programs()
-        self.options = options  # Of `batch`
+        """The first scene is run to see what outputs there are; `options` are those of `batch`."""
+        self.plan, self.path, self.programs, self.options = plan, path.absolute(), programs(), options
         circuit = plan.circuit
         # What a parameter does not accept: values of the grid, and quantiles beyond which there are draws.
         beyond = plan.quantiles(np.repeat([[1.0 / plan.n], [1.0 - 1.0 / plan.n]], len(plan.drawn), axis=1))
@@ -88,11 +87,8 @@ class Work:
                 kind = "the distribution of" if name in plan.drawn else "the values of"
                 raise InputError(f"{kind} {name}: {error}") from None
         middle = plan.quantiles(np.full((1, len(plan.drawn)), 0.5))
-        ends = plan.spread({name: values[[0, -1]] for name, values in plan.grid.items()}, middle)
-        told = scenes_warnings(
-            circuit, options.get("t_stop"), checked_scenes(circuit, ends), options.get("skin", "own")
-        )
-        for text in told:
+        ends = checked_scenes(circuit, plan.spread({name: x[[0, -1]] for name, x in plan.grid.items()}, middle))
+        for text in scenes_warnings(circuit, options.get("t_stop"), ends, options.get("skin", "own")):
             warnings.warn(text, FingerspiceWarning, stacklevel=4)
         scene = plan.spread({name: values[:1] for name, values in plan.grid.items()}, middle)
         with warnings.catch_warnings():
@@ -101,12 +97,9 @@ class Work:
             first = batch(circuit, scene, **options)
         if "u_gap" in first:
             raise InputError("outputs are u_gap, and a store has figures, which are one number for each scene")
-        status, failures = int(first.status[0]), first.attrs["failures"]
-        if status >= REFUSED and len(circuit.by_device("GAP")) > 1:
-            raise InputError(f"the middle of the sweep has no result ({failures[0]}); allowed: one that has")
         self.block: tuple[int, ...] = ()  # Scenes of a chunk along each dimension
         for length in reversed(plan.sizes):
-            size = CHUNK if status == LOCKSTEP else SLOW_CHUNK
+            size = CHUNK if first.status[0] == LOCKSTEP else SLOW_CHUNK
             self.block = min(length, max(1, size // math.prod(self.block))), *self.block
         self._grid = tuple(-(-size // own) for size, own in zip(plan.sizes, self.block, strict=True))
         self.chunks = math.prod(self._grid)
@@ -121,10 +114,8 @@ class Work:
             )
             for name, one in first.data_vars.items()
         }  # fmt: skip
-        last = self.outputs.pop(STATUS)
-        flags = dict(last.attributes)
-        flags |= {"flag_values": [*flags["flag_values"], MISSING], "flag_meanings": f"{flags['flag_meanings']} missing"}
-        self.outputs[STATUS] = replace(last, kind="i1", fill=MISSING, attributes=flags)
+        flags = {"flag_values": list(range(MISSING + 1)), "flag_meanings": " ".join((*STATUS_NAMES, "missing"))}
+        self.outputs[STATUS] = replace(self.outputs.pop(STATUS), kind="i1", fill=MISSING, attributes=flags)
         # The drawn parameters
         self.drawn = {
             name: Array(self.path / name, ("scene",), plan.sizes[-1:], self.block[-1:], {"units": plan.units[name]})
@@ -145,10 +136,7 @@ class Work:
             yield name, one, tuple(at.get(dim, 0) for dim in one.dims)
 
     def open(self) -> None:
-        """Create the store, or make sure that the one there is of this sweep.
-
-        Anything else there, or the store of another sweep, is refused and stays.
-        """
+        """Create the store, or make sure that the one there is of this sweep: anything else there is refused."""
         own = json.loads(json.dumps({**self._identity(), "kind of checksum": CHECKSUM}, default=float))
         if not os.path.lexists(self.path):
             plan, arrays = self.plan, self.outputs | self.drawn
@@ -163,10 +151,8 @@ class Work:
         if differ := [key for key in {**own, **held} if held.get(key) != own.get(key)]:
             key, told = differ[0], [str(one.get(differ[0])) for one in (held, own)]
             said = "" if max(map(len, told)) > 40 else f" ({told[0]}, and this one {told[1]})"
-            raise InputError(
-                f"{self.path} holds a sweep of another {key.replace('_', ' ')}{said}; allowed: another path, or to "
-                "remove that folder"
-            )
+            raise InputError(f"{self.path} holds a sweep of another {key.replace('_', ' ')}{said}; allowed: another "
+                             "path, or to remove that folder")  # fmt: skip
 
     def _identity(self) -> dict[str, Any]:
         """All inputs that determine the bytes of the store, by which a later call recognises it."""
@@ -192,59 +178,37 @@ class Work:
             **options, "block": self.block,
         }  # fmt: skip
 
-    def dataset(self) -> Dataset:
-        """The sweep, whose values are read when they are used."""
-        import xarray
-
-        found: Dataset = xarray.open_zarr(self.path, chunks=None, consolidated=False, zarr_format=3)
-        del found.attrs[RUN]
-        found = found.set_coords(list(self.drawn))
-        named = {str(name): one.attrs[NAMES] for name, one in found.coords.items() if NAMES in one.attrs}
-        return found.assign_coords(named)[list(self.outputs)]
-
     def run_chunk(
         self, index: int, computing: AbstractContextManager[Any] = _FREE, writing: AbstractContextManager[Any] = _FREE
     ) -> Ran:
-        """Run the scenes of a chunk and write them, which marks the chunk as done.
-
-        Scenes are run within `computing`: a lock, where several chunks of a process are to be computed one after
-        another; and written within `writing`.
-        """
+        """Run the scenes of a chunk within `computing`, such as a lock, and write them within `writing`."""
         if not (self.path / "zarr.json").is_file():
             raise InputError(f"{self.path} is not there on a worker; allowed: a folder that all machines share")
         if programs() != self.programs:
             raise InputError(f"a worker has {programs()}, and the sweep is of {self.programs}; allowed: the same")
-        ranges = zip(self._place(index), self.block, self.plan.sizes, strict=True)
+        plan, at = self.plan, self._place(index)
+        ranges = zip(at, self.block, plan.sizes, strict=True)
         part = tuple(slice(i * own, min((i + 1) * own, size)) for i, own, size in ranges)
         sizes = tuple(one.stop - one.start for one in part)
         with computing:
-            found, values = self._computed(index, part)
-        for name, one in self.outputs.items():
-            own, more = found[name].values, one.shape[len(part) :]
-            if own.ndim == 1 and more:
-                # No scene of the chunk has a result.
-                own = np.full((own.size, *more), np.nan)
-            values[name] = own.reshape((*sizes, *more))
+            draws = {} if self.draws is None else self.draws.part(at[-1])
+            grid = {name: values[one] for (name, values), one in zip(plan.grid.items(), part, strict=False)}
+            found = batch(plan.circuit, plan.spread(grid, draws), **self.options)
+        figures = {x: found[x].values.reshape((*sizes, *one.shape[len(part) :])) for x, one in self.outputs.items()}
         with writing:
-            self._write(index, values)
+            self._write(index, {**draws, **figures})
         failures = []
         for told in found.attrs["failures"]:
             # Scenes are told by their numbers in the whole sweep; a sweep without dimensions is one scene.
             scene, _, message = told.removeprefix("scene ").partition(": ")
             place = np.add([one.start for one in part], np.unravel_index(int(scene), sizes)).astype(int)
-            failures.append(f"scene {np.ravel_multi_index(tuple(place), self.plan.sizes) if part else 0}: {message}")
+            failures.append(f"scene {np.ravel_multi_index(tuple(place), plan.sizes) if part else 0}: {message}")
         return found.sizes["scene"], failures
-
-    def _computed(self, index: int, part: tuple[slice, ...]) -> tuple[Dataset, dict[str, NDArray[Any]]]:
-        """The batch of a chunk's scenes, and the values that are drawn."""
-        draws = {} if self.draws is None else self.draws.part(self._place(index)[-1])
-        grid = {name: values[one] for (name, values), one in zip(self.plan.grid.items(), part, strict=False)}
-        return batch(self.plan.circuit, self.plan.spread(grid, draws), **self.options), {**draws}
 
     def _write(self, index: int, values: Mapping[str, NDArray[Any]]) -> None:
         try:
             for name, one, place in self.pieces(index):
-                one.put(place, np.asarray(values[name]))
+                one.put(place, values[name])
         except OSError as error:
             raise InputError(f"cannot write {self.path}: {error.strerror or error}; {_GOES_ON}") from None
 
@@ -261,7 +225,9 @@ def stored(
     plan: Plan, options: Mapping[str, Any], path: Path, workers: int | None, scheduler: str | None,
     shard: tuple[int, int],
 ) -> Dataset:  # fmt: skip
-    """Run the missing chunks of a sweep, or of a shard of it, and return what the store has."""
+    """Run the missing chunks of a sweep, or of a shard of it, and return what the store has, read when it is used."""
+    from xarray import open_zarr
+
     if workers is not None:
         whole_number("workers", workers, 1)
         if scheduler is not None:
@@ -270,10 +236,8 @@ def stored(
     require(good, "shard", shard, "two whole numbers (i, m), with i from 1 to m")
     if os.path.lexists(path):
         _identity_at(path)
-    work = Work(plan, options, path)
     here = workers is None and scheduler is None
-    if not here:
-        work.options = {"threads": 1, **options}
+    work = Work(plan, options if here else {"threads": 1, **options}, path)
     with nullcontext() if here else _client(workers and min(workers, work.chunks), scheduler) as client:
         work.open()
         begun, mine = time.perf_counter(), range(shard[0] - 1, work.chunks, shard[1])
@@ -290,7 +254,10 @@ def stored(
         if not lacking:
             tidy(work.path)
         took = time.perf_counter() - begun
-    found = work.dataset()
+    found: Dataset = open_zarr(work.path, chunks=None, consolidated=False, zarr_format=3).set_coords(list(work.drawn))
+    named = {str(name): one.attrs[NAMES] for name, one in found.coords.items() if NAMES in one.attrs}
+    found = found.assign_coords(named)[list(work.outputs)]
+    del found.attrs[RUN]
     found.attrs |= {"chunks": len(mine), "chunks_found": there, "chunks_missing": lacking, "seconds": took}
     found.attrs["failures"] = failures[:MESSAGES]
     return found
@@ -310,19 +277,16 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     try:
         import distributed
     except ImportError:
-        raise InputError(
-            f"{'scheduler' if workers is None else 'workers'} takes the package distributed, which is not installed; "
-            "allowed: pip install 'fingerspice[cluster]'"
-        ) from None
+        raise InputError(f"{'scheduler' if workers is None else 'workers'} takes the package distributed, which is not "
+                         "installed; allowed: pip install 'fingerspice[cluster]'") from None  # fmt: skip
     with ExitStack() as held:
         try:
             if workers is not None:
-                scheduler = held.enter_context(
-                    distributed.LocalCluster(
-                        n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0",
-                        silence_logs=logging.CRITICAL,
-                    )
-                ).scheduler_address  # fmt: skip
+                cluster = distributed.LocalCluster(
+                    n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.CRITICAL,
+                )  # fmt: skip
+                scheduler = held.enter_context(cluster).scheduler_address
             client = held.enter_context(distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False))
         except (OSError, ValueError, ImportError, RuntimeError) as error:
             raise InputError(
@@ -368,9 +332,8 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[R
             if lost[index] < TRIES:
                 todo.append(index)
         except Exception as error:
-            raise InputError(
-                f"the sweep at the scheduler ended with {type(error).__name__}: {error}; {_GOES_ON}"
-            ) from None
+            ended = f"the sweep at the scheduler ended with {type(error).__name__}"
+            raise InputError(f"{ended}: {error}; {_GOES_ON}") from None
         else:
             lost[None], _ = 0, given_up.pop(index, None)
             yield answer
@@ -379,10 +342,8 @@ def _by_scheduler(work: Work, missing: Sequence[int], client: Any) -> Iterator[R
 
 
 def _lost(chunk: str, count: int, reason: Exception) -> InputError:
-    return InputError(
-        f"the workers of {chunk} were lost, {count} times: {reason}; allowed: fewer workers, if the memory is too "
-        f"small for these; {_GOES_ON}"
-    )
+    return InputError(f"the workers of {chunk} were lost, {count} times: {reason}; allowed: fewer workers, if the "
+                      f"memory is too small for these; {_GOES_ON}")  # fmt: skip
 
 
 def _run_and_write_aside(work: Work, index: int) -> Ran:

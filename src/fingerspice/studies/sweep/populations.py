@@ -19,8 +19,7 @@ from fingerspice.circuit.circuit import Circuit
 from fingerspice.circuit.describe import require_circuit
 from fingerspice.sets.parameters import KINDS
 from fingerspice.sets.parameters import parameters as known_sets
-from fingerspice.studies.batch.batch import batch
-from fingerspice.studies.batch.form import REFUSED, own_path
+from fingerspice.studies.batch.batch import REFUSED, batch, own_path
 from fingerspice.waveforms.waveform import Waveform, require
 
 if TYPE_CHECKING:
@@ -41,46 +40,38 @@ _NUMBERS = "a number, an array of numbers, or a frozen distribution of scipy.sta
 
 
 class Plan:
-    """Parameters of a circuit that make a grid, those that are drawn (`n` draws by `seed`), those that are one number.
+    """Parameters of a circuit that make a grid, those that are drawn, and those that are one number, by name.
 
-    Names are paths, or several paths with commas, whose numbers are factors. A kind of named sets, such as ``finger``,
-    is a name as well, whose numbers count the sets.
+    Names are paths, several paths with commas, whose numbers are factors, or kinds of sets, whose numbers count them.
     """
 
     def __init__(self, circuit: Circuit, asked: Mapping[str, Any], n: int, seed: int, most: int) -> None:
         """Of what `sweep` is asked for as its `parameters`, with `most` draws or fewer."""
         require_circuit(circuit)
-        if not isinstance(asked, Mapping) or not asked:
-            raise InputError(f"parameters is {asked!r}; allowed: a mapping such as {{'Xgap.d': [3e-6, 4e-6]}}")
-        n, self.seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
+        good = isinstance(asked, Mapping) and bool(asked)
+        require(good, "parameters", repr(asked), "a mapping such as {'Xgap.d': [3e-6, 4e-6]}")
+        self.n, self.seed = n, seed = whole_number("n", n, 0), whole_number("seed", seed, 0)
         power = most.bit_length() - 1
         require(1 < n <= most and n & (n - 1) == 0, "n", n, f"a power of two such as 1024, at most 2^{power}")
-        sets: dict[str, tuple[tuple[str, ...], dict[str, FloatArray]]] = {}
+        # The paths of each name, with the value that its numbers are factors of, or the values of the sets, (n_set,)
+        self.own: dict[str, Mapping[str, float | FloatArray]] = {}
+        self.names: dict[str, tuple[str, ...]] = {}  # Of the sets that a name counts
+        self.units: dict[str, str] = {}
         for kind in (kind for kind in KINDS if kind in asked):
             if isinstance(asked[kind], str):
                 circuit = _applied(circuit, kind, asked[kind])[0]
             else:
-                circuit, names, differ = _together(circuit, kind, asked[kind])
-                sets[kind] = names, differ
-        rest = [name for name in asked if name in sets or name not in KINDS]
+                circuit, self.names[kind], self.own[kind] = _together(circuit, kind, asked[kind])
+        rest = [name for name in asked if name in self.names or name not in KINDS]
         if not rest:
-            raise InputError(
-                f"parameters is {dict(asked)!r}, and nothing varies; allowed: a list of sets, an array or a "
-                "distribution beside it"
-            )
-        self.n, self.circuit = n, circuit  # With the values that named sets give to every scene
-        self.grid: dict[str, FloatArray] = {}
-        self.drawn: dict[str, Any] = {}
-        self.fixed: dict[str, FloatArray] = {}
-        # The paths of each name, with the value that its numbers are factors of, or the values of the sets, (n_set,)
-        self.own: dict[str, Mapping[str, float | FloatArray]] = {}
-        self.units: dict[str, str] = {}
-        self.names: dict[str, tuple[str, ...]] = {}  # Of the sets that a name counts
+            raise InputError(f"parameters is {dict(asked)!r}, and nothing varies; allowed: a list of sets, an array or "
+                             "a distribution beside it")  # fmt: skip
+        self.circuit = circuit  # With the values that named sets give to every scene
+        self.grid, self.drawn, self.fixed = dict[str, FloatArray](), dict[str, Any](), dict[str, FloatArray]()
         known, taken = circuit.parameters, Counter[str]()
         for given in rest:
             value, name = asked[given], given
-            if given in sets:
-                self.names[name], self.own[name] = sets[given]
+            if name in self.names:
                 self.grid[name], paths = np.arange(len(self.names[name]), dtype=float), list(self.own[name])
             else:
                 paths = [own_path(circuit, one.strip()) for one in str(given).split(",")]
@@ -97,31 +88,15 @@ class Plan:
             taken.update(paths)
             if twice := [path for path, count in taken.items() if count > 1]:
                 raise InputError(f"{twice[0]} is given twice, where sets that differ in it count; allowed: once")
-
-    @property
-    def dims(self) -> tuple[str, ...]:
-        """Dimensions of the sweep."""
-        return (*self.grid, *(("scene",) if self.drawn else ()))
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Number of scenes along each dimension."""
-        return (*(values.size for values in self.grid.values()), *((self.n,) if self.drawn else ()))
-
-    @property
-    def about(self) -> dict[str, Any]:
-        """Attributes of the sweep: its draws, and the named sets in it."""
-        sets = {"sets": list(self.circuit.sets)} if self.circuit.sets else {}
-        return ({"n": self.n, "seed": self.seed} if self.drawn else {}) | sets
-
-    @property
-    def coordinates(self) -> dict[str, Any]:
-        """Of each dimension of the grid its numbers, or the names of its sets, for a Dataset."""
-        return {
-            name: (name, list(self.names[name])) if name in self.names
-            else (name, values, {"units": self.units[name]})
-            for name, values in self.grid.items()
-        }  # fmt: skip
+        # Dimensions, and the number of scenes along each; of the grid's, for a Dataset, the numbers or the sets' names
+        self.dims = *self.grid, *(("scene",) if self.drawn else ())
+        self.sizes = *(values.size for values in self.grid.values()), *((n,) if self.drawn else ())
+        of = {name: {"units": unit} for name, unit in self.units.items()}
+        shown = {name: list(self.names.get(name, values)) for name, values in self.grid.items()}
+        self.coordinates: dict[str, Any] = {name: (name, x, of.get(name)) for name, x in shown.items()}
+        # Attributes of the sweep: its draws, and the named sets in it
+        self.about = {"n": n, "seed": seed} if self.drawn else dict[str, Any]()
+        self.about |= {"sets": list(circuit.sets)} if circuit.sets else {}
 
     def paths(self, values: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         """Values of each path of these names."""
@@ -156,27 +131,22 @@ class Draws:
     def __init__(self, plan: Plan, count: int) -> None:
         self.plan, self.count = plan, count
         # Sums of point 0 and the points `count`, 2 `count`, ..., (n_drawn,) each.
-        self._steps: list[NDArray[np.int64]] = []
-        engine, at = self._engine(), count
-        first = self._bits(engine, 1) if at < plan.n else 0
-        while at < plan.n:
-            engine.fast_forward(at - engine.num_generated)
-            self._steps.append((self._bits(engine, 1) ^ first)[0])
-            at *= 2
+        starts = [count << i for i in range((plan.n // count).bit_length() - 1)]
+        self._steps = [(self._bits(start, 1) ^ self._bits(0, 1))[0] for start in starts]
 
-    def _engine(self) -> Any:
-        """The sequence of points of the unit cube, from its beginning."""
+    def _bits(self, start: int, count: int) -> NDArray[np.int64]:
+        """Bits of so many points of the unit cube from one on, shape (count, n_drawn)."""
         from scipy.stats import qmc
 
-        return qmc.Sobol(len(self.plan.drawn), scramble=True, bits=BITS, rng=self.plan.seed)
-
-    def _bits(self, engine: Any, count: int) -> NDArray[np.int64]:
+        engine = qmc.Sobol(len(self.plan.drawn), scramble=True, bits=BITS, rng=self.plan.seed)
+        if start:
+            engine.fast_forward(start)
         return np.asarray(engine.random(count) * 2.0**BITS, np.int64)
 
     @cached_property
     def _first(self) -> NDArray[np.int64]:
-        """Bits of the first part, shape (count, n_drawn): a process that is sent the draws makes them once."""
-        return self._bits(self._engine(), self.count)
+        """Bits of the first part: a process that is sent the draws makes them once."""
+        return self._bits(0, self.count)
 
     # Two chunks may run at once, and those after them mostly have the same draws.
     @lru_cache(2)  # noqa: B019
@@ -192,21 +162,15 @@ class Draws:
 def _together(circuit: Circuit, kind: str, names: Any) -> tuple[Circuit, tuple[str, ...], dict[str, FloatArray]]:
     """The circuit with the values in which several sets agree, the sets' names, and by path values that differ."""
     given = list(names) if isinstance(names, list | tuple | np.ndarray) else []
-    if not given or not all(isinstance(name, str) for name in given):
-        raise InputError(f"{kind} is {names!r}; allowed: the name of a set of parameters, or a list of names")
+    good = bool(given) and all(isinstance(name, str) for name in given)
+    require(good, kind, repr(names), "the name of a set of parameters, or a list of names")
     found = dict(_applied(circuit, kind, name)[1:] for name in given)
-    if len(found) < len(given):
-        raise InputError(f"{kind} is {given!r}, where a set is named twice; allowed: each once")
-    if any(isinstance(value, Waveform) for one in found.values() for value in one.values()):
-        raise InputError(
-            f"{kind} is {given!r}, whose sets replace the source; allowed: one of them by itself, with arrays of "
-            "numbers such as source.frequency beside it"
-        )
-    own = circuit.parameters
-    whole = {
-        path: np.array([one.get(path, own[path].value) for one in found.values()], float)
-        for path in dict.fromkeys(path for one in found.values() for path in one)
-    }
+    require(len(found) == len(given), kind, f"{given!r}, where a set is named twice", "each once")
+    waves = any(isinstance(value, Waveform) for one in found.values() for value in one.values())
+    require(not waves, kind, f"{given!r}, whose sets replace the source", "one of them by itself, with arrays of "
+            "numbers such as source.frequency beside it")  # fmt: skip
+    own, paths = circuit.parameters, dict.fromkeys(path for one in found.values() for path in one)
+    whole = {path: np.array([one.get(path, own[path].value) for one in found.values()], float) for path in paths}
     same = {path: float(each[0]) for path, each in whole.items() if np.all(each == each[0])}
     differ = {path: each for path, each in whole.items() if path not in same}
     return circuit.replace(same) if same else circuit, tuple(found), differ
@@ -286,9 +250,8 @@ def sweep(
         plan = Plan(circuit, parameters, n, seed, MOST_STORED_SAMPLES)
         return stored(plan, options, Path(store), workers, scheduler, shard)
     if workers is not None or scheduler is not None or tuple(shard) != (1, 1):
-        raise InputError(
-            "workers, scheduler or shard is given without store; allowed: a folder such as 'out/sweep.zarr'"
-        )
+        raise InputError("workers, scheduler or shard is given without store; allowed: a folder such as "
+                         "'out/sweep.zarr'")  # fmt: skip
     from xarray import Dataset
 
     plan = Plan(circuit, parameters, n, seed, MOST_SAMPLES)
@@ -300,9 +263,8 @@ def sweep(
         name: ((*plan.dims, *one.dims[1:]), one.values.reshape((*plan.sizes, *one.shape[1:])), one.attrs)
         for name, one in found.data_vars.items()
     }
-    coords: dict[str, Any] = plan.coordinates
+    coords = plan.coordinates | {name: one for name, one in found.coords.items() if name == "turn"}
     coords |= {name: ("scene", values, {"units": plan.units[name]}) for name, values in draws.items()}
-    coords |= {name: one for name, one in found.coords.items() if name == "turn"}
     return Dataset(data, coords, found.attrs | plan.about)
 
 
@@ -374,11 +336,9 @@ def _indices(
     def figures(x: FloatArray) -> FloatArray:
         found = batch(plan.circuit, plan.spread(place, dict(zip(plan.drawn, x, strict=True))), **options)
         if lost := int(np.count_nonzero(found.status >= REFUSED)):
-            why = f" ({found.attrs['failures'][0]})" if len(found.attrs["failures"]) else ""
-            raise InputError(
-                f"{lost} of {found.sizes['scene']} scenes have no result{why}, and indices need all; allowed: "
-                "distributions that stay where the circuit works"
-            )
+            raise InputError(f"{lost} of {found.sizes['scene']} scenes have no result ({found.attrs['failures'][0]}), "
+                             "and indices need all; allowed: distributions that stay where the circuit "
+                             "works")  # fmt: skip
         values = np.array([found[name].values for name in outputs])
         require(values.ndim == 2, "outputs", "one for each of several gaps", "figures of a circuit with one GAP")
         return values

@@ -1,32 +1,65 @@
-"""Scenes of a batch in lockstep; the number of steps is doubled for the scenes whose error is too large.
-
-What is wanted of scenes in lockstep, with its error: figures and gap voltages, or derivatives of means.
-"""
+"""Scenes of a batch in lockstep: what goes there, the table of its values, and its figures, or derivatives of means."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial import chebyshev as powers
 
 from fingerspice.base.arrays import BoolArray, FloatArray, IntArray
+from fingerspice.circuit.circuit import Circuit, Element
+from fingerspice.circuit.devices import Value
+from fingerspice.circuit.statespace import Stack, build_stack, is_stack
 from fingerspice.engine.lockstep.card import march_on_card
 from fingerspice.engine.lockstep.march import N_PORTION, march, march_samples
-from fingerspice.engine.lockstep.scenes import CELL_ROWS, LOAD, LOSS, N_OTHERS, OMEGA, REST, STRESS, new_block
+from fingerspice.engine.lockstep.scenes import CELL_ROWS, LARGEST_X, LOAD, LOSS, OMEGA, REST, STRESS, new_block
 from fingerspice.engine.lockstep.step import ALL_MOMENTS, START_TIMES, marks_of
+from fingerspice.numerics import chebyshev
 from fingerspice.numerics.modes import STEP
-from fingerspice.studies.batch.form import FIGURES, LOCKSTEP, LockstepForm, Task, curves_of, peak_of, table_of
+from fingerspice.physics.contact import universal_curve_array
+from fingerspice.physics.materials import EPS0
+from fingerspice.waveforms.periodic import Pulse, Square
+from fingerspice.waveforms.samples import Samples, as_samples
+from fingerspice.waveforms.waveform import AM, DC, Sine
 
+if TYPE_CHECKING:
+    from fingerspice.studies.batch.batch import Task
+
+#: Status of a scene that has been run in lockstep.
+LOCKSTEP = 0
+#: For each figure that lockstep gives, the moments that it needs: the means of u^2 A (0), (u^2 A)^2 (1) and u^2 (2).
+FIGURES: dict[str, tuple[int, ...]] = {
+    "f_el_mean": (0,), "f_el_rms": (1,), "f_t_mean": (0,), "f_t_rms": (0, 1), "friction_mean": (0,),
+    "friction_rms": (0, 1), "u_gap_rms": (2,),
+}  # fmt: skip
+# Parameters that must be equal in all scenes of a lockstep, because the form of the equations depends on them.
+_FORM = ("m_exp", "n_exp", "a_fix", "tau")
+# Most layers and most tones of a lockstep: code is compiled for each number of cells and of tones.
+_MOST_LAYERS, _MOST_TONES = 4, 4
+_LAYERS = ("LAYER", "SLAB", "SKIN", "SKIN_DISPERSIVE", "GAP")
+# Largest ratio of a tone's frequency to that of the whole source.
+_MOST_PERIODS = 2000
+# Numbers of points tried for the universal curve's Chebyshev series, and the relative error allowed.
+_CURVE_SIZES, _CURVE_ERROR = (16, 20, 24, 28), 1e-13
+# Smallest rtol at which derivatives are taken in lockstep: below it their kinks would take too many steps.
+_LEAST_RTOL_OF_SLOPES = 5e-7
 # By the smallest rtol served: initial number of steps per period, with which nearly all scenes meet it, under one tone
-# and (of the highest) under several; and initial degree of the area's polynomial, of which each takes the compiler 8 s.
-_RUNGS = ((5e-4, 20, 16, 8), (5e-5, 32, 24, 8), (5e-6, 48, 48, 16), (5e-7, 72, 72, 16), (0.0, 112, 112, 16))
+# and (of the highest) under several, and of a piece of a square's half period; and initial degree of the area's
+# polynomial, of which each takes the compiler 8 s.
+_RUNGS = (
+    (5e-4, 20, 16, 4, 8), (5e-5, 32, 24, 4, 8), (5e-6, 48, 48, 6, 16), (5e-7, 72, 72, 8, 16), (0.0, 112, 112, 16, 16),
+)  # fmt: skip
 # By how much that grows where the last coefficient is more than this share of rtol; and the largest number of steps.
 _MORE_DEGREE, _SMALL_TAIL, _MOST_STEPS = 8, 0.1, 8192
 # Under a recording: initial number of steps a sample, and the largest.
 _PARTS = (2, 16)
 # Largest gap voltage that the area's polynomial covers, as a ratio to its estimate: the second one for scenes that the
-# first did not cover. It is the same for all numbers of steps, whose results are compared, because the linear part of
-# the equations has the area of its middle, so that the error of a step depends on it.
+# first did not cover. As the linear part of the equations has the area of its middle, results are compared at one only.
 _COVERED = 1.2, 1.8
 # Allowed defect of the periodic state relative to rtol, and that of a run from rest that ends when it has settled.
 _CLOSING, _SETTLED = 0.02, 0.05
@@ -34,9 +67,8 @@ _CLOSING, _SETTLED = 0.02, 0.05
 # time constants of the fastest cell; and the voltage at the start that counts as 0 V, over all tones. Also from
 # there a leaking gap's voltage jumps, as it leads the source: below this rtol the first step is as short as a square's.
 _LONGEST_STEP, _FROM_ZERO, _LEADING = 1.0, 1e-12, 5e-5
-# Steps of a piece of a square's half period by the smallest rtol served; and the number by which the first step, with
-# `_PIECE_START` steps a piece, is shorter than the fastest cell's time constant.
-_PIECES = ((5e-5, 4), (5e-6, 6), (5e-7, 8), (0.0, 16))
+# Number by which the first step of a square, with so many steps a piece, is shorter than the fastest cell's time
+# constant; and the largest number of pieces.
 _PIECE_START, _MOST_PIECES = 2, 20
 #: A scene is accepted if its estimate is at most this fraction of the error allowed.
 ENOUGH = 0.7
@@ -44,23 +76,184 @@ ENOUGH = 0.7
 _ROUNDING = 1e-11
 # The error is estimated as this share of the change from half the steps to all steps. The order is 4, which would give
 # a fifteenth, and 3 for what the kinks of 1/A leave, where the gap voltage is 0. Pieces of 2 and of 4 steps are still
-# far from the order.
-_STATED, _STATED_JUMPING = 0.25, 0.5
-# Where a step is longer than this many of the fastest time constants, the start of a run from rest is not resolved, and
-# the change is no larger than the error; it is smaller where that start is most of the error.
-_STIFF, _STATED_STIFF = 2.0, 0.8
-# A gap voltage shows the kinks at its zeros more than means do.
-_STATED_TRACED = 0.8
-# Under a recording the order is 3, which would give a seventh, and 2 for what the zeros of the gap voltage leave; but
-# 1, which gives 1, for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
-_STATED_RECORDED, _STATED_DISPERSIVE = 0.5, 1.0
-# What decays after a start away from 0 V meets steps of several lengths, whose errors may cancel with half the steps.
-_STATED_STARTED = 0.8
+# far from the order. Under a recording it is 3, which would give a seventh, and 2 at those zeros; but 1, which gives 1,
+# for a dispersive skin, some of whose modes decay from each sample on within a part of a step.
+_STATED, _STATED_JUMPING, _STATED_RECORDED, _STATED_DISPERSIVE = 0.25, 0.5, 0.5, 1.0
+# It is more of gap voltages, which show the kinks at their zeros more than means do; where a step is longer than this
+# many of the fastest time constants, so that the start of a run from rest is not resolved; and after a start away from
+# 0 V, as what decays then meets steps of several lengths, whose errors may cancel with half the steps.
+_STATED_MORE, _STIFF = 0.8, 2.0
 # Rounding error of a run in which the area's polynomial has degree d, relative: 2^d times this, by which the powers'
 # coefficients are larger than those of Chebyshev's series. And, in a derivative, that of all else.
 _EPS, _ROUNDING_OF_SLOPES = 4.4e-16, 1e-13
 # The stated error of a derivative has this many changes from half the steps to all steps.
 _STATED_SLOPES = 2.0
+
+
+@dataclass(frozen=True)
+class LockstepForm:
+    """Properties that all scenes in lockstep have in common."""
+
+    stack: Stack
+    gap: Element
+    # The sources that are on; each with the sign of the gap along the loop times the sign of the source
+    sources: tuple[tuple[Element, float], ...]
+    multiples: tuple[int, ...]  # Frequency of every tone of the sources' sum, in that of the sum
+    # That of the sum, Hz; None for one source of one tone, whose frequency may vary. For a recording half of its sample
+    # rate, so that a sample's length is half a period.
+    frequency: float | None
+    jumping: bool  # Whether the source is a square
+    recording: Samples | None  # The samples of the only source, if it is a recording
+
+    @property
+    def cells(self) -> int:
+        """Number of cells of all layers."""
+        return self.stack.c.size
+
+
+def lockstep_form(circuit: Circuit, varied: Iterable[str]) -> LockstepForm | str:
+    """The common form of scenes in lockstep, or the reason why there is none; `varied` has the paths that vary."""
+    if not is_stack(circuit):
+        return "the circuit is no series stack of layers"
+    stack, tran = build_stack(circuit), circuit.tran
+    if stack.contact is None or stack.gap is None or stack.gap_layer is None or stack.area_given is not None:
+        return "the stack has no contact whose area follows the gap"
+    if not {e.device for e in stack.layers} <= set(_LAYERS) or not 2 <= len(stack.layers) <= _MOST_LAYERS:
+        return f"the stack has other layers than {', '.join(_LAYERS)}, or not 2 to {_MOST_LAYERS} of them"
+    if (circuit.charge_law or "local") != "local" or circuit.work != "gap":
+        return "the charge law is mobile, or the total voltage is held"
+    sources = tuple((e, float(turn * stack.sign[stack.gap])) for e, turn in stack.sources if e.waveform != DC(0.0))
+    waves = [e.waveform for e, _ in sources]
+    recording = as_samples(waves[0]) if len(waves) == 1 and waves[0] is not None else None
+    jumping = recording is None and any(isinstance(wave, Square | Pulse) for wave in waves)
+    tones = [hz for wave in waves for hz, *_ in _tones_of(wave, {})[0]]
+    multiples: tuple[int, ...] = (1,)
+    frequency, charged = None, jumping
+    if recording is not None:
+        if recording.start != 0.0:
+            return "the recording does not start at 0 s"
+        frequency, charged = 0.5 * recording.rate, recording.between(0, 1)[0] != 0.0
+    elif not (tones and all(tones) and len(tones) <= (1 if jumping else _MOST_TONES)):
+        said = f"the sources are not 1 to {_MOST_TONES} plain sines, not a square that starts with its period"
+        return f"{said}, and not a recording"
+    elif len(tones) > 1:
+        period = stack.waveform.period
+        if period is None or max(tones) * period > _MOST_PERIODS:
+            return "the sources' tones have no common period, or one of very many of their own"
+        multiples, frequency = tuple(round(hz * period) for hz in tones), 1.0 / period
+    varied = [path.lower() for path in varied]
+    given = circuit.initial or any(e.initial is not None for e in circuit.elements)
+    if tran is not None and not tran.uic:
+        # The operating point of sines that start at 0 V is the uncharged state.
+        others = [e.waveform for e in circuit.by_device("V") if not isinstance(e.waveform, AM)]
+        charged = charged or any(getattr(wave, "phase_deg", 0.0) for wave in others)
+        given = given or charged or any(path.endswith(".phase_deg") for path in varied)
+    if given or (tran is not None and tran.start > 0.0):
+        return "the run does not start uncharged, or its figures start late"
+    fixed = () if frequency is None else ("frequency",)
+    may_vary = {e.name.lower(): set(_tones_of(e.waveform, {})[1]).difference(fixed) for e, _ in sources}
+    layers = {e.name.lower() for e in stack.layers}
+    for path in varied:
+        name, _, parameter = path.rpartition(".")
+        if parameter not in may_vary[name] if name in may_vary else parameter in _FORM or name not in layers:
+            return f"{path} varies"
+    return LockstepForm(stack, stack.layers[stack.gap_layer], sources, multiples, frequency, jumping, recording)
+
+
+def why_alone(form: LockstepForm | str, outputs: Iterable[str], slopes_at: float | None = None) -> str:
+    """Why outputs, or with `slopes_at` their derivatives at that rtol, need runs of their own; '' in lockstep."""
+    if isinstance(form, str):
+        return form
+    if slopes_at is not None and form.recording is not None:
+        return "the source is a recording"
+    # Of a recording no last period is kept.
+    suffix = "_periodic" if form.recording is None else ""
+    others = [name for name in outputs if name != "u_gap" and name.removesuffix(suffix) not in FIGURES]
+    if others:
+        return f"{', '.join(others)} needs a run of its own"
+    if slopes_at is not None and slopes_at < _LEAST_RTOL_OF_SLOPES:
+        return f"rtol is below {_LEAST_RTOL_OF_SLOPES:g}"
+    return ""
+
+
+def _tones_of(wave: object, given: Mapping[str, Value]) -> tuple[list[tuple[float, Value, Value]], tuple[str, ...]]:
+    """Frequency (Hz; 0 of no tone), amplitude (V) and phase (rad) of a source's tones, and parameters that may vary."""
+    height, depth, phase = (given.get(name, getattr(wave, name, 0.0)) for name in ("amplitude", "depth", "phase_deg"))
+    turn: Value = np.radians(phase)
+    match wave:
+        case AM():
+            # sin(x) sin(y) is half of cos(x - y) = sin(x - y + pi/2) and of -cos(x + y) = sin(x + y - pi/2).
+            share, quarter = height / (1.0 + depth), 0.5 * np.pi
+            side, low, high = 0.5 * depth * share, wave.carrier - wave.modulation, wave.carrier + wave.modulation
+            tones = [(wave.carrier, share, 0.0), (low, side, quarter - turn), (high, side, turn - quarter)]
+            return tones, ("amplitude", "depth", "phase_deg")
+        case Sine(offset=0.0, delay=0.0, damping=0.0):
+            return [(wave.frequency, height, turn)], ("amplitude", "frequency", "phase_deg")
+        case Square(half_wave=True, phase_deg=0.0, delay=0.0):
+            return [(wave.frequency, height, turn)], ("amplitude", "frequency")
+        case Pulse(half_wave=True, rise=0.0, delay=0.0):
+            return [(wave.tone() or 0.0, wave.v2, 0.0)], ()
+    return [(0.0, 0.0, 0.0)], ()
+
+
+def table_of(form: LockstepForm, scenes: Mapping[str, FloatArray]) -> FloatArray:
+    """The table (n_row, n) that `engine.lockstep.march` takes of scenes, which are values by path in lower case."""
+
+    def values(element: Element) -> dict[str, Any]:
+        start = f"{element.name.lower()}."
+        given = {path.removeprefix(start): array for path, array in scenes.items() if path.startswith(start)}
+        return {**element.values, **given}
+
+    first = form.sources[0][0]
+    period = first.waveform.period if first.waveform is not None else None
+    frequency = form.frequency or values(first).get("frequency", 1.0 / (period or math.nan))
+    rows = [*_contact_rows(values(form.gap)), 2.0 * np.pi * np.asarray(frequency)]
+    for element, sign in form.sources:
+        recorded = None if form.recording is None else [(0.0, peak_of(form.recording), 0.0)]
+        for _, amplitude, phase in recorded or _tones_of(element.waveform, values(element))[0]:
+            rows += [sign * amplitude * np.cos(phase), sign * amplitude * np.sin(phase)]
+    n, others, cell = next(iter(scenes.values())).size, CELL_ROWS * form.cells, 0
+    out = np.empty((others + len(rows), n))
+    for i, row in enumerate(rows, others):
+        out[i] = row
+    of_cells = out[:others].reshape(CELL_ROWS, form.cells, n)
+    for layer, count in zip(form.stack.layers, form.stack.cells, strict=True):
+        assert layer.spec.cells is not None
+        cells = layer.spec.cells(values(layer), None)
+        of_cells[:, cell : cell + count] = np.moveaxis(cells.reshape(count, CELL_ROWS, -1), 0, 1)
+        cell += count
+    return out
+
+
+def peak_of(recording: Samples) -> float:
+    """Largest sample, V; 1 V if all are 0."""
+    return float(np.abs(recording.values).max()) or 1.0
+
+
+def _contact_rows(v: Mapping[str, Value]) -> tuple[Value, ...]:
+    """As `Contact.packed`, for arrays of values: X at 1 V, A0, stress at 1 V, load, c2 mu^2."""
+    m, n, f_n, d = v["m_exp"], v["n_exp"], np.asarray(v["fn"]), v["d"]
+    p = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
+    alpha, beta = np.asarray(v["alpha"]) * 1e-6, np.asarray(v["beta"]) * 1e-6 * 1e3**n
+    area = alpha * f_n**m
+    per_volt = EPS0 * v["eps_r"] / d
+    xi = np.sqrt(per_volt * (n * n / (n - m)) * beta ** (1.0 / n) * alpha ** (-1.0 / m)) * area**p / f_n
+    return xi, area, 0.5 * per_volt / d, f_n, v["c2"] * 1e-12 * np.asarray(v["mu"]) ** 2
+
+
+@lru_cache(maxsize=32)
+def curves_of(m: float, n: float, degree: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Power series of the universal curve, if there is one, Chebyshev nodes and matrix of a degree, as for `march`."""
+    p = 0.5 * (1.0 + 1.0 / m - 1.0 / n)
+    series = chebyshev.fit(lambda x: universal_curve_array(x, 1.0 / m, p), 0.0, LARGEST_X, _CURVE_ERROR, _CURVE_SIZES)
+    if series is None:
+        return None
+    to_powers = np.zeros((degree + 1, degree + 1))
+    for k, one in enumerate(np.eye(degree + 1)):
+        to_powers[: k + 1, k] = powers.cheb2poly(one[: k + 1])
+    highest_first = (to_powers @ chebyshev.coefficients(np.eye(degree + 1)))[::-1]
+    at = chebyshev.nodes(degree + 1, -1.0, 1.0)
+    return np.ascontiguousarray(powers.cheb2poly(series)[::-1]), at, np.ascontiguousarray(highest_first)
 
 
 class Level(NamedTuple):
@@ -110,13 +303,8 @@ class Ladder:
         # Rows of the moments that the figures need
         self.needed = sorted({i for name in self.names for i in FIGURES[name.removesuffix("_periodic")]} or {0})
         self.n_moment = ALL_MOMENTS if self.needed[-1] else 1
-        self._look()
-
-    def _look(self) -> None:
-        """Find what the scenes need of their steps, each of shape (n,)."""
-        form, table, periodic = self.form, self.table, self.task.periodic
-        cells, others = form.cells, CELL_ROWS * form.cells
-        # Whether there is contact
+        # What the scenes need of their steps, each of shape (n,); first, whether there is contact
+        table, periodic, cells, others = self.table, task.periodic, form.cells, CELL_ROWS * form.cells
         self.possible = table[others + REST] ** 2 > table[others + LOSS] * table[others + LOAD] ** 2
         # Leakage rate of every cell with its area at rest; the largest is an upper bound of the rates of the modes.
         leaks = table[cells : 2 * cells] / table[others + REST] + table[2 * cells : 3 * cells]
@@ -127,15 +315,16 @@ class Ladder:
         first: FloatArray | float = 0.0
         if form.jumping:
             # Gap voltages at equal distances need a single piece.
-            most = 1 if self.task.traced else _MOST_PIECES
+            most = 1 if task.traced else _MOST_PIECES
             self.pieces = np.ceil(np.log2(1.0 + _PIECE_START * self.decays)).clip(1, most).astype(int)
             first = self.pieces / (2.0**self.pieces - 1.0)
         elif form.recording is not None and not periodic:
             first = 0.5 * (form.recording.between(0, 1)[0] != 0.0)
         elif not periodic:
-            sines, cosines = table[others + N_OTHERS :: 2], table[others + N_OTHERS + 1 :: 2]
-            from_zero = abs(cosines.sum(axis=0)) <= _FROM_ZERO * np.hypot(sines, cosines).sum(axis=0)
-            first = np.where(from_zero, START_TIMES[2] if self.task.rtol < _LEADING else 0.0, 1.0)
+            tones = table[-2 * len(form.multiples) :]
+            size = np.hypot(tones[::2], tones[1::2]).sum(axis=0)
+            from_zero = abs(tones[1::2].sum(axis=0)) <= _FROM_ZERO * size
+            first = np.where(from_zero, START_TIMES[2] if task.rtol < _LEADING else 0.0, 1.0)
         # Least number of steps a period (sample), so that steps after a jump of the source are short enough; else 0
         self.least = 2.0 * first * self.decays / _LONGEST_STEP
 
@@ -143,18 +332,16 @@ class Ladder:
         """Find what is wanted in runs of so many half periods; scenes whose error stays too large stay not done."""
         # Scenes that settle after about as many periods share a block, which ends when all of its scenes have settled.
         order = np.argsort(self.slowest) if halves > 4 else np.arange(self.members.size)
-        rtol, highest = self.task.rtol, max(self.form.multiples)
-        _, one, several, degree = next(rung for rung in _RUNGS if rtol >= rung[0])
+        rtol, highest, points = self.task.rtol, max(self.form.multiples), self.task.points
+        _, one, several, of_piece, degree = next(rung for rung in _RUNGS if rtol >= rung[0])
         for pieces in np.unique(self.pieces[self.possible]).tolist():
-            steps = one if highest == 1 else several * highest
-            if pieces > 1:
-                steps = 2 * pieces * next(s for least, s in _PIECES if rtol >= least)
+            steps = 2 * pieces * of_piece if pieces > 1 else one if highest == 1 else several * highest
             if self.form.recording is not None:
                 steps = _PARTS[0]
             if self.task.traced:
                 # Half of the steps, too, are an even number.
-                points = self.task.points * (1 if self.task.points % 4 == 0 else 2)
-                steps = points * -(-steps // points)
+                each = points * (1 if points % 4 == 0 else 2)
+                steps = each * -(-steps // each)
             pending = order[(self.possible & (self.pieces == pieces))[order]]
             for covered in _COVERED:
                 pending = self._climb(Level(halves, pieces, covered, steps, degree), pending)
@@ -190,11 +377,9 @@ class Ladder:
             left &= ~beyond
             outside.append(pending[beyond])
             kept = np.tile(left, self.copies)
-            before = run.fine[:, kept], run.trace[kept]
-            last, pending = error[left], pending[left]
-            degree = level.degree
-            if tail[:, left].max(initial=0.0) > _SMALL_TAIL * rtol:
-                degree = max(degree, min(degree + _MORE_DEGREE, highest))
+            before, last, pending = (run.fine[:, kept], run.trace[kept]), error[left], pending[left]
+            more = _MORE_DEGREE if tail[:, left].max(initial=0.0) > _SMALL_TAIL * rtol else 0
+            degree = max(level.degree, min(level.degree + more, highest))
             level = level._replace(steps=2 * level.steps, degree=degree)
         return np.concatenate(outside)
 
@@ -243,12 +428,12 @@ class Ladder:
         if signal == "f_el":
             return np.asarray(stress * (m[0] if kind == "mean" else np.sqrt(m[1])))
         mu = self.scenes.get(f"{gap.name.lower()}.mu")
-        friction = np.full(columns.size, gap.values["mu"]) if mu is None else mu[columns]
-        # Sum of load and electroadhesive force, N.
+        # Friction coefficient times the sum of load and electroadhesive force, N
         normal = load + stress * m[0]
         if kind == "rms":
             normal = np.sqrt(load * load + 2.0 * load * stress * m[0] + stress * stress * m[1])
-        return np.asarray(friction * normal if signal == "f_t" else friction * normal / load)
+        force = (gap.values["mu"] if mu is None else mu[columns]) * normal
+        return np.asarray(force if signal == "f_t" else force / load)
 
     def enter(self, level: Level, run: Run, pending: IntArray, good: BoolArray) -> None:
         """Put what is wanted of the scenes that are `good` among `pending` into the task."""
@@ -260,8 +445,7 @@ class Ladder:
             self.task.values[name][self.members[at]] = self.figure(name, moments, at)
         if self.task.traced:
             u, some = self.task.values["u_gap"], run.trace[good, :: level.steps // self.task.points]
-            u[self.members[at], : some.shape[1]] = some
-            u[self.members[at], some.shape[1] :] = np.nan
+            u[self.members[at]] = np.pad(some, ((0, 0), (0, u.shape[1] - some.shape[1])), constant_values=np.nan)
 
     def error(self, level: Level, run: Run, pending: IntArray) -> FloatArray:
         """Estimated error of the scenes `pending`: the largest of all outputs, relative to themselves."""
@@ -283,20 +467,15 @@ class Ladder:
             off = np.abs(run.trace[:, : 2 * run.trace_coarse.shape[1] : 2] - run.trace_coarse).max(axis=1)
             changes.append(off / np.where(peak > 0.0, peak, 1.0))
         # The area's polynomial of the run with half the steps may be another one.
-        change = np.max(changes, axis=0) + run.coarse[-1]
-        share = self._share(level, self.decays[pending], self.least[pending])
-        return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING + 2.0**level.degree * _EPS)
-
-    def _share(self, level: Level, decays: FloatArray, least: FloatArray) -> FloatArray | float:
-        """The error as a share of the change."""
-        if self.form.recording is not None:
-            return _STATED_RECORDED if self.form.cells == len(self.form.stack.layers) else _STATED_DISPERSIVE
-        if self.form.jumping:
-            return _STATED_JUMPING
-        own = _STATED_TRACED if self.task.traced else _STATED
-        share = np.where(2.0 * decays > _STIFF * level.steps, max(own, _STATED_STIFF), own)
+        change, decays = np.max(changes, axis=0) + run.coarse[-1], self.decays[pending]
         # A start away from 0 V asks for more steps than there are decays in a half period, any other for fewer.
-        return np.where(least > decays, _STATED_STARTED, share)
+        more = self.task.traced | (2.0 * decays > _STIFF * level.steps) | (self.least[pending] > decays)
+        share: FloatArray | float = np.where(more, _STATED_MORE, _STATED)
+        if self.form.recording is not None:
+            share = _STATED_RECORDED if self.form.cells == len(self.form.stack.layers) else _STATED_DISPERSIVE
+        elif self.form.jumping:
+            share = _STATED_JUMPING
+        return np.asarray(share * change + tail + 2.0 * closing + _ROUNDING + 2.0**level.degree * _EPS)
 
 
 class Slopes(Ladder):
@@ -326,8 +505,7 @@ class Slopes(Ladder):
         moved = {path: np.tile(array, (2, len(task.paths), 1)) for path, array in self.scenes.items()}
         for k, together in enumerate(task.paths.values()):
             for path in together:
-                for side, sign in enumerate((-1.0, 1.0)):
-                    moved[path.lower()][side, k] *= 1.0 + sign * STEP
+                moved[path.lower()][:, k] *= [[1.0 - STEP], [1.0 + STEP]]
         self.scenes = {path: array.ravel() for path, array in moved.items()}
         self.table = table_of(form, self.scenes)
 
@@ -352,10 +530,7 @@ class Slopes(Ladder):
         return np.asarray(_STATED_SLOPES * change + cut + tail + noise / STEP)
 
     def _changes(self, mean: FloatArray, pending: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Changes of outputs by each parameter, for all of it, shape (n_output, n_parameter, n), and relative to them.
-
-        `mean` is the mean of u^2 A in all copies of the scenes.
-        """
+        """Changes of outputs by all of each parameter (n_output, n_parameter, n), and relative to the outputs."""
         columns, outputs = self._columns(pending), self.task.outputs
         values = np.array([self.figure(name, mean[None], columns) for name in outputs])
         low, high = np.moveaxis(values.reshape(len(outputs), 2, len(self.task.paths), -1), 1, 0)
