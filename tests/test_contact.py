@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import mpmath as mp
 import numpy as np
@@ -14,9 +13,6 @@ from hypothesis import strategies as st
 import fingerspice as fs
 from analytic import TABLE1, Parameters, area_mp, contact, jkr_area, jkr_parameters, work_factor
 from fingerspice.circuit.statespace import build_stack
-from fingerspice.engine.one_area.rows import polynomial_rows
-from fingerspice.engine.one_area.system import area_error, area_missed, area_polynomial
-from fingerspice.numerics.lobatto import ROWS
 from fingerspice.physics.contact import Contact, inverse_area, ridge_area, universal_curve
 from fingerspice.physics.materials import SKIN_LADDER
 from scenes import cases, table1, table1_deck
@@ -179,32 +175,6 @@ def test_the_curve_agrees_with_the_exact_area_over_its_range_and_beyond_its_end(
         assert inverse_area(u, curve)[0] * ridge_area(u, packed) == pytest.approx(1.0, abs=1e-13)
     for u in np.array([0.2, 0.99, 1.0, 1.01, 2.9]) * u_max:
         assert abs(inverse_area(u, curve)[0] * area_mp(u)[1] - 1) < 1e-13
-
-
-@cache
-def inverse_mp(u: float) -> mp.mpf:
-    return 1 / area_mp(u)[1]
-
-
-@pytest.mark.parametrize("decade", [-4, -6, -8, -9])
-@pytest.mark.parametrize("u_source", [200.0, 400.0, 600.0, 2000.0])
-def test_what_steps_evaluate_of_the_area_misses_no_more_than_the_run_asks_for(u_source: float, decade: int) -> None:
-    """The polynomial or the longer series, both of whole rows, and its derivative: against Eqs. 1 to 4 to 40 digits."""
-    tol = area_error(decade)
-    curve = PAPER.curve(1.3 * u_source)
-    powers, slopes, lo, scale = area_polynomial(curve, tol)
-    assert scale > 0.0, "a series serves"
-    u = np.linspace(0.0, 1.3 * u_source, ROWS)
-    inverse, slope = np.empty(ROWS), np.empty(ROWS)
-    polynomial_rows(powers, lo, scale, -u, -1.0, inverse)
-    polynomial_rows(slopes, lo, scale, -u, -1.0, slope)
-    exact = np.array([float(inverse_mp(x)) for x in u])
-    assert np.abs(inverse / exact - 1.0).max() <= 2.0 * tol + 1e-13
-    assert area_missed(curve, decade) <= tol
-    steps = [(x, 1e-4 * x) for x in u[1:-1]]
-    by_difference = np.array([float((inverse_mp(x + h) - inverse_mp(x - h)) / (2 * h)) for x, h in steps])
-    size = np.abs(by_difference).max()
-    assert slope[1:-1] * scale == pytest.approx(by_difference, abs=size * max(1e-6, 1e4 * tol))
 
 
 @settings(max_examples=25, derandomize=True, deadline=None)
