@@ -11,7 +11,7 @@ import analytic as ref
 import fingerspice as fs
 from batches import check, population, singles, singly
 from fingerspice.circuit.circuit import Circuit
-from scenes import cases, table1
+from scenes import cases, shipped, table1
 
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 OUTPUTS = ("f_el_mean", "f_el_mean_periodic", "f_t_rms", "u_gap_rms")
@@ -297,7 +297,7 @@ def test_what_lockstep_cannot_do_goes_one_by_one(
 
 
 def test_figures_of_several_gaps_have_a_column_each() -> None:
-    circuit = fs.read_netlist("circuits/two_fingers.cir")
+    circuit = shipped("two_fingers")
     gap = circuit.by_device("GAP")[0].name
     found = fs.batch(circuit, {f"{gap}.d": [3e-6, 4e-6]}, rtol=1e-3)
     assert found.f_el_mean.dims == ("scene", "gap")

@@ -20,11 +20,10 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.numerics.linear import first_order_hold
 from fingerspice.solve import closed_form
-from scenes import cases, deck, table1
+from scenes import cases, deck, every_law, table1
 
 AREA = 34.9715871843e-6
 F = 100.0
-every_law = pytest.mark.parametrize("law", ["local", "mobile"])
 
 
 def linear(source: fs.Waveform | str, t: np.ndarray, stop: float, f: float = F, **options: Any) -> fs.Solution:

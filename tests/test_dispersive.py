@@ -13,13 +13,11 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.describe import energy_outside
 from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, Ladder, skin_permittivity, skin_resistivity
-from scenes import table1_deck
+from scenes import CIRCUITS, every_law, table1_deck
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 BAND = np.geomspace(*SKIN_BAND, 401)
 D = 350e-6
 AREA = 34.8e-6
-every_law = pytest.mark.parametrize("law", ["local", "mobile"])
 
 
 def admittivity(f: np.ndarray) -> np.ndarray:

@@ -18,9 +18,8 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from scenes import deck, table1
+from scenes import deck, every_law, table1
 
-every_law = pytest.mark.parametrize("law", ["local", "mobile"])
 T = np.linspace(0.0, 0.0199, 57)
 NS = 1e-9
 CONTACT = "fn=0.5 mu=0.3 alpha=54.4 m_exp=0.52 beta=32 n_exp=1.41 c2=5000"
@@ -344,7 +343,7 @@ def test_a_hundred_thousand_cycles_do_not_drift(shape: str, method: str) -> None
     assert solution.stats["steps"] <= 8 * CYCLES
 
 
-@pytest.mark.parametrize("law", ["local", "mobile"])
+@every_law
 @pytest.mark.parametrize("shape", LONG)
 def test_ten_million_cycles_end_like_the_first_settled_one(shape: str, law: str) -> None:
     source, segments = LONG[shape]
@@ -443,7 +442,7 @@ def stepped_otherwise(case: str, law: str) -> fs.Solution:
 
 
 @pytest.mark.parametrize("rtol", [1e-5, 1e-7, 1e-9])
-@pytest.mark.parametrize("law", ["local", "mobile"])
+@every_law
 @pytest.mark.parametrize("case", HIDDEN)
 def test_nothing_hides_between_the_nodes_of_a_step(case: str, law: str, rtol: float) -> None:
     solution, other = hidden(case, law, rtol=rtol), stepped_otherwise(case, law)

@@ -12,7 +12,6 @@ import pytest
 
 import fingerspice as fs
 from commands import run_here
-from fingerspice.studies.limits import fold_voltage
 from network_reference import Floating
 from scenes import CIRCUITS, cases, deck, every_law, finger, floating, shipped, table1
 
@@ -375,13 +374,3 @@ def test_the_command_sweeps_one_of_several_fingers(monkeypatch: Any, capsys: Any
     )
     (want,) = fs.large_signal(shipped("two_fingers"), [1e3, 5e3], finger="Xlight.Xgap", rtol=1e-7)
     np.testing.assert_allclose(answer["sweeps"][0]["f_el_mean"], want.f_el_mean, rtol=1e-12)
-
-
-def test_a_stack_with_a_resistor_beside_it_folds_where_the_stack_does() -> None:
-    stack = table1("SIN(0 200 100)").replace({"Xgap.d": 200e-9})
-    text = table1("SIN(0 200 100)").text.replace("\nXcoat", "\nRload drive 0 1meg\nXcoat", 1)
-    network = fs.parse_netlist(text).replace({"Xgap.d": 200e-9})
-    one, other = (fold_voltage(c, 200.0, 0.01) for c in (stack, network))
-    assert math.isfinite(one)
-    # Each is found to 1e-3.
-    assert other == pytest.approx(one, rel=2e-3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -194,19 +193,6 @@ def test_an_ideal_jump_is_the_limit_of_a_fast_ramp(law: str) -> None:
     assert off[2] <= 3e-5
     assert 8.0 < off[0] / off[1] < 12.0
     assert 8.0 < off[1] / off[2] < 12.0
-
-
-@every_law
-def test_errors_are_stated_honestly_on_a_mixed_network(law: str) -> None:
-    circuit = floating("SIN(0 200 5k)")
-    t = np.linspace(0.0, 1e-3, 301)
-    exact = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=1e-12)
-    for rtol in (1e-3, 1e-5, 1e-7, 1e-9):
-        s = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=rtol)
-        u, f = np.abs(s.u_gap - exact.u_gap).max(), np.abs(s.f_el - exact.f_el).max()
-        assert u <= s.error.u_gap <= rtol * np.abs(exact.u_gap).max() * 1.01
-        assert f <= s.error.f_el <= rtol * exact.f_el.max() * 1.01
-        assert np.abs(s.q_source - exact.q_source).max() <= s.error.q_source + 1e-12 * np.abs(exact.q_source).max()
 
 
 # Energy ------------------------------------------------------------------------------------------------------
@@ -426,8 +412,7 @@ def test_a_gap_voltage_that_turns_back_right_after_its_zero_keeps_its_branch(see
     source = fs.PWL(tuple(t), tuple(100.0 + 10.0 * rng.standard_normal(t.size)))
     last = float(t[-1])
     at = np.unique(np.concatenate([t, t[:-1] + 3e-8, *(t[9:-1:10] + x for x in np.geomspace(1e-8, 1e-6, 8))]))
-    deck = Path(__file__).parents[1] / "circuits" / "ungrounded_user.cir"
-    circuit = fs.read_netlist(deck).replace({"Vdrive": source})
+    circuit = shipped("ungrounded_user").replace({"Vdrive": source})
     run, implicit = (
         fs.simulate(circuit, t_stop=last, t_eval=at[at <= last], charge_law=law, charge=False, method=method, rtol=1e-8)
         for method in ("auto", "radau")
@@ -507,11 +492,6 @@ def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: str, 
         assert np.abs(run.q_source - stepped.q_source).max() <= run.error.q_source + stepped.error.q_source
         whole = np.abs(run.i_source - stepped.i_source).max()
         assert whole <= 300.0 * rtol * np.abs(stepped.i_source).max()
-        # It goes on from there.
-        after = fs.simulate(circuit, t_stop=13e-3, t_eval=[12.9e-3], charge_law=law, rtol=rtol, start=run)
-        direct = fs.simulate(circuit, t_stop=13e-3, t_eval=[12.9e-3], charge_law=law, rtol=rtol)
-        assert abs(after.u_gap[0] - direct.u_gap[0]) <= 2.0 * (run.error.u_gap + direct.error.u_gap)
-        assert abs(after.q_source[0] - direct.q_source[0]) <= 2.0 * (run.error.q_source + direct.error.q_source)
 
 
 def test_windows_of_a_long_run_join() -> None:
