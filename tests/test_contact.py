@@ -15,7 +15,7 @@ from analytic import TABLE1, Parameters, area_mp, contact, jkr_area, jkr_paramet
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.physics.contact import Contact, inverse_area, ridge_area, universal_curve
 from fingerspice.physics.materials import SKIN_LADDER
-from scenes import cases, table1, table1_deck
+from scenes import cases, dispersive_deck, table1
 
 SEARCH = settings(max_examples=60, derandomize=True, deadline=None)
 MM2 = 1e6
@@ -221,8 +221,7 @@ def test_with_the_total_voltage_held_the_area_is_larger_by_less_than_a_percent(f
 
 
 def test_with_the_total_voltage_held_a_dispersive_skin_counts_with_its_permittivity_above_all_poles() -> None:
-    text = table1_deck(extra=".options work=total").replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
-    circuit = fs.parse_netlist(text)
+    circuit = fs.parse_netlist(dispersive_deck(extra=".options work=total"))
     # The sum of d / eps_r over coating, gap and skin, over the gap's.
     for skin_at, eps in ((None, 1004.82), (100.0, float(SKIN_LADDER.permittivity([100.0])[0]))):
         held = build_stack(circuit, skin_at).contact
