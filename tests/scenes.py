@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,6 +36,12 @@ GAP = {
 def cases(whole: T, few: T) -> T:
     """How many random cases a statistic takes, or which: `whole` in ``make stress``, which sets STRESS, else `few`."""
     return whole if os.environ.get("STRESS") else few
+
+
+def by_turns(values: Iterable[T]) -> list[tuple[T, str]]:
+    """Every value with both laws in ``make stress``, and with one and the other by turns in the suite."""
+    both = [(value, law) for value in values for law in LAWS]
+    return cases(both, [both[2 * i + i % 2] for i in range(len(both) // 2)])
 
 
 def covers(hits: int, count: int) -> bool:

@@ -47,7 +47,8 @@ def test_a_mean_that_half_the_steps_have_by_chance_is_not_believed_at_once() -> 
     check(circuit, parameters, ("f_el_mean",), expected, 1e-6, periods=0.5)
 
 
-@pytest.mark.parametrize(("periods", "rtols"), [(0.5, (1e-4, 1e-6)), (5, (1e-4,)), (1, (1e-6,))])
+# Below 5e-5 one loop serves all.
+@pytest.mark.parametrize(("periods", "rtols"), [(0.5, (4e-5, 1e-6)), (5, (4e-5,)), (1, (1e-6,))])
 @pytest.mark.parametrize("phase", [21.0, 90.0, 250.0])
 def test_what_a_start_away_from_0_v_excites_is_in_the_error(phase: float, periods: float, rtols: Any) -> None:
     rng = np.random.default_rng(5)
@@ -193,7 +194,7 @@ def test_tones_and_the_dispersive_skin(source: str, skin: str) -> None:
         parameters |= {"V2.amplitude": rng.uniform(0.0, 80.0, 20), "V3.phase_deg": rng.uniform(-180.0, 180.0, 20)}
     outputs = FEW if skin else OUTPUTS
     expected = singly(circuit, parameters, outputs)
-    for rtol in ((1e-4, 4e-7, 1e-6) if source == "AM" else (4e-7, 1e-4, 1e-6))[: cases(3, 1)]:
+    for rtol in ((1e-6, 1e-4, 4e-7) if source == "AM" else (4e-7, 1e-4, 1e-6))[: cases(3, 1)]:
         found = check(circuit, parameters, outputs, expected, rtol)
         assert np.all(found.status == 0)
 

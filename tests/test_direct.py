@@ -20,7 +20,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.numerics.linear import first_order_hold
 from fingerspice.solve import closed_form
-from scenes import cases, deck, every_law, table1
+from scenes import by_turns, cases, deck, every_law, table1
 
 AREA = 34.9715871843e-6
 F = 100.0
@@ -140,8 +140,7 @@ SCENES = {
 }
 
 
-@every_law
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(("name", "law"), by_turns(SCENES))
 def test_any_source_gives_the_reference_s_voltages_charge_and_current(name: str, law: str) -> None:
     source, segments, stop = SCENES[name]
     t = np.sort(np.append(np.random.default_rng(2).uniform(0.0, stop, 80), [0.0, 0.999 * stop]))
@@ -160,8 +159,7 @@ def test_any_source_gives_the_reference_s_voltages_charge_and_current(name: str,
 # Charge -----------------------------------------------------------------------------------------------------
 
 
-@every_law
-@pytest.mark.parametrize("r_coat", ["0.2meg", "1", "inf"])
+@pytest.mark.parametrize(("r_coat", "law"), by_turns(["0.2meg", "1", "inf"]))
 @pytest.mark.parametrize("name", ["chirp", "AM", "Exp"])
 def test_the_charge_is_what_every_layer_stores_and_leaks(name: str, r_coat: str, law: str) -> None:
     source, segments, stop = SCENES[name]

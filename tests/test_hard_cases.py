@@ -18,7 +18,7 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from scenes import deck, every_law, table1
+from scenes import by_turns, deck, every_law, table1
 
 T = np.linspace(0.0, 0.0199, 57)
 NS = 1e-9
@@ -63,9 +63,8 @@ SHAPES = {
 }
 
 
-@every_law
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("case", LEAKS)
+@pytest.mark.parametrize(("case", "law"), by_turns(LEAKS))
 def test_extreme_leaks_are_solved_without_a_step_explosion(case: str, shape: str, law: str) -> None:
     (r_coat, r_gap), (source, segments) = LEAKS[case], SHAPES[shape]
     coat, gap, skin = ref.table1_layers(100.0)
@@ -115,9 +114,8 @@ JUMPS = {
 }
 
 
-@every_law
 @pytest.mark.parametrize("given", ["outputs of the deck", "outputs asked for"])
-@pytest.mark.parametrize("case", JUMPS)
+@pytest.mark.parametrize(("case", "law"), by_turns(JUMPS))
 def test_both_one_sided_values_of_a_jump_are_right(case: str, given: str, law: str) -> None:
     points = JUMPS[case]
     source = fs.PWL(*zip(*points, strict=True))
@@ -175,8 +173,7 @@ def around(points: list[tuple[float, float]]) -> np.ndarray:
 EDGE_ROUNDED = 2.0 * float(np.spacing(3e-3)) * 200.0 / NS
 
 
-@every_law
-@pytest.mark.parametrize("width", [NS, 20e-6, 2e-3], ids=["1 ns", "20 us", "2 ms"])
+@pytest.mark.parametrize(("width", "law"), by_turns([NS, 20e-6, 2e-3]))
 @pytest.mark.parametrize("kind", ["PWL", "deck"])
 def test_declared_edges_of_a_nanosecond_are_not_missed(kind: str, width: float, law: str) -> None:
     points = pulse(3e-3, width)
@@ -442,8 +439,7 @@ def stepped_otherwise(case: str, law: str) -> fs.Solution:
 
 
 @pytest.mark.parametrize("rtol", [1e-5, 1e-7, 1e-9])
-@every_law
-@pytest.mark.parametrize("case", HIDDEN)
+@pytest.mark.parametrize(("case", "law"), by_turns(HIDDEN))
 def test_nothing_hides_between_the_nodes_of_a_step(case: str, law: str, rtol: float) -> None:
     solution, other = hidden(case, law, rtol=rtol), stepped_otherwise(case, law)
     peak = np.abs(other.u_gap).max()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import analytic
 import fingerspice as fs
 from network_reference import Floating, Nodal, Tone
-from scenes import COAT, GAP, assignments, deck, every_law, finger, floating, shipped
+from scenes import COAT, GAP, assignments, by_turns, deck, every_law, finger, floating, shipped
 
 # Linear networks ---------------------------------------------------------------------------------------------
 
@@ -115,8 +115,9 @@ def test_two_sources_in_two_branches_superpose() -> None:
 # The same stack as a network ---------------------------------------------------------------------------------
 
 
-@every_law
-@pytest.mark.parametrize("source", ["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)", "SIN(60 120 5k)"])
+@pytest.mark.parametrize(
+    ("source", "law"), by_turns(["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)", "SIN(60 120 5k)"])
+)
 def test_a_stack_beside_a_load_is_the_stack(source: str, law: str) -> None:
     f = 5000.0 if "5k" in source else 100.0
     tran = f".tran {0.005 / f} {2.5 / f} uic"
@@ -135,8 +136,7 @@ def test_a_stack_beside_a_load_is_the_stack(source: str, law: str) -> None:
     assert a.layers == b.layers
 
 
-@every_law
-@pytest.mark.parametrize("source", ["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)"])
+@pytest.mark.parametrize(("source", "law"), by_turns(["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)"]))
 @pytest.mark.parametrize("resistance", ["10m", "1u"])
 def test_a_small_resistor_in_the_way_changes_nothing_and_costs_little(source: str, law: str, resistance: str) -> None:
     tran = ".tran 50u 25m uic"
@@ -440,8 +440,7 @@ MARCHED = {
 }  # fmt: skip
 
 
-@every_law
-@pytest.mark.parametrize("name", MARCHED)
+@pytest.mark.parametrize(("name", "law"), by_turns(MARCHED))
 def test_the_error_stated_covers_the_difference_from_radau(name: str, law: str) -> None:
     lines, stop = MARCHED[name]
     circuit = deck(*lines, f".tran {stop / 500.0!r} {stop!r} uic")
@@ -478,8 +477,9 @@ def test_near_a_fold_radau_takes_over() -> None:
     assert s.method == "radau"
 
 
-@every_law
-@pytest.mark.parametrize("source", ["SIN(0 200 5k)", "SIN(30 120 5k)", "PULSE(120 -120 100u 0 0 100u 200u)"])
+@pytest.mark.parametrize(
+    ("source", "law"), by_turns(["SIN(0 200 5k)", "SIN(30 120 5k)", "PULSE(120 -120 100u 0 0 100u 200u)"])
+)
 def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: str, law: str) -> None:
     circuit = deck(f"Vdrive a 0 {source}", "Rout a b 47k", *finger("b", "0"), "Ccable b 0 150p", ".tran 1u 12.1m uic")
     t = np.linspace(0.0, 12.1e-3, 3001)
