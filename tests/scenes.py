@@ -20,17 +20,9 @@ every_law = pytest.mark.parametrize("law", LAWS)
 T = TypeVar("T")
 COAT = {"d": "1u", "eps_r": 3.9, "r": "0.2meg"}
 GAP = {
-    "d": "3.5u",
-    "eps_r": 1,
-    "r": "1meg",
-    "fn": 0.5,
-    "mu": 0.3,
-    "alpha": 54.4,
-    "m_exp": 0.52,
-    "beta": 32,
-    "n_exp": 1.41,
+    "d": "3.5u", "eps_r": 1, "r": "1meg", "fn": 0.5, "mu": 0.3, "alpha": 54.4, "m_exp": 0.52, "beta": 32, "n_exp": 1.41,
     "c2": 5000,
-}
+}  # fmt: skip
 
 
 def cases(whole: T, few: T) -> T:

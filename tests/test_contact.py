@@ -77,16 +77,6 @@ def test_the_universal_curve_is_exact_to_1e_13_for_any_legal_exponents(m: float,
     assert abs(universal_curve(x, inv_m, p) / exact - 1) < 1e-13
 
 
-@SEARCH
-@given(m=st.floats(0.05, 1.5), over=st.floats(1.05, 10.0), x=st.floats(0.0, 10.0), more=st.floats(1e-3, 1.0))
-def test_the_universal_curve_starts_at_one_and_rises(m: float, over: float, x: float, more: float) -> None:
-    inv_m = 1.0 / m
-    p = 0.5 * (1.0 + inv_m - 1.0 / (m * over))
-    assume(inv_m - p > 0.05)
-    assert universal_curve(0.0, inv_m, p) == 1.0
-    assert universal_curve(x + more, inv_m, p) > universal_curve(x, inv_m, p)
-
-
 @pytest.mark.parametrize(("u", "a0", "a", "f_el", "f_t"), [
     (0.0, 37.9370277247, 34.9715871843, 0.0, 0.15),
     (100.0, 39.1785016088, 34.6867464471, 0.125353654303, 0.187606096291),
