@@ -45,7 +45,7 @@ test: $(VENV)/.test
 
 stress: $(VENV)/.test
 	$(BIN)/python tests/stress.py --scenes 10000 --json benchmarks/results/stress.json
-	STRESS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal $$(grep -l '\bcases(' tests/test_*.py)
+	STRESS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal $$(grep -lE '\b(cases|by_turns)\(' tests/test_*.py)
 
 fuzz: $(VENV)/.test
 	$(BIN)/python tests/fuzz.py --inputs 1000000

@@ -5,19 +5,6 @@ equation numbers in brackets) in its repaired reading. SI units at every functio
 and N occur only in `PAPER_TABLE1`, where they are converted once, and inside `ridge_area_unloaded_mp`, which
 solves Eq. 4 as printed.
 
-What is where
--------------
-parameters   `Parameters`, `TABLE1`, `rho_sc`, `eps_sc`, `Layer`, `table1_layers`, `work_factor`
-contact      `ridge_area_unloaded_mp`, `area_mp` (40 digits); `area`, `contact` (double);
-             `jkr_area`, `jkr_parameters`
-phasors      `phasor_gains`, `gap_gain_eq12`, `gap_phase_eq13`, `gap_limit_eq14`, `gap_limit_eq15`,
-             `coupled_phasor`
-frozen area  `periodic_sine_frozen`, `sine_frozen_from_rest`, `piecewise_constant_frozen`, `square_frozen`
-transients   `transient`, `periodic_state` (collocation, any number of layers); checks: `dop853_voltage`,
-             `dop853_leak`
-mobile law   `mobile_gap_voltage` (bracketed), `FoldError`
-sources      `constant_segments`, `sine_segments`, `square_segments`, `pwl_segments`
-
 How a transient is computed
 ---------------------------
 State: the leaked charges w_x (per area under `local`, total under `mobile`), so no derivative of U is
@@ -48,9 +35,7 @@ from scipy.integrate import DOP853
 from scipy.optimize import brentq
 from scipy.special import roots_jacobi, roots_legendre
 
-# ----------------------------------------------------------------------------------------------------------
-# 1. Parameters and materials
-# ----------------------------------------------------------------------------------------------------------
+# 1. Parameters and materials ---------------------------------------------------------------------------------
 
 PAPER_TABLE1 = {
     "mu0": 0.3, "F_N_N": 0.5, "eps_r_i": 3.9, "eps_r_a": 1.0, "eps0": 8.854e-12,
@@ -159,24 +144,14 @@ def work_factor(freq: float, params: Parameters = TABLE1) -> float:
     return total / (p.d_a / p.eps_a)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# 2. Contact
-# ----------------------------------------------------------------------------------------------------------
+# 2. Contact --------------------------------------------------------------------------------------------------
 
 
 def ridge_area_unloaded_mp(u: float, params: Parameters = TABLE1, dps: int = 40, k: float = 1.0) -> mp.mpf:
-    """A_R0 at gap voltage u: the root of Eq. 4 as repaired (square root over all of it), to `dps` digits.
+    """A_R0 (m^2) at gap voltage u (V): the root of Eq. 4 as repaired (square root over all of it), to `dps` digits.
 
-    Parameters
-    ----------
-    u : gap voltage, V (only its magnitude matters).
-    params : the finger.
-    dps : decimal digits of the result.
-    k : work-of-adhesion factor, 1 (gap voltage held) or `work_factor` (total voltage held).
-
-    Returns
-    -------
-    mpf, m^2. Inside, lengths are in mm and w in N/mm, the paper's units.
+    `k` is 1 (gap voltage held) or `work_factor` (total voltage held). Inside, lengths are in mm and w in N/mm, the
+    paper's units.
     """
     with mp.workdps(dps + 15):
         m, n, force = mp.mpf(params.m), mp.mpf(params.n), mp.mpf(params.force_normal)
@@ -259,20 +234,11 @@ def _contact_constants(params: Parameters, k: float) -> tuple[float, float, floa
 
 
 def contact(v: np.ndarray | float, params: Parameters = TABLE1, k: float = 1.0) -> tuple[np.ndarray, ...]:
-    """Contact at gap voltage magnitude v, in double precision, from the definition by Newton (no table).
+    """A_R0 (m^2, Eq. 4), A_R (m^2, Eqs. 1, 3), dA_R/dv (m^2/V) and F_el (N, Eqs. 1, 2) at gap voltages |u_a| = v (V).
 
-    Parameters
-    ----------
-    v : array, V. The magnitude |u_a|. Negative values give the analytic continuation of the branch v > 0
-        through v = 0 (A is smooth in v, with a kink only in |u|); it is cut off where the universal X falls
-        below -0.9.
-    params : the finger.
-    k : work-of-adhesion factor.
-
-    Returns
-    -------
-    a0, a, da_dv, f_el : arrays: A_R0 in m^2 (Eq. 4), A_R in m^2 (Eqs. 1, 3), dA_R/dv in m^2/V, F_el in N
-        (Eqs. 1, 2).
+    In double precision, from the definition by Newton (no table). Negative v give the analytic continuation of the
+    branch v > 0 through v = 0 (A is smooth in v, with a kink only in |u|), cut off where the universal X falls below
+    -0.9.
     """
     v = np.asarray(v, dtype=float)
     p, a_hertz, x_per_u, sigma_per_u2, c = _contact_constants(params, k)
@@ -323,19 +289,10 @@ def area_primitive(u: np.ndarray | float, params: Parameters = TABLE1, k: float 
 
 
 def jkr_parameters(radius: float, e_star: float) -> tuple[float, float, float, float]:
-    """(m, n, alpha, beta) that make Eqs. 5, 6 the Hertz contact of a sphere.
+    """m, n, alpha (m^2 / N^(2/3)) and beta (m) that make Eqs. 5, 6 the Hertz contact of a sphere of R (m) and E* (Pa).
 
     Hertz: a^3 = 3 F R / (4 E*), so A = pi a^2 = pi (3 R / (4 E*))^(2/3) F^(2/3): m = 2/3 and alpha;
     delta = a^2 / R, so A = pi R delta: n = 1 and beta = pi R.
-
-    Parameters
-    ----------
-    radius : R, m.
-    e_star : E*, Pa.
-
-    Returns
-    -------
-    m, n, alpha (m^2 / N^(2/3)), beta (m).
     """
     return 2.0 / 3.0, 1.0, math.pi * (3.0 * radius / (4.0 * e_star)) ** (2.0 / 3.0), math.pi * radius
 
@@ -351,9 +308,7 @@ def jkr_area(force: float, w: float, e_star: float, radius: float) -> float:
     return math.pi * a3 ** (2.0 / 3.0)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# 3. Phasors (frozen area, and the mean-area coupling)
-# ----------------------------------------------------------------------------------------------------------
+# 3. Phasors (frozen area, and the mean-area coupling) --------------------------------------------------------
 
 
 def phasor_gains(f: float, a: float, layers: Sequence[Layer]) -> np.ndarray:
@@ -431,17 +386,9 @@ class CoupledPhasor:
 
 
 def coupled_phasor(f: float, u0: float, params: Parameters = TABLE1, *, k: float = 1.0) -> CoupledPhasor:
-    """Phasor solution with the mean-area coupling A = g(U_a0 / sqrt 2), iterated to rounding.
+    """Phasors at f (Hz) and a source of u0 (V) with the mean-area coupling A = g(U_a0 / sqrt 2), iterated to rounding.
 
-    Parameters
-    ----------
-    f : frequency, Hz; the skin is evaluated there.
-    u0 : source amplitude, V.
-    params, k : as in `transient`.
-
-    Returns
-    -------
-    CoupledPhasor. The mean force is eps0 eps_a U_a0^2 A / (4 d_a^2).
+    The skin is evaluated at f. The mean force is eps0 eps_a U_a0^2 A / (4 d_a^2).
     """
     layers = table1_layers(f, params)
     a, last = float(area(0.0, params, k)), math.inf
@@ -457,9 +404,7 @@ def coupled_phasor(f: float, u0: float, params: Parameters = TABLE1, *, k: float
     return CoupledPhasor(gains, a, mean)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# 4. Frozen area: exact linear responses (mpmath)
-# ----------------------------------------------------------------------------------------------------------
+# 4. Frozen area: exact linear responses (mpmath) -------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -546,22 +491,10 @@ def piecewise_constant_frozen(
     *,
     periodic: bool = False,
 ) -> np.ndarray:
-    """Exact layer voltages of the frozen stack under a piecewise-constant source, from the uncharged state.
+    """Exact layer voltages (len(t_out), n) of the frozen stack under a piecewise-constant source, from 0 V on.
 
-    A jump of the source splits by 1/c_x.
-
-    Parameters
-    ----------
-    edges : times t_0 < t_1 < ... < t_n, s; level k holds on [t_k, t_(k+1)).
-    levels : source voltages, V, length n.
-    t_out : output times in [t_0, t_n], s; values at an edge are right-hand values (at t_n: left-hand).
-    a : area, m^2.
-    layers : the stack.
-    periodic : return the periodic state of period t_n - t_0 instead.
-
-    Returns
-    -------
-    array (len(t_out), n_layers), V, correctly rounded for all practical purposes.
+    Level k (V) holds on [t_k, t_(k+1)) of the edges (s). A jump of the source splits by 1/c_x; values at an edge are
+    right-hand ones (at the last: left-hand). With `periodic` the state is that of the edges' period instead.
     """
     circuit = _FrozenCircuit(layers, a)
     n = len(layers)
@@ -629,9 +562,7 @@ def sine_frozen_from_rest(
         return np.array([_as_float(steady(t) + circuit.advance(rest, t)) for t in t_out])
 
 
-# ----------------------------------------------------------------------------------------------------------
-# 5. Sources: segments (t0, t1, U, dU/dt), smooth on each closed segment
-# ----------------------------------------------------------------------------------------------------------
+# 5. Sources: segments (t0, t1, U, dU/dt), smooth on each closed segment --------------------------------------
 
 Waveform = Callable[[np.ndarray], np.ndarray]
 Segment = tuple[float, float, Waveform, Waveform]
@@ -680,20 +611,11 @@ def pwl_segments(points: Sequence[tuple[float, float]]) -> list[Segment]:
     return out
 
 
-# ----------------------------------------------------------------------------------------------------------
-# 6. Mobile law: the scalar equation and its fold
-# ----------------------------------------------------------------------------------------------------------
+# 6. The stack as an ODE in the leaked charges ----------------------------------------------------------------
 
 
 class FoldError(ValueError):
-    """The `mobile` law has no gap voltage for the given source and stored charge.
-
-    Attributes
-    ----------
-    margin : V, negative: largest value of the (sign-normalised) residual; the source or the leaked part
-        would have to move by that much for a solution to exist.
-    u_gap : V, where that maximum lies: the gap voltage at the fold nearest to the given data.
-    """
+    """The `mobile` law has no gap voltage: by how much the source is past the fold (V, negative), and the fold (V)."""
 
     def __init__(self, margin: float, u_gap: float) -> None:
         super().__init__(f"mobile law: no gap voltage, {margin:.6g} V beyond the fold at u_a = {u_gap:.6g} V")
@@ -775,11 +697,6 @@ def mobile_gap_voltage(
         while residual(high) < 0.0:
             high *= 2.0
     return s * float(brentq(residual, low, high, xtol=1e-14 * max(abs(p), abs(kk)), rtol=1e-15))
-
-
-# ----------------------------------------------------------------------------------------------------------
-# 7. The stack as an ODE in the leaked charges
-# ----------------------------------------------------------------------------------------------------------
 
 
 class _NoStep(RuntimeError):
@@ -983,9 +900,7 @@ class _Stack:
         return self.c[self.gap] * area_primitive(u, self.params, self.k)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# 8. Collocation
-# ----------------------------------------------------------------------------------------------------------
+# 7. Collocation ----------------------------------------------------------------------------------------------
 
 
 class _Nodes:
@@ -1064,26 +979,15 @@ class Fold:
 
 @dataclass(frozen=True)
 class Transient:
-    """Result of `transient`.
+    """Result of `transient`."""
 
-    Attributes
-    ----------
-    t : (m,) output times, s.
-    u : (m, n_layers) layer voltages, V; right-hand values at jumps; NaN after a fold.
-    area : (m,) ridge area, m^2.
-    force : (m,) electroadhesive force F_el, N.
-    q : (m,) charge through the terminals since before the start (a jump at the start is included), C.
-    fold : Fold or None.
-    zeros : times of the zero crossings of u_a that ended a step, s.
-    """
-
-    t: np.ndarray
-    u: np.ndarray
-    area: np.ndarray
-    force: np.ndarray
-    q: np.ndarray
+    t: np.ndarray  # (m,) output times, s
+    u: np.ndarray  # (m, n_layers) layer voltages, V; right-hand values at jumps; NaN after a fold
+    area: np.ndarray  # (m,) ridge area, m^2
+    force: np.ndarray  # (m,) electroadhesive force F_el, N
+    q: np.ndarray  # (m,) charge through the terminals since before the start, a jump at the start included, C
     fold: Fold | None
-    zeros: tuple[float, ...]
+    zeros: tuple[float, ...]  # times of the zero crossings of u_a that ended a step, s
     stack: _Stack = field(repr=False)
     nodes: _Nodes = field(repr=False)
     steps: tuple[_Step, ...] = field(repr=False)
@@ -1468,40 +1372,22 @@ def transient(
 ) -> Transient:
     """Transient of N layers in series under an ideal source, to about 1e-13 of the peak voltage.
 
-    Parameters
-    ----------
-    segments : (t0, t1, U, ...) in order, without holes; U(t) takes arrays in s and gives V, smooth on [t0,
-        t1]; a number stands for a constant. Jumps of U are allowed only between segments. Further entries
-        (dU/dt) are ignored here.
-    t_out : output times, s.
-    law : 'local' or 'mobile': what the area does to the charge.
-    params : the finger: contact, and the default stack.
-    freq : Hz, where the skin of the default stack is evaluated (required unless `layers` is given).
-    layers, gap : another stack and the index of its gap.
-    area_mode : 'coupled' (A = g(|u_a|) at every instant), 'frozen' (A = g(0), friction included) or an area
-        in m^2.
-    k : work-of-adhesion factor, see `work_factor`.
-    start : 'uncharged' (all layers at 0 V; U(t0) then jumps in, split by 1/c_x), 'dc' (operating point of
-        U(t0)), or the layer voltages before t0 in V, whose sum is U before t0.
-    method, stages, tol : collocation family 'radau' or 'gauss', its stages, and the bound on the last two
-        Legendre coefficients of every step relative to the peak source (or start) voltage.
+    `segments` are (t0, t1, U, ...) in order, without holes, U smooth on each and a function of arrays in s, or a
+    number. The skin of the default stack is evaluated at `freq` (Hz); `layers` and `gap` are another stack and the
+    index of its gap. `area_mode` is 'coupled' (A = g(|u_a|) at every instant), 'frozen' (A = g(0), friction included)
+    or an area in m^2; `start` is 'uncharged' (all layers at 0 V; U(t0) then jumps in, split by 1/c_x), 'dc' (operating
+    point of U(t0)), or the layer voltages before t0 in V. `method`, `stages` and `tol` are the collocation family
+    'radau' or 'gauss', its stages, and the bound on the last two Legendre coefficients of every step relative to the
+    peak source (or start) voltage. Values at a jump are right-hand values; at the last time, left-hand ones. Under
+    `mobile` a fold ends the run: `fold` says where, later outputs are NaN.
 
-    Returns
-    -------
-    Transient. Values at a jump are right-hand values; at the last time, left-hand ones. Under `mobile` a
-    fold ends the run: `fold` says where, later outputs are NaN.
-
-    Notes
-    -----
     Charge: i = A D' = c_a A u_a' + u_a / R_a, so q = c_a (G(u_a) - G(u_a before)) + int u_a / R_a dt with G
     the primitive of A(|u|), exact also across jumps (`local`); c_a A u_a replaces c_a G under `mobile`.
 
     Accuracy, all relative to the peak (Table 1 at 200 V and 2 kV, 100 Hz and 5 kHz, sine, square and ramps
     with jumps, both laws): Radau 12 against Gauss 16 and Radau 9 agree to 1.2e-15 in u, 3e-15 in q, 1.4e-15
-    in F_el; against DOP853 at rtol 1e-13, in voltage form to 1.6e-13 and in leaked-charge form to 4e-13 (its
-    own error, and 1.5e-11 where it crosses a 0.1 us ramp in one step: 1e-15 at rtol 3e-14); against 30-digit
-    extrapolation with Eq. 4 solved in mpmath (0.4 ms at 100 Hz, 80 us at 5 kHz), 1.5e-16; frozen area against
-    the mpmath exponentials, 5e-15 (R_i = 1 ohm included). 500 periods at 5 kHz: 4e-15 in u. Zeros of u_a are
+    in F_el; against DOP853 at rtol 1e-13, in voltage form, to 1.6e-13 (its own error); frozen area against the mpmath
+    exponentials, 5e-15 (R_i = 1 ohm included). 500 periods at 5 kHz: 4e-15 in u. Zeros of u_a are
     hit to 1.2e-15 of the peak. Fold times: 1e-11 of the period where u_a runs into the fold (10 nm gap), 1e-7
     of the period at F_N = 1e-4 N (slaved gap).
     """
@@ -1554,17 +1440,9 @@ def periodic_state(
     t_out: Sequence[float] = (),
     **options: object,
 ) -> Transient:
-    """Periodic steady state under a periodic source, as one period of a `Transient`.
+    """One period, that of `segments`, whose start reproduces its end (to about 1e-13 of the peak voltage).
 
-    Parameters
-    ----------
-    segments : one period of the source, from t = t0 to t0 + T.
-    t_out : output times within the period, s.
-    Others as in `transient`.
-
-    Returns
-    -------
-    Transient over one period whose start reproduces its end (to about 1e-13 of the peak voltage).
+    Arguments are as in `transient`.
     """
     if layers is None:
         if freq is None:
@@ -1601,9 +1479,7 @@ def periodic_state(
     return transient(segments, t_out, start=u, **common)
 
 
-# ----------------------------------------------------------------------------------------------------------
-# 9. The same equations by DOP853, in two other forms: the check of section 8
-# ----------------------------------------------------------------------------------------------------------
+# 8. The same equations by DOP853, in two other forms: the check of section 7 ------------------------------------
 
 
 @np.errstate(all="ignore")

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import gc
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+import fingerspice as fs
 from commands import QUICK, Command, run_here
 from deck_edits import edited
 from ngspice_tools import WITHOUT
+from scenes import shipped, table1
 
 
 @pytest.fixture
@@ -22,6 +25,16 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
     threshold = gc.get_threshold()
     yield lambda *arguments: run_here(monkeypatch, capsys, *arguments)
     gc.set_threshold(*threshold)
+
+
+def pytest_configure() -> None:
+    """Of several workers one compiles what steps stacks, and one what steps networks, which else all would at once."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if worker == "gw0":
+        for method in ("exponential", "radau"):
+            fs.simulate(table1(), t_stop=1e-3, method=method)
+    elif worker == "gw1":
+        fs.simulate(shipped("amplifier"), t_stop=1e-4, method="exponential")
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,22 +20,20 @@ every_law = pytest.mark.parametrize("law", LAWS)
 T = TypeVar("T")
 COAT = {"d": "1u", "eps_r": 3.9, "r": "0.2meg"}
 GAP = {
-    "d": "3.5u",
-    "eps_r": 1,
-    "r": "1meg",
-    "fn": 0.5,
-    "mu": 0.3,
-    "alpha": 54.4,
-    "m_exp": 0.52,
-    "beta": 32,
-    "n_exp": 1.41,
+    "d": "3.5u", "eps_r": 1, "r": "1meg", "fn": 0.5, "mu": 0.3, "alpha": 54.4, "m_exp": 0.52, "beta": 32, "n_exp": 1.41,
     "c2": 5000,
-}
+}  # fmt: skip
 
 
 def cases(whole: T, few: T) -> T:
     """How many random cases a statistic takes, or which: `whole` in ``make stress``, which sets STRESS, else `few`."""
     return whole if os.environ.get("STRESS") else few
+
+
+def by_turns(values: Iterable[T]) -> list[tuple[T, str]]:
+    """Every value with both laws in ``make stress``, and with one and the other by turns in the suite."""
+    both = [(value, law) for value in values for law in LAWS]
+    return cases(both, [both[2 * i + i % 2] for i in range(len(both) // 2)])
 
 
 def covers(hits: int, count: int) -> bool:

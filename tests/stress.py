@@ -385,23 +385,6 @@ def _judged(seed: int, number: int) -> tuple[int, Verdict | None, str, float]:
     return number, verdict, wrong, time.perf_counter() - begin
 
 
-def again(file: Path) -> int:
-    """Judge again the scenes that a file of counts calls wrong, and put their ends into it; 1 where one is wrong."""
-    data = json.loads(file.read_text(encoding="utf-8"))
-    for number in map(int, tuple(data["wrong"])):
-        _, verdict, error, _ = _judged(data["seed"], number)
-        if verdict is None:
-            data["wrong"][str(number)] = error
-            print(f"scene {number}: {error}")
-            continue
-        del data["wrong"][str(number)]
-        data["counts"]["WRONG"] -= 1
-        data["counts"][verdict.end] = data["counts"].get(verdict.end, 0) + 1
-        data.setdefault("judged_again", {})[str(number)] = verdict.end
-    file.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
-    return 1 if data["wrong"] else 0
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Judge scenes, tell the wrong ones, count all; 1 where one was wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -410,10 +393,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="processes")
     parser.add_argument("--json", type=Path, help="where to write the counts")
-    parser.add_argument("--again", type=Path, help="judge the wrong scenes of such a file again")
     options = parser.parse_args(arguments)
-    if options.again is not None:
-        return again(options.again)
     counts: collections.Counter[str] = collections.Counter()
     stated: dict[str, dict[int, float]] = {
         name: {} for name in ("u_gap", "f_el", "q_source", "u_gap_peak", "f_el_max", "f_el_mean")

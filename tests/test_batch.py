@@ -6,15 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 
 import analytic as ref
 import fingerspice as fs
 from batches import check, population, singles, singly
 from fingerspice.circuit.circuit import Circuit
-from fingerspice.engine.lockstep import step as lockstep
-from fingerspice.engine.lockstep.step import marks_of
-from scenes import cases, table1
+from scenes import cases, shipped, table1
 
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")
 OUTPUTS = ("f_el_mean", "f_el_mean_periodic", "f_t_rms", "u_gap_rms")
@@ -50,7 +47,8 @@ def test_a_mean_that_half_the_steps_have_by_chance_is_not_believed_at_once() -> 
     check(circuit, parameters, ("f_el_mean",), expected, 1e-6, periods=0.5)
 
 
-@pytest.mark.parametrize(("periods", "rtols"), [(0.5, (1e-4, 1e-6)), (5, (1e-4,)), (1, (1e-6,))])
+# Below 5e-5 one loop serves all.
+@pytest.mark.parametrize(("periods", "rtols"), [(0.5, (4e-5, 1e-6)), (5, (4e-5,)), (1, (1e-6,))])
 @pytest.mark.parametrize("phase", [21.0, 90.0, 250.0])
 def test_what_a_start_away_from_0_v_excites_is_in_the_error(phase: float, periods: float, rtols: Any) -> None:
     rng = np.random.default_rng(5)
@@ -196,7 +194,7 @@ def test_tones_and_the_dispersive_skin(source: str, skin: str) -> None:
         parameters |= {"V2.amplitude": rng.uniform(0.0, 80.0, 20), "V3.phase_deg": rng.uniform(-180.0, 180.0, 20)}
     outputs = FEW if skin else OUTPUTS
     expected = singly(circuit, parameters, outputs)
-    for rtol in ((1e-4, 4e-7, 1e-6) if source == "AM" else (4e-7, 1e-4, 1e-6))[: cases(3, 1)]:
+    for rtol in ((1e-6, 1e-4, 4e-7) if source == "AM" else (4e-7, 1e-4, 1e-6))[: cases(3, 1)]:
         found = check(circuit, parameters, outputs, expected, rtol)
         assert np.all(found.status == 0)
 
@@ -300,7 +298,7 @@ def test_what_lockstep_cannot_do_goes_one_by_one(
 
 
 def test_figures_of_several_gaps_have_a_column_each() -> None:
-    circuit = fs.read_netlist("circuits/two_fingers.cir")
+    circuit = shipped("two_fingers")
     gap = circuit.by_device("GAP")[0].name
     parameters = {f"{gap}.d": [3e-6, 4e-6]}
     found = fs.batch(circuit, parameters, rtol=1e-3)
@@ -380,39 +378,3 @@ def test_bad_input_is_refused_in_one_sentence(parameters: Any, options: dict[str
     with pytest.raises(fs.InputError, match=message) as caught:
         fs.batch(table1(), parameters, **options)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("y", [0.0, 1e-6, 0.3, 5.0, 19.0, 38.0, 39.0, 200.0])
-def test_an_exponential_simpson_step_is_exact_for_a_straight_source_and_a_quadratic(y: float) -> None:
-    h, lanes = 2e-3, 8
-    marks = marks_of(1, 1, 1, 1, 1, lanes)
-    still, moving = np.empty(lockstep.N_WEIGHTS * lanes), np.empty((2, lockstep.N_WEIGHTS * lanes))
-    rates = np.full((1, lanes), y / h)
-    lockstep.weigh(np.full(lanes, h / 2), rates, np.full((1, lanes), 2.0), (still, moving), np.empty((9, lanes)), marks)
-    g = moving[1].reshape(lockstep.N_WEIGHTS, lanes)[:, 3]
-
-    def integral(n: Any, part: float = 1.0) -> float:
-        # Of a step that begins at s = 0, up to a part of it.
-        return float(
-            h * quad(lambda s: np.exp(-y * (part - s)) * n(s), 0.0, part, epsabs=1e-15, points=[0.9 * part])[0]
-        )
-
-    assert g[[lockstep.HALF, lockstep.DECAY]] == pytest.approx(np.exp([-0.5 * y, -y]), rel=1e-12, abs=1e-15)
-    for part, first, last in ((0.5, lockstep.HALF_SOURCE, lockstep.HALF_SOURCE_END),
-                              (1.0, lockstep.SOURCE, lockstep.SOURCE_END)):  # fmt: skip
-        assert g[first] == pytest.approx(2.0 * integral(lambda s: 1.0 - s, part), rel=1e-10)
-        assert g[last] == pytest.approx(2.0 * integral(lambda s: s, part), rel=1e-10)
-
-    def n(s: float) -> float:
-        return 1.0 + s - 2.0 * s**2
-
-    corrected = (lockstep.CORRECT, lockstep.CORRECT_MIDDLE, lockstep.CORRECT_END)
-    found = sum(g[row] * n(s) for row, s in zip(corrected, (0.0, 0.5, 1.0), strict=True))
-    assert found == pytest.approx(integral(n), rel=1e-10)
-    # As predicted from the middle of the step before, which is as long, the start and the middle.
-    curve = 0.5 * ((n(0.5) - n(0.0)) - (n(0.0) - n(-0.5)))
-    found = g[lockstep.PREDICT] * n(0.0) + g[lockstep.PREDICT_MIDDLE] * n(0.5) + g[lockstep.PREDICT_CURVE] * curve
-    assert found == pytest.approx(integral(n), rel=1e-10)
-    curve = n(0.0) - 2.0 * n(-0.5) + n(-1.0)
-    found = g[lockstep.HALF_NOW] * n(0.0) + g[lockstep.HALF_TREND] * (n(0.0) - n(-0.5) + 0.5 * curve)
-    assert found + g[lockstep.HALF_CURVE] * curve == pytest.approx(integral(n, 0.5), rel=1e-10)

@@ -11,10 +11,9 @@ import pytest
 import fingerspice as fs
 from batches import population
 from fingerspice.circuit.circuit import Circuit
-from scenes import cases, table1
+from scenes import cases, shipped, table1
 
 pytestmark = pytest.mark.filterwarnings("ignore:the gap voltage reaches")
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 # Relative step of the differences: truncation about 1e-12 of the force, rounding 1e-15 over the step.
 STEP = 3e-4
 WEIGHTS = {-2: 1.0, -1: -8.0, 1: 8.0, 2: -1.0}
@@ -59,7 +58,7 @@ TWO, CLOCK = {"Xgap.d": [3e-6, 4e-6]}, ("Vdrive.frequency", "Xgap.d")
 OWN, FOLLOWED = ("Xgap.d", "Xcoat.r"), {"Vdrive.frequency": [80.0, 400.0]}
 BY_TURNS, FOLLOW, PERIODIC = {"periods": 3}, {"periods": 3, "skin": "follow"}, {"periodic": True}
 MOBILE = {"library": "fingerspice_mobile.lib"}
-DISPERSIVE = fs.read_netlist(CIRCUITS / "fingerpad_dispersive.cir")
+DISPERSIVE = shipped("fingerpad_dispersive")
 # Status, circuit, parameters of its scenes, paths, `rtol`, and how they run.
 CASES: dict[str, tuple[Any, ...]] = {
     "sine": (0, table1(), THREE, PATHS, (1e-4, 1e-6), BY_TURNS),
@@ -197,7 +196,7 @@ def test_bad_input_is_refused_in_one_sentence(gradients: Any, options: dict[str,
 
 
 def test_two_fingers_are_refused() -> None:
-    two = fs.read_netlist(CIRCUITS / "two_fingers.cir")
+    two = shipped("two_fingers")
     gap = two.by_device("GAP")[0].name
     with pytest.raises(fs.InputError, match="the circuit has 2 GAPs"):
         fs.batch(two, {f"{gap}.d": [3e-6]}, gradients=(f"{gap}.d",))

@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfilt
 import fingerspice as fs
 from batches import check, singly
 from fingerspice.base.errors import InputError
-from scenes import cases, table1, table1_deck
+from scenes import cases, dispersive_deck, table1, table1_deck
 
 RATE, COUNT = 48_000.0, 961
 T_STOP = (COUNT - 1) / RATE
@@ -66,10 +66,8 @@ def test_stated_errors_cover_fingers_that_differ_little(seed: int) -> None:
 
 
 def test_a_dispersive_skin_states_its_error() -> None:
-    text = table1_deck().replace("SKIN d=350u f=100.0", "SKIN_DISPERSIVE d=350u")
-    check_all(
-        recorded(8000.0, fs.parse_netlist(text)), people(cases(16, 6)), (1e-3,), in_lockstep=1.0 - 1e-9, rounding=0.0
-    )
+    circuit = recorded(8000.0, fs.parse_netlist(dispersive_deck()))
+    check_all(circuit, people(cases(16, 6)), (1e-3,), in_lockstep=1.0 - 1e-9, rounding=0.0)
 
 
 def test_threads_and_order_change_no_byte() -> None:

@@ -25,10 +25,9 @@ from fingerspice.engine.collocation import readout
 from fingerspice.solve.problem import MOST_BYTES
 from fingerspice.waveforms import periodic
 from processes import ended, start
-from scenes import table1
+from scenes import CIRCUITS, shipped, table1
 from waveform_cases import CASES, Case
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 GIB = 2**30
 #: What the engine, compiled, and the libraries take; not a tenth of what these requests would.
 ROOM = 4 * GIB
@@ -210,7 +209,7 @@ def test_a_run_with_changed_parameters_leaves_no_cycle(name: str) -> None:
 
 def test_garbage_collection_would_find_a_cycle() -> None:
     with collected() as found:
-        run = fs.simulate(fs.read_netlist(CIRCUITS / "fingerpad.cir"), t_stop=1e-3)
+        run = fs.simulate(shipped("fingerpad"), t_stop=1e-3)
         run.__dict__["own"] = run
         del run
     assert "Solution" in {type(one).__name__ for one in found}

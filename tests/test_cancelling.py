@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
-from scenes import cases, table1
+from scenes import cases, every_law, table1
 
 THREE_PHASES = """Three sources of 50 V, 120 degrees apart
 .include fingerspice.lib
@@ -34,7 +34,7 @@ def quiet(circuit: fs.Circuit, **how: object) -> fs.Solution:
         return fs.simulate(circuit, **how)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("law", ["local", "mobile"])
+@every_law
 @pytest.mark.parametrize("beside", ["", "Rload drive 0 1meg\n"], ids=["stack", "network"])
 def test_a_balanced_drive_is_0_v_and_no_trouble(law: str, beside: str) -> None:
     circuit = fs.parse_netlist(THREE_PHASES.format(beside=beside))

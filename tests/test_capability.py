@@ -13,9 +13,8 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
-from scenes import cases, table1
+from scenes import CIRCUITS, cases, shipped, table1
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 pytestmark = pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
 
 
@@ -79,7 +78,7 @@ def voltage_by_search(circuit: fs.Circuit, mean: float, amplitude: float, f: flo
 
 @pytest.mark.parametrize("f", [125.0, 250.0][: cases(2, 1)])
 def test_behind_an_amplifier_it_is_what_a_direct_search_over_carriers_finds(f: float) -> None:
-    circuit = fs.read_netlist(CIRCUITS / "amplifier.cir")
+    circuit = shipped("amplifier")
     found = fs.capability(circuit, 150.0, carrier=2000.0, frequency=[f], means=5)
     mean, amplitude = float(found.mean[3]), float(found.amplitude[3, 0])
     assert amplitude < 0.9 * (mean - found.smallest_mean)

@@ -12,9 +12,8 @@ import pytest
 
 import fingerspice as fs
 from commands import Command
-from scenes import cases, covers, deck
+from scenes import CIRCUITS, cases, covers, deck, shipped
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 TRUE = {"alpha": 48.0, "m_exp": 0.45, "beta": 40.0, "n_exp": 1.6, "mu": 0.35, "c2": 4000.0}
 FN = np.geomspace(0.1, 2.0, 10)
 DEPTH = np.linspace(0.3, 1.2, 8)
@@ -25,7 +24,7 @@ Columns = dict[str, np.ndarray]
 
 @pytest.fixture(scope="module")
 def circuit() -> fs.Circuit:
-    return fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    return shipped("fingerpad")
 
 
 def resting(fn: np.ndarray) -> np.ndarray:
@@ -237,7 +236,7 @@ def test_bad_requests(circuit: fs.Circuit, tmp_path: Path, data: object, options
 
 
 def test_circuits_without_one_contact_are_refused(circuit: fs.Circuit) -> None:
-    two, data = fs.read_netlist(CIRCUITS / "two_fingers.cir"), {"fn": FN, "area": 1e-6 * resting(FN)}
+    two, data = shipped("two_fingers"), {"fn": FN, "area": 1e-6 * resting(FN)}
     for other, said in (
         (two, "several GAPs; allowed: finger= one of"),
         (circuit.replace({"Xgap.a_fix": 30.0}), r"Xgap.a_fix is 30 mm\^2; allowed: 0"),

@@ -25,10 +25,7 @@ import scipy.integrate
 
 import fingerspice as fs
 from fingerspice.plots.drawing import save
-from scenes import cases, table1
-
-CIRCUITS = Path(__file__).parents[1] / "circuits"
-
+from scenes import cases, every_law, shipped, table1
 
 DRY = """no layer leaks
 Vdrive drive 0 SIN(0 200 100)
@@ -52,15 +49,15 @@ STACKS: dict[str, tuple[Callable[[], fs.Circuit], dict[str, Any]]] = {
     "mobile": (lambda: table1("SQUARE(200 100)", tran="50u 50m uic"), {"charge_law": "mobile"}),
     "linear": (lambda: table1(tran="50u 20m uic"), {"area": "frozen"}),
     "linear chirp": (lambda: table1().replace({"Vdrive": fs.Chirp(200, 20, 2000, 0.02)}), {"area": 35e-6}),
-    "dispersive": (lambda: fs.read_netlist(CIRCUITS / "fingerpad_dispersive.cir"), {"area": "mean", "t_stop": 0.02}),
+    "dispersive": (lambda: shipped("fingerpad_dispersive"), {"area": "mean", "t_stop": 0.02}),
     "algebraic": (lambda: fs.parse_netlist(DRY), {}),
     "function": (lambda: table1().replace({"Vdrive": fs.Function(wobble)}), {"t_stop": 0.02}),
     "samples": (lambda: table1(), {"sources": {"Vdrive": recorded()}, "t_stop": 0.02, "rtol": 1e-6}),
     "radau": (lambda: table1(tran="50u 10m uic"), {"method": "radau", "rtol": 1e-6}),
 }
 NETWORKS: dict[str, tuple[Callable[[], fs.Circuit], dict[str, Any]]] = {
-    "network": (lambda: fs.read_netlist(CIRCUITS / "two_fingers.cir"), {"t_stop": 4e-4, "rtol": 1e-5}),
-    "linear network": (lambda: fs.read_netlist(CIRCUITS / "two_fingers.cir"), {"area": "frozen"}),
+    "network": (lambda: shipped("two_fingers"), {"t_stop": 4e-4, "rtol": 1e-5}),
+    "linear network": (lambda: shipped("two_fingers"), {"area": "frozen"}),
 }
 SCENES = STACKS | NETWORKS
 
@@ -214,7 +211,7 @@ def test_threads_may_run_different_scenes_and_tolerances_of_shared_circuits(righ
 
 
 @pytest.mark.usefixtures("switching")
-@pytest.mark.parametrize("law", ["local", "mobile"])
+@every_law
 def test_threads_may_ask_for_the_periodic_state_of_one_circuit(law: str) -> None:
     expected = steady(table1(), law)
     circuit = table1()

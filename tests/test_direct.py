@@ -14,19 +14,16 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.numerics.linear import first_order_hold, respond
+from fingerspice.numerics.linear import first_order_hold
 from fingerspice.solve import closed_form
-from scenes import cases, deck, table1
+from scenes import by_turns, cases, deck, every_law, table1
 
 AREA = 34.9715871843e-6
 F = 100.0
-every_law = pytest.mark.parametrize("law", ["local", "mobile"])
 
 
 def linear(source: fs.Waveform | str, t: np.ndarray, stop: float, f: float = F, **options: Any) -> fs.Solution:
@@ -143,8 +140,7 @@ SCENES = {
 }
 
 
-@every_law
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(("name", "law"), by_turns(SCENES))
 def test_any_source_gives_the_reference_s_voltages_charge_and_current(name: str, law: str) -> None:
     source, segments, stop = SCENES[name]
     t = np.sort(np.append(np.random.default_rng(2).uniform(0.0, stop, 80), [0.0, 0.999 * stop]))
@@ -163,8 +159,7 @@ def test_any_source_gives_the_reference_s_voltages_charge_and_current(name: str,
 # Charge -----------------------------------------------------------------------------------------------------
 
 
-@every_law
-@pytest.mark.parametrize("r_coat", ["0.2meg", "1", "inf"])
+@pytest.mark.parametrize(("r_coat", "law"), by_turns(["0.2meg", "1", "inf"]))
 @pytest.mark.parametrize("name", ["chirp", "AM", "Exp"])
 def test_the_charge_is_what_every_layer_stores_and_leaks(name: str, r_coat: str, law: str) -> None:
     source, segments, stop = SCENES[name]
@@ -250,6 +245,31 @@ def test_some_of_the_samples_times_are_as_good_as_all(keep: slice) -> None:
     whole = linear(source, t, 400 / 48e3, charge=False)
     some = linear(source, t[keep], float(t[keep][-1]), charge=False)
     assert np.abs(some.u_layer - whole.u_layer[keep]).max() <= 1e-12 * np.abs(values).max()
+
+
+def layered(rng: np.random.Generator, layers: int) -> tuple[fs.Circuit, list[ref.Layer]]:
+    """A stack of random layers at a sine of 10 V and 500 Hz, and its layers as the reference takes them."""
+    d, eps, r = rng.uniform(1e-6, 1e-4, layers), rng.uniform(1.0, 50.0, layers), 10.0 ** rng.uniform(5.0, 7.0, layers)
+    nodes = ["in", *(f"n{i}" for i in range(layers - 1)), "0"]
+    lines = [
+        f"X{i} {nodes[i]} {nodes[i + 1]} area LAYER d={d[i]:.17g} eps_r={eps[i]:.17g} r={r[i]:.17g}"
+        for i in range(layers)
+    ]
+    circuit = deck("V1 in 0 SIN(0 10 500)", *lines, "Varea area 0 40", ".tran 10u 5m uic")
+    return circuit, [ref.Layer(8.854e-12 * e / x, r_total=y) for e, x, y in zip(eps, d, r, strict=True)]
+
+
+# Stretches of the recursion begin after the first sample, every 500.
+@pytest.mark.parametrize("count", [2, 3, 62, 499, 500, 501, 502, 1517])
+@pytest.mark.parametrize("layers", [1, 2, 4, 9])
+def test_any_number_of_samples_and_of_layers_is_the_closed_form(layers: int, count: int) -> None:
+    rng = np.random.default_rng([layers, count])
+    circuit, _ = layered(rng, layers)
+    values, t = rng.normal(0.0, 60.0, count), np.arange(count) / 48e3
+    given = {"sources": {"V1": fs.Samples(values, 48e3)}, "t_eval": t, "t_stop": t[-1]}
+    quick, slow = (fs.simulate(circuit, charge=charge, **given) for charge in (False, True))
+    assert quick.method == slow.method == "linear"
+    assert np.abs(quick.u_layer - slow.u_layer).max() <= 2e-14 * np.abs(values).max()
 
 
 # Ends and starts --------------------------------------------------------------------------------------------
@@ -417,15 +437,7 @@ def test_a_pure_capacitor_stack_follows_the_source_without_delay() -> None:
 @every_law
 @pytest.mark.parametrize("layers", [1, 2, 6, 12])
 def test_any_number_of_layers_from_rest_and_in_the_periodic_state(layers: int, law: str) -> None:
-    rng = np.random.default_rng(layers)
-    d, eps, r = rng.uniform(1e-6, 1e-4, layers), rng.uniform(1.0, 50.0, layers), 10.0 ** rng.uniform(5.0, 7.0, layers)
-    nodes = ["in", *(f"n{i}" for i in range(layers - 1)), "0"]
-    lines = [
-        f"X{i} {nodes[i]} {nodes[i + 1]} area LAYER d={d[i]:.17g} eps_r={eps[i]:.17g} r={r[i]:.17g}"
-        for i in range(layers)
-    ]
-    circuit = deck("V1 in 0 SIN(0 10 500)", *lines, "Varea area 0 40", ".tran 10u 5m uic")
-    stack = [ref.Layer(8.854e-12 * e / x, r_total=y) for e, x, y in zip(eps, d, r, strict=True)]
+    circuit, stack = layered(np.random.default_rng(layers), layers)
     t = np.linspace(0.0, 5e-3, 41)
     run = fs.simulate(circuit, t_eval=t, rtol=1e-10, charge_law=law)
     assert np.abs(run.u_layer - ref.sine_frozen_from_rest(500.0, 10.0, 40e-6, t, stack)).max() <= 1e-9 * 10.0
@@ -438,15 +450,6 @@ def test_any_number_of_layers_from_rest_and_in_the_periodic_state(layers: int, l
 # Response of linear modes to sampled input -------------------------------------------------------------------
 
 DT = 1e-6
-# Stretches of the recursion begin after the first sample.
-BLOCK = 500
-
-
-def system(n, seed=0):
-    """Rates, gains, direct part, weights and state of n modes."""
-    rng = np.random.default_rng(seed)
-    rates = 10.0 ** rng.uniform(2.0, 5.5, n)
-    return rates, rates * rng.uniform(0.5, 2.0, n), 0.3, rng.standard_normal(n), rng.standard_normal(n)
 
 
 def run(u, modes, dt=DT):
@@ -502,46 +505,6 @@ def test_a_million_samples_add_up_no_rounding(rates):
         assert np.all(np.abs(w_end - state) <= 1e-13 * peak)
 
 
-@pytest.mark.parametrize("n", [0, 1, 2, 3, 8, 65])
-def test_any_number_of_modes_and_any_length(n):
-    modes = system(n, n)
-    rng = np.random.default_rng(n)
-    for m in (1, 2, BLOCK // 8, BLOCK - 1, BLOCK, BLOCK + 1, BLOCK + 2, 3 * BLOCK + 17):
-        u = rng.standard_normal(m)
-        y, w_end = run(u, modes)
-        expected, state, peak = extended(u, modes)
-        assert deviation(y, expected) <= 2e-15
-        assert np.all(np.abs(w_end - state) <= 1e-14 * peak)
-
-
-@settings(max_examples=40, deadline=None, derandomize=True)
-@given(
-    st.lists(st.one_of(st.just(0.0), st.floats(-3.0, 18.0).map(lambda x: 10.0**x)), min_size=1, max_size=4),
-    st.lists(st.floats(-1.0, 1.0), min_size=2, max_size=30),
-)
-def test_samples_equal_ramps_in_closed_form(rates, samples):
-    u = np.array([1.0, *samples])
-    rates = np.array(rates)
-    gains, w0 = rates + 1.0 / DT, np.linspace(0.5, 1.0, rates.size)
-    t = DT * np.arange(u.size)
-    terms = np.zeros((u.size - 1, 2, 6))
-    terms[:, 0, 0] = u[:-1]
-    terms[:, 1, 0] = np.diff(u) / np.diff(t)
-    terms[:, 1, 1] = 1.0
-    rows, w_end = respond(rates, gains, t, terms, np.zeros((u.size - 1, 0)), w0, t)
-    y, state = run(u, (rates, gains, -1.0, np.ones(rates.size), w0))
-    assert np.abs(y - (rows.sum(axis=1) - u)).max() <= 1e-14 * rates.size * np.abs(rows).max()
-    assert np.all(np.abs(state - w_end) <= 1e-14 * np.abs(rows).max(axis=0))
-
-
-def test_no_output_depends_on_later_samples():
-    modes = system(3)
-    u = np.random.default_rng(6).standard_normal(4 * BLOCK + 123)
-    whole, _ = run(u, modes)
-    for m in (1, 100, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK + 700, 4 * BLOCK):
-        assert np.array_equal(run(u[:m], modes)[0], whole[:m])
-
-
 def test_silence_after_a_pulse_ends_in_zeros_not_in_denormals():
     u = np.zeros(1_000_000)
     u[:10] = 1.0
@@ -552,22 +515,3 @@ def test_silence_after_a_pulse_ends_in_zeros_not_in_denormals():
         denormal = (y != 0.0) & (np.abs(y) < 2.3e-308)
         # A stretch may end in a few, none begins with them.
         assert np.count_nonzero(denormal) <= 125
-
-
-@pytest.mark.parametrize("n", [1, 2, 3])
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("at", [0, 1, 124, 125, 999, 1000, 1500, 2600])
-def test_what_is_not_finite_stays_and_changes_nothing_before(n, bad, at):
-    rates, gains, direct, weights, w0 = system(n)
-    # One mode forgets at once: exp(-rate dt) is zero.
-    rates[-1] = 1e12
-    modes = rates, gains, direct, weights, w0
-    u = np.random.default_rng(10).standard_normal(2700)
-    expected, _ = run(u, modes)
-    u[at] = bad
-    y, w_end = run(u, modes)
-    assert np.array_equal(y[:at], expected[:at])
-    assert not np.any(np.isfinite(y[at:]))
-    assert not np.any(np.isfinite(w_end))
-    if np.isnan(bad):
-        assert np.all(np.isnan(y[at:]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from pathlib import Path
 
@@ -12,14 +11,12 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.describe import energy_outside
-from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, Ladder, skin_permittivity, skin_resistivity
-from scenes import table1_deck
+from fingerspice.physics.materials import EPS0, SKIN_BAND, SKIN_LADDER, skin_permittivity, skin_resistivity
+from scenes import CIRCUITS, dispersive_deck, every_law, table1_deck
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 BAND = np.geomspace(*SKIN_BAND, 401)
 D = 350e-6
 AREA = 34.8e-6
-every_law = pytest.mark.parametrize("law", ["local", "mobile"])
 
 
 def admittivity(f: np.ndarray) -> np.ndarray:
@@ -34,10 +31,7 @@ def eqs_18_19(f: np.ndarray) -> np.ndarray:
 
 def dispersive(source: str = "SIN(0 200 100)", library: str = "fingerspice.lib") -> fs.Circuit:
     """Table 1's deck with the dispersive skin."""
-    text = table1_deck(source, library=library)
-    changed = re.sub(r"SKIN +d=(\S+) +f=\S+", r"SKIN_DISPERSIVE d=\1", text)
-    assert changed != text
-    return fs.parse_netlist(changed)
+    return fs.parse_netlist(dispersive_deck(source, library=library))
 
 
 def cells() -> tuple[ref.Layer, ...]:
@@ -84,17 +78,6 @@ def test_cells_in_series_are_the_branches_side_by_side() -> None:
     assert min(eps_r.min(), rho.min()) > 0.0
     series = sum(1.0 / (1.0 / r + 2j * np.pi * f * EPS0 * e) for e, r in zip(eps_r, rho, strict=True))
     np.testing.assert_allclose(series * SKIN_LADDER.admittivity(f), 1.0, rtol=1e-12)
-
-
-def test_cells_of_a_single_branch_are_the_roots_of_a_quadratic() -> None:
-    g0, eps, p, k = 2e-5, 300.0, 5e3, 4e-5
-    eps_r, rho = Ladder(g0, eps, (p,), (k,)).cells()
-    c = EPS0 * eps
-    # (g0 + s c)(s + p) + s k = 0
-    roots = np.sort(-np.roots([c, g0 + k + c * p, g0 * p]).real)
-    np.testing.assert_allclose(np.sort(1.0 / (rho * EPS0 * eps_r)), roots, rtol=1e-12)
-    assert rho.sum() == pytest.approx(1.0 / g0, rel=1e-12)
-    assert (1.0 / eps_r).sum() == pytest.approx(1.0 / eps, rel=1e-12)
 
 
 @pytest.mark.parametrize("library", ["fingerspice.lib", "fingerspice_mobile.lib"])
@@ -213,25 +196,6 @@ def test_am_and_noise_are_the_superposition_of_their_phasors() -> None:
     assert np.abs(periodic(noise, t) - want).max() <= 1e-9 * np.abs(want).max()
 
 
-def test_a_chirp_is_the_superposition_of_its_phasors() -> None:
-    # 50 Hz to 3 kHz under a bell that starts and ends below rounding; silence until all charge has leaked.
-    def burst(t: float) -> float:
-        return 200.0 * math.sin(2 * math.pi * (50.0 + 15e3 * t) * t) * math.exp(-(((t - 0.1) / 0.0165) ** 2))
-
-    span, count = 0.6, 2**16
-    run = fs.simulate(
-        dispersive(), sources={"Vdrive": burst}, area=AREA, rtol=1e-11, t_stop=span, t_eval=np.linspace(0, 0.25, 500)
-    )
-    assert run.plan.tier == "linear"
-    grid = np.arange(count) * (span / count)
-    spectrum = np.fft.rfft([burst(x) for x in grid]) / count
-    f = np.arange(1, spectrum.size) / span
-    weights = 2.0 * spectrum[1:] * gap_gain(f)
-    kept = np.abs(weights) > 1e-14 * np.abs(weights).max()
-    want = np.array([(weights[kept] * np.exp(2j * np.pi * f[kept] * x)).real.sum() for x in run.t])
-    assert np.abs(run.u_gap - want).max() <= 1e-9 * np.abs(want).max()
-
-
 @every_law
 @pytest.mark.parametrize("shape", ["sine", "square"])
 def test_the_coupled_run_is_the_independent_references(shape: str, law: str) -> None:
@@ -251,13 +215,6 @@ def test_the_coupled_run_is_the_independent_references(shape: str, law: str) -> 
     # The skin is one layer for its user.
     assert run.layers == ("Xcoat", "Xgap", "Xskin")
     assert np.abs(run.u_layer[:, 2] - exact.u[:, 2:].sum(axis=1)).max() <= rtol * 200.0
-
-
-@every_law
-def test_an_implicit_method_agrees(law: str) -> None:
-    options = {"t_stop": 0.01, "t_eval": np.linspace(0.0, 0.01, 101), "rtol": 1e-8, "charge_law": law}
-    own, other = (fs.simulate(dispersive(), method=m, **options) for m in ("auto", "radau"))
-    assert np.abs(own.u_gap - other.u_gap).max() <= own.error.u_gap + other.error.u_gap
 
 
 def test_phasors_use_the_same_ladder() -> None:

@@ -12,7 +12,7 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 import stress
-from scenes import cases, table1
+from scenes import cases, every_law, table1
 
 N = cases(100, 12)
 PERIODS = 2
@@ -141,7 +141,7 @@ def test_the_stated_error_covers_the_true_one_where_the_area_is_a_long_series(am
         assert np.abs(run.f_el - exact.force).max() <= run.error.f_el <= rtol * exact.force.max()
 
 
-@pytest.mark.parametrize("law", ["local", "mobile"])
+@every_law
 def test_the_errors_of_area_and_friction_follow_from_those_of_voltage_and_force(law: str) -> None:
     t = np.sort(np.random.default_rng(5).uniform(0.0, 2.0 / 300.0, 400))
     exact = ref.transient(triangle(200.0, 300.0), t, law=law, freq=100.0)

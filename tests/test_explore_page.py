@@ -15,11 +15,11 @@ import pytest
 import fingerspice as fs
 from fingerspice.explorer.scene import EXAMPLES
 from fingerspice.explorer.server import static_page
+from scenes import CIRCUITS
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright for Python")
 CHROMIUM = shutil.which("chromium")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 SINE = fs.parse_netlist(EXAMPLES[0].deck)
 
 

@@ -19,7 +19,6 @@ from fingerspice.explorer.scene import EXAMPLES, applied, as_python, before, sce
 from fingerspice.explorer.server import framed
 from test_explore import baked, run_as_python
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 DECKS = {example.name: example.deck for example in EXAMPLES}
 SINE, FINGERS = DECKS["sine"], DECKS["two-fingers"]
 

@@ -14,7 +14,7 @@ from fingerspice.netlist.reader import LIBRARIES, library_text
 from ngspice_tools import CIRCUITS, call_ngspice, run_ngspice
 from random_decks import NETWORKS, SOURCES
 from random_decks import deck as random_deck
-from scenes import cases, deck, table1
+from scenes import cases, deck, shipped, table1
 
 LAWS = ["local", "mobile"]
 SEEDS = range(cases(50, 20))
@@ -247,7 +247,7 @@ def test_the_random_decks_hold_every_device_source_and_directive() -> None:
 @pytest.mark.parametrize("start", ["", " uic"])
 def test_times_of_zero_and_before_the_start_are_the_same_there(source: fs.Waveform, start: str) -> None:
     # ngspice takes PW = 0 for TSTOP, TD1 = 0 for TSTEP and TD2 = 0 for TD1 + TSTEP: by 90 %, and by up to 9.5 %.
-    circuit = fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    circuit = shipped("fingerpad")
     text = circuit.text.replace("50m uic", f"12m{start}")
     assert deviation(fs.parse_netlist(text).replace({"Vdrive": source}))[1] <= 5e-5
 

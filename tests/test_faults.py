@@ -17,9 +17,7 @@ from commands import QUICK, Command
 from deck_edits import edited
 from fingerspice.base.files import write_aside
 from processes import ended, no_room, start
-from scenes import cases
-
-CIRCUITS = Path(__file__).parents[1] / "circuits"
+from scenes import CIRCUITS, cases
 
 COMMANDS = {
     "run": (["run", "pad.cir", "--overwrite", "--out", "out"], ["pad.nc", "pad.png"]),

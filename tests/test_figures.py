@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 
 import fingerspice as fs
-from fingerspice.solve.simulation import simulate
 from fingerspice.studies import figures
 from fingerspice.studies.figures import TABLE1_DECK, table1_circuit
 from scenes import table1
@@ -131,7 +130,7 @@ def test_figs_4_and_5_are_two_periods_of_the_periodic_state(folder: Path, number
 
 
 def test_numbers_of_the_time_responses_are_those_of_a_long_run_and_of_the_papers_figures() -> None:
-    long = simulate(table1(), t_stop=0.1, rtol=1e-8)
+    long = fs.simulate(table1(), t_stop=0.1, rtol=1e-8)
     sine = figures.time_response(fs.Sine, 100.0)
     assert sine.summary()["f_el_mean_periodic"] == pytest.approx(long.summary()["f_el_mean_periodic"], rel=1e-5)
     # The square wave's force is volatile at 100 Hz and nearly constant at 5 kHz.

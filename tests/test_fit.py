@@ -17,16 +17,15 @@ from commands import Command
 from fingerspice.base.errors import InputError
 from fingerspice.studies.fit import circuitfit
 from fingerspice.studies.fit.fitting import Fitted, followed
-from scenes import cases, covers, table1, table1_deck
+from scenes import CIRCUITS, cases, covers, shipped, table1, table1_deck
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 TRUE = {"Xgap.d": 3.1e-6, "Xgap.r": 1.4e6, "Xgap.alpha": 48.0}
 Data = dict[str, np.ndarray]
 
 
 @pytest.fixture(scope="module")
 def circuit() -> fs.Circuit:
-    return fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    return shipped("fingerpad")
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +129,7 @@ def test_what_one_voltage_cannot_tell_is_said(circuit: fs.Circuit) -> None:
 
 
 def test_a_network_is_fitted_by_differences_and_its_skin_follows_the_source() -> None:
-    circuit = fs.read_netlist(CIRCUITS / "amplifier.cir")
+    circuit = shipped("amplifier")
     ends = "gap.d", "skin.f", ".amplitude", ".frequency"
     path, skin, amplitude, frequency = (next(p for p in circuit.parameters if p.endswith(end)) for end in ends)
     gap = 0.9 * circuit.parameters[path].value
@@ -142,7 +141,7 @@ def test_a_network_is_fitted_by_differences_and_its_skin_follows_the_source() ->
 
 
 def test_circuits_that_have_no_such_mean_are_refused(circuit: fs.Circuit) -> None:
-    two = fs.read_netlist(CIRCUITS / "two_fingers.cir")
+    two = shipped("two_fingers")
     for other, said in (
         (two, "the circuit has 2 GAPs; allowed: one"),
         (dataclasses.replace(circuit, tran=None), "the deck has no .tran, and average is 'run'; allowed"),
@@ -400,7 +399,7 @@ def test_the_example_finds_its_finger_and_predicts_another_force(
     assert (tmp_path / "fit_finger.png").stat().st_size > 10_000
     assert covered(found) == len(TRUE)
     middle, low, high = program["predicted"](found)
-    assert low < force_of(fs.read_netlist(CIRCUITS / "fingerpad.cir").replace(dict(TRUE)), 180.0, 300.0) < high
+    assert low < force_of(shipped("fingerpad").replace(dict(TRUE)), 180.0, 300.0) < high
     assert f"force at 180 V and 300 Hz: {1e3 * middle:.4g} mN" in said
     # The force is known better than the area, as the errors of gap and area are correlated.
     area, least, most = program["area_at_rest"](found)

@@ -6,17 +6,15 @@ import re
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import analytic
 import fingerspice as fs
 from ngspice_tools import CIRCUITS, run_ngspice
-from scenes import cases, deck, finger, table1
+from scenes import LAWS, cases, deck, every_law, finger, table1
 from start_reference import deck_of, random_network
 
 pytestmark = pytest.mark.filterwarnings("ignore:.* has no effect here")
 
-LAWS = ("local", "mobile")
 DC_AMPLIFIER = (("1m uic", "1m"), ("SIN(0 200 5k)", "SIN(26 100 5k)"))
 SLOW = ("c2=5000", "c2=5000 tau=50u")
 STEP, STOP = 2e-9, 2e-6
@@ -129,7 +127,7 @@ def test_a_capacitor_with_ic_beside_others_that_ic_lines_give() -> None:
     assert [v["b"], v["c"]] == pytest.approx([b, c], rel=1e-13)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 @pytest.mark.parametrize("top", [0.0, 40.0, -100.0])
 def test_a_charged_cable_shares_its_charge_with_the_finger(law: str, top: float) -> None:
     cable = 250.0
@@ -146,13 +144,13 @@ def test_a_charged_cable_shares_its_charge_with_the_finger(law: str, top: float)
     assert moved == pytest.approx(np.full(3, 1e-9 * (cable - v["drive"])), rel=1e-10)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 def test_a_charged_cable_is_as_in_ngspice(law: str) -> None:
     # Its first step takes the area at the end of what settles, not on the way: 1.2e-4.
     assert apart(shipped("amplifier", ("150p", "150p IC=100")), law) <= 2e-4
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 @pytest.mark.parametrize("initial", [(), (".ic v(skin)=3",)])
 def test_a_capacitor_across_an_ideal_source_moves_nothing(law: str, initial: tuple[str, ...]) -> None:
     lines = ("V1 a 0 SIN(20 50 5k)", *finger("a", "0"), *initial, ".tran 1u 100u uic")
@@ -208,7 +206,7 @@ def test_a_node_that_only_capacitors_reach_starts_where_ic_says() -> None:
     assert start(deck(*lines, ".ic v(b)=7", ".tran 1n 10n"))["b"] == pytest.approx(7.0, rel=1e-13)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 @pytest.mark.parametrize("which", ["amplifier", "stack"])
 def test_a_held_node_is_met_and_the_others_follow(which: str, law: str) -> None:
     if which == "stack":
@@ -243,7 +241,7 @@ def test_the_difference_of_two_nodes_is_node_p_minus_node_n() -> None:
 # Areas with dynamics of their own ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 @pytest.mark.parametrize("changes", [(), DC_AMPLIFIER], ids=["uic", "operating point"])
 def test_ic_of_the_area_starts_one_with_dynamics_of_its_own(law: str, changes: tuple[tuple[str, str], ...]) -> None:
     circuit = shipped("amplifier", SLOW, *changes, extra=".ic v(area)=20")
@@ -254,7 +252,7 @@ def test_ic_of_the_area_starts_one_with_dynamics_of_its_own(law: str, changes: t
     assert apart(circuit, law) <= 5e-5
 
 
-@pytest.mark.parametrize("law", LAWS)
+@every_law
 def test_a_start_from_rest_has_the_area_at_rest_though_the_source_jumps(law: str) -> None:
     lines = ["V1 a 0 PWL(0 60 0 160)", *finger("a", "0", tau="1m"), ".tran 1u 100u"]
     s = fs.simulate(deck(*lines), charge_law=law, t_eval=np.array([0.0, 1e-9]))
@@ -325,14 +323,3 @@ def test_the_other_reading_of_eq_7_starts_the_same_there() -> None:
     circuit = table1(extra=".options work=total\n.ic v(top)=30 v(skin)=10", tran="10u 10m uic")
     for law in LAWS:
         assert apart(circuit, law) <= 1e-4
-
-
-def test_a_run_that_goes_on_from_a_settled_start_is_the_run() -> None:
-    circuit = shipped("amplifier", ("150p", "150p IC=100"))
-    times: NDArray[np.float64] = np.linspace(0.0, 4e-4, 41)
-    whole = fs.simulate(circuit, t_stop=4e-4, t_eval=times, rtol=1e-9)
-    first = fs.simulate(circuit, t_stop=2e-4, rtol=1e-9)
-    rest = fs.simulate(circuit, start=first, t_stop=4e-4, t_eval=times[21:], rtol=1e-9)
-    assert whole.u_gap is not None
-    assert np.abs(rest.u_gap - whole.u_gap[21:]).max() <= 1e-6
-    assert np.abs(rest.q_source - whole.q_source[21:]).max() <= 1e-7 * np.abs(whole.q_source).max()

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fingerspice.numerics.linear import periodic_state, respond
+from fingerspice.numerics.linear import respond
 
 NO_SERIES = np.zeros((1, 0))
 
@@ -95,19 +95,6 @@ def test_every_kind_of_term_from_rest(p, wave):
         assert w_end[0] == rows[-1, 0]
 
 
-@pytest.mark.parametrize(
-    ("rate", "row"),
-    [(3.0, term(2.0, 3, -1.5, 4.0, 0.3)), (0.5, term(1.0, 1, -0.5)), (8.0, term(1.0, 4, 0.5, 9.0, -2.0))],
-)
-def test_the_reference_itself_equals_quadrature(rate, row):
-    c, p, a, omega, phi, _ = row
-    with mp.workdps(30):
-        value = mp.quad(
-            lambda s: c * mp.exp(-rate * (2 - s)) * s**p * mp.exp(a * s) * mp.cos(phi + omega * s), mp.linspace(0, 2, 9)
-        )
-    assert float(value) == pytest.approx(exact_term(rate, row, 2.0).real, rel=1e-15)
-
-
 @pytest.mark.parametrize("off", [0.0, 1e-15, 1e-12, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 3.0])
 @pytest.mark.parametrize("p", [0, 1, 4])
 def test_a_wave_that_decays_as_the_mode_does(p, off):
@@ -171,24 +158,6 @@ def test_a_chebyshev_series_at_any_rate(count):
         assert error(rows, [exact_series(rate, c, length, x) for x in t]) <= 3e-14
 
 
-def test_series_and_terms_add_and_trailing_zeros_change_nothing():
-    rates, gains, edges, t = [0.0, 3.0, 1e4], [1.0, 2.0, 3.0], [0.0, 0.5, 1.25], np.linspace(0.0, 1.25, 21)
-    terms = np.array([[term(2.0), term(1.0, 1)], [term(0.0), term(1.5, 0, 0.0, 9.0)]])
-    series = np.array([[1.0, 0.5, 0.25], [0.3, 0.0, 0.0]])
-    w0 = np.array([1.0, -1.0, 0.5])
-    both = respond(rates, gains, edges, terms, series, w0, t)[0]
-    apart = respond(rates, gains, edges, terms, np.zeros((2, 0)), w0, t)[0]
-    apart = apart + respond(rates, gains, edges, 0.0 * terms, series, 0.0 * w0, t)[0]
-    longer = respond(rates, gains, edges, terms, np.pad(series, ((0, 0), (0, 6))), w0, t)[0]
-    assert np.abs(both - apart).max() <= 1e-15 * np.abs(both).max()
-    assert np.abs(both - longer).max() <= 1e-15 * np.abs(both).max()
-    # The same input as a series alone: tau = (T_0 + T_1) length / 2.
-    ramp = respond(rates, gains, edges, [[term(2.0), term(1.0, 1)]] * 2, np.zeros((2, 0)), w0, t)[0]
-    half = 0.5 * np.diff(edges)
-    as_series = respond(rates, gains, edges, [[term(0.0)]] * 2, np.stack([2.0 + half, half], axis=1), w0, t)[0]
-    assert np.abs(ramp - as_series).max() <= 1e-15 * np.abs(ramp).max()
-
-
 def test_a_chain_of_segments_equals_the_matrix_exponential():
     rates, gains = np.array([0.0, 0.0, 2.0, 2.0, 2.0 + 1e-12, 900.0]), np.array([1.0, -2.0, 3.0, 1.0, 1.0, 900.0])
     edges = np.array([0.5, 0.6, 1.6, 1.601, 3.0])
@@ -212,33 +181,6 @@ def test_a_chain_of_segments_equals_the_matrix_exponential():
         w = (expm(full * (edges[s + 1] - edges[s])) @ y)[:n]
     assert np.all(np.abs(rows - expected) <= 1e-12 * np.abs(expected).max(axis=0))
     assert np.all(np.abs(w_end - w) <= 1e-12 * np.abs(expected).max(axis=0))
-
-
-def test_outputs_on_edges_are_the_same_to_the_bit_on_either_side():
-    edges = np.array([0.0, 0.3, 0.3, 1.0])
-    terms = np.array([[term(2.0, 0, 0.0, 40.0)], [term(1.0)], [term(-1.0, 1, 0.5)]])
-    t = np.array([0.0, 0.3, 0.3, 1.0, 1.0])
-    left = np.array([True, True, False, True, False])
-    w0 = np.array([0.7, -0.2])
-    rows, w_end = respond([1.0, 1e3], [1.0, 1e3], edges, terms, np.zeros((3, 0)), w0, t, left)
-    assert np.array_equal(rows[0], w0)
-    assert np.array_equal(rows[1], rows[2])
-    assert np.array_equal(rows[3], rows[4])
-    assert np.array_equal(rows[4], w_end)
-
-
-def test_no_output_depends_on_which_others_are_asked_for():
-    rng = np.random.default_rng(1)
-    edges = np.linspace(0.0, 1.0, 6)
-    terms = np.array([[term(c, 0, 0.0, 30.0, c)] for c in rng.standard_normal(5)])
-    series = rng.standard_normal((5, 7))
-    arguments = [0.0, 5.0, 1e5], [1.0, 5.0, 1e5], edges, terms, series, [1.0, 2.0, 3.0]
-    t = np.sort(np.concatenate([edges, rng.random(40)]))
-    rows, w_end = respond(*arguments, t)
-    few, same_end = respond(*arguments, t[::3])
-    assert np.array_equal(few, rows[::3])
-    assert np.array_equal(same_end, w_end)
-    assert np.array_equal(rows[-1], w_end)
 
 
 def test_a_hundred_thousand_segments_add_up_no_rounding():
@@ -266,58 +208,3 @@ def test_decayed_states_are_zero_and_never_denormal():
         assert np.all(rows[t >= 2.5] == 0.0)
         assert w_end[0] == 0.0
         assert not np.any((rows != 0.0) & (np.abs(rows) < 2.3e-308))
-
-
-def test_the_periodic_state_of_a_sine_is_its_phasor():
-    f, rates = 50.0, np.array([1e-2, 3.0, 500.0, 1e6, 1e12])
-    omega = 2.0 * np.pi * f
-    w0 = periodic_state(rates, rates, [0.0, 1.0 / f], [[term(3.0, 0, 0.0, omega, 0.4)]], NO_SERIES)
-    expected = (3.0 * np.exp(0.4j) * rates / (rates + 1j * omega)).real
-    # The slowest keeps the rounding of the mean, over what is lost in a period.
-    assert np.all(
-        np.abs(w0 - expected) <= 1e-15 * (10.0 + 1.0 / (rates / f)) * 3.0 * rates / np.hypot(rates, omega) + 1e-15
-    )
-
-
-def test_the_periodic_state_closes():
-    rng = np.random.default_rng(3)
-    rates = np.array([1e-3, 1.0, 1.0, 1.0 + 1e-12, 70.0, 1e5, 1e12])
-    edges = np.array([2.0, 2.1, 2.7, 3.0])
-    terms = np.array([[term(c, 1, -1.0, 6.0, c), term(c)] for c in rng.standard_normal(3)])
-    series = rng.standard_normal((3, 5))
-    w0 = periodic_state(rates, rates, edges, terms, series)
-    rows, w_end = respond(rates, rates, edges, terms, series, w0, np.linspace(2.0, 3.0, 50))
-    assert np.all(np.abs(w_end - w0) <= 1e-14 * np.abs(rows).max(axis=0))
-
-
-@pytest.mark.parametrize("start", [0.0, 1e3])
-def test_a_mode_without_decay_has_a_periodic_state_where_the_mean_is_zero(start):
-    edges = start + np.array([0.0, 0.3e-3, 1e-3, 1.7e-3, 2e-3])
-    square = np.array([[term(c)] for c in (200.0, -200.0, 200.0, -200.0)])
-    gains = [1e4, -3e4]
-    none = np.zeros((4, 0))
-    assert np.array_equal(periodic_state([0.0, 0.0], gains, edges, square, none), [0.0, 0.0])
-    rows, w_end = respond([0.0, 0.0], gains, edges, square, none, [0.0, 0.0], edges)
-    assert np.all(np.abs(w_end) <= 1e-9 * np.abs(rows).max(axis=0))
-    square[0, 0, 0] *= 1.0 + 1e-6
-    assert np.all(np.isnan(periodic_state([0.0, 0.0], gains, edges, square, none)))
-    sine = [[term(5.0, 0, 0.0, 2.0 * np.pi * 100.0, 1.1)]]
-    got = periodic_state([0.0, 100.0], [1.0, 1.0], [0.0, 0.03], sine, NO_SERIES)
-    assert got[0] == 0.0
-    assert np.isfinite(got[1])
-
-
-def test_constant_and_integer_arguments():
-    edges = np.array([0.0, 1.0])
-    edges.flags.writeable = False
-    # The second term has no coefficient: what else it says does not matter.
-    terms = np.broadcast_to(np.array([[term(2), [0, -1, 0.5, 3, 4, 5]]]), (1, 2, 6))
-    rows, w_end = respond((0, 1), np.array([1, 1]), edges, terms, NO_SERIES, [0, 0], [0, 0.5, 1])
-    expected = np.array([[0.0, 0.0], [1.0, -2.0 * np.expm1(-0.5)], [2.0, -2.0 * np.expm1(-1.0)]])
-    assert np.abs(rows - expected).max() <= 1e-15
-    assert np.array_equal(w_end, rows[-1])
-
-
-def test_a_window_without_segments_keeps_the_state():
-    rows, w_end = respond([1.0], [1.0], [2.0], np.zeros((0, 1, 6)), np.zeros((0, 0)), [0.5], [2.0])
-    assert rows[0, 0] == w_end[0] == 0.5

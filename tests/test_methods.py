@@ -180,3 +180,12 @@ def test_lsoda_s_nan_is_not_a_success():
     assert solution.status is fs.Status.FOLD
     assert not solution.success
     assert np.all(np.isfinite(solution.u_gap))
+
+
+def test_the_tolerance_is_relative_to_the_source():
+    # So small a voltage moves no area: the circuit is linear, and a thousandth of the source gives a thousandth of all.
+    evaluations = {
+        fs.simulate(table1(), sources={"Vdrive": fs.Sine(u, 100)}, t_stop=0.02, rtol=1e-6, method="radau").nfev
+        for u in (1e-3, 1e-6, 1e-9)
+    }
+    assert max(evaluations) <= 1.02 * min(evaluations)

@@ -12,9 +12,8 @@ import pytest
 
 import fingerspice as fs
 from commands import run_here
-from fingerspice.studies.limits import fold_voltage
 from network_reference import Floating
-from scenes import CIRCUITS, cases, deck, every_law, finger, floating, shipped, table1
+from scenes import CIRCUITS, by_turns, cases, deck, every_law, finger, floating, shipped, table1
 
 WAVES = (fs.Sine(200.0, 5000.0), fs.Square(200.0, 5000.0), fs.Square(150.0, 5000.0, duty=0.3))
 SHIPPED = ("amplifier", "ungrounded_user", "two_fingers")
@@ -23,8 +22,7 @@ SHIPPED = ("amplifier", "ungrounded_user", "two_fingers")
 # The state --------------------------------------------------------------------------------------------------
 
 
-@every_law
-@pytest.mark.parametrize("source", WAVES)
+@pytest.mark.parametrize(("source", "law"), by_turns(WAVES))
 @pytest.mark.parametrize("name", SHIPPED)
 def test_it_is_where_a_long_run_ends_within_the_error_stated(name: str, source: fs.Waveform, law: str) -> None:
     circuit = shipped(name).replace({"Vdrive": source})
@@ -72,8 +70,7 @@ def test_an_independent_integration_leads_back_to_it_and_has_its_multipliers(law
     assert state.stability_margin == pytest.approx(1.0 - want[-1], abs=2e-4)
 
 
-@every_law
-@pytest.mark.parametrize("source", ["SIN(0 200 100)", "SIN(60 120 1k)", "SQUARE(180 200 0.2)"])
+@pytest.mark.parametrize(("source", "law"), by_turns(["SIN(0 200 100)", "SIN(60 120 1k)", "SQUARE(180 200 0.2)"]))
 def test_a_stack_with_a_resistor_beside_it_has_the_stacks_state(source: str, law: str) -> None:
     stack = table1(source)
     network = fs.parse_netlist(stack.text.replace("\nXcoat", "\nRload drive 0 1meg\nXcoat", 1))
@@ -375,13 +372,3 @@ def test_the_command_sweeps_one_of_several_fingers(monkeypatch: Any, capsys: Any
     )
     (want,) = fs.large_signal(shipped("two_fingers"), [1e3, 5e3], finger="Xlight.Xgap", rtol=1e-7)
     np.testing.assert_allclose(answer["sweeps"][0]["f_el_mean"], want.f_el_mean, rtol=1e-12)
-
-
-def test_a_stack_with_a_resistor_beside_it_folds_where_the_stack_does() -> None:
-    stack = table1("SIN(0 200 100)").replace({"Xgap.d": 200e-9})
-    text = table1("SIN(0 200 100)").text.replace("\nXcoat", "\nRload drive 0 1meg\nXcoat", 1)
-    network = fs.parse_netlist(text).replace({"Xgap.d": 200e-9})
-    one, other = (fold_voltage(c, 200.0, 0.01) for c in (stack, network))
-    assert math.isfinite(one)
-    # Each is found to 1e-3.
-    assert other == pytest.approx(one, rel=2e-3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 import analytic
 import fingerspice as fs
 from network_reference import Floating, Nodal, Tone
-from scenes import COAT, GAP, assignments, deck, every_law, finger, floating, shipped
+from scenes import COAT, GAP, assignments, by_turns, deck, every_law, finger, floating, shipped
 
 # Linear networks ---------------------------------------------------------------------------------------------
 
@@ -116,8 +115,9 @@ def test_two_sources_in_two_branches_superpose() -> None:
 # The same stack as a network ---------------------------------------------------------------------------------
 
 
-@every_law
-@pytest.mark.parametrize("source", ["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)", "SIN(60 120 5k)"])
+@pytest.mark.parametrize(
+    ("source", "law"), by_turns(["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)", "SIN(60 120 5k)"])
+)
 def test_a_stack_beside_a_load_is_the_stack(source: str, law: str) -> None:
     f = 5000.0 if "5k" in source else 100.0
     tran = f".tran {0.005 / f} {2.5 / f} uic"
@@ -136,8 +136,7 @@ def test_a_stack_beside_a_load_is_the_stack(source: str, law: str) -> None:
     assert a.layers == b.layers
 
 
-@every_law
-@pytest.mark.parametrize("source", ["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)"])
+@pytest.mark.parametrize(("source", "law"), by_turns(["SIN(0 200 100)", "PULSE(150 -150 5m 0 0 5m 10m)"]))
 @pytest.mark.parametrize("resistance", ["10m", "1u"])
 def test_a_small_resistor_in_the_way_changes_nothing_and_costs_little(source: str, law: str, resistance: str) -> None:
     tran = ".tran 50u 25m uic"
@@ -194,19 +193,6 @@ def test_an_ideal_jump_is_the_limit_of_a_fast_ramp(law: str) -> None:
     assert off[2] <= 3e-5
     assert 8.0 < off[0] / off[1] < 12.0
     assert 8.0 < off[1] / off[2] < 12.0
-
-
-@every_law
-def test_errors_are_stated_honestly_on_a_mixed_network(law: str) -> None:
-    circuit = floating("SIN(0 200 5k)")
-    t = np.linspace(0.0, 1e-3, 301)
-    exact = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=1e-12)
-    for rtol in (1e-3, 1e-5, 1e-7, 1e-9):
-        s = fs.simulate(circuit, t_eval=t, charge_law=law, rtol=rtol)
-        u, f = np.abs(s.u_gap - exact.u_gap).max(), np.abs(s.f_el - exact.f_el).max()
-        assert u <= s.error.u_gap <= rtol * np.abs(exact.u_gap).max() * 1.01
-        assert f <= s.error.f_el <= rtol * exact.f_el.max() * 1.01
-        assert np.abs(s.q_source - exact.q_source).max() <= s.error.q_source + 1e-12 * np.abs(exact.q_source).max()
 
 
 # Energy ------------------------------------------------------------------------------------------------------
@@ -426,8 +412,7 @@ def test_a_gap_voltage_that_turns_back_right_after_its_zero_keeps_its_branch(see
     source = fs.PWL(tuple(t), tuple(100.0 + 10.0 * rng.standard_normal(t.size)))
     last = float(t[-1])
     at = np.unique(np.concatenate([t, t[:-1] + 3e-8, *(t[9:-1:10] + x for x in np.geomspace(1e-8, 1e-6, 8))]))
-    deck = Path(__file__).parents[1] / "circuits" / "ungrounded_user.cir"
-    circuit = fs.read_netlist(deck).replace({"Vdrive": source})
+    circuit = shipped("ungrounded_user").replace({"Vdrive": source})
     run, implicit = (
         fs.simulate(circuit, t_stop=last, t_eval=at[at <= last], charge_law=law, charge=False, method=method, rtol=1e-8)
         for method in ("auto", "radau")
@@ -455,8 +440,7 @@ MARCHED = {
 }  # fmt: skip
 
 
-@every_law
-@pytest.mark.parametrize("name", MARCHED)
+@pytest.mark.parametrize(("name", "law"), by_turns(MARCHED))
 def test_the_error_stated_covers_the_difference_from_radau(name: str, law: str) -> None:
     lines, stop = MARCHED[name]
     circuit = deck(*lines, f".tran {stop / 500.0!r} {stop!r} uic")
@@ -493,8 +477,9 @@ def test_near_a_fold_radau_takes_over() -> None:
     assert s.method == "radau"
 
 
-@every_law
-@pytest.mark.parametrize("source", ["SIN(0 200 5k)", "SIN(30 120 5k)", "PULSE(120 -120 100u 0 0 100u 200u)"])
+@pytest.mark.parametrize(
+    ("source", "law"), by_turns(["SIN(0 200 5k)", "SIN(30 120 5k)", "PULSE(120 -120 100u 0 0 100u 200u)"])
+)
 def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: str, law: str) -> None:
     circuit = deck(f"Vdrive a 0 {source}", "Rout a b 47k", *finger("b", "0"), "Ccable b 0 150p", ".tran 1u 12.1m uic")
     t = np.linspace(0.0, 12.1e-3, 3001)
@@ -507,11 +492,6 @@ def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: str, 
         assert np.abs(run.q_source - stepped.q_source).max() <= run.error.q_source + stepped.error.q_source
         whole = np.abs(run.i_source - stepped.i_source).max()
         assert whole <= 300.0 * rtol * np.abs(stepped.i_source).max()
-        # It goes on from there.
-        after = fs.simulate(circuit, t_stop=13e-3, t_eval=[12.9e-3], charge_law=law, rtol=rtol, start=run)
-        direct = fs.simulate(circuit, t_stop=13e-3, t_eval=[12.9e-3], charge_law=law, rtol=rtol)
-        assert abs(after.u_gap[0] - direct.u_gap[0]) <= 2.0 * (run.error.u_gap + direct.error.u_gap)
-        assert abs(after.q_source[0] - direct.q_source[0]) <= 2.0 * (run.error.q_source + direct.error.q_source)
 
 
 def test_windows_of_a_long_run_join() -> None:

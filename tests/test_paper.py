@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import re
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import analytic as ref
 import fingerspice as fs
 from fingerspice.circuit.statespace import build_stack
 from fingerspice.studies.steady import steady_state
-from scenes import table1, table1_deck
+from scenes import dispersive_deck, table1
 
 
 @functools.cache
@@ -48,8 +47,7 @@ def test_gap_voltage_of_the_coupled_run_at_100_hz_is_a_little_less_than_the_phas
 
 
 def test_with_the_skins_data_at_every_frequency_a_square_of_100_hz_gives_less_force():
-    deck = table1_deck("SQUARE(200 100)")
-    dispersive = fs.parse_netlist(re.sub(r"SKIN +d=(\S+) +f=\S+", r"SKIN_DISPERSIVE d=\1", deck))
+    dispersive = fs.parse_netlist(dispersive_deck("SQUARE(200 100)"))
     found = steady_state(dispersive, rtol=1e-9, points=2000).solution.summary()
     own = square(100.0).summary()
     assert found["f_el_mean"] / own["f_el_mean"] == pytest.approx(1.0 - 0.019, abs=5e-4)

@@ -19,8 +19,6 @@ from PIL import Image
 
 import fingerspice as fs
 from fingerspice.plots import drawing, traces
-from fingerspice.solve.simulation import simulate
-from fingerspice.studies.comparison import compare
 from scenes import deck, shipped, table1
 
 if TYPE_CHECKING:
@@ -50,12 +48,12 @@ def with_source(value: fs.Waveform, **options: object) -> fs.Solution:
     """A run of Table 1 under `value`, whatever comes of it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fs.FingerspiceWarning)
-        return simulate(table1(), sources={"Vdrive": value}, throw=False, **options)  # type: ignore[arg-type]
+        return fs.simulate(table1(), sources={"Vdrive": value}, throw=False, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
 def sine() -> fs.Solution:
-    return simulate(table1())
+    return fs.simulate(table1())
 
 
 def test_a_run_is_shown_in_four_panels_with_units(sine: fs.Solution) -> None:
@@ -82,7 +80,7 @@ def test_a_run_is_shown_in_four_panels_with_units(sine: fs.Solution) -> None:
 
 
 def test_both_sides_of_a_jump_are_drawn() -> None:
-    solution = simulate(table1(), sources={"Vdrive": fs.Square(200.0, 100.0)}, t_stop=0.01, rtol=1e-6)
+    solution = fs.simulate(table1(), sources={"Vdrive": fs.Square(200.0, 100.0)}, t_stop=0.01, rtol=1e-6)
     t, u = curve(traces.plot_solution(solution).axes[0], "source")
     np.testing.assert_array_equal(u[np.isclose(t, 5.0)], [200.0, -200.0])
 
@@ -92,7 +90,7 @@ def test_without_a_gap_the_layers_voltages_are_shown_alone() -> None:
         "V1 a 0 SIN(0 200 100)", "Xc$x$ a b area LAYER d=1u eps_r=3.9 r=0.2meg",
         "Xs b 0 area SKIN d=350u f=100", "Varea area 0 35", ".tran 10u 20m",
     )  # fmt: skip
-    solution = simulate(circuit)
+    solution = fs.simulate(circuit)
     figure = traces.plot_solution(solution)
     assert labels(figure) == ["Voltage [V]"]
     assert legend(figure.axes[0]) == ["source", "layer Xc$x$", "layer Xs"]
@@ -125,13 +123,13 @@ def test_a_run_that_stopped_at_once_still_makes_a_picture(sine: fs.Solution, tmp
 
 def test_lines_are_within_their_frames(tmp_path: Path) -> None:
     for amplitude in (0.01, 0.5, 10.0, 50.0, 200.0):
-        run = simulate(table1(f"SIN(0 {amplitude} 100)"), t_stop=0.02, rtol=1e-4)
+        run = fs.simulate(table1(f"SIN(0 {amplitude} 100)"), t_stop=0.02, rtol=1e-4)
         (ax,) = traces.plot_solution(run, "f_t").axes
         bottom, top = ax.get_ylim()
         assert bottom == 0.0
         assert float(np.max(ax.lines[0].get_ydata())) < 0.97 * top
     # A fixed area is drawn flat, and no voltage is no force.
-    low, high = traces.plot_solution(simulate(table1(), area="frozen", t_stop=0.01)).axes[2].get_ylim()
+    low, high = traces.plot_solution(fs.simulate(table1(), area="frozen", t_stop=0.01)).axes[2].get_ylim()
     assert low < 34.0 < 36.0 < high
     figure = traces.plot_solution(with_source(fs.DC(0.0), t_stop=0.01))
     assert figure.axes[1].get_ylim() == pytest.approx((0.0, figure.axes[1].get_ylim()[1]))
@@ -164,17 +162,17 @@ def test_a_single_frequency_and_a_source_without_fundamental_are_drawn_too(tmp_p
 
 @pytest.mark.parametrize("phase", [0.0, 70.0])
 def test_the_phasor_lies_on_the_transient_where_the_area_is_fixed(phase: float) -> None:
-    axes = compare(table1(f"SIN(0 200 100 0 0 {phase})", gap={"a_fix": 35})).plot().axes
+    axes = fs.compare(table1(f"SIN(0 200 100 0 0 {phase})", gap={"a_fix": 35})).plot().axes
     for ax, name, scale in ((axes[0], "gap", 200.0), (axes[1], "electroadhesive force", 0.2)):
         np.testing.assert_allclose(curve(ax, name)[1], curve(ax, f"{name}, phasor")[1], atol=1e-6 * scale)
 
 
 def test_the_comparison_shows_its_table_which_has_room_for_the_names_of_several_fingers() -> None:
-    comparison = compare(table1())
+    comparison = fs.compare(table1())
     table = comparison.plot().axes[2].tables[0].get_celld()
     assert table[1, 0].get_text().get_text() == "Gap voltage at the fundamental [V]"
     assert table[3, 3].get_text().get_text() == f"{comparison.coupled.f_el_mean:.5g}"
-    figure = compare(shipped("two_fingers"), rtol=1e-5).plot()
+    figure = fs.compare(shipped("two_fingers"), rtol=1e-5).plot()
     figure.canvas.draw()
     cells = figure.axes[2].tables[0].get_celld()
     for row in range(1, 9):
@@ -225,7 +223,7 @@ def test_what_a_deck_names_is_drawn_without_formulas_floods_or_warnings(tmp_path
     title = "$\\frac{$ 漢字 😀 \x1b[31m" + "x" * 100_000
     # Warnings are errors here: matplotlib has one for each picture that the font lacks, and for what finds no room.
     circuit = fs.parse_netlist("\n".join((title, *lines)))
-    figure = simulate(circuit).plot()
+    figure = fs.simulate(circuit).plot()
     drawing.save(figure, tmp_path / "odd.png", dpi=20.0)
     shown = legend(figure.axes[0])
     assert any(text.startswith("n$x^$□\\x1b[31myyy") for text in shown)
@@ -272,7 +270,7 @@ def test_a_window_is_what_is_shown(sine: fs.Solution) -> None:
 
 
 def test_other_runs_lie_over_it_called_by_what_sets_them_apart(sine: fs.Solution) -> None:
-    thick = simulate(table1().replace({"Xgap.d": 5e-6}))
+    thick = fs.simulate(table1().replace({"Xgap.d": 5e-6}))
     assert "Table 1 (changed: Xgap.d = 5 um)" in small_print(thick.plot())
     figure = sine.plot("f_el", others=thick)
     names = ["electroadhesive force, the deck as it is", "electroadhesive force, Xgap.d = 5 um"]
@@ -289,7 +287,7 @@ def test_other_runs_lie_over_it_called_by_what_sets_them_apart(sine: fs.Solution
 
 
 def test_each_finger_keeps_its_colour_in_every_panel_and_has_a_legend_in_each() -> None:
-    run = simulate(shipped("two_fingers"))
+    run = fs.simulate(shipped("two_fingers"))
     figure = run.plot()
     colors: dict[str, set[object]] = {gap: set() for gap in run.gaps}
     for ax in figure.axes:
@@ -308,7 +306,7 @@ def test_each_finger_keeps_its_colour_in_every_panel_and_has_a_legend_in_each() 
 
 
 def test_a_long_run_is_an_envelope_beside_its_last_oscillations() -> None:
-    run = simulate(table1("SIN(0 200 5k)", f=5000.0, tran="5u 50m uic"))
+    run = fs.simulate(table1("SIN(0 200 5k)", f=5000.0, tran="5u 50m uic"))
     figure = run.plot()
     left, right = figure.axes[:8:2], figure.axes[1:8:2]
     assert left[3].get_xlabel() == "Time [ms]: envelope of 250 oscillations"

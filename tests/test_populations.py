@@ -14,13 +14,12 @@ from scipy import stats
 import fingerspice as fs
 from commands import Command
 from fingerspice.studies.sweep import populations
-
-CIRCUITS = Path(__file__).parents[1] / "circuits"
+from scenes import CIRCUITS, shipped
 
 
 @pytest.fixture(scope="module")
 def circuit() -> fs.Circuit:
-    return fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    return shipped("fingerpad")
 
 
 HOW = {"periodic": True, "outputs": ("f_el_mean_periodic",), "rtol": 1e-4}

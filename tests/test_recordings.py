@@ -5,14 +5,12 @@ from __future__ import annotations
 import pickle
 from typing import Any
 
-import mpmath
 import numpy as np
 import pytest
 
 import analytic
 import fingerspice as fs
 import recording_errors
-from fingerspice.numerics.linear import moments
 from fingerspice.solve.recordings import run as lanes_of_a_run
 from fingerspice.waveforms.samples import as_samples
 from scenes import cases, every_law, table1_deck
@@ -183,15 +181,6 @@ def test_figures_are_those_of_the_run_and_not_of_its_outputs() -> None:
     assert rare.method == "relaxation"
     assert rare.f_el_mean == pytest.approx(exact.f_el_mean, rel=1e-6)
     assert rare.summary()["f_el_max"] == pytest.approx(exact.summary()["f_el_max"], rel=1e-5)
-
-
-def test_moments_are_integrals() -> None:
-    for z in (0.0, 1e-9, 0.3, 3.9, 4.1, 50.0):
-        found = np.empty(5)
-        moments(z, found)
-        for j in range(5):
-            exact = mpmath.quad(lambda x, j=j, z=z: mpmath.exp(-z * (1 - x)) * x**j, [0, 0.9, 1])
-            assert found[j] == pytest.approx(float(exact), rel=4e-15)
 
 
 @every_law

@@ -14,8 +14,6 @@ from scipy.integrate import simpson
 
 import analytic as ref
 import fingerspice as fs
-from fingerspice.numerics.chebyshev import largest
-from fingerspice.numerics.lobatto import NODES, POINTS
 from fingerspice.results import steps
 from fingerspice.results.summary import Figures
 from scenes import cases, deck, every_law, shipped, table1
@@ -320,22 +318,6 @@ def test_weights_of_outputs_integrate_cubics_between_jumps_and_lines_where_point
     # Of 400,000 outputs with a jump at every tenth a loop over the pieces in Python took 18 s.
     t = np.repeat(np.linspace(0.0, 1.0, 360_001), np.where(np.arange(360_001) % 9 == 8, 2, 1))
     assert steps.weigh_outputs(t, np.sin(7.0 * t)).mean() == pytest.approx((1.0 - np.cos(7.0)) / 7.0, rel=1e-12)
-
-
-@pytest.mark.parametrize("side", [0, -1])
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_summit_between_a_panel_s_last_two_nodes_is_found_behind_another_one(side: int, sign: float) -> None:
-    # Both nodes lie alike on its two sides, below the summit of the panel that is looked at first.
-    x = POINTS[:NODES]
-    middle = 0.5 * (x[0] + x[1]) if side == 0 else 0.5 * (x[-1] + x[-2])
-    half = middle if side == 0 else 1.0 - middle
-    height = 1.0 + 0.5 * half**2
-    values = np.array([1.0 - (x - x[6]) ** 2, height - (x - middle) ** 2])
-    assert values[1].max() < 1.0
-    panel, place, top = largest(sign * values, sign)
-    assert panel == 1
-    assert place == pytest.approx(middle, abs=1e-7)
-    assert top == pytest.approx(height, rel=1e-14)
 
 
 # As attributes, each an integral of its own, computed once

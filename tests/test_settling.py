@@ -10,7 +10,7 @@ import pytest
 import analytic as ref
 import fingerspice as fs
 from fingerspice.solve import stepping
-from scenes import dispersive_deck, every_law, table1, table1_deck
+from scenes import by_turns, dispersive_deck, every_law, table1, table1_deck
 
 # A square's edges reach beyond the band of the dispersive skin's data.
 pytestmark = pytest.mark.filterwarnings("ignore:of the source's energy")
@@ -42,8 +42,7 @@ def alike(run: fs.Solution, stepped: fs.Solution, grown: float) -> None:
     assert np.abs(run.q_source - stepped.q_source).max() <= run.error.q_source + stepped.error.q_source
 
 
-@every_law
-@pytest.mark.parametrize("source", SOURCES.values(), ids=SOURCES.keys())
+@pytest.mark.parametrize(("source", "law"), by_turns(SOURCES.values()))
 @pytest.mark.parametrize("rtol", [1e-4, 1e-9])
 def test_a_repeated_period_is_the_one_that_would_have_been_stepped(source: fs.Waveform, law: str, rtol: float) -> None:
     run, stepped = both(table1().replace({"Vdrive": source}), 60.4 * source.period, law, rtol)
@@ -132,8 +131,7 @@ FAST = {
 }
 
 
-@every_law
-@pytest.mark.parametrize("source", FAST.values(), ids=FAST.keys())
+@pytest.mark.parametrize(("source", "law"), by_turns(FAST.values()))
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8])
 def test_a_skin_that_remembers_for_many_periods_settles(source: fs.Waveform, law: str, rtol: float) -> None:
     # Its slowest branch remembers for 7 ms, 28 to 48 periods.

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import mpmath as mp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fingerspice as fs
-from fingerspice.circuit.statespace import Stack, build_stack
-from fingerspice.numerics.modes import modes
+from fingerspice.circuit.statespace import build_stack
 from scenes import deck, table1
 
 SEARCH = settings(max_examples=50, derandomize=True, deadline=None)
+# Rates twelve decades apart, squared in the characteristic polynomial, with room to spare.
+DIGITS = 80
 EPS0 = 8.854e-12
 AREA = 35e-6
 
@@ -47,11 +49,16 @@ class Slice:
 
 
 logs = st.floats(-7.0, -4.0).map(lambda x: 10.0**x)
+# Of a few decades, exactly or nearly, or anywhere.
+near = st.tuples(st.sampled_from([1e-3, 1.0, 1e6]), st.sampled_from([1.0, 1.0 + 2.3e-16, 1.0 + 1e-13, 1.0 + 1e-9]))
+ohms = st.one_of(near.map(lambda x: x[0] * x[1]), st.floats(-3.0, 9.0).map(lambda x: 10.0**x))
 slices = st.one_of(
     st.builds(Slice, logs, st.floats(1.0, 50.0)),
-    st.builds(Slice, logs, st.floats(1.0, 50.0), st.floats(3.0, 8.0).map(lambda x: 10.0**x)),
+    st.builds(Slice, st.just(1e-6), st.just(3.0), ohms),
+    st.builds(Slice, logs, st.floats(1.0, 50.0), ohms),
     st.builds(Slice, logs, st.floats(1.0, 50.0), st.none(), st.floats(2.0, 7.0).map(lambda x: 10.0**x)),
 )
+Made = tuple[list[Slice], list[bool], list[int]]
 
 
 def chain(layers: list[Slice], turned: list[bool], order: list[int], source: str = "Vdrive n0 0 200") -> fs.Circuit:
@@ -65,59 +72,46 @@ def chain(layers: list[Slice], turned: list[bool], order: list[int], source: str
 
 
 @st.composite
-def chains(draw: st.DrawFn) -> tuple[list[Slice], list[bool], list[int]]:
+def chains(draw: st.DrawFn) -> Made:
     layers = draw(st.lists(slices, min_size=1, max_size=8))
     turned = draw(st.lists(st.booleans(), min_size=len(layers), max_size=len(layers)))
     return layers, turned, draw(st.permutations(range(len(layers) + 2)))
 
 
-def dense_rates(layers: list[Slice], u: np.ndarray) -> tuple[np.ndarray, float]:
-    """Rates of the layer voltages under a constant source, and of sum(lambda/c)/S, by the leaked charges.
+def exact(layers: list[Slice], times: list[float]) -> tuple[list[mp.mpf], list[np.ndarray]]:
+    """Rates (1/s, ascending, as many as layers but one) and layer voltages (V) after 200 V came on, to many digits.
 
-    d lambda_x / dt = leak_x u_x; u_x = (D - lambda_x) / c_x; D = (U + sum lambda/c) / S. Nothing is reduced.
+    x' = (k 1^T - I) diag(r) (x + k U) where u = x + k U, nothing reduced: the whole matrix, with one rate of zero more.
     """
-    c = np.array([x.c for x in layers])
-    rate = np.array([x.leak(AREA) for x in layers]) * u
-    d_rate = np.sum(rate / c) / np.sum(1.0 / c)
-    return (d_rate - rate) / c, d_rate
-
-
-# Incidence --------------------------------------------------------------------------------------------------
-
-
-def reduced(stack: Stack) -> tuple[np.ndarray, ...]:
-    """The stack's modes at `AREA`, rows in loop order: w' = -rates w + gain U, x = shape @ w, u = k U + x; and feed."""
-    order = list(stack.state_order)
-    rates, gain, feed, shape = modes(stack.leak_rates(AREA)[order], stack.k[order])
-    back = np.argsort(order)
-    return rates, gain, shape[back], feed[back]
+    with mp.workdps(DIGITS):
+        n = len(layers)
+        inverse = [1 / mp.mpf(x.c) for x in layers]
+        share = mp.matrix([x / mp.fsum(inverse) for x in inverse])
+        leaks = mp.diag([mp.mpf(x.leak(AREA)) * y for x, y in zip(layers, inverse, strict=True)])
+        matrix = (share * mp.ones(1, n) - mp.eye(n)) * leaks
+        rates = sorted(abs(x) for x in mp.eig(matrix)[0])[1:]
+        driven = mp.zeros(n + 1)
+        driven[:n, :n], driven[:n, n] = matrix, 200 * matrix * share
+        moved = [mp.expm(driven * t)[:n, n] + 200 * share for t in times]
+        return rates, [np.array([float(x) for x in u]) for u in moved]
 
 
 @SEARCH
-@given(chains(), st.integers(0, 2**32 - 1))
-def test_the_reduced_system_has_the_rates_of_the_dense_one(made, seed: int) -> None:
+@given(chains())
+def test_rates_and_voltages_have_their_digits_though_rates_are_decades_apart_or_coincide(made: Made) -> None:
     layers, turned, order = made
-    stack = build_stack(chain(layers, turned, order))
-    n = len(layers)
-    rates, gain, shape, feed = reduced(stack)
-    assert shape.shape == feed.shape == (n, n - 1)
-    start = np.random.default_rng(seed).uniform(-100.0, 100.0, n)
-    start -= start.sum() * stack.k
-    u_source = 137.0
-    # `feed` takes -p + k sum(p) to modes; here p = -start, and sum(start) is zero
-    w = -start @ feed
-    u = stack.k * u_source + shape @ w
-    np.testing.assert_allclose(shape @ w, start, rtol=0, atol=1e-12 * 100.0)
-    assert u.sum() == pytest.approx(u_source, abs=1e-10)
-    got = shape @ (-rates * w + gain * u_source)
-    dense, d_rate = dense_rates(layers, u)
-    # Rounding is that of the leaks, which may cancel (in a single layer they do so exactly).
-    scale = float(max(abs(x.leak(AREA) * v / x.c) for x, v in zip(layers, u, strict=True))) + 1e-300
-    np.testing.assert_allclose(got, dense, rtol=0, atol=1e-12 * scale)
-    # What is left of D' after every layer's own c u' is the leak: any layer gives it.
-    leaks = stack.leak_rates(AREA) * stack.c * u
-    bound = 1e-13 * float((stack.c * scale).max())
-    np.testing.assert_allclose(stack.c * got + leaks, d_rate, rtol=1e-11, atol=100.0 * bound)
+    circuit = chain(layers, turned, order)
+    times = [2e-5]
+    rates, voltages = exact(layers, times)
+    found = sorted(fs.plan(circuit).rates)
+    assert len(found) == len(rates) == len(layers) - 1
+    for got, want in zip(found, rates, strict=True):
+        assert abs(got - want) <= 1e-13 * want + mp.mpf(10) ** -30
+    # A run that ends at the last time, so that nothing else rounds it.
+    solution = fs.simulate(circuit, t_eval=times, t_stop=times[-1])
+    signs = np.array([-1.0 if turned[int(name[1:])] else 1.0 for name in solution.layers])
+    back = [int(name[1:]) for name in solution.layers]
+    np.testing.assert_allclose(solution.u_layer * signs, np.array(voltages)[:, back], rtol=0, atol=200.0 * 1e-12)
 
 
 @pytest.mark.parametrize("n", range(1, 9))
@@ -137,7 +131,7 @@ def test_without_resistors_the_voltages_split_by_the_inverse_capacitances_for_ev
     solution = fs.simulate(circuit)
     share = np.array([1.0 / x.c for x in layers]) / sum(1.0 / x.c for x in layers)
     np.testing.assert_allclose(solution.u_layer, np.outer(solution.u_source, share), rtol=0, atol=1e-14 * 10.0)
-    assert np.all(reduced(build_stack(circuit))[0] == 0.0)
+    assert all(rate == 0.0 for rate in fs.plan(circuit).rates)
 
 
 # Sources ----------------------------------------------------------------------------------------------------

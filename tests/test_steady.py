@@ -12,15 +12,9 @@ import pytest
 
 import analytic as ref
 import fingerspice as fs
-from scenes import CIRCUITS, cases, deck, every_law, shipped, table1
+from scenes import CIRCUITS, by_turns, deck, every_law, shipped, table1
 
 AREA = 34.9715871843e-6
-
-
-def by_turns(names: Any) -> list[tuple[Any, str]]:
-    """Every name with both laws in ``make stress``, and with one and the other by turns in the suite."""
-    both = [(name, law) for name in names for law in ("local", "mobile")]
-    return both if cases(1, 0) else [both[2 * i + i % 2] for i in range(len(both) // 2)]
 
 
 def trapezoids(f: float) -> list[Any]:

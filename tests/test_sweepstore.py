@@ -28,9 +28,8 @@ from commands import Command, tree
 from fingerspice.studies.sweep import chunks
 from fingerspice.studies.sweep.populations import Draws, Plan
 from processes import forked, no_room_here
-from scenes import cases
+from scenes import CIRCUITS, cases, shipped
 
-CIRCUITS = Path(__file__).parents[1] / "circuits"
 # How often a whole program, and a worker, is killed; each takes seconds to start.
 KILLS, KILLS_OF_WORKERS = cases(20, 2), cases(20, 1)
 CHUNK = chunks.CHUNK
@@ -50,7 +49,7 @@ CHUNKS = 3 * HOW["n"] // 64
 
 @pytest.fixture(scope="module")
 def circuit() -> fs.Circuit:
-    return fs.read_netlist(CIRCUITS / "fingerpad.cir")
+    return shipped("fingerpad")
 
 
 @pytest.fixture(autouse=True)
@@ -154,7 +153,7 @@ def test_a_store_has_what_a_sweep_in_memory_has(circuit: fs.Circuit, tmp_path: P
 
 
 def test_a_network_and_several_fingers_go_into_a_store(tmp_path: Path) -> None:
-    circuit = fs.read_netlist(CIRCUITS / "two_fingers.cir")
+    circuit = shipped("two_fingers")
     path = next(name for name in circuit.parameters if name.endswith("ap.d"))
     how = {"outputs": ("f_el_mean",), "t_stop": 5e-3}
     _, stored = both(circuit, {path: [3e-6, 3.2e-6, 3.4e-6]}, tmp_path / "s.zarr", **how)
