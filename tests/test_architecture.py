@@ -20,12 +20,12 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 600
 # Lines of all files together and of each package, and the number of files: as many as there are. They are only ever
 # lowered; what moves from one package to another takes its lines along.
-ALL_LINES = 39_633
-ALL_FILES = 133
+ALL_LINES = 37_201
+ALL_FILES = 131
 PACKAGE_LINES = {
-    "base": 1_038, "circuit": 2_291, "cli": 1_767, "engine": 8_518, "explorer": 1_429, "netlist": 2_379,
-    "numerics": 1_166, "physics": 508, "plots": 1_320, "results": 2_706, "sets": 385, "solve": 6_368,
-    "studies": 6_801, "torch": 414, "waveforms": 2_394,
+    "base": 1_011, "circuit": 2_125, "cli": 1_550, "engine": 8_276, "explorer": 1_300, "netlist": 2_137,
+    "numerics": 1_166, "physics": 508, "plots": 1_232, "results": 2_551, "sets": 367, "solve": 5_946,
+    "studies": 6_214, "torch": 391, "waveforms": 2_278,
 }  # fmt: skip
 
 # Functions outside compiled code: lines of the body without its docstring, and parameters without `self`.
