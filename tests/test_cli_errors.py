@@ -70,6 +70,7 @@ OTHERS = [
     (["run", "missing.cir"], "'missing.cir' does not exist"),
     (["run", "pat.cir"], "'pat.cir' does not exist; did you mean 'pad.cir'?"),
     (["run", "folder"], "'folder' is a folder, not a file"),
+    (["run", "/proc/self/mem"], "'/proc/self/mem' cannot be read: Input/output error"),
     (["ac", "empty.cir"], "'empty.cir' is empty: a netlist begins with a title line"),
     (["compare", "binary.cir"], "'binary.cir' is not a text file (it holds NUL bytes): save it as UTF-8"),
     (["export", "latin.cir", "-o", "x.cir"], "'latin.cir' is neither UTF-8 nor Latin-1 text (byte 0x81 in line 2)"),

@@ -422,8 +422,8 @@ def file_fault(path: Path, most: int) -> str:
         if not path.is_file():
             there = "is not an ordinary file" if path.exists() else "does not exist"
             return "is a folder, not a file" if path.is_dir() else there
-        path.open("rb").close()
-        size = path.stat().st_size
+        with path.open("rb") as file:
+            size = len(file.read(1)) and file.seek(0, 2)
         return f"has {size / 2**20:,.0f} MiB; allowed: at most {most >> 20:,} MiB" if size > most else ""
     except (OSError, ValueError) as error:
         return f"cannot be read: {getattr(error, 'strerror', None) or error}"
