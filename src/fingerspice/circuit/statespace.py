@@ -200,17 +200,17 @@ def _ways(branches: list[Element], start: str) -> dict[str, Element | None]:
     came: dict[str, Element | None] = {start: None}
     while ahead:
         for element in at.get(ahead.pop(), ()):
-            new = [node for node in element.nodes[:2] if node not in came]
-            came.update(dict.fromkeys(new, element))
-            ahead += new
+            for node in element.nodes[:2]:
+                if node not in came:
+                    came[node] = element
+                    ahead.append(node)
     return came
 
 
 def spanning_tree(branches: Iterable[tuple[str, ...]]) -> tuple[list[bool], dict[str, FloatArray]]:
-    """Which branches, given by their nodes p and n, close no loop with those before.
+    """Which branches, given by their nodes p and n, close no loop with those before: they form a tree.
 
-    They form a tree. Given with them is the voltage of every node that it connects to ground, as a row of coefficients
-    of its branches' voltages.
+    With it goes each node's voltage against ground, as a row of coefficients of the tree's voltages.
     """
     above, taken, count = dict[str, str](), list[bool](), 0
     # Of each node its branches: the other node, the branch's number, and the sign of its voltage from here

@@ -163,9 +163,9 @@ class Flattener:
             problem = f"'{stray.text}' follows the parameters: nodes and the device's name come first{hint}"
             raise InputError(problem, stray.where)
         plain = [word for word in words.words if isinstance(word, Lexeme) and word.text.lower() != "params:"]
-        refuse(not plain, f"missing value: {name} needs nodes and a device's name", lexemes[0].where)
+        refuse(not plain, f"missing value: {name} needs nodes and a device's name", lexemes[0])
         *nodes, device = plain
-        refuse(device.kind != "word", f"{device.written} stands where a device's name belongs", device.where)
+        refuse(device.kind != "word", f"{device.written} stands where a device's name belongs", device)
         native, key = device.text.upper(), device.text.lower()
         around = tuple(dropwhile(lambda one: key not in one.definition.inner, (instance, *instance.around)))
         called = around[0].definition.inner[key] if around else None
@@ -173,7 +173,7 @@ class Flattener:
             raise InputError(_unknown_device(plain, instance), device.where)
         shown, wanted = (called.name, called.ports) if called else (native, DEVICES[native].nodes)
         count = f"{len(wanted)} node{'' if len(wanted) == 1 else 's'}" + (f" ({' '.join(wanted)})" if wanted else "")
-        refuse(len(nodes) != len(wanted), f"{name}: {shown} has {count}, {len(nodes)} given", device.where)
+        refuse(len(nodes) != len(wanted), f"{name}: {shown} has {count}, {len(nodes)} given", device)
         if called is None:
             canonical, written = zip(*instance.nodes(nodes), strict=True)
             params = scope.pairs(words, bare="arithmetic")

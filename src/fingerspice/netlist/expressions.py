@@ -355,7 +355,7 @@ class Scope:
         for definition in definitions:
             key, name = definition.key, definition.key.text.lower()
             problem = f"parameter '{key.text}' has the name of a function of ngspice; allowed: another name"
-            refuse(name in RESERVED, problem, key.where)
+            refuse(name in RESERVED, problem, key)
             first = self._definitions.setdefault(name, definition)
             if first is not definition:
                 raise InputError(f"parameter '{key.text}' is defined twice, first at {first.key.where}", key.where)
@@ -385,7 +385,8 @@ class Scope:
 
     def number(self, lexeme: Lexeme) -> Number:
         """Value of a lexeme that must be arithmetic, with or without braces."""
-        refuse(lexeme.kind == "string", f"a number is needed, not the text {lexeme.written}", lexeme.where)
+        if lexeme.kind == "string":
+            raise InputError(f"a number is needed, not the text {lexeme.written}", lexeme.where)
         value, expression = evaluated(lexeme.text, self._visible, lexeme.place), compiled(lexeme.text)
         mega = Token(expression.mega[0], lexeme.place(expression.mega[1])) if expression.mega else None
         for name in expression.names:
@@ -468,13 +469,13 @@ def definitions(line: Line, start: int) -> list[Assignment]:
     for (key, begin), end in zip(keys, ends[1:], strict=True):
         raw = line.text[begin:end]
         text = raw.strip(" \t,")
-        refuse(not text, f"missing value of '{key.text}'", key.where)
+        refuse(not text, f"missing value of '{key.text}'", key)
         value = Lexeme("word", text, begin + len(raw) - len(raw.lstrip(" \t,")), line)
         if text[0] in "{'":
             closing = "}" if text[0] == "{" else "'"
             known = closing in text[1:]
             problem = f"what follows {closing} belongs inside" if known else f"{text[0]} is never closed"
-            refuse(len(text) < 2 or text[-1] != closing, problem, value.where)
+            refuse(len(text) < 2 or text[-1] != closing, problem, value)
             value = value._replace(kind="expression", text=text[1:-1])
         out.append(Assignment(key, value))
     return out

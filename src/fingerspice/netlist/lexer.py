@@ -208,11 +208,11 @@ def group(lexemes: list[Lexeme], plain: int = 0, *, probes: bool = False) -> Gro
         elif lexeme.kind == "=":
             raise InputError("the name before '=' is missing", lexeme.where)
         elif lexeme.kind == ")":
-            refuse(not brackets, "')' without an opening '('", lexeme.where)
+            refuse(not brackets, "')' without an opening '('", lexeme)
             inside = brackets.pop()[1]
         elif following == "(" and lexeme.kind == "word" and not _NUMERIC.match(lexeme.text) and len(top.words) >= plain:
             problem = f"'{lexeme.text}(' inside brackets: arithmetic goes in braces, as in {{{lexeme.text}(...)}}"
-            refuse(inside is not top, problem, lexeme.where)
+            refuse(inside is not top, problem, lexeme)
             brackets.append((lexemes[after], inside))
             inside = Group(lexeme)
             top.words.append(inside)

@@ -229,7 +229,7 @@ def _read_passive(statement: Statement, notes: list[str]) -> tuple[dict[str, flo
             reason = ", there are no inductors here" if key == "lser" else ""
             raise InputError(f"{name} takes no parameter {key!r}{reason}; allowed: {shown}", part.key)
     given = [*statement.body, *(params[key] for key in kind.aliases if key in params)]
-    refuse(len(given) != 1, f"{name} needs one value in {spec.unit}, {len(given)} are given", statement.where)
+    refuse(len(given) != 1, f"{name} needs one value in {spec.unit}, {len(given)} are given", statement)
     value = _value(name, spec, number(given[0], f"{name} value", f"a number {spec.unit}"), notes)
     copies = params.get(_COPIES)
     if copies is not None:
@@ -248,7 +248,7 @@ def _value(name: str, spec: ParameterSpec, given: Value, notes: list[str]) -> fl
         allowed = f"a number{unit}, or the name of a .param"
         raise InputError(f"{name} {spec.name} is {given.text!r}; allowed: {allowed}", given.where)
     trap = unit_trap(spec, given.text)
-    refuse(trap, f"{name} {spec.name} {trap}", given.where)
+    refuse(trap, f"{name} {spec.name} {trap}", given)
     notes.extend(f"{place}: {name} {spec.name}: {doubt}" for place, doubt in _doubts(given, spec))
     if not spec.accepts(given.value):
         plain = f"{given.value:g}{unit}"
@@ -268,7 +268,7 @@ def _doubts(given: Number, spec: ParameterSpec) -> Iterator[tuple[Where, str]]:
 def _numbers(directive: Directive, usage: str) -> tuple[list[Number], list[str]]:
     """The numbers and the other words of a directive's line."""
     for arg in directive.args:
-        refuse(isinstance(arg, Call), f"{directive.name}: {arg.text!r} is not understood; allowed: {usage}", arg.where)
+        refuse(isinstance(arg, Call), f"{directive.name}: {arg.text!r} is not understood; allowed: {usage}", arg)
     for key, value in directive.params.items():
         raise InputError(f"{directive.name} takes no {key!r}; allowed: {usage}", value.key)
     numbers = [arg for arg in directive.args if isinstance(arg, Number)]
@@ -284,7 +284,7 @@ def read_tran(directive: Directive, notes: list[str]) -> Tran:
             raise InputError(f".tran {word}: {_LTSPICE_START[word]}", directive.where)
     apart = "; a unit joins its number, such as 20m" if any(is_unit(w) for w in words) else ""
     problem = f"{directive.text.strip()!r} is not understood; allowed: {usage}{apart}"
-    refuse(any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4, problem, directive.where)
+    refuse(any(w != "uic" for w in words) or not 1 <= len(numbers) <= 4, problem, directive)
     step, stop, start, longest = [None, numbers[0], None, None] if len(numbers) == 1 else [*numbers, None, None][:4]
     assert stop is not None
     _require(stop.value > 0.0, "TSTOP", stop, "more than 0 s")
@@ -340,7 +340,7 @@ def read_start(given: list[Directive], elements: tuple[Element, ...], uic: bool)
     area_nodes = {e.nodes[2] for e in layers}
     out: dict[str, float] = {}
     for directive in given:
-        refuse(directive.args, f"{directive.text.strip()!r} is not understood; {usage}", directive.where)
+        refuse(directive.args, f"{directive.text.strip()!r} is not understood; {usage}", directive)
         for key, value in directive.params.items():
             place = value.key
             refuse(not (key.startswith("v(") and key.endswith(")")), f".ic {key!r} is not understood; {usage}", place)

@@ -48,8 +48,7 @@ def library_text(law: str) -> str:
     name = LIBRARIES[law]
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "lib", package.parents[1] / "circuits"):
-        path = folder / name
-        if path.is_file():
+        if (path := folder / name).is_file():
             return path.read_text(encoding="utf-8")
     raise InputError(f"{name} is missing from this installation; reinstall fingerspice")
 
@@ -317,7 +316,7 @@ class Reader:
             self._take(line)
         if self._control is not None:
             raise InputError(".control without its .endc", self._control.where())
-        refuse(len(self._open) > 1, f".subckt {self._open[-1].name} without its .ends", self._open[-1].where)
+        refuse(len(self._open) > 1, f".subckt {self._open[-1].name} without its .ends", self._open[-1])
 
     def warn(self, message: str, where: Where) -> None:
         """Keep a warning with its place, unless there are many already."""
@@ -410,14 +409,14 @@ class Reader:
             port = word.text.lower()
             if port in ("0", "gnd"):
                 raise InputError("ground is the same node everywhere and cannot be a subcircuit's node", word.where)
-            refuse(port in ports, f"node '{word.text}' is given twice", word.where)
+            refuse(port in ports, f"node '{word.text}' is given twice", word)
             ports[port] = None
         defaults = list(words.params.values())
         for _, value in defaults:
-            refuse(value.kind == "string", "a number is needed, not a text", value.where)
+            refuse(value.kind == "string", "a number is needed, not a text", value)
         defined = Subcircuit(name, line.where(), tuple(ports), defaults, characters=len(line.text))
         first = around.inner.setdefault(name.lower(), defined)
-        refuse(first is not defined, f"subcircuit '{name}' is defined twice, first at {first.where}", defined.where)
+        refuse(first is not defined, f"subcircuit '{name}' is defined twice, first at {first.where}", defined)
         return defined
 
     def _include(self, directive: str, line: Line, rest: int) -> None:

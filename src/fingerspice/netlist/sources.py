@@ -55,7 +55,7 @@ class _Arguments:
         """An argument whose SPICE default is TSTEP."""
         tran = self.context.tran
         problem = f"{self.name} leaves out {name}, which defaults to TSTEP, and there is no .tran line"
-        refuse(name not in self.words and tran is None, f"{problem}; allowed: give {name}", self.call.where)
+        refuse(name not in self.words and tran is None, f"{problem}; allowed: give {name}", self.call)
         return self.get(name, tran.step if tran else math.nan)
 
     def whole(self, name: str) -> int | None:
@@ -63,7 +63,7 @@ class _Arguments:
         if name not in self.words:
             return None
         value = number(self.words[name], name).value
-        refuse(value != int(value), f"{name} is {value:g}; allowed: a whole number", self.words[name].where)
+        refuse(value != int(value), f"{name} is {value:g}; allowed: a whole number", self.words[name])
         return int(value)
 
     def column(self, name: str) -> str | int | None:
@@ -106,7 +106,7 @@ def _exp(a: _Arguments) -> Waveform:
 def _pwl(a: _Arguments) -> Waveform:
     shift, repeat = a.get("td", 0.0), a.get("r", -1.0)
     if "file" in a.words:
-        refuse(a.call.args, "PWL has points and file= too; allowed: one of them", a.call.where)
+        refuse(a.call.args, "PWL has points and file= too; allowed: one of them", a.call)
         points = PWL.from_table(a.file("file"), pairs=True)
         given, levels = points.times, points.values
     else:
@@ -135,7 +135,7 @@ def _table(a: _Arguments) -> Waveform:
     values, rate, times = read_table(path, a.column("time"), a.column("value"), given)
     if rate is not None:
         return a.upsampled(Samples(values, rate))
-    refuse("upsample" in a.words, "TABLE upsample goes with a rate, and this table has times", a.call.where)
+    refuse("upsample" in a.words, "TABLE upsample goes with a rate, and this table has times", a.call)
     return PWL(times, values)  # type: ignore[arg-type]
 
 
@@ -204,12 +204,12 @@ def read_source(statement: Statement, context: Context, notes: list[str]) -> tup
         word = words.popleft()
         if isinstance(word, Number):
             problem = f"{name}: a second value {word.text!r}; allowed: one value or source function"
-            refuse(level is not None or waveform is not None, f"{problem}, such as SIN(0 200 100)", word.where)
+            refuse(level is not None or waveform is not None, f"{problem}, such as SIN(0 200 100)", word)
             level = word.value
             continue
         key = _ALIASES.get(word.text.lower(), word.text.lower())
         apart = isinstance(word, Token) and is_unit(key) and (level is not None or waveform is not None)
-        refuse(apart, f"{name}: {word.text!r} stands apart; a unit joins its number, such as 5{word.text}", word.where)
+        refuse(apart, f"{name}: {word.text!r} stands apart; a unit joins its number, such as 5{word.text}", word)
         if isinstance(word, Token):
             numbers = list[Number]()  # A call may also be written without brackets: SIN 0 200 100.
             while words and isinstance(words[0], Number):
@@ -220,13 +220,13 @@ def read_source(statement: Statement, context: Context, notes: list[str]) -> tup
             problem = f"{name}: {key.upper()} has no parameter {next(iter(word.params))!r}; allowed: {_LEVELS[key]}"
             raise InputError(problem, next(iter(word.params.values())).key)
         if key == "dc":
-            refuse(len(word.args) != 1, f"{name}: DC needs one value", word.where)
+            refuse(len(word.args) != 1, f"{name}: DC needs one value", word)
             level = number(word.args[0], f"{name} DC").value
         elif key == "ac":
-            refuse(ac is not None, f"{name} has AC twice; allowed: {_LEVELS[key]} once", word.where)
+            refuse(ac is not None, f"{name} has AC twice; allowed: {_LEVELS[key]} once", word)
             given = [number(arg, f"{name} AC").value for arg in word.args]
             problem = f"{name}: AC takes at most 2 values, {len(given)} given; allowed: {_LEVELS[key]}"
-            refuse(len(given) > 2, problem, word.where)
+            refuse(len(given) > 2, problem, word)
             ac = SmallSignal(*given)
         elif waveform is not None:
             raise InputError(f"{name} has two source functions, the second is {key.upper()}", word.where)
@@ -266,7 +266,7 @@ def _words(statement: Statement) -> list[Word]:
 def _read_call(name: str, key: str, call: Call, context: Context) -> Waveform:
     function = SOURCES.get(key)
     refused = f"SFFM {_CHANGED}" if key == "sffm" else function.refused if function and context.in_deck else ""
-    refuse(refused, f"{name}: {refused}", call.where)
+    refuse(refused, f"{name}: {refused}", call)
     if function is None:
         hint = nearest(key, SOURCES)
         raise InputError(f"{name}: unknown source {key.upper()!r}{hint}; allowed: {_KNOWN}", call.where)

@@ -46,8 +46,7 @@ class Recorder:
 
     def drain(self, counters: IntArray) -> None:
         """Collect the steps that the loop has recorded; none of them where there are too many."""
-        count = int(counters[RECORDED])
-        counters[RECORDED] = 0
+        count, counters[RECORDED] = int(counters[RECORDED]), 0
         self.numbers += count * self.columns * NODES
         if self.numbers > MOST_NUMBERS:
             self.parts.clear()
@@ -91,8 +90,9 @@ class Recorded:
         """Parts of the steps between two times (s); equal periods are one panel with the duration of all of them."""
         start, length, reached, reach, count, period = self.times
         begin, end = start + period, reached + period
-        slack = same_time(1.0) * np.abs(end)
-        index = np.arange(float(start.size))
+        slack, index = same_time(1.0) * np.abs(end), np.arange(float(start.size))
+        if ((begin >= since - slack) & (end + (count - 1) * period <= until + slack)).all():
+            return np.array([index, 0.0 * index, reach, count * reach * length])
         period = np.where(count > 1, period, 1.0)
         # Of the periods that a step represents, those from number `first` to `last` lie wholly inside.
         first = np.clip(np.ceil((since - slack - begin) / period), 0, count)

@@ -229,10 +229,10 @@ def require(condition: bool, what: str, given: Any, allowed: str) -> None:
         raise InputError(f"{what} is {given}; allowed: {allowed}")
 
 
-def refuse(wrong: object, problem: str, where: Where | None = None) -> None:
-    """Refuse what is wrong, at its place in a netlist if it has one."""
+def refuse(wrong: object, problem: str, place: Any = None) -> None:
+    """Refuse what is wrong, at its place in a netlist: a `Where`, or what has one."""
     if wrong:
-        raise InputError(problem, where)
+        raise InputError(problem, getattr(place, "where", place))
 
 
 def terms_of(m: int, *terms: tuple[FloatArray | float, ...]) -> FloatArray:
