@@ -201,6 +201,20 @@ def test_points_of_a_source_need_a_tran_line_and_a_bound() -> None:
         fs.export_netlist(endless)
 
 
+@pytest.mark.parametrize(("rise", "fall"), [(0.0, 0.0), (2e-4, 0.0), (0.0, 3e-4)])
+def test_a_pulse_ends_at_its_time_and_a_single_one_does_not_come_again(rise: float, fall: float) -> None:
+    pulse = fs.Pulse(0.0, 100.0, delay=30.0, rise=rise, fall=fall, width=1e-3)
+    text = fs.export_netlist(table1(tran="10u 10m").replace({"Vdrive": pulse}))
+    (given,) = re.findall(r"PULSE\((.*?)\)", text.replace("\n+", " "))
+    _, _, delay, up, down, width, period = map(float, given.split())
+    # A jump is an edge, within which the width is measured.
+    assert delay == 30.0
+    assert 0.0 < up <= max(rise, 1e-8)
+    assert 0.0 < down <= max(fall, 1e-8)
+    assert up + width == pytest.approx(rise + 1e-3, rel=1e-12)
+    assert period > 10.0 * (delay + up + width + down)
+
+
 def test_names_that_would_become_one_are_refused() -> None:
     text = NESTED.replace("plate", "Xf_inner")
     with pytest.raises(fs.InputError, match=r"Xf\.inner and Xf_inner would be one name in the export"):

@@ -139,7 +139,7 @@ class Stepping(Integration):
         return Status.TOO_MANY_STEPS if code == readout.TOO_MANY else self.stuck()
 
     def march(self, sources: Sources, t_end: float, looks: Looks) -> int:
-        """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `loopstate`."""
+        """Step to `t_end` (s) in the compiled loop, or to a look that has found something: a code of `readout`."""
         while True:
             state = LoopState(
                 self.y, self.error, self.controls, self.counters, self.step, self.peaks, self.collected, self.outputs,
