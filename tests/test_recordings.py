@@ -13,7 +13,7 @@ import fingerspice as fs
 import recording_errors
 from fingerspice.solve.recordings import run as lanes_of_a_run
 from fingerspice.waveforms.samples import as_samples
-from scenes import cases, every_law, table1_deck
+from scenes import cases, every_law, table1, table1_deck
 
 RATE = 8000.0
 pytestmark = pytest.mark.filterwarnings("ignore::fingerspice.FingerspiceWarning")
@@ -246,3 +246,11 @@ def test_a_recording_takes_as_few_steps_a_sample_as_its_kinks_allow() -> None:
     for changes, rtol, parts in (({}, 1e-4, 1), ({}, 1e-6, 1), ({}, 1e-8, 4), (fast, 1e-5, 2), (fast, 1e-6, 4)):
         run = follow(samples, (n - 1) / 48e3, rtol=rtol, t_eval=[0.1], parameters=changes)
         assert run.stats["steps"] == parts * (n - 1)
+
+
+@every_law
+def test_the_current_at_the_end_is_that_of_a_run_that_goes_on(law: str) -> None:
+    circuit = table1().replace({"Vdrive": fs.Samples(100.0 * np.sin(np.arange(2000) / 30.0), 48e3)})
+    one, other = (fs.simulate(circuit, t_eval=[0.01, 0.02], t_stop=t, charge_law=law, rtol=1e-6) for t in (0.02, 0.03))
+    assert one.method == other.method == "relaxation"
+    assert one.i_source[-1] == pytest.approx(other.i_source[-1], rel=1e-5)

@@ -130,6 +130,14 @@ def test_any_circuit_is_streamed(name: str, monkeypatch: pytest.MonkeyPatch) -> 
     assert np.abs(joined(one, "u_gap") - whole.u_gap).max() <= 4e-6 * np.abs(whole.u_gap).max()
 
 
+def test_later_windows_state_the_errors_of_the_louder_ones_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streaming, "WINDOW", 300)
+    fading = {"Vdrive": fs.Sine(200.0, 500.0, damping=200.0)}
+    errors = [c.error.u_gap for c in fs.stream(shipped("amplifier"), count=300, rtol=1e-6, t_stop=0.03, sources=fading)]
+    assert len(errors) > 3
+    assert errors == sorted(errors)
+
+
 def test_what_cannot_be_followed_by_samples_goes_on_by_other_steps() -> None:
     values = 100.0 * recording_errors.noise(5, pieces.PIECE + 600, RATE, 50.0, 2000.0)
     # Beyond the range of the area's polynomial, in the second piece only.
