@@ -254,3 +254,14 @@ def test_the_current_at_the_end_is_that_of_a_run_that_goes_on(law: str) -> None:
     one, other = (fs.simulate(circuit, t_eval=[0.01, 0.02], t_stop=t, charge_law=law, rtol=1e-6) for t in (0.02, 0.03))
     assert one.method == other.method == "relaxation"
     assert one.i_source[-1] == pytest.approx(other.i_source[-1], rel=1e-5)
+
+
+def test_the_least_distance_to_the_fold_is_that_of_the_loudest_sample() -> None:
+    values = 100.0 * np.sin(np.arange(4000) / 40.0)
+    values[:1700] *= 0.3
+    values[2300:] *= 0.3
+    circuit = table1().replace({"Vdrive": fs.Samples(values, 48e3), "Xgap.d": 8e-7})
+    run = fs.simulate(circuit, t_stop=4000 / 48e3, charge_law="mobile", rtol=1e-4)
+    assert run.method == "relaxation"
+    assert run.fold_margin.min() < 0.96
+    assert 1.0 - run.fold_margin_min == pytest.approx(1.0 - run.fold_margin.min(), rel=0.01)
