@@ -249,11 +249,15 @@ def test_a_recording_takes_as_few_steps_a_sample_as_its_kinks_allow() -> None:
 
 
 @every_law
-def test_the_current_at_the_end_is_that_of_a_run_that_goes_on(law: str) -> None:
+def test_the_current_is_that_of_steps_and_at_the_end_that_of_a_run_that_goes_on(law: str) -> None:
     circuit = table1().replace({"Vdrive": fs.Samples(100.0 * np.sin(np.arange(2000) / 30.0), 48e3)})
     one, other = (fs.simulate(circuit, t_eval=[0.01, 0.02], t_stop=t, charge_law=law, rtol=1e-6) for t in (0.02, 0.03))
     assert one.method == other.method == "relaxation"
     assert one.i_source[-1] == pytest.approx(other.i_source[-1], rel=1e-5)
+    stepped = fs.simulate(circuit, t_stop=0.02, charge_law=law, rtol=1e-8, method="exponential")
+    followed = fs.simulate(circuit, t_eval=stepped.t, t_stop=0.02, charge_law=law, rtol=1e-6)
+    assert followed.method == "relaxation"
+    assert np.abs(followed.i_source - stepped.i_source).max() <= 1e-5 * np.abs(stepped.i_source).max()
 
 
 def test_the_least_distance_to_the_fold_is_that_of_the_loudest_sample() -> None:
