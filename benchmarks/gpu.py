@@ -22,7 +22,7 @@ import fingerspice as fs
 from batch import PERIODS, REFERENCES, population, seconds, single
 from fingerspice.engine.lockstep import card as lockcard
 from fingerspice.engine.lockstep.card import card_compiler
-from fingerspice.studies.batch import ladder
+from fingerspice.studies.batch import lockstep
 
 HERE = Path(__file__).resolve().parent
 
@@ -43,13 +43,13 @@ def kernel_seconds(call: Any, repeats: int) -> float:
         spent[-1] += time.perf_counter() - begin
         return out
 
-    ladder.march_on_card = timed
+    lockstep.march_on_card = timed
     try:
         for _ in range(repeats):
             spent.append(0.0)
             call()
     finally:
-        ladder.march_on_card = lockcard.march_on_card
+        lockstep.march_on_card = lockcard.march_on_card
     return float(np.median(spent[1:]))
 
 

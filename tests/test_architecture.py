@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -274,6 +275,18 @@ def test_the_whole_grows_no_more() -> None:
     for package, allowed in PACKAGE_LINES.items():
         own = sum(n for path, n in lines.items() if path.relative_to(PACKAGE).parts[0] == package)
         assert 0 < own <= allowed, f"{package} has {own} lines; allowed: {allowed}"
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "docs", "tests"])
+def test_what_others_import_from_the_package_exists(folder: str) -> None:
+    found = {x for path in (ROOT / folder).rglob("*.py") for x in imports(path) if x.startswith("fingerspice.")}
+    assert found <= {f"fingerspice.{name}" for name in NAMES}
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("fingerspice."):
+                whole = importlib.import_module(str(node.module))
+                for name in (alias.name for alias in node.names if f"{node.module}.{alias.name}" not in found):
+                    assert hasattr(whole, name), f"{path}: {node.module} has no {name}"
 
 
 @each_file
