@@ -239,7 +239,7 @@ class Stream:
         shown = problem.scene.shown
         span = (float(t[0]), float(t[-1])) if t.size else (problem.t_start, problem.t_start)
         network = within(shown.network, *span)
-        record = Record(network, shown.net, t, np.zeros(t.size, bool), np.ascontiguousarray(rows), problem.charge)
+        record = Record(network, shown.net, t, np.zeros(t.size, bool), rows, problem.charge)
         found = solution_of(problem, self.plan, run, record, t, self.rtol, self._method)
         return replace(found, first=span[0], t_stop=span[1])
 

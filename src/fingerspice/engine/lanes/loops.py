@@ -102,6 +102,18 @@ def span(
     return False
 
 
+@jit
+def hand_on(left: FloatArray, added: FloatArray, before: FloatArray, out: FloatArray) -> None:
+    """What is there at the start of each piece, and at the end of the last one, into `out` (rows, pieces + 1).
+
+    First it is `before` (rows,), of which `left` (rows, pieces) remains, and each piece adds `added` (rows, pieces).
+    """
+    for row in range(out.shape[0]):
+        out[row, 0] = before[row]
+        for i in range(left.shape[1]):
+            out[row, i + 1] = left[row, i] * out[row, i] + added[row, i]
+
+
 # Rows of what intervals lead to, behind the modes: gap voltage at the end, and the integrals of u^2 A and A.
 GAP, SQUARES, AREAS, MORE = range(4)
 

@@ -18,9 +18,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from fingerspice.base.arrays import FloatArray, IntArray
-from fingerspice.engine.lanes.loops import MORE, lead, show, span
+from fingerspice.engine.lanes.loops import MORE, hand_on, lead, show, span
 from fingerspice.engine.lanes.rows import along, rows_of
 from fingerspice.solve.problem import Problem
 from fingerspice.solve.recordings.form import PIECES, LaneForm, finger, rounded_peak, stack
@@ -97,6 +98,9 @@ class Block:
         self.x[: x.size], self.x[x.size :] = x, x[-1]
         self.h = np.append(h, np.zeros(self.x.size - x.size)) if self.own else h
         self.first = self.count * np.arange(PIECES)
+        # Samples of a window, and the source's largest move in each window of each piece, V.
+        self.width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + form.bent))))
+        self.moves = np.empty((PIECES, self.count // self.width))
         self.marks, self.active = form.marks(self.own), form.active
         self.rates = np.maximum(form.lanes.rates, _STILL)
         self.room, self.weights = form.room(self.own)
@@ -108,12 +112,8 @@ class Block:
         self.lengths = np.full(PIECES, self.count * self.h[0])
         if self.own:
             self.lengths = self.h.reshape(PIECES, self.count).sum(axis=1)
-        # (m, pieces, 1 + pieces): What is left at the start of each piece of the modes at the start of the block and
-        # the ends of the pieces.
-        ends = np.concatenate([[0.0], np.cumsum(self.lengths)])
-        since = ends[:PIECES, None] - ends[None, :]
-        left = np.exp(-self.rates[:, None, None] * np.maximum(since, 0.0))
-        self.handed = np.where(np.tri(PIECES, 1 + PIECES, dtype=bool), left, 0.0)
+        # (m, pieces): What is left of the modes at the end of each piece.
+        self.decay = np.exp(-self.rates[:, None] * self.lengths)
 
     def _span(self, first: IntArray, count: int, parts: int, tol: float, kept: FloatArray) -> bool:
         """`engine.lanes.loops.span` from the modes in `kept` at the samples `first`."""
@@ -141,8 +141,8 @@ class Block:
         # Least distances to the fold; the last sweep may stop before the end of the pieces.
         margins, folds = [1.0], rows_of(self.marks).fold * PIECES
         own = np.zeros((self.m, PIECES))
-        along(form.lanes, self.h, self.x, self.first, self.count, own)
-        starts = np.einsum("kij,kj->ki", self.handed, np.concatenate([start[: self.m, None], own], axis=1))
+        along(form.lanes, self.h, self.x, self.first, self.count, own, self.width, self.moves)
+        starts = self._handed_on(own, start[: self.m])[:, :-1]
         starts[active:] = 0.0
         for sweep in range(PIECES + 1):
             self.kept[: self.m, :, 0] = starts
@@ -154,8 +154,7 @@ class Block:
             if stops:
                 break
             off = self.kept[:active, :, -1] - np.roll(starts[:active], -1, axis=1)
-            off[:, -1] = 0.0
-            change = np.einsum("kij,kj->ki", self.handed[:active, :, 1:], off)
+            change = self._handed_on(off, np.zeros(active))[:, :-1]
             self.left[:active] = np.abs(change).max(axis=1)
             most = float(np.abs(form.lanes.shape) @ self.left)
             if not most < np.inf:
@@ -168,12 +167,11 @@ class Block:
         for k in range(active, self.m):
             # Passive modes have begun at 0 in every piece.
             self.kept[k] += np.cumsum(np.append(start[k], self.kept[k, :-1, -1]))[:, None]
-        self.xi, self.sizes = _scratch("xi", self.n + 1), _scratch("sizes", PIECES, self.count)
+        self.xi = _scratch("xi", self.x.size)
         show(form.xi[None], self.x, self.first, self.count, 0, self.n + 1, self.kept, self.xi[None])
-        np.abs(self.xi[:-1], out=self.sizes.reshape(-1)[: self.n])
-        self.sizes.reshape(-1)[self.n :] = 0.0
-        largest = self.sizes.max(axis=1)
-        self.peaks = np.maximum(largest, np.append(largest[1:], abs(self.xi[-1])))
+        self.xi[self.n + 1 :] = self.xi[self.n]
+        in_pieces = sliding_window_view(self.xi, self.count + 1)[:: self.count]
+        self.peaks = np.maximum(in_pieces.max(axis=1), -in_pieces.min(axis=1))
         return True
 
     def end(self) -> FloatArray:
@@ -195,8 +193,10 @@ class Block:
             share[active:], of_products[active:, active:] = self.busy
         own = window.off[:m, :, -1]
         products = own[:, None] * own
-        handed, alike = self._hand_on(own * share, alike)
-        lucky, chance = self._hand_on(products * of_products, chance)
+        handed, lucky = self._handed_on(own * share, alike), self._handed_on(products * of_products, chance)
+        last = (self.n - 1) // self.count
+        alike, chance = handed[:, last + 1], lucky[..., last + 1]
+        handed, lucky = handed[:, :-1], lucky[..., :-1]
         # What the sweeps leave of the starts is left of the end, too.
         alike = alike + np.copysign(self.left / OF_FORCE, alike)
 
@@ -219,17 +219,16 @@ class Block:
         alone += np.abs(c.shape @ (own * (share - 1.0))).max()
         return Judged(self._errors(window, over, later, 1e-9 * peak + 1e-300), float(alone), alike, chance)
 
-    def _hand_on(self, added: FloatArray, before: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Errors at the start of each piece (*kinds, pieces), and at the end of the block.
+    def _handed_on(self, added: FloatArray, before: FloatArray) -> FloatArray:
+        """What is there at the start of each piece and at the end (*kinds, pieces + 1), of modes or of products of two.
 
-        Pieces add `added` (*kinds, pieces), and `before` (*kinds,) is there at the start: of modes, or products of two.
+        `before` (*kinds,) is there at the start of the block, of which a part is left, and pieces add `added`.
         """
-        handed, lane = self.handed, (self.n - 1) // self.count
-        left = np.exp(-self.rates * self.lengths[lane])
+        left, out = self.decay[: len(before)], np.empty((before.size, PIECES + 1))
         if before.ndim == 2:
-            handed, left = handed[:, None] * handed, left[:, None] * left
-        at_starts = np.einsum("...ij,...j->...i", handed, np.concatenate([before[..., None], added], axis=-1))
-        return at_starts, left * at_starts[..., lane] + added[..., lane]
+            left = left[:, None] * left
+        hand_on(left.reshape(-1, PIECES), added.reshape(-1, PIECES), before.ravel(), out)
+        return out.reshape(*before.shape, PIECES + 1)
 
     def _errors(self, window: _Window, over: FloatArray, later: FloatArray, least: float) -> FloatArray:
         """Errors as in `Judged` from those of xi and of what `LaneForm.judged` shows, and of xi after the first sample.
@@ -238,7 +237,7 @@ class Block:
         """
         form, c, shown, (over, *others) = self.form, self.form.lanes, self.form.judged, over
         top = np.maximum(self.peaks, least)
-        first = np.maximum(np.abs(self.xi[np.minimum(self.first, self.n)]) + over, least)
+        first = np.maximum(np.abs(self.xi[self.first]) + over, least)
         rises, rises_at_first = ((form.force(1.001 * xi) - form.force(xi)) / (1e-3 * xi) for xi in (top, first))
         # What an error of xi changes at most, between 0 V and the peak: gap voltages, what `Shown.bends` multiplies
         # (m^2), and 1/A (1/m^2/V).
@@ -275,12 +274,13 @@ class Block:
 
     def _check(self, parts: int) -> _Window:
         """Follow a window of every piece by twice as many steps."""
-        width = min(self.count, max(FEWEST, round(self.count * WINDOW / (1 + self.form.bent))))
-        lanes, inside = np.arange(PIECES), np.arange(width + 1)
+        width = self.width
+        lanes = np.arange(PIECES)
         off, z, at = np.empty(0), np.empty(0), lanes
-        for number, place in enumerate(self._windows(width)):
+        windows = partial(sliding_window_view, window_shape=width + 1, axis=-1)
+        for number, place in enumerate(self._windows()):
             first = np.maximum(place, 0)
-            coarse = self.kept[:, lanes[:, None], first[:, None] + inside]
+            coarse = windows(self.kept)[:, lanes, first]
             fine = np.empty(coarse.shape)
             fine[..., 0] = coarse[..., 0]
             self._span(self.first + first, width, 2 * parts, -1.0, fine)
@@ -292,16 +292,13 @@ class Block:
             in_xi, before = (np.abs(np.einsum("k,kij->ij", self.form.xi[1:], x)).max(axis=1) for x in (found, off))
             worse = in_xi > before
             off[:, worse], z[:, worse], at[worse] = found[:, worse], coarse[:, worse], first[worse]
-        index = (self.first + at)[:, None] + inside
-        took = self.h[index[:, :-1]].sum(axis=1) if self.own else np.full(PIECES, width * self.h[0])
-        index = np.minimum(index, self.n)
-        return _Window(z, off, self.x[index], self.xi[index], took)
+        at += self.first
+        took = sliding_window_view(self.h, width)[at].sum(axis=1) if self.own else np.full(PIECES, width * self.h[0])
+        return _Window(z, off, windows(self.x)[at], windows(self.xi)[at], took)
 
-    def _windows(self, width: int) -> list[IntArray]:
+    def _windows(self) -> list[IntArray]:
         """Where windows begin in each piece, -1 for none: at large moves of the source, under N at large |xi|, too."""
-        moves, whole = _scratch("moves", PIECES * self.count), self.count - self.count % width
-        np.abs(np.subtract(self.x[1:], self.x[:-1], out=moves), out=moves)
-        most = moves.reshape(PIECES, self.count)[:, :whole].reshape(PIECES, -1, width).max(axis=-1)
+        most, width = self.moves, self.width
         # Windows end before the last sample.
         most[self.first[:, None] + width * np.arange(1, most.shape[1] + 1) > self.n] = -1.0
         place = np.where(most.max(axis=1) >= 0.0, width * np.argmax(most, axis=1), -1)
@@ -313,7 +310,8 @@ class Block:
         if not self.form.bent:
             return [place]
         ends = np.minimum(self.count, self.n - self.first) - width
-        largest = np.minimum(np.argmax(self.sizes, axis=1) - width // 2, ends)
+        largest = np.argmax(np.abs(self.xi[:-1]).reshape(PIECES, self.count), axis=1)
+        largest = np.minimum(largest - width // 2, ends)
         return [place, np.where(place >= 0, np.maximum(largest, 0), -1)]
 
     def at(self, number: IntArray, since: FloatArray, length: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:

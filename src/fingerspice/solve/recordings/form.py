@@ -286,8 +286,6 @@ class StackForm(LaneForm):
         return on_branch(problem.scene, self.system.model, found, math.copysign(1.0, u_gap))
 
     def recorded(self, problem: Problem, out: FloatArray) -> FloatArray:
-        turn = problem.scene.shown.turn
-        out[: turn.size] *= turn[:, None]
         if self.flows and self.mobile:
             out[self.rows.k.size - 1] -= problem.inner.offset
         return out.T
@@ -316,7 +314,9 @@ def stack(problem: Problem, rtol: float) -> StackForm | None:
         feed = np.column_stack([feed, system.push[0] / area0])
         kinks = np.append(kinks, -curve["steep"] / (q0 + curve["rest"]) ** 2)
         shape, by, missed_bend = area0 * q0 * shape, area0, missed * peak / q0
-    columns, k, moves, nodes = by * system.shown[0], system.k_shown, np.zeros(system.k_shown.size), by * system.node[0]
+    turn = scene.shown.turn
+    columns, k, moves = by * turn[:, None] * system.shown[0], turn * system.k_shown, np.zeros(turn.size)
+    nodes = by * system.node[0]
     if problem.charge:
         column, stored, gain_of, feed_of, moved = _charge(system, stack)
         rates, gain, feed = np.append(rates, 0.0), np.append(gain, gain_of), np.vstack([feed, feed_of])

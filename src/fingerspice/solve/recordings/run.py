@@ -218,9 +218,10 @@ class LaneMarch:
         """Write the outputs at the end of the run."""
         count, after = t_out.size - self.outputs, 1e-3 * self.usual
         if count:
-            # With the source's slope after the end of the run.
-            here, later = self.wave.value([self.problem.t_stop, self.problem.t_stop + after]).tolist()
-            x, slope = np.full(count, self.u_last), np.full(count, float(later - here) / after)
+            x, slope = np.full(count, self.u_last), np.zeros(count)
+            if self.form.flows:
+                # The source's slope after the end of the run.
+                slope += float(np.diff(self.wave.value([self.problem.t_stop, self.problem.t_stop + after]))[0]) / after
             self._show_at(x, slope, np.repeat(self.z[:, None], count, axis=1), out)
 
     def _stated(self, errors: FloatArray, peak: float) -> tuple[FloatArray, float, float | None]:
