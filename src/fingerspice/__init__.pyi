@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from fingerspice.solve.simulation import simulate as simulate
     from fingerspice.solve.streaming import stream as stream
     from fingerspice.studies.batch.batch import batch as batch
-    from fingerspice.studies.comparison import Comparison as Comparison
-    from fingerspice.studies.comparison import compare as compare
     from fingerspice.studies.export import export_netlist as export_netlist
     from fingerspice.studies.feel import Feel as Feel
     from fingerspice.studies.feel import feel as feel
@@ -43,7 +41,9 @@ if TYPE_CHECKING:
     from fingerspice.studies.limits import FoldLimits as FoldLimits
     from fingerspice.studies.limits import capability as capability
     from fingerspice.studies.limits import fold_limits as fold_limits
+    from fingerspice.studies.steady import Comparison as Comparison
     from fingerspice.studies.steady import SteadyState as SteadyState
+    from fingerspice.studies.steady import compare as compare
     from fingerspice.studies.steady import large_signal as large_signal
     from fingerspice.studies.steady import phasor as phasor
     from fingerspice.studies.steady import steady_state as steady_state

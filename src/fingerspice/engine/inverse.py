@@ -15,6 +15,7 @@ import numpy as np
 
 from fingerspice.base.arrays import BoolArray, FloatArray
 from fingerspice.base.compiled import jit
+from fingerspice.numerics.linear import moments
 from fingerspice.physics.contact import inverse_area
 
 # Where a limit holds the source, the secant method finds the gap voltage: tolerance of the source voltage (V), and most
@@ -39,27 +40,18 @@ def _step(
     j = (cells[gap, 1] * q_area + cells[gap, 2]) * u * scale
     q0, j0 = before[1, gap], before[0, gap]
     after[0, gap], after[1, gap] = j, q
-    voltage = u
+    voltage, response = u, np.empty(2)
     for i in range(cells.shape[0]):
         if i == gap:
             continue
         r = (cells[i, 1] * q_area + cells[i, 2]) / cells[i, 0]
         after[1, i] = r
-        if h == 0.0:
-            after[0, i] = 0.0
-        else:
-            mean = 0.5 * (r + before[1, i])
-            z = mean * h
-            decay = math.exp(-z)
-            # Responses to a constant forcing of 1, and to one that rises from 0 to 1 at the end, over the step length.
-            if z > 1e-3:
-                all_of = (1.0 - decay) / z
-                end = (1.0 - all_of) / z
-            else:
-                all_of = 1.0 - z * (0.5 - z / 6.0)
-                end = 0.5 - z * (1.0 / 6.0 - z / 24.0)
-            g0, g1 = j0 - mean * q0, j - mean * q
-            after[0, i] = decay * before[0, i] + h * ((all_of - end) * g0 + end * g1)
+        mean = 0.5 * (r + before[1, i])
+        # Responses to a constant forcing of 1, and to one that rises from 0 to 1 at the end, over the step length.
+        moments(mean * h, response)
+        g0, g1 = j0 - mean * q0, j - mean * q
+        forced = (response[0] - response[1]) * g0 + response[1] * g1
+        after[0, i] = math.exp(-mean * h) * before[0, i] + h * forced
         voltage += (after[0, i] + q) / (cells[i, 0] * scale)
     return voltage
 
@@ -73,14 +65,12 @@ def drive_stack(
 
     The stack starts uncharged. `cells`, shape (n_cell, 3), are capacitance per area, total and areal leakage of each
     cell. Where the source would pass `limit` (V) or change by more than `change` (V) in a step, it is held at that
-    limit, the sample is marked in `held` (n,), and the layers go on from the state at the gap voltage that results.
+    limit, the sample is marked in `held` (n,), and the layers go on from the state at the gap voltage that results. Of
+    a gap alone, the drive is `target` within the limits.
     """
     before = np.zeros((2, cells.shape[0]))
     after = np.zeros((2, cells.shape[0]))
-    slope = 0.0
-    for i in range(cells.shape[0]):
-        slope += cells[gap, 0] / cells[i, 0]
-    last, step = 0.0, 0.0
+    slope, last, step = np.sum(cells[gap, 0] / cells[:, 0]), 0.0, 0.0
     for n in range(target.size):
         u = target[n]
         voltage = _step(u, before, step, curve, cells, gap, mobile, after)
@@ -100,16 +90,3 @@ def drive_stack(
         drive[n] = voltage
         last, step = voltage, h
         before, after = after, before
-
-
-@jit
-def hold(wish: FloatArray, limit: float, change: float, drive: FloatArray, held: BoolArray) -> None:
-    """Fill `drive` (n,) with `wish` (n,), limited to `limit` (V) and to changes of `change` (V) a step.
-
-    `held` (n,) marks the samples at which a limit applies.
-    """
-    last = 0.0
-    for n in range(wish.size):
-        last = min(max(wish[n], max(-limit, last - change)), min(limit, last + change))
-        drive[n] = last
-        held[n] = last != wish[n]

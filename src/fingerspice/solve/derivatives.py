@@ -67,10 +67,7 @@ class _Parameter:
         parameter = self.circuit.parameters[self.path]
         self.value, self.unit, self.step = parameter.value, parameter.unit, _STEP
         if not (math.isfinite(self.value) and self.value != 0.0):
-            raise InputError(
-                f"sensitivities names {self.path}, which is {self.value:g}; allowed: parameters whose value is finite "
-                "and not 0, as steps are relative to it"
-            )
+            raise self.not_by(f"is {self.value:g}", "whose value is finite and not 0, as steps are relative to it")
         element, span = self.path.rpartition(".")[0], (problem.t_start, problem.t_stop)
         own = self.circuit[element].waveform
         if own is None:
@@ -79,10 +76,11 @@ class _Parameter:
         self.step /= max(1.0, 2.0 * math.pi * problem.t_stop / own.shortest_time())
         for wave in (circuit[element].waveform for circuit in self.circuits()):
             if wave is None or not np.array_equal(wave.breakpoints(*span), own.breakpoints(*span)):
-                raise InputError(
-                    f"sensitivities names {self.path}, which moves the edges of its source; allowed: parameters "
-                    "that leave them where they are, such as an amplitude, or the frequency of a sine"
-                )
+                allowed = "that leave them where they are, such as an amplitude, or the frequency of a sine"
+                raise self.not_by("moves the edges of its source", allowed)
+
+    def not_by(self, which: str, allowed: str) -> InputError:
+        return InputError(f"sensitivities names {self.path}, which {which}; allowed: parameters {allowed}")
 
     def circuits(self, share: float = 1.0) -> list[Circuit]:
         """Circuits around its value, with a `share` of the step."""
@@ -108,10 +106,8 @@ class _Parameter:
             if other.failure is not None and not known:
                 raise SolveError(other.failure, solution)
             if not np.array_equal(other.t, solution.t):
-                raise InputError(
-                    f"sensitivities names {self.path}, which moves the times at which the run has outputs; allowed: "
-                    "other parameters, or given t_eval"
-                )
+                said = f"sensitivities names {self.path}, which moves the times at which the run has outputs"
+                raise InputError(f"{said}; allowed: other parameters, or given t_eval")
         return found
 
 
@@ -137,10 +133,8 @@ def check_request(problem: Problem, paths: Sequence[str], method: str) -> str:
         (f"the method is {method!r}", method not in ("auto", "exponential")),
     ):
         if refused:
-            raise InputError(
-                f"sensitivities are asked for, and {what}; allowed: a circuit with a GAP, one of the other starts, and "
-                "the methods 'auto' and 'exponential'"
-            )
+            allowed = "a circuit with a GAP, one of the other starts, and the methods 'auto' and 'exponential'"
+            raise InputError(f"sensitivities are asked for, and {what}; allowed: {allowed}")
     # A recording, or a PWL with many points, is otherwise followed point by point, to no error as small as needed here.
     return method if driving(problem)[1] is None else "exponential"
 
@@ -153,10 +147,8 @@ def sensitivities_of(
     for one in [_Parameter(problem, path) for path in paths]:
         longer = one.longer() if problem.begun is not None else 0.0
         if math.isnan(longer):
-            raise InputError(
-                f"sensitivities of a periodic state name {one.path}, near whose value the source has no such period; "
-                "allowed: other parameters, or a run from another start"
-            )
+            said = f"sensitivities of a periodic state name {one.path}, near whose value the source has no such period"
+            raise InputError(f"{said}; allowed: other parameters, or a run from another start")
         runs = one.runs(1.0, run, solution)
         by: dict[str, Any] = {name: one.by([getattr(other, name) for other in runs]) for name in (*SIGNALS, *MEANS)}
         for share in _CLOSER:
@@ -188,10 +180,8 @@ def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
         value = real_numbers(name, given, "numbers, derivatives by the signal")
         shape, finite = () if name in MEANS else run.t.shape, bool(np.isfinite(value).all())
         if value.shape != shape or not finite:
-            raise InputError(
-                f"{name} has the shape {value.shape}{'' if finite else ' and numbers that are not finite'}; allowed: "
-                f"the shape {shape}, finite: the derivative of a number by that signal"
-            )
+            said = f"{name} has the shape {value.shape}{'' if finite else ' and numbers that are not finite'}"
+            raise InputError(f"{said}; allowed: the shape {shape}, finite: the derivative of a number by that signal")
         by[name] = value
     ((_, contact),) = run.record.fingers
     # F_t = mu (F_N + F_el), and the friction coefficient is F_t / F_N.
@@ -201,39 +191,41 @@ def _weights(run: Solution, of: Mapping[str, ArrayLike]) -> dict[str, Any]:
 
 
 class _Intervals:
-    """The intervals of a run between the samples of its source."""
+    """The intervals of a run between the samples of its source, its outputs, and the start of its means."""
 
     def __init__(self, run: Solution) -> None:
         self.run, self.problem = run, _problem(run, {})
-        problem, stack, rtol = self.problem, self.problem.scene.stack, run.rtol
+        problem, rtol = self.problem, run.rtol
         if len(problem.network.fingers) != 1 or not problem.scene.coupled:
             raise InputError(f"{_ASKED}the circuit has no single GAP whose area is coupled; allowed: one")
         # Of each source: its name, its sign along the loop, and its samples.
-        sources = [(e, 1.0) for e in problem.network.sources] if stack is None else stack.sources
-        waves = [(e.name, float(sign), None if e.waveform is None else as_samples(e.waveform)) for e, sign in sources]
+        drives = problem.network.drives
+        waves = [(e.name, sign, as_samples(e.waveform)) for e, sign in drives if e.waveform is not None]
         known = [(name, sign, wave) for name, sign, wave in waves if wave is not None]
         if len(known) != 1 or not isinstance(driving(problem)[1], Samples):
-            others = "sources of 0" if stack is None else "constant ones"
-            raise InputError(
-                f"{_ASKED}of the circuit's {len(waves)} sources {len(known)} are recordings; allowed: one, such as "
-                f"fs.Samples, or a PWL on an even grid, beside {others}"
-            )
+            others = "sources of 0" if problem.scene.stack is None else "constant ones"
+            said = f"of the circuit's {len(waves)} sources {len(known)} are recordings; allowed: one, such as"
+            raise InputError(f"{_ASKED}{said} fs.Samples, or a PWL on an even grid, beside {others}")
         ((self.name, self.sign, wave),) = known
         form = ready(problem, max(_OF_AREA * rtol, 1e-13)) or ready(problem, rtol)
         if form is None:
-            raise InputError(
-                f"{_ASKED}this circuit is not followed sample by sample (docs/recordings.md); allowed: a circuit that "
-                "is"
-            )
-        self.wave, self.form, self.first, self.m = wave, form, 0 if rtol >= _COARSE else 1, form.lanes.rates.size
-        t0, t1 = problem.t_start, problem.t_stop
+            said = "this circuit is not followed sample by sample (docs/recordings.md)"
+            raise InputError(f"{_ASKED}{said}; allowed: a circuit that is")
+        self.wave, self.form, self.m = wave, form, form.lanes.rates.size
+        self.parts = _STEPS if rtol >= _COARSE else _STEPS[1:]
+
+    def _divide(self, by: Mapping[str, Any]) -> None:
+        """Make the intervals, for the outputs that count."""
+        run, wave, t0, t1 = self.run, self.wave, self.problem.t_start, self.problem.t_stop
         first, last = math.ceil((t0 - wave.start) * wave.rate - 1e-6), math.floor((t1 - wave.start) * wave.rate + 1e-6)
-        t, slack = wave.start + np.arange(first, last + 1) / wave.rate, 1e-6 / wave.rate
-        t = np.concatenate([[t0], t[(t > t0 + slack) & (t < t1 - slack)], [t1]])
-        # (n + 1,): Start and end of the run, samples between, and the start of the means, s
-        self.t = t if np.abs(t - run.first).min() <= slack else np.insert(t, np.searchsorted(t, run.first), run.first)
+        more, self.slack = np.append(run.t[np.any([by[name] for name in SIGNALS], axis=0)], run.first), 1e-6 / wave.rate
+        more = more[np.abs((more - wave.start) * wave.rate % 1.0 - 0.5) < 0.5 - 1e-6]
+        t = np.unique(np.concatenate([wave.start + np.arange(first, last + 1) / wave.rate, more]))
+        t = np.concatenate([[t0], t[(t > t0 + self.slack) & (t < t1 - self.slack)], [t1]])
+        # (n + 1,): Start and end of the run, and samples and outputs between, s
+        self.t = t[np.append(True, np.diff(t) > self.slack)]
         # (n + 1,): The source at these times
-        self.x, h = np.ascontiguousarray(problem.waveform.value(self.t)), np.diff(self.t)
+        self.x, h = np.ascontiguousarray(self.problem.waveform.value(self.t)), np.diff(self.t)
         # Lengths of the intervals (n,), or their common one (1,), s
         self.h = h if np.ptp(h) > 1e-9 * h[0] else np.array([h.mean()])
 
@@ -249,22 +241,20 @@ class _Intervals:
         out *= np.tile(0.5 / apart, 2)[:, None, None]
         return np.ascontiguousarray((out[: m + 2] - out[m + 2 :]).transpose(1, 0, 2))
 
-    def slopes(self, at: IntArray, to: FloatArray, length: FloatArray, rows: BoolArray) -> list[FloatArray]:
-        """Derivatives (`_slopes`) from the starts of the intervals `at`, where the source goes to `to` in a `length`.
+    def slopes(self, at: IntArray, rows: BoolArray) -> list[FloatArray]:
+        """Derivatives (`_slopes`) of what the intervals `at` lead to, of which `rows` says which are wanted.
 
-        They come twice: as of the shortest steps, and extrapolated. `rows` says which of them are wanted.
+        They come twice: as of the shortest steps, and extrapolated.
         """
-        if not length.any():
-            return 2 * [self._slopes(at, to, length, 1)]
-        m, many, allowed = self.m, length.size > 1, _ALLOWED * self.run.rtol
-        two, *finer = _STEPS[self.first : self.first + 2], *_STEPS[self.first + 2 :]
-        coarse, fine = (self._slopes(at, to, length, parts) for parts in two)
+        m, many, allowed, to = self.m, self.h.size > 1, _ALLOWED * self.run.rtol, self.x[at + 1]
+        length = self.h[at] if many else self.h
+        coarse, fine = (self._slopes(at, to, length, parts) for parts in self.parts[:2])
         # By the modes for what moves them, and by the source relative to the largest one.
         moved = self.delta[:m, None] * np.abs(fine[:, :m])
         scale = np.abs(fine[:, m:]).max(axis=(1, 2))[:, None] + np.zeros(m + 2)
         scale[:, :m] = moved.max(axis=(1, 2))[:, None] / self.delta[:m]
         wanted = rows[:, None, None] & (np.abs(fine - coarse) > allowed * scale[..., None])
-        for parts in finer:
+        for parts in self.parts[2:]:
             (still,) = np.nonzero(wanted.any(axis=(0, 1)))
             if not still.size:
                 break
@@ -276,8 +266,8 @@ class _Intervals:
         return [fine, fine + (fine - coarse) / 7.0]
 
     def outputs(self, by: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of a number by modes (2, m, n) and source (2, n + 1) at all times, by the outputs after each."""
-        n, m, t, x, run, stack = self.x.size - 1, self.m, self.t, self.x, self.run, self.problem.scene.stack
+        """Derivatives of a number, by its outputs, by the modes (m, n + 1) and the source (n + 1,) at all times."""
+        m, run, stack = self.m, self.run, self.problem.scene.stack
         ((_, contact),) = run.record.fingers
         assert run.u_gap is not None
         # By the gap voltage along the loop.
@@ -287,54 +277,48 @@ class _Intervals:
         dq = dq * np.sign(u)
         by_u = turn * by["u_gap"] - by["area"] * dq / q**2
         by_u = by_u + by["f_el"] * contact.stress(1.0) * u * (2.0 - u * dq / q) / q
-        of_modes, of_source = np.zeros((2, m, n)), np.zeros((2, n + 1))
-        place = np.clip(np.searchsorted(t, run.t, "right") - 1, 0, n - 1)
-        share = (run.t - t[place]) / (t[place + 1] - t[place])
-        on = share < 1e-9
-        for which, between in ((on, False), (~on, True)):
-            for some in _parts_of(np.flatnonzero(which & (by_u != 0.0))):
-                at, part = place[some], share[some] if between else np.zeros(some.size)
-                to = x[at] + part * (x[at + 1] - x[at])
-                length = part * np.diff(t)[at] if between else np.zeros(1)
-                for row, found in enumerate(self.slopes(at, to, length, np.arange(m + MORE) == m + GAP)):
-                    of_gap = by_u[some] * found[m + GAP]
-                    for k in range(m):
-                        np.add.at(of_modes[row, k], at, of_gap[k])
-                    np.add.at(of_source[row], at, of_gap[m] + (1.0 - part) * of_gap[m + 1])
-                    np.add.at(of_source[row], at + 1, part * of_gap[m + 1])
+        of_modes, of_source = np.zeros((m, self.t.size)), np.zeros(self.t.size)
+        place = np.searchsorted(self.t, run.t - self.slack)
+        for some in _parts_of(np.flatnonzero(by_u)):
+            at = place[some]
+            of_gap = by_u[some] * self._slopes(at, self.x[at], np.zeros(1), 1)[m + GAP]
+            np.add.at(of_modes.T, at, of_gap[:m].T)
+            np.add.at(of_source, at, of_gap[m] + of_gap[m + 1])
         return of_modes, of_source
 
     def swept(self, by: Mapping[str, Any]) -> FloatArray:
         """Derivatives of a number by the samples, with half the steps and with all, shape (2, n_sample)."""
+        self._divide(by)
         t, m, wave, form, ((_, contact),) = self.t, self.m, self.wave, self.form, self.run.record.fingers
         block, start = Block(form, self.x, self.h, True), form.start(self.problem)[0][:m]
         peak = float(np.abs(self.x).max(initial=1e-300)) * form.gain
-        solved = block.solve(start, _STEPS[self.first + 2], _CLOSED * peak) and block.on_one_branch
+        solved = block.solve(start, self.parts[2], _CLOSED * peak) and block.on_one_branch
         if not solved or float(np.abs(form.gap(block.xi)).max()) > form.u_top:
             cause = "the run is not followed sample by sample, for its derivatives by samples"
             action = "a higher sample rate takes shorter steps"
             raise SolveError(Failure(Status.STEP_UNDERFLOW, cause, action, float(t[0])))
-        # The modes at the starts of all intervals (m, n), and the distances of their differences (m + 1,).
-        self.z = block.kept[:m, :, :-1].reshape(m, -1)[:, : t.size - 1]
+        # The modes at all times (m, n + 1), and the distances of their differences (m + 1,).
+        starts = block.kept[:m, :, :-1].reshape(m, -1)[:, : t.size - 1]
+        self.z = np.column_stack([starts, block.end()[:m]])
         sizes = np.append(np.abs(self.z).max(axis=1), np.abs(self.x).max())
         self.delta = _APART * np.where(sizes > 0.0, sizes, peak)
-        of_modes, of_source = self.outputs(by)
-        n, after, means = t.size - 1, np.zeros((2, m)), np.zeros((MORE, t.size - 1))
+        of_modes, by_outputs = self.outputs(by)
+        n, means = t.size - 1, np.zeros((MORE, t.size - 1))
+        of_source, after = np.tile(by_outputs, (2, 1)), np.tile(of_modes[:, n], (2, 1))
         means[SQUARES], means[AREAS] = by["f_el_mean"] * contact.stress(1.0), by["area_mean"]
         means *= (t[:-1] >= self.run.first - 1e-9 * (t[-1] - t[0])) / (t[-1] - self.run.first)
         rows = np.append(np.ones(m, bool), means.any(axis=1))
         for at in reversed(_parts_of(np.arange(n))):
             a, b = at[0], at[-1] + 1
-            length = self.h[a:b] if self.h.size > 1 else self.h
-            for row, found in enumerate(self.slopes(at, self.x[at + 1], length, rows)):
-                own = np.ascontiguousarray(means[:, a:b]), np.ascontiguousarray(of_modes[row, :, a:b])
+            own = np.ascontiguousarray(means[:, a:b]), np.ascontiguousarray(of_modes[:, a:b])
+            for row, found in enumerate(self.slopes(at, rows)):
                 sum_back(found, *own, of_source[row, a : b + 1], after[row])
         if self.problem.initial.s_before.any():
             # The modes at the start follow the source there.
             step = STEP * self.problem.scene.u_peak
             moved = [Sum((wave, DC(self.sign * at * step))) for at in AT]
-            starts = [form.start(_problem(self.run, {self.name: one})) for one in moved]
-            of_source[:, 0] += after @ derivative([start[:m] for start, _ in starts], step)
+            begun = [form.start(_problem(self.run, {self.name: one})) for one in moved]
+            of_source[:, 0] += after @ derivative([start[:m] for start, _ in begun], step)
         # Samples before the times, and how far these are beyond, in samples.
         out, place = np.zeros((2, wave.count)), np.clip((t - wave.start) * wave.rate, 0.0, wave.count - 1.0)
         first = np.minimum(np.floor(place + 1e-6), wave.count - 2.0).astype(np.int64)
@@ -360,10 +344,8 @@ def _parts_of(numbers: IntArray) -> list[IntArray]:
 def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradient:
     """See `Solution.sample_gradient`."""
     if run.stored is not None or run.start == "given":
-        raise InputError(
-            f"{_ASKED}the run goes on from another one or was read from a file; allowed: a run just made from its "
-            "circuit's own start"
-        )
+        allowed = "a run just made from its circuit's own start"
+        raise InputError(f"{_ASKED}the run goes on from another one or was read from a file; allowed: {allowed}")
     if run.failure is not None:
         raise InputError(f"{_ASKED}the run failed; allowed: a run to its end")
     one = _Intervals(run)
@@ -371,10 +353,6 @@ def sample_gradient(run: Solution, of: Mapping[str, ArrayLike]) -> SampleGradien
     largest = float(np.abs(fine).max())
     error = float(np.abs(fine - coarse).max()) + run.rtol * largest
     if error > _ALLOWED * run.rtol * largest:
-        warnings.warn(
-            f"the derivatives by samples have an error of {error:.1e}, {error / largest:.0e} of the largest one; a "
-            "higher sample rate makes it smaller",
-            FingerspiceWarning,
-            stacklevel=3,
-        )
+        said = f"the derivatives by samples have an error of {error:.1e}, {error / largest:.0e} of the largest one"
+        warnings.warn(f"{said}; a higher sample rate makes it smaller", FingerspiceWarning, stacklevel=3)
     return SampleGradient(one.name, one.wave.rate, one.wave.start, one.sign * fine, error)

@@ -185,41 +185,31 @@ def run_warnings(problem: Problem, run: Run, record: Record) -> Iterator[str]:
         where, unloaded = f" of {name}" if several else "", record.net.area0[problem.network.fingers[finger]]
         least, largest = _areas_met(problem, record, finger, u_peak)
         if u_peak > BREAKDOWN_VOLTAGE:
-            yield (
-                f"the gap voltage{where} reaches {u_peak:.4g} V; air breaks down above about {BREAKDOWN_VOLTAGE:g} V "
-                "(Paschen minimum 327 V), which the model does not contain"
-            )
+            limit = f"air breaks down above about {BREAKDOWN_VOLTAGE:g} V (Paschen minimum 327 V)"
+            yield f"the gap voltage{where} reaches {u_peak:.4g} V; {limit}, which the model does not contain"
         if least < LEAST_AREA * unloaded:
-            yield (
-                f"the contact area{where} falls to {1e6 * least:.3g} mm^2, below {100.0 * LEAST_AREA:g} % of the "
-                f"{1e6 * unloaded:.3g} mm^2 at 0 V: the contact model was not made for so little"
-            )
+            little = f"below {100.0 * LEAST_AREA:g} % of the {1e6 * unloaded:.3g} mm^2 at 0 V"
+            said = f"the contact area{where} falls to {1e6 * least:.3g} mm^2, {little}"
+            yield f"{said}: the contact model was not made for so little"
         yield from beyond_fingers(where, f_peak, float(contact.stress(u_peak)), largest)
         if success and 0.0 < u_peak <= u_error and not several:
-            yield (
-                f"the gap takes no more than rounding of the source's voltage: of its {u_peak:.2g} V nothing is "
-                "known but that they are as good as 0"
-            )
+            known = f"of its {u_peak:.2g} V nothing is known but that they are as good as 0"
+            yield f"the gap takes no more than rounding of the source's voltage: {known}"
     for e in problem.circuit.by_device("V", "I"):
         if e.waveform is not None and e.waveform.precision > DOUBLE:
-            yield (
-                f"the source function of {e.name} gives numbers rounded to {e.waveform.precision:.2g} of their size, "
-                f"not doubles: it is rough by {run.rough:.2g} V, which the stated errors contain"
-            )
+            rounded = f"numbers rounded to {e.waveform.precision:.2g} of their size, not doubles"
+            rough = f"it is rough by {run.rough:.2g} V, which the stated errors contain"
+            yield f"the source function of {e.name} gives {rounded}: {rough}"
     if run.margin < NEAR_FOLD and success:
-        yield (
-            f"the fold of the mobile charge law is near: the distance to it falls to {run.margin:.2g} (1 far, 0 at the "
-            "fold)"
-        )
+        distance = f"the distance to it falls to {run.margin:.2g} (1 far, 0 at the fold)"
+        yield f"the fold of the mobile charge law is near: {distance}"
     for i, layer in enumerate(problem.network.layers):
         strength = layer.values.get("e_max", math.inf)
         if math.isfinite(strength) and record.t.size:
             field = float(np.abs(record.u_layer[:, i]).max()) / layer.values["d"]
             if field > strength:
-                yield (
-                    f"the field in {layer.name} reaches {field:.3g} V/m at the outputs; its dielectric strength is "
-                    f"{strength:.3g} V/m"
-                )
+                met = f"the field in {layer.name} reaches {field:.3g} V/m at the outputs"
+                yield f"{met}; its dielectric strength is {strength:.3g} V/m"
 
 
 def _areas_met(problem: Problem, record: Record, finger: int, u_peak: float) -> tuple[float, float]:
@@ -241,10 +231,9 @@ def _source_warnings(problem: Problem) -> Iterator[str]:
     event = shortest_event(problem)
     plain = any(isinstance(wave, Function) and not wave.breaks for wave in problem.waveforms)
     if plain and event > _EVENT:
-        yield (
-            f"the source is a function, which was looked at every {format_si(event, 's')}: an event shorter than that "
-            "may have been missed; give Function(f, breaks=(...)) its edges, or the circuit a .tran of a shorter TSTEP"
-        )
+        seen = f"which was looked at every {format_si(event, 's')}: an event shorter than that may have been missed"
+        mend = "give Function(f, breaks=(...)) its edges, or the circuit a .tran of a shorter TSTEP"
+        yield f"the source is a function, {seen}; {mend}"
     yield from spectrum_warning(problem.circuit, problem.waveform, problem.t_stop)
 
 
@@ -255,10 +244,8 @@ def _off_warning(problem: Problem) -> Iterator[str]:
         return
     small = ", ".join(e.name for e in driving(problem.circuit) if e.ac is not None)
     if small:
-        yield (
-            f"the sources are 0 all the time: {small} has AC alone, which drives sweeps (fingerspice ac); a sine "
-            "in time is SIN(VO VA FREQ)"
-        )
+        alone = f"{small} has AC alone, which drives sweeps (fingerspice ac)"
+        yield f"the sources are 0 all the time: {alone}; a sine in time is SIN(VO VA FREQ)"
     elif not problem.initial.y.any() and not any(
         problem.t_stop <= wave.course[0] < math.inf for wave in problem.waveforms
     ):

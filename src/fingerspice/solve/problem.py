@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, Literal
@@ -35,8 +35,8 @@ MOST_PERIODS, MOST_BREAKPOINTS = 1e10, 4e9
 MOST_BYTES = 2e9
 # Round-off of a gap voltage relative to the voltages that cancel in it; finer steps cannot reduce the error below that.
 ROUNDING = 2e-14
-# Largest number of breakpoints and of output times (0.3 MB) cached with a waveform, and of breakpoints in memory.
-KEPT_BREAKPOINTS, KEPT_OUTPUTS, _BREAKPOINTS_AT_ONCE = 8192, 32_768, 65_536
+# Largest number of times (0.3 MB) that are cached with a waveform, and of breakpoints in memory.
+KEPT, _BREAKPOINTS_AT_ONCE = 32_768, 65_536
 # Resolution of a time in units of its rounding error; a difference of a source's two limits at an edge is no jump if
 # the source changes as much within this resolution beside the edge.
 _RESOLVED = 8.0
@@ -103,12 +103,16 @@ class Problem:
         return (t - self.t_start) / (self.t_stop - self.t_start)
 
     def breakpoints(self) -> FloatArray:
-        """The sources' breakpoints in the run, s; the waveform caches them if they are few."""
-        kept, key = self.waveform.kept, ("breakpoints", self.t_start, self.t_stop)
-        edges = kept_with(kept, key, 1, lambda: self.waveform.breakpoints(self.t_start, self.t_stop))
-        if edges.size > KEPT_BREAKPOINTS:
+        """The sources' breakpoints in the run, s."""
+        return self.kept("breakpoints", lambda: self.waveform.breakpoints(self.t_start, self.t_stop))
+
+    def kept(self, what: str, make: Callable[[], FloatArray], *how: Any) -> FloatArray:
+        """Times that follow from the sources and the run; the waveform caches them if they are few."""
+        kept, key = self.waveform.kept, (what, self.t_start, self.t_stop, *how)
+        found = kept_with(kept, key, 1, make)
+        if found.size > KEPT:
             kept.pop(key, None)
-        return edges
+        return found
 
     @property
     def max_step(self) -> float:
@@ -138,12 +142,10 @@ def prepare(
     t_start = start.state.t if isinstance(start, Solution) else 0.0
     scene = scene_of(circuit, charge_law, area_given(area), t_stop, rtol)
     tran, wave, stop = circuit.tran, scene.waveform, t_stop
-    if stop is None and tran is not None:
-        stop = t_start + tran.stop
-    elif stop is None and t_eval is not None and t_eval.size:
-        stop = float(t_eval[-1])
-    elif stop is None:
-        raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+    if stop is None:
+        if tran is None and (t_eval is None or not t_eval.size):
+            raise InputError("no t_stop: the deck has no .tran line and none was given; give t_stop in s")
+        stop = float(t_eval[-1]) if tran is None else t_start + tran.stop  # type: ignore[index]
     require(math.isfinite(stop) and stop > t_start, "t_stop", f"{stop:g} s", f"more than {t_start:g} s")
     if t_eval is not None:
         require(t_eval.ndim == 1 and t_eval.size > 0, "t_eval", f"of shape {t_eval.shape}", "one row of times")
@@ -219,17 +221,14 @@ def asked_for(problem: Problem, t_eval: FloatArray | None, jumps: str) -> tuple[
     if t_eval is not None:
         return t_eval, np.zeros(t_eval.size, bool)
     check_outputs(problem.circuit, (problem.t_stop - problem.first) / problem.step)
-    kept, key = problem.waveform.kept, ("outputs", problem.t_start, problem.t_stop, problem.first, problem.step, jumps)
-    t_out, left = kept_with(kept, key, 1, lambda: _output_times(problem, jumps))
-    if t_out.size > KEPT_OUTPUTS:
-        kept.pop(key, None)
-    # Check again, because each jump adds two outputs.
+    t_out = problem.kept("outputs", lambda: _output_times(problem, jumps), problem.first, problem.step, jumps)
+    # Check again, because each jump adds two outputs, of which the first is left-hand.
     check_outputs(problem.circuit, t_out.size)
-    return t_out, left
+    return t_out, t_out == np.append(t_out[1:], np.nan)
 
 
-def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
-    """Times TSTART:TSTEP:TSTOP (s), unless `jumps` is "none" with two at each later jump, and which are left-hand."""
+def _output_times(problem: Problem, jumps: str) -> FloatArray:
+    """Times TSTART:TSTEP:TSTOP (s), unless `jumps` is "none" with two at each later jump."""
     step, first = problem.step, problem.first
     count = int(np.floor((problem.t_stop - first) / step * (1.0 + 1e-12) + 1e-9))
     grid = np.asarray(first + step * np.arange(count + 1), float)
@@ -249,15 +248,11 @@ def _output_times(problem: Problem, jumps: str) -> tuple[FloatArray, BoolArray]:
             found.append(np.where(edges > problem.t_stop - same_time(problem.t_stop), problem.t_stop, edges))
     at = np.unique(np.concatenate(found))
     if at.size:
-        near = np.clip(np.searchsorted(at, grid), 1, max(at.size - 1, 1))
-        distance = np.minimum(np.abs(grid - at[near - 1]), np.abs(grid - at[np.minimum(near, at.size - 1)]))
-        grid = grid[distance > 1e-9 * step]
-    t = np.concatenate([grid, at, at])
-    left = np.repeat([False, True, False], [grid.size, at.size, at.size])
-    order = np.lexsort((~left, t))
-    t, left = t[order], left[order]
-    t.flags.writeable = left.flags.writeable = False
-    return t, left
+        nearest = at[np.searchsorted(0.5 * (at[1:] + at[:-1]), grid)]
+        grid = grid[np.abs(grid - nearest) > 1e-9 * step]
+    t = np.sort(np.concatenate([grid, at, at]))
+    t.flags.writeable = False
+    return t
 
 
 PERIODS_PER_WINDOW, BREAKPOINTS_PER_WINDOW = 4096.0, 2000.0
@@ -277,13 +272,11 @@ class Tables:
     def __init__(self, problem: Problem, tol: float, *, no_chirps: bool = False) -> None:
         self.problem, self.no_chirps = problem, no_chirps
         self.tol = min(1e-3, max(0.05 * tol, 1e-14))
-        span = problem.t_stop - problem.t_start
-        rate = max(
-            problem.waveform.breakpoint_rate() / BREAKPOINTS_PER_WINDOW,
-            1.0 / (PERIODS_PER_WINDOW * problem.waveform.shortest_time()),
-            # A function is sampled at the output step.
-            1.0 / (4096.0 * problem.step) if problem.scene.is_sampled else 0.0,
-        )
+        span, wave = problem.t_stop - problem.t_start, problem.waveform
+        # A function is sampled at the output step.
+        longest = 4096.0 * problem.step if problem.scene.is_sampled else math.inf
+        longest = min(longest, PERIODS_PER_WINDOW * wave.shortest_time())
+        rate = max(wave.breakpoint_rate() / BREAKPOINTS_PER_WINDOW, 1.0 / longest)
         count = max(1, int(np.ceil(span * rate)))
         # Limits (s) of the windows: short ones bound memory and the phases' round-off.
         self.edges = [problem.t_start + span * i / count for i in range(count)] + [problem.t_stop]

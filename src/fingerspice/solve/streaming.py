@@ -88,9 +88,11 @@ class Stream:
     def __init__(self, problem: Problem, plan: Plan, outputs: Outputs, count: int, rtol: float, method: str) -> None:
         self.problem, self.plan, self.outputs, self.count, self.rtol = problem, plan, outputs, count, rtol
         self.done = 0
-        # Outputs integrated so far; those that no chunk has contained yet: the mark before each piece, times (s), rows.
+        # Outputs integrated so far; the times (s) and rows of those that no chunk has contained yet; and the states
+        # before the pieces that these come from.
         self._written = 0
-        self._ready: list[tuple[Mark, FloatArray, FloatArray]] = []
+        self._t, self._rows = np.empty(0), np.empty((0, max(problem.initial.y.size, 1)))
+        self._marks: list[Mark] = []
         # Of a recording that is followed sample by sample: its pieces, the number of the next one, and its march.
         own, by_samples = own_rtol(problem, plan, rtol), method == "auto" and plan.tier == "coupled"
         self._pieces, form = (prepared(problem, own) if by_samples else None) or ([], None)
@@ -118,19 +120,25 @@ class Stream:
             self.done = self.outputs.total
             raise SolveError(solution.failure, solution)
         self.done += wanted
+        self._marks = self._marks[sum(mark["written"] <= self.done for mark in self._marks) - 1 :]
         return solution
 
     def mark(self) -> Mark:
         """The state before the piece that contains the next chunk's first output, as plain data; see `go_to`."""
-        marks = [*(mark for mark, _, _ in self._ready), self._here()]
-        return [mark for mark in marks if mark["written"] <= self.done][-1]
+        return [mark for mark in (*self._marks, self._here()) if mark["written"] <= self.done][-1]
 
     def go_to(self, mark: Mark, done: int) -> None:
         """Continue a stream from its mark, after `done` outputs; allowed before this stream's first chunk only."""
-        self._stand(mark)
-        self.done = done
+        self._written, self.done = mark["written"], done
+        if self._march is not None and "march" in mark:
+            self._place = mark["place"]
+            self._march.stand(mark["march"])
+        else:
+            kept: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in mark["state"].items()}
+            self._state, self._march = State(**kept), None
+            self._gaps = np.array(mark["gaps"], float).reshape(-1, 4)
         self._reach(done + 1)
-        self._take(done - (self._ready[0][0]["written"] if self._ready else done))
+        self._take(done - mark["written"])
 
     def _here(self) -> Mark:
         """The mark of the state reached."""
@@ -138,17 +146,6 @@ class Stream:
             return {"written": self._written, "place": self._place, "march": self._march.mark()}
         state = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self._state).items()}
         return {"written": self._written, "state": state, "gaps": self._gaps.tolist()}
-
-    def _stand(self, mark: Mark) -> None:
-        """Restore the state of a mark."""
-        self._written = mark["written"]
-        if self._march is not None and "march" in mark:
-            self._place = mark["place"]
-            self._march.stand(mark["march"])
-            return
-        kept: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in mark["state"].items()}
-        self._state, self._march = State(**kept), None
-        self._gaps = np.array(mark["gaps"], float).reshape(-1, 4)
 
     @property
     def _over(self) -> bool:
@@ -160,16 +157,19 @@ class Stream:
 
     def _reach(self, written: int) -> None:
         """Integrate pieces until so many outputs are there, or the run ends."""
+        found = [(self._t, self._rows)] if self._t.size else []
+        before = len(found)
         while self._written < written and not self._over:
-            mark, march = self._here(), self._march
-            if march is None:
-                self._ready.append((mark, *self._window()))
-                continue
-            try:
-                self._ready.append((mark, *self._piece(march)))
-            except LostError:
-                # The state before this piece.
-                self._state, self._march = march.state, None
+            self._marks.append(self._here())
+            found.append(self._window() if self._march is None else self._piece(self._march))
+        if len(found) > before:
+            self._t, self._rows = (np.concatenate(parts) for parts in zip(*found, strict=True))
+
+    def _take(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Take the next `count` outputs, or all if there are fewer: times (s) and rows."""
+        t, rows = self._t[:count], self._rows[:count]
+        self._t, self._rows = self._t[count:], self._rows[count:]
+        return t, rows
 
     def _piece(self, march: LaneMarch) -> tuple[FloatArray, FloatArray]:
         """Times (s) and rows of the next piece of a recording."""
@@ -178,9 +178,14 @@ class Stream:
         number = (piece.stop - o.start) * o.over if o.rated else (piece.stop - o.start) / o.over
         end = o.total if last else min(max(math.ceil(number) - o.low + 2, self._written), o.total)
         t = o.times(self._written, end)
-        run_at = t if o.rated else at_breakpoints(_between(self.problem, piece.start, piece.stop), t)
+        run_at = t if o.rated else at_breakpoints(replace(self.problem, t_start=piece.start, t_stop=piece.stop), t)
         out = march.outputs_at(run_at)
-        march.follow(piece, run_at, out)
+        try:
+            march.follow(piece, run_at, out)
+        except LostError:
+            # The state before this piece.
+            self._state, self._march = march.state, None
+            return self._window()
         if last:
             march.finish(run_at, out)
         count = march.outputs
@@ -192,9 +197,9 @@ class Stream:
         end = min(self._written + WINDOW, self.outputs.total)
         t, whole = self.outputs.times(self._written, end), self.problem
         stop = whole.t_stop if end == self.outputs.total else on_breakpoint(whole.waveform, float(t[-1]))
-        problem = _between(whole, self._state.t, stop)
-        scene = replace(whole.scene, network=within(whole.network, self._state.t, stop + whole.step))
-        problem = replace(problem, scene=scene, initial=self._state)
+        start, state = self._state.t, self._state
+        scene = replace(whole.scene, network=within(whole.network, start, stop + whole.step))
+        problem = replace(whole, scene=scene, t_start=start, t_stop=stop, first=start, initial=state)
         problem = problem.at(at_breakpoints(problem, t), np.zeros(t.size, bool))
         run, self._method = integrated(problem, self.plan, self.rtol, self._asked)
         if run.gaps.shape == self._gaps.shape:
@@ -209,31 +214,15 @@ class Stream:
         place = [shown.layers.index(shown.cells[i].element) for i in shown.live]
         return t[: run.t.size], np.column_stack([record.u_layer[:, place], record.rows[:, n:]])
 
-    def _take(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Take the next `count` outputs, or all if there are fewer: times (s) and rows."""
-        times, rows, left = [np.empty(0)], [], count
-        while left > 0 and self._ready:
-            mark, t, r = self._ready.pop(0)
-            times.append(t[:left])
-            rows.append(r[:left])
-            if t.size > left:
-                self._ready.insert(0, (mark, t[left:], r[left:]))
-            left -= times[-1].size
-        width = max(self.problem.initial.y.size, 1)
-        return np.concatenate(times), np.concatenate(rows) if rows else np.empty((0, width))
-
     def _solution(self, t: FloatArray, rows: FloatArray) -> Solution:
         problem, none = self.problem, (np.empty(0), np.empty(0, bool), np.empty((0, 0)))
         if self._march is not None:
             run = self._march.run(*none)
-            if self.plan.error_bound > 0.0:
-                run.add_error(self.plan.error_bound * run.gaps[:, 0])
-            if self._over:
-                state_error(problem, run, self.plan, self.rtol)
+            state_error(problem, run, self.plan, self.rtol)
         else:
             assert self._last is not None
             run = replace(self._last, t=none[0], left=none[1], rows=none[2], continuous=None)
-        if self._ready:
+        if self._t.size or not self._over:
             # A failure concerns a later chunk if outputs before it are still waiting for their chunk.
             run.status, run.t_failed = Status.SUCCESS, None
         shown = problem.scene.shown
@@ -244,17 +233,10 @@ class Stream:
         return replace(found, first=span[0], t_stop=span[1])
 
 
-def _between(problem: Problem, t0: float, t1: float) -> Problem:
-    """The problem restricted to the times from t0 to t1, s."""
-    return replace(problem, t_start=t0, t_stop=t1, first=t0)
-
-
 def within(network: Network, t0: float, t1: float) -> Network:
     """The network with its recordings cut to the samples needed from t0 to t1, s."""
-    cut = [
-        replace(e, waveform=e.waveform.part(t0, t1)) if isinstance(e.waveform, Samples) else e for e in network.sources
-    ]
-    return replace(network, sources=tuple(cut))
+    cut = ((e, e.waveform.part(t0, t1) if isinstance(e.waveform, Samples) else e.waveform) for e in network.sources)
+    return replace(network, sources=tuple(replace(e, waveform=wave) for e, wave in cut))
 
 
 def stream(
@@ -316,8 +298,7 @@ def stream(
         count = whole_number("count", count, 1)
         require(chunk is None, "count", "given beside chunk", "one of them")
     circuit = overridden(circuit, sources, parameters)
-    how: dict[str, Any] = {"t_stop": t_stop, "charge_law": charge_law, "area": area, "start": start}
-    problem = asked(circuit, charge=charge, rtol=rtol, **how)
+    problem = asked(circuit, t_stop=t_stop, charge_law=charge_law, area=area, start=start, charge=charge, rtol=rtol)
     check_length(problem.waveform, problem.t_start, problem.t_stop)
     outputs = outputs_of(problem, step)
     if count is None:

@@ -33,11 +33,9 @@ NOW = 1e-30
 # thus above the usual abstol of 1e-12. The last of several .options lines counts, so this one follows the library.
 _OPTIONS = ".options reltol=1e-4 trtol=1e4 abstol=1e-4"
 
-# Points per shortest time scale of a waveform; linear interpolation of a sine then has an error of 5e-6 of its
-# amplitude.
-_POINTS_PER_TIME_SCALE = 1000
-_MAX_POINTS = 2_000_000
-_FEW_POINTS = 1000
+# Points per shortest time scale of a waveform: between them, a sine is off by 5e-6 of its amplitude. Most points of a
+# source, and how many are few.
+_DENSITY, _MOST, _FEW = 1000, 2_000_000, 1000
 
 
 def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
@@ -50,11 +48,6 @@ def export_netlist(circuit: Circuit, *, charge_law: str | None = None) -> str:
     circuit : Circuit
     charge_law : str, optional
         ``"local"`` or ``"mobile"``; the circuit's own by default.
-
-    Returns
-    -------
-    str
-        The deck.
 
     Raises
     ------
@@ -188,7 +181,7 @@ def _source_text(w: Waveform, name: str, circuit: Circuit) -> str:
         # The rise time of a jump is subtracted from the width, so that the pulse still ends at its time.
         width = w.width - (0.0 if w.rise else edge) if math.isfinite(w.width) else 10.0 * span
         period = w.pulse_period if math.isfinite(w.pulse_period) else 20.0 * span + rise + width + fall
-        jumps = empty and w.value(0.0) != 0.0 and w.breakpoint_rate() * stop < _FEW_POINTS
+        jumps = empty and w.value(0.0) != 0.0 and w.breakpoint_rate() * stop < _FEW
         if not jumps and width > 0.0 and rise + width + fall <= period:
             return _call("PULSE", (w.v1, w.v2, w.delay, rise, fall, width, period))
     t, v = _points(w, name, circuit)
@@ -217,8 +210,7 @@ def _points(w: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.nd
     """
     tran = circuit.tran
     if isinstance(w, PWL | Samples) and w.period is None:
-        v = np.asarray(w.values)
-        t = np.asarray(w.times if isinstance(w, PWL) else w.start + np.arange(v.size) / w.rate)
+        t, v = w.knots
         if tran is not None:
             count = int(np.searchsorted(t, tran.stop, side="right")) + 1
             t, v = t[:count], v[:count]
@@ -229,14 +221,14 @@ def _points(w: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.nd
         return t, v
     if tran is None:
         raise InputError(f"{name}: exporting this source as PWL needs a .tran line to know how far")
-    stop, spacing = tran.stop, w.shortest_time() / _POINTS_PER_TIME_SCALE
+    stop, spacing = tran.stop, w.shortest_time() / _DENSITY
     if not math.isfinite(spacing) and w.terms(np.array([0.0]), np.array([stop])) is None:
         spacing = tran.step / 4.0
     count = math.ceil(stop / spacing) if math.isfinite(spacing) else 1
     # Test with the rate, an upper bound, before the breakpoints are listed: there may be too many to list.
     most = count + 2.0 * w.breakpoint_rate() * stop
-    breaks = w.breakpoints(0.0, stop) if most <= 10 * _MAX_POINTS else np.empty(0)
-    _refuse_many(count + 2 * breaks.size if most <= 10 * _MAX_POINTS else most, name)
+    breaks = w.breakpoints(0.0, stop) if most <= 10 * _MOST else np.empty(0)
+    _refuse_many(count + 2 * breaks.size if most <= 10 * _MOST else most, name)
     if tran.uic:
         # The left value at t = 0 only matters for an operating point, which a run with uic does not have.
         breaks = breaks[breaks > 0.0]
@@ -248,6 +240,6 @@ def _points(w: Waveform, name: str, circuit: Circuit) -> tuple[np.ndarray, np.nd
 
 
 def _refuse_many(points: float, name: str) -> None:
-    if points > _MAX_POINTS:
-        raise InputError(f"{name}: the source would take {points:.0f} PWL points; allowed: at most {_MAX_POINTS}; "
+    if points > _MOST:
+        raise InputError(f"{name}: the source would take {points:.0f} PWL points; allowed: at most {_MOST}; "
                          "shorten the run (--stop, or .tran)")  # fmt: skip

@@ -34,8 +34,6 @@ Xskin   skin  0    area  SKIN  d=350u f=100
 .end
 """
 """Table 1 under a sine of 200 V and 100 Hz (Fig. 4, left), as in `circuits/fingerpad.cir`."""
-
-
 #: Source amplitudes of Fig. 3, and of Figs. 4 and 5, V; and the frequencies of the latter, Hz.
 U0_FORCE, U0_TIME, FREQUENCIES = 140.0, 200.0, (100.0, 5000.0)
 # Letters of units in a data file.
@@ -51,9 +49,8 @@ def table1_circuit(*, dispersive: bool = False) -> Circuit:
 class Variation(NamedTuple):
     """One panel of Fig. 3: a parameter, its values, and the circuit parameters that it changes."""
 
-    # title, symbol, unit: Texts of the picture; the symbol is in TeX
     title: str
-    symbol: str
+    symbol: str  # In TeX
     unit: str
     name: str  # Name in the data file
     paths: tuple[str, ...]  # Paths of the circuit parameters that are proportional to the varied parameter

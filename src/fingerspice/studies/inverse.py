@@ -20,9 +20,9 @@ from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import CHARGE_LAWS, Circuit
 from fingerspice.circuit.describe import head_lines, heading, require_circuit
-from fingerspice.circuit.network import Network, network_of
+from fingerspice.circuit.network import Network, linear_scene
 from fingerspice.circuit.statespace import find_branches
-from fingerspice.engine.inverse import drive_stack, hold
+from fingerspice.engine.inverse import drive_stack
 from fingerspice.physics.contact import fixed_area_curve
 from fingerspice.plots import drawing
 from fingerspice.results.record import Sealed
@@ -69,12 +69,9 @@ class Finger:
         tau = self.gap.values["tau"]
         if tau > 0.0:
             raise InputError(f"{self.gap.name} has tau={tau:g} s: its area follows with a delay; allowed here: tau=0")
-        self.network = network_of(circuit)
-        (place,), stack = self.network.fingers, self.network.stack
-        contact = self.network.contacts[place]
-        assert contact is not None
-        self.contact = contact
-        self.area = self.network.areas[place].given  # Fixed by the deck, m^2, or None
+        scene = linear_scene(circuit)
+        self.network, self.contact, stack = scene.network, scene.contact, scene.network.stack
+        self.area = scene.network.areas[scene.finger].given  # Fixed by the deck, m^2, or None
         # Time in which the force rises to its first value, s: by default none in a stack, which jumps with the source.
         self.lead = 2e-3 if stack is None else 0.0
         # Sign of the GAP's voltage, from p to n, relative to the voltage along the source.
@@ -135,18 +132,16 @@ class Finger:
         """
         stack = self.network.stack
         if stack is None:
-            wish = _linear_inverse(self.network)
+            # The source as it is, within its limits: a stack of nothing but a gap.
+            wish, gap, cells, curve = _linear_inverse(self.network), 0, np.eye(1, 3), fixed_area_curve(1.0)
         else:
             assert stack.gap is not None
-            gap, cells = stack.gap, np.column_stack([stack.c, stack.g_total, stack.g_area])
+            wish, gap, cells = (lambda u, _: u), stack.gap, np.column_stack([stack.c, stack.g_total, stack.g_area])
             curve = fixed_area_curve(self.area) if self.area is not None else self.contact.curve(1.2 * max(u_max, 1.0))
 
         def drive(u: FloatArray, h: float, limit: float, slew: float) -> tuple[FloatArray, BoolArray]:
             out, held = np.empty(u.size), np.empty(u.size, np.bool_)
-            if stack is None:
-                hold(wish(u, h), limit, slew * h, out, held)
-            else:
-                drive_stack(u, h, curve, cells, gap, self.law == "mobile", limit, slew * h, out, held)
+            drive_stack(wish(u, h), h, curve, cells, gap, self.law == "mobile", limit, slew * h, out, held)
             return out, held
 
         return drive
@@ -301,8 +296,7 @@ class InverseDrive(Sealed, Shown):
     def plot(self) -> drawing.Picture:
         """Picture of the wanted and the reached quantity, their difference, and the drive, against time."""
         figure, (top, middle, bottom) = drawing.new_figure(3, height=5.2, sharex=True, height_ratios=(3, 1.4, 2))
-        (wanted, reached, miss), volts = self._asked, self.drive.values
-        at = np.arange(volts.size) / self.drive.rate
+        (wanted, reached, miss), (at, volts) = self._asked, self.drive.knots
         scale, unit = drawing.engineering(float(at[-1]), "s")
         force, newton = drawing.engineering(float(wanted.max(initial=0.0)) or 1.0, "N")
         small, milli = drawing.engineering(max(self.worst, 1e-12), "N")
@@ -353,8 +347,7 @@ class InverseDrive(Sealed, Shown):
 
     def to_csv(self, path: str | Path) -> Path:
         """Write the drive as CSV: time (s) and voltage (V)."""
-        t = np.arange(self.drive.values.size) / self.drive.rate
-        return write_csv(path, ("time (s)", "drive (V)"), zip(t, self.drive.values, strict=True))
+        return write_csv(path, ("time (s)", "drive (V)"), zip(*self.drive.knots, strict=True))
 
     def friction_to_csv(self, path: str | Path) -> Path:
         """Write wanted and predicted force and friction as CSV."""
@@ -527,13 +520,19 @@ class Task:
         # Negative round-off becomes 0.
         self.wanted = np.maximum(force, 0.0)
         self.target = finger.voltages(float(self.wanted.max()), rate, carrier)(self.wanted[:: self.fine], self.lead)
+        # Ends of the carrier's periods; and times after the lead at which forces are compared, s.
+        self.edges, self.times = np.empty(0), t
+        if carrier is not None:
+            self.edges = np.arange(math.floor(t[-1] * carrier * (1.0 + 1e-12)) + 1) / carrier
+            self.times = 0.5 * (self.edges[1:] + self.edges[:-1])
 
     def solve(self, limit: float = math.inf, slew: float = math.inf, close: float = CLOSE) -> InverseDrive:
         """The drive within limits (V, V/s), corrected by the errors of the gap voltage until they are `close`."""
         finger, target, contact, fine = self.finger, self.target, self.finger.contact, self.fine
-        peak = float(np.abs(target).max())
+        peak, wanted = float(np.abs(target).max()), self._compared(self.wanted)
         inverter = finger.inverter(peak)
         t = np.arange(fine * (target.size - 1) + 1) / (fine * self.rate)
+        how: dict[str, Any] = {"t_stop": float(t[-1]), "charge_law": finger.law, "rtol": close * RTOL / CLOSE}
         wish, least, levelled = target.copy(), math.inf, self.carrier is None
         for done in range(CORRECTIONS + 1):
             values, held = inverter(wish, 1.0 / self.rate, limit, slew)
@@ -541,47 +540,35 @@ class Task:
             circuit = finger.circuit.varied({finger.source.name: drive})
             # The reader has given the deck's warnings, and those of an uncorrected drive do not concern the user.
             with warnings.catch_warnings(action="ignore", category=FingerspiceWarning):
-                run = simulate(
-                    circuit, t_stop=float(t[-1]), t_eval=t, charge_law=finger.law, rtol=close * RTOL / CLOSE,
-                    start="uncharged", charge=False,
-                )  # fmt: skip
-            force = run.record.one("f_el")
+                run = simulate(circuit, t_eval=t, start="uncharged", charge=False, **how)
+            reached = self._compared(run.record.one("f_el")[self.lead * fine :])
             miss = np.where(held, 0.0, target - finger.sign * run.record.one("u_gap")[::fine])
             size = float(np.abs(miss[self.lead :]).max()) / max(peak, 1e-300)
             stalled = size > STALLED * least
             if size < least:
-                best, least = (circuit, drive, held, force, done), size
+                best, least = (circuit, drive, held, reached, done), size
             wish = wish + miss
             if size <= close or stalled:
                 if levelled:
                     break
                 # The gap voltage is linear between samples, not a sine, which changes the mean force: now that the
                 # force is known, scale the envelope once, so that the mean of each period becomes the wanted one.
-                times, wanted, reached = self._compared(force)
                 some = (reached > 0.5 * wanted) & (wanted > 1e-3 * wanted.max())
                 factor = np.sqrt(np.divide(wanted, reached, out=np.ones_like(wanted), where=some))
                 at = (np.arange(target.size) - self.lead) / self.rate
-                factor, levelled, least = np.where(held, 1.0, np.interp(at, times, factor)), True, math.inf
+                factor, levelled, least = np.where(held, 1.0, np.interp(at, self.times, factor)), True, math.inf
                 target, wish = target * factor, wish * factor
-        circuit, drive, held, force, done = best
-        lead, (times, wanted, reached) = self.lead / self.rate, self._compared(force)
+        (circuit, drive, held, reached, done), lead = best, self.lead / self.rate
         return InverseDrive(
-            circuit, drive, lead + times, wanted, reached, contact.mu * (contact.f_n + wanted),
+            circuit, drive, lead + self.times, wanted, reached, contact.mu * (contact.f_n + wanted),
             contact.mu * (contact.f_n + reached), self.kind, self.carrier, limit, slew, lead, float(held.mean()), done,
         )  # fmt: skip
 
-    def _compared(self, force: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Times after the lead (s), and the forces wanted and reached (N): means over the periods of a carrier."""
-        reached = force[self.lead * self.fine :]
+    def _compared(self, force: FloatArray) -> FloatArray:
+        """Of a force (N) after the lead what is compared: with a carrier, its means over the periods."""
         if self.carrier is None:
-            return np.arange(reached.size) / self.rate, self.wanted, reached
-        count = math.floor((self.wanted.size - 1) / (2.0 * self.rate) * self.carrier * (1.0 + 1e-12))
-        edges = np.arange(count + 1) / self.carrier
-
-        def means(fine: FloatArray) -> FloatArray:
-            parts = (fine[:-2:2] + 4.0 * fine[1::2] + fine[2::2]) / (6.0 * self.rate)
-            total = np.append(0.0, np.cumsum(parts))
-            at_edges = np.interp(edges, np.arange(total.size) / self.rate, total)
-            return np.asarray(np.diff(at_edges) / np.diff(edges))
-
-        return 0.5 * (edges[1:] + edges[:-1]), means(self.wanted), means(reached)
+            return force
+        parts = (force[:-2:2] + 4.0 * force[1::2] + force[2::2]) / (6.0 * self.rate)
+        total = np.append(0.0, np.cumsum(parts))
+        at_edges = np.interp(self.edges, np.arange(total.size) / self.rate, total)
+        return np.asarray(np.diff(at_edges) / np.diff(self.edges))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -244,11 +244,8 @@ class FoldSweep:
     values: FloatArray  # (n,): of the parameter
     voltages: FloatArray  # (n,): the source's peak at the fold, V; NaN if there is no fold up to `HIGHEST`
 
-    @property
-    def rows(self) -> list[tuple[float, float | None]]:
-        """Every value with the voltage at its fold, or None without one."""
-        pairs = zip(self.values.tolist(), self.voltages.tolist(), strict=True)
-        return [(x, u if math.isfinite(u) else None) for x, u in pairs]
+    def rows(self) -> Iterator[tuple[float, float]]:
+        return zip(self.values.tolist(), self.voltages.tolist(), strict=True)
 
 
 @dataclass(frozen=True, repr=False)
@@ -277,7 +274,7 @@ class FoldLimits(Shown):
         head = f"under the mobile law this deck {how}; its source reaches {format_si(self.peak, 'V')}{share}"
         lines: list[str | Table] = [*head_lines(self.circuit), head]
         for sweep in self.sweeps:
-            rows = [(format_si(x, sweep.unit), "none" if u is None else format_si(u, "V")) for x, u in sweep.rows]
+            rows = [(format_si(x, sweep.unit), format_si(u, "V") if u > 0.0 else "none") for x, u in sweep.rows()]
             lines += ["", Table((sweep.name, "folds at"), rows)]
         return Page(lines)
 
@@ -306,7 +303,7 @@ class FoldLimits(Shown):
 
     def to_csv(self, path: str | Path) -> Path:
         """Write the map as CSV; a row without a fold has an empty voltage."""
-        rows = [(one.name, x, one.unit, "" if u is None else u) for one in self.sweeps for x, u in one.rows]
+        rows = [(one.name, x, one.unit, u if u > 0.0 else "") for one in self.sweeps for x, u in one.rows()]
         return write_csv(path, ("parameter", "value [SI]", "unit", "fold [V]"), rows)
 
 
@@ -389,10 +386,7 @@ def fold_voltage(circuit: Circuit, peak: float, t_stop: float, guess: float | No
         by = as_waveform(voltage / peak)
         raised = circuit.varied({name: Product((by, wave)) for name, wave in waves.items()})
         try:
-            problem = prepare(
-                raised, t_stop=t_stop, t_eval=None, charge_law="mobile", area="coupled", start="deck", charge=False,
-                rtol=RTOL,
-            )  # fmt: skip
+            problem = prepare(raised, t_stop=t_stop, charge_law="mobile", charge=False, rtol=RTOL)
             if problem.scene.stack is not None and (met := meets_fold(problem, RTOL)) is not None:
                 return met
             # Not by `simulate`, which would warn about voltages that the user did not ask for.

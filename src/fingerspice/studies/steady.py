@@ -1,32 +1,33 @@
-"""Phasors of a circuit (Eqs. 9 to 15), its periodic state, and its response to sines of given amplitude."""
+"""Phasors of a circuit (Eqs. 9 to 15), its periodic state and its response to sines; and one beside the other."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fingerspice.base.arrays import FloatArray, positive_row, whole_number
 from fingerspice.base.errors import FingerspiceWarning, InputError
-from fingerspice.base.pages import Page, Shown
+from fingerspice.base.pages import Page, Shown, Table
 from fingerspice.base.units import format_si
 from fingerspice.circuit.circuit import AcSweep, Circuit, Element
-from fingerspice.circuit.describe import Parameters, Sources, area_given, overridden, require_circuit
+from fingerspice.circuit.describe import Parameters, Sources, area_given, head_lines, overridden, require_circuit
 from fingerspice.circuit.devices import beyond_fingers
 from fingerspice.circuit.network import build_network, linear_scene, phasor_areas, with_skin_held
 from fingerspice.physics.materials import SKIN_BAND
+from fingerspice.plots import drawing, traces
+from fingerspice.results import summary
 from fingerspice.results.outcome import ErrorEstimate, SolveError
 from fingerspice.results.solution import Sensitivity, Solution
 from fingerspice.results.spectrum import PhasorSolution
 from fingerspice.results.steps import weigh_outputs
-from fingerspice.results.summary import Figured, Figures
 from fingerspice.solve.derivatives import check_request, period_of, sensitivities_of
 from fingerspice.solve.periodic import close_period
 from fingerspice.solve.problem import Problem, prepare
@@ -60,20 +61,19 @@ def sweep_drive(
 def sweep_notes(circuit: Circuit, f: FloatArray, note: str, skin: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Remarks on a sweep (Hz), on the frequency of the skin's data and a `note`, and warnings about extrapolation."""
     skins = {e.name: e.values["f"] for e in circuit.by_device("SKIN")}
-    own = ", ".join(f"{name} f = {x:g} Hz" for name, x in skins.items())
-    notes, warned = list[str](), list[str]()
+    own, said = ", ".join(f"{name} f = {x:g} Hz" for name, x in skins.items()), ""
     if skins and skin == "own":
-        notes.append(f"the skin's data are held at the deck's own frequency ({own}) over the whole sweep")
+        said = f"the skin's data are held at the deck's own frequency ({own}) over the whole sweep"
     elif any(np.any(np.abs(f / x - 1.0) > 1e-9) for x in skins.values()):
-        notes.append(f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})")
+        said = f"the skin's data are taken at each frequency of the sweep, not at the deck's own ({own})"
     low, high = float(f.min()), float(f.max())
     ends = ("down to", low, SKIN_BAND[0] / low, "below"), ("up to", high, high / SKIN_BAND[1], "above")
     # The tolerance of 1e-6 allows for rounding of a sweep's end.
     beyond = [f"{to} {x:g} Hz, {math.log10(by):.2g} decades {side}" for to, x, by, side in ends if by > 1.0 + 1e-6]
-    if beyond and (circuit.by_device("SKIN_DISPERSIVE") or (skins and skin != "own")):
-        warned.append(f"the sweep goes {' and '.join(beyond)} the 10 Hz to 100 kHz of the skin's data (Eqs. 18, 19): "
-                      "what it shows there is extrapolated")  # fmt: skip
-    return (*notes, *([note] if note else [])), tuple(warned)
+    warned = (f"the sweep goes {' and '.join(beyond)} the 10 Hz to 100 kHz of the skin's data (Eqs. 18, 19): what it "
+              "shows there is extrapolated",)  # fmt: skip
+    used = circuit.by_device("SKIN_DISPERSIVE") or (skins and skin != "own")
+    return tuple(filter(None, (said, note))), warned if beyond and used else ()
 
 
 def sweep_frequencies(sweep: AcSweep) -> FloatArray:
@@ -117,10 +117,6 @@ def phasor(
         ``"swept"``: SKIN's data at each frequency; ``"own"``: its data at its own f, as in ngspice.
     finger : str, optional
         Name of the GAP whose figures are wanted; needed if the circuit has several.
-
-    Returns
-    -------
-    PhasorSolution
 
     Raises
     ------
@@ -171,9 +167,8 @@ def phasor(
         impedance = np.array([network.impedance(float(x), a) for x, a in zip(f, areas, strict=True)]) if alone else None
     finite = np.logical_and.reduce([np.isfinite(x).reshape(f.size, -1).all(axis=1) for x in results])
     if not finite.all():
-        raise InputError(f"the phasor at {f[np.argmin(finite)]:g} Hz is beyond the range of numbers; allowed: "
-                         "frequencies nearer to the 10 Hz to 100 kHz of the skin's data, and values nearer to Table "
-                         "1's")  # fmt: skip
+        nearer = "frequencies nearer to the 10 Hz to 100 kHz of the skin's data, and values nearer to Table 1's"
+        raise InputError(f"the phasor at {f[np.argmin(finite)]:g} Hz is beyond the range of numbers; allowed: {nearer}")
     if scene is not None:
         warned = (*warned, *beyond_fingers("", *(float(np.max(x)) for x in (force, stress, size))))
     for text in warned:
@@ -186,7 +181,7 @@ def phasor(
 
 
 @dataclass(frozen=True, repr=False)
-class SteadyState(Shown, Figured):
+class SteadyState(Shown, summary.Figured):
     """The periodic state with its defect, stability and error; its figures (`f_el_mean`, ...) are those of the period.
 
     Attributes
@@ -258,7 +253,7 @@ class SteadyState(Shown, Figured):
         return 1.0 - float(self.multipliers.max(initial=0.0))
 
     @property
-    def _figures(self) -> Figures:
+    def _figures(self) -> summary.Figures:
         return self.solution._figures
 
     @property
@@ -320,10 +315,6 @@ def steady_state(
         Output steps in the period.
     sensitivities : sequence of str
         As in `simulate`: how the periodic state changes with these parameters.
-
-    Returns
-    -------
-    SteadyState
 
     Raises
     ------
@@ -417,10 +408,186 @@ def large_signal(
         (areas, forces), gain = table[:, :2].real.T.copy(), table[:, 2:].copy()
         u_gap = gain[:, scene.gap] * size * np.exp(1j * phase)
         largest = forces.max(), scene.contact.stress(np.abs(u_gap)).max(), areas.max()
-        found.append(
-            PhasorSolution(
-                f, gain[:, scene.gap], gain, u_gap, areas, forces, size, s.layers, phase, drive, notes,
-                (*warned, *beyond_fingers("", *map(float, largest))), circuit,
-            )
-        )  # fmt: skip
+        found.append(PhasorSolution(
+            f, gain[:, scene.gap], gain, u_gap, areas, forces, size, s.layers, phase, drive, notes,
+            (*warned, *beyond_fingers("", *map(float, largest))), circuit,
+        ))  # fmt: skip
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Gap voltage at the fundamental, mean force and mean area from one method; arrays (n_gap,) of several GAPs."""
+
+    amplitude: float | NDArray[np.float64]  # V
+    phase_deg: float | NDArray[np.float64]  # Lead over the source's fundamental, degrees
+    f_el_mean: float | NDArray[np.float64]  # N
+    area_mean: float | NDArray[np.float64]  # m^2
+
+    def of_gap(self, i: int) -> dict[str, float]:
+        """The figures of one GAP by their names."""
+        return {name: np.atleast_1d(value)[i].item() for name, value in vars(self).items()}
+
+
+# Of every figure: its unit in tables, the factor from SI to that unit, and its name on the page and in the picture.
+_FIGURES = {
+    "amplitude": ("V", 1.0, "gap voltage amplitude", "Gap voltage at the fundamental"),
+    "phase_deg": ("deg", 1.0, "lead over the source", "Its lead over the source"),
+    "f_el_mean": ("N", 1.0, "mean force", "Mean electroadhesive force"),
+    "area_mean": ("mm^2", 1e6, "mean area", "Mean ridge area"),
+}
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
+    """The same scene solved by three methods.
+
+    Attributes
+    ----------
+    phasor : Figures
+        Eqs. 9 to 15, with every area coupled through its mean stress.
+    mean : Figures
+        Transient with the phasor's constant areas; its difference from `phasor` is due to the source's harmonics.
+    coupled : Figures
+        Transient with the areas coupled at every instant; its difference from `mean` is due to the areas' ripple.
+    frequency : float
+        Hz.
+    solution : Solution
+        One period of the coupled transient.
+    """
+
+    phasor: Figures
+    mean: Figures
+    coupled: Figures
+    frequency: float
+    solution: Solution
+
+    def _page(self) -> Page:
+        rows = [(f"{label} [{unit}]", *(f"{x:.6g}" for x in numbers)) for label, unit, numbers in self._labelled(2)]
+        head = ("", "phasor", "transient, mean area", "transient, coupled", "coupled - phasor", "of it, ripple")
+        state = f"periodic state at {format_si(self.frequency, 'Hz')}, charge law {self.solution.charge_law}"
+        page: list[str | Table] = [*head_lines(self.solution.circuit), state, "", Table(head, rows), ""]
+        for i, gap in enumerate(self.gaps):
+            reference, mean, coupled = (f.of_gap(i)["f_el_mean"] for f in (self.phasor, self.mean, self.coupled))
+            # Round before formatting, and add 0.0, so that -0.00 is not printed.
+            total, waveform = (round(100.0 * (x / reference - 1.0), 2) + 0.0 for x in (coupled, mean))
+            of = f" of {gap}" if len(self.gaps) > 1 else ""
+            parts = f"{total - waveform:+.2f} % of that is the ripple of the area, {waveform:+.2f} % is the waveform's"
+            page.append(f"mean force{of}: {total:+.2f} % against the phasor; {parts} (zero for a sine)")
+        return Page(page)
+
+    def plot(self) -> drawing.Picture:
+        """Picture of one period of the transient and of the phasor, with the figures of both."""
+        # The table has four rows for each GAP.
+        more = 0.53 * (len(self.gaps) - 1)
+        figure, axes = drawing.new_figure(3, height=5.6 + 1.67 * more, height_ratios=[1.3, 1.3, 0.75 + more])
+        solution, runs = self.solution, [(self.solution, "")]
+        start, stop = float(solution.t[0]), float(solution.t[-1])
+        turns = 2.0 * np.pi * self.frequency * solution.t
+        turns += solution.fundamental.phase if solution.fundamental else 0.0
+        t = traces.time_unit(runs)[0] * solution.t
+        style: dict[str, Any] = {"color": drawing.BLACK, "linestyle": drawing.DASHES[3], "linewidth": 1.5}
+        for ax, keys in zip(axes, (["u_source", "u_gap"], ["f_el"]), strict=False):
+            drawn, factor, unit = traces.draw_panel(ax, runs, keys, start, stop)
+            for i, trace in enumerate(drawn[-len(self.gaps) :]):
+                p = self.phasor.of_gap(i)
+                wave = np.sin(turns + np.radians(p["phase_deg"]))
+                curve = 2.0 * p["f_el_mean"] * wave**2 if keys == ["f_el"] else p["amplitude"] * wave
+                ax.plot(t, factor * curve, label=f"{trace.label}, phasor", **style)
+            traces.finish_panel(ax, keys, drawn, factor, unit)
+        traces.time_axis(axes[:2], runs, start, stop)
+        drawing.caption(figure, f"{traces.about_all(runs)} · periodic state; the phasor is of the fundamental alone")
+        figure.align_ylabels(axes[:2])
+        split = "transient,\nmean area", "transient,\ncoupled", "coupled −\nphasor", "of it, ripple\nof the area"
+        cells = [["", "phasor", *split]]
+        for label, unit, numbers in self._labelled(3):
+            texts = [f"{x:{'.5g' if place < 3 else '+.2g'}}".replace("-", "−") for place, x in enumerate(numbers)]
+            cells.append([f"{label} [{unit.replace('deg', '°').replace('^2', '²')}]", *texts])
+        axes[2].axis("off")
+        # Names of GAPs need more room.
+        first, size = (0.36, drawing.FONT - 0.5) if len(self.gaps) == 1 else (0.42, drawing.SMALL)
+        widths = [first, *[0.2 * (1.0 - first)] * 5]
+        table = axes[2].table(cells, cellLoc="right", loc="center", edges="horizontal", colWidths=widths)
+        table.auto_set_font_size(False)
+        table.set_fontsize(size)
+        for (row, column), cell in table.get_celld().items():
+            cell.set(edgecolor="#BBBBBB", linewidth=0.6, height=(1.0 if row else 1.7) * cell.get_height())
+            if column == 0:
+                cell.get_text().set_horizontalalignment("left")
+                cell.PAD = 0.0
+        return figure
+
+    def rows(self) -> list[tuple[str, str, float, float, float, float, float]]:
+        """Rows of quantity, unit, phasor, transient at mean area, coupled, coupled - phasor, coupled - mean area.
+
+        If the circuit has several GAPs, the quantity is ``name:gap``.
+        """
+        out = []
+        for i, gap in enumerate(self.gaps):
+            for name, (unit, factor, *_) in _FIGURES.items():
+                p, m, c = (factor * f.of_gap(i)[name] for f in (self.phasor, self.mean, self.coupled))
+                out.append((name if len(self.gaps) == 1 else f"{name}:{gap}", unit, p, m, c, c - p, c - m))
+        return out
+
+    def _labelled(self, place: int) -> Iterator[tuple[str, str, list[float]]]:
+        """Rows with the names at this place of `_FIGURES`."""
+        for what, unit, *numbers in self.rows():
+            name, _, gap = what.partition(":")
+            yield f"{_FIGURES[name][place]} {gap}".rstrip(), unit, numbers
+
+    @property
+    def gaps(self) -> tuple[str, ...]:
+        """Names of the GAPs."""
+        return self.solution.gaps
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures as plain data, in SI units."""
+        parts = {"phasor": self.phasor, "transient_mean_area": self.mean, "transient_coupled": self.coupled}
+        plain = {key: {name: np.asarray(x).tolist() for name, x in vars(part).items()} for key, part in parts.items()}
+        return {"frequency": self.frequency, "gaps": list(self.gaps), **plain}
+
+
+def compare(
+    circuit: Circuit,
+    *,
+    sources: Sources | None = None,
+    parameters: Parameters | None = None,
+    charge_law: str | None = None,
+    rtol: float = 1e-8,
+) -> Comparison:
+    """Compare the periodic state of the transient with the phasor.
+
+    Parameters
+    ----------
+    circuit : Circuit
+        A circuit with at least one GAP and one periodic source with a fundamental; a stack may have several sources.
+    sources, parameters, charge_law
+        As in `simulate`.
+    rtol : float
+        Error of the transients, relative to their peaks.
+
+    Raises
+    ------
+    InputError
+        If the circuit has no GAP, a network has several sources, or the source has no period or fundamental.
+    SolveError
+        If a transient fails.
+    """
+    circuit = overridden(circuit, sources, parameters)
+    names = [e.name for e in circuit.by_device("GAP")]
+    fundamental = linear_scene(circuit, next(iter(names), None)).network.waveforms[0].fundamental
+    if fundamental is None:
+        raise InputError("compare needs a source with a fundamental: a periodic one; this source has none")
+    phasors = {name: phasor(circuit, finger=name) for name in names}
+    how: dict[str, Any] = {"charge_law": charge_law, "rtol": rtol, "points": 2000}
+    coupled, mean = (steady_state(circuit, area=area, **how).solution for area in ("coupled", "mean"))
+    found = [phasors[name] for name in coupled.gaps]
+    figures = [(abs(p.u_gap[0]), np.degrees(np.angle(p.gain[0])), p.f_el_mean[0], p.area[0]) for p in found]
+    ways: list[Any] = [np.array(figures).T]
+    for one in (mean, coupled):
+        lead = np.asarray(one.u_gap_phase_deg, float) - np.degrees(fundamental.phase)
+        area = one._figures.value("area", "mean_periodic")
+        every = one.u_gap_amplitude, (lead + 180.0) % 360.0 - 180.0, one.f_el_mean_periodic, area
+        ways.append(np.array(every, float).reshape(len(every), -1))
+    first, second, third = (Figures(*(way[:, 0].tolist() if len(found) == 1 else way)) for way in ways)
+    return Comparison(first, second, third, fundamental.frequency, coupled)
