@@ -36,7 +36,7 @@ from fingerspice.circuit.describe import digests, scenes_warnings
 from fingerspice.results.runfile import CHECKSUM, Array, attributes_of, create, tidy
 from fingerspice.studies.batch.batch import MESSAGES, STATUS_NAMES, batch, checked_scenes
 from fingerspice.studies.batch.lockstep import LOCKSTEP
-from fingerspice.studies.sweep.populations import Draws, Plan
+from fingerspice.studies.sweep.populations import Plan
 from fingerspice.waveforms.waveform import require
 
 if TYPE_CHECKING:
@@ -105,7 +105,8 @@ class Work:
         self.chunks = math.prod(self._grid)
         require(self.chunks <= MOST_CHUNKS, "the sweep", f"{math.prod(plan.sizes):,} scenes", "at most "
                 f"{MOST_CHUNKS:,} chunks of {math.prod(self.block):,}")  # fmt: skip
-        self.draws = Draws(plan, self.block[-1]) if plan.drawn else None
+        if plan.drawn:
+            plan.divide(self.block[-1])
         # With ``error`` and, as the last, ``status``
         self.outputs = {
             str(name): Array(
@@ -191,7 +192,7 @@ class Work:
         part = tuple(slice(i * own, min((i + 1) * own, size)) for i, own, size in ranges)
         sizes = tuple(one.stop - one.start for one in part)
         with computing:
-            draws = {} if self.draws is None else self.draws.part(at[-1])
+            draws = plan.draws(at[-1]) if at else {}
             grid = {name: values[one] for (name, values), one in zip(plan.grid.items(), part, strict=False)}
             found = batch(plan.circuit, plan.spread(grid, draws), **self.options)
         figures = {x: found[x].values.reshape((*sizes, *one.shape[len(part) :])) for x, one in self.outputs.items()}
