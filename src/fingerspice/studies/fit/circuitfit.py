@@ -134,8 +134,8 @@ def _data_of(circuit: Circuit, given: Given, by: str | None) -> Data:
             allowed += ", as the electroadhesive force counts as positive where it pulls towards the screen"
         value = f"{checked[low[0]]:g} {_UNITS[name]}".rstrip()
         raise InputError(f"{place}: {name} is {value} {where}; allowed: {allowed}")
-    least = math.inf if sigma is None else sigma.min()
-    refuse(not least > 0.0, f"{place}: the smallest sigma is {least:g}; allowed: more than 0")
+    least = math.inf if sigma is None else sigma.min(initial=math.inf)
+    refuse(least <= 0.0, f"{place}: the smallest sigma is {least:g}; allowed: more than 0")
     conditions: dict[str, FloatArray] = {}
     data = Data(names[name], values, sigma, conditions, t, phase, groups)
     if t is not None:
